@@ -121,6 +121,7 @@ impl CommandRun {
             ticket,
             joined,
             was_begun,
+            behind,
             ..
         } = command;
         let effects = confirm::effects(profile, &order);
@@ -147,7 +148,7 @@ impl CommandRun {
                 .collect(),
             Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
             Order::Points(_) if unsendable.is_some() && urgency != Urgency::Stop => VecDeque::new(),
-            Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop),
+            Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop, behind.is_some()),
         };
         let actions = actions
             .into_iter()
@@ -517,7 +518,9 @@ impl CommandRun {
             StepPurpose::ReadWord => self.urgency != Urgency::Stop && !self.ends_pulse(),
             _ => false,
         };
-        let is_busy = matches!(reply, Reply::Exception(code) if code.is_busy());
+        // A read that it still works on has changed nothing, and is asked for again.
+        let is_busy = matches!(reply, Reply::Exception(code) if code.is_busy()
+            || (*code == Exception::ACKNOWLEDGE && step.purpose == StepPurpose::ReadWord));
         if !(is_busy && waits) || (self.only_ends && self.tries.busy >= MOST_BUSY) {
             return false;
         }
@@ -571,11 +574,16 @@ impl CommandRun {
     }
 
     fn word_refused(&mut self, step: &Step, code: Exception, words: &KnownWords) -> Option<Outcome> {
+        // What the drive says to a read tells nothing of a write that it may have taken.
+        let refused = match self.tries.in_doubt {
+            true => self.tries.unanswered.clone(),
+            false => Outcome::Exception(code),
+        };
         if let Some((table, address)) = self.settings()
             && words.is_reported(table, address)
         {
             // It reported its settings before: what was read then is no longer what it has.
-            return Some(Outcome::Exception(code));
+            return Some(refused);
         }
         let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
         let known = matches!(&step.pdu, RequestPdu::Read { table, start, .. } if words.get(*table, *start).is_some());
@@ -583,9 +591,9 @@ impl CommandRun {
             return None;
         }
         if kept_back || self.urgency == Urgency::Stop {
-            return self.without_word(Outcome::Exception(code));
+            return self.without_word(refused);
         }
-        Some(Outcome::Exception(code))
+        Some(refused)
     }
 
     /// The value stands all the same: a supervisor that looks away does not see changes at the panel, no more.

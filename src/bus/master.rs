@@ -42,6 +42,8 @@ use crate::process_image::DriveImage;
 const LOOK_ROUND: Duration = Duration::from_millis(100);
 /// Response timeouts for which an N2 reply may come late.
 const N2_LATE: u32 = 3;
+/// But no longer than that: a drive that does not answer is probed within 10 s.
+const LONGEST_N2_LATE: Duration = Duration::from_secs(9);
 /// Time for the first byte of the reply to a probe of a drive that does not answer, or to a stop, unless it is known to be
 /// slower: probed every 10 s, it costs less than 2 % of the line by that.
 const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
@@ -272,7 +274,7 @@ impl Master {
         let late = late.filter_map(LateReplies::until);
         let window = match self.sessions.is_empty() {
             true => FORGOTTEN_AFTER,
-            false => N2_LATE * self.response_timeout,
+            false => self.n2_window(),
         };
         let broken_off = broken_off.map(|deadline| deadline + window);
         Handover {
@@ -378,6 +380,11 @@ impl Master {
         }
         let known = self.drives.get(turn.drive).map(|drive| 2 * drive.answers_within);
         self.response_timeout.min(PROBE_TIMEOUT.max(known.unwrap_or_default()))
+    }
+
+    /// How long a reply may come late on an N2 line.
+    pub(super) fn n2_window(&self) -> Duration {
+        (N2_LATE * self.response_timeout).min(LONGEST_N2_LATE)
     }
 
     /// What may still come late on an N2 line, for the exchange that is about to begin.

@@ -5,12 +5,18 @@
 //! for how long. Meanwhile no request goes out whose reply has such a form; others go on. A frame of a form that cannot be
 //! the reply of the present exchange is the late one, which is not expected any more from then on. What a reply shares
 //! with a late one by chance, such as a refusal, is not believed.
+//!
+//! Two things end the wait early. A drive answers in order: once it has answered a later request whose reply has another
+//! form, nothing that it was asked before is still to come. And process data may be asked for again at once, as long as the
+//! request was not answered since: whichever reply comes, it is the same object of the same drive. Its value is dated by
+//! the first of these requests.
 
 use std::time::{Duration, Instant};
 
-use crate::codec::RequestPdu;
 use crate::codec::n2::command::Answer;
 use crate::codec::n2::{Form, form};
+use crate::codec::{Exception, RequestPdu};
+use crate::drive::{PlannedRead, PollClass};
 
 /// Late replies remembered; beyond that the oldest is forgotten.
 const KEPT: usize = 16;
@@ -19,12 +25,31 @@ const KEPT: usize = 16;
 #[derive(Debug, Clone, Default)]
 pub struct N2LateReplies(Vec<Late>);
 
+/// A request to a drive.
 #[derive(Debug, Clone, Copy)]
+pub struct Asked<'r> {
+    /// The address of the drive.
+    pub address: u8,
+    /// What it was asked.
+    pub pdu: &'r RequestPdu,
+    /// The device type by which it identifies itself.
+    pub device: u8,
+    /// When the request was sent.
+    pub at: Instant,
+}
+
+#[derive(Debug, Clone)]
 struct Late {
+    address: u8,
+    pdu: RequestPdu,
     form: Form,
     /// The device type that an identity would show.
     device: u8,
+    /// When the first of the requests was sent that may be answered late.
+    asked: Instant,
     until: Instant,
+    /// The same request was answered since: by which of the replies, nobody knows.
+    answered: bool,
 }
 
 /// What a sound frame is in an exchange.
@@ -39,17 +64,48 @@ pub enum Taken {
 }
 
 impl N2LateReplies {
-    /// No believable answer to `pdu` came until `now`, and none will later than in the time of `window`. `device` is the
-    /// type by which the drive identifies itself.
-    pub fn given_up(&mut self, pdu: &RequestPdu, device: u8, window: Duration, now: Instant) {
+    /// No believable answer came until `now`, and none will later than in the time of `window`.
+    pub fn given_up(&mut self, asked: Asked<'_>, window: Duration, now: Instant) {
         self.0.retain(|late| late.until > now);
+        let Some(form) = form(asked.pdu) else { return };
+        let until = now + window;
+        if let Some(late) = self.of(asked.address, asked.pdu) {
+            (late.until, late.answered) = (until, false);
+            return;
+        }
         if self.0.len() >= KEPT {
             self.0.remove(0);
         }
-        if let Some(form) = form(pdu) {
-            let until = now + window;
-            self.0.push(Late { form, device, until });
+        self.0.push(Late {
+            address: asked.address,
+            pdu: asked.pdu.clone(),
+            form,
+            device: asked.device,
+            asked: asked.at,
+            until,
+            answered: false,
+        });
+    }
+
+    fn of(&mut self, address: u8, pdu: &RequestPdu) -> Option<&mut Late> {
+        self.0.iter_mut().find(|late| late.is_of(address, pdu))
+    }
+
+    /// The drive answered a request: what it was asked before, and would answer in another form, is not to come any more.
+    /// Of the same request another reply may still come, within the time of `window`.
+    pub fn answered(&mut self, address: u8, pdu: &RequestPdu, window: Duration, now: Instant) {
+        let Some(form) = form(pdu) else { return };
+        self.0
+            .retain(|late| late.address != address || late.form.is_like(form) || form.is_like(late.form));
+        if let Some(late) = self.of(address, pdu).filter(|late| !late.answered) {
+            (late.until, late.answered) = (now + window, true);
         }
+    }
+
+    /// When the object was asked for that the reply to this request shows, which came now.
+    pub fn asked_by(&self, address: u8, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
+        let late = self.0.iter().find(|late| late.is_of(address, pdu) && late.until > now);
+        late.map(|late| late.asked)
     }
 
     /// How many replies may still come.
@@ -70,12 +126,25 @@ impl N2LateReplies {
     /// Until when a request must wait because a late reply could pass for its own.
     pub fn blocks(&self, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
         let wanted = form(pdu)?;
-        let alike = |late: &&Late| late.until > now && late.form.is_like(wanted);
-        self.0.iter().filter(alike).map(|late| late.until).max()
+        self.alike(wanted, now).map(|late| late.until).max()
     }
 
-    /// What the whole frame at the beginning of `bytes` is, received at `now` in the exchange of `pdu`.
-    pub fn take(&mut self, pdu: &RequestPdu, bytes: &[u8], now: Instant) -> Taken {
+    /// The same for a poll: one of process data may go out again, unless it was answered since.
+    pub(super) fn blocks_poll(&self, address: u8, read: &PlannedRead, now: Instant) -> Option<Instant> {
+        let pdu = read.pdu();
+        let again = |late: &Late| read.class == PollClass::Fast && !late.answered && late.is_of(address, &pdu);
+        let others = self.alike(form(&pdu)?, now).filter(|late| !again(late));
+        others.map(|late| late.until).max()
+    }
+
+    fn alike(&self, wanted: Form, now: Instant) -> impl Iterator<Item = &Late> {
+        let alike = move |late: &&Late| late.until > now && late.form.is_like(wanted);
+        self.0.iter().filter(alike)
+    }
+
+    /// What the whole frame at the beginning of `bytes` is, received at `now` in the exchange of `pdu` with the drive of
+    /// that address.
+    pub fn take(&mut self, address: u8, pdu: &RequestPdu, bytes: &[u8], now: Instant) -> Taken {
         self.0.retain(|late| late.until > now);
         let Some((used, answer)) = frame(bytes).filter(|_| !self.0.is_empty()) else {
             return Taken::Reply;
@@ -83,11 +152,24 @@ impl N2LateReplies {
         let Some(index) = self.0.iter().position(|late| late.could_be(&answer)) else {
             return Taken::Reply;
         };
-        if form(pdu).is_some_and(|form| has_form(form, &answer)) || matches!(answer, Answer::Nak(_)) {
-            return Taken::Doubtful;
+        let mut alike = self.0.iter().filter(|late| late.could_be(&answer));
+        let is_own = match &answer {
+            // Whatever of it a drive refused because it waits for Identify, it does wait.
+            Answer::Nak(code) if Exception::n2(*code) == Exception::N2_RESTARTED => {
+                alike.all(|late| late.address == address)
+            }
+            // An acknowledgement could be that of a write before another one.
+            _ => !pdu.is_write() && alike.all(|late| late.is_of(address, pdu)),
+        };
+        match answer {
+            _ if is_own => Taken::Reply,
+            Answer::Nak(_) => Taken::Doubtful,
+            answer if form(pdu).is_some_and(|form| has_form(form, &answer)) => Taken::Doubtful,
+            _ => {
+                self.0.remove(index);
+                Taken::Late(used)
+            }
         }
-        self.0.remove(index);
-        Taken::Late(used)
     }
 
     /// The frame was a late reply: it is not expected any more.
@@ -99,13 +181,13 @@ impl N2LateReplies {
         }
     }
 
-    /// The answer to `pdu` was doubtful: if it was a late one, the reply itself may still come. So may the late one, if it
-    /// was not.
-    pub fn doubted(&mut self, pdu: &RequestPdu, device: u8, window: Duration, now: Instant) {
-        match self.0.iter_mut().find(|late| Some(late.form) == form(pdu)) {
-            Some(late) => late.until = late.until.max(now + window),
-            None => self.given_up(pdu, device, window, now),
+    /// The answer was doubtful: if it was a late one, the reply itself may still come. So may the late one, if it was not.
+    pub fn doubted(&mut self, asked: Asked<'_>, window: Duration, now: Instant) {
+        let alike = |late: &&mut Late| Some(late.form) == form(asked.pdu);
+        if let Some(late) = self.0.iter_mut().find(alike) {
+            late.until = late.until.max(now + window);
         }
+        self.given_up(asked, window, now);
     }
 }
 
@@ -142,6 +224,10 @@ fn has_form(form: Form, answer: &Answer) -> bool {
 }
 
 impl Late {
+    fn is_of(&self, address: u8, pdu: &RequestPdu) -> bool {
+        self.address == address && self.pdu == *pdu
+    }
+
     fn could_be(&self, answer: &Answer) -> bool {
         match (self.form, answer) {
             // Whatever was asked may have been refused.
@@ -185,35 +271,48 @@ mod tests {
         RequestPdu::Read { table, start, count }
     }
 
+    fn asked(address: u8, pdu: &RequestPdu, at: Instant) -> Asked<'_> {
+        Asked {
+            address,
+            pdu,
+            device: 0x10,
+            at,
+        }
+    }
+
     #[test]
     fn what_could_be_mistaken_waits_and_another_form_settles_it() {
         let now = Instant::now();
         let float = read(Table::Input, 0, 2);
         let state = read(Table::DiscreteInput, 0, 1);
         let mut late = N2LateReplies::default();
-        assert_eq!(late.take(&float, b"A4248000092\r", now), Taken::Reply);
-        late.given_up(&float, 0x10, WINDOW, now);
+        assert_eq!(late.take(1, &float, b"A4248000092\r", now), Taken::Reply);
+        late.given_up(asked(2, &float, now), WINDOW, now);
         assert_eq!(late.blocks(&read(Table::Input, 8, 2), now), Some(now + WINDOW));
         assert_eq!(late.blocks(&state, now), None);
-        assert_eq!(late.take(&state, b"A0060\r", now), Taken::Reply, "a byte is no float");
-        assert_eq!(late.take(&state, b"A424800", now), Taken::Reply, "not whole");
         assert_eq!(
-            late.take(&state, b"A4248000093\r", now),
+            late.take(1, &state, b"A0060\r", now),
+            Taken::Reply,
+            "a byte is no float"
+        );
+        assert_eq!(late.take(1, &state, b"A424800", now), Taken::Reply, "not whole");
+        assert_eq!(
+            late.take(1, &state, b"A4248000093\r", now),
             Taken::Reply,
             "a wrong checksum"
         );
         assert_eq!(
-            late.take(&state, b"N01\r", now),
+            late.take(1, &state, b"N01\r", now),
             Taken::Doubtful,
             "whose refusal is it?"
         );
-        assert_eq!(late.take(&float, b"A4248000092\r", now), Taken::Doubtful);
-        assert_eq!(late.take(&state, b"A4248000092\r", now), Taken::Late(12));
+        assert_eq!(late.take(1, &float, b"A4248000092\r", now), Taken::Doubtful);
+        assert_eq!(late.take(1, &state, b"A4248000092\r", now), Taken::Late(12));
         assert_eq!(late.blocks(&float, now), None, "it came");
-        late.given_up(&float, 0x10, WINDOW, now);
+        late.given_up(asked(2, &float, now), WINDOW, now);
         assert!(late.may_come(now) && !late.may_come(now + WINDOW));
         assert_eq!(
-            late.take(&float, b"A4248000092\r", now + WINDOW),
+            late.take(1, &float, b"A4248000092\r", now + WINDOW),
             Taken::Reply,
             "forgotten"
         );
@@ -224,12 +323,99 @@ mod tests {
         let now = Instant::now();
         let state = read(Table::DiscreteInput, 0, 1);
         let mut late = N2LateReplies::default();
-        late.given_up(&RequestPdu::N2(Session::Identify), 0x10, WINDOW, now);
+        late.given_up(asked(2, &RequestPdu::N2(Session::Identify), now), WINDOW, now);
         for pdu in [read(Table::Input, 0, 2), state.clone(), read(Table::Input, 0x4000, 1)] {
             assert_eq!(late.blocks(&pdu, now), None);
         }
-        assert_eq!(late.take(&state, b"A4064\r", now), Taken::Reply);
-        assert_eq!(late.take(&state, b"A1061\r", now), Taken::Doubtful);
-        assert_eq!(late.take(&read(Table::Input, 0, 2), b"A1061\r", now), Taken::Late(6));
+        assert_eq!(late.take(1, &state, b"A4064\r", now), Taken::Reply);
+        assert_eq!(late.take(1, &state, b"A1061\r", now), Taken::Doubtful);
+        assert_eq!(late.take(1, &read(Table::Input, 0, 2), b"A1061\r", now), Taken::Late(6));
+    }
+
+    #[test]
+    fn a_drive_answers_in_order() {
+        let (now, soon) = (Instant::now(), Instant::now() + Duration::from_millis(50));
+        let (float, other) = (read(Table::Input, 0, 2), read(Table::Input, 2, 2));
+        let state = read(Table::DiscreteInput, 0, 1);
+        let mut late = N2LateReplies::default();
+        late.given_up(asked(1, &float, now), WINDOW, now);
+        late.answered(2, &state, WINDOW, now);
+        assert!(
+            late.blocks(&float, now).is_some(),
+            "another drive says nothing of this one"
+        );
+        late.answered(1, &other, WINDOW, now);
+        assert!(late.blocks(&float, now).is_some(), "it may have been the late one");
+        late.answered(1, &state, WINDOW, soon);
+        assert_eq!(late.blocks(&float, soon), None);
+        assert_eq!(late.owed(soon), 0);
+    }
+
+    #[test]
+    fn process_data_is_asked_for_again_until_it_is_answered() {
+        let now = Instant::now();
+        let soon = now + Duration::from_millis(50);
+        let fast = |start| PlannedRead {
+            class: PollClass::Fast,
+            table: Table::Input,
+            start,
+            count: 2,
+            wide: 0,
+        };
+        let (read, reply) = (fast(0), b"A4248000092\r".as_slice());
+        let pdu = read.pdu();
+        let mut late = N2LateReplies::default();
+        late.given_up(asked(1, &pdu, now), WINDOW, now);
+        assert_eq!(late.blocks_poll(1, &read, now), None);
+        assert!(
+            late.blocks_poll(2, &read, now).is_some(),
+            "the same object of another drive"
+        );
+        assert!(late.blocks_poll(1, &fast(2), now).is_some(), "another object");
+        let slow = PlannedRead {
+            class: PollClass::Slow,
+            ..read
+        };
+        assert!(
+            late.blocks_poll(1, &slow, now).is_some(),
+            "it would keep the others waiting"
+        );
+        assert_eq!(late.take(1, &pdu, reply, soon), Taken::Reply);
+        assert_eq!(late.take(2, &pdu, reply, soon), Taken::Doubtful);
+        assert_eq!(
+            late.asked_by(1, &pdu, soon),
+            Some(now),
+            "perhaps the reply to the first request"
+        );
+        late.answered(1, &pdu, WINDOW, soon);
+        assert_eq!(
+            late.blocks_poll(1, &read, soon),
+            Some(soon + WINDOW),
+            "once more, and the wait would never end"
+        );
+        late.answered(1, &pdu, WINDOW, soon + WINDOW / 2);
+        assert_eq!(
+            late.blocks_poll(1, &read, soon),
+            Some(soon + WINDOW),
+            "nor is it renewed"
+        );
+        assert_eq!(late.asked_by(1, &pdu, soon + WINDOW), None);
+    }
+
+    #[test]
+    fn a_refusal_is_believed_where_nobody_else_can_have_sent_it() {
+        let now = Instant::now();
+        let (float, state) = (read(Table::Input, 0, 2), read(Table::DiscreteInput, 0, 1));
+        let mut late = N2LateReplies::default();
+        late.given_up(asked(1, &float, now), WINDOW, now);
+        assert_eq!(
+            late.take(1, &state, b"N00\r", now),
+            Taken::Reply,
+            "whatever it refuses, it waits for Identify"
+        );
+        assert_eq!(late.take(1, &state, b"N11\r", now), Taken::Doubtful, "of which object?");
+        assert_eq!(late.take(1, &float, b"N11\r", now), Taken::Reply);
+        late.given_up(asked(2, &float, now), WINDOW, now);
+        assert_eq!(late.take(1, &state, b"N00\r", now), Taken::Doubtful, "of which drive?");
     }
 }

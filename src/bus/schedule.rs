@@ -126,6 +126,8 @@ pub struct Schedule {
     cadence: Cadence,
     drives: Vec<DriveSchedule>,
     round: VecDeque<(usize, PlannedRead)>,
+    /// Of the round, what decides the state of a drive of which nothing is known: no slow poll goes before it.
+    state_first: Vec<(usize, PlannedRead)>,
     round_due: Instant,
     round_started: Option<Instant>,
     new_round: Option<RoundStart>,
@@ -163,7 +165,7 @@ impl Schedule {
         let drives = plans.iter().enumerate().map(|(index, plan)| {
             let reads = plan.reads.iter().chain(&plan.on_fault);
             let items = reads.map(|read| Item::new(*read, *read, cost(index, read), now));
-            DriveSchedule::new(items.collect(), now)
+            DriveSchedule::new(items.collect(), plan.behind_state.clone(), now)
         });
         let drives: Vec<DriveSchedule> = drives.collect();
         let slow = drives.iter().flat_map(|drive| &drive.items);
@@ -177,6 +179,7 @@ impl Schedule {
             cadence,
             drives,
             round: VecDeque::new(),
+            state_first: Vec::new(),
             round_due: now,
             round_started: None,
             new_round: None,
@@ -199,6 +202,7 @@ impl Schedule {
     pub fn next(&mut self, now: Instant, waiting: Option<Urgency>) -> Decision {
         self.earn(now);
         self.start_round(now);
+        self.rejoin(now);
         let poll = self.due_poll(now);
         if poll.is_none() {
             self.share.line_is_free();
@@ -269,6 +273,7 @@ impl Schedule {
             if self.round.front() == Some(&(poll.drive, poll.read)) {
                 self.round.pop_front();
             }
+            self.state_first.retain(|first| *first != (poll.drive, poll.read));
             self.probed = false;
         } else {
             self.slow_credit = match turn {
@@ -338,8 +343,36 @@ impl Schedule {
             drive.presence = Presence::Away(until, pause);
         }
         if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
+            item.postponed = true;
             item.due = item.due.max(until);
             item.asked = item.asked.map(|since| since.max(until));
+        }
+    }
+
+    /// Polls that were postponed are due again, as far as they may go now.
+    pub fn recall(&mut self, now: Instant, may_go: impl Fn(usize, &PlannedRead) -> bool) {
+        for (index, drive) in self.drives.iter_mut().enumerate() {
+            let postponed = drive.items.iter_mut().filter(|item| item.postponed);
+            for item in postponed.filter(|item| may_go(index, &item.read)) {
+                item.due = item.due.min(now);
+                item.asked = item.asked.map(|since| since.min(now));
+            }
+        }
+    }
+
+    /// Process data that was postponed and may be read now takes part in the round that goes on.
+    fn rejoin(&mut self, now: Instant) {
+        if self.round.is_empty() {
+            return;
+        }
+        for (index, drive) in self.drives.iter_mut().enumerate() {
+            let online = drive.presence == Presence::Online;
+            for item in drive.items.iter_mut().filter(|item| item.postponed && item.due <= now) {
+                item.postponed = false;
+                if online && item.read.class == PollClass::Fast && !self.round.contains(&(index, item.read)) {
+                    self.round.push_back((index, item.read));
+                }
+            }
         }
     }
 
@@ -358,14 +391,35 @@ impl Schedule {
     }
 
     /// Everything of a drive is read again, what is read once too.
-    pub fn read_again(&mut self, drive: usize, now: Instant) {
-        let Some(drive) = self.drives.get_mut(drive) else {
+    pub fn read_again(&mut self, index: usize, now: Instant) {
+        let Some(drive) = self.drives.get_mut(index) else {
             return;
         };
         let again = |item: &&mut Item| !item.refused && item.read.class != PollClass::Fault;
         for item in drive.items.iter_mut().filter(again) {
             item.wanted = true;
             item.due = item.due.min(now);
+        }
+        self.state_first(index, None);
+    }
+
+    /// What decides a drive's state, of which nothing is known, is read next, apart from what was read just now.
+    fn state_first(&mut self, index: usize, just_read: Option<PlannedRead>) {
+        let Some(drive) = self
+            .drives
+            .get(index)
+            .filter(|drive| drive.presence == Presence::Online)
+        else {
+            return;
+        };
+        let may_go = |read: &PlannedRead| {
+            let sound = |item: &Item| item.read == *read && !item.refused && !item.postponed;
+            Some(*read) != just_read && drive.items.iter().any(sound)
+        };
+        for read in drive.behind_state.iter().rev().filter(|read| may_go(read)) {
+            self.round.retain(|waiting| *waiting != (index, *read));
+            self.round.push_front((index, *read));
+            self.state_first.push((index, *read));
         }
     }
 
@@ -399,7 +453,10 @@ impl Schedule {
     }
 
     /// Something had to be said to a drive before its poll, which is still due: the others have their turn in between.
-    pub fn session_done(&mut self) {
+    pub fn session_done(&mut self, drive: usize) {
+        if let Some(drive) = self.drives.get_mut(drive) {
+            (drive.heard, drive.failures) = (true, 0);
+        }
         self.probed = true;
         self.share.polled(Duration::ZERO);
     }
@@ -427,6 +484,7 @@ impl Schedule {
     /// Forgets all presence: the port was lost, every drive is found anew.
     pub fn reset(&mut self, now: Instant) {
         self.round.clear();
+        self.state_first.clear();
         self.round_due = now;
         self.round_started = None;
         self.slow_started = None;

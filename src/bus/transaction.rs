@@ -191,7 +191,10 @@ impl Transaction {
                 self.foreign += 1;
                 self.late.came(&frame);
             }
-            match self.late.take(&self.request.pdu, &self.received, now) {
+            match self
+                .late
+                .take(self.request.address, &self.request.pdu, &self.received, now)
+            {
                 Taken::Reply => {}
                 Taken::Late(used) => {
                     self.foreign += 1;

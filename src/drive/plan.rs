@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
+use super::model::ModelPoint;
 use super::profile::{PollClass, Profile, Source};
 use crate::codec::{LineFormat, Protocol, RequestPdu, Table};
 
@@ -46,6 +47,8 @@ pub struct Plan {
     pub reads: Vec<PlannedRead>,
     /// What a drive with a new fault is asked for, as far as no fast read has it: once a fault, among its slow reads.
     pub on_fault: Vec<PlannedRead>,
+    /// The reads of process data that decide the drive's state: fault, running, ready.
+    pub behind_state: Vec<PlannedRead>,
 }
 
 impl Plan {
@@ -76,7 +79,24 @@ impl Plan {
             .map(|raw| (raw.table, raw.address, raw.form.items()))
             .collect();
         let on_fault = merge(profile, PollClass::Fault, &on_fault);
-        Plan { reads, on_fault }
+        let mut plan = Plan {
+            reads,
+            on_fault,
+            behind_state: Vec::new(),
+        };
+        plan.behind_state = plan.behind_state(profile);
+        plan
+    }
+
+    fn behind_state(&self, profile: &Profile) -> Vec<PlannedRead> {
+        let deciding = [ModelPoint::Fault, ModelPoint::Running, ModelPoint::Ready];
+        let deciding = deciding.into_iter().filter_map(|point| profile.model_index(point));
+        let deciding: Vec<usize> = deciding.flat_map(|point| profile.raw_points_of(point)).collect();
+        let raws = || deciding.iter().filter_map(|point| profile.points.get(*point)?.raw());
+        let decides =
+            |read: &&PlannedRead| raws().any(|raw| raw.addresses().any(|address| read.covers(raw.table, address)));
+        let fast = self.reads.iter().filter(|read| read.class == PollClass::Fast);
+        fast.filter(decides).copied().collect()
     }
 
     /// Whether these requests read a point of that profile: everything it is in or derived from.

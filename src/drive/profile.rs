@@ -312,6 +312,18 @@ impl Profile {
         self.model_index(point).and_then(|i| self.points.get(i))
     }
 
+    /// The points with registers of their own that a point is, or is derived from.
+    pub(crate) fn raw_points_of(&self, point: usize) -> Vec<usize> {
+        match self.points.get(point).map(|point| &point.source) {
+            Some(Source::Derived(derived)) => {
+                let of = derived.rests_on();
+                of.into_iter().flat_map(|of| self.raw_points_of(of)).collect()
+            }
+            Some(Source::Raw(_)) => vec![point],
+            None => Vec::new(),
+        }
+    }
+
     /// The profile with the points that are fast where the line carries it; `None` if it has none.
     pub(crate) fn with_faster_points(&self) -> Option<Profile> {
         if !self.points.iter().any(|point| point.fast_if_carried) {

@@ -72,9 +72,9 @@ impl Timed for Note {
 
 /// A drive as its samples tell, with the reads that only a fault asks for.
 pub(super) fn empty_snapshot(spec: &DriveSpec) -> Snapshot {
-    let Plan { mut reads, on_fault } = Plan::of(&spec.profile);
-    reads.extend(on_fault.iter().copied());
-    let mut snapshot = Snapshot::empty(&Plan { reads, on_fault });
+    let mut plan = Plan::of(&spec.profile);
+    plan.reads.extend_from_slice(&plan.on_fault);
+    let mut snapshot = Snapshot::empty(&plan);
     // What is not answered is not in the samples, so whatever is there was said.
     snapshot.link = Link::Online(std::time::SystemTime::UNIX_EPOCH);
     snapshot

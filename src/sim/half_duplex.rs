@@ -15,6 +15,7 @@ use super::framing;
 use super::slave::{Asked, Heard, Slaves, refuse};
 use super::statistics::{Direction, Lateness, Recorded, Statistics, Transcript};
 use crate::codec::{Exception, LineFormat, Protocol, rtu};
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 /// How the bytes of a reply reach the master.
@@ -140,6 +141,8 @@ pub struct HalfDuplex {
     faults: FaultPlan,
     incoming: Option<Incoming>,
     outgoing: Vec<Outgoing>,
+    /// When each drive will have said what it has to say.
+    said_until: BTreeMap<u8, SimTime>,
     /// End of the last frame that the master sent or could expect.
     last_end: Option<SimTime>,
     /// End of the last reply that the master could expect; it may lie ahead.
@@ -164,6 +167,7 @@ impl HalfDuplex {
             faults,
             incoming: None,
             outgoing: Vec::new(),
+            said_until: BTreeMap::new(),
             last_end: None,
             reply_end: None,
             pause_before: Duration::MAX,
@@ -224,6 +228,7 @@ impl HalfDuplex {
     pub fn cut(&mut self) {
         self.incoming = None;
         self.outgoing.clear();
+        self.said_until.clear();
         self.last_end = None;
         self.reply_end = None;
         self.provoked_end = None;
@@ -469,6 +474,11 @@ impl HalfDuplex {
         self.statistics.replies += u64::from(bursts.iter().any(|burst| burst.kind != Kind::Echo));
         let own = self.slaves.drive(asked.address).and_then(|drive| drive.turnaround());
         let mut at = now + own.unwrap_or(self.rules.turnaround);
+        // A drive answers in order: what it still has to say goes before. On N2 the master relies on that; with Modbus late
+        // replies overtake each other, which is harder for the master than what a drive does.
+        if self.rules.protocol == Protocol::N2 {
+            at = at.max(self.said_until.get(&asked.address).copied().unwrap_or_default());
+        }
         for burst in bursts {
             if burst.kind == Kind::Echo {
                 // It cannot come earlier: only now is known that this request meets the fault.
@@ -484,6 +494,7 @@ impl HalfDuplex {
                     self.hum(hertz, at, &mut burst.bytes);
                 }
                 at = self.send(at + burst.gap, burst);
+                self.said_until.insert(asked.address, at);
             }
         }
     }

@@ -94,13 +94,15 @@ fn a_reply_of_bits_that_could_be_a_request_is_not_believed() {
 #[test]
 fn an_n2_reply_belongs_to_the_request_before_it() {
     let (read, state) = (&b">0111020388\r"[..], &b">0112020288\r"[..]);
+    let other = &b">0211020389\r"[..];
     let sum = b"42700000".iter().fold(0u8, |sum, byte| sum.wrapping_add(*byte));
     let float = format!("A42700000{sum:02X}\r").into_bytes();
     let all = |frames: &[(&[u8], u64)]| believed(Protocol::N2, frames);
     assert_eq!(all(&[(read, 5), (&float, 5)]), [(1, 2, vec![0x4270, 0])]);
     assert_eq!(all(&[(state, 5), (b"A4064\r", 5)]), [(1, 1, vec![1])]);
-    // The float may be the late one; a state is none.
-    assert_eq!(all(&[(read, 5), (read, 300), (&float, 5)]), []);
+    // The float may be the late one of another object or drive; a state is none, nor is that of the same object.
+    assert_eq!(all(&[(other, 5), (read, 300), (&float, 5)]), []);
+    assert_eq!(all(&[(read, 5), (read, 300), (&float, 5)]), [(1, 2, vec![0x4270, 0])]);
     assert_eq!(all(&[(read, 5), (state, 300), (b"A4064\r", 5)]), [(1, 1, vec![1])]);
 }
 

@@ -545,7 +545,7 @@ fn n2() {
         row("late:20ms", Nothing, 0.75),
         row("late:255ms", Timeouts, 0.15),
         row("late:275ms", Timeouts, 0.15),
-        row("late:400ms", Timeouts, 0.15),
+        row("late:400ms", Timeouts, 0.10),
         // No reply of N2 names anything, so that a foreign one cannot be recognised: here it is none.
         row("foreign-address", Timeouts, 0.15),
         row("foreign-function", Timeouts, 0.15),

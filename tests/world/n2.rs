@@ -1,11 +1,13 @@
 //! One bus with N2 boards: sessions, overrides, what the boards say of themselves.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use drivegate::codec::{Exception, Protocol, n2};
 use drivegate::command::Outcome;
 use drivegate::drive::{ModelPoint, Profile, Quality, State, Value};
 use drivegate::event::EventKind;
+use drivegate::sim::faults::FaultPlan;
 
 use super::bus::Parts;
 use super::rig::{PATIENCE, Rig, line};
@@ -220,4 +222,90 @@ fn what_means_no_object_and_what_the_drive_refuses() {
     assert_eq!(rig.read(1, 0, 4), Outcome::Exception(Exception::ADDRESS));
     assert_eq!(rig.read(1, 98, 2), Outcome::Exception(Exception::n2(0x10)));
     assert!(rig.read(1, 0, 2).is_ok());
+}
+
+/// The longest time in which a drive said nothing of its state, from now on.
+fn longest_without_state(rig: &mut Rig, address: u8, time: Duration) -> Duration {
+    let until = rig.now + time;
+    let (mut known, mut longest) = (rig.now, Duration::ZERO);
+    while rig.step(until).is_some() {
+        if rig.drive(address).reading(rig.now).overall() == Quality::Good {
+            known = rig.now;
+        }
+        longest = longest.max(rig.now - known);
+    }
+    longest
+}
+
+/// The share of looks, one in 10 ms, in which the state of the first drive is known.
+fn known_state(drives: u8, rates: &str) -> f64 {
+    let mut rig = ready(drives);
+    rig.set_faults(FaultPlan::new(rates.parse().unwrap(), 7));
+    let looks = 60_000;
+    let mut known = 0;
+    for _ in 0..looks {
+        rig.run(Duration::from_millis(10));
+        let reading = rig.drive(1);
+        let reading = reading.reading(rig.now);
+        known += u32::from(reading.overall() == Quality::Good);
+    }
+    f64::from(known) / f64::from(looks)
+}
+
+#[test]
+fn the_state_of_a_drive_that_started_anew_is_known_within_a_second() {
+    for address in 1..=2 {
+        let mut rig = ready(2);
+        rig.run(Duration::from_secs(20));
+        let now = rig.bus.sim(rig.now);
+        rig.bus.wire.slaves().board(address).unwrap().restart(now);
+        let without = longest_without_state(&mut rig, address, Duration::from_secs(20));
+        assert!(without <= Duration::from_secs(1), "drive {address}: {without:?}");
+        let other = longest_without_state(&mut rig, 3 - address, Duration::from_secs(20));
+        assert!(other <= Duration::from_secs(1), "the other: {other:?}");
+    }
+}
+
+#[test]
+fn the_state_of_a_drive_that_is_back_is_known_within_a_second() {
+    for away in [50, 300, 800, 3_000, 20_000].map(Duration::from_millis) {
+        let mut rig = ready(2);
+        rig.run(Duration::from_secs(20));
+        rig.set_alive(1, false);
+        rig.run(away);
+        rig.set_alive(1, true);
+        let asked = count(&rig, ">01");
+        rig.until("it is asked", PATIENCE, |rig| count(rig, ">01") > asked);
+        let known = |rig: &Rig| rig.drive(1).reading(rig.now).overall() == Quality::Good;
+        let after = rig.until("its state is known", PATIENCE, known);
+        assert!(after <= Duration::from_secs(1), "away {away:?}: {after:?}");
+    }
+}
+
+#[test]
+fn the_state_is_mostly_known_on_a_line_that_loses_a_sixth_of_all_replies() {
+    let rates = "drop=0.09,corrupt=0.09";
+    for (drives, least) in [(1, 0.7), (2, 0.45)] {
+        let share = known_state(drives, rates);
+        assert!(share >= least, "{drives} drives: {share:.3}");
+    }
+}
+
+#[test]
+fn a_reset_takes_the_run_command_away_once() {
+    for (order, stops) in [
+        (&[("fault_reset", 1.0)][..], 1),
+        (&[("run", 0.0), ("fault_reset", 1.0)], 1),
+    ] {
+        let mut rig = ready(1);
+        assert!(rig.set(1, &[("speed_reference", 50.0), ("run", 1.0)]).is_ok());
+        rig.until_good(1, ModelPoint::Running, Value::Bool(true));
+        rig.with_drive(1, |drive, _| drive.trip(1));
+        rig.until_good(1, ModelPoint::FaultCode, Value::Integer(1));
+        let before = count(&rig, ">0172040100");
+        assert!(rig.set(1, order).is_ok());
+        rig.run(Duration::from_secs(10));
+        assert_eq!(count(&rig, ">0172040100") - before, stops, "{order:?}");
+        assert_eq!(rig.good(1, ModelPoint::Fault), Some(Value::Bool(false)));
+    }
 }

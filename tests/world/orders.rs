@@ -48,7 +48,8 @@ impl Wish {
     /// Whether it takes the place of an older one that waits: a reference, or the same parameter.
     pub fn replaces(self, older: Wish) -> bool {
         let is_reference = |wish| matches!(wish, Wish::Reference | Wish::Converted);
-        (is_reference(self) && is_reference(older)) || (self == Wish::Parameter && older == self)
+        (is_reference(self) && (is_reference(older) || older == Wish::StopAtReference))
+            || (self == Wish::Parameter && older == self)
     }
 
     /// One that the dice choose.

@@ -137,7 +137,8 @@ pub(super) fn names_run(profile: &Profile, values: &[(usize, Value)]) -> bool {
     raws.filter(|raw| raw.covers(run.table, run.address)).any(is_run)
 }
 
-pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool) -> VecDeque<Action> {
+/// The actions of a command. `stopped`: it is the rest of an order whose stop went before it.
+pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool, stopped: bool) -> VecDeque<Action> {
     let mut numbers = VecDeque::new();
     let mut pulses = VecDeque::new();
     let mut words: BTreeMap<(Table, u16), WordChange> = BTreeMap::new();
@@ -151,7 +152,10 @@ pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool) 
                 if value.as_bool() {
                     let hold = Action::Hold(2 * profile.update_period);
                     let elsewhere = |run: &Raw| (run.table, run.address) != (raw.table, raw.address);
-                    if let Some((run, bit, invert)) = profile.run_bit().filter(|(run, ..)| elsewhere(run)) {
+                    // A stop takes the run command away itself, before the reset.
+                    let is_armed = !stopped && !(stop && names_run(profile, values));
+                    let run = profile.run_bit().filter(|_| is_armed);
+                    if let Some((run, bit, invert)) = run.filter(|(run, ..)| elsewhere(run)) {
                         let raw = run.clone();
                         pulses.push_back(Action::Disarm { raw, bit, invert });
                     }

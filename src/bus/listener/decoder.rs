@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use crate::bus::late_replies::{FORGOTTEN_AFTER, LateReplies};
-use crate::bus::n2_late_replies::{N2LateReplies, Taken};
+use crate::bus::n2_late_replies::{Asked, N2LateReplies, Taken};
 use crate::bus::transaction::{Ended, MAY_BE_LATE};
 use crate::codec::frames::{Cut, Frames, GLITCH, HELD_BACK, Piece, are_sound, may_be_request};
 use crate::codec::n2::{self, N2Options};
@@ -235,7 +235,7 @@ impl Decoder {
     fn late(&mut self, bytes: &[u8], at: Instant) -> Option<&'static str> {
         let request = self.open.as_ref()?.request.as_ref()?;
         let may_be_late = match self.protocol {
-            Protocol::N2 => self.n2_late.take(&request.pdu, bytes, at) != Taken::Reply,
+            Protocol::N2 => self.n2_late.take(request.address, &request.pdu, bytes, at) != Taken::Reply,
             Protocol::ModbusRtu | Protocol::ModbusAscii => {
                 let late = self.late.get_mut(&request.address);
                 late.is_some_and(|late| late.blocks(&request.pdu, at).is_some())
@@ -274,8 +274,13 @@ impl Decoder {
         if let Some(request) = open.request.as_ref().filter(|_| !mangled) {
             match self.protocol {
                 Protocol::N2 => {
-                    let device = request.n2.device_type;
-                    self.n2_late.given_up(&request.pdu, device, N2_LATE, now);
+                    let asked = Asked {
+                        address: request.address,
+                        pdu: &request.pdu,
+                        device: request.n2.device_type,
+                        at: open.began,
+                    };
+                    self.n2_late.given_up(asked, N2_LATE, now);
                 }
                 Protocol::ModbusRtu | Protocol::ModbusAscii => {
                     let late = self.late.entry(request.address).or_default();
@@ -305,6 +310,13 @@ impl Decoder {
             }
             asked_by = late.asked_by(&request.pdu, at);
             late.answered(&request.pdu, open.began, at);
+        }
+        if let (Some(request), Some(Ended::Reply(reply)), None) = (&open.request, &ended, doubt)
+            && self.protocol == Protocol::N2
+            && !matches!(reply, Reply::Exception(_))
+        {
+            self.n2_late.answered(request.address, &request.pdu, N2_LATE, at);
+            asked_by = self.n2_late.asked_by(request.address, &request.pdu, at).unwrap_or(at);
         }
         heard.push(Heard::Exchange(Box::new(Exchange {
             address: open.address,

@@ -364,8 +364,12 @@ impl Master {
         let pdu = poll.read.pdu();
         let drive = self.drives.get_mut(poll.drive)?;
         let session = self.sessions.before(poll.drive, None, now);
-        let next = session.map_or_else(|| pdu.clone(), RequestPdu::N2);
-        if let Some(until) = drive.late.blocks(&pdu, now).max(self.n2_late.blocks(&next, now)) {
+        let address = self.bus.image.drives.get(poll.drive)?.spec.address;
+        let on_n2 = match session {
+            Some(session) => self.n2_late.blocks(&RequestPdu::N2(session), now),
+            None => self.n2_late.blocks_poll(address, &poll.read, now),
+        };
+        if let Some(until) = drive.late.blocks(&pdu, now).max(on_n2) {
             self.schedule.postpone(&poll, until);
             return None;
         }

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::{Before, Master, Purpose, Turn, TurnEnd};
 use crate::bus::command_run::{Step, StepPurpose};
+use crate::bus::n2_late_replies::Asked;
 use crate::bus::n2_session::Progress;
 use crate::bus::news::News;
 use crate::bus::schedule::{Change, Poll, Polled};
@@ -53,6 +54,9 @@ impl Master {
             // Nobody answers it.
             return;
         }
+        if !self.sessions.is_empty() {
+            self.note_late_on_n2(turn, end, now);
+        }
         let stranger = self.stranger(turn);
         let mut drive = self.drives.get_mut(turn.drive);
         match &end.ended {
@@ -87,16 +91,42 @@ impl Master {
                     late.given_up(&turn.pdu, end.began, now);
                 }
             }
-            Ended::Corrupt(MAY_BE_LATE) => {
-                let window = super::N2_LATE * self.response_timeout;
-                let device = self.sessions.device(turn.drive);
-                self.n2_late.doubted(&turn.pdu, device, window, now);
+            Ended::Silent | Ended::Corrupt(_) => {}
+        }
+    }
+
+    /// The same on an N2 line. What waited for a late reply that will not come is due again.
+    fn note_late_on_n2(&mut self, turn: &Turn, end: &TurnEnd, now: Instant) {
+        let configured = self.bus.image.drives.get(turn.drive);
+        let Some(address) = configured
+            .map(|image| image.spec.address)
+            .or_else(|| self.stranger(turn))
+        else {
+            return;
+        };
+        let window = self.n2_window();
+        let asked = Asked {
+            address,
+            pdu: &turn.pdu,
+            device: self.sessions.device(turn.drive),
+            at: end.began,
+        };
+        match &end.ended {
+            Ended::Reply(Reply::Exception(_)) => {}
+            Ended::Reply(_) => {
+                self.n2_late.answered(address, &turn.pdu, window, now);
+                let Master {
+                    schedule, n2_late, bus, ..
+                } = self;
+                let drives = &bus.image.drives;
+                schedule.recall(now, |drive, read| {
+                    let address = drives.get(drive).map_or(0, |image| image.spec.address);
+                    n2_late.blocks_poll(address, read, now).is_none()
+                });
             }
-            Ended::Silent | Ended::Corrupt(_) => {
-                let device = self.sessions.device(turn.drive);
-                self.n2_late
-                    .given_up(&turn.pdu, device, super::N2_LATE * self.response_timeout, now);
-            }
+            Ended::Corrupt(_) if end.mangled && !self.late_before => {}
+            Ended::Corrupt(MAY_BE_LATE) => self.n2_late.doubted(asked, window, now),
+            Ended::Silent | Ended::Corrupt(_) => self.n2_late.given_up(asked, window, now),
         }
     }
 
@@ -126,7 +156,7 @@ impl Master {
         let end = TurnEnd { ended, ..end };
         match before {
             Before::Poll(poll) if failed => self.polled(poll, end, now, news),
-            Before::Poll(_) => self.schedule.session_done(),
+            Before::Poll(_) => self.schedule.session_done(drive),
             Before::Command(slot, rank) => {
                 self.schedule.command_done(*rank, end.took);
                 if failed {
@@ -208,7 +238,9 @@ impl Master {
         let Some(drive) = self.drives.get_mut(index) else {
             return;
         };
-        let at = drive.late.asked_by(&pdu, now);
+        let address = self.bus.image.drives.get(index).map(|image| image.spec.address);
+        let asked = address.and_then(|address| self.n2_late.asked_by(address, &pdu, now));
+        let at = asked.unwrap_or_else(|| drive.late.asked_by(&pdu, now));
         drive.late.answered(&pdu, sent, now);
         if let Some(words) = reply.into_words() {
             self.learn(index, read, words, at, news);

@@ -79,7 +79,9 @@ impl Schedule {
         let slow = self.due_slow(now);
         // A whole round went by without room for it: the line is saturated.
         let left_out = |due| now.saturating_duration_since(due) > self.cadence.fast;
-        let on_credit = |(due, _, cost): &(Instant, Poll, Duration)| self.slow_credit >= *cost && left_out(*due);
+        let yields = self.round.front().is_some_and(|front| self.state_first.contains(front));
+        let on_credit =
+            |(due, _, cost): &(Instant, Poll, Duration)| !yields && self.slow_credit >= *cost && left_out(*due);
         if let Some((_, poll, _)) = slow.filter(on_credit) {
             self.turn = Turn::OnCredit;
             return Some(poll);
@@ -145,7 +147,7 @@ impl Schedule {
             .drives
             .iter()
             .enumerate()
-            .filter(|(_, d)| d.presence == Presence::Online)
+            .filter(|(_, d)| d.presence == Presence::Online && !d.waits_for_fast())
         {
             let slow = drive.items.iter().filter(|item| item.is_slow());
             for (due, item) in slow.map(|item| (drive.due(item), item)).filter(|(due, _)| *due <= now) {
@@ -171,7 +173,8 @@ impl Schedule {
                 Presence::Away(_, _) if drive.items.is_empty() => None,
                 Presence::Away(at, _) => Some(at),
                 Presence::Online => {
-                    let slow = drive.items.iter().filter(|i| i.is_slow()).map(|i| drive.due(i));
+                    let slow = drive.items.iter().filter(|i| i.is_slow() && !drive.waits_for_fast());
+                    let slow = slow.map(|i| drive.due(i));
                     let asked = drive.items.iter().filter_map(|i| i.asked);
                     slow.chain(asked).filter(|due| *due > now).min()
                 }

@@ -33,6 +33,8 @@ pub(super) struct Item {
     /// The read of the plan that this one is a part of.
     pub(super) origin: PlannedRead,
     pub(super) due: Instant,
+    /// It is due later than it would be, because another reply could pass for its own.
+    pub(super) postponed: bool,
     pub(super) cost: Duration,
     pub(super) refused: bool,
     /// How often in a row.
@@ -62,20 +64,28 @@ pub(super) struct DriveSchedule {
     pub(super) presence: Presence,
     pub(super) early: EarlyProbes,
     pub(super) tried: bool,
+    /// It answered what is said to it before it is read, since it was probed last.
+    pub(super) heard: bool,
     /// It did not answer a command: a fast poll shows whether it is there, before anything else is read.
     pub(super) doubted: bool,
     pub(super) failures: u32,
     pub(super) garbled: u32,
+    /// It did not answer when it was asked last.
+    pub(super) unanswered: bool,
     /// When process data was last asked for in vain.
     pub(super) troubled: Option<Instant>,
     pub(super) items: Vec<Item>,
+    /// Those that decide its state.
+    pub(super) behind_state: Vec<PlannedRead>,
 }
 
 /// The probes of a drive soon after it went away.
 #[derive(Debug)]
 pub(super) struct EarlyProbes {
-    /// How many it has saved up.
-    saved: u32,
+    /// How many it has whatever they cost: all after it was sound for a while.
+    free: usize,
+    /// Time on the line that it has saved up for more of them.
+    saved: Duration,
     /// Online since; saves up.
     online_since: Option<Instant>,
     /// When it went away, and how many of them it had since.
@@ -85,7 +95,8 @@ pub(super) struct EarlyProbes {
 impl Default for EarlyProbes {
     fn default() -> Self {
         EarlyProbes {
-            saved: EARLY_PROBES.len() as u32,
+            free: EARLY_PROBES.len(),
+            saved: Duration::ZERO,
             online_since: None,
             outage: None,
         }
@@ -106,14 +117,19 @@ impl EarlyProbes {
     /// When the next one comes, after a request in vain that took the line for `took`; none when they are used up.
     fn next(&mut self, now: Instant, took: Duration) -> Option<Instant> {
         if let Some(since) = self.online_since.take() {
-            let share = now.saturating_duration_since(since).mul_f64(DEAD_SHARE);
-            let earned = share.as_nanos() / took.as_nanos().max(1);
-            let most = EARLY_PROBES.len() as u32;
-            self.saved = most.min(self.saved.saturating_add(u32::try_from(earned).unwrap_or(most)));
+            let online = now.saturating_duration_since(since);
+            if online >= SOUND_FOR {
+                self.free = EARLY_PROBES.len();
+            }
+            self.saved += online.min(SOUND_FOR).mul_f64(DEAD_SHARE);
         }
         let (since, used) = self.outage.get_or_insert((now, 0));
-        let at = *since + *EARLY_PROBES.get(*used).filter(|_| self.saved > 0)?;
-        (*used, self.saved) = (*used + 1, self.saved - 1);
+        let at = *since + *EARLY_PROBES.get(*used)?;
+        match self.free.checked_sub(1) {
+            Some(free) => self.free = free,
+            None => self.saved = self.saved.checked_sub(took)?,
+        }
+        *used += 1;
         // The others have as much of the line in between.
         Some(at.max(now + took))
     }
@@ -125,6 +141,7 @@ impl Item {
             read,
             origin,
             due: now,
+            postponed: false,
             cost,
             refused: false,
             refusals: 0,
@@ -148,16 +165,19 @@ impl Item {
 
 impl DriveSchedule {
     /// A drive that was not asked yet.
-    pub(super) fn new(items: Vec<Item>, now: Instant) -> DriveSchedule {
+    pub(super) fn new(items: Vec<Item>, behind_state: Vec<PlannedRead>, now: Instant) -> DriveSchedule {
         DriveSchedule {
             presence: Presence::Away(now, Duration::ZERO),
             early: EarlyProbes::default(),
             tried: false,
+            heard: false,
             doubted: false,
             failures: 0,
             garbled: 0,
+            unanswered: false,
             troubled: None,
             items,
+            behind_state,
         }
     }
 
@@ -168,6 +188,7 @@ impl DriveSchedule {
             Presence::Online => Duration::ZERO,
             Presence::Away(_, pause) => pause,
         };
+        self.heard = false;
         let (first, longest) = PROBE_PAUSE;
         if let Some(at) = self.early.next(now, took) {
             self.presence = Presence::Away(at, (pause * 2).max(first));
@@ -200,6 +221,11 @@ impl DriveSchedule {
     pub(super) fn has_unread(&self) -> bool {
         let unread = |item: &Item| item.unread && !item.refused && item.failures == 0 && item.is_slow();
         self.presence == Presence::Online && self.items.iter().any(unread)
+    }
+
+    /// Whether slow reads wait until process data shows that it still answers.
+    pub(super) fn waits_for_fast(&self) -> bool {
+        self.unanswered && self.has_fast()
     }
 
     pub(super) fn has_fast(&self) -> bool {

@@ -20,6 +20,7 @@ impl Schedule {
         };
         drive.failures = 0;
         drive.garbled = 0;
+        drive.unanswered = false;
         drive.tried = true;
         drive.doubted = false;
         let came = drive.presence != Presence::Online;
@@ -54,7 +55,11 @@ impl Schedule {
                 item.due = if next < now || early { now + slow } else { next };
             }
         }
-        if came { Change::Online } else { change }
+        if came {
+            self.state_first(poll.drive, Some(poll.read));
+            return Change::Online;
+        }
+        change
     }
 
     pub(super) fn failed(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
@@ -64,7 +69,8 @@ impl Schedule {
         };
         if let Presence::Away(_, pause) = drive.presence {
             drive.failures += 1;
-            if !drive.tried && drive.failures <= retries {
+            // One that has just said something is there.
+            if (!drive.tried || drive.heard) && drive.failures <= retries {
                 drive.presence = Presence::Away(now, pause);
                 return Change::None;
             }
@@ -73,6 +79,7 @@ impl Schedule {
             drive.is_away(now, took);
             return if first { Change::Offline } else { Change::None };
         }
+        drive.unanswered = true;
         let presence_counts = poll.read.class == PollClass::Fast || !drive.has_fast();
         if !presence_counts {
             // A request that is never answered must not take the drive away while its process data comes.
@@ -84,6 +91,7 @@ impl Schedule {
                     None => now,
                 };
             }
+            self.ask_whether_it_answers(poll.drive, now);
             return Change::None;
         }
         drive.failures += 1;
@@ -100,7 +108,19 @@ impl Schedule {
         drive.failures = 0;
         drive.garbled = 0;
         self.round.retain(|(index, _)| *index != poll.drive);
+        self.state_first.retain(|(index, _)| *index != poll.drive);
         Change::Offline
+    }
+
+    /// The process data of a drive that did not answer something else is read now, though its round is not due: slow reads
+    /// wait for it.
+    fn ask_whether_it_answers(&mut self, index: usize, now: Instant) {
+        if !self.round.is_empty() {
+            return;
+        }
+        let items = self.drives.get(index).into_iter().flat_map(|drive| &drive.items);
+        let fast = items.filter(|item| item.read.class == PollClass::Fast && item.due <= now);
+        self.round.extend(fast.map(|item| (index, item.read)));
     }
 
     pub(super) fn garbled(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {

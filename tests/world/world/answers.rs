@@ -43,7 +43,8 @@ impl World {
             let answer = record.answer.as_ref();
             !record.succeeded
                 && newest.wish.replaces(record.wish)
-                && answer.is_some_and(|(code, at)| code == "replaced" && *at == now)
+                // The rest of an order that stops waits as a reference of its own.
+                && answer.is_some_and(|(code, at)| (code == "replaced" || code == "stop_only") && *at == now)
         };
         let recent = before.iter_mut().rev().take(1_000);
         let mut replaced = recent.filter(of_drive).filter(just_replaced);

@@ -1,7 +1,7 @@
 //! Answers on an N2 line that may be late ones.
 
 use super::*;
-use crate::bus::n2_late_replies::N2LateReplies;
+use crate::bus::n2_late_replies::{Asked, N2LateReplies};
 use crate::codec::Table;
 
 const WINDOW: Duration = Duration::from_millis(750);
@@ -20,7 +20,13 @@ fn behind_late_state(pdu: RequestPdu, now: Instant) -> Transaction {
     let mut frame = Vec::new();
     Protocol::N2.encode(&request, &mut frame);
     let mut late = N2LateReplies::default();
-    late.given_up(&state(3), 0x10, WINDOW, now);
+    let asked = Asked {
+        address: 2,
+        pdu: &state(3),
+        device: 0x10,
+        at: now,
+    };
+    late.given_up(asked, WINDOW, now);
     let mut transaction = Transaction::new(
         Protocol::N2,
         request,
