@@ -392,7 +392,9 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
 
 /// Deadline of an exchange, silence, and the exchanges until the next good one.
 fn longest(protocol: Protocol) -> Duration {
-    protocol.usual_timeout() * 5 / 4
+    // The reply to a poll of N2 may be a long report, which is waited for at 9600 baud.
+    let report = if protocol == Protocol::N2 { 2 } else { 1 };
+    protocol.usual_timeout() * 5 / 4 * report
 }
 
 fn matrix(protocol: Protocol, rows: impl IntoIterator<Item = Row>) {

@@ -535,7 +535,13 @@ fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() 
     let sent = writes(&rig, 0);
     assert_eq!(sent.len(), 2);
     assert!(sent[0] < given_up + COST * 2, "it waits for nobody");
-    assert!(sent[1] >= sent[0] + rig.master.response_timeout * N2_LATE);
+    // A drive answers in order: once each has answered something else, no late one is to come.
+    let asked = |of: usize| {
+        let between = |at: &Instant| *at > sent[0] && *at < sent[1];
+        rig.wire.iter().any(|(at, turn)| turn.drive == of && between(at))
+    };
+    assert!(asked(0) && asked(1));
+    assert!(sent[1] < sent[0] + rig.master.response_timeout * N2_LATE);
     assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
 }
 
