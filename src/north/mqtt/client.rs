@@ -20,9 +20,7 @@ use self::discovery::{announcer, discovery_topics, report_refused, subscriptions
 use self::repair::Repair;
 use super::back_off::BackOff;
 use super::commands::{Commands, FinishedCommand, Rules};
-use super::connection::{
-    self, BrokerLimits, Connection, ConnectionEvent, SILENCE, SUBSCRIBE_TIMEOUT, Subscribed, Subscription,
-};
+use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, SUBSCRIBE_TIMEOUT, Subscribed, Subscription};
 use super::home_assistant::{Announcer, Sources};
 use super::outage_log::OutageLog;
 use super::outbox::{Delivery, Key, Kind, Message, Outbox, Settled};
@@ -100,8 +98,6 @@ enum BrokerLink {
 struct BrokerSession {
     connection: Connection,
     phase: Phase,
-    /// Time of the last packet from the broker.
-    last_packet: Instant,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -109,6 +105,16 @@ enum Phase {
     Connecting,
     Subscribing { limits: BrokerLimits, since: Instant },
     Ready { limits: BrokerLimits, since: Instant },
+}
+
+impl Phase {
+    /// What the broker can do, once it is known.
+    fn limits(self) -> Option<BrokerLimits> {
+        match self {
+            Phase::Connecting => None,
+            Phase::Subscribing { limits, .. } | Phase::Ready { limits, .. } => Some(limits),
+        }
+    }
 }
 
 struct Client {
@@ -219,9 +225,6 @@ impl Client {
         let BrokerLink::Open(session) = &mut self.link else {
             return;
         };
-        if !matches!(event, ConnectionEvent::Sent(_) | ConnectionEvent::Room) {
-            session.last_packet = Instant::now();
-        }
         match event {
             ConnectionEvent::Connected(limits) => self.connected(limits),
             ConnectionEvent::Subscribed(refused) => {
@@ -232,7 +235,7 @@ impl Client {
             }
             ConnectionEvent::Sent(packet) => {
                 if let Err(why) = self.outbox.numbered(packet) {
-                    self.lost(why);
+                    self.give_up(why);
                 }
             }
             ConnectionEvent::Acked(packet) => {
@@ -247,7 +250,8 @@ impl Client {
             }
             ConnectionEvent::Message(message) => self.on_message(*message),
             ConnectionEvent::Room | ConnectionEvent::Alive => {}
-            ConnectionEvent::Lost(why) => self.lost(&why),
+            ConnectionEvent::Stuck(why) => self.give_up(why),
+            ConnectionEvent::Lost(why) => drop(self.lost(&why)),
         }
     }
 
@@ -308,7 +312,7 @@ impl Client {
             // A client that reads `online` may send commands, so the subscription comes first.
             session.phase = Phase::Subscribing { limits, since };
         } else {
-            self.lost("the subscription could not be sent");
+            self.give_up("the subscription could not be sent");
         }
     }
 
@@ -346,7 +350,17 @@ impl Client {
         self.outbox.put_first(self.topics.status().into(), b"online".to_vec());
     }
 
-    fn lost(&mut self, why: &str) {
+    /// Ends the connection for this reason, and tells the broker. Once the status is `online`, the last will is true: whoever
+    /// waits for the gateway learns that it is away.
+    fn give_up(&mut self, why: &str) {
+        let true_now = self.is_ready();
+        if let BrokerLink::Open(session) = self.lost(why) {
+            session.connection.give_up(true_now);
+        }
+    }
+
+    /// There is no connection any more; returns what was there. Dropping it aborts its task and closes the socket.
+    fn lost(&mut self, why: &str) -> BrokerLink {
         let now = Instant::now();
         let held = match &self.link {
             BrokerLink::Open(BrokerSession {
@@ -356,8 +370,7 @@ impl Client {
             _ => Duration::ZERO,
         };
         let wait = self.back_off.after(held);
-        // Dropping the session aborts its task and closes the socket.
-        self.link = BrokerLink::Disconnected { retry_at: now + wait };
+        let before = std::mem::replace(&mut self.link, BrokerLink::Disconnected { retry_at: now + wait });
         self.outbox.lost();
         self.look_at = now;
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
@@ -372,6 +385,7 @@ impl Client {
         } else {
             tracing::debug!("no connection to the broker: {why}");
         }
+        before
     }
 
     fn on_message(&mut self, message: Incoming) {
@@ -452,16 +466,14 @@ impl Client {
 
     async fn check(&mut self, now: Instant) {
         self.update_plant();
-        match &self.link {
+        match &mut self.link {
             BrokerLink::Disconnected { retry_at } if now >= *retry_at => self.connect().await,
             BrokerLink::Disconnected { .. } => {}
             BrokerLink::Open(session) => match session.phase {
                 Phase::Subscribing { since, .. } if now.saturating_duration_since(since) > SUBSCRIBE_TIMEOUT => {
-                    self.lost("the broker does not answer the subscription");
+                    self.give_up("the broker does not answer the subscription");
                 }
-                _ if now.saturating_duration_since(session.last_packet) > SILENCE => {
-                    self.lost("the broker is silent");
-                }
+                phase if session.connection.is_silent(phase.limits(), now) => self.give_up("the broker is silent"),
                 _ => {}
             },
         }
@@ -493,7 +505,6 @@ impl Client {
     }
 
     async fn connect(&mut self) {
-        let now = Instant::now();
         let options = self.options.clone();
         // Read for each attempt, so that renewed certificates are used without a restart.
         let config = tokio::task::spawn_blocking(move || tls::client_config(&options)).await;
@@ -505,10 +516,9 @@ impl Client {
                 self.link = BrokerLink::Open(BrokerSession {
                     connection,
                     phase: Phase::Connecting,
-                    last_packet: now,
                 });
             }
-            Err(why) => self.lost(&why),
+            Err(why) => drop(self.lost(&why)),
         }
     }
 

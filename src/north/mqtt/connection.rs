@@ -13,9 +13,9 @@ use futures_util::FutureExt;
 use rumqttc::mqttbytes::v5::Filter;
 use rumqttc::mqttbytes::{Error as PacketError, QoS};
 use rumqttc::{
-    AsyncClient, ConnAck, ConnectProperties, ConnectReturnCode, ConnectionError, Event, EventLoop, LastWill,
-    MqttOptions, NetworkOptions, Outgoing, Packet, PubAckReason, PublishProperties, RetainForwardRule, StateError,
-    SubscribeReasonCode, TlsConfiguration, Transport,
+    AsyncClient, ConnAck, ConnectProperties, ConnectReturnCode, ConnectionError, DisconnectProperties,
+    DisconnectReasonCode, Event, EventLoop, LastWill, MqttOptions, NetworkOptions, Outgoing, Packet, PubAckReason,
+    PublishProperties, RetainForwardRule, StateError, SubscribeReasonCode, TlsConfiguration, Transport,
 };
 use rustls::ClientConfig;
 use tokio::sync::mpsc;
@@ -24,13 +24,8 @@ use tokio::task::JoinHandle;
 use super::Options;
 use super::outbox::Message;
 use super::request::Incoming;
+use super::silence::{KEEP_ALIVE_S, Silence, Verdict};
 
-/// Keep-alive interval, s.
-const KEEP_ALIVE_S: u16 = 10;
-/// Keep-alive interval.
-const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
-/// Without a packet from the broker for this long, the connection is considered lost.
-pub(super) const SILENCE: Duration = KEEP_ALIVE.saturating_mul(3);
 /// Time limit for the broker to answer the subscription.
 pub(super) const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of unacknowledged messages; the broker may allow fewer.
@@ -48,6 +43,8 @@ const MAX_PACKET: u32 = 2 << 20;
 const RECEIVE_MAXIMUM: u16 = 64;
 /// What the system buffers of sent messages: a result waits behind no more than that.
 const SEND_BUFFER: u32 = 256 << 10;
+/// Time for the DISCONNECT of a connection that the gateway gives up.
+const LAST_PACKET: Duration = Duration::from_millis(500);
 /// Time limit for TCP, TLS and CONNACK.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -70,6 +67,8 @@ pub(super) enum ConnectionEvent {
     Room,
     /// Any other packet from the broker.
     Alive,
+    /// The connection stands and cannot be used any more, for this reason: it is to be given up.
+    Stuck(&'static str),
     /// The connection is lost, with the reason. The last event.
     Lost(String),
 }
@@ -132,6 +131,8 @@ pub(super) struct BrokerLimits {
     pub(super) retains: bool,
     /// Number of topic aliases.
     aliases: u16,
+    /// The keep-alive interval that it set in place of ours, s.
+    keep_alive: Option<u16>,
 }
 
 impl BrokerLimits {
@@ -145,6 +146,7 @@ impl BrokerLimits {
             acknowledges: properties.and_then(|p| p.max_qos) != Some(0),
             retains: properties.and_then(|p| p.retain_available) != Some(0),
             aliases: properties.and_then(|p| p.topic_alias_max).unwrap_or_default(),
+            keep_alive: properties.and_then(|p| p.server_keep_alive),
         }
     }
 }
@@ -156,7 +158,11 @@ pub(super) struct Connection {
     event: mpsc::Receiver<ConnectionEvent>,
     backlog: Arc<Backlog>,
     aliases: Aliases,
-    task: JoinHandle<()>,
+    silence: Silence,
+    /// What a broker that may be silent is asked.
+    question: Option<Filter>,
+    /// `None` once it ends by itself.
+    task: Option<JoinHandle<()>>,
 }
 
 /// Short names of topics, for telemetry that is published again and again: a topic gets one when it is published for the
@@ -202,7 +208,9 @@ struct Backlog {
 
 impl Drop for Connection {
     fn drop(&mut self) {
-        self.task.abort();
+        if let Some(task) = &self.task {
+            task.abort();
+        }
     }
 }
 
@@ -225,7 +233,9 @@ impl Connection {
             event,
             backlog,
             aliases: Aliases::default(),
-            task,
+            silence: Silence::new(Instant::now()),
+            question: None,
+            task: Some(task),
         }
     }
 
@@ -233,12 +243,37 @@ impl Connection {
     pub(super) async fn next(&mut self) -> ConnectionEvent {
         // The sender is dropped without a last event only if the task panicked.
         let silent = || ConnectionEvent::Lost("the MQTT client failed".to_string());
-        self.event.recv().await.unwrap_or_else(silent)
+        let event = self.event.recv().await.unwrap_or_else(silent);
+        if matches!(event, ConnectionEvent::Sent(_) | ConnectionEvent::Room) {
+            return event;
+        }
+        self.silence.heard(Instant::now());
+        match event {
+            ConnectionEvent::Subscribed(_) if self.silence.answered() => ConnectionEvent::Alive,
+            event => event,
+        }
     }
 
     /// Subscribes; false if the connection does not take it.
-    pub(super) fn subscribe(&self, filters: Vec<Filter>) -> bool {
+    pub(super) fn subscribe(&mut self, filters: Vec<Filter>) -> bool {
+        self.question = filters.first().map(|first| Filter {
+            retain_forward_rule: RetainForwardRule::Never,
+            ..first.clone()
+        });
         self.client.try_subscribe_many(filters).is_ok()
+    }
+
+    /// Whether the broker said nothing for so long that the connection is lost. One that has no reason to speak is asked for a
+    /// subscription that it has already: it must answer, and nothing changes.
+    pub(super) fn is_silent(&mut self, limits: Option<BrokerLimits>, now: Instant) -> bool {
+        let verdict = self.silence.judge(limits.and_then(|limits| limits.keep_alive), now);
+        if verdict == Verdict::Ask
+            && let Some(question) = &self.question
+            && self.client.try_subscribe_many([question.clone()]).is_ok()
+        {
+            self.silence.asked();
+        }
+        verdict == Verdict::Lost
     }
 
     /// Publishes a message; false if there is no room until [`ConnectionEvent::Room`].
@@ -276,6 +311,33 @@ impl Connection {
     /// Disconnects in order, so that the broker does not publish the last will.
     pub(super) fn disconnect(&self) -> bool {
         self.client.try_disconnect_now().is_ok()
+    }
+
+    /// Ends the connection without waiting for it, and tells the broker, as far as it listens. The last will is published if it
+    /// is `true_now`: others take the gateway for online.
+    pub(super) fn give_up(mut self, true_now: bool) {
+        let reason = match true_now {
+            true => DisconnectReasonCode::DisconnectWithWillMessage,
+            false => DisconnectReasonCode::NormalDisconnection,
+        };
+        let properties = DisconnectProperties {
+            session_expiry_interval: None,
+            reason_string: None,
+            user_properties: Vec::new(),
+            server_reference: None,
+        };
+        let told = self.client.try_disconnect_now_with_properties(reason, properties);
+        let Some(task) = self.task.take().filter(|_| told.is_ok()) else {
+            return;
+        };
+        let abort = task.abort_handle();
+        tokio::spawn(async move {
+            // The task ends when all its events are taken.
+            let ended = async { while self.event.recv().await.is_some() {} };
+            if tokio::time::timeout(LAST_PACKET, ended).await.is_err() {
+                abort.abort();
+            }
+        });
     }
 }
 
@@ -394,7 +456,7 @@ fn interpret(event: Event, came: Instant) -> Option<ConnectionEvent> {
         Event::Incoming(_) => Some(ConnectionEvent::Alive),
         // A packet id was about to be used again before its acknowledgement.
         Event::Outgoing(Outgoing::AwaitAck(_)) => {
-            Some(ConnectionEvent::Lost("the broker did not acknowledge a message".into()))
+            Some(ConnectionEvent::Stuck("the broker did not acknowledge a message"))
         }
         Event::Outgoing(_) | Event::Auth(_) => None,
     }

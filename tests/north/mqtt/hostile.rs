@@ -25,6 +25,8 @@ struct Manners {
     backwards: bool,
     /// The first connection ends with this DISCONNECT after the first event.
     farewell: Option<Vec<u8>>,
+    /// It does not answer subscriptions.
+    deaf: bool,
 }
 
 #[derive(Default)]
@@ -35,6 +37,8 @@ struct Seen {
     most_in_flight: usize,
     longest: usize,
     by_alias: usize,
+    /// What the gateway says when it leaves.
+    farewells: Vec<Vec<u8>>,
 }
 
 struct Hostile {
@@ -142,6 +146,7 @@ impl Session {
                     let body = [&[0, 0, u8::try_from(properties.len()).unwrap()][..], &properties].concat();
                     self.send(0x20, &body)?;
                 }
+                8 if self.manners.deaf => {}
                 8 => {
                     // Packet id, properties (none), then filters with a byte of options each.
                     let (mut rest, mut codes) = (&body[3..], Vec::new());
@@ -153,7 +158,10 @@ impl Session {
                 }
                 3 => self.publish(kind, &body)?,
                 12 => self.send(0xD0, &[])?,
-                14 => return None,
+                14 => {
+                    self.seen.lock().unwrap().farewells.push(body);
+                    return None;
+                }
                 _ => {}
             }
         }
@@ -376,4 +384,24 @@ fn a_session_taken_over_loses_no_event() {
         assert!(broker.seen.lock().unwrap().connections > 1);
         gateway.stop();
     }
+}
+
+#[test]
+fn a_connection_that_is_given_up_ends_with_a_word() {
+    let broker = Hostile::start(Manners {
+        deaf: true,
+        ..Manners::default()
+    });
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    wait_for("the gateway to give up", || {
+        let seen = broker.seen.lock().unwrap();
+        (!seen.farewells.is_empty()).then_some(())
+    });
+    // Normal, without the last will: the gateway was not online.
+    let reason = broker.seen.lock().unwrap().farewells[0].first().copied().unwrap_or(0);
+    assert_eq!(reason, 0x00);
+    wait_for("another attempt", || {
+        (broker.seen.lock().unwrap().connections > 1).then_some(())
+    });
+    gateway.stop();
 }

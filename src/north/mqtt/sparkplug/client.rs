@@ -13,9 +13,7 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::super::back_off::BackOff;
-use super::super::connection::{
-    self, BrokerLimits, Connection, ConnectionEvent, SILENCE, SUBSCRIBE_TIMEOUT, commanding,
-};
+use super::super::connection::{self, BrokerLimits, Connection, ConnectionEvent, SUBSCRIBE_TIMEOUT, commanding};
 use super::super::outage_log::OutageLog;
 use super::super::outbox::Message;
 use super::super::request::Incoming;
@@ -95,7 +93,6 @@ struct Up {
     /// Once the broker has accepted it.
     limits: Option<BrokerLimits>,
     subscribed: bool,
-    last_packet: Instant,
     /// Acknowledgements that are awaited: of the death of the node.
     unacknowledged: bool,
 }
@@ -269,15 +266,15 @@ impl Client {
             self.adopt();
         }
         self.stats.mqtt.lost(MqttLoss::History, self.session.take_lost());
-        match &self.link {
+        match &mut self.link {
             Link::Down { retry_at } if now >= *retry_at => self.connect().await,
             Link::Down { .. } => {}
             Link::Up(up) => {
-                let since = |at: Instant| now.saturating_duration_since(at);
-                if up.limits.is_some() && !up.subscribed && since(up.opened) > SUBSCRIBE_TIMEOUT {
-                    self.lost("the broker does not answer the subscription");
-                } else if since(up.last_packet) > SILENCE {
-                    self.lost("the broker is silent");
+                let late = now.saturating_duration_since(up.opened) > SUBSCRIBE_TIMEOUT;
+                if up.limits.is_some() && !up.subscribed && late {
+                    self.give_up("the broker does not answer the subscription");
+                } else if up.connection.is_silent(up.limits, now) {
+                    self.give_up("the broker is silent");
                 }
             }
         }
@@ -291,7 +288,7 @@ impl Client {
         let config = config.map_err(|error| error.to_string());
         match config.and_then(|config| config.map_err(|error| error.to_string())) {
             Ok(config) => self.open(bd_seq, config),
-            Err(why) => self.lost(&why),
+            Err(why) => drop(self.lost(&why)),
         }
     }
 
@@ -306,7 +303,6 @@ impl Client {
             opened: now,
             limits: None,
             subscribed: false,
-            last_packet: now,
             unacknowledged: false,
         });
     }
@@ -342,16 +338,13 @@ impl Client {
     async fn on_event(&mut self, event: ConnectionEvent) {
         let Link::Up(up) = &mut self.link else { return };
         let now = Instant::now();
-        if !matches!(event, ConnectionEvent::Sent(_) | ConnectionEvent::Room) {
-            up.last_packet = now;
-        }
         match event {
             ConnectionEvent::Connected(limits) => {
                 (up.limits, up.opened) = (Some(limits), now);
                 self.bd_seq.accepted();
                 self.session.opened(up.bd_seq);
                 if !up.connection.subscribe(filters(&self.topics, self.broker.commands)) {
-                    self.lost("the subscription could not be sent");
+                    self.give_up("the subscription could not be sent");
                 }
             }
             ConnectionEvent::Subscribed(refused) => {
@@ -361,7 +354,8 @@ impl Client {
             ConnectionEvent::Acked(_) | ConnectionEvent::Refused(..) => up.unacknowledged = false,
             ConnectionEvent::Message(message) => self.on_message(&message).await,
             ConnectionEvent::Sent(_) | ConnectionEvent::Room | ConnectionEvent::Alive => {}
-            ConnectionEvent::Lost(why) => self.lost(&why),
+            ConnectionEvent::Stuck(why) => self.give_up(why),
+            ConnectionEvent::Lost(why) => drop(self.lost(&why)),
         }
     }
 
@@ -513,7 +507,7 @@ impl Client {
             let (topic, most) = (&message.topic, limits.max_packet);
             let why =
                 format!("the broker accepts at most {most} bytes per packet, {topic} needs more; raise its limit");
-            self.lost(&why);
+            self.give_up(&why);
             return false;
         }
         if !connection.publish(message.clone(), *limits) {
@@ -524,7 +518,17 @@ impl Client {
         true
     }
 
-    fn lost(&mut self, why: &str) {
+    /// Ends the connection for this reason, and tells the broker. Its last will, the death of the node, is true once the node was
+    /// born.
+    fn give_up(&mut self, why: &str) {
+        let true_now = self.session.is_alive();
+        if let Link::Up(up) = self.lost(why) {
+            up.connection.give_up(true_now);
+        }
+    }
+
+    /// There is no connection any more; returns what was there.
+    fn lost(&mut self, why: &str) -> Link {
         let now = Instant::now();
         if self.outages.permit(why, now) {
             let (host, port) = (&self.broker.host, self.broker.port);
@@ -536,21 +540,21 @@ impl Client {
         } else {
             tracing::debug!("Sparkplug: no connection to the broker: {why}");
         }
-        self.down(now);
+        self.down(now)
     }
 
-    /// Without a connection; the next attempt follows after a while.
-    fn down(&mut self, now: Instant) {
+    /// Without a connection; the next attempt follows after a while. Dropping what is returned aborts its task and closes the
+    /// socket.
+    fn down(&mut self, now: Instant) -> Link {
         let held = match &self.link {
             Link::Up(up) if up.subscribed => now.saturating_duration_since(up.opened),
             _ => Duration::ZERO,
         };
         let retry_at = now + self.back_off.after(held);
-        // Dropping the connection aborts its task and closes the socket.
-        self.link = Link::Down { retry_at };
         self.held = None;
         self.session.closed();
         self.look_at = now;
+        std::mem::replace(&mut self.link, Link::Down { retry_at })
     }
 
     /// Declares the node dead and disconnects, within half a second; after that time the broker publishes the last will.
@@ -558,7 +562,7 @@ impl Client {
         if tokio::time::timeout(END, self.disconnect()).await.is_err() {
             tracing::warn!("Sparkplug: the orderly disconnect timed out; the broker publishes the last will");
         }
-        self.down(Instant::now());
+        drop(self.down(Instant::now()));
     }
 
     async fn disconnect(&mut self) {
