@@ -28,6 +28,7 @@ use super::payload::{self, Topics};
 use super::publisher::{Publisher, Update};
 use super::reply::ResponseTopics;
 use super::request::Incoming;
+use super::retry::Retry;
 use super::store::{Loaded, LostCount, Store};
 use super::{Buffer, History, Options, tls};
 use crate::event::{BURST, Event, EventKind};
@@ -145,7 +146,8 @@ struct Client {
     link: BrokerLink,
     back_off: BackOff,
     outages: OutageLog,
-    /// Log lines about messages that the broker refused.
+    /// When messages that the broker refused are published again, and log lines about them.
+    retry: Retry,
     refused: LogThrottle,
     /// Number of events lost because they arrived too fast.
     missed: u64,
@@ -193,6 +195,7 @@ impl Client {
             link: BrokerLink::Disconnected { retry_at: now },
             back_off: BackOff::default(),
             outages: OutageLog::default(),
+            retry: Retry::default(),
             refused: LogThrottle::every(REFUSED_LOGGED),
             missed: 0,
             lost_logged: (0, None),
@@ -243,16 +246,26 @@ impl Client {
                 let settled = self.outbox.acked(packet);
                 self.settled(settled);
             }
-            ConnectionEvent::Refused(packet, why) => {
-                let settled = self.outbox.acked(packet);
-                self.drop_refused(settled.as_ref(), &refusal(why));
-                self.settled(settled);
-            }
+            ConnectionEvent::Refused(packet, why) => self.refused(packet, why),
             ConnectionEvent::Message(message) => self.on_message(*message),
             ConnectionEvent::Room | ConnectionEvent::Alive => {}
             ConnectionEvent::Stuck(why) => self.give_up(why),
             ConnectionEvent::Lost(why) => drop(self.lost(&why)),
         }
+    }
+
+    /// The broker refused a message. What must arrive, and what it refuses for now only, is published again.
+    fn refused(&mut self, packet: u16, why: PubAckReason) {
+        let for_now = matches!(why, PubAckReason::QuotaExceeded | PubAckReason::PacketIdentifierInUse);
+        let now = Instant::now();
+        if let Some(topic) = self.outbox.put_back(packet, for_now) {
+            let wait = self.retry.refused(now).saturating_duration_since(now);
+            let what = format!("a message on {topic} is published again in {} s", wait.as_secs().max(1));
+            return self.log_refused(&what, &refusal(why), now);
+        }
+        let settled = self.outbox.acked(packet);
+        self.drop_refused(settled.as_ref(), &refusal(why));
+        self.settled(settled);
     }
 
     /// A message cannot be delivered: counted, and logged once a minute.
@@ -264,22 +277,27 @@ impl Client {
             Some(Kind::History) => self.stats.mqtt.lost(MqttLoss::History, 1),
             None => {}
         }
-        if let Some(omitted) = self.refused.permit(Instant::now()) {
-            let root = self.topics.root();
-            let discovery = self
-                .announcer
-                .as_ref()
-                .map_or_else(String::new, |announcer| format!(", {}", announcer.own_topics()));
-            let more = match omitted {
-                0 => String::new(),
-                omitted => format!(" ({omitted} more messages, on this or other topics, since the last such line)"),
-            };
-            tracing::warn!(
-                "dropped a message on {topic}: {why}; the broker must let client {} publish to {root}/#{discovery} and to \
-                 the response topics in use{more}",
-                self.options.client_id
-            );
-        }
+        self.log_refused(&format!("dropped a message on {topic}"), why, Instant::now());
+    }
+
+    fn log_refused(&mut self, what: &str, why: &str, now: Instant) {
+        let Some(omitted) = self.refused.permit(now) else {
+            return;
+        };
+        let root = self.topics.root();
+        let discovery = self
+            .announcer
+            .as_ref()
+            .map_or_else(String::new, |announcer| format!(", {}", announcer.own_topics()));
+        let more = match omitted {
+            0 => String::new(),
+            omitted => format!(" ({omitted} more messages, on this or other topics, since the last such line)"),
+        };
+        tracing::warn!(
+            "{what}: {why}; the broker must let client {} publish to {root}/#{discovery} and to the response topics in \
+             use{more}",
+            self.options.client_id
+        );
     }
 
     /// A message left the outbox.
@@ -478,6 +496,9 @@ impl Client {
             },
         }
         self.repair_status(now);
+        if self.retry.is_due(now) {
+            self.outbox.retry();
+        }
         // What the disk had no room for the last time.
         self.store.acknowledge(self.outbox.oldest(Kind::Event));
         self.history.acknowledge(self.outbox.oldest(Kind::History));
@@ -647,6 +668,7 @@ impl Client {
 fn refusal(why: PubAckReason) -> String {
     match why {
         PubAckReason::NotAuthorized => "the broker does not allow it (ACL)".to_string(),
+        PubAckReason::QuotaExceeded => "the broker takes no more for now (quota exceeded)".to_string(),
         why => format!("the broker refuses it ({why:?})"),
     }
 }

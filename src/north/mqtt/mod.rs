@@ -31,6 +31,7 @@ mod publisher;
 mod record;
 mod reply;
 mod request;
+mod retry;
 mod silence;
 pub mod sparkplug;
 mod store;

@@ -17,8 +17,8 @@ const STATE: &str = "drivegate/hall/drive/p1/state";
 struct Manners {
     /// Properties of its CONNACK.
     properties: Vec<u8>,
-    /// Topics below this get this reason code.
-    refused: Option<(&'static str, u8)>,
+    /// Topics below this get this reason code, so many times.
+    refused: Option<(&'static str, u8, usize)>,
     /// It writes each byte on its own.
     piecemeal: bool,
     /// It acknowledges two events at a time, the later one first.
@@ -37,6 +37,7 @@ struct Seen {
     most_in_flight: usize,
     longest: usize,
     by_alias: usize,
+    refusals: usize,
     /// What the gateway says when it leaves.
     farewells: Vec<Vec<u8>>,
 }
@@ -209,13 +210,14 @@ impl Session {
         if qos == 0 {
             return Some(());
         }
-        let code = self
-            .manners
-            .refused
-            .filter(|(below, _)| topic.starts_with(below))
-            .map_or(0, |(_, code)| code);
         let in_flight = self.owed.len() + 1;
         let mut seen = self.seen.lock().unwrap();
+        let refused = self
+            .manners
+            .refused
+            .filter(|(below, _, times)| topic.starts_with(below) && seen.refusals < *times);
+        seen.refusals += usize::from(refused.is_some());
+        let code = refused.map_or(0, |(_, code, _)| code);
         seen.most_in_flight = seen.most_in_flight.max(in_flight);
         drop(seen);
         // An event waits for another event only: telemetry in between does not end the wait, so that no event is left over.
@@ -304,7 +306,7 @@ fn odd_brokers_are_served() {
         (
             "the points refused",
             Manners {
-                refused: Some(("drivegate/hall/drive/p1/point", 0x87)),
+                refused: Some(("drivegate/hall/drive/p1/point", 0x87, usize::MAX)),
                 ..Manners::default()
             },
         ),
@@ -338,9 +340,9 @@ fn odd_brokers_are_served() {
 
 #[test]
 fn refused_messages_concern_their_topic() {
-    for code in [0x80, 0x83, 0x87, 0x90, 0x91, 0x97, 0x99] {
+    for code in [0x80, 0x83, 0x87, 0x90, 0x99] {
         let broker = Hostile::start(Manners {
-            refused: Some((EVENT, code)),
+            refused: Some((EVENT, code, usize::MAX)),
             ..Manners::default()
         });
         let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
@@ -349,6 +351,57 @@ fn refused_messages_concern_their_topic() {
         wait_for("the loss to be counted", || (lost() == 20).then_some(()));
         assert_eq!(broker.seen.lock().unwrap().connections, 1, "{code:02X}");
         assert!(gateway.connected());
+        gateway.stop();
+    }
+}
+
+#[test]
+fn what_is_refused_for_now_comes_later() {
+    // Quota exceeded, packet id in use.
+    for code in [0x97, 0x91] {
+        let broker = Hostile::start(Manners {
+            refused: Some((EVENT, code, 3)),
+            ..Manners::default()
+        });
+        let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+        wait_for("the connection", || gateway.connected().then_some(()));
+        let texts: Vec<String> = (0..20).map(|n| format!("event {n}")).collect();
+        for text in &texts {
+            gateway.publish_event("p1", EventKind::Fault, text);
+        }
+        let missing = || {
+            let events = broker.events();
+            texts
+                .iter()
+                .any(|text| events.iter().filter(|event| *event == text).count() < 1)
+        };
+        wait_for("all events, and the three again", || {
+            (broker.events().len() == 23 && !missing() && gateway.buffered() == 0).then_some(())
+        });
+        assert_eq!(gateway.stats.mqtt.losses().map(|(_, count)| count).sum::<u64>(), 0);
+        gateway.stop();
+    }
+}
+
+#[test]
+fn a_status_that_is_refused_is_repeated_until_the_broker_takes_it() {
+    for code in [0x97, 0x87, 0x80] {
+        let broker = Hostile::start(Manners {
+            refused: Some(("drivegate/hall/status", code, 2)),
+            ..Manners::default()
+        });
+        let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+        let statuses = || {
+            let seen = broker.seen.lock().unwrap();
+            let of_status = seen
+                .messages
+                .iter()
+                .filter(|(topic, ..)| topic == "drivegate/hall/status");
+            of_status.map(|(.., payload)| payload.clone()).collect::<Vec<_>>()
+        };
+        wait_for("the third attempt", || (statuses().len() >= 3).then_some(()));
+        assert_eq!(statuses(), [b"online", b"online", b"online"], "{code:02X}");
+        assert_eq!(broker.seen.lock().unwrap().connections, 1);
         gateway.stop();
     }
 }

@@ -109,7 +109,7 @@ impl Client {
     pub(super) fn announce(&mut self) {
         let Some(announcer) = &mut self.announcer else { return };
         let outbox = &self.outbox;
-        let updates = announcer.next(Instant::now(), |topic| outbox.has_telemetry(topic));
+        let updates = announcer.next(Instant::now(), |topic| outbox.is_under_way(topic));
         for Update { topic, payload } in updates {
             self.outbox.put_lasting(topic, payload);
         }

@@ -593,13 +593,15 @@ impl Client {
         }
     }
 
-    /// Waits for the next event of a connection that ends: whether it is lost. The broker counts a command that comes meanwhile as
+    /// Waits for the next event of a connection that ends: whether it is lost, or is to be closed without DISCONNECT. The broker counts a command that comes meanwhile as
     /// delivered, so it is carried out.
     async fn is_lost_next(&mut self) -> bool {
         match next(&mut self.link).await {
             ConnectionEvent::Lost(_) => return true,
             ConnectionEvent::Message(message) => self.on_device_command(&message),
-            ConnectionEvent::Acked(_) | ConnectionEvent::Refused(..) => {
+            // The broker did not take the death of the node: it publishes the last will instead.
+            ConnectionEvent::Refused(..) => return true,
+            ConnectionEvent::Acked(_) => {
                 if let Link::Up(up) = &mut self.link {
                     up.unacknowledged = false;
                 }
