@@ -545,6 +545,8 @@ impl Client {
 
     /// Publishes from the outbox as far as the connection allows.
     fn publish_waiting(&mut self) {
+        self.outbox.drop_gone(Kind::Event, self.store.gone());
+        self.outbox.drop_gone(Kind::History, self.history.gone());
         self.store.load(self.outbox.room(Kind::Event));
         if let BrokerLink::Open(BrokerSession {
             phase: Phase::Ready { limits, .. },

@@ -251,6 +251,25 @@ impl Outbox {
         }
     }
 
+    /// Nothing up to this message is on disk any more, because the buffer was full: what waits of it is lost, as it would be
+    /// after a restart. What is in flight has probably been delivered.
+    pub(super) fn drop_gone(&mut self, kind: Kind, through: Number) {
+        let queue = self.queue_mut(kind);
+        let is_older = |entry: &&Entry| entry.number.is_none_or(|number| number <= through);
+        let is_gone = |entry: &Entry| !entry.in_flight && entry.number.is_some();
+        let mut dropped = 0;
+        // The numbers ascend, so this ends with the first one that is kept.
+        while let Some(place) = queue.entries.iter().take_while(is_older).position(is_gone) {
+            queue.remove(place);
+            dropped += 1;
+        }
+        match kind {
+            Kind::Event => self.lost.events += dropped,
+            Kind::History => self.lost.history += dropped,
+            Kind::Result => {}
+        }
+    }
+
     fn queue(&self, kind: Kind) -> &Queue {
         match kind {
             Kind::Result => &self.results,
