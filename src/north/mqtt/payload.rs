@@ -10,18 +10,6 @@ use crate::event::Event;
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, Reading, value_or_null};
 
-/// Keys of the state object that are not points; a profile point of that name is omitted.
-const STATE_KEYS: [&str; 8] = [
-    "state",
-    "blocked_by",
-    "quality",
-    "time",
-    "age_ms",
-    "fault_text",
-    "point_quality",
-    "historical",
-];
-
 /// The topics of one gateway.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Topics {
@@ -79,11 +67,10 @@ impl Topics {
     }
 }
 
-/// The points of a drive that are published: index in the profile and name.
+/// The points of a drive that are published: index in the profile and name. None of them is a key of the state object:
+/// profiles do not take such names.
 pub(super) fn published_points(profile: &Profile) -> Vec<(usize, &str)> {
-    let mut points = crate::process_image::public_points(profile);
-    points.retain(|(_, name)| !STATE_KEYS.contains(name));
-    points
+    crate::process_image::public_points(profile)
 }
 
 /// The state object of a drive without its times; a change of it is published.
