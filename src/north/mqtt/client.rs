@@ -8,8 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use rumqttc::mqttbytes::QoS;
-use rumqttc::{LastWill, PubAckReason};
+use rumqttc::PubAckReason;
 use tokio::sync::Notify;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
@@ -19,8 +18,11 @@ use self::buffering::buffers;
 use self::discovery::{announcer, discovery_topics, report_refused, subscriptions};
 use self::repair::Repair;
 use super::back_off::BackOff;
+use super::broker_limits::{BrokerLimits, Lack, WillForm};
 use super::commands::{Commands, FinishedCommand, Rules};
-use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, SUBSCRIBE_TIMEOUT, Subscribed, Subscription};
+use super::connection::{
+    self, CLOSED, Connection, ConnectionEvent, NO_WILDCARDS, SUBSCRIBE_TIMEOUT, Subscribed, Subscription,
+};
 use super::home_assistant::{Announcer, Sources};
 use super::outage_log::OutageLog;
 use super::outbox::{Delivery, Key, Kind, Message, Outbox, Settled};
@@ -30,6 +32,7 @@ use super::reply::ResponseTopics;
 use super::request::Incoming;
 use super::retry::Retry;
 use super::store::{Loaded, LostCount, Store};
+use super::takeover::Takeovers;
 use super::{Buffer, History, Options, tls};
 use crate::event::{BURST, Event, EventKind};
 use crate::files::names::{MQTT_EVENTS, MQTT_HISTORY};
@@ -144,8 +147,10 @@ struct Client {
     history_at: Instant,
     commands: Commands,
     link: BrokerLink,
+    will: WillForm,
     back_off: BackOff,
     outages: OutageLog,
+    takeovers: Takeovers,
     /// When messages that the broker refused are published again, and log lines about them.
     retry: Retry,
     refused: LogThrottle,
@@ -193,8 +198,10 @@ impl Client {
             commands,
             outbox: Outbox::new(delivery),
             link: BrokerLink::Disconnected { retry_at: now },
+            will: WillForm::default(),
             back_off: BackOff::default(),
             outages: OutageLog::default(),
+            takeovers: Takeovers::default(),
             retry: Retry::default(),
             refused: LogThrottle::every(REFUSED_LOGGED),
             missed: 0,
@@ -231,10 +238,8 @@ impl Client {
         match event {
             ConnectionEvent::Connected(limits) => self.connected(limits),
             ConnectionEvent::Subscribed(refused) => {
-                report_refused(&self.subscriptions, &refused);
-                if let Phase::Subscribing { limits, since } = session.phase {
-                    self.ready(limits, since);
-                }
+                let phase = session.phase;
+                self.subscribed(phase, &refused);
             }
             ConnectionEvent::Sent(packet) => {
                 if let Err(why) = self.outbox.numbered(packet) {
@@ -249,6 +254,7 @@ impl Client {
             ConnectionEvent::Refused(packet, why) => self.refused(packet, why),
             ConnectionEvent::Message(message) => self.on_message(*message),
             ConnectionEvent::Room | ConnectionEvent::Alive => {}
+            ConnectionEvent::Refuses(lack) => self.lessen_will(lack),
             ConnectionEvent::Stuck(why) => self.give_up(why),
             ConnectionEvent::Lost(why) => drop(self.lost(&why)),
         }
@@ -314,23 +320,59 @@ impl Client {
 
     fn connected(&mut self, limits: BrokerLimits) {
         let since = Instant::now();
-        let BrokerLink::Open(session) = &mut self.link else {
-            return;
-        };
+        if let BrokerLink::Open(session) = &mut self.link {
+            // A client that reads `online` may send commands, so the subscription comes first.
+            session.phase = Phase::Subscribing { limits, since };
+        }
+        self.subscribe(limits);
+    }
+
+    fn subscribe(&mut self, limits: BrokerLimits) {
+        let plant = (!limits.wildcards).then_some(self.observed.as_ref());
         self.subscriptions = subscriptions(
             &self.topics,
             self.options.commands,
             self.announcer.as_ref(),
             self.leftovers_known,
+            plant,
         );
-        if session
-            .connection
-            .subscribe(self.subscriptions.iter().map(Subscription::filter).collect())
+        let filters = self.subscriptions.iter().map(Subscription::filter).collect();
+        if let BrokerLink::Open(session) = &mut self.link
+            && !session.connection.subscribe(filters, limits)
         {
-            // A client that reads `online` may send commands, so the subscription comes first.
-            session.phase = Phase::Subscribing { limits, since };
-        } else {
             self.give_up("the subscription could not be sent");
+        }
+    }
+
+    /// The broker answered the subscriptions.
+    fn subscribed(&mut self, phase: Phase, refused: &[Option<String>]) {
+        if let Phase::Subscribing { limits, since } = phase
+            && limits.wildcards
+            && refused.iter().flatten().any(|why| why == NO_WILDCARDS)
+            && let BrokerLink::Open(session) = &mut self.link
+        {
+            let limits = BrokerLimits {
+                wildcards: false,
+                ..limits
+            };
+            session.phase = Phase::Subscribing { limits, since };
+            return self.subscribe(limits);
+        }
+        report_refused(&self.subscriptions, refused);
+        if let Phase::Subscribing { limits, since } = phase {
+            self.ready(limits, since);
+        }
+    }
+
+    /// The broker refused the connection because of the last will: another one follows with less, at once, if there is less.
+    fn lessen_will(&mut self, lack: Lack) {
+        if self.will.lessen(lack) {
+            tracing::debug!("the broker refuses the last will ({lack:?}); trying a lesser one");
+            self.link = BrokerLink::Disconnected {
+                retry_at: Instant::now(),
+            };
+        } else {
+            drop(self.lost("the broker refuses the last will in every form"));
         }
     }
 
@@ -341,22 +383,16 @@ impl Client {
         };
         session.phase = Phase::Ready { limits, since };
         self.stats.mqtt.connected.store(true, Ordering::Relaxed);
-        tracing::info!("connected to the broker at {}:{}", self.options.host, self.options.port);
-        if !limits.acknowledges || !limits.retains {
-            tracing::warn!(
-                "the broker lacks {}: messages may be lost, or are not there for later subscribers",
-                if limits.acknowledges {
-                    "retained messages"
-                } else {
-                    "QoS 1"
-                }
-            );
+        let (host, port) = (&self.options.host, self.options.port);
+        tracing::info!("connected to the broker at {host}:{port}");
+        for lost in limits.losses() {
+            tracing::warn!("the broker at {host}:{port} {lost}");
         }
         self.outages.end();
         self.repair.forget();
         self.publish_online();
         self.keep_recorded();
-        self.publisher.restart();
+        self.publisher.restart(limits.max_packet);
         if let Some(announcer) = &mut self.announcer {
             announcer.restart(limits.max_packet);
         }
@@ -380,6 +416,10 @@ impl Client {
     /// There is no connection any more; returns what was there. Dropping it aborts its task and closes the socket.
     fn lost(&mut self, why: &str) -> BrokerLink {
         let now = Instant::now();
+        if self.is_ready() {
+            // The next broker, or this one with another configuration, may take more.
+            self.will = WillForm::default();
+        }
         let held = match &self.link {
             BrokerLink::Open(BrokerSession {
                 phase: Phase::Ready { since, .. },
@@ -402,6 +442,10 @@ impl Client {
             tracing::warn!("no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
         } else {
             tracing::debug!("no connection to the broker: {why}");
+        }
+        if why == CLOSED && self.takeovers.closed(now) {
+            let words = Takeovers::words(&self.options.client_id);
+            tracing::warn!("{}:{}: {words}", self.options.host, self.options.port);
         }
         before
     }
@@ -458,6 +502,9 @@ impl Client {
                 let (updates, next) = self.publisher.tick(now, wall);
                 for Update { topic, payload } in updates {
                     self.outbox.put(topic, payload);
+                }
+                for line in self.publisher.take_reduced() {
+                    tracing::warn!("broker {}:{}: {line}", self.options.host, self.options.port);
                 }
                 next
             }
@@ -523,6 +570,12 @@ impl Client {
         self.publisher.adopt(&plant, discovery);
         self.observed = plant;
         self.remember_topics();
+        if let BrokerLink::Open(session) = &self.link
+            && let Some(limits) = session.phase.limits()
+            && !limits.wildcards
+        {
+            self.subscribe(limits);
+        }
     }
 
     async fn connect(&mut self) {
@@ -532,7 +585,7 @@ impl Client {
         let config = config.map_err(|error| error.to_string());
         match config.and_then(|config| config.map_err(|error| error.to_string())) {
             Ok(config) => {
-                let will = LastWill::new(self.topics.status(), "offline", QoS::AtLeastOnce, true, None);
+                let will = self.will.will(self.topics.status(), "offline", true);
                 let connection = Connection::open(&self.options, &self.options.client_id, will, config);
                 self.link = BrokerLink::Open(BrokerSession {
                     connection,
@@ -652,8 +705,8 @@ impl Client {
             }
         }
         if let BrokerLink::Open(session) = &mut self.link
-            && !matches!(session.phase, Phase::Connecting)
-            && session.connection.disconnect()
+            && let Some(limits) = session.phase.limits()
+            && session.connection.disconnect(limits)
         {
             // The broker counts what is still under way from it as delivered.
             loop {

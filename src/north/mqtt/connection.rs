@@ -13,19 +13,22 @@ use futures_util::FutureExt;
 use rumqttc::mqttbytes::v5::Filter;
 use rumqttc::mqttbytes::{Error as PacketError, QoS};
 use rumqttc::{
-    AsyncClient, ConnAck, ConnectProperties, ConnectReturnCode, ConnectionError, DisconnectProperties,
-    DisconnectReasonCode, Event, EventLoop, LastWill, MqttOptions, NetworkOptions, Outgoing, Packet, PubAckReason,
-    PublishProperties, RetainForwardRule, StateError, SubscribeReasonCode, TlsConfiguration, Transport,
+    AsyncClient, ConnectProperties, ConnectReturnCode, ConnectionError, DisconnectProperties, DisconnectReasonCode,
+    Event, EventLoop, LastWill, MqttOptions, NetworkOptions, Outgoing, Packet, PubAckReason, PublishProperties,
+    RetainForwardRule, StateError, SubscribeReasonCode, TlsConfiguration, Transport,
 };
 use rustls::ClientConfig;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use super::Options;
+use super::broker_limits::{BrokerLimits, Lack};
 use super::outbox::Message;
 use super::request::Incoming;
 use super::silence::{KEEP_ALIVE_S, Silence, Verdict};
 
+/// Why a broker refuses filters with wildcards.
+pub(super) const NO_WILDCARDS: &str = "WildcardSubscriptionsNotSupported";
 /// Time limit for the broker to answer the subscription.
 pub(super) const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of unacknowledged messages; the broker may allow fewer.
@@ -41,6 +44,8 @@ const EVENTS: usize = 64;
 const MAX_PACKET: u32 = 2 << 20;
 /// Number of unacknowledged commands that the broker may send.
 const RECEIVE_MAXIMUM: u16 = 64;
+/// Size of a packet with subscriptions, bytes, at most.
+const SUBSCRIBE_BYTES: usize = 8 << 10;
 /// What the system buffers of sent messages: a result waits behind no more than that.
 const SEND_BUFFER: u32 = 256 << 10;
 /// Time for the DISCONNECT of a connection that the gateway gives up.
@@ -69,6 +74,8 @@ pub(super) enum ConnectionEvent {
     Alive,
     /// The connection stands and cannot be used any more, for this reason: it is to be given up.
     Stuck(&'static str),
+    /// The broker refused the connection because of the last will. The last event.
+    Refuses(Lack),
     /// The connection is lost, with the reason. The last event.
     Lost(String),
 }
@@ -118,39 +125,6 @@ pub(super) enum Subscribed {
     Leftovers,
 }
 
-/// What the broker can do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct BrokerLimits {
-    /// Number of unacknowledged messages.
-    pub(super) window: usize,
-    /// Maximum packet size, bytes.
-    pub(super) max_packet: usize,
-    /// Whether it acknowledges messages (QoS 1).
-    pub(super) acknowledges: bool,
-    /// Whether it keeps retained messages.
-    pub(super) retains: bool,
-    /// Number of topic aliases.
-    aliases: u16,
-    /// The keep-alive interval that it set in place of ours, s.
-    keep_alive: Option<u16>,
-}
-
-impl BrokerLimits {
-    fn of(ack: &ConnAck) -> BrokerLimits {
-        let properties = ack.properties.as_ref();
-        let window = properties.and_then(|p| p.receive_max).unwrap_or(u16::MAX).min(INFLIGHT);
-        let max_packet = properties.and_then(|p| p.max_packet_size).unwrap_or(u32::MAX);
-        BrokerLimits {
-            window: usize::from(window).max(1),
-            max_packet: usize::try_from(max_packet).unwrap_or(usize::MAX),
-            acknowledges: properties.and_then(|p| p.max_qos) != Some(0),
-            retains: properties.and_then(|p| p.retain_available) != Some(0),
-            aliases: properties.and_then(|p| p.topic_alias_max).unwrap_or_default(),
-            keep_alive: properties.and_then(|p| p.server_keep_alive),
-        }
-    }
-}
-
 /// One connection, from the connection attempt to its end.
 #[derive(Debug)]
 pub(super) struct Connection {
@@ -161,6 +135,9 @@ pub(super) struct Connection {
     silence: Silence,
     /// What a broker that may be silent is asked.
     question: Option<Filter>,
+    /// Number of subscriptions whose answers are awaited, and the answers so far.
+    wanted: usize,
+    answers: Vec<Option<String>>,
     /// `None` once it ends by itself.
     task: Option<JoinHandle<()>>,
 }
@@ -235,6 +212,8 @@ impl Connection {
             aliases: Aliases::default(),
             silence: Silence::new(Instant::now()),
             question: None,
+            wanted: 0,
+            answers: Vec::new(),
             task: Some(task),
         }
     }
@@ -250,17 +229,40 @@ impl Connection {
         self.silence.heard(Instant::now());
         match event {
             ConnectionEvent::Subscribed(_) if self.silence.answered() => ConnectionEvent::Alive,
+            ConnectionEvent::Subscribed(answers) => {
+                self.answers.extend(answers);
+                match self.answers.len() < self.wanted {
+                    true => ConnectionEvent::Alive,
+                    false => ConnectionEvent::Subscribed(std::mem::take(&mut self.answers)),
+                }
+            }
             event => event,
         }
     }
 
-    /// Subscribes; false if the connection does not take it.
-    pub(super) fn subscribe(&mut self, filters: Vec<Filter>) -> bool {
+    /// Subscribes, in as many packets as the broker wants; false if the connection does not take it.
+    pub(super) fn subscribe(&mut self, filters: Vec<Filter>, limits: BrokerLimits) -> bool {
+        (self.wanted, self.answers) = (filters.len(), Vec::new());
         self.question = filters.first().map(|first| Filter {
             retain_forward_rule: RetainForwardRule::Never,
             ..first.clone()
         });
-        self.client.try_subscribe_many(filters).is_ok()
+        let most = limits.max_packet.min(SUBSCRIBE_BYTES);
+        let mut packets: Vec<(usize, Vec<Filter>)> = Vec::new();
+        for filter in filters {
+            // Besides the path: its length, the options; the head of the packet.
+            let bytes = filter.path.len() + 3;
+            match packets.last_mut().filter(|(size, _)| size + bytes <= most) {
+                Some((size, packet)) => {
+                    *size += bytes;
+                    packet.push(filter);
+                }
+                None => packets.push((bytes + 8, vec![filter])),
+            }
+        }
+        packets
+            .into_iter()
+            .all(|(_, packet)| self.client.try_subscribe_many(packet).is_ok())
     }
 
     /// Whether the broker said nothing for so long that the connection is lost. One that has no reason to speak is asked for a
@@ -308,9 +310,13 @@ impl Connection {
         attempt.is_ok()
     }
 
-    /// Disconnects in order, so that the broker does not publish the last will.
-    pub(super) fn disconnect(&self) -> bool {
-        self.client.try_disconnect_now().is_ok()
+    /// Disconnects in order, so that the broker does not publish the last will. What a broker does not acknowledge is sent
+    /// before.
+    pub(super) fn disconnect(&self, limits: BrokerLimits) -> bool {
+        match limits.acknowledges {
+            true => self.client.try_disconnect_now().is_ok(),
+            false => self.client.try_disconnect().is_ok(),
+        }
     }
 
     /// Ends the connection without waiting for it, and tells the broker, as far as it listens. The last will is published if it
@@ -352,10 +358,13 @@ pub(super) fn commanding(path: String) -> Filter {
     }
 }
 
+/// What a packet needs besides topic, payload and correlation data, bytes, at most.
+pub(super) const PACKET_OVERHEAD: usize = 24;
+
 /// Maximum size of the packet with `message`, bytes.
 pub(super) fn packet_size(message: &Message) -> usize {
     let correlation = message.correlation.as_ref().map_or(0, |c| c.len() + 3);
-    message.topic.len() + message.payload.len() + correlation + 24
+    message.topic.len() + message.payload.len() + correlation + PACKET_OVERHEAD
 }
 
 fn mqtt_options(options: &Options, client_id: &str, will: LastWill, tls: Option<Arc<ClientConfig>>) -> MqttOptions {
@@ -422,12 +431,19 @@ async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>, ba
                 (packet != 0).then_some(ConnectionEvent::Sent(packet))
             }
             Ok(event) => interpret(event, came),
+            Err(ConnectionError::ConnectionRefused(ConnectReturnCode::QoSNotSupported)) => {
+                Some(ConnectionEvent::Refuses(Lack::Acknowledgements))
+            }
+            Err(ConnectionError::ConnectionRefused(ConnectReturnCode::RetainNotSupported)) => {
+                Some(ConnectionEvent::Refuses(Lack::Retained))
+            }
+            Err(error) if accepted && is_closed(&error) => Some(ConnectionEvent::Lost(CLOSED.to_string())),
             Err(error) if accepted => Some(ConnectionEvent::Lost(reason(&error))),
             Err(error) => Some(ConnectionEvent::Lost(refusal(&error))),
         };
         let Some(item) = item else { continue };
         accepted |= matches!(item, ConnectionEvent::Connected(_));
-        let end = matches!(item, ConnectionEvent::Lost(_));
+        let end = matches!(item, ConnectionEvent::Lost(_) | ConnectionEvent::Refuses(_));
         if event.send(item).await.is_err() || end {
             return;
         }
@@ -479,16 +495,33 @@ fn refusal(error: &ConnectionError) -> String {
 /// What to do about a broker of an older version.
 const MQTT_5: &str = "the gateway requires MQTT 5: use Mosquitto 1.6 or later, or another broker that supports it";
 
+/// The broker ended an accepted connection, and did not say why.
+pub(super) const CLOSED: &str = "the broker closed the connection";
+
+/// Whether the other end closed the connection.
+fn is_closed(error: &ConnectionError) -> bool {
+    let io = match error {
+        ConnectionError::MqttState(StateError::ConnectionAborted) => return true,
+        ConnectionError::MqttState(StateError::Io(io) | StateError::Deserialization(PacketError::Io(io)))
+        | ConnectionError::Io(io) => io,
+        _ => return false,
+    };
+    use std::io::ErrorKind::{BrokenPipe, ConnectionAborted, ConnectionReset, UnexpectedEof};
+    matches!(
+        io.kind(),
+        BrokenPipe | ConnectionAborted | ConnectionReset | UnexpectedEof
+    )
+}
+
 fn reason(error: &ConnectionError) -> String {
     use ConnectReturnCode::{
-        BadUserNamePassword, Banned, ClientIdentifierNotValid, NotAuthorized, RetainNotSupported,
-        UnsupportedProtocolVersion,
+        BadUserNamePassword, Banned, ClientIdentifierNotValid, NotAuthorized, UnsupportedProtocolVersion,
     };
     let ConnectionError::ConnectionRefused(code) = error else {
         return match error {
             ConnectionError::Timeout(_) => "timed out".to_string(),
             ConnectionError::MqttState(StateError::AwaitPingResp) => "the broker no longer responds".to_string(),
-            ConnectionError::MqttState(StateError::ConnectionAborted) => "the broker closed the connection".to_string(),
+            ConnectionError::MqttState(StateError::ConnectionAborted) => CLOSED.to_string(),
             _ => error.to_string(),
         };
     };
@@ -500,7 +533,6 @@ fn reason(error: &ConnectionError) -> String {
             "; check mqtt.username, mqtt.password_file and the permissions at the broker"
         }
         ClientIdentifierNotValid => "; change mqtt.client_id",
-        RetainNotSupported => "; the gateway requires a broker that supports retained messages",
         _ => "",
     };
     format!("the broker refuses the connection ({code:?}){advice}")

@@ -7,7 +7,7 @@ use serde::ser::{Serialize, SerializeMap, Serializer};
 
 use crate::drive::{ModelPoint, Point, Profile, Quality, State, Value};
 use crate::event::Event;
-use crate::plant::{BusHandle, Plant};
+use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{BusHealth, Reading, value_or_null};
 
 /// The topics of one gateway.
@@ -55,6 +55,18 @@ impl Topics {
     /// The filters of all set topics.
     pub(super) fn set_filters(&self) -> [String; 2] {
         [self.drive("+", "set"), self.drive("+", "set/+")]
+    }
+
+    /// The set topics of each drive of this plant, for a broker that takes no wildcards.
+    pub(super) fn set_topics(&self, plant: &Plant) -> Vec<String> {
+        let of_drive = |drive: DriveHandle| {
+            let spec = &drive.image.spec;
+            let points = spec.profile.points.iter().filter(|point| point.write);
+            let points = points.map(|point| self.drive(&spec.name, &format!("set/{}", point.name)));
+            let whole = self.drive(&spec.name, "set");
+            std::iter::once(whole).chain(points).collect::<Vec<String>>()
+        };
+        plant.drives().flat_map(of_drive).collect()
     }
 
     /// Which drive and point a topic sets; `None` for any other topic.
@@ -124,6 +136,8 @@ pub(super) struct StateObject<'s> {
     pub(super) wall: SystemTime,
     /// It is no longer current: part of the history.
     pub(super) historical: bool,
+    /// Number of points that are left out because the broker takes no larger message.
+    pub(super) omitted: usize,
 }
 
 impl Serialize for StateObject<'_> {
@@ -139,6 +153,9 @@ impl Serialize for StateObject<'_> {
         map.serialize_entry("age_ms", &self.age.map(|a| a.as_millis() as u64))?;
         map.serialize_entry("fault_text", &self.fault_text)?;
         map.serialize_entry("blocked_by", &self.shown.blocked_by)?;
+        if self.omitted > 0 {
+            map.serialize_entry("omitted", &self.omitted)?;
+        }
         let points = || self.names.iter().zip(&self.shown.points);
         for (name, (value, _)) in points() {
             map.serialize_entry(name, &value_or_null(value.map(tidy)))?;
@@ -390,6 +407,7 @@ mod tests {
                 age: None,
                 wall: SystemTime::UNIX_EPOCH,
                 historical: false,
+                omitted: 0,
             };
             serde_json::to_value(&object).unwrap()
         };
@@ -430,6 +448,7 @@ mod tests {
             age: None,
             wall: SystemTime::UNIX_EPOCH,
             historical: false,
+            omitted: 0,
         };
         let object = serde_json::to_value(&object).unwrap();
         assert_eq!(

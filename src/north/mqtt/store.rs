@@ -442,6 +442,8 @@ impl Thread {
         let (file, new) = (self.topics_file(), self.dir.join(format!("{MQTT_TOPICS}.new")));
         let written = std::fs::write(&new, self.topics.join("\n")).and_then(|()| std::fs::rename(&new, &file));
         if let Err(error) = written {
+            // A part of it would only take room from the messages.
+            let _ = std::fs::remove_file(&new);
             let file = file.display();
             tracing::warn!("{file}: {error}; topics removed before the next start are not cleared");
         }

@@ -27,6 +27,10 @@ struct Manners {
     farewell: Option<Vec<u8>>,
     /// It does not answer subscriptions.
     deaf: bool,
+    /// It refuses a last will with QoS 1, and one that is retained.
+    no_will: bool,
+    /// It refuses filters with wildcards.
+    no_wildcards: bool,
 }
 
 #[derive(Default)]
@@ -38,6 +42,7 @@ struct Seen {
     longest: usize,
     by_alias: usize,
     refusals: usize,
+    filters: Vec<String>,
     /// What the gateway says when it leaves.
     farewells: Vec<Vec<u8>>,
 }
@@ -142,6 +147,14 @@ impl Session {
         loop {
             let (kind, body) = self.packet()?;
             match kind >> 4 {
+                1 if self.manners.no_will && body[7] & 0x08 != 0 => {
+                    self.send(0x20, &[0, 0x9B, 0])?;
+                    return None;
+                }
+                1 if self.manners.no_will && body[7] & 0x20 != 0 => {
+                    self.send(0x20, &[0, 0x9A, 0])?;
+                    return None;
+                }
                 1 => {
                     let properties = self.manners.properties.clone();
                     let body = [&[0, 0, u8::try_from(properties.len()).unwrap()][..], &properties].concat();
@@ -152,8 +165,12 @@ impl Session {
                     // Packet id, properties (none), then filters with a byte of options each.
                     let (mut rest, mut codes) = (&body[3..], Vec::new());
                     while rest.len() > 2 {
-                        rest = &rest[number(rest) + 3..];
-                        codes.push(1);
+                        let (filter, next) = rest[2..].split_at(number(rest));
+                        let filter = String::from_utf8(filter.to_vec()).unwrap();
+                        let refused = self.manners.no_wildcards && filter.contains(['+', '#']);
+                        codes.push(if refused { 0xA2 } else { 1 });
+                        self.seen.lock().unwrap().filters.push(filter);
+                        rest = &next[1..];
                     }
                     self.send(0x90, &[&body[..2], &[0], &codes].concat())?;
                 }
@@ -328,7 +345,17 @@ fn odd_brokers_are_served() {
         assert_eq!(seen.connections, 1, "{name}");
         match name {
             "receive maximum 1" => assert_eq!(seen.most_in_flight, 1),
-            "QoS 0 only" => assert!(seen.messages.iter().all(|(_, qos, ..)| *qos == 0)),
+            "QoS 0 only" => {
+                assert!(seen.messages.iter().all(|(_, qos, ..)| *qos == 0));
+                drop(seen);
+                gateway.stop();
+                wait_for("the farewell", || {
+                    (!broker.seen.lock().unwrap().farewells.is_empty()).then_some(())
+                });
+                let seen = broker.seen.lock().unwrap();
+                assert_eq!(seen.messages.last().unwrap().3, b"offline");
+                continue;
+            }
             "no retained messages" => assert!(seen.messages.iter().all(|(.., retain, _)| !retain)),
             "topic aliases" => assert!(seen.by_alias > 0),
             _ => {}
@@ -419,8 +446,13 @@ fn packets_beyond_the_limit_are_not_sent() {
     });
     let seen = broker.seen.lock().unwrap();
     assert!(seen.longest <= 256, "{}", seen.longest);
-    assert!(seen.messages.iter().all(|(topic, ..)| topic != STATE));
+    let states = seen.messages.iter().filter(|(topic, ..)| topic == STATE);
+    let states: Vec<serde_json::Value> = states
+        .map(|(.., state)| serde_json::from_slice(state).unwrap())
+        .collect();
+    assert!(!states.is_empty() && states.iter().all(|state| state["omitted"].as_u64() > Some(0)));
     drop(seen);
+    wait_log(broker.port, "the state of drive p1 is too large");
     gateway.stop();
 }
 
@@ -457,4 +489,52 @@ fn a_connection_that_is_given_up_ends_with_a_word() {
         (broker.seen.lock().unwrap().connections > 1).then_some(())
     });
     gateway.stop();
+}
+
+#[test]
+fn a_broker_that_refuses_the_last_will_gets_a_lesser_one() {
+    let broker = Hostile::start(Manners {
+        no_will: true,
+        properties: vec![0x24, 0, 0x25, 0],
+        ..Manners::default()
+    });
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    serves(&broker, &gateway, 10);
+    assert_eq!(broker.seen.lock().unwrap().connections, 3, "refused twice");
+    wait_log(broker.port, "no QoS 1");
+    gateway.stop();
+}
+
+#[test]
+fn without_wildcards_the_gateway_subscribes_drive_by_drive() {
+    // It says so, or refuses the subscription.
+    for (properties, no_wildcards) in [(vec![0x28, 0], false), (vec![], true)] {
+        let broker = Hostile::start(Manners {
+            properties,
+            no_wildcards,
+            ..Manners::default()
+        });
+        let gateway = Gateway::start(options(broker.port), plant(&["p1", "p2"]));
+        serves(&broker, &gateway, 5);
+        let seen = broker.seen.lock().unwrap();
+        for filter in ["p1/set", "p2/set", "p1/set/run", "p2/set/speed_reference"] {
+            let filter = format!("drivegate/hall/drive/{filter}");
+            assert!(seen.filters.contains(&filter), "{filter} is not in {:?}", seen.filters);
+        }
+        assert_eq!(seen.filters.iter().any(|filter| filter.contains('+')), no_wildcards);
+        assert_eq!(seen.connections, 1);
+        drop(seen);
+        gateway.stop();
+    }
+}
+
+#[test]
+fn two_gateways_with_one_client_id_are_told_apart_from_a_broken_broker() {
+    // Mosquitto 2.0 closes the connection of the first without a word.
+    let broker = Broker::with("allow_anonymous true\n");
+    let first = Gateway::start(options(broker.port), plant(&["p1"]));
+    let second = Gateway::start(options(broker.port), plant(&["p1"]));
+    wait_log(broker.port, "another client has the client id `drivegate-hall`");
+    first.stop();
+    second.stop();
 }

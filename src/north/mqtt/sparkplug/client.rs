@@ -5,7 +5,6 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use rumqttc::LastWill;
 use rumqttc::mqttbytes::QoS;
 use rumqttc::mqttbytes::v5::Filter;
 use rustls::ClientConfig;
@@ -13,16 +12,20 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::super::back_off::BackOff;
-use super::super::connection::{self, BrokerLimits, Connection, ConnectionEvent, SUBSCRIBE_TIMEOUT, commanding};
+use super::super::broker_limits::{BrokerLimits, Lack, WillForm};
+use super::super::connection::{
+    self, CLOSED, Connection, ConnectionEvent, NO_WILDCARDS, PACKET_OVERHEAD, SUBSCRIBE_TIMEOUT, commanding,
+};
 use super::super::outage_log::OutageLog;
 use super::super::outbox::Message;
 use super::super::request::Incoming;
+use super::super::takeover::Takeovers;
 use super::super::{Options as BrokerOptions, tls};
 use super::bd_seq::BdSeq;
 use super::model::{self, DriveMetrics, Moment, millis};
 use super::orders::{Finished, Orders};
-use super::session::{Packet, REBIRTH_METRIC, Rules, Session, Tick};
-use super::topics::{Received, Topics};
+use super::session::{FIXED_METRICS, Packet, REBIRTH_METRIC, Rules, Session, Tick};
+use super::topics::{Kind, Received, Topics};
 use super::wire::{MetricValue, Payload};
 use super::{Options, model::COMMAND_ERROR, model::COMMAND_RESULT};
 use crate::north::log_throttle::LogThrottle;
@@ -124,8 +127,10 @@ struct Client {
     check_at: Instant,
     buses_at: Instant,
     link: Link,
+    will: WillForm,
     back_off: BackOff,
     outages: OutageLog,
+    takeovers: Takeovers,
     waits_logged: bool,
     not_understood: LogThrottle,
 }
@@ -167,8 +172,10 @@ impl Client {
             check_at: now,
             buses_at: now,
             link: Link::Down { retry_at: now },
+            will: WillForm::default(),
             back_off: BackOff::default(),
             outages: OutageLog::default(),
+            takeovers: Takeovers::default(),
             waits_logged: false,
             not_understood: LogThrottle::every(LOGGED),
         };
@@ -202,6 +209,9 @@ impl Client {
             self.tell(place, now, SystemTime::now());
         }
         self.tell_node(now, SystemTime::now());
+        if matches!(&self.link, Link::Up(Up { limits: Some(limits), .. }) if !limits.wildcards) {
+            self.subscribe();
+        }
     }
 
     fn tell(&mut self, place: usize, now: Instant, wall: SystemTime) {
@@ -295,7 +305,7 @@ impl Client {
     fn open(&mut self, bd_seq: u8, config: Option<Arc<ClientConfig>>) {
         let death = self.session.will(bd_seq, tick().millis);
         let topic = self.topics.of(death.kind, None);
-        let will = LastWill::new(topic, death.payload.encoded(), QoS::AtLeastOnce, false, None);
+        let will = self.will.will(topic, death.payload.encoded(), false);
         let now = Instant::now();
         self.link = Link::Up(Up {
             connection: Connection::open(&self.broker, &self.client_id, will, config),
@@ -342,15 +352,11 @@ impl Client {
             ConnectionEvent::Connected(limits) => {
                 (up.limits, up.opened) = (Some(limits), now);
                 self.bd_seq.accepted();
-                self.session.opened(up.bd_seq);
-                if !up.connection.subscribe(filters(&self.topics, self.broker.commands)) {
-                    self.give_up("the subscription could not be sent");
-                }
+                self.session.opened(up.bd_seq, limits.max_packet);
+                self.subscribe();
             }
-            ConnectionEvent::Subscribed(refused) => {
-                up.subscribed = true;
-                self.subscribed(refused);
-            }
+            ConnectionEvent::Subscribed(refused) => self.subscribed(&refused),
+            ConnectionEvent::Refuses(lack) => self.lessen_will(lack, now),
             ConnectionEvent::Acked(_) | ConnectionEvent::Refused(..) => up.unacknowledged = false,
             ConnectionEvent::Message(message) => self.on_message(&message).await,
             ConnectionEvent::Sent(_) | ConnectionEvent::Room | ConnectionEvent::Alive => {}
@@ -359,15 +365,84 @@ impl Client {
         }
     }
 
-    fn subscribed(&mut self, refused: Vec<Option<String>>) {
-        for (filter, why) in filters(&self.topics, self.broker.commands).iter().zip(refused) {
-            if let Some(why) = why {
+    /// The broker refused the connection because of the last will: another one follows with less, at once, if there is less.
+    fn lessen_will(&mut self, lack: Lack, now: Instant) {
+        if self.will.lessen(lack) {
+            tracing::debug!("Sparkplug: the broker refuses the last will ({lack:?}); trying a lesser one");
+            self.link = Link::Down { retry_at: now };
+        } else {
+            drop(self.lost("the broker refuses the last will in every form"));
+        }
+    }
+
+    fn filters(&self, limits: BrokerLimits) -> Vec<Filter> {
+        let drives = self
+            .drives
+            .iter()
+            .map(|drive| drive.metrics.drive.image.spec.name.as_str());
+        filters(
+            &self.topics,
+            self.broker.commands,
+            (!limits.wildcards).then(|| drives.collect()),
+        )
+    }
+
+    fn subscribe(&mut self) {
+        let Link::Up(Up {
+            limits: Some(limits), ..
+        }) = &self.link
+        else {
+            return;
+        };
+        let limits = *limits;
+        let filters = self.filters(limits);
+        if let Link::Up(up) = &mut self.link
+            && !up.connection.subscribe(filters, limits)
+        {
+            self.give_up("the subscription could not be sent");
+        }
+    }
+
+    /// The broker answered the subscriptions.
+    fn subscribed(&mut self, refused: &[Option<String>]) {
+        let Link::Up(Up {
+            limits: Some(limits),
+            subscribed,
+            ..
+        }) = &mut self.link
+        else {
+            return;
+        };
+        if limits.wildcards && refused.iter().flatten().any(|why| why == NO_WILDCARDS) {
+            limits.wildcards = false;
+            return self.subscribe();
+        }
+        let (limits, again) = (*limits, std::mem::replace(subscribed, true));
+        self.report_refused(&self.filters(limits), refused);
+        if !again {
+            self.ready(limits);
+        }
+    }
+
+    fn report_refused(&self, filters: &[Filter], refused: &[Option<String>]) {
+        for (filter, why) in filters.iter().zip(refused) {
+            // Most hosts do without the topic of version 2.2.
+            let spare = self.topics.old_state().is_some_and(|old| old == filter.path);
+            if let Some(why) = why
+                && !spare
+            {
                 tracing::error!(
                     "the broker refuses a Sparkplug subscription ({why}); allow client {} to subscribe to {}",
                     self.client_id,
                     filter.path
                 );
             }
+        }
+    }
+
+    fn ready(&mut self, limits: BrokerLimits) {
+        for lost in limits.losses() {
+            tracing::warn!("Sparkplug: the broker {lost}");
         }
         tracing::info!(
             "Sparkplug: connected to the broker at {}:{} as {}",
@@ -379,13 +454,16 @@ impl Client {
         self.session.subscribed();
         if self.session.is_waiting() && !std::mem::replace(&mut self.waits_logged, true) {
             let state = self.topics.state().unwrap_or_default();
-            tracing::info!("Sparkplug: waiting for the primary host to be online ({state})");
+            let old = self.topics.old_state().unwrap_or_default();
+            tracing::info!(
+                "Sparkplug: waiting for the primary host to be online, on {state}, or {old} as in version 2.2"
+            );
         }
     }
 
     async fn on_message(&mut self, message: &Incoming) {
         match self.topics.parse(&message.topic) {
-            Some(Received::State) => match self.session.host_state(&message.payload) {
+            Some(Received::State(form)) => match self.session.host_state(form, &message.payload) {
                 Ok(false) => {}
                 Ok(true) => {
                     tracing::info!("Sparkplug: the primary host is offline; values are kept until it is back");
@@ -401,6 +479,8 @@ impl Client {
 
     fn on_device_command(&mut self, message: &Incoming) {
         match self.topics.parse(&message.topic) {
+            // A retained command was cleared.
+            Some(Received::DeviceCommand(_)) if message.retain && message.payload.is_empty() => {}
             Some(Received::DeviceCommand(device)) if self.broker.commands => {
                 let drives = self.drives.iter().map(|drive| &drive.metrics);
                 let place = drives
@@ -467,7 +547,10 @@ impl Client {
             let message = match self.held.take() {
                 Some(message) => message,
                 None => match self.session.next(tick()) {
-                    Ok(packet) => self.message(packet, false),
+                    Ok(packet) => {
+                        let packet = self.fitted(packet);
+                        self.message(packet, false)
+                    }
                     Err(due) => {
                         self.look_at = self.look_at.min(due.unwrap_or(self.look_at));
                         return;
@@ -490,6 +573,40 @@ impl Client {
                 packet.payload.encoded(),
             )
         }
+    }
+
+    /// A birth without the metrics for which the broker's packets are too small; the session leaves them out from now on.
+    fn fitted(&mut self, mut packet: Packet) -> Packet {
+        let Link::Up(Up {
+            limits: Some(limits), ..
+        }) = &self.link
+        else {
+            return packet;
+        };
+        let (most, all) = (limits.max_packet, packet.payload.metrics.len());
+        let fixed = match packet.kind {
+            Kind::NodeBirth => FIXED_METRICS,
+            Kind::DeviceBirth => 0,
+            _ => return packet,
+        };
+        let topic = self.topics.of(packet.kind, packet.device.as_deref());
+        let room = most.saturating_sub(topic.len() + PACKET_OVERHEAD);
+        let mut omitted = Vec::new();
+        while packet.payload.encoded().len() > room && packet.payload.metrics.len() > fixed {
+            omitted.extend(packet.payload.metrics.pop().and_then(|metric| metric.name));
+        }
+        if !omitted.is_empty() {
+            self.session
+                .keep(packet.device.as_deref(), packet.payload.metrics.len() - fixed);
+            omitted.reverse();
+            tracing::warn!(
+                "Sparkplug: {topic} is too large for the broker, which accepts {most} bytes per packet: {} of {all} metrics \
+                 are left out until the next connection ({}); raise the broker's limit",
+                omitted.len(),
+                omitted.join(", ")
+            );
+        }
+        packet
     }
 
     /// Whether another message may follow.
@@ -540,6 +657,10 @@ impl Client {
         } else {
             tracing::debug!("Sparkplug: no connection to the broker: {why}");
         }
+        if why == CLOSED && self.takeovers.closed(now) {
+            let words = Takeovers::words(&self.client_id);
+            tracing::warn!("Sparkplug: {}:{}: {words}", self.broker.host, self.broker.port);
+        }
         self.down(now)
     }
 
@@ -550,6 +671,10 @@ impl Client {
             Link::Up(up) if up.subscribed => now.saturating_duration_since(up.opened),
             _ => Duration::ZERO,
         };
+        if !held.is_zero() {
+            // The next broker, or this one with another configuration, may take more.
+            self.will = WillForm::default();
+        }
         let retry_at = now + self.back_off.after(held);
         self.held = None;
         self.session.closed();
@@ -588,7 +713,8 @@ impl Client {
                 return;
             }
         }
-        if matches!(&self.link, Link::Up(up) if up.connection.disconnect()) {
+        if matches!(&self.link, Link::Up(Up { connection, limits: Some(limits), .. }) if connection.disconnect(*limits))
+        {
             while !self.is_lost_next().await {}
         }
     }
@@ -630,16 +756,19 @@ impl Client {
 }
 
 /// What the node subscribes to: commands for itself, the primary host, commands for its devices.
-fn filters(topics: &Topics, commands: bool) -> Vec<Filter> {
+/// `drives` if the broker takes no wildcards.
+fn filters(topics: &Topics, commands: bool, drives: Option<Vec<&str>>) -> Vec<Filter> {
     let plain = |path| Filter {
         path,
         qos: QoS::AtLeastOnce,
         ..Filter::default()
     };
     let mut filters = vec![commanding(topics.node_commands())];
-    filters.extend(topics.state().map(plain));
-    if commands {
-        filters.push(commanding(topics.device_commands()));
+    filters.extend(topics.state().into_iter().chain(topics.old_state()).map(plain));
+    match drives {
+        _ if !commands => {}
+        None => filters.push(commanding(topics.device_commands())),
+        Some(drives) => filters.extend(drives.into_iter().map(|drive| commanding(topics.commands_of(drive)))),
     }
     filters
 }
