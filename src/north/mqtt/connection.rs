@@ -131,7 +131,7 @@ pub(super) struct Connection {
     client: AsyncClient,
     event: mpsc::Receiver<ConnectionEvent>,
     backlog: Arc<Backlog>,
-    aliases: Aliases,
+    aliases: Box<Aliases>,
     silence: Silence,
     /// What a broker that may be silent is asked.
     question: Option<Filter>,
@@ -209,7 +209,7 @@ impl Connection {
             client,
             event,
             backlog,
-            aliases: Aliases::default(),
+            aliases: Box::default(),
             silence: Silence::new(Instant::now()),
             question: None,
             wanted: 0,

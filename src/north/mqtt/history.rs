@@ -22,6 +22,8 @@ pub(super) struct Recorder {
     entries: usize,
     array: Vec<u8>,
     begun: Option<Instant>,
+    /// Largest packet of the broker, bytes, as far as it is known.
+    max_packet: usize,
     /// Arrays that are complete because the broker takes no larger ones.
     complete: Vec<Update>,
 }
@@ -34,17 +36,22 @@ impl Recorder {
             entries: 0,
             array: Vec::new(),
             begun: None,
+            max_packet: usize::MAX,
             complete: Vec::new(),
         }
     }
 
+    /// The broker takes packets of so many bytes.
+    pub(super) fn limit(&mut self, max_packet: usize) {
+        self.max_packet = max_packet;
+    }
+
     /// Records what a drive shows: when it changed, or with [`History::All`] when it is `fresh`; at most once in `min`.
-    /// Returns how long to wait if it is too early. `max_packet` is the largest packet of the broker, as far as it is known.
+    /// Returns how long to wait if it is too early.
     pub(super) fn record(
         &mut self,
         mode: History,
         min: Duration,
-        max_packet: usize,
         shown: StateContent,
         fresh: bool,
         render: impl FnOnce(&StateContent) -> Option<Vec<u8>>,
@@ -67,7 +74,7 @@ impl Recorder {
             return Some(early);
         }
         if let Some(entry) = render(&shown) {
-            let room = max_packet.saturating_sub(self.topic.len() + PACKET_OVERHEAD);
+            let room = self.max_packet.saturating_sub(self.topic.len() + PACKET_OVERHEAD);
             if self.array.len() + entry.len() + 2 > room {
                 let array = self.take();
                 self.complete.extend(array);

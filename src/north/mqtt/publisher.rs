@@ -257,7 +257,8 @@ impl Publisher {
                 let fits = drive.fits;
                 render((names, indices, fits), &reading, shown, wall, true)
             };
-            let wait = drive.recorder.record(mode, pace.min, most, shown, fresh, render, now);
+            drive.recorder.limit(most);
+            let wait = drive.recorder.record(mode, pace.min, shown, fresh, render, now);
             drive.seen = Some(reading.snapshot);
             drive.look_at = Some(now + wait.unwrap_or(LOOK).min(LOOK));
         });

@@ -1,4 +1,4 @@
-//! Connections that the broker closes without a reason, again and again: so looks another client with the same client id. Time
+//! Connections that the broker closes without a reason, again and again, as it does when two clients have one client id. Time
 //! is an argument.
 
 use std::collections::VecDeque;
@@ -34,8 +34,8 @@ impl Takeovers {
     /// What it looks like, and the remedy.
     pub(super) fn words(client_id: &str) -> String {
         format!(
-            "the broker closed {CLOSED} connections within a minute without a reason: so it looks when another client has the \
-             client id `{client_id}`, and each connection of one ends that of the other; give each gateway a name or a \
+            "the broker closed {CLOSED} connections within a minute without giving a reason; this is what it looks like when another \
+             client uses the client id `{client_id}`, too: each takes the connection from the other; give each gateway a name or a \
              `client_id` of its own"
         )
     }

@@ -276,7 +276,7 @@ fn serves(broker: &Hostile, gateway: &Gateway, count: usize) {
 #[test]
 fn odd_brokers_are_served() {
     let window = |n: u16| [&[0x21][..], &n.to_be_bytes()].concat();
-    let cases: [(&str, Manners); 7] = [
+    let cases: [(&str, Manners); 9] = [
         (
             "receive maximum 1",
             Manners {
@@ -310,6 +310,20 @@ fn odd_brokers_are_served() {
             "topic aliases",
             Manners {
                 properties: vec![0x22, 0, 5],
+                ..Manners::default()
+            },
+        ),
+        (
+            "no topic aliases, a keep-alive interval of its own",
+            Manners {
+                properties: vec![0x22, 0, 0, 0x13, 0, 60],
+                ..Manners::default()
+            },
+        ),
+        (
+            "a client id assigned by the broker",
+            Manners {
+                properties: vec![0x12, 0, 3, b'x', b'y', b'z'],
                 ..Manners::default()
             },
         ),
@@ -358,6 +372,7 @@ fn odd_brokers_are_served() {
             }
             "no retained messages" => assert!(seen.messages.iter().all(|(.., retain, _)| !retain)),
             "topic aliases" => assert!(seen.by_alias > 0),
+            "no topic aliases, a keep-alive interval of its own" => assert_eq!(seen.by_alias, 0),
             _ => {}
         }
         drop(seen);
@@ -534,7 +549,7 @@ fn two_gateways_with_one_client_id_are_told_apart_from_a_broken_broker() {
     let broker = Broker::with("allow_anonymous true\n");
     let first = Gateway::start(options(broker.port), plant(&["p1"]));
     let second = Gateway::start(options(broker.port), plant(&["p1"]));
-    wait_log(broker.port, "another client has the client id `drivegate-hall`");
+    wait_log(broker.port, "uses the client id `drivegate-hall`");
     first.stop();
     second.stop();
 }

@@ -1,6 +1,7 @@
 //! Discovery for Home Assistant, and what is subscribed to.
 
 use super::*;
+use crate::north::mqtt::connection::Subscribed;
 
 /// The discovery messages, if they are configured.
 pub(super) fn announcer(options: &Options, topics: &Topics) -> Option<Announcer> {

@@ -1,21 +1,19 @@
 //! The task that owns session, orders and connection. It never waits for the broker: what finds no room is kept, and
 //! the session is not asked for more until there is room.
 
+mod answers;
+
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use rumqttc::mqttbytes::QoS;
-use rumqttc::mqttbytes::v5::Filter;
 use rustls::ClientConfig;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::super::back_off::BackOff;
-use super::super::broker_limits::{BrokerLimits, Lack, WillForm};
-use super::super::connection::{
-    self, CLOSED, Connection, ConnectionEvent, NO_WILDCARDS, PACKET_OVERHEAD, SUBSCRIBE_TIMEOUT, commanding,
-};
+use super::super::broker_limits::{BrokerLimits, WillForm};
+use super::super::connection::{self, CLOSED, Connection, ConnectionEvent, SUBSCRIBE_TIMEOUT};
 use super::super::outage_log::OutageLog;
 use super::super::outbox::Message;
 use super::super::request::Incoming;
@@ -24,8 +22,8 @@ use super::super::{Options as BrokerOptions, tls};
 use super::bd_seq::BdSeq;
 use super::model::{self, DriveMetrics, Moment, millis};
 use super::orders::{Finished, Orders};
-use super::session::{FIXED_METRICS, Packet, REBIRTH_METRIC, Rules, Session, Tick};
-use super::topics::{Kind, Received, Topics};
+use super::session::{Packet, REBIRTH_METRIC, Rules, Session, Tick};
+use super::topics::{Received, Topics};
 use super::wire::{MetricValue, Payload};
 use super::{Options, model::COMMAND_ERROR, model::COMMAND_RESULT};
 use crate::north::log_throttle::LogThrottle;
@@ -365,81 +363,6 @@ impl Client {
         }
     }
 
-    /// The broker refused the connection because of the last will: another one follows with less, at once, if there is less.
-    fn lessen_will(&mut self, lack: Lack, now: Instant) {
-        if self.will.lessen(lack) {
-            tracing::debug!("Sparkplug: the broker refuses the last will ({lack:?}); trying a lesser one");
-            self.link = Link::Down { retry_at: now };
-        } else {
-            drop(self.lost("the broker refuses the last will in every form"));
-        }
-    }
-
-    fn filters(&self, limits: BrokerLimits) -> Vec<Filter> {
-        let drives = self
-            .drives
-            .iter()
-            .map(|drive| drive.metrics.drive.image.spec.name.as_str());
-        filters(
-            &self.topics,
-            self.broker.commands,
-            (!limits.wildcards).then(|| drives.collect()),
-        )
-    }
-
-    fn subscribe(&mut self) {
-        let Link::Up(Up {
-            limits: Some(limits), ..
-        }) = &self.link
-        else {
-            return;
-        };
-        let limits = *limits;
-        let filters = self.filters(limits);
-        if let Link::Up(up) = &mut self.link
-            && !up.connection.subscribe(filters, limits)
-        {
-            self.give_up("the subscription could not be sent");
-        }
-    }
-
-    /// The broker answered the subscriptions.
-    fn subscribed(&mut self, refused: &[Option<String>]) {
-        let Link::Up(Up {
-            limits: Some(limits),
-            subscribed,
-            ..
-        }) = &mut self.link
-        else {
-            return;
-        };
-        if limits.wildcards && refused.iter().flatten().any(|why| why == NO_WILDCARDS) {
-            limits.wildcards = false;
-            return self.subscribe();
-        }
-        let (limits, again) = (*limits, std::mem::replace(subscribed, true));
-        self.report_refused(&self.filters(limits), refused);
-        if !again {
-            self.ready(limits);
-        }
-    }
-
-    fn report_refused(&self, filters: &[Filter], refused: &[Option<String>]) {
-        for (filter, why) in filters.iter().zip(refused) {
-            // Most hosts do without the topic of version 2.2.
-            let spare = self.topics.old_state().is_some_and(|old| old == filter.path);
-            if let Some(why) = why
-                && !spare
-            {
-                tracing::error!(
-                    "the broker refuses a Sparkplug subscription ({why}); allow client {} to subscribe to {}",
-                    self.client_id,
-                    filter.path
-                );
-            }
-        }
-    }
-
     fn ready(&mut self, limits: BrokerLimits) {
         for lost in limits.losses() {
             tracing::warn!("Sparkplug: the broker {lost}");
@@ -573,40 +496,6 @@ impl Client {
                 packet.payload.encoded(),
             )
         }
-    }
-
-    /// A birth without the metrics for which the broker's packets are too small; the session leaves them out from now on.
-    fn fitted(&mut self, mut packet: Packet) -> Packet {
-        let Link::Up(Up {
-            limits: Some(limits), ..
-        }) = &self.link
-        else {
-            return packet;
-        };
-        let (most, all) = (limits.max_packet, packet.payload.metrics.len());
-        let fixed = match packet.kind {
-            Kind::NodeBirth => FIXED_METRICS,
-            Kind::DeviceBirth => 0,
-            _ => return packet,
-        };
-        let topic = self.topics.of(packet.kind, packet.device.as_deref());
-        let room = most.saturating_sub(topic.len() + PACKET_OVERHEAD);
-        let mut omitted = Vec::new();
-        while packet.payload.encoded().len() > room && packet.payload.metrics.len() > fixed {
-            omitted.extend(packet.payload.metrics.pop().and_then(|metric| metric.name));
-        }
-        if !omitted.is_empty() {
-            self.session
-                .keep(packet.device.as_deref(), packet.payload.metrics.len() - fixed);
-            omitted.reverse();
-            tracing::warn!(
-                "Sparkplug: {topic} is too large for the broker, which accepts {most} bytes per packet: {} of {all} metrics \
-                 are left out until the next connection ({}); raise the broker's limit",
-                omitted.len(),
-                omitted.join(", ")
-            );
-        }
-        packet
     }
 
     /// Whether another message may follow.
@@ -753,22 +642,4 @@ impl Client {
         self.end_connection().await;
         self.stats.mqtt.keep_node_orders(Some(self.orders.leave()));
     }
-}
-
-/// What the node subscribes to: commands for itself, the primary host, commands for its devices.
-/// `drives` if the broker takes no wildcards.
-fn filters(topics: &Topics, commands: bool, drives: Option<Vec<&str>>) -> Vec<Filter> {
-    let plain = |path| Filter {
-        path,
-        qos: QoS::AtLeastOnce,
-        ..Filter::default()
-    };
-    let mut filters = vec![commanding(topics.node_commands())];
-    filters.extend(topics.state().into_iter().chain(topics.old_state()).map(plain));
-    match drives {
-        _ if !commands => {}
-        None => filters.push(commanding(topics.device_commands())),
-        Some(drives) => filters.extend(drives.into_iter().map(|drive| commanding(topics.commands_of(drive)))),
-    }
-    filters
 }

@@ -228,3 +228,18 @@ async fn deleted_files_and_topics_are_written_again() {
     let (_, topics) = store.take(report);
     assert_eq!((store.waiting(), topics), (6, vec!["a/b".to_string()]));
 }
+
+#[tokio::test]
+async fn a_list_of_topics_that_finds_no_room_leaves_nothing_behind() {
+    let dir = tempfile::tempdir().unwrap();
+    let buffer = Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 1 << 20,
+    };
+    let new = dir.path().join(format!("{MQTT_TOPICS}.new"));
+    std::os::unix::fs::symlink("/dev/full", &new).unwrap();
+    let store = Store::open(Some(buffer), "mqtt-events", count());
+    store.remember(vec!["a/b".to_string()]);
+    store.close().await;
+    assert!(new.symlink_metadata().is_err(), "it would take the room of messages");
+}
