@@ -146,13 +146,15 @@ impl Daemon {
         // Before anything happens: it knows what happened earlier.
         daemon.apply_keeper(&settings).await;
         daemon.apply_audit(&settings).await;
-        // MQTT first, so that it misses no event; the servers that report readiness last.
-        daemon.apply_mqtt(&settings).await?;
+        // So that MQTT misses no event, though it comes after the buses: its first messages tell of them.
+        drop(daemon.stats.mqtt.keep_unread(Some(daemon.events.subscribe())));
         let prepared = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings).await?;
         daemon.apply_params(&settings);
         daemon.hold_unfinished(&settings).await;
         daemon.replace_buses(&settings, prepared).await;
+        daemon.apply_mqtt(&settings).await?;
+        // The servers that report readiness come last.
         let servers = daemon.prepare_servers(&settings).await?;
         daemon.commit_servers(servers).await;
         daemon.apply_local(&settings).await;

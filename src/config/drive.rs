@@ -29,7 +29,8 @@ pub(super) struct Found {
     /// The unit is the address, because none is written.
     pub(super) unit_is_address: bool,
     pub(super) access: (Access, Place),
-    /// Places of `supervision` and of a stop `on_shutdown`.
+    /// Places of `limits`, of `supervision` and of a stop `on_shutdown`.
+    pub(super) limits: Place,
     pub(super) lease: Option<Place>,
     pub(super) shutdown_stop: Option<Place>,
     pub(super) spec: Option<DriveSpec>,
@@ -87,6 +88,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
         unit: unit.map(|u| (u, DRIVE.unit.place(reader))),
         unit_is_address: !reader.has(DRIVE.unit.name),
         access: (access, DRIVE.access.place(reader)),
+        limits: reader.place_of(DRIVE.limits.name),
         lease: reader
             .has(DRIVE.supervision.name)
             .then(|| DRIVE.supervision.place(reader)),

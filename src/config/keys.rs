@@ -461,7 +461,7 @@ keys! {
         client_id: String = Parsed { parse: mqtt::parse_client_id, words: &[], pattern: "", range: "a string in quotes" },
             or "`drivegate-` and the gateway's name";
         /// User name on the broker.
-        username: String = STRING, or "none";
+        username: String = Parsed { parse: mqtt::parse_username, words: &[], pattern: "", range: "a string in quotes" }, or "none";
         /// Password of the user; `password_file` is better.
         password: String = STRING, or "none";
         /// File whose only line is the password: a systemd credential, a container secret.

@@ -301,6 +301,9 @@ fn judge(
     let slots = || buses.iter().flat_map(|bus| &bus.slots);
     let listeners = listeners.chain(slots().flat_map(|slot| &slot.listeners));
     unique::check_listeners(reader.document(), listeners);
+    if mqtt.is_some_and(|m| m.as_ref().is_some_and(|m| m.commands && m.home_assistant.is_some())) {
+        check_numbers_of_home_assistant(reader, buses);
+    }
     warn_of_emptiness(reader);
     let commanded = modbus_tcp.is_some_and(|m| m.commands)
         || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands))
@@ -319,6 +322,23 @@ fn judge(
         warn_of_long_shutdowns(reader, buses);
         let written = modbus_tcp.filter(|m| m.stale_written);
         warn_of_cadence(reader, buses, written.map(|m| (m.stale_after, &m.stale_place)));
+    }
+}
+
+/// Home Assistant takes no number whose lowest value is its highest, and would refuse the whole drive.
+fn check_numbers_of_home_assistant(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for drive in buses.iter().flat_map(|bus| &bus.drives) {
+        let Some(spec) = drive.spec.as_ref().filter(|_| drive.access.0 == Access::Control) else {
+            continue;
+        };
+        for (point, range) in spec.limits.iter().filter(|(_, range)| range.start() == range.end()) {
+            let only = range.start();
+            reader.document().problem(
+                &drive.limits,
+                format!("the limits of `{point}` leave only {only}, and Home Assistant takes no such number"),
+                "write a range, access = \"monitor\", or home_assistant = false",
+            );
+        }
     }
 }
 

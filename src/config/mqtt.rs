@@ -16,6 +16,12 @@ use crate::north::{ServerIdentity, TlsFile};
 /// Most bytes of a secret: a longer file is not a password.
 const SECRET: u64 = 4096;
 
+/// Longest client id, base or id of Sparkplug, bytes: MQTT allows 65,535 for a whole topic, in which names of drives and points
+/// follow, and for a client id, to which `-sparkplug` is added.
+const LONGEST_NAME: usize = 16_384;
+/// Most levels of a base; brokers allow 200 (Mosquitto) or fewer for a whole topic.
+const MOST_LEVELS: usize = 64;
+
 /// What telemetry is published as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum TelemetryTopic {
@@ -131,8 +137,30 @@ pub(super) fn parse_client_id(text: &str) -> Result<String, Finding> {
             "the client id is empty",
             "write a name or leave the key out",
         )),
-        text => Ok(text.to_string()),
+        text => Ok(within_mqtt("the client id", text, LONGEST_NAME)?.to_string()),
     }
+}
+
+/// A text as brokers take it: they close the connection for others, or must.
+fn within_mqtt<'t>(what: &str, text: &'t str, most: usize) -> Result<&'t str, Finding> {
+    let odd = |c: &char| c.is_control() || matches!(u32::from(*c), 0xFDD0..=0xFDEF) || u32::from(*c) & 0xFFFE == 0xFFFE;
+    if let Some(odd) = text.chars().find(odd) {
+        return Err(Finding::new(
+            format!("{what} contains U+{:04X}, which MQTT does not allow", u32::from(odd)),
+            "write it without control characters",
+        ));
+    }
+    match text.len() {
+        bytes if bytes > most => Err(Finding::new(
+            format!("{what} has {bytes} bytes"),
+            format!("write {most} bytes at most"),
+        )),
+        _ => Ok(text),
+    }
+}
+
+pub(super) fn parse_username(text: &str) -> Result<String, Finding> {
+    Ok(within_mqtt("the user name", text, usize::from(u16::MAX))?.to_string())
 }
 
 pub(super) fn parse_url(text: &str) -> Result<Broker, Finding> {
@@ -267,7 +295,13 @@ pub(super) fn parse_base(text: &str) -> Result<String, Finding> {
             "write levels joined by /, none of them empty, without + and #, not starting with $",
         ));
     }
-    Ok(text.to_string())
+    if levels().count() > MOST_LEVELS {
+        return Err(Finding::new(
+            format!("the topic has {} levels", levels().count()),
+            format!("write {MOST_LEVELS} levels at most: brokers refuse deeper topics"),
+        ));
+    }
+    Ok(within_mqtt("the topic", text, LONGEST_NAME)?.to_string())
 }
 
 pub(super) fn parse_topic(text: &str) -> Result<TelemetryTopic, Finding> {
@@ -394,7 +428,7 @@ pub(super) fn parse_sparkplug_id(text: &str) -> Result<String, Finding> {
             "write another id",
         ));
     }
-    Ok(text.to_string())
+    Ok(within_mqtt("the id", text, LONGEST_NAME)?.to_string())
 }
 
 pub(super) fn parse_primary_host(text: &str) -> Result<String, Finding> {

@@ -39,3 +39,85 @@ async fn whoever_hears_of_a_bus_finds_it_in_the_plant() {
     assert_eq!(listener.join().unwrap(), Vec::<String>::new());
     daemon.stop().await;
 }
+
+/// A broker that answers CONNECT and SUBSCRIBE; returns the first packet whose topic contains `wanted`.
+fn first_packet(listener: &std::net::TcpListener, wanted: &'static str) -> std::thread::JoinHandle<Vec<u8>> {
+    let listener = listener.try_clone().unwrap();
+    std::thread::spawn(move || {
+        let (sender, found) = std::sync::mpsc::channel();
+        // The plain client and the node.
+        for stream in listener.incoming().take(2).map_while(Result::ok) {
+            let sender = sender.clone();
+            std::thread::spawn(move || {
+                let mut stream = stream;
+                while let Some((kind, body)) = packet(&mut stream) {
+                    let answer = match kind >> 4 {
+                        1 => vec![0x20, 3, 0, 0, 0],
+                        8 => {
+                            // Packet id, no properties, filters with a byte of options each.
+                            let (mut rest, mut codes) = (&body[3..], Vec::new());
+                            while let [high, low, after @ ..] = rest {
+                                rest = &after[usize::from(u16::from_be_bytes([*high, *low])) + 1..];
+                                codes.push(1);
+                            }
+                            let length = u8::try_from(3 + codes.len()).unwrap();
+                            [&[0x90, length, body[0], body[1], 0][..], &codes].concat()
+                        }
+                        3 if body.windows(wanted.len()).any(|part| part == wanted.as_bytes()) => {
+                            let _ = sender.send(body);
+                            continue;
+                        }
+                        _ => continue,
+                    };
+                    std::io::Write::write_all(&mut stream, &answer).unwrap();
+                }
+            });
+        }
+        found.recv_timeout(std::time::Duration::from_secs(60)).unwrap()
+    })
+}
+
+/// The next packet of MQTT: its first byte and its body.
+fn packet(stream: &mut impl std::io::Read) -> Option<(u8, Vec<u8>)> {
+    let mut byte = [0];
+    stream.read_exact(&mut byte).ok()?;
+    let (kind, mut length, mut shift) = (byte[0], 0, 0);
+    loop {
+        stream.read_exact(&mut byte).ok()?;
+        length |= usize::from(byte[0] & 0x7F) << shift;
+        shift += 7;
+        if byte[0] & 0x80 == 0 {
+            break;
+        }
+    }
+    let mut body = vec![0; length];
+    stream.read_exact(&mut body).ok()?;
+    Some((kind, body))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_first_birth_of_the_node_names_its_buses() {
+    // Whether it comes before the buses is a matter of milliseconds.
+    for _ in 0..6 {
+        let (state, listener) = (
+            tempfile::tempdir().unwrap(),
+            std::net::TcpListener::bind("127.0.0.1:0").unwrap(),
+        );
+        let birth = first_packet(&listener, "/NBIRTH/");
+        let mut settings = without_adapters(3);
+        let text = format!(
+            "[gateway]\nname = \"hall\"\nstate_dir = {:?}\n[mqtt]\nurl = \"mqtt://{}\"\n[mqtt.sparkplug]\ngroup = \"plant\"\n\
+             [[bus]]\nname = \"b\"\nport = \"/dev/null\"\n[[bus.drive]]\nname = \"d\"\naddress = 1\nprofile = \"vacon-nx\"\n",
+            state.path(),
+            listener.local_addr().unwrap()
+        );
+        let loaded = Settings::parse("drivegate.toml", &text, std::iter::empty());
+        settings.mqtt = loaded.settings.unwrap_or_else(|| panic!("{:?}", loaded.errors)).mqtt;
+        let daemon = Daemon::start(settings).await.unwrap();
+        let birth = tokio::task::spawn_blocking(|| birth.join().unwrap()).await.unwrap();
+        for bus in ["Bus/line0/state", "Bus/line2/queue"] {
+            assert!(birth.windows(bus.len()).any(|part| part == bus.as_bytes()), "no {bus}");
+        }
+        daemon.stop().await;
+    }
+}

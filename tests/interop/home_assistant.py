@@ -1,16 +1,22 @@
 """Home Assistant from PyPI shows the drives by themselves, commands them, and knows when they are away."""
 
 import json
+import shutil
 import subprocess
 import time
 from pathlib import Path
 
-from bench import Bench, end, expect, python_of, say, until, venv
+from bench import ROOT, Bench, end, expect, python_of, say, until, venv
 
 VERSION = "2025.4.4"
 # Of the MQTT integration; Home Assistant would install it by itself.
 REQUIREMENTS = [f"homeassistant=={VERSION}", "paho-mqtt==2.1.0"]
 DISCOVERY = "[mqtt.home_assistant]\n"
+# A profile of each family, the example of a meter, and their protocols.
+FAMILIES = {
+    "eaton-hvx": "modbus-rtu", "eaton-hvx-n2": "n2", "eaton-svx": "modbus-rtu", "teco-7300pa": "modbus-ascii",
+    "teco-7300pa-n2": "n2", "vacon-cx": "modbus-rtu", "vacon-nx": "modbus-rtu", "vacon-nx-n2": "n2", "energy-meter": "modbus-rtu",
+}
 # Entities of the gateway for each bus.
 OF_BUS = 5
 # Keys of a state that are no entities.
@@ -62,8 +68,36 @@ def expected_entities(bench, drives):
     return count
 
 
+def check_schemas(python):
+    """All entities of all families, held against the schemas of Home Assistant."""
+    with Bench() as bench:
+        bench.broker()
+        profiles = bench.dir / "profiles"
+        profiles.mkdir()
+        shutil.copy(ROOT / "docs" / "energy-meter.toml", profiles)
+        text = f'[gateway]\nname = "hall"\nsocket = ""\nstate_dir = "{bench.dir}/state"\nprofile_dirs = ["{profiles}"]\n'
+        for number, (profile, protocol) in enumerate(FAMILIES.items()):
+            text += f'[[bus]]\nname = "line{number}"\nport = "{bench.dir}/no-line{number}"\nprotocol = "{protocol}"\n'
+            text += f'[[bus.drive]]\nname = "{profile}"\naddress = 1\nprofile = "{profile}"\naccess = "control"\n'
+        text += f'[mqtt]\nurl = "mqtt://127.0.0.1:{bench.mqtt}"\ncommands = true\n{DISCOVERY}'
+        configuration = bench.dir / "drivegate.toml"
+        configuration.write_text(text)
+        bench.gateway(configuration)
+        topics = "homeassistant/device/drivegate_hall/+/config"
+        read = lambda: bench.subscribe("-t", topics, "--retained-only", "-W", "1", "-F", "%t %p").splitlines()
+        lines, _ = until("all messages", lambda: [lines for lines in [read()] if len(lines) == len(FAMILIES) + 1])
+        messages = [dict(zip(("topic", "payload"), line.split(" ", 1))) for line in lines[0]]
+        tool = Path(__file__).parent / "lib" / "discovery_schemas.py"
+        told = "\n".join(json.dumps(message) for message in messages)
+        answer = subprocess.run([python, tool], input=told, capture_output=True, text=True, check=True).stdout.splitlines()
+        for fault in answer[:-1]:
+            say(f"   {fault}")
+        expect(f"{answer[-1]} of all families fit the schemas of Home Assistant", len(answer) == 1)
+
+
 def main():
     python = venv("home-assistant", REQUIREMENTS, python_of("3.13"))
+    check_schemas(python)
     with Bench() as bench:
         bench.broker()
         line = bench.line(3)

@@ -12,6 +12,22 @@ use super::{is_name, read_pair};
 use crate::codec::Table;
 use crate::document::{Finding, Reader};
 
+/// Names that are keys of states and commands, or metrics of their own: a point of that name could not be told from them.
+const TAKEN: [&str; 13] = [
+    "age_ms",
+    "blocked_by",
+    "command_error",
+    "command_result",
+    "expires_ms",
+    "fault_text",
+    "historical",
+    "id",
+    "omitted",
+    "point_quality",
+    "quality",
+    "state",
+    "time",
+];
 /// Address of ADI 1 of N2 in the table of input registers.
 const FIRST_ADI: u16 = 0x4000;
 
@@ -28,6 +44,13 @@ pub(super) fn read_point(
             "name",
             format!("`{name}` is not a valid name"),
             "write a-z, 0-9 and _, starting with a letter",
+        );
+    }
+    if TAKEN.contains(&name.as_str()) {
+        reader.problem(
+            "name",
+            format!("`{name}` is a key of the gateway's own in states, commands or metrics"),
+            format!("write another name, such as `drive_{name}`"),
         );
     }
     if names.iter().take(index).any(|n| *n == name) {

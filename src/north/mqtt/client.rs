@@ -1,5 +1,6 @@
 //! The task that owns outbox, journal and publisher, and publishes while there is a connection.
 
+mod answers;
 mod buffering;
 mod discovery;
 mod repair;
@@ -8,21 +9,18 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use rumqttc::mqttbytes::QoS;
-use rumqttc::{LastWill, PubAckReason};
 use tokio::sync::Notify;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio_util::sync::CancellationToken;
 
 use self::buffering::buffers;
-use self::discovery::{announcer, discovery_topics, report_refused, subscriptions};
+use self::discovery::{announcer, discovery_topics};
 use self::repair::Repair;
 use super::back_off::BackOff;
+use super::broker_limits::{BrokerLimits, WillForm};
 use super::commands::{Commands, FinishedCommand, Rules};
-use super::connection::{
-    self, BrokerLimits, Connection, ConnectionEvent, SILENCE, SUBSCRIBE_TIMEOUT, Subscribed, Subscription,
-};
+use super::connection::{self, CLOSED, Connection, ConnectionEvent, SUBSCRIBE_TIMEOUT, Subscription};
 use super::home_assistant::{Announcer, Sources};
 use super::outage_log::OutageLog;
 use super::outbox::{Delivery, Key, Kind, Message, Outbox, Settled};
@@ -30,7 +28,9 @@ use super::payload::{self, Topics};
 use super::publisher::{Publisher, Update};
 use super::reply::ResponseTopics;
 use super::request::Incoming;
+use super::retry::Retry;
 use super::store::{Loaded, LostCount, Store};
+use super::takeover::Takeovers;
 use super::{Buffer, History, Options, tls};
 use crate::event::{BURST, Event, EventKind};
 use crate::files::names::{MQTT_EVENTS, MQTT_HISTORY};
@@ -100,8 +100,6 @@ enum BrokerLink {
 struct BrokerSession {
     connection: Connection,
     phase: Phase,
-    /// Time of the last packet from the broker.
-    last_packet: Instant,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -109,6 +107,16 @@ enum Phase {
     Connecting,
     Subscribing { limits: BrokerLimits, since: Instant },
     Ready { limits: BrokerLimits, since: Instant },
+}
+
+impl Phase {
+    /// What the broker can do, once it is known.
+    fn limits(self) -> Option<BrokerLimits> {
+        match self {
+            Phase::Connecting => None,
+            Phase::Subscribing { limits, .. } | Phase::Ready { limits, .. } => Some(limits),
+        }
+    }
 }
 
 struct Client {
@@ -137,9 +145,12 @@ struct Client {
     history_at: Instant,
     commands: Commands,
     link: BrokerLink,
+    will: WillForm,
     back_off: BackOff,
     outages: OutageLog,
-    /// Log lines about messages that the broker refused.
+    takeovers: Takeovers,
+    /// When messages that the broker refused are published again, and log lines about them.
+    retry: Retry,
     refused: LogThrottle,
     /// Number of events lost because they arrived too fast.
     missed: u64,
@@ -185,8 +196,11 @@ impl Client {
             commands,
             outbox: Outbox::new(delivery),
             link: BrokerLink::Disconnected { retry_at: now },
+            will: WillForm::default(),
             back_off: BackOff::default(),
             outages: OutageLog::default(),
+            takeovers: Takeovers::default(),
+            retry: Retry::default(),
             refused: LogThrottle::every(REFUSED_LOGGED),
             missed: 0,
             lost_logged: (0, None),
@@ -219,20 +233,15 @@ impl Client {
         let BrokerLink::Open(session) = &mut self.link else {
             return;
         };
-        if !matches!(event, ConnectionEvent::Sent(_) | ConnectionEvent::Room) {
-            session.last_packet = Instant::now();
-        }
         match event {
             ConnectionEvent::Connected(limits) => self.connected(limits),
             ConnectionEvent::Subscribed(refused) => {
-                report_refused(&self.subscriptions, &refused);
-                if let Phase::Subscribing { limits, since } = session.phase {
-                    self.ready(limits, since);
-                }
+                let phase = session.phase;
+                self.subscribed(phase, &refused);
             }
             ConnectionEvent::Sent(packet) => {
                 if let Err(why) = self.outbox.numbered(packet) {
-                    self.lost(why);
+                    self.give_up(why);
                 }
             }
             ConnectionEvent::Acked(packet) => {
@@ -240,41 +249,12 @@ impl Client {
                 let settled = self.outbox.acked(packet);
                 self.settled(settled);
             }
-            ConnectionEvent::Refused(packet, why) => {
-                let settled = self.outbox.acked(packet);
-                self.drop_refused(settled.as_ref(), &refusal(why));
-                self.settled(settled);
-            }
+            ConnectionEvent::Refused(packet, why) => self.refused(packet, why),
             ConnectionEvent::Message(message) => self.on_message(*message),
             ConnectionEvent::Room | ConnectionEvent::Alive => {}
-            ConnectionEvent::Lost(why) => self.lost(&why),
-        }
-    }
-
-    /// A message cannot be delivered: counted, and logged once a minute.
-    fn drop_refused(&mut self, settled: Option<&Settled>, why: &str) {
-        let Some(Settled { topic, kind }) = settled else { return };
-        match kind {
-            Some(Kind::Event) => self.stats.mqtt.lost(MqttLoss::Event, 1),
-            Some(Kind::Result) => self.stats.mqtt.lost(MqttLoss::Result, 1),
-            Some(Kind::History) => self.stats.mqtt.lost(MqttLoss::History, 1),
-            None => {}
-        }
-        if let Some(omitted) = self.refused.permit(Instant::now()) {
-            let root = self.topics.root();
-            let discovery = self
-                .announcer
-                .as_ref()
-                .map_or_else(String::new, |announcer| format!(", {}", announcer.own_topics()));
-            let more = match omitted {
-                0 => String::new(),
-                omitted => format!(" ({omitted} more messages, on this or other topics, since the last such line)"),
-            };
-            tracing::warn!(
-                "dropped a message on {topic}: {why}; the broker must let client {} publish to {root}/#{discovery} and to \
-                 the response topics in use{more}",
-                self.options.client_id
-            );
+            ConnectionEvent::Refuses(lack) => self.lessen_will(lack),
+            ConnectionEvent::Stuck(why) => self.give_up(why),
+            ConnectionEvent::Lost(why) => drop(self.lost(&why)),
         }
     }
 
@@ -290,28 +270,6 @@ impl Client {
         }
     }
 
-    fn connected(&mut self, limits: BrokerLimits) {
-        let since = Instant::now();
-        let BrokerLink::Open(session) = &mut self.link else {
-            return;
-        };
-        self.subscriptions = subscriptions(
-            &self.topics,
-            self.options.commands,
-            self.announcer.as_ref(),
-            self.leftovers_known,
-        );
-        if session
-            .connection
-            .subscribe(self.subscriptions.iter().map(Subscription::filter).collect())
-        {
-            // A client that reads `online` may send commands, so the subscription comes first.
-            session.phase = Phase::Subscribing { limits, since };
-        } else {
-            self.lost("the subscription could not be sent");
-        }
-    }
-
     /// Publishes the status, then everything else.
     fn ready(&mut self, limits: BrokerLimits, since: Instant) {
         let BrokerLink::Open(session) = &mut self.link else {
@@ -319,22 +277,16 @@ impl Client {
         };
         session.phase = Phase::Ready { limits, since };
         self.stats.mqtt.connected.store(true, Ordering::Relaxed);
-        tracing::info!("connected to the broker at {}:{}", self.options.host, self.options.port);
-        if !limits.acknowledges || !limits.retains {
-            tracing::warn!(
-                "the broker lacks {}: messages may be lost, or are not there for later subscribers",
-                if limits.acknowledges {
-                    "retained messages"
-                } else {
-                    "QoS 1"
-                }
-            );
+        let (host, port) = (&self.options.host, self.options.port);
+        tracing::info!("connected to the broker at {host}:{port}");
+        for lost in limits.losses() {
+            tracing::warn!("the broker at {host}:{port} {lost}");
         }
         self.outages.end();
         self.repair.forget();
         self.publish_online();
         self.keep_recorded();
-        self.publisher.restart();
+        self.publisher.restart(limits.max_packet);
         if let Some(announcer) = &mut self.announcer {
             announcer.restart(limits.max_packet);
         }
@@ -346,8 +298,22 @@ impl Client {
         self.outbox.put_first(self.topics.status().into(), b"online".to_vec());
     }
 
-    fn lost(&mut self, why: &str) {
+    /// Ends the connection for this reason, and tells the broker. Once the status is `online`, the last will is true: whoever
+    /// waits for the gateway learns that it is away.
+    fn give_up(&mut self, why: &str) {
+        let true_now = self.is_ready();
+        if let BrokerLink::Open(session) = self.lost(why) {
+            session.connection.give_up(true_now);
+        }
+    }
+
+    /// There is no connection any more; returns what was there. Dropping it aborts its task and closes the socket.
+    fn lost(&mut self, why: &str) -> BrokerLink {
         let now = Instant::now();
+        if self.is_ready() {
+            // The next broker, or this one with another configuration, may take more.
+            self.will = WillForm::default();
+        }
         let held = match &self.link {
             BrokerLink::Open(BrokerSession {
                 phase: Phase::Ready { since, .. },
@@ -356,8 +322,7 @@ impl Client {
             _ => Duration::ZERO,
         };
         let wait = self.back_off.after(held);
-        // Dropping the session aborts its task and closes the socket.
-        self.link = BrokerLink::Disconnected { retry_at: now + wait };
+        let before = std::mem::replace(&mut self.link, BrokerLink::Disconnected { retry_at: now + wait });
         self.outbox.lost();
         self.look_at = now;
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
@@ -372,6 +337,11 @@ impl Client {
         } else {
             tracing::debug!("no connection to the broker: {why}");
         }
+        if why == CLOSED && self.takeovers.closed(now) {
+            let words = Takeovers::words(&self.options.client_id);
+            tracing::warn!("{}:{}: {words}", self.options.host, self.options.port);
+        }
+        before
     }
 
     fn on_message(&mut self, message: Incoming) {
@@ -427,6 +397,9 @@ impl Client {
                 for Update { topic, payload } in updates {
                     self.outbox.put(topic, payload);
                 }
+                for line in self.publisher.take_reduced() {
+                    tracing::warn!("broker {}:{}: {line}", self.options.host, self.options.port);
+                }
                 next
             }
             (false, History::Off) => now + CHECK,
@@ -452,20 +425,21 @@ impl Client {
 
     async fn check(&mut self, now: Instant) {
         self.update_plant();
-        match &self.link {
+        match &mut self.link {
             BrokerLink::Disconnected { retry_at } if now >= *retry_at => self.connect().await,
             BrokerLink::Disconnected { .. } => {}
             BrokerLink::Open(session) => match session.phase {
                 Phase::Subscribing { since, .. } if now.saturating_duration_since(since) > SUBSCRIBE_TIMEOUT => {
-                    self.lost("the broker does not answer the subscription");
+                    self.give_up("the broker does not answer the subscription");
                 }
-                _ if now.saturating_duration_since(session.last_packet) > SILENCE => {
-                    self.lost("the broker is silent");
-                }
+                phase if session.connection.is_silent(phase.limits(), now) => self.give_up("the broker is silent"),
                 _ => {}
             },
         }
         self.repair_status(now);
+        if self.retry.is_due(now) {
+            self.outbox.retry();
+        }
         // What the disk had no room for the last time.
         self.store.acknowledge(self.outbox.oldest(Kind::Event));
         self.history.acknowledge(self.outbox.oldest(Kind::History));
@@ -490,30 +464,36 @@ impl Client {
         self.publisher.adopt(&plant, discovery);
         self.observed = plant;
         self.remember_topics();
+        if let BrokerLink::Open(session) = &self.link
+            && let Some(limits) = session.phase.limits()
+            && !limits.wildcards
+        {
+            self.subscribe(limits);
+        }
     }
 
     async fn connect(&mut self) {
-        let now = Instant::now();
         let options = self.options.clone();
         // Read for each attempt, so that renewed certificates are used without a restart.
         let config = tokio::task::spawn_blocking(move || tls::client_config(&options)).await;
         let config = config.map_err(|error| error.to_string());
         match config.and_then(|config| config.map_err(|error| error.to_string())) {
             Ok(config) => {
-                let will = LastWill::new(self.topics.status(), "offline", QoS::AtLeastOnce, true, None);
+                let will = self.will.will(self.topics.status(), "offline", true);
                 let connection = Connection::open(&self.options, &self.options.client_id, will, config);
                 self.link = BrokerLink::Open(BrokerSession {
                     connection,
                     phase: Phase::Connecting,
-                    last_packet: now,
                 });
             }
-            Err(why) => self.lost(&why),
+            Err(why) => drop(self.lost(&why)),
         }
     }
 
     /// Publishes from the outbox as far as the connection allows.
     fn publish_waiting(&mut self) {
+        self.outbox.drop_gone(Kind::Event, self.store.gone());
+        self.outbox.drop_gone(Kind::History, self.history.gone());
         self.store.load(self.outbox.room(Kind::Event));
         if let BrokerLink::Open(BrokerSession {
             phase: Phase::Ready { limits, .. },
@@ -619,8 +599,8 @@ impl Client {
             }
         }
         if let BrokerLink::Open(session) = &mut self.link
-            && !matches!(session.phase, Phase::Connecting)
-            && session.connection.disconnect()
+            && let Some(limits) = session.phase.limits()
+            && session.connection.disconnect(limits)
         {
             // The broker counts what is still under way from it as delivered.
             loop {
@@ -631,13 +611,6 @@ impl Client {
                 }
             }
         }
-    }
-}
-
-fn refusal(why: PubAckReason) -> String {
-    match why {
-        PubAckReason::NotAuthorized => "the broker does not allow it (ACL)".to_string(),
-        why => format!("the broker refuses it ({why:?})"),
     }
 }
 

@@ -13,24 +13,22 @@ use futures_util::FutureExt;
 use rumqttc::mqttbytes::v5::Filter;
 use rumqttc::mqttbytes::{Error as PacketError, QoS};
 use rumqttc::{
-    AsyncClient, ConnAck, ConnectProperties, ConnectReturnCode, ConnectionError, Event, EventLoop, LastWill,
-    MqttOptions, NetworkOptions, Outgoing, Packet, PubAckReason, PublishProperties, RetainForwardRule, StateError,
-    SubscribeReasonCode, TlsConfiguration, Transport,
+    AsyncClient, ConnectProperties, ConnectReturnCode, ConnectionError, DisconnectProperties, DisconnectReasonCode,
+    Event, EventLoop, LastWill, MqttOptions, NetworkOptions, Outgoing, Packet, PubAckReason, PublishProperties,
+    RetainForwardRule, StateError, SubscribeReasonCode, TlsConfiguration, Transport,
 };
 use rustls::ClientConfig;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use super::Options;
+use super::broker_limits::{BrokerLimits, Lack};
 use super::outbox::Message;
 use super::request::Incoming;
+use super::silence::{KEEP_ALIVE_S, Silence, Verdict};
 
-/// Keep-alive interval, s.
-const KEEP_ALIVE_S: u16 = 10;
-/// Keep-alive interval.
-const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
-/// Without a packet from the broker for this long, the connection is considered lost.
-pub(super) const SILENCE: Duration = KEEP_ALIVE.saturating_mul(3);
+/// Why a broker refuses filters with wildcards.
+pub(super) const NO_WILDCARDS: &str = "WildcardSubscriptionsNotSupported";
 /// Time limit for the broker to answer the subscription.
 pub(super) const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of unacknowledged messages; the broker may allow fewer.
@@ -46,8 +44,12 @@ const EVENTS: usize = 64;
 const MAX_PACKET: u32 = 2 << 20;
 /// Number of unacknowledged commands that the broker may send.
 const RECEIVE_MAXIMUM: u16 = 64;
+/// Size of a packet with subscriptions, bytes, at most.
+const SUBSCRIBE_BYTES: usize = 8 << 10;
 /// What the system buffers of sent messages: a result waits behind no more than that.
 const SEND_BUFFER: u32 = 256 << 10;
+/// Time for the DISCONNECT of a connection that the gateway gives up.
+const LAST_PACKET: Duration = Duration::from_millis(500);
 /// Time limit for TCP, TLS and CONNACK.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -70,6 +72,10 @@ pub(super) enum ConnectionEvent {
     Room,
     /// Any other packet from the broker.
     Alive,
+    /// The connection stands and cannot be used any more, for this reason: it is to be given up.
+    Stuck(&'static str),
+    /// The broker refused the connection because of the last will. The last event.
+    Refuses(Lack),
     /// The connection is lost, with the reason. The last event.
     Lost(String),
 }
@@ -119,44 +125,21 @@ pub(super) enum Subscribed {
     Leftovers,
 }
 
-/// What the broker can do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct BrokerLimits {
-    /// Number of unacknowledged messages.
-    pub(super) window: usize,
-    /// Maximum packet size, bytes.
-    pub(super) max_packet: usize,
-    /// Whether it acknowledges messages (QoS 1).
-    pub(super) acknowledges: bool,
-    /// Whether it keeps retained messages.
-    pub(super) retains: bool,
-    /// Number of topic aliases.
-    aliases: u16,
-}
-
-impl BrokerLimits {
-    fn of(ack: &ConnAck) -> BrokerLimits {
-        let properties = ack.properties.as_ref();
-        let window = properties.and_then(|p| p.receive_max).unwrap_or(u16::MAX).min(INFLIGHT);
-        let max_packet = properties.and_then(|p| p.max_packet_size).unwrap_or(u32::MAX);
-        BrokerLimits {
-            window: usize::from(window).max(1),
-            max_packet: usize::try_from(max_packet).unwrap_or(usize::MAX),
-            acknowledges: properties.and_then(|p| p.max_qos) != Some(0),
-            retains: properties.and_then(|p| p.retain_available) != Some(0),
-            aliases: properties.and_then(|p| p.topic_alias_max).unwrap_or_default(),
-        }
-    }
-}
-
 /// One connection, from the connection attempt to its end.
 #[derive(Debug)]
 pub(super) struct Connection {
     client: AsyncClient,
     event: mpsc::Receiver<ConnectionEvent>,
     backlog: Arc<Backlog>,
-    aliases: Aliases,
-    task: JoinHandle<()>,
+    aliases: Box<Aliases>,
+    silence: Silence,
+    /// What a broker that may be silent is asked.
+    question: Option<Filter>,
+    /// Number of subscriptions whose answers are awaited, and the answers so far.
+    wanted: usize,
+    answers: Vec<Option<String>>,
+    /// `None` once it ends by itself.
+    task: Option<JoinHandle<()>>,
 }
 
 /// Short names of topics, for telemetry that is published again and again: a topic gets one when it is published for the
@@ -202,7 +185,9 @@ struct Backlog {
 
 impl Drop for Connection {
     fn drop(&mut self) {
-        self.task.abort();
+        if let Some(task) = &self.task {
+            task.abort();
+        }
     }
 }
 
@@ -224,8 +209,12 @@ impl Connection {
             client,
             event,
             backlog,
-            aliases: Aliases::default(),
-            task,
+            aliases: Box::default(),
+            silence: Silence::new(Instant::now()),
+            question: None,
+            wanted: 0,
+            answers: Vec::new(),
+            task: Some(task),
         }
     }
 
@@ -233,12 +222,60 @@ impl Connection {
     pub(super) async fn next(&mut self) -> ConnectionEvent {
         // The sender is dropped without a last event only if the task panicked.
         let silent = || ConnectionEvent::Lost("the MQTT client failed".to_string());
-        self.event.recv().await.unwrap_or_else(silent)
+        let event = self.event.recv().await.unwrap_or_else(silent);
+        if matches!(event, ConnectionEvent::Sent(_) | ConnectionEvent::Room) {
+            return event;
+        }
+        self.silence.heard(Instant::now());
+        match event {
+            ConnectionEvent::Subscribed(_) if self.silence.answered() => ConnectionEvent::Alive,
+            ConnectionEvent::Subscribed(answers) => {
+                self.answers.extend(answers);
+                match self.answers.len() < self.wanted {
+                    true => ConnectionEvent::Alive,
+                    false => ConnectionEvent::Subscribed(std::mem::take(&mut self.answers)),
+                }
+            }
+            event => event,
+        }
     }
 
-    /// Subscribes; false if the connection does not take it.
-    pub(super) fn subscribe(&self, filters: Vec<Filter>) -> bool {
-        self.client.try_subscribe_many(filters).is_ok()
+    /// Subscribes, in as many packets as the broker wants; false if the connection does not take it.
+    pub(super) fn subscribe(&mut self, filters: Vec<Filter>, limits: BrokerLimits) -> bool {
+        (self.wanted, self.answers) = (filters.len(), Vec::new());
+        self.question = filters.first().map(|first| Filter {
+            retain_forward_rule: RetainForwardRule::Never,
+            ..first.clone()
+        });
+        let most = limits.max_packet.min(SUBSCRIBE_BYTES);
+        let mut packets: Vec<(usize, Vec<Filter>)> = Vec::new();
+        for filter in filters {
+            // Besides the path: its length, the options; the head of the packet.
+            let bytes = filter.path.len() + 3;
+            match packets.last_mut().filter(|(size, _)| size + bytes <= most) {
+                Some((size, packet)) => {
+                    *size += bytes;
+                    packet.push(filter);
+                }
+                None => packets.push((bytes + 8, vec![filter])),
+            }
+        }
+        packets
+            .into_iter()
+            .all(|(_, packet)| self.client.try_subscribe_many(packet).is_ok())
+    }
+
+    /// Whether the broker said nothing for so long that the connection is lost. One that has no reason to speak is asked for a
+    /// subscription that it has already: it must answer, and nothing changes.
+    pub(super) fn is_silent(&mut self, limits: Option<BrokerLimits>, now: Instant) -> bool {
+        let verdict = self.silence.judge(limits.and_then(|limits| limits.keep_alive), now);
+        if verdict == Verdict::Ask
+            && let Some(question) = &self.question
+            && self.client.try_subscribe_many([question.clone()]).is_ok()
+        {
+            self.silence.asked();
+        }
+        verdict == Verdict::Lost
     }
 
     /// Publishes a message; false if there is no room until [`ConnectionEvent::Room`].
@@ -273,9 +310,40 @@ impl Connection {
         attempt.is_ok()
     }
 
-    /// Disconnects in order, so that the broker does not publish the last will.
-    pub(super) fn disconnect(&self) -> bool {
-        self.client.try_disconnect_now().is_ok()
+    /// Disconnects in order, so that the broker does not publish the last will. What a broker does not acknowledge is sent
+    /// before.
+    pub(super) fn disconnect(&self, limits: BrokerLimits) -> bool {
+        match limits.acknowledges {
+            true => self.client.try_disconnect_now().is_ok(),
+            false => self.client.try_disconnect().is_ok(),
+        }
+    }
+
+    /// Ends the connection without waiting for it, and tells the broker, as far as it listens. The last will is published if it
+    /// is `true_now`: others take the gateway for online.
+    pub(super) fn give_up(mut self, true_now: bool) {
+        let reason = match true_now {
+            true => DisconnectReasonCode::DisconnectWithWillMessage,
+            false => DisconnectReasonCode::NormalDisconnection,
+        };
+        let properties = DisconnectProperties {
+            session_expiry_interval: None,
+            reason_string: None,
+            user_properties: Vec::new(),
+            server_reference: None,
+        };
+        let told = self.client.try_disconnect_now_with_properties(reason, properties);
+        let Some(task) = self.task.take().filter(|_| told.is_ok()) else {
+            return;
+        };
+        let abort = task.abort_handle();
+        tokio::spawn(async move {
+            // The task ends when all its events are taken.
+            let ended = async { while self.event.recv().await.is_some() {} };
+            if tokio::time::timeout(LAST_PACKET, ended).await.is_err() {
+                abort.abort();
+            }
+        });
     }
 }
 
@@ -290,10 +358,13 @@ pub(super) fn commanding(path: String) -> Filter {
     }
 }
 
+/// What a packet needs besides topic, payload and correlation data, bytes, at most.
+pub(super) const PACKET_OVERHEAD: usize = 24;
+
 /// Maximum size of the packet with `message`, bytes.
 pub(super) fn packet_size(message: &Message) -> usize {
     let correlation = message.correlation.as_ref().map_or(0, |c| c.len() + 3);
-    message.topic.len() + message.payload.len() + correlation + 24
+    message.topic.len() + message.payload.len() + correlation + PACKET_OVERHEAD
 }
 
 fn mqtt_options(options: &Options, client_id: &str, will: LastWill, tls: Option<Arc<ClientConfig>>) -> MqttOptions {
@@ -360,12 +431,19 @@ async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>, ba
                 (packet != 0).then_some(ConnectionEvent::Sent(packet))
             }
             Ok(event) => interpret(event, came),
+            Err(ConnectionError::ConnectionRefused(ConnectReturnCode::QoSNotSupported)) => {
+                Some(ConnectionEvent::Refuses(Lack::Acknowledgements))
+            }
+            Err(ConnectionError::ConnectionRefused(ConnectReturnCode::RetainNotSupported)) => {
+                Some(ConnectionEvent::Refuses(Lack::Retained))
+            }
+            Err(error) if accepted && is_closed(&error) => Some(ConnectionEvent::Lost(CLOSED.to_string())),
             Err(error) if accepted => Some(ConnectionEvent::Lost(reason(&error))),
             Err(error) => Some(ConnectionEvent::Lost(refusal(&error))),
         };
         let Some(item) = item else { continue };
         accepted |= matches!(item, ConnectionEvent::Connected(_));
-        let end = matches!(item, ConnectionEvent::Lost(_));
+        let end = matches!(item, ConnectionEvent::Lost(_) | ConnectionEvent::Refuses(_));
         if event.send(item).await.is_err() || end {
             return;
         }
@@ -394,7 +472,7 @@ fn interpret(event: Event, came: Instant) -> Option<ConnectionEvent> {
         Event::Incoming(_) => Some(ConnectionEvent::Alive),
         // A packet id was about to be used again before its acknowledgement.
         Event::Outgoing(Outgoing::AwaitAck(_)) => {
-            Some(ConnectionEvent::Lost("the broker did not acknowledge a message".into()))
+            Some(ConnectionEvent::Stuck("the broker did not acknowledge a message"))
         }
         Event::Outgoing(_) | Event::Auth(_) => None,
     }
@@ -417,16 +495,33 @@ fn refusal(error: &ConnectionError) -> String {
 /// What to do about a broker of an older version.
 const MQTT_5: &str = "the gateway requires MQTT 5: use Mosquitto 1.6 or later, or another broker that supports it";
 
+/// The broker ended an accepted connection, and did not say why.
+pub(super) const CLOSED: &str = "the broker closed the connection";
+
+/// Whether the other end closed the connection.
+fn is_closed(error: &ConnectionError) -> bool {
+    let io = match error {
+        ConnectionError::MqttState(StateError::ConnectionAborted) => return true,
+        ConnectionError::MqttState(StateError::Io(io) | StateError::Deserialization(PacketError::Io(io)))
+        | ConnectionError::Io(io) => io,
+        _ => return false,
+    };
+    use std::io::ErrorKind::{BrokenPipe, ConnectionAborted, ConnectionReset, UnexpectedEof};
+    matches!(
+        io.kind(),
+        BrokenPipe | ConnectionAborted | ConnectionReset | UnexpectedEof
+    )
+}
+
 fn reason(error: &ConnectionError) -> String {
     use ConnectReturnCode::{
-        BadUserNamePassword, Banned, ClientIdentifierNotValid, NotAuthorized, RetainNotSupported,
-        UnsupportedProtocolVersion,
+        BadUserNamePassword, Banned, ClientIdentifierNotValid, NotAuthorized, UnsupportedProtocolVersion,
     };
     let ConnectionError::ConnectionRefused(code) = error else {
         return match error {
             ConnectionError::Timeout(_) => "timed out".to_string(),
             ConnectionError::MqttState(StateError::AwaitPingResp) => "the broker no longer responds".to_string(),
-            ConnectionError::MqttState(StateError::ConnectionAborted) => "the broker closed the connection".to_string(),
+            ConnectionError::MqttState(StateError::ConnectionAborted) => CLOSED.to_string(),
             _ => error.to_string(),
         };
     };
@@ -438,7 +533,6 @@ fn reason(error: &ConnectionError) -> String {
             "; check mqtt.username, mqtt.password_file and the permissions at the broker"
         }
         ClientIdentifierNotValid => "; change mqtt.client_id",
-        RetainNotSupported => "; the gateway requires a broker that supports retained messages",
         _ => "",
     };
     format!("the broker refuses the connection ({code:?}){advice}")

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::History;
+use super::connection::PACKET_OVERHEAD;
 use super::payload::StateContent;
 use super::publisher::Update;
 
@@ -21,6 +22,10 @@ pub(super) struct Recorder {
     entries: usize,
     array: Vec<u8>,
     begun: Option<Instant>,
+    /// Largest packet of the broker, bytes, as far as it is known.
+    max_packet: usize,
+    /// Arrays that are complete because the broker takes no larger ones.
+    complete: Vec<Update>,
 }
 
 impl Recorder {
@@ -31,7 +36,14 @@ impl Recorder {
             entries: 0,
             array: Vec::new(),
             begun: None,
+            max_packet: usize::MAX,
+            complete: Vec::new(),
         }
+    }
+
+    /// The broker takes packets of so many bytes.
+    pub(super) fn limit(&mut self, max_packet: usize) {
+        self.max_packet = max_packet;
     }
 
     /// Records what a drive shows: when it changed, or with [`History::All`] when it is `fresh`; at most once in `min`.
@@ -62,6 +74,11 @@ impl Recorder {
             return Some(early);
         }
         if let Some(entry) = render(&shown) {
+            let room = self.max_packet.saturating_sub(self.topic.len() + PACKET_OVERHEAD);
+            if self.array.len() + entry.len() + 2 > room {
+                let array = self.take();
+                self.complete.extend(array);
+            }
             self.array.push(if self.entries == 0 { b'[' } else { b',' });
             self.array.extend(entry);
             self.entries += 1;
@@ -71,15 +88,23 @@ impl Recorder {
         None
     }
 
-    /// The array, if it is complete.
-    pub(super) fn ripe(&mut self, now: Instant) -> Option<Update> {
+    /// The arrays that are complete.
+    pub(super) fn ripe(&mut self, now: Instant) -> Vec<Update> {
         let old = |begun| now.saturating_duration_since(begun) >= COMPLETE;
         let complete = self.entries >= ENTRIES || self.array.len() >= BYTES || self.begun.is_some_and(old);
-        complete.then(|| self.take()).flatten()
+        match complete {
+            true => self.take_all(),
+            false => std::mem::take(&mut self.complete),
+        }
     }
 
-    /// The array, as far as it goes.
-    pub(super) fn take(&mut self) -> Option<Update> {
+    /// All arrays, the last one as far as it goes.
+    pub(super) fn take_all(&mut self) -> Vec<Update> {
+        let last = self.take();
+        std::mem::take(&mut self.complete).into_iter().chain(last).collect()
+    }
+
+    fn take(&mut self) -> Option<Update> {
         self.begun.take()?;
         self.entries = 0;
         let mut payload = std::mem::take(&mut self.array);

@@ -13,7 +13,7 @@
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind};
-use std::os::unix::fs::FileExt;
+use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::{FlockOperation, flock};
@@ -66,6 +66,10 @@ pub(super) struct Journal {
     lost: u64,
     /// Of the gaps in the numbers that are still to be met, those that are counted already.
     counted: u64,
+    /// Up to here nothing is kept: the buffer was full. What of it was taken and is not acknowledged is lost.
+    gone: u64,
+    /// The files were deleted since the last call of [`Journal::take_wiped`].
+    wiped: bool,
 }
 
 #[derive(Debug)]
@@ -77,7 +81,7 @@ struct Place {
     /// Creates the file of a segment.
     create: fn(&Path) -> io::Result<File>,
     /// Locked while the journal is open, since two gateways would damage each other's files.
-    _lock: File,
+    lock: File,
 }
 
 impl Journal {
@@ -97,6 +101,8 @@ impl Journal {
             unsynced: false,
             lost: 0,
             counted: 0,
+            gone: 0,
+            wiped: false,
         }
     }
 
@@ -106,22 +112,14 @@ impl Journal {
     /// The directory cannot be used, or another process uses it (`WouldBlock`).
     pub(super) fn open(dir: &Path, name: &'static str, max_bytes: u64) -> io::Result<Journal> {
         fs::create_dir_all(dir)?;
-        let lock = OpenOptions::new()
-            .create(true)
-            .truncate(false)
-            .write(true)
-            .open(dir.join(format!("{name}.lock")))?;
-        flock(&lock, FlockOperation::NonBlockingLockExclusive).map_err(|_| {
-            let text = "another process uses this directory; give each gateway its own";
-            io::Error::new(ErrorKind::WouldBlock, text)
-        })?;
+        let lock = lock(dir, name)?;
         let mut journal = Journal {
             place: Some(Place {
                 dir: dir.to_path_buf(),
                 name,
                 max_bytes,
                 create: |path| OpenOptions::new().read(true).write(true).create_new(true).open(path),
-                _lock: lock,
+                lock,
             }),
             ..Journal::in_memory()
         };
@@ -164,16 +162,15 @@ impl Journal {
             }
         }
         if end < bytes.len() as u64 {
-            // Nothing valid follows: what was being written when the process ended.
+            // Nothing valid follows: what was being written when the process ended, or when the disk was full.
             if let Err(error) = self.quarantine(number, end, bytes.get(end as usize..).unwrap_or_default())
                 && end == 0
+                && !is_full(&error)
             {
                 // Nothing in it is understood, and nothing of it could be kept elsewhere.
-                let what = format!(
-                    "{}: none of it is valid, and it cannot be copied: {error}",
-                    path.display()
-                );
-                return Err(io::Error::new(error.kind(), what));
+                let path = path.display();
+                tracing::warn!("{path}: none of it is valid; it is left as it is, and nothing of it is published");
+                return Ok(());
             }
             self.lost += 1;
             file.set_len(end)?;
@@ -211,6 +208,21 @@ impl Journal {
     /// Number of messages lost since the last call: the buffer was full, or they were damaged.
     pub(super) fn take_lost(&mut self) -> u64 {
         std::mem::take(&mut self.lost)
+    }
+
+    /// Up to this message nothing is kept any more, because the buffer was full.
+    pub(super) fn gone(&self) -> u64 {
+        self.gone
+    }
+
+    /// Number of lost messages among those that wait.
+    pub(super) fn missing(&self) -> u64 {
+        self.counted
+    }
+
+    /// Whether the files were deleted since the last call.
+    pub(super) fn take_wiped(&mut self) -> bool {
+        std::mem::take(&mut self.wiped)
     }
 
     /// Appends a message; [`Journal::write`] writes it. One that is `taken` already is kept only until it is acknowledged.
@@ -343,6 +355,7 @@ impl Journal {
         if self.place.is_none() {
             return Ok(written);
         }
+        self.restore_wiped()?;
         self.remove_acknowledged()?;
         while let Some((number, _)) = self.unwritten.front() {
             if *number <= self.acknowledged {
@@ -437,9 +450,44 @@ impl Journal {
         };
         if let Some((_, last)) = oldest.numbers {
             self.pass_all(last);
+            self.gone = self.gone.max(last);
         }
         fs::remove_file(&oldest.path)?;
         Ok(true)
+    }
+
+    /// Writes the files again if somebody deleted them: what they held is still there as long as they are open.
+    fn restore_wiped(&mut self) -> io::Result<()> {
+        let Some(place) = &mut self.place else { return Ok(()) };
+        let files = self.segments.iter().map(|s| &s.file).chain([&place.lock]);
+        if !files.map(is_deleted).fold(false, |any, one| any | one) {
+            return Ok(());
+        }
+        fs::create_dir_all(&place.dir)?;
+        if is_deleted(&place.lock) {
+            place.lock = lock(&place.dir, place.name)?;
+        }
+        let mut kept = 0;
+        for segment in self.segments.iter_mut().filter(|segment| is_deleted(&segment.file)) {
+            let mut bytes = vec![0; segment.end as usize];
+            segment.file.read_exact_at(&mut bytes, 0)?;
+            let file = (place.create)(&segment.path)?;
+            if let Err(error) = file.write_all_at(&bytes, 0) {
+                // The next attempt creates it again.
+                let _ = fs::remove_file(&segment.path);
+                return Err(error);
+            }
+            segment.file = file;
+            kept += segment.end;
+        }
+        (self.wiped, self.unsynced) = (true, true);
+        tracing::error!(
+            "the files of {} in {} were deleted while the gateway runs: written again, {kept} bytes; do not clean this \
+             directory, or stop the gateway before",
+            place.name,
+            place.dir.display()
+        );
+        Ok(())
     }
 
     fn remove_acknowledged(&mut self) -> io::Result<()> {
@@ -492,6 +540,25 @@ impl Journal {
         );
         kept
     }
+}
+
+/// Locks the directory for this process.
+fn lock(dir: &Path, name: &str) -> io::Result<File> {
+    let lock = OpenOptions::new()
+        .create(true)
+        .truncate(false)
+        .write(true)
+        .open(dir.join(format!("{name}.lock")))?;
+    flock(&lock, FlockOperation::NonBlockingLockExclusive).map_err(|_| {
+        let text = "another process uses this directory; give each gateway its own";
+        io::Error::new(ErrorKind::WouldBlock, text)
+    })?;
+    Ok(lock)
+}
+
+/// Whether the name of an open file was deleted.
+fn is_deleted(file: &File) -> bool {
+    file.metadata().is_ok_and(|metadata| metadata.nlink() == 0)
 }
 
 fn segment_size(max_bytes: u64) -> u64 {

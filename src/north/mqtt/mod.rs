@@ -15,6 +15,7 @@
 //! sent again from the outbox. `sparkplug` is a client of its own, on a connection of its own.
 
 mod back_off;
+mod broker_limits;
 mod client;
 mod commands;
 mod connection;
@@ -31,8 +32,11 @@ mod publisher;
 mod record;
 mod reply;
 mod request;
+mod retry;
+mod silence;
 pub mod sparkplug;
 mod store;
+mod takeover;
 mod tls;
 
 use std::fmt;

@@ -101,9 +101,13 @@ pub(super) struct Delivery {
 struct Slot {
     /// The latest payload that is not published yet.
     waiting: Option<Vec<u8>>,
-    /// It must arrive and lasts: the status, and the end of a topic.
+    /// What is in flight with an acknowledgement to come, in case the broker refuses it.
+    sent: Option<Vec<u8>>,
+    /// It must arrive and lasts: the status, discovery, and the end of a topic.
     lasting: bool,
     in_flight: bool,
+    /// The broker refused it; it waits for [`Outbox::retry`].
+    put_back: bool,
 }
 
 #[derive(Debug)]
@@ -120,6 +124,8 @@ struct Entry {
 struct Queue {
     entries: VecDeque<Entry>,
     bytes: usize,
+    /// The broker refused one of them for now; all wait for [`Outbox::retry`], so that the order stays.
+    put_back: bool,
 }
 
 /// All messages that wait or are in flight.
@@ -194,7 +200,7 @@ impl Outbox {
     /// As [`Outbox::put_lasting`], published before everything else.
     pub(super) fn put_first(&mut self, topic: Arc<str>, payload: Vec<u8>) {
         let slot = self.latest.entry(topic.clone()).or_default();
-        (slot.waiting, slot.lasting) = (Some(payload), true);
+        (slot.waiting, slot.lasting, slot.put_back) = (Some(payload), true, false);
         self.order.retain(|t| *t != topic);
         self.order.push_front(topic);
         self.has_leader = true;
@@ -238,6 +244,25 @@ impl Outbox {
             in_flight: false,
             attempts: 0,
         });
+        match kind {
+            Kind::Event => self.lost.events += dropped,
+            Kind::History => self.lost.history += dropped,
+            Kind::Result => {}
+        }
+    }
+
+    /// Nothing up to this message is on disk any more, because the buffer was full: what waits of it is lost, as it would be
+    /// after a restart. What is in flight has probably been delivered.
+    pub(super) fn drop_gone(&mut self, kind: Kind, through: Number) {
+        let queue = self.queue_mut(kind);
+        let is_older = |entry: &&Entry| entry.number.is_none_or(|number| number <= through);
+        let is_gone = |entry: &Entry| !entry.in_flight && entry.number.is_some();
+        let mut dropped = 0;
+        // The numbers ascend, so this ends with the first one that is kept.
+        while let Some(place) = queue.entries.iter().take_while(is_older).position(is_gone) {
+            queue.remove(place);
+            dropped += 1;
+        }
         match kind {
             Kind::Event => self.lost.events += dropped,
             Kind::History => self.lost.history += dropped,
@@ -305,6 +330,11 @@ impl Outbox {
         self.results.entries.len() + self.events.entries.len()
     }
 
+    /// Whether telemetry of that topic waits for its first attempt, or is in flight.
+    pub(super) fn is_under_way(&self, topic: &str) -> bool {
+        self.latest.get(topic).is_some_and(|slot| !slot.put_back)
+    }
+
     /// Whether telemetry of that topic waits or is in flight.
     pub(super) fn has_telemetry(&self, topic: &str) -> bool {
         self.latest.contains_key(topic)
@@ -339,7 +369,7 @@ impl Outbox {
 
     fn next_latest(&self, free: bool) -> Option<(Key, Message)> {
         self.order.iter().find_map(|topic| {
-            let slot = self.latest.get(topic).filter(|slot| !slot.in_flight)?;
+            let slot = self.latest.get(topic).filter(|s| !s.in_flight && !s.put_back)?;
             let acknowledged = slot.lasting || self.delivery.telemetry == Qos::AtLeastOnce;
             let payload = slot.waiting.as_ref().filter(|_| free || !acknowledged)?.clone();
             let lasting = slot.lasting || payload.is_empty();
@@ -360,7 +390,7 @@ impl Outbox {
         match &key {
             Key::Latest(topic) => {
                 if let Some(slot) = self.latest.get_mut(topic) {
-                    (slot.waiting, slot.in_flight) = (None, true);
+                    (slot.sent, slot.in_flight) = (slot.waiting.take().filter(|_| acknowledged), true);
                 }
                 // At or near the front: only topics in flight come before it.
                 if let Some(place) = self.order.iter().position(|t| t == topic) {
@@ -407,6 +437,42 @@ impl Outbox {
         self.settle(self.unacknowledged.get(&packet).cloned()?, Some(packet))
     }
 
+    /// The broker refused a message. If that holds only `for_now`, or the message must arrive, it stays, to be published again
+    /// after [`Outbox::retry`], and its topic is returned; otherwise [`Outbox::acked`] removes it.
+    pub(super) fn put_back(&mut self, packet: u16, for_now: bool) -> Option<Arc<str>> {
+        let key = self.unacknowledged.get(&packet)?.clone();
+        let topic = match &key {
+            Key::Latest(topic) => {
+                let slot = self.latest.get_mut(topic).filter(|slot| for_now || slot.lasting)?;
+                (slot.in_flight, slot.put_back) = (false, true);
+                let sent = slot.sent.take();
+                if slot.waiting.is_none() {
+                    slot.waiting = sent;
+                    self.order.push_back(topic.clone());
+                }
+                topic.clone()
+            }
+            Key::Queued(kind, serial) if for_now => {
+                let queue = self.queue_mut(*kind);
+                queue.put_back = true;
+                let entry = queue.get_mut(*serial)?;
+                entry.in_flight = false;
+                entry.message.topic.clone()
+            }
+            Key::Queued(..) => return None,
+        };
+        self.unacknowledged.remove(&packet);
+        Some(topic)
+    }
+
+    /// What was put back may be published again.
+    pub(super) fn retry(&mut self) {
+        self.latest.values_mut().for_each(|slot| slot.put_back = false);
+        for queue in [&mut self.results, &mut self.events, &mut self.history] {
+            queue.put_back = false;
+        }
+    }
+
     /// Drops the message of `key`, which cannot be sent.
     pub(super) fn give_up(&mut self, key: Key) -> Option<Settled> {
         if let Key::Latest(topic) = &key {
@@ -423,7 +489,7 @@ impl Outbox {
         match key {
             Key::Latest(topic) => {
                 let slot = self.latest.get_mut(&topic)?;
-                slot.in_flight = false;
+                (slot.in_flight, slot.sent) = (false, None);
                 if slot.waiting.is_none() {
                     self.latest.remove(&topic);
                 }
@@ -461,6 +527,7 @@ impl Outbox {
         self.published.clear();
         self.unacknowledged.clear();
         self.has_leader = false;
+        self.retry();
         for queue in [&mut self.results, &mut self.events, &mut self.history] {
             for entry in &mut queue.entries {
                 entry.attempts = entry.attempts.saturating_add(u8::from(entry.in_flight));
@@ -491,7 +558,7 @@ impl Queue {
     }
 
     fn next(&self, kind: Kind, free: bool) -> Option<(Key, Message)> {
-        let entry = self.entries.iter().find(|e| !e.in_flight)?;
+        let entry = self.entries.iter().find(|e| !e.in_flight).filter(|_| !self.put_back)?;
         let may = free || !entry.message.acknowledged;
         may.then(|| (Key::Queued(kind, entry.serial), entry.message.clone()))
     }

@@ -7,20 +7,8 @@ use serde::ser::{Serialize, SerializeMap, Serializer};
 
 use crate::drive::{ModelPoint, Point, Profile, Quality, State, Value};
 use crate::event::Event;
-use crate::plant::{BusHandle, Plant};
+use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{BusHealth, Reading, value_or_null};
-
-/// Keys of the state object that are not points; a profile point of that name is omitted.
-const STATE_KEYS: [&str; 8] = [
-    "state",
-    "blocked_by",
-    "quality",
-    "time",
-    "age_ms",
-    "fault_text",
-    "point_quality",
-    "historical",
-];
 
 /// The topics of one gateway.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -69,6 +57,18 @@ impl Topics {
         [self.drive("+", "set"), self.drive("+", "set/+")]
     }
 
+    /// The set topics of each drive of this plant, for a broker that takes no wildcards.
+    pub(super) fn set_topics(&self, plant: &Plant) -> Vec<String> {
+        let of_drive = |drive: DriveHandle| {
+            let spec = &drive.image.spec;
+            let points = spec.profile.points.iter().filter(|point| point.write);
+            let points = points.map(|point| self.drive(&spec.name, &format!("set/{}", point.name)));
+            let whole = self.drive(&spec.name, "set");
+            std::iter::once(whole).chain(points).collect::<Vec<String>>()
+        };
+        plant.drives().flat_map(of_drive).collect()
+    }
+
     /// Which drive and point a topic sets; `None` for any other topic.
     pub(super) fn parse_set<'t>(&self, topic: &'t str) -> Option<SetTopic<'t>> {
         let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix("/drive/")?;
@@ -79,11 +79,10 @@ impl Topics {
     }
 }
 
-/// The points of a drive that are published: index in the profile and name.
+/// The points of a drive that are published: index in the profile and name. None of them is a key of the state object:
+/// profiles do not take such names.
 pub(super) fn published_points(profile: &Profile) -> Vec<(usize, &str)> {
-    let mut points = crate::process_image::public_points(profile);
-    points.retain(|(_, name)| !STATE_KEYS.contains(name));
-    points
+    crate::process_image::public_points(profile)
 }
 
 /// The state object of a drive without its times; a change of it is published.
@@ -137,6 +136,8 @@ pub(super) struct StateObject<'s> {
     pub(super) wall: SystemTime,
     /// It is no longer current: part of the history.
     pub(super) historical: bool,
+    /// Number of points that are left out because the broker takes no larger message.
+    pub(super) omitted: usize,
 }
 
 impl Serialize for StateObject<'_> {
@@ -152,6 +153,9 @@ impl Serialize for StateObject<'_> {
         map.serialize_entry("age_ms", &self.age.map(|a| a.as_millis() as u64))?;
         map.serialize_entry("fault_text", &self.fault_text)?;
         map.serialize_entry("blocked_by", &self.shown.blocked_by)?;
+        if self.omitted > 0 {
+            map.serialize_entry("omitted", &self.omitted)?;
+        }
         let points = || self.names.iter().zip(&self.shown.points);
         for (name, (value, _)) in points() {
             map.serialize_entry(name, &value_or_null(value.map(tidy)))?;
@@ -403,6 +407,7 @@ mod tests {
                 age: None,
                 wall: SystemTime::UNIX_EPOCH,
                 historical: false,
+                omitted: 0,
             };
             serde_json::to_value(&object).unwrap()
         };
@@ -443,6 +448,7 @@ mod tests {
             age: None,
             wall: SystemTime::UNIX_EPOCH,
             historical: false,
+            omitted: 0,
         };
         let object = serde_json::to_value(&object).unwrap();
         assert_eq!(

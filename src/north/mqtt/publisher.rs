@@ -11,6 +11,7 @@ use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::Notify;
 
 use super::Telemetry;
+use super::connection::PACKET_OVERHEAD;
 use super::history::Recorder;
 use super::payload::{self, BusFigures, BusState, PointPayload, StateContent, StateObject, Topics};
 use crate::drive::ModelPoint;
@@ -46,6 +47,10 @@ pub(super) struct Publisher {
     buses_at: Option<Instant>,
     /// Retained topics that are published besides.
     besides: Vec<Arc<str>>,
+    /// Largest packet of the broker, bytes.
+    max_packet: usize,
+    /// States that do not fit whole, to be logged.
+    reduced: Vec<String>,
     /// Topics that are no longer published, to be cleared at the broker.
     vanished: BTreeSet<Arc<str>>,
     vanished_cleared: bool,
@@ -79,6 +84,8 @@ struct DriveTopics {
     /// Index in the profile and name of each published point.
     indices: Vec<usize>,
     names: Vec<String>,
+    /// Number of points in the state object: all, unless the broker takes only smaller packets.
+    fits: usize,
     last: Option<(StateContent, Instant)>,
     points: Vec<PointTopic>,
 }
@@ -125,6 +132,8 @@ impl Publisher {
             buses: Vec::new(),
             buses_at: None,
             besides: Vec::new(),
+            max_packet: usize::MAX,
+            reduced: Vec::new(),
             vanished: BTreeSet::new(),
             vanished_cleared: false,
         }
@@ -176,15 +185,21 @@ impl Publisher {
         drives.chain(self.buses.iter().map(|b| &b.topic)).chain(&self.besides)
     }
 
-    /// Publishes everything again, since the broker may have lost it.
-    pub(super) fn restart(&mut self) {
+    /// Publishes everything again, since the broker may have lost it; `max_packet` is the largest packet that it takes.
+    pub(super) fn restart(&mut self, max_packet: usize) {
+        self.max_packet = max_packet;
         self.vanished_cleared = false;
         self.buses_at = None;
         for drive in &mut self.drives {
-            (drive.last, drive.look_at) = (None, None);
+            (drive.last, drive.look_at, drive.fits) = (None, None, drive.names.len());
             drive.points.iter_mut().for_each(|p| p.last = None);
         }
         self.buses.iter_mut().for_each(|b| (b.state, b.figures) = (None, None));
+    }
+
+    /// What is to be logged about states that do not fit whole, since the last call.
+    pub(super) fn take_reduced(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.reduced)
     }
 
     /// Topics that are still to be cleared.
@@ -209,8 +224,16 @@ impl Publisher {
     /// a drive asks for a call earlier.
     pub(super) fn tick(&mut self, now: Instant, wall: SystemTime) -> (Vec<Update>, Instant) {
         let mut updates = Vec::new();
-        let pace = self.pace;
-        let all = self.look(now, |drive| drive.tick(pace, now, wall, &mut updates));
+        let (pace, most) = (self.pace, self.max_packet);
+        let mut reduced = std::mem::take(&mut self.reduced);
+        let all = self.look(now, |drive| {
+            let fits = drive.fits;
+            drive.tick(pace, most, now, wall, &mut updates);
+            if drive.fits < fits {
+                reduced.push(drive.reduced(most));
+            }
+        });
+        self.reduced = reduced;
         if self.buses_at.is_none_or(|at| at <= now) {
             for bus in &mut self.buses {
                 bus.tick(pace, now, wall, &mut updates);
@@ -224,13 +247,17 @@ impl Publisher {
     /// Records values while the broker is away, and when to call again; see [`Publisher::tick`].
     pub(super) fn record(&mut self, now: Instant, wall: SystemTime) -> (Vec<Update>, Instant) {
         let mut updates = Vec::new();
-        let (pace, mode) = (self.pace, self.telemetry.history);
+        let (pace, mode, most) = (self.pace, self.telemetry.history, self.max_packet);
         let all = self.look(now, |drive| {
             let fresh = drive.is_fresh();
             let (names, indices) = (&drive.names, &drive.indices);
             let reading = drive.drive.reading(now);
             let shown = StateContent::of(&reading, indices.iter().copied(), drive.drive.why(&reading).words());
-            let render = |shown: &StateContent| render(names, indices, &reading, shown, wall, true);
+            let render = |shown: &StateContent| {
+                let fits = drive.fits;
+                render((names, indices, fits), &reading, shown, wall, true)
+            };
+            drive.recorder.limit(most);
             let wait = drive.recorder.record(mode, pace.min, shown, fresh, render, now);
             drive.seen = Some(reading.snapshot);
             drive.look_at = Some(now + wait.unwrap_or(LOOK).min(LOOK));
@@ -246,7 +273,7 @@ impl Publisher {
     pub(super) fn recorded(&mut self) -> Vec<Update> {
         self.drives
             .iter_mut()
-            .filter_map(|drive| drive.recorder.take())
+            .flat_map(|drive| drive.recorder.take_all())
             .collect()
     }
 
@@ -305,6 +332,7 @@ impl DriveTopics {
             recorder: Recorder::new(topics.drive(&spec.name, "history").into()),
             indices: published.iter().map(|(index, _)| *index).collect(),
             names: published.iter().map(|(_, name)| (*name).to_string()).collect(),
+            fits: published.len(),
             last: None,
             points,
             drive,
@@ -317,8 +345,38 @@ impl DriveTopics {
         self.seen.as_ref().is_none_or(|seen| image.is_newer_than(seen))
     }
 
-    fn tick(&mut self, pace: PublishInterval, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
-        let reading = self.drive.reading(now);
+    /// The line of the log about a state that is published without some of its points.
+    fn reduced(&self, most: usize) -> String {
+        let omitted = self.names.get(self.fits..).unwrap_or_default().join(", ");
+        format!(
+            "the state of drive {} is too large for the broker, which accepts {most} bytes per packet: it is published without \
+             {omitted}; raise the broker's limit, or read these as single points",
+            self.drive.image.spec.name
+        )
+    }
+
+    /// The state object, without its last points if the broker takes only so many bytes.
+    fn state_object(
+        &mut self,
+        reading: &Reading<'_>,
+        shown: &StateContent,
+        most: usize,
+        wall: SystemTime,
+    ) -> Option<Vec<u8>> {
+        let room = most.saturating_sub(self.state.as_ref().map_or(0, |topic| topic.len()) + PACKET_OVERHEAD);
+        loop {
+            let points = (self.names.as_slice(), self.indices.as_slice(), self.fits);
+            let payload = render(points, reading, shown, wall, false)?;
+            if payload.len() <= room || self.fits == 0 {
+                return Some(payload);
+            }
+            self.fits -= 1;
+        }
+    }
+
+    fn tick(&mut self, pace: PublishInterval, most: usize, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
+        let drive = self.drive.clone();
+        let reading = drive.reading(now);
         let shown = StateContent::of(&reading, self.indices.iter().copied(), self.drive.why(&reading).words());
         let mut look_at = now + LOOK.min(pace.max);
         for point in &mut self.points {
@@ -339,10 +397,9 @@ impl DriveTopics {
                 look_at = look_at.min(*at + pace.min);
             }
         }
-        if let Some(topic) = &self.state {
+        if let Some(topic) = self.state.clone() {
             if pace.is_due(self.last.as_ref(), &shown, now) {
-                let payload = render(&self.names, &self.indices, &reading, &shown, wall, false);
-                let topic = topic.clone();
+                let payload = self.state_object(&reading, &shown, most, wall);
                 updates.extend(payload.map(|payload| Update { topic, payload }));
                 self.last = Some((shown, now));
             } else if let Some((last, at)) = &self.last
@@ -356,10 +413,9 @@ impl DriveTopics {
     }
 }
 
-/// The state object.
+/// The state object with the first points, of which there are so many.
 fn render(
-    names: &[String],
-    indices: &[usize],
+    (names, indices, fits): (&[String], &[usize], usize),
     reading: &Reading<'_>,
     shown: &StateContent,
     wall: SystemTime,
@@ -367,8 +423,9 @@ fn render(
 ) -> Option<Vec<u8>> {
     let object = StateObject {
         shown,
-        names,
-        indices,
+        names: names.get(..fits).unwrap_or(names),
+        indices: indices.get(..fits).unwrap_or(indices),
+        omitted: names.len().saturating_sub(fits),
         profile: &reading.spec.profile,
         fault_text: reading.fault_text(),
         age: reading.age(),

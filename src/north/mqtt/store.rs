@@ -7,7 +7,7 @@
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU64, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use flume::{Receiver, RecvTimeoutError, Sender, TrySendError};
@@ -87,8 +87,27 @@ struct Disk {
     jobs: Sender<Job>,
     /// Size of the messages among them.
     bytes: Arc<AtomicUsize>,
+    gone: Arc<Gone>,
     loaded: mpsc::Receiver<Loaded>,
     ended: tokio::sync::oneshot::Receiver<()>,
+}
+
+/// What the disk gave up because the buffer was full.
+#[derive(Debug)]
+struct Gone {
+    /// Up to this message nothing is kept.
+    through: AtomicI64,
+    /// Number of lost messages among those behind it.
+    missing: AtomicU64,
+}
+
+impl Default for Gone {
+    fn default() -> Gone {
+        Gone {
+            through: AtomicI64::new(Number::MIN),
+            missing: AtomicU64::new(0),
+        }
+    }
 }
 
 impl Store {
@@ -104,9 +123,10 @@ impl Store {
         let (end, ended) = tokio::sync::oneshot::channel();
         let of_thread = lost.clone();
         let bytes: Arc<AtomicUsize> = Arc::default();
-        let waiting = bytes.clone();
+        let gone: Arc<Gone> = Arc::default();
+        let (waiting, given_up) = (bytes.clone(), gone.clone());
         let work = move || {
-            Thread::open(&buffer, name, sender, of_thread).work(&todo, &waiting);
+            Thread::open(&buffer, name, sender, of_thread, given_up).work(&todo, &waiting);
             // The client may be gone.
             let _ = end.send(());
         };
@@ -116,6 +136,7 @@ impl Store {
                     lost,
                     jobs,
                     bytes,
+                    gone,
                     loaded,
                     ended,
                 }),
@@ -209,9 +230,17 @@ impl Store {
         }
     }
 
+    /// Up to this message nothing is kept any more, because the buffer was full; what of it is in the outbox is lost.
+    pub(super) fn gone(&self) -> Number {
+        let gone = self.disk.as_ref().map(|disk| disk.gone.through.load(Ordering::Relaxed));
+        gone.unwrap_or(Number::MIN)
+    }
+
     /// Number of messages on disk that are not in the outbox.
     pub(super) fn waiting(&self) -> u64 {
-        u64::try_from(self.pushed - self.through).unwrap_or_default()
+        let Some(disk) = &self.disk else { return 0 };
+        let kept = u64::try_from(self.pushed - self.through.max(self.gone())).unwrap_or_default();
+        kept.saturating_sub(disk.gone.missing.load(Ordering::Relaxed))
     }
 
     /// Writes what waits and ends; the caller limits the time.
@@ -247,6 +276,9 @@ struct Thread {
     journal: Journal,
     report: mpsc::Sender<Loaded>,
     lost: LostCount,
+    gone: Arc<Gone>,
+    /// The topics to be kept for the next run.
+    topics: Vec<String>,
     /// The last number of earlier runs.
     base: u64,
     /// Whether the last write failed; logged once.
@@ -255,7 +287,13 @@ struct Thread {
 }
 
 impl Thread {
-    fn open(buffer: &Buffer, name: &'static str, report: mpsc::Sender<Loaded>, lost: LostCount) -> Thread {
+    fn open(
+        buffer: &Buffer,
+        name: &'static str,
+        report: mpsc::Sender<Loaded>,
+        lost: LostCount,
+        gone: Arc<Gone>,
+    ) -> Thread {
         let dir = buffer.dir.clone();
         let mut attempts = LOCK_ATTEMPTS;
         let journal = loop {
@@ -287,6 +325,8 @@ impl Thread {
             journal,
             report,
             lost,
+            gone,
+            topics: Vec::new(),
             failing: false,
             synced: Instant::now(),
         };
@@ -313,7 +353,10 @@ impl Thread {
                     }
                     Job::Acknowledge(number) => self.journal.acknowledge(self.base.saturating_add_signed(number)),
                     Job::Load(most) => load = Some(most),
-                    Job::Topics(topics) => self.write_topics(&topics),
+                    Job::Topics(topics) => {
+                        self.topics = topics;
+                        self.write_topics();
+                    }
                 }
                 count += 1;
                 // The answer tells what is there when it is given: nothing that comes later.
@@ -330,15 +373,15 @@ impl Thread {
         self.sync();
     }
 
+    /// A number of the journal as the client knows it.
+    fn number(&self, number: u64) -> Number {
+        number as Number - self.base as Number
+    }
+
     fn load(&mut self, most: usize) {
-        let number = |number: u64| number as Number - self.base as Number;
-        let messages: Vec<_> = self
-            .journal
-            .take(most)
-            .into_iter()
-            .map(|(n, m)| (number(n), m))
-            .collect();
-        let through = number(self.journal.through());
+        let taken = self.journal.take(most);
+        let messages: Vec<_> = taken.into_iter().map(|(n, m)| (self.number(n), m)).collect();
+        let through = self.number(self.journal.through());
         self.tell(Loaded::Messages { messages, through });
     }
 
@@ -361,10 +404,16 @@ impl Thread {
             }
             _ => {}
         }
+        if self.journal.take_wiped() && !self.topics.is_empty() {
+            self.write_topics();
+        }
         let lost = self.journal.take_lost();
         if lost > 0 {
             self.lost.add(lost);
         }
+        let (gone, missing) = (self.number(self.journal.gone()), self.journal.missing());
+        self.gone.through.store(gone, Ordering::Relaxed);
+        self.gone.missing.store(missing, Ordering::Relaxed);
         if self.synced.elapsed() >= SYNC {
             self.sync();
         }
@@ -389,10 +438,12 @@ impl Thread {
         text.lines().map(str::to_string).collect()
     }
 
-    fn write_topics(&self, topics: &[String]) {
+    fn write_topics(&self) {
         let (file, new) = (self.topics_file(), self.dir.join(format!("{MQTT_TOPICS}.new")));
-        let written = std::fs::write(&new, topics.join("\n")).and_then(|()| std::fs::rename(&new, &file));
+        let written = std::fs::write(&new, self.topics.join("\n")).and_then(|()| std::fs::rename(&new, &file));
         if let Err(error) = written {
+            // A part of it would only take room from the messages.
+            let _ = std::fs::remove_file(&new);
             let file = file.display();
             tracing::warn!("{file}: {error}; topics removed before the next start are not cleared");
         }

@@ -17,14 +17,20 @@ const STATE: &str = "drivegate/hall/drive/p1/state";
 struct Manners {
     /// Properties of its CONNACK.
     properties: Vec<u8>,
-    /// Topics below this get this reason code.
-    refused: Option<(&'static str, u8)>,
+    /// Topics below this get this reason code, so many times.
+    refused: Option<(&'static str, u8, usize)>,
     /// It writes each byte on its own.
     piecemeal: bool,
     /// It acknowledges two events at a time, the later one first.
     backwards: bool,
     /// The first connection ends with this DISCONNECT after the first event.
     farewell: Option<Vec<u8>>,
+    /// It does not answer subscriptions.
+    deaf: bool,
+    /// It refuses a last will with QoS 1, and one that is retained.
+    no_will: bool,
+    /// It refuses filters with wildcards.
+    no_wildcards: bool,
 }
 
 #[derive(Default)]
@@ -35,6 +41,10 @@ struct Seen {
     most_in_flight: usize,
     longest: usize,
     by_alias: usize,
+    refusals: usize,
+    filters: Vec<String>,
+    /// What the gateway says when it leaves.
+    farewells: Vec<Vec<u8>>,
 }
 
 struct Hostile {
@@ -137,23 +147,39 @@ impl Session {
         loop {
             let (kind, body) = self.packet()?;
             match kind >> 4 {
+                1 if self.manners.no_will && body[7] & 0x08 != 0 => {
+                    self.send(0x20, &[0, 0x9B, 0])?;
+                    return None;
+                }
+                1 if self.manners.no_will && body[7] & 0x20 != 0 => {
+                    self.send(0x20, &[0, 0x9A, 0])?;
+                    return None;
+                }
                 1 => {
                     let properties = self.manners.properties.clone();
                     let body = [&[0, 0, u8::try_from(properties.len()).unwrap()][..], &properties].concat();
                     self.send(0x20, &body)?;
                 }
+                8 if self.manners.deaf => {}
                 8 => {
                     // Packet id, properties (none), then filters with a byte of options each.
                     let (mut rest, mut codes) = (&body[3..], Vec::new());
                     while rest.len() > 2 {
-                        rest = &rest[number(rest) + 3..];
-                        codes.push(1);
+                        let (filter, next) = rest[2..].split_at(number(rest));
+                        let filter = String::from_utf8(filter.to_vec()).unwrap();
+                        let refused = self.manners.no_wildcards && filter.contains(['+', '#']);
+                        codes.push(if refused { 0xA2 } else { 1 });
+                        self.seen.lock().unwrap().filters.push(filter);
+                        rest = &next[1..];
                     }
                     self.send(0x90, &[&body[..2], &[0], &codes].concat())?;
                 }
                 3 => self.publish(kind, &body)?,
                 12 => self.send(0xD0, &[])?,
-                14 => return None,
+                14 => {
+                    self.seen.lock().unwrap().farewells.push(body);
+                    return None;
+                }
                 _ => {}
             }
         }
@@ -201,13 +227,14 @@ impl Session {
         if qos == 0 {
             return Some(());
         }
-        let code = self
-            .manners
-            .refused
-            .filter(|(below, _)| topic.starts_with(below))
-            .map_or(0, |(_, code)| code);
         let in_flight = self.owed.len() + 1;
         let mut seen = self.seen.lock().unwrap();
+        let refused = self
+            .manners
+            .refused
+            .filter(|(below, _, times)| topic.starts_with(below) && seen.refusals < *times);
+        seen.refusals += usize::from(refused.is_some());
+        let code = refused.map_or(0, |(_, code, _)| code);
         seen.most_in_flight = seen.most_in_flight.max(in_flight);
         drop(seen);
         // An event waits for another event only: telemetry in between does not end the wait, so that no event is left over.
@@ -249,7 +276,7 @@ fn serves(broker: &Hostile, gateway: &Gateway, count: usize) {
 #[test]
 fn odd_brokers_are_served() {
     let window = |n: u16| [&[0x21][..], &n.to_be_bytes()].concat();
-    let cases: [(&str, Manners); 7] = [
+    let cases: [(&str, Manners); 9] = [
         (
             "receive maximum 1",
             Manners {
@@ -287,6 +314,20 @@ fn odd_brokers_are_served() {
             },
         ),
         (
+            "no topic aliases, a keep-alive interval of its own",
+            Manners {
+                properties: vec![0x22, 0, 0, 0x13, 0, 60],
+                ..Manners::default()
+            },
+        ),
+        (
+            "a client id assigned by the broker",
+            Manners {
+                properties: vec![0x12, 0, 3, b'x', b'y', b'z'],
+                ..Manners::default()
+            },
+        ),
+        (
             "packets in single bytes",
             Manners {
                 piecemeal: true,
@@ -296,7 +337,7 @@ fn odd_brokers_are_served() {
         (
             "the points refused",
             Manners {
-                refused: Some(("drivegate/hall/drive/p1/point", 0x87)),
+                refused: Some(("drivegate/hall/drive/p1/point", 0x87, usize::MAX)),
                 ..Manners::default()
             },
         ),
@@ -318,9 +359,20 @@ fn odd_brokers_are_served() {
         assert_eq!(seen.connections, 1, "{name}");
         match name {
             "receive maximum 1" => assert_eq!(seen.most_in_flight, 1),
-            "QoS 0 only" => assert!(seen.messages.iter().all(|(_, qos, ..)| *qos == 0)),
+            "QoS 0 only" => {
+                assert!(seen.messages.iter().all(|(_, qos, ..)| *qos == 0));
+                drop(seen);
+                gateway.stop();
+                wait_for("the farewell", || {
+                    (!broker.seen.lock().unwrap().farewells.is_empty()).then_some(())
+                });
+                let seen = broker.seen.lock().unwrap();
+                assert_eq!(seen.messages.last().unwrap().3, b"offline");
+                continue;
+            }
             "no retained messages" => assert!(seen.messages.iter().all(|(.., retain, _)| !retain)),
             "topic aliases" => assert!(seen.by_alias > 0),
+            "no topic aliases, a keep-alive interval of its own" => assert_eq!(seen.by_alias, 0),
             _ => {}
         }
         drop(seen);
@@ -330,9 +382,9 @@ fn odd_brokers_are_served() {
 
 #[test]
 fn refused_messages_concern_their_topic() {
-    for code in [0x80, 0x83, 0x87, 0x90, 0x91, 0x97, 0x99] {
+    for code in [0x80, 0x83, 0x87, 0x90, 0x99] {
         let broker = Hostile::start(Manners {
-            refused: Some((EVENT, code)),
+            refused: Some((EVENT, code, usize::MAX)),
             ..Manners::default()
         });
         let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
@@ -341,6 +393,57 @@ fn refused_messages_concern_their_topic() {
         wait_for("the loss to be counted", || (lost() == 20).then_some(()));
         assert_eq!(broker.seen.lock().unwrap().connections, 1, "{code:02X}");
         assert!(gateway.connected());
+        gateway.stop();
+    }
+}
+
+#[test]
+fn what_is_refused_for_now_comes_later() {
+    // Quota exceeded, packet id in use.
+    for code in [0x97, 0x91] {
+        let broker = Hostile::start(Manners {
+            refused: Some((EVENT, code, 3)),
+            ..Manners::default()
+        });
+        let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+        wait_for("the connection", || gateway.connected().then_some(()));
+        let texts: Vec<String> = (0..20).map(|n| format!("event {n}")).collect();
+        for text in &texts {
+            gateway.publish_event("p1", EventKind::Fault, text);
+        }
+        let missing = || {
+            let events = broker.events();
+            texts
+                .iter()
+                .any(|text| events.iter().filter(|event| *event == text).count() < 1)
+        };
+        wait_for("all events, and the three again", || {
+            (broker.events().len() == 23 && !missing() && gateway.buffered() == 0).then_some(())
+        });
+        assert_eq!(gateway.stats.mqtt.losses().map(|(_, count)| count).sum::<u64>(), 0);
+        gateway.stop();
+    }
+}
+
+#[test]
+fn a_status_that_is_refused_is_repeated_until_the_broker_takes_it() {
+    for code in [0x97, 0x87, 0x80] {
+        let broker = Hostile::start(Manners {
+            refused: Some(("drivegate/hall/status", code, 2)),
+            ..Manners::default()
+        });
+        let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+        let statuses = || {
+            let seen = broker.seen.lock().unwrap();
+            let of_status = seen
+                .messages
+                .iter()
+                .filter(|(topic, ..)| topic == "drivegate/hall/status");
+            of_status.map(|(.., payload)| payload.clone()).collect::<Vec<_>>()
+        };
+        wait_for("the third attempt", || (statuses().len() >= 3).then_some(()));
+        assert_eq!(statuses(), [b"online", b"online", b"online"], "{code:02X}");
+        assert_eq!(broker.seen.lock().unwrap().connections, 1);
         gateway.stop();
     }
 }
@@ -358,8 +461,13 @@ fn packets_beyond_the_limit_are_not_sent() {
     });
     let seen = broker.seen.lock().unwrap();
     assert!(seen.longest <= 256, "{}", seen.longest);
-    assert!(seen.messages.iter().all(|(topic, ..)| topic != STATE));
+    let states = seen.messages.iter().filter(|(topic, ..)| topic == STATE);
+    let states: Vec<serde_json::Value> = states
+        .map(|(.., state)| serde_json::from_slice(state).unwrap())
+        .collect();
+    assert!(!states.is_empty() && states.iter().all(|state| state["omitted"].as_u64() > Some(0)));
     drop(seen);
+    wait_log(broker.port, "the state of drive p1 is too large");
     gateway.stop();
 }
 
@@ -376,4 +484,72 @@ fn a_session_taken_over_loses_no_event() {
         assert!(broker.seen.lock().unwrap().connections > 1);
         gateway.stop();
     }
+}
+
+#[test]
+fn a_connection_that_is_given_up_ends_with_a_word() {
+    let broker = Hostile::start(Manners {
+        deaf: true,
+        ..Manners::default()
+    });
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    wait_for("the gateway to give up", || {
+        let seen = broker.seen.lock().unwrap();
+        (!seen.farewells.is_empty()).then_some(())
+    });
+    // Normal, without the last will: the gateway was not online.
+    let reason = broker.seen.lock().unwrap().farewells[0].first().copied().unwrap_or(0);
+    assert_eq!(reason, 0x00);
+    wait_for("another attempt", || {
+        (broker.seen.lock().unwrap().connections > 1).then_some(())
+    });
+    gateway.stop();
+}
+
+#[test]
+fn a_broker_that_refuses_the_last_will_gets_a_lesser_one() {
+    let broker = Hostile::start(Manners {
+        no_will: true,
+        properties: vec![0x24, 0, 0x25, 0],
+        ..Manners::default()
+    });
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    serves(&broker, &gateway, 10);
+    assert_eq!(broker.seen.lock().unwrap().connections, 3, "refused twice");
+    wait_log(broker.port, "no QoS 1");
+    gateway.stop();
+}
+
+#[test]
+fn without_wildcards_the_gateway_subscribes_drive_by_drive() {
+    // It says so, or refuses the subscription.
+    for (properties, no_wildcards) in [(vec![0x28, 0], false), (vec![], true)] {
+        let broker = Hostile::start(Manners {
+            properties,
+            no_wildcards,
+            ..Manners::default()
+        });
+        let gateway = Gateway::start(options(broker.port), plant(&["p1", "p2"]));
+        serves(&broker, &gateway, 5);
+        let seen = broker.seen.lock().unwrap();
+        for filter in ["p1/set", "p2/set", "p1/set/run", "p2/set/speed_reference"] {
+            let filter = format!("drivegate/hall/drive/{filter}");
+            assert!(seen.filters.contains(&filter), "{filter} is not in {:?}", seen.filters);
+        }
+        assert_eq!(seen.filters.iter().any(|filter| filter.contains('+')), no_wildcards);
+        assert_eq!(seen.connections, 1);
+        drop(seen);
+        gateway.stop();
+    }
+}
+
+#[test]
+fn two_gateways_with_one_client_id_are_told_apart_from_a_broken_broker() {
+    // Mosquitto 2.0 closes the connection of the first without a word.
+    let broker = Broker::with("allow_anonymous true\n");
+    let first = Gateway::start(options(broker.port), plant(&["p1"]));
+    let second = Gateway::start(options(broker.port), plant(&["p1"]));
+    wait_log(broker.port, "uses the client id `drivegate-hall`");
+    first.stop();
+    second.stop();
 }

@@ -472,3 +472,65 @@ fn a_reload_bears_the_node_anew() {
     ];
     assert_eq!(seen.births_and_deaths(), expected);
 }
+
+#[test]
+fn a_cleared_command_is_no_refused_command() {
+    let (broker, state) = (Broker::start(), tempfile::tempdir().unwrap());
+    let watcher = watcher(&broker);
+    let run = json!([{ "name": "run", "type": "Boolean", "value": true }]);
+    command(&broker, P1, run, &["-r"]);
+    let gateway = Gateway::start(options(broker.port, state.path()), plant(&["p1"]));
+    let results = |seen: &Seen| {
+        seen.values("p1", "command_result", false)
+            .into_iter()
+            .filter(|r| r != "")
+            .count()
+    };
+    wait_seen("the refusal of the retained command", &watcher, |seen| {
+        results(seen) == 1
+    });
+    assert!(broker.run("mosquitto_pub", &["-t", P1, "-r", "-n"]).status.success());
+    let stop = json!([{ "name": "run", "type": "Boolean", "value": false }]);
+    command(&broker, P1, stop, &[]);
+    wait_for("the stop", || (!gateway.ordered().is_empty()).then_some(()));
+    let seen = wait_seen("its result", &watcher, |seen| results(seen) >= 2);
+    let codes = seen.values("p1", "command_result", false);
+    let refused = codes.iter().filter(|code| *code == "not_allowed").count();
+    assert_eq!(refused, 1, "{codes:?}");
+    gateway.stop();
+}
+
+#[test]
+fn a_host_of_version_2_is_taken_for_online_too() {
+    let (broker, state) = (Broker::start(), tempfile::tempdir().unwrap());
+    let watcher = watcher(&broker);
+    let mut options = options(broker.port, state.path());
+    options.sparkplug.as_mut().unwrap().primary_host = "scada".to_string();
+    let gateway = Gateway::start(options, plant(&["p1"]));
+    gateway.wait_connected(true);
+    broker.publish("STATE/scada", "ONLINE", &["-r"]);
+    watcher.wait("the birth", |m| m.topic == "spBv1.0/plant/DBIRTH/pump-house/p1");
+    broker.publish("STATE/scada", "OFFLINE", &["-r"]);
+    watcher.wait("the death", |m| m.topic == "spBv1.0/plant/NDEATH/pump-house");
+    gateway.stop();
+}
+
+#[test]
+fn births_that_are_too_large_for_the_broker_lack_their_last_metrics() {
+    let broker = Broker::with("allow_anonymous true\nmax_packet_size 600\n");
+    let (watcher, state) = (watcher(&broker), tempfile::tempdir().unwrap());
+    let gateway = Gateway::start(options(broker.port, state.path()), plant(&["p1"]));
+    watcher.wait("a birth", |m| m.topic == "spBv1.0/plant/DBIRTH/pump-house/p1");
+    gateway.read("p1", 3000);
+    watcher.wait("data", |m| m.topic == "spBv1.0/plant/DDATA/pump-house/p1");
+    let seen = Seen::of(&watcher);
+    // Data that the birth does not name would break a rule.
+    seen.keeps(&[
+        "topics-nbirth-metric-reqs",
+        "topics-dbirth-metric-reqs",
+        "payloads-ddata-seq-inc",
+    ]);
+    let births = seen.births_and_deaths();
+    assert_eq!(births, ["NBIRTH", "DBIRTH p1"], "one connection");
+    gateway.stop();
+}

@@ -1,6 +1,7 @@
 //! Discovery for Home Assistant, and what is subscribed to.
 
 use super::*;
+use crate::north::mqtt::connection::Subscribed;
 
 /// The discovery messages, if they are configured.
 pub(super) fn announcer(options: &Options, topics: &Topics) -> Option<Announcer> {
@@ -21,16 +22,20 @@ pub(super) fn discovery_topics(announcer: Option<&mut Announcer>, plant: &Plant)
     })
 }
 
-/// What a connection subscribes to.
+/// What a connection subscribes to; `plant` if the broker takes no wildcards.
 pub(super) fn subscriptions(
     topics: &Topics,
     commands: bool,
     announcer: Option<&Announcer>,
     leftovers_known: bool,
+    plant: Option<&Plant>,
 ) -> Vec<Subscription> {
     let subscription = |of| move |filter| Subscription { filter, of };
-    let sets = commands.then(|| topics.set_filters());
-    let leftovers = announcer.filter(|_| !leftovers_known);
+    let sets = commands.then(|| match plant {
+        None => topics.set_filters().to_vec(),
+        Some(plant) => topics.set_topics(plant),
+    });
+    let leftovers = announcer.filter(|_| !leftovers_known && plant.is_none());
     std::iter::once(topics.status())
         .map(subscription(Subscribed::Status))
         .chain(sets.into_iter().flatten().map(subscription(Subscribed::Commands)))
@@ -55,14 +60,18 @@ pub(super) fn report_refused(subscriptions: &[Subscription], refused: &[Option<S
         pairs.find_map(|(subscription, why)| Some((&subscription.filter, why.as_ref()?)))
     };
     if let Some((_, why)) = of(Subscribed::Commands) {
-        let filters: Vec<&str> = subscriptions
-            .iter()
-            .filter(|subscription| subscription.of == Subscribed::Commands)
-            .map(|subscription| subscription.filter.as_str())
+        let refused = subscriptions.iter().zip(refused);
+        let filters: Vec<&str> = refused
+            .filter(|(subscription, why)| subscription.of == Subscribed::Commands && why.is_some())
+            .map(|(subscription, _)| subscription.filter.as_str())
             .collect();
+        let more = match filters.len() {
+            0..=2 => String::new(),
+            all => format!(" and {} more", all - 2),
+        };
         tracing::error!(
-            "the broker refuses the set topics ({why}): no commands over MQTT; allow the client to subscribe to {}",
-            filters.join(" and ")
+            "the broker refuses set topics ({why}): no commands over MQTT there; allow the client to subscribe to {}{more}",
+            filters.get(..filters.len().min(2)).unwrap_or_default().join(" and ")
         );
     }
     if let Some((filter, why)) = of(Subscribed::Birth) {
@@ -109,7 +118,7 @@ impl Client {
     pub(super) fn announce(&mut self) {
         let Some(announcer) = &mut self.announcer else { return };
         let outbox = &self.outbox;
-        let updates = announcer.next(Instant::now(), |topic| outbox.has_telemetry(topic));
+        let updates = announcer.next(Instant::now(), |topic| outbox.is_under_way(topic));
         for Update { topic, payload } in updates {
             self.outbox.put_lasting(topic, payload);
         }

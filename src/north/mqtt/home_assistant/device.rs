@@ -6,6 +6,9 @@ use super::entity::{self, Entities};
 use super::{Sources, id_of};
 use crate::plant::{DriveHandle, Plant};
 
+/// With whose names titles of profiles begin.
+const MANUFACTURERS: [&str; 3] = ["Eaton", "TECO", "Vacon"];
+
 /// A device of Home Assistant.
 #[derive(Debug)]
 pub(super) struct Device {
@@ -56,12 +59,12 @@ impl Device {
     pub(super) fn payloads(&self, sources: &Sources, limit: usize) -> Vec<Vec<u8>> {
         let (head, entities) = match &self.kind {
             Kind::Gateway { name, buses } => (
-                self.head(sources, name, "drivegate", None),
+                self.head(sources, name, ("drivegate", "gateway"), None),
                 entity::of_gateway(sources, &self.id, buses),
             ),
             Kind::Drive { drive, gateway } => {
                 let spec = &drive.image.spec;
-                let mut head = self.head(sources, &spec.name, &spec.profile.title, Some(gateway));
+                let mut head = self.head(sources, &spec.name, made(&spec.profile.title), Some(gateway));
                 head.insert("avty".into(), entity::of_drive_availability(sources, spec));
                 (head, entity::of_drive(sources, &self.id, spec))
             }
@@ -69,18 +72,40 @@ impl Device {
         parts(&head, entities, limit)
     }
 
-    fn head(&self, sources: &Sources, name: &str, model: &str, gateway: Option<&str>) -> Map<String, Value> {
+    fn head(
+        &self,
+        sources: &Sources,
+        name: &str,
+        (manufacturer, model): (&str, &str),
+        gateway: Option<&str>,
+    ) -> Map<String, Value> {
         let version = env!("CARGO_PKG_VERSION");
-        let device = match gateway {
+        let mut device = match gateway {
             Some(gateway) => json!({ "ids": [self.id], "name": name, "mdl": model, "via_device": gateway }),
             None => json!({ "ids": [self.id], "name": name, "mdl": model, "sw": version }),
         };
+        if let Some(device) = device.as_object_mut().filter(|_| !manufacturer.is_empty()) {
+            device.insert("mf".into(), manufacturer.into());
+        }
         let mut head = Map::new();
         head.insert("dev".into(), device);
         head.insert("o".into(), json!({ "name": "drivegate", "sw": version }));
         head.insert("avty".into(), entity::of_gateway_availability(sources));
         head.insert("avty_mode".into(), "all".into());
         head
+    }
+}
+
+/// Manufacturer and model by the title of a profile; Home Assistant shows "NX by Vacon".
+pub(super) fn made(title: &str) -> (&str, &str) {
+    let by = |manufacturer: &&str| {
+        title
+            .strip_prefix(manufacturer)
+            .is_some_and(|rest| rest.starts_with(' '))
+    };
+    match MANUFACTURERS.into_iter().find(by) {
+        Some(manufacturer) => (manufacturer, title.get(manufacturer.len() + 1..).unwrap_or_default()),
+        None => ("", title),
     }
 }
 

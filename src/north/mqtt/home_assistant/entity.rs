@@ -6,6 +6,7 @@ use serde_json::{Map, Value, json};
 
 use super::Sources;
 use crate::drive::model::Kind;
+use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, Point, PollClass, State};
 use crate::event::EventKind;
 use crate::north::mqtt::payload;
@@ -24,6 +25,11 @@ const COMMANDS: [ModelPoint; 5] = [
 ];
 /// Limits of a command in percent where neither configuration nor profile has any.
 const PERCENT: (f64, f64) = (0.0, 100.0);
+
+/// Units of what is counted.
+const COUNTED: [&str; 7] = ["Wh", "kWh", "MWh", "varh", "kvarh", "kVAh", "m³"];
+/// Words that are written in capitals.
+const CAPITALS: [&str; 8] = ["ac", "dc", "id", "io", "pi", "pid", "pwm", "rms"];
 
 /// A platform of Home Assistant.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -217,13 +223,15 @@ impl DriveEntities<'_> {
         Some((format!("{}_{name}", platform.name()), entity.into()))
     }
 
-    /// Limits of a command; none where only the drive knows them.
+    /// Limits of a command; none where only the drive knows them, or where they leave one value only, of which Home Assistant
+    /// makes no number.
     fn limits(&self, point: &Point) -> Option<(f64, f64)> {
         let index = self.spec.profile.point_index(&point.name)?;
-        match self.spec.limits_of(index) {
+        let limits = match self.spec.limits_of(index) {
             Some(limits) => Some(limits.into_inner()),
             None => (point.unit == "%").then_some(PERCENT),
-        }
+        };
+        limits.filter(|(least, most)| least < most)
     }
 
     fn sensor(&self, point: &Point) -> (String, Value) {
@@ -387,16 +395,31 @@ fn quantity(entity: &mut Map<String, Value>, point: &Point) {
         entity.insert("unit_of_meas".into(), point.unit.as_str().into());
     }
     device_class(entity, &point.unit);
-    let counts = matches!(point.model, Some(ModelPoint::Energy | ModelPoint::OperatingHours));
+    let counts = matches!(point.model, Some(ModelPoint::Energy | ModelPoint::OperatingHours))
+        || COUNTED.contains(&point.unit.as_str());
     let class = match point.class {
-        _ if counts || entity.get("dev_cla").is_some_and(|class| class == "energy") => "total_increasing",
+        _ if counts && may_fall(point) => "total",
+        _ if counts => "total_increasing",
         PollClass::Fast | PollClass::Slow => "measurement",
         PollClass::Once | PollClass::Fault | PollClass::Never => return,
     };
     entity.insert("stat_cla".into(), class.into());
 }
 
-/// The device class of Home Assistant that has this unit, if there is one.
+/// Whether a count may go down, as a balance does: Home Assistant would take that for a meter that begins anew.
+fn may_fall(point: &Point) -> bool {
+    match point.raw().map(|raw| raw.form) {
+        Some(Form::I16 | Form::I32(_)) => true,
+        // The energy of a drive on N2 is such a number, and never falls.
+        Some(Form::F32(_)) | None => {
+            point.model.is_none() && point.range.as_ref().is_none_or(|range| *range.start() < 0.0)
+        }
+        Some(_) => false,
+    }
+}
+
+/// The device class of Home Assistant that has this unit, if there is one in all versions from 2024.12 on: it refuses the
+/// whole device for a class that it does not know.
 fn device_class(entity: &mut Map<String, Value>, unit: &str) {
     let class = match unit {
         "A" | "mA" => "current",
@@ -407,6 +430,10 @@ fn device_class(entity: &mut Map<String, Value>, unit: &str) {
         "W" | "kW" => "power",
         "ms" | "s" | "min" | "h" | "d" => "duration",
         "bar" | "mbar" | "Pa" | "kPa" => "pressure",
+        "VA" => "apparent_power",
+        "var" => "reactive_power",
+        "m³" => "volume",
+        "m³/h" => "volume_flow_rate",
         _ => return,
     };
     entity.insert("dev_cla".into(), class.into());
@@ -418,9 +445,16 @@ fn extend(entity: &mut Map<String, Value>, more: Value) {
     }
 }
 
-/// A name for people: `motor_current` is `Motor current`.
-fn title(name: &str) -> String {
-    let mut letters = name.chars();
-    let first: String = letters.next().into_iter().flat_map(char::to_uppercase).collect();
-    first + &letters.as_str().replace('_', " ")
+/// A name for people: `dc_link_voltage` is `DC link voltage`.
+pub(super) fn title(name: &str) -> String {
+    let word = |(place, word): (usize, &str)| {
+        let mut letters = word.chars();
+        match letters.next() {
+            _ if CAPITALS.contains(&word) => word.to_uppercase(),
+            Some(first) if place == 0 => first.to_uppercase().chain(letters).collect(),
+            _ => word.to_string(),
+        }
+    };
+    let words: Vec<String> = name.split('_').enumerate().map(word).collect();
+    words.join(" ")
 }

@@ -4,7 +4,7 @@ use serde_json::Value;
 
 use super::super::{History, fixture};
 use super::*;
-use crate::drive::profile::Profiles;
+use crate::drive::profile::{Profile, Profiles};
 use crate::process_image::{Access, DriveSpec};
 
 fn sources(base: &str, commands: bool, [state, points]: [bool; 2]) -> Sources {
@@ -307,4 +307,88 @@ fn a_flood_of_births_announces_everything_twice() {
     let rest = all(&mut announcer, start + BIRTHS);
     assert_eq!(rest.len(), updates.len(), "and once for all others");
     assert!(all(&mut announcer, start + 2 * BIRTHS).is_empty());
+}
+
+/// A meter, with points of these names, types and units.
+fn meter(points: &[(&str, &str, &str, &str)]) -> DriveSpec {
+    let point = |(place, (name, form, unit, more)): (usize, &(&str, &str, &str, &str))| {
+        let at = 2 * place;
+        let unit = match unit.is_empty() {
+            true => String::new(),
+            false => format!("unit = \"{unit}\"\n"),
+        };
+        format!("[[point]]\nname = \"{name}\"\nat = \"holding {at}\"\ntype = \"{form}\"\n{unit}{more}\n")
+    };
+    let head = "name = \"meter\"\ntitle = \"A meter\"\nprotocols = [\"modbus-rtu\"]\n\
+                [[range]]\ntable = \"holding\"\nfirst = 0\nlast = 99\nread = 100\n";
+    let source: String = std::iter::once(head.to_string())
+        .chain(points.iter().enumerate().map(point))
+        .collect();
+    let profile = Profile::parse("meter.toml", &source, false).unwrap_or_else(|problems| panic!("{problems:?}"));
+    DriveSpec::new("p1", "line1", 1, Arc::new(profile))
+}
+
+#[test]
+fn a_count_that_may_fall_is_a_total_and_units_have_their_classes() {
+    let cases = [
+        (("energy", "u32", "", ""), ("energy", "total_increasing")),
+        (("imported", "u32", "kWh", ""), ("energy", "total_increasing")),
+        (("balance", "i32", "kWh", ""), ("energy", "total")),
+        (("float_balance", "f32", "MWh", ""), ("energy", "total")),
+        (
+            ("float_meter", "f32", "MWh", "range = [0.0, 1e9]"),
+            ("energy", "total_increasing"),
+        ),
+        (("reactive_balance", "i32", "kvarh", ""), ("", "total")),
+        (("reactive", "u32", "kvarh", ""), ("", "total_increasing")),
+        (("water", "u32", "m³", ""), ("volume", "total_increasing")),
+        (("flow", "u16", "m³/h", ""), ("volume_flow_rate", "measurement")),
+        (("apparent", "u16", "VA", ""), ("apparent_power", "measurement")),
+        (("reactive_power", "i16", "var", ""), ("reactive_power", "measurement")),
+        (("active_power", "i16", "kW", ""), ("power", "measurement")),
+        (("share", "i16", "%", ""), ("", "measurement")),
+    ];
+    let spec = meter(&cases.map(|(point, _)| point));
+    let sources = sources("drivegate", true, [true, true]);
+    let all = entity::of_drive(&sources, "id", &spec);
+    for ((name, ..), (class, state)) in cases {
+        let key = format!("sensor_{name}");
+        let (_, entity) = all.iter().find(|(k, _)| *k == key).unwrap();
+        let seen = (
+            entity["dev_cla"].as_str().unwrap_or(""),
+            entity["stat_cla"].as_str().unwrap_or(""),
+        );
+        assert_eq!(seen, (class, state), "{name}");
+    }
+}
+
+#[test]
+fn names_are_written_as_people_do_and_drives_have_a_manufacturer() {
+    for (name, expected) in [
+        ("dc_link_voltage", "DC link voltage"),
+        ("io_control", "IO control"),
+        ("motor_current", "Motor current"),
+        ("run", "Run"),
+    ] {
+        assert_eq!(entity::title(name), expected);
+    }
+    let (_, updates) = announced(&["p1"]);
+    let [gateway, drive] = [0, 1].map(|place: usize| json(&updates[place].payload)["dev"].clone());
+    assert_eq!((&drive["mf"], &gateway["mf"]), (&"Vacon".into(), &"drivegate".into()));
+    assert!(drive["mdl"].as_str().unwrap().starts_with("NX, "), "{drive}");
+    for profile in Profiles::built_in().iter() {
+        assert!(!device::made(&profile.title).0.is_empty(), "{}", profile.title);
+    }
+    assert_eq!(device::made("Vaconic 3000"), ("", "Vaconic 3000"));
+}
+
+#[test]
+fn a_reference_with_one_value_is_no_number() {
+    let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let mut spec = DriveSpec::new("p1", "line1", 1, profile);
+    spec.access = Access::Control;
+    spec.limits.insert("speed_reference".to_string(), 50.0..=50.0);
+    let all = entity::of_drive(&sources("drivegate", true, [true, true]), "id", &spec);
+    let keys: Vec<&str> = present(&all).map(|(key, _)| key).collect();
+    assert!(keys.contains(&"sensor_speed_reference") && !keys.contains(&"number_speed_reference"));
 }

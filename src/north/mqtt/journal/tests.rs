@@ -381,3 +381,48 @@ fn a_directory_belongs_to_one_process() {
     assert!(error.to_string().contains("another process"), "{error}");
     Journal::open(dir.path(), "mqtt-history", BIG).unwrap();
 }
+
+#[test]
+fn files_that_somebody_deletes_are_written_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let inner = dir.path().join("buffer");
+    let mut journal = open(&inner, 64 << 10);
+    append(&mut journal, 0..200);
+    assert!(files(&inner, SUFFIX).len() > 1);
+    let number_of = |path: &PathBuf| path.file_name().map(ToOwned::to_owned);
+    let before: Vec<_> = files(&inner, SUFFIX).iter().map(number_of).collect();
+    for wipe in [
+        (|dir| fs::remove_dir_all(dir).unwrap()) as fn(&Path),
+        |dir| fs::remove_file(&files(dir, SUFFIX)[0]).unwrap(),
+        |dir| fs::remove_file(dir.join("mqtt-events.lock")).unwrap(),
+    ] {
+        wipe(&inner);
+        assert!(!journal.write().unwrap(), "nothing new");
+        assert!(journal.take_wiped() && !journal.take_wiped());
+        let after: Vec<_> = files(&inner, SUFFIX).iter().map(number_of).collect();
+        assert_eq!(after, before);
+        let error = Journal::open(&inner, "mqtt-events", BIG).unwrap_err();
+        assert_eq!(error.kind(), ErrorKind::WouldBlock, "it is locked again");
+    }
+    append(&mut journal, 200..210);
+    drop(journal);
+    let mut journal = open(&inner, 64 << 10);
+    assert_eq!(numbers(&take_all(&mut journal)), (0..210).collect::<Vec<_>>());
+    assert_eq!(journal.take_lost(), 0);
+}
+
+#[test]
+fn what_a_full_disk_left_of_a_file_does_not_keep_the_others_from_being_read() {
+    let dir = tempfile::tempdir().unwrap();
+    append(&mut open(dir.path(), 64 << 10), 0..200);
+    let last = files(dir.path(), SUFFIX).len() + 1;
+    let torn = dir.path().join(format!("mqtt-events-{last:012}{SUFFIX}"));
+    fs::write(&torn, [7; 100]).unwrap();
+    // There is no room for a copy.
+    let copy = dir.path().join(format!("mqtt-events-{last:012}-0{DAMAGED}"));
+    std::os::unix::fs::symlink("/dev/full", &copy).unwrap();
+    let mut journal = open(dir.path(), 64 << 10);
+    append(&mut journal, 200..201);
+    assert_eq!(numbers(&take_all(&mut journal)), (0..201).collect::<Vec<_>>());
+    assert_eq!(journal.take_lost(), 1);
+}

@@ -215,3 +215,61 @@ fn messages_that_cannot_be_sent_are_dropped() {
     assert!(outbox.next(1, true).is_none());
     assert!(!outbox.has_telemetry("big"));
 }
+
+#[test]
+fn what_the_broker_refuses_for_now_is_published_again_in_its_order() {
+    let mut outbox = outbox();
+    for name in ["e1", "e2", "e3"] {
+        outbox.push(Kind::Event, event(name), None);
+    }
+    assert_eq!(drain(&mut outbox, 2).len(), 2);
+    (1..=2).for_each(|packet| outbox.numbered(packet).unwrap());
+    assert_eq!(outbox.put_back(1, true).unwrap().as_ref(), "e1");
+    assert!(outbox.acked(2).is_some() && outbox.acked(1).is_none());
+    assert!(
+        outbox.next(10, true).is_none(),
+        "no event overtakes the one that was refused"
+    );
+    outbox.push_result(event("r"));
+    assert_eq!(names(&drain(&mut outbox, 10)), ["r"], "results go on");
+    outbox.retry();
+    assert_eq!(names(&drain(&mut outbox, 10)), ["e1", "e3"]);
+    outbox.lost();
+    assert_eq!(outbox.waiting(), 3);
+}
+
+#[test]
+fn the_status_is_repeated_whatever_the_reason_and_telemetry_only_for_a_while() {
+    let mut outbox = outbox();
+    for for_now in [true, false] {
+        outbox.put_first(topic("status"), vec![1]);
+        outbox.put(topic("t"), vec![2]);
+        assert_eq!(drain(&mut outbox, 10).len(), 2);
+        (1..=2).for_each(|packet| outbox.numbered(packet).unwrap());
+        assert!(outbox.put_back(1, for_now).is_some());
+        assert_eq!(outbox.put_back(2, for_now).is_some(), for_now);
+        if !for_now {
+            assert!(outbox.acked(2).is_some());
+        }
+        assert!(outbox.has_telemetry("status") && !outbox.is_under_way("status"));
+        assert!(outbox.next(10, true).is_none());
+        outbox.put(topic("t"), vec![3]);
+        outbox.retry();
+        let expected = [("status".to_string(), vec![1]), ("t".to_string(), vec![3])];
+        assert_eq!(drain(&mut outbox, 10), expected, "with the latest value");
+        (1..=2).for_each(|packet| outbox.numbered(packet).unwrap());
+        (1..=2).for_each(|packet| assert!(outbox.acked(packet).is_some()));
+        assert!(!outbox.has_telemetry("status"));
+    }
+}
+
+#[test]
+fn a_new_status_does_not_wait_for_the_retry() {
+    let mut outbox = outbox();
+    outbox.put_first(topic("status"), vec![1]);
+    drain(&mut outbox, 10);
+    outbox.numbered(1).unwrap();
+    assert!(outbox.put_back(1, true).is_some());
+    outbox.put_first(topic("status"), vec![0]);
+    assert_eq!(drain(&mut outbox, 10), [("status".to_string(), vec![0])]);
+}

@@ -213,7 +213,7 @@ fn bus_changes_are_published_at_once_and_figures_every_second() {
 fn after_a_restart_everything_comes_again() {
     let mut bench = Bench::new();
     let first = topics(&bench.after(0)).len();
-    bench.publisher.restart();
+    bench.publisher.restart(usize::MAX);
     let again = bench.after(1);
     assert_eq!(topics(&again).len(), first);
 }
@@ -228,7 +228,7 @@ fn vanished_drives_are_cleared_until_they_come_back() {
     assert_eq!(payload(&all, "drive/p2/point/running"), Some(""));
     assert!(payload(&all, "drive/p3/state").unwrap().contains("offline"));
     assert_eq!(payload(&bench.after(1000), "drive/p2/state"), None, "once");
-    bench.publisher.restart();
+    bench.publisher.restart(usize::MAX);
     assert_eq!(
         payload(&bench.after(1), "drive/p2/state"),
         Some(""),
@@ -317,7 +317,7 @@ fn topics_of_an_earlier_run_are_cleared_until_the_broker_has_it() {
     bench.publisher.clear(old.map(Arc::from));
     assert_eq!(bench.publisher.cleared(), [Arc::from(old[0])]);
     assert!(bench.publisher.cleared().is_empty(), "once per connection");
-    bench.publisher.restart();
+    bench.publisher.restart(usize::MAX);
     assert_eq!(bench.publisher.cleared().len(), 1);
     assert!(!bench.publisher.was_cleared(&Arc::from("x")));
     assert!(bench.publisher.was_cleared(&Arc::from(old[0])));
@@ -375,4 +375,64 @@ fn every_client_that_observes_a_drive_is_woken_once() {
         let woken = || listener.notified().now_or_never().is_some();
         assert_eq!((woken(), woken()), (true, false));
     }
+}
+
+#[test]
+fn a_state_that_is_too_large_for_the_broker_goes_without_its_last_points() {
+    let mut bench = Bench::new();
+    let whole = bench.after(0);
+    let whole: Json = serde_json::from_str(payload(&whole, "drive/p1/state").unwrap()).unwrap();
+    let most = 400;
+    bench.publisher.restart(most);
+    let updates = bench.after(1000);
+    let state = payload(&updates, "drive/p1/state").unwrap();
+    assert!(
+        state.len() + "drivegate/hall/drive/p1/state".len() + PACKET_OVERHEAD <= most,
+        "{state}"
+    );
+    let reduced: Json = serde_json::from_str(state).unwrap();
+    let (whole, reduced) = (whole.as_object().unwrap(), reduced.as_object().unwrap());
+    let omitted = usize::try_from(reduced["omitted"].as_u64().unwrap()).unwrap();
+    assert!(omitted > 0 && reduced.contains_key("running"), "{state}");
+    assert_eq!(
+        (&reduced["state"], &reduced["quality"]),
+        (&whole["state"], &whole["quality"])
+    );
+    let lines = bench.publisher.take_reduced();
+    let of_p1: Vec<&String> = lines.iter().filter(|line| line.contains("drive p1")).collect();
+    let [line] = of_p1[..] else { panic!("{lines:?}") };
+    let names = whole
+        .keys()
+        .filter(|key| !reduced.contains_key(*key) && !key.ends_with("_text") && *key != "point_quality");
+    for name in names {
+        assert!(line.contains(name.as_str()), "{line} lacks {name}");
+    }
+    bench.read(0x0023, 2600);
+    assert!(payload(&bench.after(1000), "drive/p1/state").is_some());
+    assert!(bench.publisher.take_reduced().is_empty(), "it is told once");
+    bench.publisher.restart(usize::MAX);
+    let updates = bench.after(1000);
+    assert!(!payload(&updates, "drive/p1/state").unwrap().contains("omitted"));
+}
+
+#[test]
+fn arrays_of_the_history_fit_into_the_packets_of_the_broker() {
+    let mut bench = Bench::new();
+    let most = 2000;
+    bench.publisher.restart(most);
+    let mut arrays = Vec::new();
+    for n in 0..30 {
+        bench.now += Duration::from_millis(200);
+        bench.read(0x0023, 2500 + n);
+        arrays.extend(bench.publisher.record(bench.now, bench.wall).0);
+    }
+    arrays.extend(bench.publisher.recorded());
+    let of_p1 = arrays.iter().filter(|update| update.topic.contains("/p1/"));
+    let mut entries = 0;
+    for update in of_p1 {
+        assert!(update.topic.len() + update.payload.len() + PACKET_OVERHEAD <= most);
+        let array: Vec<Json> = serde_json::from_slice(&update.payload).unwrap();
+        entries += array.len();
+    }
+    assert_eq!(entries, 30);
 }

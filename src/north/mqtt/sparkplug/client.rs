@@ -1,24 +1,23 @@
 //! The task that owns session, orders and connection. It never waits for the broker: what finds no room is kept, and
 //! the session is not asked for more until there is room.
 
+mod answers;
+
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use rumqttc::LastWill;
-use rumqttc::mqttbytes::QoS;
-use rumqttc::mqttbytes::v5::Filter;
 use rustls::ClientConfig;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::super::back_off::BackOff;
-use super::super::connection::{
-    self, BrokerLimits, Connection, ConnectionEvent, SILENCE, SUBSCRIBE_TIMEOUT, commanding,
-};
+use super::super::broker_limits::{BrokerLimits, WillForm};
+use super::super::connection::{self, CLOSED, Connection, ConnectionEvent, SUBSCRIBE_TIMEOUT};
 use super::super::outage_log::OutageLog;
 use super::super::outbox::Message;
 use super::super::request::Incoming;
+use super::super::takeover::Takeovers;
 use super::super::{Options as BrokerOptions, tls};
 use super::bd_seq::BdSeq;
 use super::model::{self, DriveMetrics, Moment, millis};
@@ -95,7 +94,6 @@ struct Up {
     /// Once the broker has accepted it.
     limits: Option<BrokerLimits>,
     subscribed: bool,
-    last_packet: Instant,
     /// Acknowledgements that are awaited: of the death of the node.
     unacknowledged: bool,
 }
@@ -127,8 +125,10 @@ struct Client {
     check_at: Instant,
     buses_at: Instant,
     link: Link,
+    will: WillForm,
     back_off: BackOff,
     outages: OutageLog,
+    takeovers: Takeovers,
     waits_logged: bool,
     not_understood: LogThrottle,
 }
@@ -170,8 +170,10 @@ impl Client {
             check_at: now,
             buses_at: now,
             link: Link::Down { retry_at: now },
+            will: WillForm::default(),
             back_off: BackOff::default(),
             outages: OutageLog::default(),
+            takeovers: Takeovers::default(),
             waits_logged: false,
             not_understood: LogThrottle::every(LOGGED),
         };
@@ -205,6 +207,9 @@ impl Client {
             self.tell(place, now, SystemTime::now());
         }
         self.tell_node(now, SystemTime::now());
+        if matches!(&self.link, Link::Up(Up { limits: Some(limits), .. }) if !limits.wildcards) {
+            self.subscribe();
+        }
     }
 
     fn tell(&mut self, place: usize, now: Instant, wall: SystemTime) {
@@ -269,15 +274,15 @@ impl Client {
             self.adopt();
         }
         self.stats.mqtt.lost(MqttLoss::History, self.session.take_lost());
-        match &self.link {
+        match &mut self.link {
             Link::Down { retry_at } if now >= *retry_at => self.connect().await,
             Link::Down { .. } => {}
             Link::Up(up) => {
-                let since = |at: Instant| now.saturating_duration_since(at);
-                if up.limits.is_some() && !up.subscribed && since(up.opened) > SUBSCRIBE_TIMEOUT {
-                    self.lost("the broker does not answer the subscription");
-                } else if since(up.last_packet) > SILENCE {
-                    self.lost("the broker is silent");
+                let late = now.saturating_duration_since(up.opened) > SUBSCRIBE_TIMEOUT;
+                if up.limits.is_some() && !up.subscribed && late {
+                    self.give_up("the broker does not answer the subscription");
+                } else if up.connection.is_silent(up.limits, now) {
+                    self.give_up("the broker is silent");
                 }
             }
         }
@@ -291,14 +296,14 @@ impl Client {
         let config = config.map_err(|error| error.to_string());
         match config.and_then(|config| config.map_err(|error| error.to_string())) {
             Ok(config) => self.open(bd_seq, config),
-            Err(why) => self.lost(&why),
+            Err(why) => drop(self.lost(&why)),
         }
     }
 
     fn open(&mut self, bd_seq: u8, config: Option<Arc<ClientConfig>>) {
         let death = self.session.will(bd_seq, tick().millis);
         let topic = self.topics.of(death.kind, None);
-        let will = LastWill::new(topic, death.payload.encoded(), QoS::AtLeastOnce, false, None);
+        let will = self.will.will(topic, death.payload.encoded(), false);
         let now = Instant::now();
         self.link = Link::Up(Up {
             connection: Connection::open(&self.broker, &self.client_id, will, config),
@@ -306,7 +311,6 @@ impl Client {
             opened: now,
             limits: None,
             subscribed: false,
-            last_packet: now,
             unacknowledged: false,
         });
     }
@@ -342,38 +346,26 @@ impl Client {
     async fn on_event(&mut self, event: ConnectionEvent) {
         let Link::Up(up) = &mut self.link else { return };
         let now = Instant::now();
-        if !matches!(event, ConnectionEvent::Sent(_) | ConnectionEvent::Room) {
-            up.last_packet = now;
-        }
         match event {
             ConnectionEvent::Connected(limits) => {
                 (up.limits, up.opened) = (Some(limits), now);
                 self.bd_seq.accepted();
-                self.session.opened(up.bd_seq);
-                if !up.connection.subscribe(filters(&self.topics, self.broker.commands)) {
-                    self.lost("the subscription could not be sent");
-                }
+                self.session.opened(up.bd_seq, limits.max_packet);
+                self.subscribe();
             }
-            ConnectionEvent::Subscribed(refused) => {
-                up.subscribed = true;
-                self.subscribed(refused);
-            }
+            ConnectionEvent::Subscribed(refused) => self.subscribed(&refused),
+            ConnectionEvent::Refuses(lack) => self.lessen_will(lack, now),
             ConnectionEvent::Acked(_) | ConnectionEvent::Refused(..) => up.unacknowledged = false,
             ConnectionEvent::Message(message) => self.on_message(&message).await,
             ConnectionEvent::Sent(_) | ConnectionEvent::Room | ConnectionEvent::Alive => {}
-            ConnectionEvent::Lost(why) => self.lost(&why),
+            ConnectionEvent::Stuck(why) => self.give_up(why),
+            ConnectionEvent::Lost(why) => drop(self.lost(&why)),
         }
     }
 
-    fn subscribed(&mut self, refused: Vec<Option<String>>) {
-        for (filter, why) in filters(&self.topics, self.broker.commands).iter().zip(refused) {
-            if let Some(why) = why {
-                tracing::error!(
-                    "the broker refuses a Sparkplug subscription ({why}); allow client {} to subscribe to {}",
-                    self.client_id,
-                    filter.path
-                );
-            }
+    fn ready(&mut self, limits: BrokerLimits) {
+        for lost in limits.losses() {
+            tracing::warn!("Sparkplug: the broker {lost}");
         }
         tracing::info!(
             "Sparkplug: connected to the broker at {}:{} as {}",
@@ -385,13 +377,16 @@ impl Client {
         self.session.subscribed();
         if self.session.is_waiting() && !std::mem::replace(&mut self.waits_logged, true) {
             let state = self.topics.state().unwrap_or_default();
-            tracing::info!("Sparkplug: waiting for the primary host to be online ({state})");
+            let old = self.topics.old_state().unwrap_or_default();
+            tracing::info!(
+                "Sparkplug: waiting for the primary host to be online, on {state}, or {old} as in version 2.2"
+            );
         }
     }
 
     async fn on_message(&mut self, message: &Incoming) {
         match self.topics.parse(&message.topic) {
-            Some(Received::State) => match self.session.host_state(&message.payload) {
+            Some(Received::State(form)) => match self.session.host_state(form, &message.payload) {
                 Ok(false) => {}
                 Ok(true) => {
                     tracing::info!("Sparkplug: the primary host is offline; values are kept until it is back");
@@ -407,6 +402,8 @@ impl Client {
 
     fn on_device_command(&mut self, message: &Incoming) {
         match self.topics.parse(&message.topic) {
+            // A retained command was cleared.
+            Some(Received::DeviceCommand(_)) if message.retain && message.payload.is_empty() => {}
             Some(Received::DeviceCommand(device)) if self.broker.commands => {
                 let drives = self.drives.iter().map(|drive| &drive.metrics);
                 let place = drives
@@ -473,7 +470,10 @@ impl Client {
             let message = match self.held.take() {
                 Some(message) => message,
                 None => match self.session.next(tick()) {
-                    Ok(packet) => self.message(packet, false),
+                    Ok(packet) => {
+                        let packet = self.fitted(packet);
+                        self.message(packet, false)
+                    }
                     Err(due) => {
                         self.look_at = self.look_at.min(due.unwrap_or(self.look_at));
                         return;
@@ -513,7 +513,7 @@ impl Client {
             let (topic, most) = (&message.topic, limits.max_packet);
             let why =
                 format!("the broker accepts at most {most} bytes per packet, {topic} needs more; raise its limit");
-            self.lost(&why);
+            self.give_up(&why);
             return false;
         }
         if !connection.publish(message.clone(), *limits) {
@@ -524,7 +524,17 @@ impl Client {
         true
     }
 
-    fn lost(&mut self, why: &str) {
+    /// Ends the connection for this reason, and tells the broker. Its last will, the death of the node, is true once the node was
+    /// born.
+    fn give_up(&mut self, why: &str) {
+        let true_now = self.session.is_alive();
+        if let Link::Up(up) = self.lost(why) {
+            up.connection.give_up(true_now);
+        }
+    }
+
+    /// There is no connection any more; returns what was there.
+    fn lost(&mut self, why: &str) -> Link {
         let now = Instant::now();
         if self.outages.permit(why, now) {
             let (host, port) = (&self.broker.host, self.broker.port);
@@ -536,21 +546,29 @@ impl Client {
         } else {
             tracing::debug!("Sparkplug: no connection to the broker: {why}");
         }
-        self.down(now);
+        if why == CLOSED && self.takeovers.closed(now) {
+            let words = Takeovers::words(&self.client_id);
+            tracing::warn!("Sparkplug: {}:{}: {words}", self.broker.host, self.broker.port);
+        }
+        self.down(now)
     }
 
-    /// Without a connection; the next attempt follows after a while.
-    fn down(&mut self, now: Instant) {
+    /// Without a connection; the next attempt follows after a while. Dropping what is returned aborts its task and closes the
+    /// socket.
+    fn down(&mut self, now: Instant) -> Link {
         let held = match &self.link {
             Link::Up(up) if up.subscribed => now.saturating_duration_since(up.opened),
             _ => Duration::ZERO,
         };
+        if !held.is_zero() {
+            // The next broker, or this one with another configuration, may take more.
+            self.will = WillForm::default();
+        }
         let retry_at = now + self.back_off.after(held);
-        // Dropping the connection aborts its task and closes the socket.
-        self.link = Link::Down { retry_at };
         self.held = None;
         self.session.closed();
         self.look_at = now;
+        std::mem::replace(&mut self.link, Link::Down { retry_at })
     }
 
     /// Declares the node dead and disconnects, within half a second; after that time the broker publishes the last will.
@@ -558,7 +576,7 @@ impl Client {
         if tokio::time::timeout(END, self.disconnect()).await.is_err() {
             tracing::warn!("Sparkplug: the orderly disconnect timed out; the broker publishes the last will");
         }
-        self.down(Instant::now());
+        drop(self.down(Instant::now()));
     }
 
     async fn disconnect(&mut self) {
@@ -584,18 +602,21 @@ impl Client {
                 return;
             }
         }
-        if matches!(&self.link, Link::Up(up) if up.connection.disconnect()) {
+        if matches!(&self.link, Link::Up(Up { connection, limits: Some(limits), .. }) if connection.disconnect(*limits))
+        {
             while !self.is_lost_next().await {}
         }
     }
 
-    /// Waits for the next event of a connection that ends: whether it is lost. The broker counts a command that comes meanwhile as
+    /// Waits for the next event of a connection that ends: whether it is lost, or is to be closed without DISCONNECT. The broker counts a command that comes meanwhile as
     /// delivered, so it is carried out.
     async fn is_lost_next(&mut self) -> bool {
         match next(&mut self.link).await {
             ConnectionEvent::Lost(_) => return true,
             ConnectionEvent::Message(message) => self.on_device_command(&message),
-            ConnectionEvent::Acked(_) | ConnectionEvent::Refused(..) => {
+            // The broker did not take the death of the node: it publishes the last will instead.
+            ConnectionEvent::Refused(..) => return true,
+            ConnectionEvent::Acked(_) => {
                 if let Link::Up(up) = &mut self.link {
                     up.unacknowledged = false;
                 }
@@ -621,19 +642,4 @@ impl Client {
         self.end_connection().await;
         self.stats.mqtt.keep_node_orders(Some(self.orders.leave()));
     }
-}
-
-/// What the node subscribes to: commands for itself, the primary host, commands for its devices.
-fn filters(topics: &Topics, commands: bool) -> Vec<Filter> {
-    let plain = |path| Filter {
-        path,
-        qos: QoS::AtLeastOnce,
-        ..Filter::default()
-    };
-    let mut filters = vec![commanding(topics.node_commands())];
-    filters.extend(topics.state().map(plain));
-    if commands {
-        filters.push(commanding(topics.device_commands()));
-    }
-    filters
 }

@@ -2,6 +2,8 @@
 
 use serde::Deserialize;
 
+use super::topics::StateForm;
+
 /// A STATE message: `{"online": true, "timestamp": 1700000000000}`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 struct State {
@@ -12,23 +14,44 @@ struct State {
 
 /// The primary host as its messages on this connection tell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Host(Option<State>);
+pub(super) struct Host {
+    state: Option<State>,
+    /// It speaks Sparkplug 3.0: a word that an older version left at the broker counts for nothing.
+    has_objects: bool,
+}
 
 impl Host {
+    /// Its state is told anew.
+    pub(super) fn forget(&mut self) {
+        self.state = None;
+    }
+
     /// Takes a STATE message; older ones than the last count for nothing.
     ///
     /// # Errors
     /// Why it is none.
-    pub(super) fn take(&mut self, payload: &[u8]) -> Result<(), String> {
-        let state: State = serde_json::from_slice(payload).map_err(|error| error.to_string())?;
-        if self.0.is_none_or(|last| state.timestamp >= last.timestamp) {
-            self.0 = Some(state);
+    pub(super) fn take(&mut self, form: StateForm, payload: &[u8]) -> Result<(), String> {
+        let state: State = match form {
+            StateForm::Object => serde_json::from_slice(payload).map_err(|error| error.to_string())?,
+            StateForm::Word if self.has_objects => return Ok(()),
+            StateForm::Word => State {
+                online: match payload {
+                    b"ONLINE" => true,
+                    b"OFFLINE" => false,
+                    _ => return Err("it is neither ONLINE nor OFFLINE".to_string()),
+                },
+                timestamp: 0,
+            },
+        };
+        self.has_objects |= form == StateForm::Object;
+        if self.state.is_none_or(|last| state.timestamp >= last.timestamp) {
+            self.state = Some(state);
         }
         Ok(())
     }
 
     pub(super) fn is_online(self) -> bool {
-        self.0.is_some_and(|state| state.online)
+        self.state.is_some_and(|state| state.online)
     }
 }
 
@@ -47,7 +70,7 @@ mod tests {
             (r#"{"online": true, "timestamp": 99}"#, false),
             (r#"{"online": true, "timestamp": 101}"#, true),
         ] {
-            host.take(message.as_bytes()).unwrap();
+            host.take(StateForm::Object, message.as_bytes()).unwrap();
             assert_eq!(host.is_online(), online, "{message}");
         }
         for bad in [
@@ -57,8 +80,26 @@ mod tests {
             r#"{"online": 1, "timestamp": 5}"#,
             r#"{"online": true}"#,
         ] {
-            assert!(host.take(bad.as_bytes()).is_err(), "{bad}");
+            assert!(host.take(StateForm::Object, bad.as_bytes()).is_err(), "{bad}");
         }
         assert!(host.is_online());
+    }
+
+    #[test]
+    fn the_words_of_sparkplug_2_count_until_there_is_an_object() {
+        let mut host = Host::default();
+        for (word, online) in [("ONLINE", true), ("OFFLINE", false), ("ONLINE", true)] {
+            host.take(StateForm::Word, word.as_bytes()).unwrap();
+            assert_eq!(host.is_online(), online, "{word}");
+        }
+        assert!(host.take(StateForm::Word, b"online?").is_err());
+        let object = br#"{"online": false, "timestamp": 5}"#;
+        host.take(StateForm::Object, object).unwrap();
+        assert!(!host.is_online());
+        host.take(StateForm::Word, b"ONLINE").unwrap();
+        assert!(!host.is_online(), "left by an older version");
+        host.forget();
+        host.take(StateForm::Word, b"ONLINE").unwrap();
+        assert!(!host.is_online(), "on the next connection too");
     }
 }

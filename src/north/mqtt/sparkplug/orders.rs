@@ -118,9 +118,11 @@ impl Orders {
             session.metric(place, metric.name.as_deref(), metric.alias)
         });
         let touched = request.metrics();
-        let points = request.points(&drive.image.spec.profile, |metric| {
-            session.definition(place, metric).map(|d| d.name.clone())
-        });
+        let points = request.points(
+            &drive.image.spec.profile,
+            |metric| session.definition(place, metric).map(|d| d.name.clone()),
+            |metric| session.alias(place, metric),
+        );
         let refuse = |refusal, origin| {
             let answer = drive.refuse(&request.what(), refusal, origin, now);
             Some(Finished::of(device, touched.clone(), &answer, None))
@@ -248,7 +250,9 @@ impl Request {
             let why = format!("the command has {count} metrics, {METRICS} are allowed");
             return refused(Refusal::BadValue(why));
         }
-        let placed = |metric: Metric| {
+        let placed = |mut metric: Metric| {
+            // Some hosts send the field empty beside an alias.
+            metric.name = metric.name.filter(|name| !name.is_empty());
             let place = place(&metric);
             (metric, place)
         };
@@ -280,9 +284,24 @@ impl Request {
     }
 
     /// The points that are understood, and why another one is not.
-    fn points(&self, profile: &Profile, name: impl Fn(usize) -> Option<String>) -> Result<Understood, Refusal> {
+    fn points(
+        &self,
+        profile: &Profile,
+        name: impl Fn(usize) -> Option<String>,
+        alias: impl Fn(usize) -> Option<u64>,
+    ) -> Result<Understood, Refusal> {
         let metrics = self.metrics.as_ref().map_err(Clone::clone)?;
         let point = |(metric, place): &(Metric, Option<usize>)| {
+            if let (Some(name), Some(sent), Some(own)) = (&metric.name, metric.alias, place.and_then(&alias))
+                && sent != own
+                && sent != 0
+            {
+                let name = excerpt(name.as_bytes());
+                return Err(Refusal::BadValue(format!(
+                    "the metric {name} has the alias {own}, not {sent}; send the name or the alias, and ask for a birth with \
+                     `Node Control/Rebirth` if the aliases are old"
+                )));
+            }
             let name = match (&metric.name, place.and_then(&name)) {
                 (Some(name), _) => name.clone(),
                 (None, Some(name)) => name,

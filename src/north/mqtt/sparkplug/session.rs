@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::history::Recorder;
 use super::host::Host;
 use super::metric::{Datum, Definition, Naming, Pace, Sample};
-use super::topics::{Kind, Topics};
+use super::topics::{Kind, StateForm, Topics};
 use super::wire::{DataType, Metric, Payload};
 use crate::drive::Quality;
 
@@ -20,6 +20,10 @@ const HISTORY_VALUES: usize = 250;
 const HISTORY_PACE: Duration = Duration::from_millis(25);
 /// Values of an outage that are kept, of all drives together.
 const HISTORY: usize = 200_000;
+/// Bytes of one value in a message of the history, about.
+const HISTORY_BYTES: usize = 100;
+/// Metrics at the beginning of a birth of the node that are no part of its definitions.
+pub(super) const FIXED_METRICS: usize = 2;
 /// The metric by which a host asks for a birth.
 pub(super) const REBIRTH_METRIC: &str = "Node Control/Rebirth";
 
@@ -82,6 +86,8 @@ pub(super) struct Session {
     rebirth: bool,
     born_at: Option<Instant>,
     history_at: Option<Instant>,
+    /// Values in one message of the history.
+    history_values: usize,
     lost: u64,
 }
 
@@ -91,6 +97,8 @@ struct Device {
     name: String,
     definitions: Vec<Definition>,
     namings: Vec<Naming>,
+    /// Number of metrics that are published, the first ones: all, unless the broker takes only smaller packets.
+    most: usize,
     present: bool,
     born: bool,
     /// It went away since its birth, even if it is back.
@@ -112,6 +120,7 @@ impl Device {
             name,
             namings: vec![Naming::Name; definitions.len()],
             sent: vec![None; definitions.len()],
+            most: usize::MAX,
             definitions,
             present: false,
             born: false,
@@ -129,12 +138,20 @@ impl Device {
         names.zip(self.namings.iter().copied()).collect()
     }
 
-    /// All metrics; they count as published at `now`.
-    fn birth(&mut self, now: Instant) -> Vec<Metric> {
-        let all = self.definitions.iter().zip(&self.namings).zip(&self.now_is);
-        let metrics = all.map(|((d, naming), sample)| d.birth(*naming, sample)).collect();
-        self.sent = self.now_is.iter().cloned().map(Some).collect();
-        (self.born, self.gone, self.changed, self.sent_at) = (true, false, false, Some(now));
+    /// All metrics, those that nothing is known of too; they count as published at `now`.
+    fn birth(&mut self, tick: Tick) -> Vec<Metric> {
+        let unknown = Sample {
+            value: None,
+            quality: Quality::Bad,
+            time: tick.millis,
+        };
+        let samples = self.now_is.iter().chain(std::iter::repeat(&unknown));
+        let all = self.definitions.iter().zip(&self.namings).zip(samples);
+        let metrics = all.map(|((d, naming), sample)| d.birth(*naming, sample));
+        let metrics = metrics.take(self.most).collect();
+        let sent = (0..self.definitions.len()).map(|place| self.now_is.get(place).cloned());
+        self.sent = sent.collect();
+        (self.born, self.gone, self.changed, self.sent_at) = (true, false, false, Some(tick.now));
         self.repeat.clear();
         metrics
     }
@@ -148,13 +165,14 @@ impl Device {
             (Some(sample), Some(Some(sent))) => !sent.is_same(sample),
             _ => true,
         };
-        let mut places: Vec<usize> = (0..self.now_is.len()).filter(|place| differs(*place)).collect();
+        let published = self.now_is.len().min(self.most);
+        let mut places: Vec<usize> = (0..published).filter(|place| differs(*place)).collect();
         let figures = |place: &usize| self.definitions.get(*place).is_some_and(|d| d.pace == Pace::Figure);
         let least = match places.iter().all(figures) && self.repeat.is_empty() {
             true => least.max(FIGURES),
             false => least,
         };
-        places.extend(self.repeat.iter().copied());
+        places.extend(self.repeat.iter().copied().filter(|place| *place < published));
         places.sort_unstable();
         places.dedup();
         if places.is_empty() {
@@ -183,7 +201,11 @@ impl Device {
     }
 
     fn history(&mut self, most: usize) -> Vec<Metric> {
+        let published = self.most;
         let metric = |(place, sample): (usize, Sample)| {
+            if place >= published {
+                return None;
+            }
             let mut metric = self
                 .definitions
                 .get(place)?
@@ -211,6 +233,7 @@ impl Session {
             rebirth: false,
             born_at: None,
             history_at: None,
+            history_values: HISTORY_VALUES,
             lost: 0,
         }
     }
@@ -260,11 +283,27 @@ impl Session {
         death(bd_seq, millis)
     }
 
-    /// The broker accepted the connection with this number; the state of the host is told anew.
-    pub(super) fn opened(&mut self, bd_seq: u8) {
+    /// The broker accepted the connection with this number and takes packets of so many bytes; the state of the host is told
+    /// anew.
+    pub(super) fn opened(&mut self, bd_seq: u8, max_packet: usize) {
         self.bd_seq = bd_seq;
-        self.host = Host::default();
+        self.host.forget();
+        self.history_values = (max_packet / HISTORY_BYTES).clamp(1, HISTORY_VALUES);
+        for device in self.devices.iter_mut().chain([&mut self.node]) {
+            device.most = usize::MAX;
+        }
         self.closed();
+    }
+
+    /// Of this device, or of the node, the first metrics are published from now on, so many.
+    pub(super) fn keep(&mut self, device: Option<&str>, most: usize) {
+        let device = match device {
+            None => Some(&mut self.node),
+            Some(name) => self.devices.iter_mut().find(|device| device.name == name),
+        };
+        if let Some(device) = device {
+            device.most = most;
+        }
     }
 
     /// The broker granted the subscriptions.
@@ -305,8 +344,8 @@ impl Session {
     ///
     /// # Errors
     /// Why the message is not understood; nothing changes.
-    pub(super) fn host_state(&mut self, payload: &[u8]) -> Result<bool, String> {
-        self.host.take(payload)?;
+    pub(super) fn host_state(&mut self, form: StateForm, payload: &[u8]) -> Result<bool, String> {
+        self.host.take(form, payload)?;
         match (self.phase, self.host.is_online()) {
             (Phase::Waiting, true) => self.phase = Phase::NodeBirth,
             (Phase::NodeBirth | Phase::DeviceBirths(_) | Phase::Live, false) => return Ok(true),
@@ -362,6 +401,14 @@ impl Session {
             (Some(name), _) => device.definitions.iter().position(|d| d.name == name),
             (None, Some(alias)) => device.namings.iter().position(|n| *n == Naming::Alias(alias)),
             (None, None) => None,
+        }
+    }
+
+    /// The alias of a metric, if it has one.
+    pub(super) fn alias(&self, device: usize, metric: usize) -> Option<u64> {
+        match self.devices.get(device)?.namings.get(metric)? {
+            Naming::Alias(alias) => Some(*alias),
+            Naming::Name => None,
         }
     }
 
@@ -472,7 +519,7 @@ impl Session {
         {
             return Err(Some(due));
         }
-        let (name, metrics) = (device.name.clone(), device.history(HISTORY_VALUES));
+        let (name, metrics) = (device.name.clone(), device.history(self.history_values));
         self.history_at = Some(tick.now);
         Ok(self.packet(Kind::DeviceData, Some(name), metrics, tick))
     }
@@ -498,13 +545,13 @@ impl Session {
             time: tick.millis,
         };
         let mut metrics = vec![number(self.bd_seq, tick.millis), control.birth(Naming::Name, &off)];
-        metrics.extend(self.node.birth(tick.now));
+        metrics.extend(self.node.birth(tick));
         self.packet(Kind::NodeBirth, None, metrics, tick)
     }
 
     fn device_birth(&mut self, place: usize, tick: Tick) -> Option<Packet> {
         let device = self.devices.get_mut(place)?;
-        let (name, metrics) = (device.name.clone(), device.birth(tick.now));
+        let (name, metrics) = (device.name.clone(), device.birth(tick));
         Some(self.packet(Kind::DeviceBirth, Some(name), metrics, tick))
     }
 

@@ -31,11 +31,20 @@ impl Kind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Received<'t> {
     /// The primary host is online or offline.
-    State,
+    State(StateForm),
     /// A command for the node.
     NodeCommand,
     /// A command for this device.
     DeviceCommand(&'t str),
+}
+
+/// The version of Sparkplug in which the primary host tells its state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum StateForm {
+    /// 3.0: `spBv1.0/STATE/{host}`, an object with the time.
+    Object,
+    /// 2.2: `STATE/{host}`, a word.
+    Word,
 }
 
 /// The topics of one edge node.
@@ -79,15 +88,28 @@ impl Topics {
         format!("{NAMESPACE}/{}/DCMD/{}/+", self.group, self.node)
     }
 
+    /// The commands of one device, for a broker that takes no wildcards.
+    pub(super) fn commands_of(&self, device: &str) -> String {
+        format!("{NAMESPACE}/{}/DCMD/{}/{device}", self.group, self.node)
+    }
+
     /// The state of the primary host, if there is one.
     pub(super) fn state(&self) -> Option<String> {
         (!self.primary_host.is_empty()).then(|| format!("{NAMESPACE}/STATE/{}", self.primary_host))
     }
 
+    /// The same in the form of Sparkplug 2.2.
+    pub(super) fn old_state(&self) -> Option<String> {
+        (!self.primary_host.is_empty()).then(|| format!("STATE/{}", self.primary_host))
+    }
+
     /// `None` for topics that were not subscribed to.
     pub(super) fn parse<'t>(&self, topic: &'t str) -> Option<Received<'t>> {
         if self.state().is_some_and(|state| state == topic) {
-            return Some(Received::State);
+            return Some(Received::State(StateForm::Object));
+        }
+        if self.old_state().is_some_and(|state| state == topic) {
+            return Some(Received::State(StateForm::Word));
         }
         if topic == self.node_commands() {
             return Some(Received::NodeCommand);
@@ -108,7 +130,9 @@ mod tests {
         assert_eq!(topics.of(Kind::NodeBirth, None), "spBv1.0/plant/NBIRTH/hall");
         assert_eq!(topics.of(Kind::DeviceDeath, Some("p1")), "spBv1.0/plant/DDEATH/hall/p1");
         for (topic, expected) in [
-            ("spBv1.0/STATE/scada", Some(Received::State)),
+            ("spBv1.0/STATE/scada", Some(Received::State(StateForm::Object))),
+            ("STATE/scada", Some(Received::State(StateForm::Word))),
+            ("STATE/other", None),
             ("spBv1.0/plant/NCMD/hall", Some(Received::NodeCommand)),
             ("spBv1.0/plant/DCMD/hall/p1", Some(Received::DeviceCommand("p1"))),
             ("spBv1.0/plant/DCMD/hall/p1/x", None),

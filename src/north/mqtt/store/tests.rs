@@ -1,3 +1,5 @@
+use super::super::Qos;
+use super::super::outbox::{Delivery, Kind, Outbox};
 use super::*;
 
 fn count() -> LostCount {
@@ -22,6 +24,7 @@ fn stalled() -> (Store, Receiver<Job>, mpsc::Sender<Loaded>, LostCount) {
             lost: lost.clone(),
             jobs,
             bytes: Arc::default(),
+            gone: Arc::default(),
             loaded,
             ended: tokio::sync::oneshot::channel().1,
         }),
@@ -145,4 +148,98 @@ async fn a_directory_that_cannot_be_used_leaves_messages_in_memory() {
     let report = store.next().await;
     assert_eq!(store.take(report).0, [(1, event(0))]);
     assert_eq!(store.push(event(1), true).unwrap().0, Some(2));
+}
+
+/// Waits until the disk has done all that it was told.
+async fn settle(store: &mut Store) {
+    // The second answer comes after the work of the first.
+    for _ in 0..2 {
+        store.disk.as_ref().unwrap().jobs.send(Job::Load(0)).unwrap();
+        let report = store.next().await;
+        store.take(report);
+    }
+}
+
+#[tokio::test]
+async fn of_a_full_buffer_each_message_waits_or_is_counted_over_a_restart() {
+    let dir = tempfile::tempdir().unwrap();
+    let buffer = Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 64 << 10,
+    };
+    let counted = count();
+    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", counted.clone());
+    let report = store.next().await;
+    store.take(report);
+    let mut outbox = Outbox::new(Delivery {
+        telemetry: Qos::AtMostOnce,
+        events: Qos::AtLeastOnce,
+        expiry: None,
+    });
+    // The first 1,024 go to the outbox at once.
+    for n in 0..1240 {
+        let message = Message::not_retained("e", format!("{n:200}").into_bytes());
+        if let Some((number, message)) = store.push(message, outbox.room(Kind::Event) > 0) {
+            outbox.push(Kind::Event, message, number);
+        }
+    }
+    settle(&mut store).await;
+    outbox.drop_gone(Kind::Event, store.gone());
+    let waiting = outbox.events() as u64 + store.waiting();
+    let given_up = lost(&counted) + outbox.take_lost().events;
+    assert!((150..400).contains(&waiting), "{waiting} in 64 KiB");
+    assert_eq!(waiting + given_up, 1240);
+    store.close().await;
+
+    let counted = count();
+    let mut store = Store::open(Some(buffer), "mqtt-events", counted.clone());
+    let report = store.next().await;
+    store.take(report);
+    assert_eq!(store.waiting(), waiting);
+    store.load(usize::MAX);
+    let report = store.next().await;
+    let (messages, _) = store.take(report);
+    let numbers = messages
+        .iter()
+        .map(|(_, message)| String::from_utf8_lossy(&message.payload).trim().to_string());
+    let newest = (1240 - waiting..1240).map(|n| n.to_string());
+    assert!(numbers.eq(newest), "the newest, in order");
+    assert_eq!(lost(&counted), 0, "they were counted before");
+}
+
+#[tokio::test]
+async fn deleted_files_and_topics_are_written_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let buffer = Buffer {
+        dir: dir.path().join("buffer"),
+        max_bytes: 1 << 20,
+    };
+    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", count());
+    store.remember(vec!["a/b".to_string()]);
+    (0..5).for_each(|n| drop(store.push(event(n), false)));
+    let report = store.next().await;
+    store.take(report);
+    settle(&mut store).await;
+    std::fs::remove_dir_all(&buffer.dir).unwrap();
+    store.push(event(5), false);
+    store.close().await;
+    let mut store = Store::open(Some(buffer), "mqtt-events", count());
+    let report = store.next().await;
+    let (_, topics) = store.take(report);
+    assert_eq!((store.waiting(), topics), (6, vec!["a/b".to_string()]));
+}
+
+#[tokio::test]
+async fn a_list_of_topics_that_finds_no_room_leaves_nothing_behind() {
+    let dir = tempfile::tempdir().unwrap();
+    let buffer = Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 1 << 20,
+    };
+    let new = dir.path().join(format!("{MQTT_TOPICS}.new"));
+    std::os::unix::fs::symlink("/dev/full", &new).unwrap();
+    let store = Store::open(Some(buffer), "mqtt-events", count());
+    store.remember(vec!["a/b".to_string()]);
+    store.close().await;
+    assert!(new.symlink_metadata().is_err(), "it would take the room of messages");
 }

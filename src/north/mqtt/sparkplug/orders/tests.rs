@@ -242,3 +242,38 @@ fn a_start_that_came_before_a_stop_and_is_taken_behind_it_is_not_executed() {
     assert_eq!(bench.take(&message(2, run(false)), "p1"), None);
     assert_eq!(bench.take(&start, "p1").unwrap().code, "purged");
 }
+
+#[test]
+fn an_empty_name_counts_for_nothing_and_a_contradiction_is_refused() {
+    let mut bench = bench();
+    let alias = |name: &str| {
+        let place = bench.session.metric(0, Some(name), None).unwrap();
+        bench.session.alias(0, place).unwrap()
+    };
+    let (run, reference) = (alias("run"), alias("speed_reference"));
+    let metric = |name: &str, alias: u64| Metric {
+        alias: Some(alias),
+        ..named(name, MetricValue::Double(40.0))
+    };
+    for (time, name, alias) in [
+        (1, "", reference),
+        (2, "speed_reference", reference),
+        (3, "speed_reference", 0),
+    ] {
+        assert_eq!(
+            bench.take(&message(time, vec![metric(name, alias)]), "p1"),
+            None,
+            "{name} {alias}"
+        );
+        let expected = vec![(bench.index("speed_reference"), Value::Number(40.0))];
+        assert_eq!(bench.pop().unwrap().order, Order::Points(expected));
+    }
+    for wrong in [run, 9999] {
+        let finished = bench
+            .take(&message(4, vec![metric("speed_reference", wrong)]), "p1")
+            .unwrap();
+        assert_eq!(finished.code, "bad_value");
+        assert!(finished.error.contains(&format!("not {wrong}")), "{}", finished.error);
+        assert!(bench.pop().is_none());
+    }
+}

@@ -209,14 +209,14 @@ impl Bench {
 
     fn connect(&mut self, bd_seq: u8) {
         self.host.connect(&self.session.will(bd_seq, self.time));
-        self.session.opened(bd_seq);
+        self.session.opened(bd_seq, usize::MAX);
     }
 
     fn state(&mut self, online: bool, time: u64) -> bool {
         let state = STATE
             .replace("ONLINE", &online.to_string())
             .replace("TIME", &time.to_string());
-        self.session.host_state(state.as_bytes()).unwrap()
+        self.session.host_state(StateForm::Object, state.as_bytes()).unwrap()
     }
 
     /// Sends up to `most` messages that are due; returns how many.
@@ -524,7 +524,7 @@ fn names_replace_aliases_where_they_are_off() {
         1,
     );
     bench.tell(0, true, 1.0);
-    bench.session.opened(0);
+    bench.session.opened(0, usize::MAX);
     bench.session.subscribed();
     let mut names = Vec::new();
     for _ in 0..2 {
@@ -628,4 +628,71 @@ fn a_thousand_connections() {
         }
         assert!(requested > 100 && !bench.host.deaths.is_empty() && !bench.host.past.is_empty());
     }
+}
+
+/// Names and nulls of the metrics of the next message, which is of this kind.
+fn next_metrics(session: &mut Session, kind: Kind, tick: Tick) -> Vec<(String, bool)> {
+    let packet = session.next(tick).unwrap();
+    assert_eq!(packet.kind, kind);
+    let metrics = packet.payload.metrics.into_iter();
+    metrics
+        .map(|metric| (metric.name.unwrap_or_default(), metric.is_null == Some(true)))
+        .collect()
+}
+
+#[test]
+fn births_have_every_metric_though_nothing_is_known_yet() {
+    let mut session = Session::new(live());
+    session.adopt(definitions(&["Bus/line1/state", "Bus/line1/load"]), vec![]);
+    session.opened(0, usize::MAX);
+    session.subscribed();
+    let (now, millis) = (Instant::now(), 7);
+    let metrics = next_metrics(&mut session, Kind::NodeBirth, Tick { now, millis });
+    let expected = [
+        ("bdSeq", false),
+        (REBIRTH_METRIC, false),
+        ("Bus/line1/state", true),
+        ("Bus/line1/load", true),
+    ];
+    assert_eq!(metrics, expected.map(|(name, null)| (name.to_string(), null)));
+    session.tell_node(vec![sample(1.0, 8), sample(2.0, 8)]);
+    let later = Tick {
+        now: now + Duration::from_secs(2),
+        millis: 8,
+    };
+    let metrics = next_metrics(&mut session, Kind::NodeData, later);
+    assert_eq!(metrics.len(), 2, "what becomes known is told");
+}
+
+#[test]
+fn what_was_left_out_of_a_birth_is_in_no_data() {
+    let mut session = Session::new(live());
+    let names = ["a", "b", "c"];
+    session.adopt(vec![], vec![("p1".to_string(), definitions(&names))]);
+    session.opened(0, 1000);
+    session.subscribed();
+    let start = Instant::now();
+    let at = |s: u64| Tick {
+        now: start + Duration::from_secs(s),
+        millis: s * 1000,
+    };
+    let tell = |session: &mut Session, number: f64| {
+        let samples = (0..3).map(|_| sample(number, 1)).collect();
+        session.tell(0, true, samples, start);
+    };
+    tell(&mut session, 1.0);
+    next_metrics(&mut session, Kind::NodeBirth, at(0));
+    assert_eq!(next_metrics(&mut session, Kind::DeviceBirth, at(0)).len(), 3);
+    session.keep(Some("p1"), 2);
+    tell(&mut session, 2.0);
+    session.repeat(0, [2]);
+    assert_eq!(next_metrics(&mut session, Kind::DeviceData, at(10)).len(), 2);
+    assert!(session.next(at(20)).is_err());
+    session.request_birth();
+    next_metrics(&mut session, Kind::NodeBirth, at(30));
+    assert_eq!(next_metrics(&mut session, Kind::DeviceBirth, at(30)).len(), 2);
+    session.opened(1, usize::MAX);
+    session.subscribed();
+    next_metrics(&mut session, Kind::NodeBirth, at(40));
+    assert_eq!(next_metrics(&mut session, Kind::DeviceBirth, at(40)).len(), 3);
 }

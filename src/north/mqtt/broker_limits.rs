@@ -1,0 +1,120 @@
+//! What the broker can do: by its CONNACK, and by what it refused. No I/O.
+
+use rumqttc::mqttbytes::QoS;
+use rumqttc::{ConnAck, LastWill};
+
+use super::connection::INFLIGHT;
+
+/// What the broker can do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct BrokerLimits {
+    /// Number of unacknowledged messages.
+    pub(super) window: usize,
+    /// Maximum packet size, bytes.
+    pub(super) max_packet: usize,
+    /// Whether it acknowledges messages (QoS 1).
+    pub(super) acknowledges: bool,
+    /// Whether it keeps retained messages.
+    pub(super) retains: bool,
+    /// Whether it takes filters with `+` and `#`.
+    pub(super) wildcards: bool,
+    /// Number of topic aliases.
+    pub(super) aliases: u16,
+    /// The keep-alive interval that it set in place of ours, s.
+    pub(super) keep_alive: Option<u16>,
+}
+
+impl BrokerLimits {
+    pub(super) fn of(ack: &ConnAck) -> BrokerLimits {
+        let properties = ack.properties.as_ref();
+        let window = properties.and_then(|p| p.receive_max).unwrap_or(u16::MAX).min(INFLIGHT);
+        let max_packet = properties.and_then(|p| p.max_packet_size).unwrap_or(u32::MAX);
+        let wildcards = properties.and_then(|p| p.wildcard_subscription_available);
+        BrokerLimits {
+            window: usize::from(window).max(1),
+            max_packet: usize::try_from(max_packet).unwrap_or(usize::MAX),
+            acknowledges: properties.and_then(|p| p.max_qos) != Some(0),
+            retains: properties.and_then(|p| p.retain_available) != Some(0),
+            wildcards: wildcards != Some(0),
+            aliases: properties.and_then(|p| p.topic_alias_max).unwrap_or_default(),
+            keep_alive: properties.and_then(|p| p.server_keep_alive),
+        }
+    }
+
+    /// What is lost with a broker that lacks something; each is the rest of a sentence about it.
+    pub(super) fn losses(&self) -> Vec<&'static str> {
+        let all = [
+            (
+                self.acknowledges,
+                "has no QoS 1: events and results that are under way when a connection breaks are lost",
+            ),
+            (
+                self.retains,
+                "keeps no retained messages: who subscribes later sees no status, and each value only when it \
+                 is published again",
+            ),
+            (
+                self.wildcards,
+                "takes no filters with wildcards: the gateway subscribes drive by drive, and commands for \
+                 unknown drives or points get no answer",
+            ),
+        ];
+        all.into_iter().filter(|(has, _)| !has).map(|(_, lost)| lost).collect()
+    }
+}
+
+/// For what a broker refuses a last will.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Lack {
+    /// It has no QoS 1.
+    Acknowledgements,
+    /// It keeps no retained messages.
+    Retained,
+}
+
+/// In which form the broker takes the last will: it is part of the CONNECT, before the broker tells what it can do.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct WillForm {
+    unacknowledged: bool,
+    not_retained: bool,
+}
+
+impl WillForm {
+    /// The broker refused the connection for that; whether there is a lesser form to try.
+    pub(super) fn lessen(&mut self, lack: Lack) -> bool {
+        let given_up = match lack {
+            Lack::Acknowledgements => &mut self.unacknowledged,
+            Lack::Retained => &mut self.not_retained,
+        };
+        !std::mem::replace(given_up, true)
+    }
+
+    /// The last will in this form.
+    pub(super) fn will(self, topic: String, payload: impl Into<Vec<u8>>, retain: bool) -> LastWill {
+        let qos = match self.unacknowledged {
+            true => QoS::AtMostOnce,
+            false => QoS::AtLeastOnce,
+        };
+        LastWill::new(topic, payload, qos, retain && !self.not_retained, None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_will_is_lessened_step_by_step_and_only_once_each() {
+        let mut form = WillForm::default();
+        let shape = |form: WillForm| {
+            let will = form.will("t".to_string(), "offline", true);
+            (will.qos, will.retain)
+        };
+        assert_eq!(shape(form), (QoS::AtLeastOnce, true));
+        assert!(form.lessen(Lack::Acknowledgements));
+        assert_eq!(shape(form), (QoS::AtMostOnce, true));
+        assert!(form.lessen(Lack::Retained));
+        assert_eq!(shape(form), (QoS::AtMostOnce, false));
+        assert!(!form.lessen(Lack::Retained) && !form.lessen(Lack::Acknowledgements));
+    }
+}

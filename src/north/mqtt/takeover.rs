@@ -1,0 +1,59 @@
+//! Connections that the broker closes without a reason, again and again, as it does when two clients have one client id. Time
+//! is an argument.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+/// So many of them within so long are told.
+const CLOSED: usize = 3;
+const WITHIN: Duration = Duration::from_secs(60);
+/// Minimum time between two lines about it.
+const AGAIN: Duration = Duration::from_secs(600);
+
+/// The last connections that the broker accepted and then closed without a reason.
+#[derive(Debug, Default)]
+pub(super) struct Takeovers {
+    closed: VecDeque<Instant>,
+    told: Option<Instant>,
+}
+
+impl Takeovers {
+    /// The broker closed an accepted connection without a reason; whether to say what that looks like.
+    pub(super) fn closed(&mut self, now: Instant) -> bool {
+        self.closed.push_back(now);
+        self.closed.retain(|at| now.saturating_duration_since(*at) < WITHIN);
+        let recent = |at: Instant| now.saturating_duration_since(at) < AGAIN;
+        if self.closed.len() < CLOSED || self.told.is_some_and(recent) {
+            return false;
+        }
+        self.closed.clear();
+        self.told = Some(now);
+        true
+    }
+
+    /// What it looks like, and the remedy.
+    pub(super) fn words(client_id: &str) -> String {
+        format!(
+            "the broker closed {CLOSED} connections within a minute without giving a reason; this is what it looks like when another \
+             client uses the client id `{client_id}`, too: each takes the connection from the other; give each gateway a name or a \
+             `client_id` of its own"
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_third_within_a_minute_is_told_once_in_ten() {
+        let (start, mut takeovers) = (Instant::now(), Takeovers::default());
+        let mut closed = |seconds: u64| takeovers.closed(start + Duration::from_secs(seconds));
+        assert_eq!([0, 40, 65, 101].map(&mut closed), [false; 4], "two within a minute");
+        assert!(closed(102));
+        assert_eq!((103..700).filter(|s| closed(*s)).count(), 0);
+        assert_eq!((700..720).filter(|s| closed(*s)).collect::<Vec<_>>(), [702]);
+        // A broker that is restarted now and then.
+        assert_eq!((10..100).filter(|n| closed(n * 100)).count(), 0);
+    }
+}
