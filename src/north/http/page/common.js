@@ -1,6 +1,8 @@
 // What all views share: elements, figures, ages, and values with their quality. Texts reach the page as text nodes
 // only, never as markup.
 
+import { t } from "./texts.js";
+
 const OLDER_MS = 500;
 
 export const $ = (id) => document.getElementById(id);
@@ -205,16 +207,27 @@ export function showValue(cell, point, newest) {
 
 /// The share of the speed range, and the reference beside it. A value that is not good has no bar.
 export function speedBar() {
-  const bar = { fill: make("i"), reference: make("span", "sub") };
+  const bar = { fill: make("i"), direction: make("span", "sub direction"), reference: make("span", "sub") };
   bar.element = make("span", "bar", bar.fill);
   return bar;
 }
 
-export function showSpeed(bar, point, reference) {
+export function showSpeed(bar, point, points) {
   hide(bar.element, !point);
   const good = isGood(point) && !point.contradicted;
   fill(bar.fill, good ? point.value / 100 : 0);
-  text(bar.reference, isGood(reference) ? `set ${figure(reference.value, reference.unit)} %` : "");
+  text(bar.direction, directionOf(points));
+  const reference = points.speed_reference;
+  text(bar.reference, isGood(reference) ? t("set {value}", { value: `${figure(reference.value, reference.unit)} %` }) : "");
+}
+
+/// The direction in words.
+export const directionWord = (isReverse) => (isReverse ? t("reverse") : t("forward"));
+
+/// The way that a drive turns, or would, with a sign; empty where it is not known.
+export function directionOf({ reversed }) {
+  if (!isGood(reversed) || reversed.contradicted) return "";
+  return `${reversed.value ? "←" : "→"} ${directionWord(reversed.value)}`;
 }
 
 // ---- Lists

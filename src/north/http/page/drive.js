@@ -95,7 +95,7 @@ function figures() {
     const cell = { point, ...valueCell("dd", "") };
     if (point === "actual_speed") {
       cell.bar = speedBar();
-      cell.element.append(cell.bar.element, cell.bar.reference);
+      cell.element.append(cell.bar.element, cell.bar.direction, cell.bar.reference);
     }
     cell.box = make("div", "", make("dt", "", titleOf(point)), cell.element);
     element.append(cell.box);
@@ -108,7 +108,7 @@ function figures() {
         const point = drive.points[cell.point];
         hide(cell.box, !point);
         showValue(cell, point, drive.age_ms);
-        if (cell.bar) showSpeed(cell.bar, point, drive.points.speed_reference);
+        if (cell.bar) showSpeed(cell.bar, point, drive.points);
       }
     },
   };

@@ -33,13 +33,13 @@ pub(in crate::north::http) const ASSETS: &[Asset] = assets! {
     "image/svg+xml": "icon.svg";
     "text/css; charset=utf-8": "operate.css", "style.css", "views.css";
     "text/javascript; charset=utf-8":
-        "common.js", "drive.js", "events.js", "gateway.js", "lines.js", "operate.js", "overview.js", "page.js", "plot.js",
-        "recording.js", "strips.js", "trend.js";
+        "common.js", "controls.js", "de.js", "drive.js", "events.js", "gateway.js", "lines.js", "operate.js", "overview.js",
+        "page.js", "plot.js", "recording.js", "session.js", "stops.js", "strips.js", "texts.js", "trend.js";
 };
 
 /// What the document has in its head for the operating part; its script comes before the page's.
 const OPERATE_HEAD: &str = "<link rel=\"stylesheet\" href=\"assets/operate.css\">\n\
-    <script src=\"assets/operate.js\" defer></script>";
+    <script src=\"assets/operate.js\" type=\"module\"></script>";
 
 /// Only this server's own files, no inline code, no forms.
 pub(in crate::north::http) const SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \

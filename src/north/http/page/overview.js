@@ -1,7 +1,7 @@
 // All drives: faults first, then warnings, then by name.
 
 import {
-  anchor, arrange, badge, blockedOf, className, faultOf, age, hide, isOn, keyed, make, places, showSpeed, showValue, speedBar,
+  anchor, arrange, badge, blockedOf, className, directionOf, faultOf, age, hide, isOn, keyed, make, places, showSpeed, showValue, speedBar,
   stateOf, text, titleOf, valueCell, words,
 } from "./common.js";
 import { eventList } from "./events.js";
@@ -12,7 +12,7 @@ const COLUMNS = [["actual_speed", "mid"], ["output_frequency", "all"], ["motor_s
   ["motor_torque", "mid"], ["motor_power", "far"], ["dc_link_voltage", "far"], ["heatsink_temperature", "far"]];
 
 // With 1,000 drives the rest of their points would be most of what the gateway sends.
-const POINTS = [...COLUMNS.map(([point]) => point), "speed_reference", "warning", "fault_code"];
+const POINTS = [...COLUMNS.map(([point]) => point), "speed_reference", "frequency_reference", "reverse", "reversed", "warning", "fault_code"];
 const EVENTS_SHOWN = 12;
 
 // Tiles: the words beside the count, which drives it counts, and its colour where there are any.
@@ -64,8 +64,10 @@ export function driveRow({ name }) {
     entry.element.setAttribute("role", "cell");
     if (point === "actual_speed") {
       entry.bar = speedBar();
-      entry.element.append(entry.bar.element, entry.bar.reference);
+      entry.element.append(entry.bar.element, entry.bar.direction, entry.bar.reference);
     }
+    // On a phone the frequency stands for the speed.
+    if (point === "output_frequency") entry.element.append((row.direction = make("span", "sub direction narrow")));
     row.cells.push(entry);
     row.element.append(entry.element);
   }
@@ -93,8 +95,9 @@ export function showDrive(row, drive) {
   for (const entry of row.cells) {
     const point = drive.points[entry.point];
     showValue(entry, point, drive.age_ms);
-    if (entry.bar) showSpeed(entry.bar, point, drive.points.speed_reference);
+    if (entry.bar) showSpeed(entry.bar, point, drive.points);
   }
+  text(row.direction, directionOf(drive.points));
   text(row.age, age(drive.age_ms));
   text(row.quality, drive.quality === "good" ? "" : drive.quality);
   className(row.quality, `tag ${drive.quality === "good" ? "" : "grey"}`);

@@ -2,7 +2,7 @@
 // that every drive, line and recording has a link of its own.
 
 import { $, make, text } from "./common.js";
-import { answered, begin, load, Refused, watch } from "./gateway.js";
+import { answered, begin, load, Refused, unanswered, watch } from "./gateway.js";
 import * as drive from "./drive.js";
 import * as events from "./events.js";
 import * as lines from "./lines.js";
@@ -84,6 +84,7 @@ async function tick() {
     answered();
   } catch (error) {
     if (error instanceof Refused) answered();
+    else unanswered();
     if (error instanceof Refused && asked === view) refused(error);
     else console.warn("cannot read the gateway:", error);
   }

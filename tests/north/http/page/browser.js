@@ -5,7 +5,7 @@ const os = require("node:os");
 const path = require("node:path");
 const { spawn } = require("node:child_process");
 
-const PATIENCE_MS = 120000;
+const PATIENCE_MS = Number(process.env.PATIENCE_MS ?? 120000);
 const FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
   "--disable-component-update", "--disable-sync", "--hide-scrollbars", "--force-color-profile=srgb", "--remote-debugging-pipe"];
 const KEYS = { Tab: 9, Enter: 13, Home: 36, End: 35, ArrowLeft: 37, ArrowRight: 39 };

@@ -115,7 +115,7 @@ async function connectionIsLostAndFound(gateway, page) {
   await page.until(() => document.querySelector(".rows .row"));
   gateway.silent = true;
   await page.until(() => document.body.classList.contains("lost"));
-  const seen = await page.eval(() => [document.getElementById("link-text").textContent, document.getElementById("banner").textContent, getComputedStyle(document.getElementById("live")).filter,
+  const seen = await page.eval(() => [document.getElementById("link-text").textContent, document.getElementById("banner").textContent, getComputedStyle(document.querySelector(".rows .row .state")).filter,
     getComputedStyle(document.querySelector(".rows .value")).textDecorationLine]);
   assert.equal(seen[0], "Connection lost");
   assert.match(seen[1], /^No connection to the gateway since .*\. What is shown below is old/);
