@@ -231,10 +231,10 @@ async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Res
         .iter()
         .filter_map(|value| value.to_str().ok())
         .collect();
-    let format = metrics::Format::accepted(&accept.join(","));
+    let (format, content_type) = metrics::Format::accepted(&accept.join(","));
     match metrics::encode(&app.plant.load(), &app.stats, Instant::now(), format) {
         Ok(text) => {
-            let headers = [(header::CONTENT_TYPE, format.content_type()), (header::VARY, "accept")];
+            let headers = [(header::CONTENT_TYPE, content_type), (header::VARY, "accept")];
             (headers, text).into_response()
         }
         Err(error) => {
