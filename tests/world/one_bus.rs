@@ -420,7 +420,7 @@ fn a_garbled_answer_is_told_apart_from_silence() {
 }
 
 #[test]
-fn a_drive_that_nothing_stops_is_told_each_time_it_comes() {
+fn a_drive_that_nothing_stops_is_told_once() {
     /// Parameter P2.7.22 of the drive.
     const FIELDBUS_FAULT_RESPONSE: u16 = 733;
     for (access, lease, response, wanted) in [

@@ -1,7 +1,7 @@
 // The controls of one drive: stop, start and direction, reference, reset.
 
 import { directionWord, hide, make, text } from "./common.js";
-import { numberOf, plain, t } from "./texts.js";
+import { numberOf, plain, t, unitOf } from "./texts.js";
 
 const isGood = (point) => point !== undefined && point.quality === "good" && point.value !== null;
 
@@ -21,9 +21,10 @@ function referenceOf(about) {
 
 const hasReverse = (about) => Boolean(about?.points.some((point) => point.name === "reverse"));
 
-const figureOf = (value, unit) => `${plain(Math.round(value * 100) / 100)} ${unit}`;
+const figureOf = (value, unit) => `${plain(value)} ${unitOf(unit)}`;
 
-function limits({ minimum, maximum, unit }) {
+function limits({ minimum, maximum, unit: name }) {
+  const unit = unitOf(name);
   if (minimum === null && maximum === null) return "";
   if (minimum === null) return t("up to {maximum} {unit}", { maximum: plain(maximum), unit });
   if (maximum === null) return t("from {minimum} {unit}", { minimum: plain(minimum), unit });
@@ -33,7 +34,7 @@ function limits({ minimum, maximum, unit }) {
 /// The reference that stands in the drive, in words.
 function standingReference({ points }) {
   const point = [points.speed_reference, points.frequency_reference].find(isGood);
-  return point ? figureOf(point.value, point.unit) : t("reference not known");
+  return point ? figureOf(Math.round(point.value * 100) / 100, point.unit) : t("reference not known");
 }
 
 /// The direction that the drive has been ordered, else the one that it shows: true for reverse.
@@ -70,7 +71,7 @@ function buildReference(panel, name, { command, tell, known }) {
 function reading(typed, point) {
   const value = numberOf(typed);
   if (value === null) return { point, problem: t("write a number {limits}", { limits: limits(point) }).trim() };
-  const words = `${plain(value)} ${point.unit}`;
+  const words = figureOf(value, point.unit);
   const outside = (point.minimum !== null && value < point.minimum) || (point.maximum !== null && value > point.maximum);
   return { point, value, words, problem: outside ? t("{value} is not {limits}", { value: words, limits: limits(point) }) : "" };
 }
@@ -166,7 +167,7 @@ function show(panel, name, drive) {
   hide(panel.reference, !point);
   if (point) {
     text(panel.label, point.name === "speed_reference" ? t("Speed reference") : t("Frequency reference"));
-    text(panel.unit, point.unit);
+    text(panel.unit, unitOf(point.unit));
     text(panel.range, limits(point));
   }
   hide(panel.reset, json.state !== "fault");

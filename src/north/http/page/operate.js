@@ -12,7 +12,7 @@ import { clock, text } from "./common.js";
 import { build } from "./controls.js";
 import { check, isLoggedIn, onSession, post } from "./session.js";
 import { notStopped, stopped } from "./stops.js";
-import { t } from "./texts.js";
+import { t, wordsOf } from "./texts.js";
 
 const ACTIVE_MS = 120000;
 const WARN_MS = 90000;
@@ -64,7 +64,7 @@ function words(status, json) {
   const ms = (value) => `${Math.round(value)} ms`;
   if (json.result === "confirmed") return t("confirmed: the drive shows it, after {time}", { time: ms(json.confirmed_ms) });
   if (json.result === "acknowledged") return t("acknowledged by the drive after {time}", { time: ms(json.latency_ms) }) + `; ${json.note || t("no read has shown its effect yet")}`;
-  if (json.error && json.error.message) return `${json.error.code.replaceAll("_", " ")}: ${json.error.message}`;
+  if (json.error && json.error.message) return `${wordsOf(json.error.code)}: ${json.error.message}`;
   return json.error || t("The gateway answered {status}.", { status });
 }
 

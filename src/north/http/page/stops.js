@@ -7,8 +7,8 @@ const open = new Map();
 
 /// How sure it is that the drive was not stopped, in words.
 const TITLES = {
-  refused: "{drive} was not stopped",
-  unknown: "{drive} may not have stopped",
+  refused: (drive) => t("{drive} was not stopped", { drive }),
+  unknown: (drive) => t("{drive} may not have stopped", { drive }),
 };
 
 function build(drive) {
@@ -39,7 +39,7 @@ export function notStopped(drive, certainty, why, tries = "") {
   }
   Object.assign(alert, { certainty, ended: false });
   className(alert.element, "not-stopped");
-  text(alert.title, `■ ${t(TITLES[certainty], { drive })}.`);
+  text(alert.title, `■ ${TITLES[certainty](drive)}.`);
   text(alert.why, why);
   text(alert.tries, tries);
 }

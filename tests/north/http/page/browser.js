@@ -52,7 +52,7 @@ class Browser {
   }
 
   /// A page of that width; it shows nothing yet.
-  async page({ width = 1400, height = 900, dark = false, calm = true } = {}) {
+  async page({ width = 1400, height = 900, dark = false, calm = true, language = "en-US" } = {}) {
     const { targetId } = await this.send("Target.createTarget", { url: "about:blank" });
     const { sessionId } = await this.send("Target.attachToTarget", { targetId, flatten: true });
     const page = new Page(this, sessionId, targetId);
@@ -60,6 +60,7 @@ class Browser {
     await page.send("Runtime.enable");
     await page.send("Log.enable");
     await page.send("Emulation.setDeviceMetricsOverride", { width, height, deviceScaleFactor: 1, mobile: width < 600 });
+    await page.send("Emulation.setUserAgentOverride", { userAgent: "test", acceptLanguage: language });
     const features = [["prefers-color-scheme", dark ? "dark" : "light"], ["prefers-reduced-motion", calm ? "reduce" : "no-preference"]];
     await page.send("Emulation.setEmulatedMedia", { features: features.map(([name, value]) => ({ name, value })) });
     return page;
