@@ -242,7 +242,9 @@ async function rowsKeepTheFocus(gateway, page) {
 }
 
 /// The language of the browser, its decimals and its units; texts of the gateway stay as they are.
-async function pageSpeaksTheLanguageOfTheBrowser(gateway, _, browser) {
+async function pageSpeaksTheLanguageOfTheBrowser(gateway, first, browser) {
+  await first.open("about:blank");
+  await first.until(() => location.href === "about:blank");
   const page = await browser.page({ language: "de-AT,de,en" });
   gateway.drives = [drive("pump-1", { state: "running", points: { actual_speed: point(62.5, { unit: "%" }), motor_speed: point(1290, { unit: "rpm" }), reversed: point(true) } })];
   gateway.events = [{ id: 2, boot: 1, time: "2026-03-02T07:40:12.118Z", event: "fault_end", bus: "line1", drive: "pump-1", text: "the fault of drive pump-1 is gone" }];
