@@ -70,10 +70,11 @@ function buildReference(panel, name, { command, tell, known }) {
 /// What was typed as a value of the point, in words, and what is wrong with it.
 function reading(typed, point) {
   const value = numberOf(typed);
-  if (value === null) return { point, problem: t("write a number {limits}", { limits: limits(point) }).trim() };
+  const allowed = limits(point);
+  if (value === null) return { point, problem: allowed ? t("write a number {limits}", { limits: allowed }) : t("write a number") };
   const words = figureOf(value, point.unit);
   const outside = (point.minimum !== null && value < point.minimum) || (point.maximum !== null && value > point.maximum);
-  return { point, value, words, problem: outside ? t("{value} is not {limits}", { value: words, limits: limits(point) }) : "" };
+  return { point, value, words, problem: outside ? t("{value} is not {limits}", { value: words, limits: allowed }) : "" };
 }
 
 // ---- Start and direction
@@ -104,6 +105,8 @@ function buildQuestion(panel, name, { command, known }) {
     const { json } = known(name);
     panel.asking = kind;
     panel.directions[orderedReverse(json) ? 1 : 0].checked = true;
+    // Whatever becomes of the drive meanwhile: what was asked is what is done.
+    panel.target = !orderedReverse(json);
     panel.ask();
     for (const each of [panel.start, panel.turn]) hide(each, true);
     hide(panel.question, false);
@@ -119,11 +122,10 @@ function buildQuestion(panel, name, { command, known }) {
   panel.ask = () => ask(panel, name, known(name));
 }
 
-/// Writes the question as things stand: direction and reference may change while it is asked.
+/// Writes the question; the reference may change while it is asked.
 function ask(panel, name, { json, about }) {
   const starts = panel.asking === "start";
-  const turned = !orderedReverse(json);
-  const isReverse = starts ? panel.directions[1].checked : turned;
+  const isReverse = starts ? panel.directions[1].checked : panel.target;
   const told = { drive: name, direction: directionWord(isReverse), reference: standingReference(json) };
   hide(panel.choice, !starts || !hasReverse(about));
   if (!starts) {

@@ -240,6 +240,7 @@ const texts = {
   "up to {time}": "bis {time}",
   "warning": "Warnung",
   "warnings": "Warnungen",
+  "write a number": "eine Zahl eingeben",
   "write a number {limits}": "eine Zahl eingeben, {limits}",
   "yes": "ja",
   "{age} ago": "vor {age}",
