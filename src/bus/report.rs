@@ -40,13 +40,22 @@ pub(super) struct Report {
     faults: Vec<Option<i64>>,
     /// What else was reported of each drive, in the order of [`WATCHED`].
     watched: Vec<[Watched; WATCHED.len()]>,
-    /// Drives whose own response to a silent master was looked at since they came online.
-    looked_at: Vec<bool>,
+    /// What is known of each drive's own response to a silent master.
+    responses: Vec<Response>,
     /// What is wrong with the line.
     pub(super) diagnosis: LineDiagnosis,
     up: bool,
     /// It was reported that the bus is down, and it is still.
     down_reported: bool,
+}
+
+/// What is known of a drive's own response to a silent master.
+#[derive(Debug, Clone, Copy, Default)]
+struct Response {
+    /// Since it came online.
+    looked_at: bool,
+    /// That it has none.
+    told: bool,
 }
 
 impl Report {
@@ -66,7 +75,7 @@ impl Report {
             writes,
             window: now,
             busy: Duration::ZERO,
-            looked_at: vec![false; faults.len()],
+            responses: vec![Response::default(); faults.len()],
             watched: vec![[Watched::default(); WATCHED.len()]; faults.len()],
             faults,
             up: false,
@@ -321,8 +330,8 @@ impl Report {
     fn online(&mut self, index: usize) {
         let Some(drive) = self.drive(index) else { return };
         drive.update(|s| s.link = Link::Online(SystemTime::now()));
-        if let Some(looked_at) = self.looked_at.get_mut(index) {
-            *looked_at = false;
+        if let Some(response) = self.responses.get_mut(index) {
+            response.looked_at = false;
         }
         self.drive_event(index, EventKind::Online, None, |name| format!("drive {name} answers"));
     }
@@ -381,17 +390,23 @@ impl Report {
         );
     }
 
-    /// Reports, once each time it comes online, a controlled drive that does not respond to a silent master.
+    /// Reports a controlled drive that does not respond to a silent master: once, and again only if it did in between.
     fn look_at_own_response(&mut self, index: usize, now: Instant) {
-        let (Some(drive), Some(looked_at)) = (self.image.drives.get(index), self.looked_at.get_mut(index)) else {
+        let (Some(drive), Some(known)) = (self.image.drives.get(index), self.responses.get_mut(index)) else {
             return;
         };
-        if *looked_at || drive.spec.access != Access::Control {
+        if known.looked_at || drive.spec.access != Access::Control {
             return;
         }
         let response = own_response(&drive.reading(now, RECENT));
-        *looked_at = response != OwnResponse::Unknown;
-        let OwnResponse::Off(point) = response else { return };
+        known.looked_at = response != OwnResponse::Unknown;
+        let OwnResponse::Off(point) = response else {
+            known.told &= response == OwnResponse::Unknown;
+            return;
+        };
+        if std::mem::replace(&mut known.told, true) {
+            return;
+        }
         if drive.spec.supervision.is_some() {
             tracing::warn!(
                 bus = %self.image.spec.name, drive = %drive.spec.name,

@@ -349,7 +349,10 @@ impl Writer {
                         shared.entries = self.store.entries().to_vec();
                         *shared.made.entry(entry.trigger).or_default() += 1;
                     }
-                    let text = format!("recording {}: {}", entry.id, entry.summary);
+                    let text = match entry.trigger.has_event() {
+                        true => format!("recording {}", entry.id),
+                        false => format!("recording {}: {}", entry.id, entry.summary),
+                    };
                     let made = RecordingMade {
                         id: entry.id.clone(),
                         trigger: entry.trigger.name().into(),

@@ -53,6 +53,18 @@ impl TriggerKind {
         TriggerKind::Command,
     ];
 
+    /// Whether what it records is an event of its own, which tells the cause.
+    pub fn has_event(self) -> bool {
+        match self {
+            TriggerKind::Fault
+            | TriggerKind::Warning
+            | TriggerKind::Lost
+            | TriggerKind::Supervision
+            | TriggerKind::NotConfirmed => true,
+            TriggerKind::RefusedStop | TriggerKind::LineErrors | TriggerKind::Point | TriggerKind::Command => false,
+        }
+    }
+
     /// The name in payloads and labels.
     pub fn name(self) -> &'static str {
         match self {

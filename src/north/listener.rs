@@ -1,27 +1,26 @@
 //! The listeners of a TCP server: binds the sockets, accepts connections and starts a task for each. At a reload new
-//! sockets are bound before old ones are closed, and a listener that stays keeps its socket and its connections.
+//! sockets are bound before old ones are closed, and a listener that stays keeps its socket and its connections. A server that
+//! starts goes on without an address that the machine does not have yet, and listens on it once it has.
+
+mod accept;
+mod state;
 
 use std::future::Future;
 use std::io;
 use std::net::{IpAddr, SocketAddr};
-use std::os::fd::AsFd;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
-use rustix::net::{Shutdown, shutdown};
-use tokio::net::{TcpListener, TcpStream};
+use rustix::io::Errno;
+use tokio::net::TcpStream;
 use tokio::runtime::Handle;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::log_throttle::LogThrottle;
 use super::{NorthStats, ServerError, ServerKind};
 
-/// Pause after an accept error of the machine: the usual one, too many open files, does not go away at once.
-const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
-/// First and longest pause before a lost socket is bound again.
-const REBIND: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
+use self::accept::{AcceptLoop, ListeningSocket, stop_listening};
+pub use self::state::ListenerStates;
 
 /// What a server does with the connections to one of its listeners.
 pub(super) trait ConnectionHandler: Send + Sync + 'static {
@@ -87,11 +86,30 @@ struct OpenListener<H> {
     stopped: Option<JoinHandle<()>>,
 }
 
+/// Where a listener of a new configuration has its socket from.
+#[derive(Debug)]
+enum Socket {
+    /// It is the open listener's.
+    Open,
+    New(std::net::TcpListener),
+    /// There is none yet: the machine does not have the address.
+    Missing(io::Error),
+}
+
+impl Socket {
+    fn bound(&self) -> Option<&std::net::TcpListener> {
+        match self {
+            Socket::New(socket) => Some(socket),
+            Socket::Open | Socket::Missing(_) => None,
+        }
+    }
+}
+
 /// Sockets for a new configuration, bound but not accepting yet.
 #[derive(Debug, Default)]
 pub(super) struct NewSockets {
-    /// In the order of the configuration; without a socket: that of the open listener.
-    wanted: Vec<(ListenerSpec, Option<std::net::TcpListener>)>,
+    /// In the order of the configuration.
+    wanted: Vec<(ListenerSpec, Socket)>,
     /// Indices of open listeners whose sockets were closed because a new one overlaps them.
     released: Vec<usize>,
 }
@@ -122,11 +140,15 @@ impl<H: ConnectionHandler> Listeners<H> {
     /// Binds the sockets that are missing. What is open goes on, with one exception: a socket that is no longer wanted is
     /// closed early if a new one overlaps it, because the system does not allow both at one time.
     ///
+    /// A server that starts takes an address that the machine does not have yet: it comes with its interface, and whoever reads
+    /// drives until then is served. In a reload such an address is an error: it would take the place of one that works.
+    ///
     /// # Errors
     /// The first address that cannot be bound; everything is open as before.
     pub(super) async fn prepare(&mut self, wanted: Vec<ListenerSpec>) -> Result<NewSockets, ServerError> {
         let mut kept = vec![false; self.open.len()];
         let mut missing = Vec::new();
+        let starts = self.open.is_empty();
         let mut new = NewSockets::default();
         for (place, spec) in wanted.into_iter().enumerate() {
             let mut running = self.open.iter().zip(&mut kept);
@@ -134,7 +156,7 @@ impl<H: ConnectionHandler> Listeners<H> {
                 Some((_, kept)) => *kept = true,
                 None => missing.push(place),
             }
-            new.wanted.push((spec, None));
+            new.wanted.push((spec, Socket::Open));
         }
         for place in missing {
             let Some(spec) = new.wanted.get(place).map(|(spec, _)| spec.clone()) else {
@@ -146,10 +168,10 @@ impl<H: ConnectionHandler> Listeners<H> {
             {
                 socket = bind(spec.address);
             }
-            match (socket, new.wanted.get_mut(place)) {
-                (Ok(socket), Some((_, free))) => *free = Some(socket),
-                (Ok(_), None) => {}
-                (Err(cause), _) => {
+            let socket = match socket {
+                Ok(socket) => Socket::New(socket),
+                Err(cause) if starts && may_come(&cause) => Socket::Missing(cause),
+                Err(cause) => {
                     self.abort(new);
                     return Err(ServerError::Listen {
                         protocol: self.server.title(),
@@ -158,6 +180,9 @@ impl<H: ConnectionHandler> Listeners<H> {
                         cause,
                     });
                 }
+            };
+            if let Some((_, place)) = new.wanted.get_mut(place) {
+                *place = socket;
             }
         }
         Ok(new)
@@ -182,7 +207,7 @@ impl<H: ConnectionHandler> Listeners<H> {
 
     /// Closes the new sockets. A listener whose socket was closed for them binds it again, now or as soon as it can.
     pub(super) fn abort(&mut self, new: NewSockets) {
-        for socket in new.wanted.iter().filter_map(|(_, socket)| socket.as_ref()) {
+        for socket in new.wanted.iter().filter_map(|(_, socket)| socket.bound()) {
             stop_listening(socket);
         }
         drop(new.wanted);
@@ -191,7 +216,7 @@ impl<H: ConnectionHandler> Listeners<H> {
                 continue;
             };
             listener.stop = self.cancel.child_token();
-            let socket = bind(listener.bound).ok();
+            let socket = bind(listener.bound);
             self.accept(&mut listener, socket);
             self.open.insert(index, listener);
         }
@@ -207,18 +232,23 @@ impl<H: ConnectionHandler> Listeners<H> {
     ) {
         let mut before = std::mem::take(&mut self.open);
         for (spec, socket) in new.wanted {
-            let Some(socket) = socket else {
-                if let Some(index) = before.iter().position(|open| open.spec.shares_socket(&spec)) {
-                    let mut listener = before.remove(index);
-                    (listener.handler, _) = handler(&spec, Some(&listener.handler), &listener.cancel);
-                    listener.spec = spec;
-                    self.open.push(listener);
+            let socket = match socket {
+                Socket::New(socket) => Ok(socket),
+                Socket::Missing(cause) => Err(cause),
+                Socket::Open => {
+                    if let Some(index) = before.iter().position(|open| open.spec.shares_socket(&spec)) {
+                        let mut listener = before.remove(index);
+                        (listener.handler, _) = handler(&spec, Some(&listener.handler), &listener.cancel);
+                        listener.spec = spec;
+                        self.open.push(listener);
+                    }
+                    continue;
                 }
-                continue;
             };
             let cancel = self.cancel.child_token();
             let (handler, runtime) = handler(&spec, None, &cancel);
-            let bound = socket.local_addr().unwrap_or(spec.address);
+            let address = socket.as_ref().ok().and_then(|socket| socket.local_addr().ok());
+            let bound = address.unwrap_or(spec.address);
             let mut listener = OpenListener {
                 spec,
                 bound,
@@ -228,8 +258,15 @@ impl<H: ConnectionHandler> Listeners<H> {
                 stop: self.cancel.child_token(),
                 stopped: None,
             };
-            tracing::info!(address = %bound, tls = listener.spec.tls, "{}: listening", self.server.title());
-            self.accept(&mut listener, Some(socket));
+            let (server, tls) = (self.server.title(), listener.spec.tls);
+            match &socket {
+                Ok(_) => tracing::info!(address = %bound, tls, "{server}: listening"),
+                Err(why) => tracing::error!(
+                    address = %bound,
+                    "{server}: not listening: {why}; the drives are polled, and the address is tried again until the machine has it"
+                ),
+            }
+            self.accept(&mut listener, socket);
             self.open.push(listener);
         }
         for listener in before {
@@ -253,18 +290,20 @@ impl<H: ConnectionHandler> Listeners<H> {
     }
 
     /// Starts the accept loop of a listener; without a socket, it binds one as soon as it can.
-    fn accept(&self, listener: &mut OpenListener<H>, socket: Option<std::net::TcpListener>) {
+    fn accept(&self, listener: &mut OpenListener<H>, socket: io::Result<std::net::TcpListener>) {
+        let state = self.stats.listeners.add(self.server, listener.bound);
+        state.set(socket.as_ref().err().map(io::Error::to_string));
         let accept = AcceptLoop {
             server: self.server,
             address: listener.bound,
             handler: listener.handler.clone(),
-            stats: self.stats.clone(),
+            state,
             tasks: self.tasks.clone(),
             stop: listener.stop.clone(),
         };
         let run = async move {
             // A socket belongs to the runtime that this runs on.
-            let first = socket.and_then(|socket| ListeningSocket::new(socket).ok());
+            let first = socket.ok().and_then(|socket| ListeningSocket::new(socket).ok());
             let address = accept.address;
             accept.run(first, move || ListeningSocket::new(bind(address)?)).await;
         };
@@ -272,142 +311,16 @@ impl<H: ConnectionHandler> Listeners<H> {
     }
 }
 
+/// Whether an address that cannot be bound for this reason may come with its interface.
+fn may_come(cause: &io::Error) -> bool {
+    cause.kind() == io::ErrorKind::AddrNotAvailable || cause.raw_os_error() == Some(Errno::NODEV.raw_os_error())
+}
+
 /// A socket that listens; not bound to a runtime yet.
 fn bind(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     let socket = std::net::TcpListener::bind(address)?;
     socket.set_nonblocking(true)?;
     Ok(socket)
-}
-
-/// Frees the address of a socket that is about to be closed, also while a copy of the socket is open: a process that
-/// was forked has one until it executes its program.
-fn stop_listening(socket: &impl AsFd) {
-    // It fails for a socket that is lost, which listens no longer.
-    let _ = shutdown(socket, Shutdown::Both);
-}
-
-/// Accepts the connections to one socket.
-struct AcceptLoop<H> {
-    server: ServerKind,
-    address: SocketAddr,
-    handler: Arc<H>,
-    stats: Arc<NorthStats>,
-    /// Where the connections run.
-    tasks: TaskTracker,
-    stop: CancellationToken,
-}
-
-impl<H: ConnectionHandler> AcceptLoop<H> {
-    /// Accepts until stopped, whatever errors the system reports. A socket that is lost, or missing at first, is bound
-    /// again with back-off; meanwhile the gateway is not ready.
-    async fn run<A: Accept>(self, mut socket: Option<A>, bind: impl Fn() -> io::Result<A> + Send) {
-        let accept = async {
-            loop {
-                let open = match socket.take() {
-                    Some(socket) => socket,
-                    None => self.rebind(&bind).await,
-                };
-                let why = self.accept(open).await;
-                let (server, address) = (self.server, self.address);
-                tracing::error!(%address, "{}: the listener is lost: {why}; binding it again", server.title());
-                self.stats.lost_listeners.set(server, address, Some(why.to_string()));
-            }
-        };
-        self.stop.run_until_cancelled(accept).await;
-        self.stats.lost_listeners.set(self.server, self.address, None);
-    }
-
-    async fn rebind<A>(&self, bind: &impl Fn() -> io::Result<A>) -> A {
-        let (server, address) = (self.server, self.address);
-        let (mut pause, longest) = REBIND;
-        loop {
-            match bind() {
-                Ok(socket) => {
-                    tracing::info!(%address, "{}: listening again", server.title());
-                    self.stats.lost_listeners.set(server, address, None);
-                    return socket;
-                }
-                Err(why) => self.stats.lost_listeners.set(server, address, Some(why.to_string())),
-            }
-            tokio::time::sleep(pause).await;
-            pause = (2 * pause).min(longest);
-        }
-    }
-
-    /// Accepts until the socket is lost; why.
-    async fn accept(&self, mut socket: impl Accept) -> io::Error {
-        let log = LogThrottle::default();
-        loop {
-            match socket.accept().await {
-                Ok((stream, peer)) => {
-                    self.admit(stream, peer);
-                    // Connections that yielded to this one close before the next comes.
-                    tokio::task::yield_now().await;
-                }
-                Err(error) if concerns_one_client(&error) => {}
-                Err(error) if is_lost(&error) => return error,
-                Err(error) => {
-                    if let Some(suppressed) = log.permit(Instant::now()) {
-                        let server = self.server.title();
-                        tracing::warn!(suppressed, "{server}: cannot accept a connection: {error}; retrying");
-                    }
-                    tokio::time::sleep(ACCEPT_PAUSE).await;
-                }
-            }
-        }
-    }
-
-    fn admit(&self, stream: TcpStream, peer: SocketAddr) {
-        // A listener on [::] sees IPv4 clients as ::ffff:a.b.c.d.
-        let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
-        if let Some(permit) = self.handler.admit(peer.ip()) {
-            self.tasks.spawn(self.handler.clone().serve(stream, peer, permit));
-        }
-    }
-}
-
-/// A socket that accepts connections.
-trait Accept: Send {
-    /// The next connection; cancel safe.
-    fn accept(&mut self) -> impl Future<Output = io::Result<(TcpStream, SocketAddr)>> + Send;
-}
-
-/// Listens until it is dropped.
-struct ListeningSocket(TcpListener);
-
-impl ListeningSocket {
-    fn new(socket: std::net::TcpListener) -> io::Result<ListeningSocket> {
-        TcpListener::from_std(socket).map(ListeningSocket)
-    }
-}
-
-impl Drop for ListeningSocket {
-    fn drop(&mut self) {
-        stop_listening(&self.0);
-    }
-}
-
-impl Accept for ListeningSocket {
-    fn accept(&mut self) -> impl Future<Output = io::Result<(TcpStream, SocketAddr)>> + Send {
-        self.0.accept()
-    }
-}
-
-/// Errors of a connection that ended before it was accepted (accept(2)).
-fn concerns_one_client(error: &io::Error) -> bool {
-    matches!(
-        error.kind(),
-        io::ErrorKind::ConnectionAborted | io::ErrorKind::ConnectionReset | io::ErrorKind::Interrupted
-    )
-}
-
-/// Errors of a socket that does not listen any more (accept(2)).
-fn is_lost(error: &io::Error) -> bool {
-    use rustix::io::Errno;
-    let lost = [Errno::INVAL, Errno::BADF, Errno::NOTSOCK, Errno::OPNOTSUPP];
-    error
-        .raw_os_error()
-        .is_some_and(|code| lost.iter().any(|lost| lost.raw_os_error() == code))
 }
 
 #[cfg(test)]

@@ -26,9 +26,10 @@ use std::net::SocketAddr;
 
 pub(crate) use identity::client_tls;
 pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
+pub use listener::ListenerStates;
 pub use stats::{
-    ConnectionRefusal, LostListeners, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats,
-    ServerKind, SlotOutcome, SlotStats,
+    ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats, ServerKind,
+    SlotOutcome, SlotStats,
 };
 
 /// Why a server cannot start.

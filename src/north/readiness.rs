@@ -21,6 +21,6 @@ pub(crate) fn reasons(plant: &Plant, stats: &NorthStats) -> Vec<String> {
             }
         }
     }
-    reasons.extend(stats.lost_listeners.reasons());
+    reasons.extend(stats.listeners.reasons());
     reasons
 }

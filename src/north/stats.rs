@@ -1,7 +1,6 @@
 //! Counters of the north sides, for the metrics.
 
 use std::collections::BTreeMap;
-use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::SystemTime;
@@ -10,6 +9,7 @@ use tokio::sync::broadcast::Receiver;
 
 use super::command_json::SharedMemory;
 use super::http::PostedCommands;
+use super::listener::ListenerStates;
 use super::mqtt::{NodeOrdersLeft, OrdersLeft};
 use crate::event::Event;
 
@@ -24,8 +24,8 @@ pub struct NorthStats {
     pub slots: SlotStats,
     /// Refused connections of all servers.
     pub refused: RefusalStats,
-    /// Listeners that do not work.
-    pub lost_listeners: LostListeners,
+    /// The listeners of all servers, and whether they listen.
+    pub listeners: Arc<ListenerStates>,
     /// The last time the configuration was read.
     pub reload: ReloadStats,
     /// Commands that came by way of the broker in the last minutes, and their results as payloads.
@@ -158,31 +158,6 @@ impl RefusalStats {
         ConnectionRefusal::ALL
             .into_iter()
             .zip(row.map(|c| c.load(Ordering::Relaxed)))
-    }
-}
-
-/// Listeners whose socket is lost, by server and address, with the reason.
-#[derive(Debug, Default)]
-pub struct LostListeners(Mutex<BTreeMap<(&'static str, SocketAddr), String>>);
-
-impl LostListeners {
-    /// The listener of `server` at `address` is lost for this reason, or works again.
-    pub(crate) fn set(&self, server: ServerKind, address: SocketAddr, reason: Option<String>) {
-        let mut lost = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let key = (server.title(), address);
-        match reason {
-            Some(reason) => drop(lost.insert(key, reason)),
-            None => drop(lost.remove(&key)),
-        }
-    }
-
-    /// One line per lost listener.
-    pub fn reasons(&self) -> Vec<String> {
-        let lost = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let line = |((server, address), why): (&(&str, SocketAddr), &String)| {
-            format!("{server} does not listen on {address}: {why}; retrying")
-        };
-        lost.iter().map(line).collect()
     }
 }
 

@@ -7,6 +7,7 @@ use serde_json::Value;
 
 use crate::support::process::{Running, drivegate, get, point, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, drive};
+use crate::support::tools::{run_well, tool};
 
 /// A gateway that records a drive for a second before and after.
 fn start(recordings: &str) -> (Site, Running, SimulatedBus) {
@@ -69,6 +70,22 @@ fn a_recording_by_command_is_listed_shown_and_exported() {
     let capture = site.path("frames.pcapng");
     printed(&site, &["recordings", "export", &id, "--pcap", "--output", &capture]);
     assert_eq!(fs::read(&capture).unwrap()[..4], [0x0A, 0x0D, 0x0D, 0x0A]);
+    // The same files over HTTP, with a name.
+    assert_eq!(
+        get(site.http, &format!("/api/v1/recordings/{id}?format=csv")).unwrap(),
+        (200, csv)
+    );
+    let url = format!("http://localhost:{}/api/v1/recordings/{id}?format=pcap", site.http);
+    let file = site.path("over-http.pcapng");
+    let headers = run_well(&tool("curl"), &["-sS", "-D", "-", "-o", &file, &url]);
+    assert!(
+        headers.contains(&format!("attachment; filename=\"{id}.pcapng\"")),
+        "{headers}"
+    );
+    assert_eq!(fs::read(&file).unwrap(), fs::read(&capture).unwrap());
+    let (status, refused) = get(site.http, &format!("/api/v1/recordings/{id}?format=xml")).unwrap();
+    assert_eq!(status, 400);
+    assert!(refused.contains("it is `json`, `csv` or `pcap`"), "{refused}");
     site.until_metric("drivegate_recordings_total{trigger=\"command\"} 1");
     // A file that is cut short is told of, with the place.
     let file = site.file("state/recordings").join(format!("{id}.dgrec"));
@@ -105,5 +122,13 @@ fn a_fault_makes_a_recording_and_a_directory_that_cannot_be_written_costs_that_o
     assert_eq!(entry["trigger"], "fault");
     let summary = entry["summary"].as_str().unwrap();
     assert!(summary.starts_with("fault 2: "), "{summary}");
-    gateway.until_printed(summary);
+    // The fault told its cause already.
+    let made = format!("recording {}", entry["id"].as_str().unwrap());
+    let log = until("the event", || {
+        let (_, events) = get(site.http, "/api/v1/events/log?kind=recording").expect("an answer");
+        events.contains(&made).then_some(events)
+    });
+    let events: Value = serde_json::from_str(&log).unwrap();
+    assert_eq!(events[0]["text"], made.as_str());
+    assert_eq!(events[0]["recording"]["summary"], summary);
 }

@@ -144,6 +144,34 @@ fn a_port_that_is_not_there_is_waited_for() {
     until("values", || mbpoll_read(site.modbus, 1, 2100, 11).ok());
 }
 
+/// The address of an interface that comes up after the gateway.
+#[test]
+fn an_address_that_is_not_there_keeps_no_drive_from_being_polled() {
+    let site = site("");
+    let _line = site.line(&[1]);
+    let [here, nowhere] = ["127.0.0.1", "203.0.113.1"].map(|host| format!("\"{host}:{}\"", site.modbus));
+    site.change(&here, &nowhere);
+    let gateway = site.run();
+    let log = gateway.until_printed("Modbus TCP: not listening: Cannot assign requested address");
+    assert!(log.contains("the drives are polled"), "{log}");
+    until("the drive", || {
+        (api(site.http, "pump-1")["online"] == true).then_some(())
+    });
+    let (status, reasons) = get(site.http, "/readyz").unwrap();
+    assert_eq!(status, 503);
+    assert!(
+        reasons.contains("Modbus TCP does not listen on 203.0.113.1"),
+        "{reasons}"
+    );
+    site.until_metric("drivegate_listener_up{server=\"modbus_tcp\"} 0");
+    site.until_metric("drivegate_listener_up{server=\"http\"} 1");
+    site.change(&nowhere, &here);
+    gateway.signal("HUP");
+    until_ready(site.http);
+    site.until_metric("drivegate_listener_up{server=\"modbus_tcp\"} 1");
+    until("values", || mbpoll_read(site.modbus, 1, 2100, 11).ok());
+}
+
 #[test]
 fn a_reload_that_cannot_listen_changes_nothing() {
     let site = site("");

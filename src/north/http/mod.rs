@@ -15,6 +15,7 @@ mod operating;
 mod page;
 mod params;
 mod query;
+mod recordings;
 mod routes;
 mod streams;
 mod terms;

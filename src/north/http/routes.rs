@@ -19,8 +19,9 @@ use tokio_util::sync::CancellationToken;
 use super::access::{Access, AccessError};
 use super::operating::{self, Cookies, Operating};
 use super::params::Parameters;
-use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, line, page, query, streams, trend};
-use crate::history::export;
+use super::{
+    Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, line, page, query, recordings, streams, trend,
+};
 use crate::north::connection_limit::{ConnectionLimit, Limits, Place};
 use crate::north::log_throttle::LogThrottle;
 use crate::north::{NorthStats, metrics, readiness};
@@ -39,7 +40,7 @@ pub(super) struct AppState {
     /// and `/healthz` does not wait for it.
     rendering: Semaphore,
     /// The permit for reading a recording: what waits for the disk holds up nothing else.
-    files: Semaphore,
+    pub(super) files: Semaphore,
     pub(super) operating: Arc<Operating>,
 }
 
@@ -107,8 +108,8 @@ pub(super) fn router(
         .route("/api/v1/buses/{name}", get(line::bus))
         .route("/api/v1/buses/{name}/diagnosis", get(diagnosis))
         .route("/api/v1/audit", get(audit))
-        .route("/api/v1/recordings", get(recordings))
-        .route("/api/v1/recordings/{id}", get(recording))
+        .route("/api/v1/recordings", get(recordings::list))
+        .route("/api/v1/recordings/{id}", get(recordings::one))
         .route("/api/v1/events", get(streams::events))
         .route("/api/v1/events/log", get(event_log::log))
         .route("/api/v1/trace", get(streams::trace))
@@ -231,10 +232,10 @@ async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Res
         .iter()
         .filter_map(|value| value.to_str().ok())
         .collect();
-    let format = metrics::Format::accepted(&accept.join(","));
+    let (format, content_type) = metrics::Format::accepted(&accept.join(","));
     match metrics::encode(&app.plant.load(), &app.stats, Instant::now(), format) {
         Ok(text) => {
-            let headers = [(header::CONTENT_TYPE, format.content_type()), (header::VARY, "accept")];
+            let headers = [(header::CONTENT_TYPE, content_type), (header::VARY, "accept")];
             (headers, text).into_response()
         }
         Err(error) => {
@@ -357,39 +358,6 @@ async fn audit(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> R
     let records = plant.writes.audit().recent(drive.as_deref());
     let list = format!("[{}]", records.join(","));
     ([(header::CONTENT_TYPE, "application/json")], list).into_response()
-}
-
-/// The recordings, oldest first.
-async fn recordings(State(app): State<Arc<AppState>>) -> Response {
-    let _turn = app.turn().await;
-    let entries = app.plant.load().recordings.list();
-    Json(entries.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
-}
-
-/// One recording with all its samples and frames.
-async fn recording(State(app): State<Arc<AppState>>, Path(id): Path<String>) -> Response {
-    let recordings = app.plant.load().recordings.clone();
-    // Files are read and converted away from the tasks of other clients, one at a time.
-    let Ok(_permit) = app.files.acquire().await else {
-        return StatusCode::SERVICE_UNAVAILABLE.into_response();
-    };
-    let wanted = id.clone();
-    let read = tokio::task::spawn_blocking(move || {
-        let read = recordings.read(&wanted);
-        read.map(|read| read.map(|recording| export::json(&recording)))
-    });
-    match read.await {
-        Ok(Some(Ok(json))) => ([(header::CONTENT_TYPE, "application/json")], json).into_response(),
-        Ok(Some(Err(error))) => {
-            let error = api::ErrorReply {
-                error: error.to_string(),
-                known: Vec::new(),
-            };
-            (StatusCode::INTERNAL_SERVER_ERROR, Json(error)).into_response()
-        }
-        Ok(None) => not_found(format!("there is no recording `{id}`"), Vec::new()),
-        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
-    }
 }
 
 async fn unknown(uri: Uri) -> Response {

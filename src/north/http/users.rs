@@ -19,6 +19,10 @@ const PASSES: u32 = 3;
 const MOST_COST: (u32, u32, u32) = (64 * 1024, 16, 4);
 /// Bytes of a salt.
 const SALT: usize = 16;
+/// How the hashes of a new user begin.
+const COST: &str = "$argon2id$v=19$m=12288,t=3,p=1$";
+/// Salt and hash of nobody, behind the cost: no password is known for it, it only takes its time.
+const NOBODY: &str = "bm9ib2R5bm9ib2R5bm9ibw$0000000000000000000000000000000000000000000";
 /// Least number of characters of a password.
 pub const MIN_PASSWORD: usize = 10;
 /// Most bytes of a password.
@@ -99,6 +103,12 @@ pub(super) fn is_password(hash: &str, password: &str) -> bool {
     Argon2::default().verify_password(password.as_bytes(), &hash).is_ok()
 }
 
+/// The part of a hash that says how it is computed: name, version and parameters of the function.
+fn cost(hash: &str) -> &str {
+    let end = hash.match_indices('$').nth(3).map(|(at, _)| at);
+    end.and_then(|end| hash.get(..=end)).unwrap_or_default()
+}
+
 /// Whether that is a hash that may be computed.
 fn is_affordable(hash: &str) -> bool {
     let Ok(hash) = PasswordHash::new(hash) else {
@@ -176,6 +186,21 @@ impl Users {
         &self.0
     }
 
+    /// The hash behind which the password of that name has to be, if there is such a user, and hashes whose password nobody knows:
+    /// all together there is one of each cost that the file has. So the comparison takes as long for every name, known or not,
+    /// whatever the hashes of the file cost.
+    pub(super) fn hashes(&self, name: &str) -> (Option<&str>, Vec<String>) {
+        let own = self.find(name).map(User::hash);
+        let mut costs: Vec<&str> = self.0.iter().map(|user| cost(user.hash())).collect();
+        if costs.is_empty() {
+            costs.push(COST);
+        }
+        costs.sort_unstable();
+        costs.dedup();
+        costs.retain(|other| own.is_none_or(|own| cost(own) != *other));
+        (own, costs.into_iter().map(|cost| format!("{cost}{NOBODY}")).collect())
+    }
+
     /// The user of that name.
     pub(super) fn find(&self, name: &str) -> Option<&User> {
         self.0.iter().find(|user| user.name == name)
@@ -218,6 +243,41 @@ mod tests {
         ] {
             assert_eq!(User::new(name, password), Err(error), "{name} {password}");
         }
+    }
+
+    #[test]
+    fn every_name_costs_the_same() {
+        let with = |parameters: &str| FOREIGN.replace("m=65536,t=2,p=1", parameters);
+        let [cheap, other] = ["m=64,t=1,p=1", "m=128,t=2,p=1"].map(with);
+        let text = format!("alice {FOREIGN}\nbob {cheap}\ncarol {other}\ndave {cheap}\n");
+        let users = Users::parse(&text).unwrap();
+        let costs = |name: &str| {
+            let (own, others) = users.hashes(name);
+            assert!(
+                others
+                    .iter()
+                    .all(|hash| is_affordable(hash) && !is_password(hash, "password"))
+            );
+            let all = own.into_iter().chain(others.iter().map(String::as_str));
+            let mut costs: Vec<String> = all.map(|hash| cost(hash).to_string()).collect();
+            costs.sort();
+            costs
+        };
+        let nobody = costs("nobody");
+        assert_eq!(nobody.len(), 3, "one of each: {nobody:?}");
+        for known in ["alice", "bob", "carol", "dave"] {
+            assert_eq!(costs(known), nobody, "{known}");
+            assert!(is_password(users.hashes(known).0.unwrap(), "password") == (known == "alice"));
+        }
+        let none = Users::default();
+        let (own, others) = none.hashes("nobody");
+        let [only] = &others[..] else { panic!("{others:?}") };
+        let new = User::new("alice", "correct horse").unwrap();
+        assert_eq!(
+            (own, cost(only)),
+            (None, cost(new.hash())),
+            "also while there is no user"
+        );
     }
 
     #[test]

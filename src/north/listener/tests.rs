@@ -1,10 +1,13 @@
 use std::collections::VecDeque;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU16, Ordering};
+use std::time::{Duration, Instant};
 
 use tokio::io::AsyncReadExt;
+use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 
+use super::accept::Accept;
 use super::*;
 
 /// Fails a number of times, then accepts.
@@ -73,7 +76,7 @@ impl Bench {
             server: ServerKind::Http,
             address,
             handler: self.handler.clone(),
-            stats: self.stats.clone(),
+            state: self.stats.listeners.add(ServerKind::Http, address),
             tasks: TaskTracker::new(),
             stop: self.stop.clone(),
         }
@@ -133,14 +136,14 @@ async fn a_lost_socket_is_bound_again_and_reported_meanwhile() {
     let rebind = {
         let (stats, seen) = (stats.clone(), seen.clone());
         move || {
-            seen.lock().unwrap().extend(stats.lost_listeners.reasons());
+            seen.lock().unwrap().extend(stats.listeners.reasons());
             attempts.lock().unwrap().pop_front().unwrap()
         }
     };
     let server = tokio::spawn(bench.accept_loop(address).run(Some(first), rebind));
     let _client = TcpStream::connect(address).await.unwrap();
     assert_eq!(bench.next().await, "served");
-    assert_eq!(stats.lost_listeners.reasons(), Vec::<String>::new());
+    assert_eq!(stats.listeners.reasons(), Vec::<String>::new());
     let seen = std::mem::take(&mut *seen.lock().unwrap());
     assert_eq!(seen.len(), 3, "{seen:?}");
     assert!(
@@ -150,6 +153,54 @@ async fn a_lost_socket_is_bound_again_and_reported_meanwhile() {
     assert!(seen[2].contains("in use"), "{seen:?}");
     bench.stop.cancel();
     server.await.unwrap();
+}
+
+/// A server that starts: it has the listeners that there can be, and the others when their addresses come.
+#[tokio::test]
+async fn an_address_that_is_not_there_yet_is_tried_again_and_an_error_in_a_reload() {
+    let mut bench = Bench::new();
+    let (mut listeners, handler) = (bench.listeners(), bench.handler.clone());
+    let (here, nowhere) = (free_address(), SocketAddr::from(([203, 0, 113, 1], 7999)));
+    let states = bench.stats.listeners.clone();
+    reload(&mut listeners, &handler, &[nowhere, here]).await.unwrap();
+    assert_eq!(listeners.addresses(false), [nowhere, here]);
+    let reason = format!("HTTP does not listen on {nowhere}: Cannot assign requested address (os error 99); retrying");
+    assert_eq!(states.reasons(), [reason]);
+    assert_eq!(states.up(), [(ServerKind::Http, false)]);
+    let _client = TcpStream::connect(here).await.unwrap();
+    assert_eq!(bench.next().await, "served", "the other listener serves");
+    let elsewhere = SocketAddr::from(([203, 0, 113, 2], 7999));
+    let refused = reload(&mut listeners, &handler, &[nowhere, elsewhere]).await;
+    assert!(refused.unwrap_err().to_string().contains("does not have that address"));
+    assert_eq!(listeners.addresses(false), [nowhere, here], "nothing has changed");
+    reload(&mut listeners, &handler, &[here]).await.unwrap();
+    while !states.reasons().is_empty() {
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(states.up(), [(ServerKind::Http, true)]);
+    bench.stop.cancel();
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_address_that_comes_is_listened_on() {
+    let mut bench = Bench::new();
+    let socket = bind("127.0.0.1:0".parse().unwrap()).unwrap();
+    let address = socket.local_addr().unwrap();
+    let not_yet = || Err(io::Error::from(io::ErrorKind::AddrNotAvailable));
+    let come = Failing(Vec::new(), TcpListener::from_std(socket).unwrap());
+    let attempts = Mutex::new(VecDeque::from([not_yet(), not_yet(), Ok(come)]));
+    let server = bench.accept_loop(address);
+    let server = tokio::spawn(server.run(None, move || attempts.lock().unwrap().pop_front().unwrap()));
+    let states = bench.stats.listeners.clone();
+    while states.up() == [(ServerKind::Http, true)] {
+        tokio::task::yield_now().await;
+    }
+    let _client = TcpStream::connect(address).await.unwrap();
+    assert_eq!(bench.next().await, "served");
+    assert_eq!(states.up(), [(ServerKind::Http, true)]);
+    bench.stop.cancel();
+    server.await.unwrap();
+    assert_eq!(states.up(), [], "a server that ended has no listener");
 }
 
 /// Listens on these addresses from now on.
@@ -239,13 +290,13 @@ async fn an_address_is_free_as_soon_as_its_listener_is_closed() {
             ..specs(&[address]).remove(0)
         };
         let new = listeners.prepare(vec![spec]).await.unwrap();
-        copies.extend(new.wanted[0].1.as_ref().map(|socket| socket.try_clone().unwrap()));
+        copies.extend(new.wanted[0].1.bound().map(|socket| socket.try_clone().unwrap()));
         listeners.commit(new, |_, _, _| (handler.clone(), Handle::current()));
         TcpStream::connect(address).await.unwrap();
     }
     assert_eq!(copies.len(), 3, "each has a socket of its own");
     let new = listeners.prepare(specs(&[address, other])).await.unwrap();
-    copies.extend(new.wanted[1].1.as_ref().map(|socket| socket.try_clone().unwrap()));
+    copies.extend(new.wanted[1].1.bound().map(|socket| socket.try_clone().unwrap()));
     listeners.abort(new);
     bind(other).unwrap();
     bench.stop.cancel();

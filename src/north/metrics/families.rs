@@ -454,6 +454,15 @@ fn north(stats: &NorthStats, all: &mut Families) {
         let labels = Labels::default().with_both(("bus", bus.into()), ("outcome", outcome.name().into()));
         all.add(tools, labels, SeriesValue::Count(count));
     }
+    let listener_up = all.family(
+        Kind::Gauge,
+        "drivegate_listener_up",
+        "Whether all addresses of a server are listened on: 1; 0 while one of them is not, which /readyz names.",
+    );
+    for (server, up) in stats.listeners.up() {
+        let labels = Labels::of([("server", server.name())]);
+        all.add(listener_up, labels, flag(up));
+    }
     let refused = all.family(
         Kind::Counter,
         "drivegate_connections_refused_total",

@@ -31,44 +31,64 @@ pub enum Format {
     OpenMetrics,
 }
 
-impl Format {
-    /// The format for an `Accept` header: OpenMetrics if the client names and prefers it.
-    pub(crate) fn accepted(accept: &str) -> Format {
-        let quality = |wanted: &[&str]| {
-            accept
-                .split(',')
-                .filter_map(|range| weight(range, wanted))
-                .fold(0.0, f64::max)
-        };
-        let open_metrics = quality(&["application/openmetrics-text"]);
-        if open_metrics > 0.0 && open_metrics >= quality(&["text/plain", "text/*"]) {
-            Format::OpenMetrics
-        } else {
-            Format::Prometheus
-        }
-    }
+/// The content types, with the versions of OpenMetrics that can be asked for: their texts are the same.
+const TYPES: [(Format, &str, &str); 3] = [
+    (
+        Format::OpenMetrics,
+        "1.0.0",
+        "application/openmetrics-text; version=1.0.0; charset=utf-8",
+    ),
+    (
+        Format::OpenMetrics,
+        "0.0.1",
+        "application/openmetrics-text; version=0.0.1; charset=utf-8",
+    ),
+    (Format::Prometheus, "0.0.4", "text/plain; version=0.0.4; charset=utf-8"),
+];
 
-    /// The content type.
-    pub(crate) fn content_type(self) -> &'static str {
-        match self {
-            Format::Prometheus => "text/plain; version=0.0.4; charset=utf-8",
-            Format::OpenMetrics => "application/openmetrics-text; version=1.0.0; charset=utf-8",
+impl Format {
+    /// The format for an `Accept` header, and its content type: OpenMetrics if the client names a version that there is, or none,
+    /// and prefers it.
+    pub(crate) fn accepted(accept: &str) -> (Format, &'static str) {
+        let weight_of = |format: Format, version: &str| {
+            let wanted: &[&str] = match format {
+                Format::OpenMetrics => &["application/openmetrics-text"],
+                Format::Prometheus => &["text/plain", "text/*"],
+            };
+            let ranges = accept.split(',').filter_map(|range| weight(range, wanted));
+            let fits =
+                ranges.filter(|(named, _)| format == Format::Prometheus || named.is_none_or(|named| named == version));
+            fits.map(|(_, weight)| weight).fold(0.0, f64::max)
+        };
+        // Who accepts nothing of all that gets the plain text.
+        let [.., (format, _, plain)] = TYPES;
+        let (mut best, mut chosen) = (0.0, (format, plain));
+        for (format, version, content_type) in TYPES {
+            let weight = weight_of(format, version);
+            if weight > best {
+                (best, chosen) = (weight, (format, content_type));
+            }
         }
+        chosen
     }
 }
 
-/// Weight of a media range of an `Accept` header if it is one of `wanted`.
-fn weight(range: &str, wanted: &[&str]) -> Option<f64> {
+/// Version and weight of a media range of an `Accept` header if it is one of `wanted`.
+fn weight<'r>(range: &'r str, wanted: &[&str]) -> Option<(Option<&'r str>, f64)> {
     let mut parts = range.split(';').map(str::trim);
     let media = parts.next()?;
     if !wanted.iter().any(|w| w.eq_ignore_ascii_case(media)) {
         return None;
     }
-    let q = parts.find_map(|p| p.strip_prefix("q=").or_else(|| p.strip_prefix("Q=")));
-    Some(
-        q.and_then(|q| q.trim().parse().ok())
-            .map_or(1.0, |q: f64| q.clamp(0.0, 1.0)),
-    )
+    let (mut version, mut weight) = (None, 1.0);
+    for (name, value) in parts.filter_map(|part| part.split_once('=')) {
+        match name.trim() {
+            "q" | "Q" => weight = value.trim().parse().map_or(1.0, |q: f64| q.clamp(0.0, 1.0)),
+            name if name.eq_ignore_ascii_case("version") => version = Some(value.trim().trim_matches('"')),
+            _ => {}
+        }
+    }
+    Some((version, weight))
 }
 
 /// All metrics as text.
@@ -231,7 +251,17 @@ mod tests {
     fn open_metrics_only_on_request() {
         let prometheus = "application/openmetrics-text;version=1.0.0,application/openmetrics-text;version=0.0.1;\
             q=0.75,text/plain;version=0.0.4;q=0.5,*/*;q=0.1";
-        assert_eq!(Format::accepted(prometheus), Format::OpenMetrics);
+        let is_open = |accept: &str, version: &str| {
+            let wanted = format!("application/openmetrics-text; version={version}; charset=utf-8");
+            Format::accepted(accept) == (Format::OpenMetrics, wanted.as_str())
+        };
+        assert!(is_open(prometheus, "1.0.0"));
+        // Requested alone: the answer has the version that was asked for.
+        assert!(is_open("application/openmetrics-text; version=1.0.0", "1.0.0"));
+        assert!(is_open("application/openmetrics-text; version=0.0.1", "0.0.1"));
+        let quoted = "application/openmetrics-text;version=\"0.0.1\", text/plain;q=0.3";
+        assert!(is_open(quoted, "0.0.1"));
+        assert!(is_open("application/openmetrics-text", "1.0.0"));
         for plain in [
             "",
             "*/*",
@@ -239,12 +269,12 @@ mod tests {
             "application/openmetrics-text;q=0",
             "application/openmetrics-text;q=0.2, text/plain;q=0.9",
             "application/json, text/*",
+            "application/openmetrics-text; version=2.0.0",
+            "application/openmetrics-text; version=2.0.0, text/plain;q=0.1",
         ] {
-            assert_eq!(Format::accepted(plain), Format::Prometheus, "{plain}");
+            let plain_text = (Format::Prometheus, "text/plain; version=0.0.4; charset=utf-8");
+            assert_eq!(Format::accepted(plain), plain_text, "{plain}");
         }
-        assert_eq!(
-            Format::accepted("Application/OpenMetrics-Text; q=0.5, */*"),
-            Format::OpenMetrics
-        );
+        assert!(is_open("Application/OpenMetrics-Text; q=0.5, */*", "1.0.0"));
     }
 }

@@ -112,10 +112,11 @@ async function accessible(browser, state) {
 }
 
 async function logIn(browser, password) {
-  await browser.until("the login", seen("#login input[name=user]"));
-  await browser.tabTo("#login input[name=user]");
+  await browser.until("the login", seen("#login .login-open"));
+  if (!(await browser.run(seen("#login-fold input[name=user]")))) await browser.press("#login .login-open");
+  await browser.tabTo("#login-fold input[name=user]");
   await browser.write("alice");
-  await browser.tabTo("#login input[name=password]");
+  await browser.tabTo("#login-fold input[name=password]");
   await browser.write(password);
   await browser.key("Enter", "\r");
 }
@@ -125,8 +126,8 @@ async function operate(browser) {
   assert.strictEqual(await browser.run("document.querySelectorAll('.operate button').length"), 0, "nothing to press before the login");
   await accessible(browser, "before the login");
   await logIn(browser, "wrong horse!");
-  await browser.until("a refusal", "document.querySelector('#login .operate-result').textContent.includes('wrong user or password')");
-  await browser.run("document.querySelector('#login input[name=user]').value = ''");
+  await browser.until("a refusal", "document.querySelector('#login-fold .operate-result').textContent.includes('wrong user or password')");
+  await browser.run("document.querySelector('#login-fold input[name=user]').value = ''");
   await logIn(browser, "correct horse");
   await browser.until("the login is shown", "document.querySelector('.login-known').innerText.includes('alice')");
   await browser.until("the stop button", seen(stopButton));
@@ -134,11 +135,11 @@ async function operate(browser) {
   await browser.until("the limits", "document.querySelector('.operate-reference').innerText.includes('from 0 to 80 %')");
   await accessible(browser, "after the login");
   // A reference outside the limits is not sent, one inside is.
-  await browser.tabTo(".operate input");
+  await browser.tabTo(".operate-reference input");
   await browser.write("90");
   await browser.key("Enter", "\r");
   await browser.until("the limits are told", result("nothing was sent"));
-  await browser.run("document.querySelector('.operate input').value = ''");
+  await browser.run("document.querySelector('.operate-reference input').value = ''");
   await browser.write("50");
   await browser.key("Enter", "\r");
   await browser.until("the reference", result("Reference 50 %: confirmed"));
@@ -151,7 +152,7 @@ async function operate(browser) {
   assert.ok(await browser.run(result("Reference 50 %")), "nothing was sent");
   await browser.press("button[aria-label='Start pump-1']");
   await browser.press("button[aria-label='Start now: pump-1']");
-  await browser.until("the start", result("Start: confirmed"));
+  await browser.until("the start", result("Start forward: confirmed"));
   await browser.until("it runs", "document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
   // The lease of 2 s is renewed while the person is active.
   for (let turn = 0; turn < 12; turn += 1) {
@@ -164,7 +165,7 @@ async function operate(browser) {
   await browser.until("the stop", result("Stop: "));
   await browser.until("it stands", "!document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
   await browser.press("#login .login-known button");
-  await browser.until("the logout", seen("#login input[name=user]"));
+  await browser.until("the logout", seen("#login .login-open"));
   assert.strictEqual(await browser.run("document.querySelectorAll('.operate button').length"), 0, "nothing to press after the logout");
 }
 
@@ -172,10 +173,16 @@ async function operate(browser) {
 async function ended(browser) {
   await logIn(browser, "correct horse");
   await browser.until("the stop button", seen(stopButton));
+  // Nobody looks after the session until the stop is pressed.
+  await browser.call("Network.enable");
+  await browser.call("Network.setBlockedURLs", { urls: ["*/api/v1/session"] });
   process.stdout.write("logged in\n");
   await new Promise((done) => process.stdin.once("data", done));
-  await browser.press(stopButton);
-  await browser.until("the end", "document.querySelector('#login .operate-result').textContent.includes('The session has ended')");
+  await browser.tabTo(stopButton);
+  await browser.call("Network.setBlockedURLs", { urls: [] });
+  await browser.key("Enter", "\r");
+  await browser.until("the end", "document.querySelector('#login-fold .operate-result').textContent.includes('The session has ended')");
+  await browser.until("the banner", "document.getElementById('stops').innerText.includes('pump-1 was not stopped')");
   assert.strictEqual(await browser.run("document.querySelectorAll('.operate button').length"), 0);
 }
 
@@ -184,7 +191,7 @@ async function ended(browser) {
   try {
     await browser.open(url);
     await { operate, ended }[what](browser);
-    const complaints = browser.messages.filter((text) => !/status of (401|403|409|422)/.test(text));
+    const complaints = browser.messages.filter((text) => !/status of (401|403|409|422)|ERR_BLOCKED_BY_CLIENT/.test(text));
     assert.deepStrictEqual(complaints, [], "the browser complains of nothing");
   } finally {
     await browser.close();

@@ -71,6 +71,12 @@ async fn the_page_follows_its_gateway() {
     browse("changes.js", Vec::new()).await;
 }
 
+/// A stop that was not carried out is not missed, references are understood as typed, and a start tells its direction.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn drives_are_operated_from_the_page() {
+    browse("operating.js", Vec::new()).await;
+}
+
 /// The time that an update takes grows with the number of drives and no faster.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_thousand_drives_stay_smooth() {

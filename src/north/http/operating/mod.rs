@@ -49,10 +49,6 @@ const IN_PROGRESS: usize = 256;
 /// Header with the token of a session.
 const CSRF: &str = "x-csrf-token";
 
-/// The hash of a user that there is not. Nobody knows its password; it only takes its time.
-const NOBODY: &str =
-    "$argon2id$v=19$m=12288,t=3,p=1$bm9ib2R5bm9ib2R5bm9ibw$0000000000000000000000000000000000000000000";
-
 /// The state of commands over HTTP. It outlives reloads and listeners.
 #[derive(Debug)]
 pub(super) struct Operating {
@@ -287,11 +283,10 @@ impl Operating {
         let failures = failures.map_err(Denied::TooMany)?;
         // Whether the user exists must not show, neither by the answer nor by its time.
         let user = users.find(&given.user);
-        let nobody = users.list().first().map_or(NOBODY, |first| first.hash());
-        let hash = user.map_or(nobody, |user| user.hash());
         let too_long = given.password.len() > MAX_PASSWORD;
         let password = if too_long { "" } else { given.password.as_str() };
-        let right = self.verifier.verify(hash, password, address, failures).await;
+        let hashes = users.hashes(&given.user);
+        let right = self.verifier.verify(hashes, password, address, failures).await;
         let mut state = self.state();
         match (right, user) {
             (None, _) => {

@@ -1,7 +1,7 @@
-// What all views share: elements, figures, ages, and values with their quality. Texts reach the page as text nodes
+// What all views share: elements, figures, ages, and values with their quality, in the language of the page. Texts reach the page as text nodes
 // only, never as markup.
 
-const OLDER_MS = 500;
+import { decimal, plain, t, unitOf, wordsOf as words } from "./texts.js";
 
 export const $ = (id) => document.getElementById(id);
 
@@ -9,6 +9,13 @@ export function make(tag, className, ...children) {
   const element = document.createElement(tag);
   if (className) element.className = className;
   element.append(...children);
+  return element;
+}
+
+/// A text of the gateway, which speaks English.
+export function told(tag, className, ...children) {
+  const element = make(tag, className, ...children);
+  element.lang = "en";
   return element;
 }
 
@@ -69,7 +76,8 @@ export function fill(element, share) {
   element.style.width = width;
 }
 
-export const words = (name) => name.replaceAll("_", " ");
+
+export { words };
 
 /// Links within the page.
 export const places = {
@@ -78,8 +86,8 @@ export const places = {
   recording: (id) => `#/recording/${encodeURIComponent(id)}`,
 };
 
-const TITLES = { actual_speed: "Speed", output_frequency: "Frequency", motor_speed: "Motor", motor_current: "Current", motor_torque: "Torque",
-  motor_power: "Power", motor_voltage: "Voltage", dc_link_voltage: "DC link", heatsink_temperature: "Heatsink" };
+const TITLES = { actual_speed: t("Speed"), output_frequency: t("Frequency"), motor_speed: t("Motor"), motor_current: t("Current"), motor_torque: t("Torque"),
+  motor_power: t("Power"), motor_voltage: t("Voltage"), dc_link_voltage: t("DC link"), heatsink_temperature: t("Heatsink") };
 
 /// The heading of a point: short for those that are on every page.
 export const titleOf = (point) => TITLES[point] ?? words(point);
@@ -90,18 +98,18 @@ const DECIMALS = { "Hz": 2, "%": 1, "A": 1, "V": 0, "rpm": 0, "°C": 0, "kWh": 0
 export const digitsOf = (unit) => DECIMALS[unit] ?? 0;
 
 export function figure(value, unit) {
-  if (value === true) return "yes";
-  if (value === false) return "no";
+  if (value === true) return t("yes");
+  if (value === false) return t("no");
   if (typeof value !== "number") return String(value);
   const decimals = DECIMALS[unit];
-  if (decimals === undefined) return String(Math.round(value * 1000) / 1000);
-  return value.toFixed(decimals);
+  if (decimals === undefined) return plain(Math.round(value * 1000) / 1000);
+  return decimal(value, decimals);
 }
 
 export function age(ms) {
-  if (ms === null || ms === undefined) return "never read";
+  if (ms === null || ms === undefined) return t("never read");
   if (ms < 1000) return `${Math.round(ms)} ms`;
-  if (ms < 60000) return `${(ms / 1000).toFixed(1)} s`;
+  if (ms < 60000) return `${decimal(ms / 1000, 1)} s`;
   if (ms < 3600000) return `${Math.floor(ms / 60000)} min`;
   return `${Math.floor(ms / 3600000)} h`;
 }
@@ -129,19 +137,14 @@ export function stamp(time) {
 }
 
 /// Bytes, for people.
-export const size = (bytes) => (bytes < 1e6 ? `${Math.ceil(bytes / 1000)} kB` : `${(bytes / 1e6).toFixed(1)} MB`);
+export const size = (bytes) => (bytes < 1e6 ? `${Math.ceil(bytes / 1000)} kB` : `${decimal(bytes / 1e6, 1)} MB`);
 
 // ---- States and qualities
 
-/// Colour and words of a state, and its rank in the list of drives.
-export const STATES = {
-  fault: ["red", "▲ fault", 0],
-  unknown: ["amber", "? unknown", 3],
-  offline: ["", "✕ offline", 3],
-  not_ready: ["amber", "◌ not ready", 3],
-  ready: ["blue", "● ready", 3],
-  running: ["green", "▶ running", 3],
-};
+/// Colour and sign of each state; faults are told first.
+export const STATES = { fault: ["red", "▲"], unknown: ["amber", "?"], offline: ["", "✕"], not_ready: ["amber", "◌"], ready: ["blue", "●"], running: ["green", "▶"] };
+
+export const stateWords = (state) => `${STATES[state]?.[1] ?? ""} ${words(state)}`.trim();
 
 export const stateOf = (drive) => drive.state || "unknown";
 
@@ -150,16 +153,15 @@ const isGood = (point) => point !== undefined && point.quality === "good";
 export const isOn = (point) => isGood(point) && Boolean(point.value);
 
 export function badge(element, state) {
-  const [colour, word] = STATES[state] || ["", words(state)];
-  className(element, `badge ${colour}`);
-  text(element, word);
+  className(element, `badge ${STATES[state]?.[0] ?? ""}`);
+  text(element, stateWords(state));
 }
 
 /// Code and text of the fault that is known for now; empty without one.
 export function faultOf(drive) {
   const code = drive.points.fault_code;
   if (!isOn(code)) return "";
-  return drive.fault_text === String(code.value) ? `fault ${code.value}` : `F${code.value} ${drive.fault_text}`;
+  return drive.fault_text === String(code.value) ? t("fault {code}", { code: code.value }) : `F${code.value} ${drive.fault_text}`;
 }
 
 /// What holds the drive, apart from the fault and being offline, which are told elsewhere.
@@ -168,19 +170,22 @@ export function blockedOf(drive) {
 }
 
 const QUALITY_TITLES = {
-  stale: (point) => `stale, ${age(point.age_ms)} old`,
-  bad: () => "bad: refused by the drive or never read",
-  contradicted: (point) => `read ${age(point.age_ms)} ago; a newer state says otherwise`,
+  stale: (point) => old(point.age_ms, "stale"),
+  bad: () => t("bad: refused by the drive or never read"),
+  contradicted: (point) => t("read {age} ago; a newer state says otherwise", { age: age(point.age_ms) }),
 };
 
 const qualityOf = (point) => (!point ? "absent" : point.contradicted ? "contradicted" : point.quality);
 
-/// What is said beside a value about its age and quality.
+/// The quality of something that is too old, with its age.
+export const old = (ms, quality) => (ms === null || ms === undefined ? t("never read") : t("{quality}, {age} old", { quality: words(quality), age: age(ms) }));
+
+/// What is said beside a value about its age and quality: nothing of one that is as good and as new as it should be.
 export function noteOf(point) {
   const quality = qualityOf(point);
-  if (quality === "bad") return "bad";
-  const old = age(point.age_ms);
-  return { contradicted: `${old}, contradicted since`, good: old }[quality] ?? `stale, ${old}`;
+  if (quality === "good") return "";
+  if (quality === "bad") return t("bad");
+  return quality === "contradicted" ? t("{age} old, contradicted since", { age: age(point.age_ms) }) : old(point.age_ms, quality);
 }
 
 /// A place for a value with its unit and, where it matters, its own age.
@@ -190,31 +195,40 @@ export function valueCell(tag, name) {
   return cell;
 }
 
-/// `newest` is the age of the process data: a good value that is much older shows its own.
-export function showValue(cell, point, newest) {
+/// `told`: the quality that is told of all its values together, which is not repeated.
+export function showValue(cell, point, told) {
   const shown = Boolean(point) && point.value !== null;
   const quality = qualityOf(point);
   text(cell.value, shown ? (point.text ?? figure(point.value, point.unit)) : point ? "—" : "");
-  text(cell.unit, shown && point.unit && !point.text ? ` ${point.unit}` : "");
+  text(cell.unit, shown && point.unit && !point.text ? ` ${unitOf(point.unit)}` : "");
   className(cell.value, `value ${quality === "good" ? "main" : quality}`);
   hint(cell.value, point && QUALITY_TITLES[quality] ? QUALITY_TITLES[quality](point) : "");
-  if (newest === undefined) return;
-  const older = shown && point.age_ms !== null && (newest === null || point.age_ms > newest + OLDER_MS);
-  text(cell.age, older ? `${age(point.age_ms)} old` : "");
+  text(cell.age, shown && quality !== told ? noteOf(point) : "");
 }
 
 /// The share of the speed range, and the reference beside it. A value that is not good has no bar.
 export function speedBar() {
-  const bar = { fill: make("i"), reference: make("span", "sub") };
+  const bar = { fill: make("i"), direction: make("span", "sub direction"), reference: make("span", "sub") };
   bar.element = make("span", "bar", bar.fill);
   return bar;
 }
 
-export function showSpeed(bar, point, reference) {
+export function showSpeed(bar, point, points) {
   hide(bar.element, !point);
   const good = isGood(point) && !point.contradicted;
   fill(bar.fill, good ? point.value / 100 : 0);
-  text(bar.reference, isGood(reference) ? `set ${figure(reference.value, reference.unit)} %` : "");
+  text(bar.direction, directionOf(points));
+  const reference = points.speed_reference;
+  text(bar.reference, isGood(reference) ? t("set {value}", { value: `${figure(reference.value, reference.unit)} %` }) : "");
+}
+
+/// The direction in words.
+export const directionWord = (isReverse) => (isReverse ? t("reverse") : t("forward"));
+
+/// The way that a drive turns, or would, with a sign; empty where it is not known.
+export function directionOf({ reversed }) {
+  if (!isGood(reversed) || reversed.contradicted) return "";
+  return `${reversed.value ? "←" : "→"} ${directionWord(reversed.value)}`;
 }
 
 // ---- Lists

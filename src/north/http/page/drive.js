@@ -2,12 +2,13 @@
 // well the line carries it.
 
 import {
-  age, anchor, badge, faultOf, figure, fillRows, hide, hours, isOn, keyed, make, noteOf, places, section, showSpeed, showValue, size,
-  speedBar, stamp, stateOf, table, text, titleOf, valueCell, words,
+  age, anchor, badge, clock, faultOf, figure, fillRows, hide, hours, isOn, keyed, make, old, places, section, showSpeed, showValue, size,
+  speedBar, stamp, stateOf, table, text, titleOf, told, valueCell, words,
 } from "./common.js";
-import { EVENT_COLOURS, eventList } from "./events.js";
+import { EVENT_COLOURS, eventList, textOf } from "./events.js";
 import { failures } from "./lines.js";
-import { minutes } from "./strips.js";
+import { minuteAxis, minutes } from "./strips.js";
+import { decimal, t } from "./texts.js";
 import { trends } from "./trend.js";
 
 const SLOW_MS = 4000;
@@ -16,14 +17,14 @@ const MAIN = ["actual_speed", "output_frequency", "motor_speed", "motor_current"
 
 // The common model in groups; what a profile has beyond it follows by its kind.
 const GROUPS = [
-  ["State", ["ready", "running", "reversed", "fault", "warning", "at_reference", "zero_speed", "remote", "fault_code"]],
-  ["Process data", ["actual_speed", "output_frequency", "motor_speed", "motor_current", "motor_torque", "motor_power", "motor_voltage",
+  [t("State"), ["ready", "running", "reversed", "fault", "warning", "at_reference", "zero_speed", "remote", "fault_code"]],
+  [t("Process data"), ["actual_speed", "output_frequency", "motor_speed", "motor_current", "motor_torque", "motor_power", "motor_voltage",
     "dc_link_voltage", "heatsink_temperature"]],
-  ["Commands and references", ["run", "reverse", "fault_reset", "speed_reference", "frequency_reference"]],
-  ["Counters", ["energy", "operating_hours"]],
+  [t("Commands and references"), ["run", "reverse", "fault_reset", "speed_reference", "frequency_reference"]],
+  [t("Counters"), ["energy", "operating_hours"]],
 ];
-const OWN_BITS = "More states";
-const OWN = "More of this family";
+const OWN_BITS = t("More states");
+const OWN = t("More of this family");
 
 function groupOf(name, point) {
   const group = GROUPS.find(([, names]) => names.includes(name));
@@ -34,7 +35,7 @@ function groupOf(name, point) {
 // ---- All points, grouped
 
 function pointList() {
-  const element = section("points", "Points");
+  const element = section("points", t("Points"));
   const groups = new Map();
   for (const name of [...GROUPS.map(([title]) => title), OWN_BITS, OWN]) {
     const list = make("dl", "points");
@@ -60,7 +61,6 @@ function pointList() {
         // A point that was never read has no kind yet.
         if (group !== entry.group) groups.get((entry.group = group)).list.append(entry.element);
         showValue(entry, point);
-        text(entry.age, noteOf(point));
       });
       for (const { group, list } of groups.values()) hide(group, list.childElementCount === 0);
     },
@@ -70,20 +70,20 @@ function pointList() {
 // ---- What it does and why
 
 function causeText(cause) {
-  const since = cause.age_ms === null || cause.age_ms === undefined ? "" : ` (${age(cause.age_ms)} ago)`;
+  const since = cause.age_ms === null || cause.age_ms === undefined ? "" : ` (${t("{age} ago", { age: age(cause.age_ms) })})`;
   return [words(cause.cause), `${cause.evidence}${since}`, cause.remedy];
 }
 
 function whyPanel() {
   const list = make("ul", "causes");
-  const element = section("why", "Why it does not run", list);
+  const element = section("why", t("Why it does not run"), list);
   element.classList.add("panel", "why-panel");
   return {
     element,
     show(causes) {
       hide(element, causes.length === 0);
       while (list.children.length > causes.length) list.lastChild.remove();
-      while (list.children.length < causes.length) list.append(make("li", "", make("b"), make("span", "evidence"), make("span", "remedy")));
+      while (list.children.length < causes.length) list.append(make("li", "", make("b"), told("span", "evidence"), told("span", "remedy")));
       causes.forEach((cause, place) => causeText(cause).forEach((part, at) => text(list.children[place].children[at], part)));
     },
   };
@@ -95,7 +95,7 @@ function figures() {
     const cell = { point, ...valueCell("dd", "") };
     if (point === "actual_speed") {
       cell.bar = speedBar();
-      cell.element.append(cell.bar.element, cell.bar.reference);
+      cell.element.append(cell.bar.element, cell.bar.direction, cell.bar.reference);
     }
     cell.box = make("div", "", make("dt", "", titleOf(point)), cell.element);
     element.append(cell.box);
@@ -107,17 +107,17 @@ function figures() {
       for (const cell of cells) {
         const point = drive.points[cell.point];
         hide(cell.box, !point);
-        showValue(cell, point, drive.age_ms);
-        if (cell.bar) showSpeed(cell.bar, point, drive.points.speed_reference);
+        showValue(cell, point, drive.quality);
+        if (cell.bar) showSpeed(cell.bar, point, drive.points);
       }
     },
   };
 }
 
 function top(name) {
-  const parts = { badge: make("span", "badge"), warning: make("span", "tag amber", "! warning"), quality: make("span", "tag"), fault: make("p", "why"),
+  const parts = { badge: make("span", "badge"), warning: make("span", "tag amber", `! ${t("warning")}`), quality: make("span", "tag"), fault: told("p", "why"),
     where: make("p", "where") };
-  parts.element = make("div", "top", make("p", "crumbs", anchor("#/", "", "Drives"), " › "), make("h1", "", name), parts.where, make("p", "state", parts.badge, " ", parts.warning, " ", parts.quality), parts.fault);
+  parts.element = make("div", "top", make("p", "crumbs", anchor("#/", "", t("Drives")), " › "), make("h1", "", name), parts.where, make("p", "state", parts.badge, " ", parts.warning, " ", parts.quality), parts.fault);
   return parts;
 }
 
@@ -127,45 +127,48 @@ function showTop(parts, drive) {
   const fault = faultOf(drive);
   text(parts.fault, fault);
   hide(parts.fault, !fault);
-  text(parts.quality, drive.age_ms === null ? "never read" : drive.quality === "good" ? `${age(drive.age_ms)} old` : `${drive.quality}, ${age(drive.age_ms)} old`);
-  const access = drive.access === "control" ? "may be commanded" : "is only read";
+  text(parts.quality, drive.quality === "good" ? "" : old(drive.age_ms, drive.quality));
+  hide(parts.quality, drive.quality === "good");
+  const access = drive.access === "control" ? t("may be commanded") : t("is only read");
   const line = anchor(places.line(drive.bus), "", drive.bus);
   if (parts.known === JSON.stringify([drive.bus, drive.address, drive.unit, drive.profile, access])) return;
   parts.known = JSON.stringify([drive.bus, drive.address, drive.unit, drive.profile, access]);
-  parts.where.replaceChildren(line, ` · address ${drive.address} · Modbus TCP unit ${drive.unit} · ${drive.profile} · ${access}`);
+  parts.where.replaceChildren(line, ` · ${t("address {address}", drive)} · ${t("Modbus TCP unit {unit}", drive)} · ${drive.profile} · ${access}`);
 }
 
 // ---- What the gateway counted, and the line
 
-function factList(...titles) {
+/// Figures by name, with their titles.
+function factList(titles) {
   const values = new Map();
   const element = make("dl", "facts");
-  for (const title of titles) {
+  for (const [name, title] of Object.entries(titles)) {
     const value = make("dd", "value");
-    values.set(title, value);
+    values.set(name, value);
     element.append(make("div", "", make("dt", "", title), value));
   }
-  return { element, set: (title, value) => text(values.get(title), value) };
+  return { element, set: (name, value) => text(values.get(name), value) };
 }
 
-const counted = (value, unit) => (value === null || value === undefined ? "not known" : `${value}${unit}`);
+const isKnown = (value) => value !== null && value !== undefined;
 
 function showCounters(facts, drive) {
   const { starts, running_seconds: running, energy_kwh: energy } = drive;
-  facts.set("Running", running === null || running === undefined ? "not known" : hours(running));
-  facts.set("Starts", counted(starts, ""));
-  facts.set("Energy", energy === null || energy === undefined ? "not known" : `${figure(energy, "kWh")} kWh`);
+  facts.set("running", isKnown(running) ? hours(running) : t("not known"));
+  facts.set("starts", isKnown(starts) ? String(starts) : t("not known"));
+  facts.set("energy", isKnown(energy) ? `${figure(energy, "kWh")} kWh` : t("not known"));
 }
 
 function showLine(facts, drive) {
   const { ok, exception, timeout, corrupt } = drive.transactions;
   const total = ok + exception + timeout + corrupt;
-  const share = total ? ` (${((100 * (timeout + corrupt)) / total).toFixed(2)} %)` : "";
-  facts.set("Online", `${drive.online ? "yes" : "no"}${drive.since ? `, since ${stamp(new Date(drive.since)).textContent}` : ""}`);
-  facts.set("Exchanges", String(total));
-  facts.set("Without a valid reply", `${timeout + corrupt}${share}`);
-  facts.set("Failures", failures(drive.transactions));
-  facts.set("Turnaround", drive.turnaround_ms === null ? "not known" : `${drive.turnaround_ms.toFixed(1)} ms`);
+  const share = total ? ` (${decimal((100 * (timeout + corrupt)) / total, 2)} %)` : "";
+  const since = drive.since ? `, ${t("since {time}", { time: clock(new Date(drive.since)) })}` : "";
+  facts.set("online", `${drive.online ? t("yes") : t("no")}${since}`);
+  facts.set("exchanges", String(total));
+  facts.set("invalid", `${timeout + corrupt}${share}`);
+  facts.set("failures", failures(drive.transactions));
+  facts.set("turnaround", drive.turnaround_ms === null ? t("not known") : `${decimal(drive.turnaround_ms, 1)} ms`);
 }
 
 // ---- Commands, recordings
@@ -180,7 +183,7 @@ function commandRow(record) {
 
 function recordingRow(record) {
   return make("tr", "", make("td", "", stamp(new Date(record.time))), make("td", "", anchor(places.recording(record.id), "", words(record.trigger))),
-    make("td", "", record.summary), make("td", "n", size(record.bytes)));
+    told("td", "", record.summary), make("td", "n", size(record.bytes)));
 }
 
 function log(id, title, none, columns, row) {
@@ -202,15 +205,16 @@ function log(id, title, none, columns, row) {
 export function open(root, { name }) {
   const parts = {
     top: top(name), figures: figures(), why: whyPanel(), trends: trends(name), points: pointList(), operate: make("div", "operate"),
-    counters: factList("Running", "Starts", "Energy"), line: factList("Online", "Exchanges", "Without a valid reply", "Failures", "Turnaround"),
-    commands: log("commands", "Commands", "No command to this drive is known.", ["Time", "Command", "By", "Client", "Result", "Took"], commandRow),
-    recordings: log("recordings", "Recordings", "There is no recording of this drive.", ["Time", "Trigger", "Summary", "Size"], recordingRow),
-    events: eventList(), strip: make("div", "strip-bars"),
+    counters: factList({ running: t("Running"), starts: t("Starts"), energy: t("Energy") }),
+    line: factList({ online: t("Online"), exchanges: t("Exchanges"), invalid: t("Without a valid reply"), failures: t("Failures"), turnaround: t("Turnaround") }),
+    commands: log("commands", t("Commands"), t("No command to this drive is known."), [t("Time"), t("Command"), t("By"), t("Client"), t("Result"), t("Took")], commandRow),
+    recordings: log("recordings", t("Recordings"), t("There is no recording of this drive."), [t("Time"), t("Trigger"), t("Summary"), t("Size")], recordingRow),
+    events: eventList(false), strip: make("div", "strip-bars"),
   };
   parts.operate.dataset.operate = name;
-  const counters = section("counters", "Counted by the gateway", parts.counters.element);
-  const line = section("line", "Line", parts.line.element, make("p", "note", "Errors by minute, the last hour"), parts.strip);
-  const events = section("drive-events", "Events", parts.events.element, make("p", "note", anchor(`#/events?drive=${encodeURIComponent(name)}`, "", "All events of this drive")));
+  const counters = section("counters", t("Counted by the gateway"), parts.counters.element);
+  const line = section("line", t("Line"), parts.line.element, make("p", "note", t("Errors by minute, the last hour")), parts.strip, minuteAxis());
+  const events = section("drive-events", t("Events"), parts.events.element, make("p", "note", anchor(`#/events?drive=${encodeURIComponent(name)}`, "", t("All events of this drive"))));
   root.append(parts.top.element, parts.why.element, parts.operate, parts.figures.element, parts.trends.element,
     make("div", "pair", counters, line), parts.points.element, parts.commands.element, make("div", "pair", events, parts.recordings.element));
   window.Operate?.mount(parts.operate, name);
@@ -225,7 +229,7 @@ export function open(root, { name }) {
     parts.events.show(events);
     // Starts and stops show in the curves.
     const marked = events.filter((event) => ["red", "amber"].includes(EVENT_COLOURS[event.event]));
-    parts.marks = marked.map((event) => ({ t: Date.parse(event.time), colour: EVENT_COLOURS[event.event], text: event.text }));
+    parts.marks = marked.map((event) => ({ t: Date.parse(event.time), colour: EVENT_COLOURS[event.event], text: textOf(event) }));
     parts.commands.show(commands.slice(-20).reverse());
     parts.recordings.show(recordings.filter((record) => record.drive === name).slice(-20).reverse());
     showMinutes(parts.strip, bus, name);
@@ -254,5 +258,5 @@ function showMinutes(place, bus, name) {
   const state = JSON.stringify(own?.errors ?? null);
   if (place.state === state) return;
   place.state = state;
-  place.replaceChildren(own ? minutes(own.errors, "errors").svg : "");
+  place.replaceChildren(own ? minutes(own.errors, t("errors")).svg : "");
 }

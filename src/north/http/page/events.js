@@ -1,6 +1,7 @@
 // Events: lists of them, and the view that searches them.
 
-import { anchor, arrange, hide, keyed, make, places, stamp, words } from "./common.js";
+import { anchor, arrange, hide, keyed, make, places, stamp, told, words } from "./common.js";
+import { t } from "./texts.js";
 
 export const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", warning: "amber", supervision: "amber", supervision_failed: "red", unsupervised: "amber",
   refused_command: "amber", restarted: "amber", unlike_profile: "amber", not_confirmed: "amber", reload_refused: "amber",
@@ -23,20 +24,29 @@ export function query(conditions) {
 
 function subjectOf(event) {
   if (event.drive) return anchor(places.drive(event.drive), "", event.drive);
-  return event.bus ? anchor(places.line(event.bus), "", event.bus) : "gateway";
+  return event.bus ? anchor(places.line(event.bus), "", event.bus) : t("gateway");
 }
 
-function item(event) {
-  const parts = [stamp(new Date(event.time)), make("b", "", subjectOf(event)), make("span", `tag ${EVENT_COLOURS[event.event] || ""}`, words(event.event)),
-    make("span", "text", event.text)];
-  if (event.recording?.id) parts.push(anchor(places.recording(event.recording.id), "", "recording"));
+/// The text of an event without the name that stands before it, or at the top of the page.
+export function textOf({ text, drive, bus, recording }) {
+  const [kind, name] = drive ? ["drive", drive] : ["bus", bus];
+  if (!name) return text;
+  const known = [`${kind} ${name} `, recording?.id && `recording ${recording.id}`].find((words) => words && text.startsWith(words)) ?? "";
+  const rest = text.slice(known.length).replace(/^: /, "");
+  return rest.replaceAll(` of ${kind} ${name}`, "").replaceAll(` of ${name} `, " ").replaceAll(`${kind} ${name}`, `the ${kind}`);
+}
+
+function item(event, named) {
+  const parts = [stamp(new Date(event.time)), ...(named ? [make("b", "", subjectOf(event))] : []), make("span", `tag ${EVENT_COLOURS[event.event] || ""}`, words(event.event)),
+    told("span", "text", textOf(event))];
+  if (event.recording?.id) parts.push(anchor(places.recording(event.recording.id), "", t("recording")));
   return make("li", "", ...parts);
 }
 
-/// A list of events, newest first.
-export function eventList() {
+/// A list of events, newest first; `named`: each with what it is about.
+export function eventList(named = true) {
   const list = make("ol", "events");
-  const note = make("p", "note", "No events.");
+  const note = make("p", "note", t("No events."));
   const entries = new Map();
   return {
     element: make("div", "", list, note),
@@ -44,9 +54,9 @@ export function eventList() {
     show(events) {
       hide(note, events.length > 0);
       hide(list, events.length === 0);
-      const named = events.map((event) => ({ ...event, name: `${event.boot} ${event.id}` }));
-      keyed(entries, named, (event) => ({ element: item(event) }), () => {});
-      arrange(list, named.map(({ name }) => entries.get(name).element));
+      const items = events.map((event) => ({ ...event, name: `${event.boot} ${event.id}` }));
+      keyed(entries, items, (event) => ({ element: item(event, named) }), () => {});
+      arrange(list, items.map(({ name }) => entries.get(name).element));
     },
   };
 }
@@ -69,7 +79,7 @@ function input(value) {
 function kinds(chosen) {
   const select = make("select");
   for (const kind of ["", ...KINDS]) {
-    const option = make("option", "", kind ? words(kind) : "all");
+    const option = make("option", "", kind ? words(kind) : t("all"));
     option.value = kind;
     select.append(option);
   }
@@ -82,8 +92,8 @@ export function open(root, place) {
   const given = (name) => place.query.get(name) ?? "";
   const controls = { text: input(given("text")), kind: kinds(given("kind")), drive: input(given("drive")), bus: input(given("bus")) };
   const list = eventList();
-  const older = make("button", "chip", "Older");
-  const newest = make("button", "chip", "Newest");
+  const older = make("button", "chip", t("Older"));
+  const newest = make("button", "chip", t("Newest"));
   const pages = [""];
   let next = null;
   for (const button of [older, newest]) button.type = "button";
@@ -97,11 +107,11 @@ export function open(root, place) {
   for (const control of Object.values(controls)) control.addEventListener("input", changed);
   older.addEventListener("click", () => next !== null && pages.push(next) && (view.stale = true));
   newest.addEventListener("click", () => (pages.length = 1) && (view.stale = true));
-  root.append(make("h1", "", "Events"), make("div", "filter",
-    field("Text", controls.text, "event-text"), field("Kind", controls.kind, "event-kind"), field("Drive", controls.drive, "event-drive"), field("Line", controls.bus, "event-bus")),
+  root.append(make("h1", "", t("Events")), make("div", "filter",
+    field(t("Text"), controls.text, "event-text"), field(t("Kind"), controls.kind, "event-kind"), field(t("Drive"), controls.drive, "event-drive"), field(t("Line"), controls.bus, "event-bus")),
   list.element, make("p", "pages", newest, " ", older));
   const view = {
-    title: "Events",
+    title: t("Events"),
     stale: true,
     async refresh(load) {
       view.stale = false;

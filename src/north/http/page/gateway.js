@@ -1,6 +1,7 @@
 // Requests to the gateway, and whether it answers.
 
 import { $, className, clock, hide, text } from "./common.js";
+import { t } from "./texts.js";
 
 const LOST_MS = 3500;
 const FETCH_MS = 4000;
@@ -17,6 +18,12 @@ export class Refused extends Error {
 let lastGood = -Infinity;
 let lastGoodTime = null;
 let lost = null;
+// Requests without an answer since the last one that had one.
+let tries = 0;
+const listeners = [];
+
+/// Calls it when the gateway answers again after a request without an answer: it may be another one by then.
+export const onReturn = (listener) => listeners.push(listener);
 
 /// JSON at `path`, below `api/v1/`. Throws `Refused` where the gateway answers that it has none.
 export async function load(path, limit = FETCH_MS) {
@@ -30,7 +37,16 @@ export async function load(path, limit = FETCH_MS) {
 export function answered() {
   lastGood = performance.now();
   lastGoodTime = new Date();
+  const returns = tries > 0;
+  tries = 0;
   show(false);
+  if (returns) for (const listener of listeners) listener();
+}
+
+/// The gateway did not answer.
+export function unanswered() {
+  tries += 1;
+  showTries();
 }
 
 /// Looks whether the gateway was heard of lately; what is older is greyed.
@@ -49,8 +65,14 @@ function show(isLost) {
   document.body.classList.toggle("lost", lost);
   className($("link"), `pill ${lost ? "red" : "green"}`);
   hide($("link"), false);
-  text($("link-text"), lost ? "Connection lost" : "Live");
-  const since = lastGoodTime ? `since ${clock(lastGoodTime)}` : "yet";
-  text($("banner"), lost ? `No connection to the gateway ${since}. What is shown below is old. Reconnecting…` : "");
+  text($("link-text"), lost ? t("Connection lost") : t("Live"));
+  const since = lastGoodTime ? t("No connection to the gateway since {time}.", { time: clock(lastGoodTime) }) : t("No connection to the gateway yet.");
   hide($("banner"), !lost);
+  text($("banner-text"), lost ? `${since} ${t("What is shown below is old.")}` : "");
+  showTries();
+}
+
+// Beside what is announced: it changes with every try.
+function showTries() {
+  text($("banner-tries"), tries ? t("Asked {count} times without an answer, last at {time}; it is asked again.", { count: tries, time: clock(new Date()) }) : "");
 }

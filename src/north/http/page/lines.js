@@ -1,22 +1,24 @@
 // Lines: load, cycles against their target, exchanges; errors of each drive over the last hour; how fast the drives answer.
 
-import { anchor, className, clock, fill, hide, keyed, make, places, section, stateOf, STATES, table, text, words } from "./common.js";
+import { anchor, className, clock, fill, hide, keyed, make, places, section, stateOf, STATES, stateWords, table, text, told, words } from "./common.js";
 import { Refused } from "./gateway.js";
 import { PlotGroup } from "./plot.js";
 import { histogram, strip } from "./strips.js";
+import { decimal, plain, t } from "./texts.js";
 
 const RATE_MS = 5000;
 const DIAGNOSIS_MS = 10000;
-const FACTS = ["Line load", "Fast cycle", "Slow cycle", "Exchanges", "Errors", "Waiting", "Drives online"];
+const TITLES = { load: t("Line load"), fast: t("Fast cycle"), slow: t("Slow cycle"), exchanges: t("Exchanges"), errors: t("Errors"), waiting: t("Waiting"), online: t("Drives online") };
+const FACTS = Object.keys(TITLES);
 /// Those of a line among others.
-export const FEW_FACTS = ["Line load", "Fast cycle", "Errors"];
+export const FEW_FACTS = ["load", "fast", "errors"];
 
-const short = (ms) => (ms >= 1000 ? `${(ms / 1000).toFixed(2).replace(/\.?0+$/, "")} s` : `${Number(ms.toPrecision(3))} ms`);
+const short = (ms) => (ms >= 1000 ? `${plain(Math.round(ms / 10) / 100)} s` : `${plain(Number(ms.toPrecision(3)))} ms`);
 
 function showCycle(element, cadence, up) {
   const known = up && cadence.cycle_ms !== null;
   const late = known && cadence.cycle_ms > 1.2 * cadence.aim_ms;
-  text(element, `${known ? short(cadence.cycle_ms) : "—"} (aim ${short(cadence.aim_ms)})${late ? " ! late" : ""}`);
+  text(element, `${known ? short(cadence.cycle_ms) : "—"} (${t("aim {time}", { time: short(cadence.aim_ms) })})${late ? ` ! ${t("late")}` : ""}`);
   className(element, late ? "value slow" : "value");
 }
 
@@ -26,17 +28,17 @@ function rate(facts, bus) {
   facts.history = (facts.history || []).filter((past) => now - past.at < RATE_MS && past.count <= bus.transactions);
   const oldest = facts.history[0];
   facts.history.push({ at: now, count: bus.transactions });
-  if (!oldest || now === oldest.at) return `${bus.transactions} in total`;
+  if (!oldest || now === oldest.at) return t("{count} in total", { count: bus.transactions });
   return `${Math.round((1000 * (bus.transactions - oldest.count)) / (now - oldest.at))} /s`;
 }
 
 /// Figures of a line.
-function busFacts(titles = FACTS) {
-  const facts = { badge: make("span", "badge"), where: make("p", "where"), why: make("p", "why"), fill: make("i"), values: {} };
+function busFacts(shown = FACTS) {
+  const facts = { badge: make("span", "badge"), where: make("p", "where"), why: told("p", "why"), fill: make("i"), values: {} };
   facts.list = make("dl");
-  for (const title of titles) {
-    facts.values[title] = make("dd", "value");
-    facts.list.append(make("div", "", make("dt", "", title), facts.values[title]));
+  for (const name of shown) {
+    facts.values[name] = make("dd", "value");
+    facts.list.append(make("div", "", make("dt", "", TITLES[name]), facts.values[name]));
   }
   facts.bar = make("span", "bar", facts.fill);
   return facts;
@@ -44,22 +46,22 @@ function busFacts(titles = FACTS) {
 
 function showFacts(facts, bus) {
   const up = bus.state === "up";
-  text(facts.badge, up ? "● up" : bus.tried ? "✕ down" : "◌ opening");
+  text(facts.badge, up ? `● ${t("up")}` : bus.tried ? `✕ ${t("down")}` : `◌ ${t("opening")}`);
   className(facts.badge, `badge ${up ? "green" : bus.tried ? "red" : "amber"}`);
   text(facts.where, `${bus.port} · ${bus.protocol} · ${bus.baud} ${bus.format}`);
   text(facts.why, bus.reason || "");
   hide(facts.why, !bus.reason);
   const known = up && bus.load_ratio !== null;
   fill(facts.fill, known ? bus.load_ratio : 0);
-  const set = (title, value) => facts.values[title] && text(facts.values[title], value);
-  set("Line load", known ? `${(bus.load_ratio * 100).toFixed(1)} %` : "—");
-  showCycle(facts.values["Fast cycle"], bus.fast, up);
-  if (facts.values["Slow cycle"]) showCycle(facts.values["Slow cycle"], bus.slow, up);
-  set("Exchanges", rate(facts, bus));
-  const errors = bus.transactions ? ` (${((100 * bus.errors) / bus.transactions).toFixed(2)} %)` : "";
-  set("Errors", `${bus.errors}${errors}`);
-  set("Waiting", String(bus.queue_depth));
-  set("Drives online", `${bus.online} of ${bus.drives}`);
+  const set = (name, value) => facts.values[name] && text(facts.values[name], value);
+  set("load", known ? `${decimal(bus.load_ratio * 100, 1)} %` : "—");
+  showCycle(facts.values.fast, bus.fast, up);
+  if (facts.values.slow) showCycle(facts.values.slow, bus.slow, up);
+  set("exchanges", rate(facts, bus));
+  const errors = bus.transactions ? ` (${decimal((100 * bus.errors) / bus.transactions, 2)} %)` : "";
+  set("errors", `${bus.errors}${errors}`);
+  set("waiting", String(bus.queue_depth));
+  set("online", t("{shown} of {count}", { shown: bus.online, count: bus.drives }));
 }
 
 /// A card for each line, with a heading of that level; the states of its drives in words. `address`: of the drives of a line; `titles`: its
@@ -87,7 +89,7 @@ export function busCards(level, address, titles) {
         showFacts(card.facts, bus);
         const own = counts.get(bus.name) ?? new Map();
         const told = Object.keys(STATES).filter((state) => own.has(state));
-        text(card.states, told.map((state) => `${STATES[state][1][0]} ${own.get(state)} ${words(state)}`).join(" · ") || "no drives");
+        text(card.states, told.map((state) => `${STATES[state][1]} ${own.get(state)} ${words(state)}`).join(" · ") || t("no drives"));
       });
     },
   };
@@ -96,9 +98,9 @@ export function busCards(level, address, titles) {
 /// All lines.
 export function open(root) {
   const cards = busCards("h2", (bus) => `#/?bus=${encodeURIComponent(bus)}`);
-  root.append(make("h1", "", "Lines"), cards.element);
+  root.append(make("h1", "", t("Lines")), cards.element);
   return {
-    title: "Lines",
+    title: t("Lines"),
     async refresh(load) {
       const [buses, drives] = await Promise.all([load("buses"), load("drives?points=")]);
       cards.show(buses, drives);
@@ -120,11 +122,11 @@ async function optional(reply) {
 function diagnosisPanel() {
   const list = make("ul", "causes");
   const note = make("p", "note");
-  const element = section("diagnosis", "Diagnosis", list, note);
+  const element = section("diagnosis", t("Diagnosis"), list, note);
   element.classList.add("panel", "why-panel");
   const item = ({ verdict, drive, certainty, meaning, evidence, remedy }) => {
     const about = drive ? [" ", anchor(places.drive(drive), "", drive)] : [];
-    return make("li", "", make("b", "", words(verdict), ...about), make("span", "evidence", `${meaning} (${certainty}): ${evidence}`), make("span", "remedy", remedy));
+    return make("li", "", make("b", "", words(verdict), ...about), told("span", "evidence", `${meaning} (${words(certainty)}): ${evidence}`), told("span", "remedy", remedy));
   };
   return {
     element,
@@ -132,7 +134,7 @@ function diagnosisPanel() {
     show(found) {
       hide(element, found === null);
       const state = JSON.stringify(found?.verdicts ?? []);
-      text(note, found?.verdicts.length ? "" : found?.time ? "Nothing wrong is seen on this line." : "Not made yet.");
+      text(note, found?.verdicts.length ? "" : found?.time ? t("Nothing wrong is seen on this line.") : t("Not made yet."));
       if (state === element.state) return;
       element.state = state;
       element.classList.toggle("quiet", !found?.verdicts.length);
@@ -153,23 +155,23 @@ function memberRow(body) {
 
 function showMember(row, drive) {
   const { ok, exception, timeout, corrupt } = drive.transactions;
-  text(row.state, STATES[stateOf(drive)]?.[1] ?? words(drive.state));
+  text(row.state, stateWords(stateOf(drive)));
   text(row.total, String(ok + exception + timeout + corrupt));
   text(row.errors, failures(drive.transactions));
-  text(row.turnaround, drive.turnaround_ms === null ? "—" : `${drive.turnaround_ms.toFixed(1)} ms`);
+  text(row.turnaround, drive.turnaround_ms === null ? "—" : `${decimal(drive.turnaround_ms, 1)} ms`);
 }
 
 /// The failed exchanges by what happened.
 export function failures({ timeout, corrupt, exception }) {
-  const told = [[timeout, "timeout"], [corrupt, "corrupt"], [exception, "exception"]].filter(([count]) => count > 0);
-  return told.map(([count, what]) => `${count} ${what}`).join(", ") || "none";
+  const told = [[timeout, t("timeout")], [corrupt, t("corrupt")], [exception, t("exception")]].filter(([count]) => count > 0);
+  return told.map(([count, what]) => `${count} ${what}`).join(", ") || t("none");
 }
 
 /// Load and fast cycle of the last hour, the cycle against what was aimed at.
 function lastHour() {
-  const group = new PlotGroup({ name: "Cursor of load and cycle", moment: (t) => clock(new Date(t)), label: (t) => clock(new Date(t)).slice(-8, -3) });
-  const load = group.add({ title: "Line load", unit: "%", digits: 1 });
-  const cycle = group.add({ title: "Fast cycle", unit: "ms", digits: 1 });
+  const group = new PlotGroup({ name: t("Cursor of load and cycle"), moment: (at) => clock(new Date(at)), label: (at) => clock(new Date(at)).slice(-8, -3) });
+  const load = group.add({ title: TITLES.load, unit: "%", digits: 1 });
+  const cycle = group.add({ title: TITLES.fast, unit: "ms", digits: 1 });
   return {
     element: group.element,
     show({ hour, fast }) {
@@ -189,25 +191,25 @@ export function openLine(root, { name }) {
   const facts = busFacts();
   const strips = make("div", "strips");
   const answers = make("div", "histogram");
-  const drives = table("Drives of this line", "Drive", "State", "Exchanges", "Errors", "Turnaround");
+  const drives = table(t("Drives of this line"), t("Drive"), t("State"), t("Exchanges"), t("Errors"), t("Turnaround"));
   const diagnosis = diagnosisPanel();
   const unknown = make("p", "note");
   const card = make("article", "card", make("p", "state", facts.badge), facts.where, facts.why, facts.bar, facts.list, unknown);
   const hour = lastHour();
-  root.append(make("h1", "", `Line ${name}`), card, diagnosis.element, section("hour", "Load and cycle, the last hour", hour.element), section("errors", "Errors by drive, the last hour", strips),
-    section("turnaround", "How fast the drives answer", answers), section("members", "Drives", drives.element));
+  root.append(make("h1", "", t("Line {line}", { line: name })), card, diagnosis.element, section("hour", t("Load and cycle, the last hour"), hour.element),
+    section("errors", t("Errors by drive, the last hour"), strips), section("turnaround", t("How fast the drives answer"), answers), section("members", t("Drives"), drives.element));
   diagnosis.show(null);
   let nextDiagnosis = 0;
   const rows = new Map();
   const create = memberRow(drives.body);
   return {
-    title: `Line ${name}`,
+    title: t("Line {line}", { line: name }),
     async refresh(load) {
       const path = `buses/${encodeURIComponent(name)}`;
       const [bus, all] = await Promise.all([load(path), load("drives?points=")]);
       showFacts(facts, bus);
       hide(unknown, !bus.unknown_drives?.length);
-      text(unknown, `Answer on this line without an entry in the configuration: addresses ${(bus.unknown_drives ?? []).join(", ")}.`);
+      text(unknown, t("Answer on this line without an entry in the configuration: addresses {addresses}.", { addresses: (bus.unknown_drives ?? []).join(", ") }));
       strip(strips, bus.by_drive);
       histogram(answers, bus.turnaround);
       hour.show(bus);

@@ -1,7 +1,8 @@
 //! The status page: one document, its styles and its scripts, all served by this server.
 //!
 //! The scripts show the JSON interface live; `page.js` opens the views: `overview.js`, `drive.js`, `lines.js`, `events.js`,
-//! `recording.js`. Without scripts the page has the tables rendered here and reloads every few seconds; their columns are in
+//! `recording.js`. `texts.js` chooses the language: English stands in the scripts, another language is a file such as `de.js`, named
+//! in `texts.js` and below. Without scripts the page has the tables rendered here and reloads every few seconds; their columns are in
 //! `COLUMNS`.
 
 use std::fmt::{self, Write as _};
@@ -33,13 +34,13 @@ pub(in crate::north::http) const ASSETS: &[Asset] = assets! {
     "image/svg+xml": "icon.svg";
     "text/css; charset=utf-8": "operate.css", "style.css", "views.css";
     "text/javascript; charset=utf-8":
-        "common.js", "drive.js", "events.js", "gateway.js", "lines.js", "operate.js", "overview.js", "page.js", "plot.js",
-        "recording.js", "strips.js", "trend.js";
+        "common.js", "controls.js", "de.js", "drive.js", "events.js", "gateway.js", "lines.js", "operate.js", "overview.js",
+        "page.js", "plot.js", "recording.js", "session.js", "stops.js", "strips.js", "texts.js", "trend.js";
 };
 
 /// What the document has in its head for the operating part; its script comes before the page's.
 const OPERATE_HEAD: &str = "<link rel=\"stylesheet\" href=\"assets/operate.css\">\n\
-    <script src=\"assets/operate.js\" defer></script>";
+    <script src=\"assets/operate.js\" type=\"module\"></script>";
 
 /// Only this server's own files, no inline code, no forms.
 pub(in crate::north::http) const SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
@@ -167,6 +168,7 @@ mod tests {
 
     use super::*;
     use crate::event::EventKind;
+    use crate::history::TriggerKind;
 
     #[test]
     fn text_cannot_become_markup() {
@@ -212,6 +214,82 @@ mod tests {
         let (list, _) = list.split_once(']').unwrap_or_default();
         let listed: BTreeSet<&str> = list.split('"').skip(1).step_by(2).collect();
         assert_eq!(listed, EventKind::ALL.iter().map(|kind| kind.name()).collect());
+    }
+
+    /// What stands between quotation marks at the beginning.
+    fn quoted(text: &str) -> Option<&str> {
+        let inner = text.strip_prefix('"')?;
+        inner.split_once('"').map(|(text, _)| text)
+    }
+
+    /// The texts that the page says, in English: what is given to `t`, and what the document marks.
+    fn said() -> BTreeSet<&'static str> {
+        let mut said: BTreeSet<&str> = ["read only", "commands after login"].into();
+        for script in ASSETS.iter().filter(|asset| asset.name.ends_with(".js")) {
+            for (at, _) in script.body.match_indices("t(\"") {
+                let before = script.body[..at].chars().next_back();
+                if !before.is_some_and(|c| c.is_alphanumeric() || c == '.' || c == '_') {
+                    said.extend(quoted(&script.body[at + 2..]));
+                }
+            }
+        }
+        let marked = DOCUMENT
+            .split("data-text>")
+            .skip(1)
+            .filter_map(|rest| rest.split('<').next());
+        let labels = DOCUMENT.split("aria-label=").filter(|rest| rest.contains("data-label"));
+        said.extend(
+            marked
+                .chain(labels.filter_map(quoted))
+                .filter(|text| !text.contains("{{")),
+        );
+        said
+    }
+
+    /// A text that a language lacks would stand in English among the others.
+    #[test]
+    fn every_language_has_every_text() {
+        let languages: Vec<_> = ASSETS
+            .iter()
+            .filter(|asset| asset.name.len() == "de.js".len())
+            .collect();
+        assert!(!languages.is_empty());
+        let holes = |text: &str| -> BTreeSet<String> {
+            let rests = text.split('{').skip(1);
+            rests
+                .filter_map(|rest| rest.split_once('}'))
+                .map(|(name, _)| name.to_string())
+                .collect()
+        };
+        for language in languages {
+            let (_, texts) = language.body.split_once("const texts = {").expect("texts");
+            let (texts, rest) = texts.split_once("\n};").expect("their end");
+            let lines = texts.lines().filter_map(|line| line.trim().split_once("\": \""));
+            let translated: Vec<(&str, &str)> = lines
+                .map(|(key, text)| (key.trim_matches('"'), text.trim_end_matches("\",")))
+                .collect();
+            let keys: BTreeSet<&str> = translated.iter().map(|(key, _)| *key).collect();
+            assert_eq!(keys, said(), "{}", language.name);
+            for (key, text) in translated {
+                assert_eq!(holes(key), holes(text), "{}: {key}", language.name);
+            }
+            let names = EventKind::ALL.iter().map(|kind| kind.name());
+            let names = names.chain(ModelPoint::ALL.iter().map(|point| point.name()));
+            let names = names.chain(TriggerKind::ALL.iter().map(|kind| kind.name()));
+            let states = [
+                State::Offline,
+                State::NotReady,
+                State::Ready,
+                State::Running,
+                State::Fault,
+            ];
+            for name in names.chain(states.map(State::name)) {
+                let has = [" ", "\n  "]
+                    .iter()
+                    .any(|before| rest.contains(&format!("{before}{name}: \"")));
+                assert!(has, "{} lacks {name}", language.name);
+            }
+        }
     }
 
     #[test]

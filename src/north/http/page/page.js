@@ -2,12 +2,13 @@
 // that every drive, line and recording has a link of its own.
 
 import { $, make, text } from "./common.js";
-import { answered, begin, load, Refused, watch } from "./gateway.js";
+import { answered, begin, load, Refused, unanswered, watch } from "./gateway.js";
 import * as drive from "./drive.js";
 import * as events from "./events.js";
 import * as lines from "./lines.js";
 import * as overview from "./overview.js";
 import * as recording from "./recording.js";
+import { language, t } from "./texts.js";
 
 const PERIOD_MS = 1000;
 const SOON_MS = 50;
@@ -45,8 +46,8 @@ function placeOf(hash) {
 }
 
 function unknownView(root, { word }) {
-  root.append(make("h1", "", "Nothing here"), make("p", "", `There is no page “${word}”.`));
-  return { title: "Nothing here", refresh: async () => {} };
+  root.append(make("h1", "", t("Nothing here")), make("p", "", t("There is no page “{word}”.", { word })));
+  return { title: t("Nothing here"), refresh: async () => {} };
 }
 
 function open(isFirst) {
@@ -84,6 +85,7 @@ async function tick() {
     answered();
   } catch (error) {
     if (error instanceof Refused) answered();
+    else unanswered();
     if (error instanceof Refused && asked === view) refused(error);
     else console.warn("cannot read the gateway:", error);
   }
@@ -121,8 +123,8 @@ function refused(error) {
   view.root.classList.add("refused");
   view.problem ??= make("p", "note problem");
   view.problem.setAttribute("role", "alert");
-  const known = error.known.length ? ` Known: ${error.known.slice(0, 20).join(", ")}${error.known.length > 20 ? " …" : ""}.` : "";
-  text(view.problem, `The gateway answers: ${error.message}.${known}`);
+  const known = error.known.length ? ` ${t("Known: {names}.", { names: `${error.known.slice(0, 20).join(", ")}${error.known.length > 20 ? " …" : ""}` })}` : "";
+  text(view.problem, `${t("The gateway answers: {message}.", { message: error.message })}${known}`);
   if (!view.problem.isConnected) view.root.querySelector("h1").after(view.problem);
 }
 
@@ -145,5 +147,9 @@ $("skip").addEventListener("click", (event) => {
   event.preventDefault();
   $("view").focus();
 });
+// What stands in the document itself.
+document.documentElement.lang = language;
+for (const element of document.querySelectorAll("[data-text]")) element.textContent = t(element.textContent.trim());
+for (const element of document.querySelectorAll("[data-label]")) element.setAttribute("aria-label", t(element.getAttribute("aria-label")));
 begin();
 open(true);

@@ -2,6 +2,7 @@
 // of a group share their range and one cursor, which is moved by pointer or by keyboard.
 
 import { draw, make, text } from "./common.js";
+import { decimal, t, unitOf } from "./texts.js";
 
 const LEFT = 52;
 const RIGHT = 10;
@@ -94,7 +95,7 @@ const place = (n) => n.toFixed(1);
 /// One plot. `digits`: of its figures; `time`: writes a time at the axis.
 class Plot {
   constructor(group, { title, unit, digits }) {
-    Object.assign(this, { group, title, unit, digits, samples: [], marks: [], reach: Infinity, aim: null, includes: [], resting: undefined, loading: true });
+    Object.assign(this, { group, title, unit: unitOf(unit), digits, samples: [], marks: [], reach: Infinity, aim: null, includes: [], resting: undefined, loading: true });
     this.svg = draw("svg", { role: "img", "aria-label": title, height: group.height });
     this.reading = make("span", "reading");
     this.spread = make("span", "sub");
@@ -153,15 +154,15 @@ class Plot {
     // Its own view cuts off what lies beyond the range.
     const inner = draw("svg", { x: LEFT, width: this.width, height, viewBox: `${LEFT} 0 ${this.width} ${height}` }, ...this.gaps(), ...this.lines());
     const parts = [...this.grid(), inner, ...this.events()];
-    if (known.length === 0) parts.push(draw("text", { class: "none", x: LEFT + this.width / 2, y: height / 2 }, this.loading ? "loading …" : "no values in this time"));
+    if (known.length === 0) parts.push(draw("text", { class: "none", x: LEFT + this.width / 2, y: height / 2 }, this.loading ? t("loading …") : t("no values in this time")));
     this.svg.replaceChildren(...parts, this.needle, this.dot);
-    const said = known.length ? `between ${this.figure(low)} and ${this.figure(high)} ${this.unit}` : this.loading ? "loading" : "no values";
+    const said = known.length ? t("between {low} and {high} {unit}", { low: this.figure(low), high: this.figure(high), unit: this.unit }) : this.loading ? t("loading …") : t("no values in this time");
     this.svg.setAttribute("aria-label", `${this.title}, ${this.group.spoken()}: ${said}`);
     this.cursor();
   }
 
   figure(value) {
-    return value.toFixed(this.digits);
+    return decimal(value, this.digits);
   }
 
   grid() {
@@ -172,7 +173,7 @@ class Plot {
     for (const value of ticks(this.scale.low, this.scale.high, this.scale.step)) {
       const y = place(this.y(value));
       parts.push(draw("line", { class: "grid", x1: LEFT, x2: LEFT + this.width, y1: y, y2: y }));
-      parts.push(draw("text", { class: "at-y", x: LEFT - 7, y: this.y(value) + 4 }, value.toFixed(digits)));
+      parts.push(draw("text", { class: "at-y", x: LEFT - 7, y: this.y(value) + 4 }, decimal(value, digits)));
     }
     const wanted = (to - from) / Math.max(1, Math.floor(this.width / LABEL_PX));
     const step = STEPS.find((each) => each >= wanted) ?? STEPS[STEPS.length - 1];
@@ -222,7 +223,7 @@ class Plot {
     if (this.aim !== null) {
       const y = place(this.y(this.aim));
       const aim = draw("line", { class: "aim", x1: LEFT, x2: LEFT + this.width, y1: y, y2: y });
-      const label = draw("text", { class: "at-aim", x: LEFT + 4, y: this.y(this.aim) + 13 }, `aim ${this.figure(this.aim)} ${this.unit}`);
+      const label = draw("text", { class: "at-aim", x: LEFT + 4, y: this.y(this.aim) + 13 }, t("aim {time}", { time: `${this.figure(this.aim)} ${this.unit}` }));
       drawn.push(aim, label);
     }
     return drawn;
@@ -255,7 +256,7 @@ class Plot {
       this.dot.setAttribute("cy", place(this.y(sample.value)));
     }
     const resting = !shown && this.resting !== undefined;
-    const value = sample ? `${this.figure(sample.value)} ${this.unit}` : "no value";
+    const value = sample ? `${this.figure(sample.value)} ${this.unit}` : t("no value");
     const spread = sample && sample.high > sample.low ? `${this.figure(sample.low)} … ${this.figure(sample.high)}` : "";
     text(this.reading, resting ? this.resting : value);
     text(this.spread, resting ? "" : spread);
@@ -293,7 +294,7 @@ export class PlotGroup {
   }
 
   spoken() {
-    return `${this.moment(this.range.from)} to ${this.moment(this.range.to)}`;
+    return t("{from} to {to}", { from: this.moment(this.range.from), to: this.moment(this.range.to) });
   }
 
   /// Puts the cursor to that time; at the end of the range it rests.
@@ -316,7 +317,7 @@ export class PlotGroup {
     const at = this.cursor ?? this.range.to;
     if (Number(this.slider.value) !== at) this.slider.value = String(at);
     const values = this.plots.map((plot) => `${plot.title} ${plot.reading.textContent}`).join(", ");
-    text(this.when, this.cursor === null && this.rests ? "now" : this.moment(at));
+    text(this.when, this.cursor === null && this.rests ? t("now") : this.moment(at));
     this.slider.setAttribute("aria-valuetext", `${this.when.textContent}: ${values}`);
     for (const listener of this.listeners) listener(at);
   }

@@ -1,9 +1,10 @@
 // A recording: what was read before and after a fault as plots with one cursor, states as lanes, events, commands and frames under
 // them. And the list of all recordings.
 
-import { anchor, digitsOf, draw, fillRows, hide, make, places, section, size, stamp, table, text, titleOf, words } from "./common.js";
-import { EVENT_COLOURS } from "./events.js";
+import { anchor, digitsOf, draw, fillRows, hide, make, places, section, size, stamp, table, text, titleOf, told, words } from "./common.js";
+import { EVENT_COLOURS, textOf } from "./events.js";
 import { PlotGroup, reachOf, sampleAt, withGaps } from "./plot.js";
+import { decimal, t } from "./texts.js";
 
 const SECOND = 1000;
 const FETCH_MS = 60000;
@@ -15,7 +16,7 @@ const PLOTS_OPEN = 6;
 // A read that failed leaves a gap: nothing is drawn over more than this many of the usual intervals.
 const GAP_INTERVALS = 4;
 
-const seconds = (t) => `${t < 0 ? "−" : "+"}${Math.abs(t).toFixed(3)} s`;
+const seconds = (time) => `${time < 0 ? "−" : "+"}${decimal(Math.abs(time), 3)} s`;
 
 // ---- Pure: what there is to draw
 
@@ -51,9 +52,10 @@ export function spans(samples, end) {
 
 /// Everything that has a moment, in its order.
 export function happenings(recording) {
-  const events = recording.events.map(({ t, event, text: what }) => ({ t, kind: words(event), colour: EVENT_COLOURS[event] || "", text: what }));
-  const commands = recording.commands.map((command) => ({ t: command.t, kind: "command", colour: "blue",
-    text: `${command.command} from ${words(command.source)} ${command.client}: ${words(command.result)} after ${command.latency_ms.toFixed(0)} ms` }));
+  const { name } = recording.drive;
+  const events = recording.events.map((event) => ({ t: event.t, kind: words(event.event), colour: EVENT_COLOURS[event.event] || "", text: textOf({ text: event.text, drive: name }) }));
+  const commands = recording.commands.map((command) => ({ t: command.t, kind: t("command"), colour: "blue",
+    text: t("{command} from {client}: {result} after {time}", { command: command.command, client: `${words(command.source)} ${command.client}`, result: words(command.result), time: `${decimal(command.latency_ms, 0)} ms` }) }));
   const more = recording.more.map(({ t, trigger, text: what }) => ({ t, kind: words(trigger), colour: "amber", text: what }));
   return [...events, ...commands, ...more].sort((a, b) => a.t - b.t);
 }
@@ -70,7 +72,7 @@ function lanes(group, states) {
     return { column, svg, value };
   });
   group.listeners.push((at) => {
-    for (const { column, value } of entries) text(value, { true: "on", false: "off" }[sampleAt(column.samples, at, Infinity)?.value] ?? "?");
+    for (const { column, value } of entries) text(value, { true: t("on"), false: t("off") }[sampleAt(column.samples, at, Infinity)?.value] ?? "?");
   });
   group.drawers.push(() => {
     const { from, to } = group.range;
@@ -80,8 +82,9 @@ function lanes(group, states) {
       const x = (t) => (1000 * (t - from)) / (to - from);
       svg.replaceChildren(draw("line", { class: "grid", x1: 0, x2: 1000, y1: 15, y2: 15 }),
         ...on.map((span) => draw("rect", { class: `on ${column.name}`, x: x(span.from), y: 2, width: Math.max(1, x(span.to) - x(span.from)), height: 13 })));
-      const told = on.map((span) => `${seconds(span.from / SECOND)} to ${seconds(span.to / SECOND)}`);
-      svg.setAttribute("aria-label", `${words(column.name)}: ${told.length === 0 ? "never on" : told.length > 4 ? `on ${told.length} times` : `on ${told.join(", ")}`}`);
+      const told = on.map((span) => t("{from} to {to}", { from: seconds(span.from / SECOND), to: seconds(span.to / SECOND) }));
+      const times = told.length === 0 ? t("never on") : told.length > 4 ? t("on {count} times", { count: told.length }) : t("on {times}", { times: told.join(", ") });
+      svg.setAttribute("aria-label", `${words(column.name)}: ${times}`);
     }
   });
   return element;
@@ -90,7 +93,7 @@ function lanes(group, states) {
 // ---- Frames
 
 function frameList(recording) {
-  const list = table("Frames on the line around the cursor", "t", "Drive", "What", "Bytes");
+  const list = table(t("Frames on the line around the cursor"), "t", t("Drive"), t("What"), t("Bytes"));
   let first = null;
   return {
     element: list.element,
@@ -122,8 +125,8 @@ function show(root, recording) {
   const all = columns(recording);
   const numbers = all.filter((column) => column.samples.some((sample) => typeof sample.value === "number") && column.samples.length > 2);
   const states = all.filter((column) => new Set(column.samples.map((sample) => sample.value).filter((value) => typeof value === "boolean")).size > 1);
-  const group = new PlotGroup({ name: "Cursor of the recording", height: 124, relative: true, rests: false,
-    moment: (t) => seconds(t / SECOND), label: (t, step) => `${t > 0.0001 ? "+" : ""}${(t / SECOND).toFixed(step < SECOND ? 1 : 0)} s` });
+  const group = new PlotGroup({ name: t("Cursor of the recording"), height: 124, relative: true, rests: false,
+    moment: (at) => seconds(at / SECOND), label: (at, step) => `${at > 0.0001 ? "+" : ""}${decimal(at / SECOND, step < SECOND ? 1 : 0)} s` });
   const known = FIRST.map((name) => numbers.find((column) => column.name === name)).filter(Boolean).slice(0, PLOTS_OPEN);
   const things = happenings(recording);
   const marks = [{ t: 0, colour: "red", text: recording.summary }, ...things.filter((thing) => Math.abs(thing.t) > 0.001).map((thing) => ({ t: thing.t * SECOND, colour: thing.colour, text: `${thing.kind}: ${thing.text}` }))];
@@ -133,12 +136,12 @@ function show(root, recording) {
   };
   root.replaceChildren(...head(recording, time));
   const rest = numbers.filter((column) => !known.includes(column));
-  const plots = section("plots", "What was read", zoom(group, from, to), group.element, choice(rest, addPlot));
+  const plots = section("plots", t("What was read"), zoom(group, from, to), group.element, choice(rest, addPlot));
   group.grid.before(lanes(group, states));
   const frames = frameList(recording);
-  const happened = thingList(things, (t) => group.point(t * SECOND));
-  root.append(plots, section("happened", "What happened", happened.element), section("frames", "Frames on the line", frames.element,
-    make("p", "note", `${recording.frames.length} frames; the command drivegate recordings export ${recording.id} --pcap writes them for Wireshark.`)));
+  const happened = thingList(things, (time) => group.point(time * SECOND));
+  root.append(plots, section("happened", t("What happened"), happened.element), section("frames", t("Frames on the line"), frames.element,
+    make("p", "note", t("{count} frames", { count: recording.frames.length }), " · ", files(recording.id, ["pcap"]))));
   known.forEach(addPlot);
   group.setRange(from, to, 1);
   group.listeners.push((at) => {
@@ -150,21 +153,33 @@ function show(root, recording) {
 
 function head(recording, time) {
   const { drive, bus } = recording;
-  const where = make("p", "where", anchor(places.drive(drive.name), "", drive.name), ` · ${drive.profile}, address ${drive.address}, on `, anchor(places.line(bus.name), "", bus.name),
-    ` · ${bus.protocol} ${bus.format} · `, stamp(time), ` · ${seconds(recording.from)} to ${seconds(recording.to)} · `);
-  const file = anchor(`api/v1/recordings/${encodeURIComponent(recording.id)}`, "", "JSON");
-  where.append(file);
-  const lost = make("p", "note problem", `${recording.lost} entries could not be taken in time.`);
+  const where = make("p", "where", anchor(places.drive(drive.name), "", drive.name), ` · ${drive.profile} · ${t("address {address}", drive)} · `, anchor(places.line(bus.name), "", bus.name),
+    ` · ${bus.protocol} ${bus.format} · `, stamp(time), ` · ${t("{from} to {to}", { from: seconds(recording.from), to: seconds(recording.to) })}`);
+  const downloads = make("p", "files", `${t("Download:")} `, files(recording.id, ["csv", "pcap", "json"]));
+  const lost = make("p", "note problem", t("{count} entries could not be taken in time.", { count: recording.lost }));
   hide(lost, recording.lost === 0);
-  return [make("p", "crumbs", anchor("#/recordings", "", "Recordings"), " › "), make("h1", "", `Recording: ${words(recording.trigger)} of ${drive.name}`), where, make("p", "why summary", recording.summary), lost];
+  return [make("p", "crumbs", anchor("#/recordings", "", t("Recordings")), " › "), make("h1", "", t("Recording: {trigger} of {drive}", { trigger: words(recording.trigger), drive: drive.name })), where,
+    told("p", "why summary", recording.summary), downloads, lost];
+}
+
+const FILES = { csv: [t("CSV of the values"), ".csv"], pcap: [t("pcap of the frames, for Wireshark"), ".pcapng"], json: [t("JSON of everything"), ".json"] };
+
+/// Links to the files of a recording.
+function files(id, formats) {
+  const links = formats.map((format) => {
+    const link = anchor(`api/v1/recordings/${encodeURIComponent(id)}?format=${format}`, "", FILES[format][0]);
+    link.download = `${id}${FILES[format][1]}`;
+    return link;
+  });
+  return make("span", "", ...links.flatMap((link, place) => (place ? [" ", link] : [link])));
 }
 
 /// Buttons that show the time around the cursor.
 function zoom(group, from, to) {
   const element = make("div", "choices");
   element.setAttribute("role", "group");
-  element.setAttribute("aria-label", "Time shown around the cursor");
-  for (const [title, span] of [["all", Infinity], ["10 s", 10 * SECOND], ["2 s", 2 * SECOND], ["0.5 s", SECOND / 2]]) {
+  element.setAttribute("aria-label", t("Time shown around the cursor"));
+  for (const [title, span] of [[t("all"), Infinity], ["10 s", 10 * SECOND], ["2 s", 2 * SECOND], [`${decimal(0.5, 1)} s`, SECOND / 2]]) {
     const button = make("button", "chip", title);
     button.type = "button";
     button.setAttribute("aria-pressed", String(span === Infinity));
@@ -182,7 +197,7 @@ function zoom(group, from, to) {
 function choice(rest, add) {
   const select = make("select");
   select.id = "more-points";
-  select.append(make("option", "", "choose …"), ...rest.map((column, place) => {
+  select.append(make("option", "", t("choose …")), ...rest.map((column, place) => {
     const option = make("option", "", words(column.name));
     option.value = String(place);
     return option;
@@ -195,7 +210,7 @@ function choice(rest, add) {
     option.disabled = true;
     select.selectedIndex = 0;
   });
-  const label = make("label", "", "Another point ");
+  const label = make("label", "", `${t("Another point")} `);
   label.htmlFor = select.id;
   const element = make("p", "field", label, select);
   hide(element, rest.length === 0);
@@ -212,17 +227,17 @@ function thingList(things, go) {
     return make("li", "", button, make("span", `tag ${thing.colour}`, thing.kind), make("span", "text", thing.text));
   });
   list.append(...items);
-  const element = things.length ? list : make("p", "note", "Neither events nor commands.");
-  return { element, mark: (t) => items.forEach((item, place) => item.classList.toggle("past", things[place].t <= t + SAME_MOMENT)) };
+  const element = things.length ? list : make("p", "note", t("Neither events nor commands."));
+  return { element, mark: (time) => items.forEach((item, place) => item.classList.toggle("past", things[place].t <= time + SAME_MOMENT)) };
 }
 
 /// One recording. It never changes, so it is fetched once, however long that takes; whether the gateway answers is asked besides.
 export function open(root, { name }) {
-  root.append(make("h1", "", "Recording"), make("p", "note", "Loading …"));
+  root.append(make("h1", "", t("Recording")), make("p", "note", t("Loading …")));
   let fetched = null;
   let shown = false;
   return {
-    title: `Recording ${name}`,
+    title: t("Recording {id}", { id: name }),
     async refresh(load) {
       fetched ??= load(`recordings/${encodeURIComponent(name)}`, FETCH_MS).then((recording) => ({ recording }), (error) => ({ error }));
       await load("buses");
@@ -240,14 +255,14 @@ export function open(root, { name }) {
 
 /// All recordings, newest first.
 export function openList(root) {
-  const list = table("Recordings", "Time", "Drive", "Trigger", "Summary", "Size");
-  const note = make("p", "note", "There are no recordings. The gateway makes one when a drive trips, is lost, or refuses a stop.");
-  root.append(make("h1", "", "Recordings"), list.element, note);
+  const list = table(t("Recordings"), t("Time"), t("Drive"), t("Trigger"), t("Summary"), t("Size"));
+  const note = make("p", "note", t("There are no recordings. The gateway makes one when a drive trips, is lost, or refuses a stop."));
+  root.append(make("h1", "", t("Recordings")), list.element, note);
   const entries = new Map();
   const row = (record) => make("tr", "", make("td", "", stamp(new Date(record.time))), make("td", "", anchor(places.drive(record.drive), "", record.drive)),
-    make("td", "", anchor(places.recording(record.id), "", words(record.trigger))), make("td", "", record.summary), make("td", "n", size(record.bytes)));
+    make("td", "", anchor(places.recording(record.id), "", words(record.trigger))), told("td", "", record.summary), make("td", "n", size(record.bytes)));
   return {
-    title: "Recordings",
+    title: t("Recordings"),
     async refresh(load) {
       const records = (await load("recordings")).reverse();
       hide(note, records.length > 0);

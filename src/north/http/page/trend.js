@@ -2,6 +2,7 @@
 
 import { anchor, clock, digitsOf, figure, hide, make, section, text, titleOf } from "./common.js";
 import { PlotGroup } from "./plot.js";
+import { t, unitOf } from "./texts.js";
 
 const MINUTE = 60000;
 // Words, the time as the gateway takes it, and how often what it shows changes.
@@ -16,7 +17,7 @@ export function samplesOf({ samples, step_s: step }) {
 
 const nowOf = (point) => {
   if (!point || point.value === null) return "—";
-  return point.quality === "good" && !point.contradicted ? `${figure(point.value, point.unit)} ${point.unit}` : "not good";
+  return point.quality === "good" && !point.contradicted ? `${figure(point.value, point.unit)} ${unitOf(point.unit)}` : t("not good");
 };
 
 /// The trends of one drive; `marks` are its events.
@@ -25,8 +26,8 @@ export function trends(drive) {
   const plots = new Map();
   const links = [];
   const group = new PlotGroup({
-    name: "Cursor of the trends", moment: (t) => clock(new Date(t)),
-    label: (t, step) => clock(new Date(t)).slice(-8, step < MINUTE ? undefined : -3),
+    name: t("Cursor of the trends"), moment: (at) => clock(new Date(at)),
+    label: (at, step) => clock(new Date(at)).slice(-8, step < MINUTE ? undefined : -3),
   });
   const buttons = SPANS.map((span) => {
     const button = make("button", "chip", span[0]);
@@ -35,11 +36,11 @@ export function trends(drive) {
     return button;
   });
   const files = make("p", "note files");
-  const note = make("p", "note", "Loading …");
+  const note = make("p", "note", t("Loading …"));
   const choices = make("div", "choices", ...buttons);
   choices.setAttribute("role", "group");
-  choices.setAttribute("aria-label", "Time shown");
-  const element = section("trends", "Trends", choices, note, group.element, files);
+  choices.setAttribute("aria-label", t("Time shown"));
+  const element = section("trends", t("Trends"), choices, note, group.element, files);
   const all = `drives/${encodeURIComponent(drive)}/trend`;
   const address = (query, span) => `${all}?${query}from=${span[1]}`;
 
@@ -57,8 +58,8 @@ export function trends(drive) {
     for (const { point, unit } of chosen.points) plots.set(point, group.add({ title: titleOf(point), unit, digits: digitsOf(unit) }));
     // The same links for every time: new ones would take the focus from those that somebody is on.
     const titles = chosen.points.map(({ point }) => [`point=${point}&`, titleOf(point)]);
-    links.push(...[["", "all"], ...titles].map(([query, title]) => ({ query, element: anchor("", "", title) })));
-    if (titles.length) files.append("As CSV:", ...links.flatMap(({ element }) => [" ", element]));
+    links.push(...[["", t("all")], ...titles].map(([query, title]) => ({ query, element: anchor("", "", title) })));
+    if (titles.length) files.append(t("As CSV:"), ...links.flatMap(({ element }) => [" ", element]));
     choose(chosen.span);
   }
 
@@ -77,7 +78,7 @@ export function trends(drive) {
       const replies = chosen.points.length ? [await load(address(`point=${[...plots.keys()].join(",")}&`, span))].flat() : [];
       if (span !== chosen.span) return;
       chosen.next = performance.now() + span[2];
-      text(note, replies.length ? "" : "This family has none of the points that are kept.");
+      text(note, replies.length ? "" : t("This family has none of the points that are kept."));
       hide(note, replies.length > 0);
       if (!replies.length) return;
       const step = replies[0].step_s * 1000;

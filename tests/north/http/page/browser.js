@@ -5,7 +5,7 @@ const os = require("node:os");
 const path = require("node:path");
 const { spawn } = require("node:child_process");
 
-const PATIENCE_MS = 120000;
+const PATIENCE_MS = Number(process.env.PATIENCE_MS ?? 120000);
 const FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
   "--disable-component-update", "--disable-sync", "--hide-scrollbars", "--force-color-profile=srgb", "--remote-debugging-pipe"];
 const KEYS = { Tab: 9, Enter: 13, Home: 36, End: 35, ArrowLeft: 37, ArrowRight: 39 };
@@ -52,7 +52,7 @@ class Browser {
   }
 
   /// A page of that width; it shows nothing yet.
-  async page({ width = 1400, height = 900, dark = false, calm = true } = {}) {
+  async page({ width = 1400, height = 900, dark = false, calm = true, language = "en-US" } = {}) {
     const { targetId } = await this.send("Target.createTarget", { url: "about:blank" });
     const { sessionId } = await this.send("Target.attachToTarget", { targetId, flatten: true });
     const page = new Page(this, sessionId, targetId);
@@ -60,6 +60,7 @@ class Browser {
     await page.send("Runtime.enable");
     await page.send("Log.enable");
     await page.send("Emulation.setDeviceMetricsOverride", { width, height, deviceScaleFactor: 1, mobile: width < 600 });
+    await page.send("Emulation.setUserAgentOverride", { userAgent: "test", acceptLanguage: language });
     const features = [["prefers-color-scheme", dark ? "dark" : "light"], ["prefers-reduced-motion", calm ? "reduce" : "no-preference"]];
     await page.send("Emulation.setEmulatedMedia", { features: features.map(([name, value]) => ({ name, value })) });
     return page;

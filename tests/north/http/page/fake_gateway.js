@@ -8,6 +8,8 @@ const FILES = path.join(__dirname, "../../../../src/north/http/page");
 const TYPES = { ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml" };
 const POLICY = /SECURITY_POLICY: &str = "((?:[^"\\]|\\\s)*)"/.exec(fs.readFileSync(path.join(FILES, "mod.rs"), "utf8"))[1].replace(/\\\s+/g, "");
 
+const HEAD = /OPERATE_HEAD: &str = "((?:[^"\\]|\\[\s\S])*)"/.exec(fs.readFileSync(path.join(FILES, "mod.rs"), "utf8"))[1].replace(/\\n|\\\s+/g, "").replace(/\\"/g, '"');
+
 const point = (value, more = {}) => ({ value, quality: "good", unit: "", age_ms: 10, time: "2026-03-02T07:40:12.118Z", ...more });
 
 function drive(name, more = {}) {
@@ -26,6 +28,8 @@ const ended = (count) => new Date(Date.now() - count * 1000).toISOString();
 class FakeGateway {
   constructor() {
     Object.assign(this, { drives: [], buses: [bus("line1")], events: [], recordings: {}, audit: [], trends: {}, diagnosis: null, asked: [] });
+    // Of a gateway that takes commands: who is logged in, what can be commanded, what was, and the answer to it.
+    Object.assign(this, { operating: false, session: null, about: null, commands: [], obey: () => [200, { result: "confirmed", confirmed_ms: 20 }] });
     this.server = http.createServer((request, response) => this.answer(request, response));
   }
 
@@ -44,14 +48,38 @@ class FakeGateway {
     if (this.silent) return;
     if (url.pathname === "/") return this.file(response, "index.html", "text/html");
     if (url.pathname.startsWith("/assets/")) return this.file(response, path.basename(url.pathname), TYPES[path.extname(url.pathname)]);
+    if (request.method === "POST") return this.post(url, request, response);
     const reply = this.reply(url);
     const found = reply !== undefined;
     response.writeHead(found ? 200 : 404, { "content-type": "application/json" });
     response.end(JSON.stringify(found ? reply : { error: `there is nothing at ${url.pathname}`, known: this.drives.map(({ name }) => name) }));
   }
 
+  async post(url, request, response) {
+    let body = "";
+    for await (const part of request) body += part;
+    const [status, json] = this.posted(url.pathname, body && JSON.parse(body), request.headers["x-csrf-token"]);
+    response.writeHead(status, { "content-type": "application/json" });
+    response.end(status === 204 ? undefined : JSON.stringify(json));
+  }
+
+  posted(path, body, csrf) {
+    if (path === "/api/v1/login") {
+      this.session = { user: body.user, csrf: "token 1", expires_in: 1800 };
+      return [200, this.session];
+    }
+    if (path === "/api/v1/logout") return [204, (this.session = null)];
+    if (!this.session) return [401, { error: "the session has ended; log in again" }];
+    if (csrf !== this.session.csrf) return [403, { error: "the header X-CSRF-Token does not have the token of this session" }];
+    if (path.endsWith("/heartbeat")) return [204];
+    const { id, ...points } = body;
+    this.commands.push(points);
+    return this.obey(points);
+  }
+
   file(response, name, type) {
-    const text = fs.readFileSync(path.join(FILES, name), "utf8").replace(/\{\{gateway\}\}/g, "test").replace(/\{\{\w+\}\}/g, "");
+    const head = this.operating ? HEAD : "";
+    const text = fs.readFileSync(path.join(FILES, name), "utf8").replace(/\{\{gateway\}\}/g, "test").replace("{{operate}}", head).replace(/\{\{\w+\}\}/g, "");
     response.writeHead(200, { "content-type": `${type}; charset=utf-8`, "content-security-policy": POLICY });
     response.end(text);
   }
@@ -59,6 +87,8 @@ class FakeGateway {
   reply(url) {
     const [kind, name, part] = url.pathname.replace("/api/v1/", "").split("/").map(decodeURIComponent);
     const one = this.drives.find((drive) => drive.name === name);
+    if (kind === "session") return this.session ?? { user: null };
+    if (kind === "drives" && part === "commands") return this.about;
     if (kind === "drives" && part === "trend") return one && this.trend(one, url.searchParams.get("point"));
     if (kind === "drives") return name ? one : this.drives;
     if (kind === "buses" && part === "diagnosis") return this.diagnosis ?? undefined;

@@ -11,16 +11,16 @@ const NASTY = "<img src=x onerror=window.hacked=1>";
 // Address, a sign that it is complete, and words that must be seen.
 const views = (recording) => [
   ["#/", ".rows .row", ["pump-1", "▶ running", "▲ fault", "F1 overcurrent", "F7 saturation trip", "✕ offline", "the adapter is gone", NASTY, "local control", "stale", "7 of 9"]],
-  ["#/drive/pump-1", ".curve", ["Trends", "Counted by the gateway", "vacon-nx", "heatsink temperature", "Starts"]],
+  ["#/drive/pump-1", ".curve", ["Trends", "Counted by the gateway", "vacon-nx", "heatsink temperature", "Starts", "−60 min"]],
   ["#/drive/pump-2", ".causes li", ["F1 overcurrent", "Why it does not run", "speed_reference=84", "mqtt", "scada", "overcurrent; speed"]],
   ["#/drive/never-1", ".figures div", ["never read"]],
   ["#/drive/blower-2", ".figures .stale", ["✕ offline", "stale, "]],
   [`#/drive/${encodeURIComponent(NASTY)}`, ".causes li", [NASTY, "F7 saturation trip"]],
   ["#/lines", ".card", ["line1", "● up", "the adapter is gone", "Line load"]],
   ["#/line/line1", ".strip .minutes rect", ["Load and cycle", "errors", "to 2 ms", "pump-2"]],
-  ["#/events", ".events li", ["drive pump-2 has fault 1: overcurrent", NASTY, "recording"]],
+  ["#/events", ".events li", ["has fault 1: overcurrent", NASTY, "recording"]],
   ["#/recordings", ".list td a", ["fault 1: overcurrent"]],
-  [`#/recording/${recording}`, ".plots .curve", ["Recording: fault of pump-2", "Current", "drive pump-2 has fault 1", "running", "sent"]],
+  [`#/recording/${recording}`, ".plots .curve", ["Recording: fault of pump-2", "Current", "has fault 1", "running", "sent", "CSV of the values"]],
 ];
 
 async function looks(page, [hash, sign, wanted], base, check) {
@@ -85,6 +85,13 @@ async function keyboardIsEnough(page, base) {
   assert.equal(await page.eval("document.activeElement.textContent"), "all", "a refresh takes the focus away");
 }
 
+/// Longer words fit, too.
+async function otherLanguagesFit(browser, views, base) {
+  const page = await browser.page({ width: 390, height: 800, language: "de" });
+  for (const [hash, sign] of views) await looks(page, [hash, sign, hash === "#/" ? ["Umrichter", "Aufzeichnungen"] : []], base, true);
+  await page.close();
+}
+
 async function main() {
   const base = process.argv[2];
   const [{ id }] = await (await fetch(`${base}api/v1/recordings`)).json();
@@ -101,6 +108,7 @@ async function main() {
       await page.close();
     }
   }
+  await otherLanguagesFit(browser, views(id), base);
   await browser.close();
 }
 

@@ -1,0 +1,182 @@
+// The controls of one drive: stop, start and direction, reference, reset.
+
+import { directionWord, hide, make, text } from "./common.js";
+import { numberOf, plain, t, unitOf } from "./texts.js";
+
+const isGood = (point) => point !== undefined && point.quality === "good" && point.value !== null;
+
+function button(name, words, label, action) {
+  const made = make("button", name, words);
+  made.type = "button";
+  if (label) made.setAttribute("aria-label", label);
+  made.addEventListener("click", action);
+  return made;
+}
+
+/// The point by which the reference of a drive is given, with its limits.
+function referenceOf(about) {
+  const points = about ? about.points : [];
+  return points.find((point) => point.name === "speed_reference") || points.find((point) => point.name === "frequency_reference");
+}
+
+const hasReverse = (about) => Boolean(about?.points.some((point) => point.name === "reverse"));
+
+const figureOf = (value, unit) => `${plain(value)} ${unitOf(unit)}`;
+
+function limits({ minimum, maximum, unit: name }) {
+  const unit = unitOf(name);
+  if (minimum === null && maximum === null) return "";
+  if (minimum === null) return t("up to {maximum} {unit}", { maximum: plain(maximum), unit });
+  if (maximum === null) return t("from {minimum} {unit}", { minimum: plain(minimum), unit });
+  return t("from {minimum} to {maximum} {unit}", { minimum: plain(minimum), maximum: plain(maximum), unit });
+}
+
+/// The reference that stands in the drive, in words.
+function standingReference({ points }) {
+  const point = [points.speed_reference, points.frequency_reference].find(isGood);
+  return point ? figureOf(Math.round(point.value * 100) / 100, point.unit) : t("reference not known");
+}
+
+/// The direction that the drive has been ordered, else the one that it shows: true for reverse.
+const orderedReverse = ({ points }) => [points.reverse, points.reversed].find(isGood)?.value === true;
+
+// ---- The reference
+
+function buildReference(panel, name, { command, tell, known }) {
+  panel.input = Object.assign(make("input"), { type: "text", inputMode: "decimal", autocomplete: "off", required: true });
+  panel.unit = make("span", "unit");
+  panel.range = make("span", "sub");
+  panel.understood = make("output", "understood");
+  panel.label = make("span", "", t("Speed reference"));
+  panel.set = Object.assign(make("button", "operate-button", t("Set")), { type: "submit" });
+  panel.set.setAttribute("aria-label", t("Set the reference of {drive}", { drive: name }));
+  panel.reference = make("form", "operate-reference", make("label", "", panel.label, " ", panel.input), panel.unit, panel.understood, panel.set, panel.range);
+  panel.reference.noValidate = true;
+  const typed = () => reading(panel.input.value, referenceOf(known(name).about));
+  panel.input.addEventListener("input", () => {
+    const { words, problem } = panel.input.value.trim() ? typed() : { words: "", problem: "" };
+    text(panel.understood, problem || `= ${words}`.replace(/^= $/, ""));
+    panel.understood.className = `understood ${problem ? "bad" : ""}`;
+  });
+  panel.reference.addEventListener("submit", (event) => {
+    event.preventDefault();
+    const { point, value, words, problem } = typed();
+    if (!problem) return command(name, { [point.name]: value }, t("Reference {value}", { value: words }));
+    tell(name, t("Reference: {problem}; nothing was sent", { problem }), false);
+    panel.input.focus();
+  });
+}
+
+/// What was typed as a value of the point, in words, and what is wrong with it.
+function reading(typed, point) {
+  const value = numberOf(typed);
+  const allowed = limits(point);
+  if (value === null) return { point, problem: allowed ? t("write a number {limits}", { limits: allowed }) : t("write a number") };
+  const words = figureOf(value, point.unit);
+  const outside = (point.minimum !== null && value < point.minimum) || (point.maximum !== null && value > point.maximum);
+  return { point, value, words, problem: outside ? t("{value} is not {limits}", { value: words, limits: allowed }) : "" };
+}
+
+// ---- Start and direction
+
+// One question for both: what is about to happen is read before it is done.
+function buildQuestion(panel, name, { command, known }) {
+  panel.asked = make("span");
+  panel.choice = make("span", "operate-directions");
+  panel.choice.setAttribute("role", "radiogroup");
+  panel.choice.setAttribute("aria-label", t("Direction of {drive}", { drive: name }));
+  panel.directions = [false, true].map((isReverse) => {
+    const radio = Object.assign(make("input"), { type: "radio", name: `direction of ${name}`, value: String(isReverse) });
+    radio.addEventListener("change", () => panel.ask());
+    panel.choice.append(make("label", "", radio, ` ${directionWord(isReverse)}`));
+    return radio;
+  });
+  panel.really = button("operate-button operate-start", "", "", () => {
+    const [points, what] = panel.order;
+    panel.close();
+    command(name, points, what);
+  });
+  panel.cancel = button("operate-button", t("Cancel"), t("Cancel: do not start {drive}", { drive: name }), () => panel.close());
+  panel.question = make("span", "operate-confirm", panel.asked, panel.choice, panel.really, panel.cancel);
+  panel.question.hidden = true;
+  panel.start = button("operate-button", t("Start …"), t("Start {drive}", { drive: name }), () => panel.open("start"));
+  panel.turn = button("operate-button", "", "", () => panel.open("turn"));
+  panel.open = (kind) => {
+    const { json } = known(name);
+    panel.asking = kind;
+    panel.directions[orderedReverse(json) ? 1 : 0].checked = true;
+    // Whatever becomes of the drive meanwhile: what was asked is what is done.
+    panel.target = !orderedReverse(json);
+    panel.ask();
+    for (const each of [panel.start, panel.turn]) hide(each, true);
+    hide(panel.question, false);
+    panel.really.focus();
+  };
+  panel.close = () => {
+    const from = panel.asking === "turn" ? panel.turn : panel.start;
+    panel.asking = null;
+    hide(panel.question, true);
+    panel.show(known(name));
+    from.focus();
+  };
+  panel.ask = () => ask(panel, name, known(name));
+}
+
+/// Writes the question; the reference may change while it is asked.
+function ask(panel, name, { json, about }) {
+  const starts = panel.asking === "start";
+  const isReverse = starts ? panel.directions[1].checked : panel.target;
+  const told = { drive: name, direction: directionWord(isReverse), reference: standingReference(json) };
+  hide(panel.choice, !starts || !hasReverse(about));
+  if (!starts) {
+    text(panel.asked, t("{drive} {direction}, {reference}? The motor turns round.", told));
+    text(panel.really, t("Turn round now"));
+    panel.order = [{ reverse: isReverse }, t("Direction {direction}", told)];
+  } else if (hasReverse(about)) {
+    text(panel.asked, t("Start {drive} {direction}, {reference}? The motor turns.", told));
+    text(panel.really, t("Start now"));
+    panel.order = [{ run: true, reverse: isReverse }, t("Start {direction}", told)];
+  } else {
+    text(panel.asked, t("Start {drive}, {reference}? The motor turns.", told));
+    text(panel.really, t("Start now"));
+    panel.order = [{ run: true }, t("Start")];
+  }
+  panel.really.setAttribute("aria-label", `${panel.really.textContent}: ${name}`);
+}
+
+// ---- All of them
+
+/// Builds the controls of a drive into the place of the panel.
+export function build(panel, name, actions) {
+  panel.stop = button("operate-stop", `■ ${t("STOP")}`, t("Stop {drive}", { drive: name }), () => actions.stop(name));
+  panel.reset = button("operate-button", t("Reset fault"), t("Reset the fault of {drive}", { drive: name }), () => actions.command(name, { fault_reset: true }, t("Reset")));
+  buildQuestion(panel, name, actions);
+  buildReference(panel, name, actions);
+  panel.result = make("span", "operate-result");
+  panel.result.setAttribute("role", "status");
+  panel.lease = make("span", "operate-lease");
+  panel.place.setAttribute("role", "group");
+  panel.place.setAttribute("aria-label", t("Commands of {drive}", { drive: name }));
+  panel.place.classList.add("operate");
+  panel.place.replaceChildren(panel.stop, make("b", "operate-name", name), panel.start, panel.turn, panel.question, panel.reference, panel.reset, panel.result, panel.lease);
+  panel.show = (drive) => show(panel, name, drive);
+  panel.built = true;
+}
+
+function show(panel, name, drive) {
+  const { json, about } = drive;
+  const point = referenceOf(about);
+  hide(panel.reference, !point);
+  if (point) {
+    text(panel.label, point.name === "speed_reference" ? t("Speed reference") : t("Frequency reference"));
+    text(panel.unit, unitOf(point.unit));
+    text(panel.range, limits(point));
+  }
+  hide(panel.reset, json.state !== "fault");
+  if (panel.asking) return panel.ask();
+  const runs = json.state === "running";
+  hide(panel.start, runs);
+  hide(panel.turn, !runs || !hasReverse(about));
+  text(panel.turn, orderedReverse(json) ? t("Forward …") : t("Reverse …"));
+  panel.turn.setAttribute("aria-label", `${name}: ${panel.turn.textContent}`);
+}

@@ -1,0 +1,105 @@
+//! Recordings: their list, and one of them as JSON, as CSV or as a capture.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::extract::{Path, RawQuery, State};
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+
+use super::api::ErrorReply;
+use super::query::{self, QueryError};
+use super::routes::{AppState, not_found};
+use crate::history::{Recording, export, pcapng};
+
+/// The forms of a recording.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Form {
+    Json,
+    Csv,
+    Pcap,
+}
+
+impl Form {
+    /// Content type, and the end of the name of a file.
+    fn kind(self) -> (&'static str, &'static str) {
+        match self {
+            Form::Json => ("application/json", "json"),
+            Form::Csv => ("text/csv; charset=utf-8", "csv"),
+            Form::Pcap => ("application/x-pcapng", "pcapng"),
+        }
+    }
+
+    fn of(self, recording: &Recording) -> Vec<u8> {
+        match self {
+            Form::Json => export::json(recording).into_bytes(),
+            Form::Csv => export::csv(recording).into_bytes(),
+            Form::Pcap => pcapng::pcapng(recording),
+        }
+    }
+}
+
+/// The form that a query asks for.
+fn form(query: Option<&str>) -> Result<Form, QueryError> {
+    let [format] = query::parameters(query, &["format"])?;
+    match format.as_deref() {
+        None | Some("json") => Ok(Form::Json),
+        Some("csv") => Ok(Form::Csv),
+        Some("pcap") => Ok(Form::Pcap),
+        Some(other) => Err(QueryError::Value {
+            name: "format",
+            value: other.to_string(),
+            expected: "it is `json`, `csv` or `pcap`",
+        }),
+    }
+}
+
+/// The recordings, oldest first.
+pub(super) async fn list(State(app): State<Arc<AppState>>) -> Response {
+    let _turn = app.turn().await;
+    let entries = app.plant.load().recordings.list();
+    Json(entries.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
+}
+
+/// One recording with all its samples and frames; with `format=csv` its samples, with `format=pcap` its frames, as a file.
+pub(super) async fn one(
+    State(app): State<Arc<AppState>>,
+    Path(id): Path<String>,
+    RawQuery(query): RawQuery,
+) -> Response {
+    let form = match form(query.as_deref()) {
+        Ok(form) => form,
+        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
+    };
+    let recordings = app.plant.load().recordings.clone();
+    // Files are read and converted away from the tasks of other clients, one at a time.
+    let Ok(_permit) = app.files.acquire().await else {
+        return StatusCode::SERVICE_UNAVAILABLE.into_response();
+    };
+    let wanted = id.clone();
+    let read = tokio::task::spawn_blocking(move || {
+        let read = recordings.read(&wanted);
+        read.map(|read| read.map(|recording| form.of(&recording)))
+    });
+    match read.await {
+        Ok(Some(Ok(bytes))) => {
+            let (content_type, end) = form.kind();
+            let mut response = ([(header::CONTENT_TYPE, content_type)], bytes).into_response();
+            // An id that there is consists of letters, digits, `-`, `_`, `.` and `:`.
+            let named = format!("attachment; filename=\"{id}.{end}\"").parse();
+            if let (Ok(named), true) = (named, form != Form::Json) {
+                response.headers_mut().insert(header::CONTENT_DISPOSITION, named);
+            }
+            response
+        }
+        Ok(Some(Err(error))) => {
+            let error = ErrorReply {
+                error: error.to_string(),
+                known: Vec::new(),
+            };
+            (StatusCode::INTERNAL_SERVER_ERROR, Json(error)).into_response()
+        }
+        Ok(None) => not_found(format!("there is no recording `{id}`"), Vec::new()),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
+}
