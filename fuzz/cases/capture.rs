@@ -11,7 +11,7 @@ use drivegate::history::capture;
 
 pub(crate) fn run(data: &[u8]) {
     let packets = match capture::read(data) {
-        Ok(packets) => packets,
+        Ok(capture) => capture.packets,
         Err(error) => {
             assert!(error.offset <= data.len(), "{error}");
             return;
@@ -21,7 +21,7 @@ pub(crate) fn run(data: &[u8]) {
     assert!(bytes <= data.len() && packets.iter().all(|packet| !packet.bytes.is_empty()));
     // What is cut off takes nothing with it.
     if let Ok(cut) = capture::read(&data[..data.len() - 1]) {
-        assert!(packets.starts_with(&cut));
+        assert!(packets.starts_with(&cut.packets));
     }
     // What the listener makes of it.
     let began = Instant::now();

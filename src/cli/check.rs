@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::{ConfigFile, EXIT_CONFIG, report};
+use super::{EXIT_CONFIG, NamedConfig, report};
 use crate::bus::predict::{PredictedRequest, Prediction};
 use crate::config::{BusSettings, Loaded, Settings, environment};
 use crate::document::{Finding, Problem};
@@ -33,10 +33,7 @@ use crate::process_image::{Access, DriveSpec};
 )]
 pub(super) struct Args {
     #[command(flatten)]
-    config: ConfigFile,
-    /// Configuration file, as with --config.
-    #[arg(value_name = "FILE", conflicts_with = "path")]
-    file: Option<PathBuf>,
+    config: NamedConfig,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -90,7 +87,7 @@ struct Request<'a> {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let path = args.file.as_ref().unwrap_or(&args.config.path);
+    let path = args.config.path();
     let mut loaded = Settings::load(path, environment());
     if args.as_service {
         loaded.errors.extend(as_service::problems(path));

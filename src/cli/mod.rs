@@ -42,7 +42,7 @@ mod watch;
 mod why;
 mod write;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::LazyLock;
 
@@ -133,6 +133,22 @@ struct ConfigFile {
     /// Configuration file.
     #[arg(long = "config", value_name = "FILE", default_value = DEFAULT_CONFIG)]
     path: PathBuf,
+}
+
+/// The option that names the configuration, or the configuration itself.
+#[derive(Debug, clap::Args)]
+struct NamedConfig {
+    #[command(flatten)]
+    config: ConfigFile,
+    /// Configuration file, as with --config.
+    #[arg(value_name = "FILE", conflicts_with = "path")]
+    file: Option<PathBuf>,
+}
+
+impl NamedConfig {
+    fn path(&self) -> &Path {
+        self.file.as_deref().unwrap_or(&self.config.path)
+    }
 }
 
 /// The whole command line, from which manual pages and completions are made.

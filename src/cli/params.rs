@@ -5,6 +5,7 @@ mod restore;
 use std::io::{IsTerminal, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::{Duration, Instant};
 
 use super::drive_access::target;
 use super::{DEFAULT_CONFIG, EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
@@ -174,21 +175,39 @@ fn read_from_drive(config: &Path, drive: &str, afresh: bool, brisk: bool) -> Res
     Ok((file?, target.spec.profile.clone()))
 }
 
-/// One line on a terminal, kept up to date; elsewhere nothing.
+/// Pause between two lines of progress that nobody watches on a terminal.
+const SAID_EVERY: Duration = Duration::from_secs(60);
+
+/// One line on a terminal, kept up to date; elsewhere a line once a minute.
 #[derive(Debug, Default)]
 struct StatusLine {
     shown: bool,
+    /// When it began, or said something last, off a terminal.
+    said: Option<Instant>,
 }
 
 impl StatusLine {
     fn show(&mut self, text: &str) {
         let mut stderr = std::io::stderr();
         if !stderr.is_terminal() {
+            if self.is_due(Instant::now()) {
+                report::note(text);
+            }
             return;
         }
         self.shown = true;
         // A terminal that is gone shows nothing.
         let _ = write!(stderr, "\r\x1b[K{text}");
+    }
+
+    /// Whether a line is due off a terminal: what is over within a minute needs none.
+    fn is_due(&mut self, now: Instant) -> bool {
+        let said = *self.said.get_or_insert(now);
+        let due = now.saturating_duration_since(said) >= SAID_EVERY;
+        if due {
+            self.said = Some(now);
+        }
+        due
     }
 
     fn end(&self) {

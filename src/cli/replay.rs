@@ -66,7 +66,15 @@ pub(super) fn run(args: &Args) -> ExitCode {
         }
     };
     let packets = match capture::read(&file) {
-        Ok(packets) => packets,
+        Ok(capture) => {
+            if let Some(error) = capture.broken {
+                report::warning(&format!(
+                    "the capture is read up to a fault: {error}; {}; what comes behind it is left out",
+                    args.capture.display()
+                ));
+            }
+            capture.packets
+        }
         Err(error) => {
             report::error(&format!(
                 "cannot read the capture: {error}; {}; make it with `drivegate trace --pcap`, or in the same format",

@@ -5,7 +5,7 @@ mod serving;
 mod watch;
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 
 use futures_util::FutureExt;
@@ -24,14 +24,13 @@ use crate::north::local::Control;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate run --config /etc/drivegate/drivegate.toml")]
 pub(super) struct Args {
-    /// Configuration file
-    #[arg(long, value_name = "FILE", default_value = super::DEFAULT_CONFIG)]
-    pub config: PathBuf,
+    #[command(flatten)]
+    config: super::NamedConfig,
 }
 
 /// Runs the daemon until SIGTERM or SIGINT.
 pub(super) fn run(args: &Args) -> ExitCode {
-    run_from(&args.config).unwrap_or_else(|why| {
+    run_from(args.config.path()).unwrap_or_else(|why| {
         report::error(&format!(
             "cannot start: {why}; the runtime; free memory, threads or file descriptors"
         ));

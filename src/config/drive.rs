@@ -57,7 +57,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let frequency_range = read_frequencies(reader);
     let limits = read_limits(reader, profile.as_deref(), frequency_range.as_ref());
     let supervision = read_supervision(reader, profile.as_deref(), &limits);
-    let on_shutdown = DRIVE.on_shutdown.get(reader);
+    let on_shutdown = read_on_shutdown(reader, profile.as_deref());
     let turnaround = DRIVE.turnaround.read(reader);
     let triggers = read_triggers(reader, profile.as_deref());
     let raw_writes = raw_writes::read(reader, profile.as_deref());
@@ -95,6 +95,25 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
         shutdown_stop: (on_shutdown == OnShutdown::Stop).then(|| DRIVE.on_shutdown.place(reader)),
         spec,
     }
+}
+
+/// What the drive does when the gateway stops: it cannot be stopped where its profile does not write `run`.
+fn read_on_shutdown(reader: &Reader<'_>, profile: Option<&Profile>) -> OnShutdown {
+    let on_shutdown = DRIVE.on_shutdown.get(reader);
+    let stops = |profile: &Profile| profile.model_point(ModelPoint::Run).is_some_and(|run| run.write);
+    if on_shutdown == OnShutdown::Stop
+        && let Some(profile) = profile.filter(|profile| !stops(profile))
+    {
+        reader.problem(
+            DRIVE.on_shutdown.name,
+            format!(
+                "the profile `{}` writes no `run`, so nothing can stop the drive",
+                profile.name
+            ),
+            "write on_shutdown = \"hold\", or give the point `run` of the profile `write = true`",
+        );
+    }
+    on_shutdown
 }
 
 const fn address_form(protocol: Protocol) -> &'static Number {

@@ -7,7 +7,7 @@ use std::time::Duration;
 use serde_json::{Map, Value, json};
 
 use super::values::{self, NAME_LENGTH};
-use crate::document::{Document, Finding, FromNode, Place, Reader, format_duration};
+use crate::document::{Document, Finding, FromNode, Place, Reader, ValueError, format_duration};
 
 /// A number and a unit, as [`crate::document::parse_duration`] reads it.
 pub(super) const DURATION: &str = r"^\s*(\d+\.?\d*|\.\d+)\s*(us|µs|ms|s|min|h)\s*$";
@@ -206,7 +206,8 @@ pub(super) struct Parsed<T> {
 
 impl<T> Form<T> for Parsed<T> {
     fn read(&self, reader: &Reader<'_>, key: &str) -> Option<T> {
-        reader.parsed(key, self.parse)
+        let text: String = of_type(reader, key, &format!("{}, in quotes", self.range))?;
+        reader.accept(key, (self.parse)(&text))
     }
 
     fn schema(&self) -> Value {
@@ -220,6 +221,20 @@ impl<T> Form<T> for Parsed<T> {
     fn range(&self) -> String {
         self.range.to_string()
     }
+}
+
+/// The value of a key whose type says less than its range: that is what is to be written in place of one of another type.
+fn of_type<T: FromNode>(reader: &Reader<'_>, key: &str, range: &str) -> Option<T> {
+    let value = T::from_node(reader.raw(key)?);
+    reader.accept(
+        key,
+        value.map_err(|error| match error {
+            ValueError::Type(..) | ValueError::NotAList(..) => {
+                Finding::new(error.to_string(), format!("write {range}"))
+            }
+            error => error.into(),
+        }),
+    )
 }
 
 /// True or false.
@@ -352,7 +367,7 @@ pub(super) struct List<T> {
 
 impl<T> Form<Vec<T>> for List<T> {
     fn read(&self, reader: &Reader<'_>, key: &str) -> Option<Vec<T>> {
-        let items: Vec<String> = reader.optional(key)?;
+        let items: Vec<String> = of_type(reader, key, self.range)?;
         if let (true, Some(remedy)) = (items.is_empty(), self.empty) {
             reader.problem(key, "the list is empty", remedy);
         }

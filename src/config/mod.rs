@@ -145,9 +145,14 @@ impl Settings {
         let path = path.as_ref();
         match document::read_file(path) {
             Ok(source) => Settings::parse(path, &source, env),
-            Err(problem) => Loaded {
+            Err(mut problem) => Loaded {
                 settings: None,
-                errors: vec![problem],
+                errors: {
+                    if !path.exists() {
+                        problem.finding.remedy = NO_FILE.to_string();
+                    }
+                    vec![problem]
+                },
                 warnings: Vec::new(),
             },
         }
@@ -158,6 +163,9 @@ impl Settings {
         parse(path.as_ref(), source, env).0
     }
 }
+
+/// What to do where there is no configuration yet.
+const NO_FILE: &str = "name the file with --config; `drivegate try` finds drives and writes a configuration";
 
 impl Settings {
     /// The local socket of the gateway that runs with the file `path`, also if the file is invalid since it started.
@@ -201,7 +209,13 @@ fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>)
     let settings = read(&document.reader(), base, &mut profile_errors);
     let known = document.known_keys().into_iter().collect();
     let is_toml = document.is_toml();
-    let (mut errors, warnings) = document.into_findings();
+    let (mut errors, mut warnings) = document.into_findings();
+    warnings.extend(
+        settings
+            .iter()
+            .flat_map(|settings| settings.profiles.warnings())
+            .cloned(),
+    );
     if is_toml {
         errors.extend(profile_errors);
         errors.extend(broken.iter().map(|(name, _)| not_text(name)));

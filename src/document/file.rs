@@ -1,8 +1,13 @@
 //! Reads the text of a document, and reports where a file stops being text.
 
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
 use super::{Finding, Problem};
+
+/// Longest file that is read: no document is longer.
+const LONGEST: u64 = 16 << 20;
 
 /// Why bytes are not the text of a document.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
@@ -20,12 +25,20 @@ enum NotText {
 pub(crate) fn read_file(path: &Path) -> Result<String, Problem> {
     let of_file =
         |what: String, remedy: &str| Problem::of_file(path.display().to_string(), "", Finding::new(what, remedy));
-    let bytes = std::fs::read(path).map_err(|error| {
+    let mut bytes = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(LONGEST + 1).read_to_end(&mut bytes));
+    read.map_err(|error| {
         of_file(
             format!("cannot read the file: {error}"),
             "check the path and its permissions",
         )
     })?;
+    if bytes.len() as u64 > LONGEST {
+        return Err(of_file(
+            format!("the file is longer than {} MiB", LONGEST >> 20),
+            "name the intended file",
+        ));
+    }
     text(bytes).map_err(|error| match error {
         NotText::Utf16 => of_file(error.to_string(), "save it as UTF-8"),
         NotText::Byte { line, .. } => Problem {
@@ -98,6 +111,12 @@ mod tests {
             "{}",
             problem()
         );
+        std::fs::write(&path, vec![b'#'; LONGEST as usize + 1]).unwrap();
+        assert_eq!(
+            problem(),
+            "the file is longer than 16 MiB; /x.toml; name the intended file"
+        );
+        assert!(read_file(Path::new("/dev/zero")).is_err());
         std::fs::write(&path, b"a\n\xB0").unwrap();
         assert_eq!(
             problem(),

@@ -7,6 +7,7 @@
 //! `tree` holds the values, `value` the types they can be read as.
 
 mod file;
+mod mistakes;
 mod reader;
 mod tree;
 mod value;
@@ -140,7 +141,10 @@ impl Document {
                 line,
                 ..Place::default()
             };
-            let problem = document.at(&place, Finding::new(format!("not valid TOML: {message}"), ""));
+            let named = mistakes::named(source, line);
+            let found = named.unwrap_or_else(|| Finding::new(message, ""));
+            let what = format!("not valid TOML: {}", found.what);
+            let problem = document.at(&place, Finding::new(what, found.remedy));
             document.syntax.push(problem);
         }
         document
@@ -239,11 +243,6 @@ impl Document {
         self.syntax.is_empty()
     }
 
-    /// The problems, in the order of the lines.
-    pub(crate) fn into_problems(self) -> Vec<Problem> {
-        self.into_findings().0
-    }
-
     /// Problems and warnings, each in the order of the lines; of a file that is not TOML, only where it is not.
     pub(crate) fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
         if !self.is_toml() {
@@ -267,7 +266,7 @@ mod tests {
         let reader = document.reader();
         read(&reader);
         reader.finish();
-        document.into_problems().iter().map(Problem::to_string).collect()
+        document.into_findings().0.iter().map(Problem::to_string).collect()
     }
 
     #[test]
@@ -348,7 +347,7 @@ mod tests {
                 "mqtt.publish.min_interval"
             ]
         );
-        let found: Vec<String> = document.into_problems().iter().map(Problem::to_string).collect();
+        let found: Vec<String> = document.into_findings().0.iter().map(Problem::to_string).collect();
         let absent = |key: &str| format!("there is no `{key}` in the file to override");
         assert_eq!(
             found,

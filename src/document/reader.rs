@@ -118,7 +118,7 @@ impl<'d> Reader<'d> {
                 self.problem(
                     key,
                     format!("`{key}` is {}, not a table", node.value.kind()),
-                    format!("write [{}]", self.header(key)),
+                    format!("write [{}] on a line of its own, and its keys below", self.header(key)),
                 );
                 None
             }

@@ -79,8 +79,8 @@ pub(crate) enum Raw {
     Table(Vec<Entry>),
     /// Text of an environment variable, read as any type.
     Env(String),
-    /// A date or an integer beyond 64 bits, which no key accepts.
-    Other,
+    /// What no key accepts: `a date`.
+    Other(&'static str),
 }
 
 impl Raw {
@@ -93,7 +93,7 @@ impl Raw {
             Raw::Bool(_) => "a boolean",
             Raw::Array(_) => "an array",
             Raw::Table(_) => "a table",
-            Raw::Other => "a date or an oversized number",
+            Raw::Other(kind) => kind,
         }
     }
 }
@@ -174,12 +174,14 @@ fn table_of(table: DeTable<'_>, lines: &Lines) -> Raw {
 fn value_of(value: DeValue<'_>, lines: &Lines) -> Raw {
     match value {
         DeValue::String(text) => Raw::Text(text.into_owned()),
-        DeValue::Integer(integer) => {
-            i64::from_str_radix(integer.as_str(), integer.radix()).map_or(Raw::Other, Raw::Integer)
-        }
-        DeValue::Float(float) => float.as_str().parse().map_or(Raw::Other, Raw::Float),
+        DeValue::Integer(integer) => i64::from_str_radix(integer.as_str(), integer.radix())
+            .map_or(Raw::Other("an integer with too many digits"), Raw::Integer),
+        DeValue::Float(float) => float
+            .as_str()
+            .parse()
+            .map_or(Raw::Other("a number that cannot be read"), Raw::Float),
         DeValue::Boolean(value) => Raw::Bool(value),
-        DeValue::Datetime(_) => Raw::Other,
+        DeValue::Datetime(_) => Raw::Other("a date"),
         DeValue::Array(array) => Raw::Array(
             array
                 .into_iter()

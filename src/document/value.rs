@@ -14,6 +14,8 @@ pub(crate) enum ValueError {
     Text(String, &'static str),
     #[error("`{0}` is not a list")]
     NotAList(String, String),
+    #[error("`{0:?}` has a decimal point")]
+    Fraction(f64, &'static str),
     #[error("wrong type: {0}")]
     Type(&'static str, String),
     #[error("{0} is out of range")]
@@ -28,10 +30,12 @@ pub(crate) enum ValueError {
 
 impl From<ValueError> for Finding {
     fn from(error: ValueError) -> Finding {
-        use ValueError::{Duration, NotAList, NotFinite, OutOfRange, Quoted, Size, Text, Type};
+        use ValueError::{Duration, Fraction, NotAList, NotFinite, OutOfRange, Quoted, Size, Text, Type};
         let remedy = match &error {
             Quoted(_, wanted) => format!("write {wanted}, without quotes"),
             Text(_, wanted) | OutOfRange(_, wanted) | NotFinite(_, wanted) => format!("write {wanted}"),
+            Fraction(value, wanted) if value.fract() == 0.0 => format!("write {wanted}, such as {value:.0}"),
+            Fraction(_, wanted) => format!("write {wanted}"),
             NotAList(_, wanted) | Type(_, wanted) => format!("write {wanted}"),
             Duration(_) => "write a number with its unit, such as 10ms, 1.5s or 2min".to_string(),
             Size(_) => "write a whole number with B, KiB, MiB or GiB, such as \"64MiB\"".to_string(),
@@ -58,6 +62,7 @@ fn wrong<T: FromNode>(node: &Node) -> ValueError {
         Raw::Text(text) if is_quoted(text) && !T::WANTED.contains("quotes") => {
             ValueError::Quoted(text.clone(), T::WANTED)
         }
+        Raw::Float(value) if T::WANTED.contains("whole") => ValueError::Fraction(*value, T::WANTED),
         Raw::Env(text) | Raw::Text(text) => ValueError::Text(text.clone(), T::WANTED),
         other => ValueError::Type(other.kind(), T::WANTED.to_string()),
     }

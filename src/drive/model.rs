@@ -171,6 +171,21 @@ pub(crate) fn tidy(value: f64) -> f64 {
     if rounded.is_finite() { rounded } else { value }
 }
 
+/// The same of a count that was only multiplied, however small the product is: rounded to twelve significant digits.
+pub(crate) fn tidy_product(value: f64) -> f64 {
+    let places = 11 - value.abs().log10().floor().clamp(-300.0, 300.0) as i32;
+    // Beyond these powers of ten are not exact; a float has no such digits anyway.
+    if value == 0.0 || !(-22..=22).contains(&places) {
+        return value;
+    }
+    let power = 10f64.powi(places.abs());
+    let rounded = match places {
+        0.. => (value * power).round() / power,
+        _ => (value / power).round() * power,
+    };
+    if rounded.is_finite() { rounded } else { value }
+}
+
 macro_rules! model_points {
     ($($variant:ident $name:literal $unit:literal $kind:ident $doc:literal,)*) => {
         /// A point of the common model.

@@ -13,7 +13,7 @@ use super::derive::Derived;
 use super::model::{Kind, ModelPoint, Value};
 use super::parameters::ParameterList;
 use crate::codec::{N2Options, Protocol, RequestPdu, Table};
-use crate::document::Node;
+use crate::document::{Node, Problem};
 
 pub use raw::{Form, Raw, WordOrder};
 
@@ -71,6 +71,8 @@ pub struct Profile {
     /// The file merged with its base, for profiles based on this one. None for built-in ones, which have no base: their
     /// text says it all, in a fifth of the memory.
     pub(super) tree: Option<Node>,
+    /// What its author may not have meant; of built-in ones nothing.
+    pub warnings: Vec<Problem>,
 }
 
 /// Text of a fault code.
@@ -419,6 +421,11 @@ impl Profiles {
     /// Adds a profile; one of the same name is replaced.
     pub(crate) fn insert(&mut self, profile: Profile) {
         self.0.insert(profile.name.clone(), Arc::new(profile));
+    }
+
+    /// The warnings about all of them.
+    pub(crate) fn warnings(&self) -> impl Iterator<Item = &Problem> {
+        self.0.values().flat_map(|profile| &profile.warnings)
     }
 
     /// The profile of that name.

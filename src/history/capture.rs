@@ -47,15 +47,30 @@ fn error(offset: usize, what: impl Into<String>) -> CaptureError {
     }
 }
 
-/// The packets with bytes, in the order of the file.
+/// What a capture holds.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LineCapture {
+    /// The packets with bytes, in the order of the file.
+    pub packets: Vec<Packet>,
+    /// Where the file ends early or is broken; what stands before is read.
+    pub broken: Option<CaptureError>,
+}
+
+/// Reads a capture as far as it goes. Packets of other interfaces than serial lines are left out.
 ///
 /// # Errors
-/// When the file is no capture of a serial line, is broken, or ends in the middle.
-pub fn read(file: &[u8]) -> Result<Vec<Packet>, CaptureError> {
-    match file.first_chunk::<4>() {
+/// The file is no capture of a serial line, or broken before its first packet with bytes.
+pub fn read(file: &[u8]) -> Result<LineCapture, CaptureError> {
+    let mut packets = Vec::new();
+    let read = match file.first_chunk::<4>() {
         None => Err(error(0, "the file is too short for a capture")),
-        Some([0x0A, 0x0D, 0x0D, 0x0A]) => read_pcapng(file),
-        Some(magic) => read_pcap(file, *magic),
+        Some([0x0A, 0x0D, 0x0D, 0x0A]) => read_pcapng(file, &mut packets),
+        Some(magic) => read_pcap(file, *magic, &mut packets),
+    };
+    let broken = read.err();
+    match broken {
+        Some(error) if packets.is_empty() => Err(error),
+        broken => Ok(LineCapture { packets, broken }),
     }
 }
 
@@ -97,7 +112,7 @@ impl Bytes<'_> {
     }
 }
 
-fn read_pcap(file: &[u8], magic: [u8; 4]) -> Result<Vec<Packet>, CaptureError> {
+fn read_pcap(file: &[u8], magic: [u8; 4], packets: &mut Vec<Packet>) -> Result<(), CaptureError> {
     let (big, nanos) = match magic {
         [0xA1, 0xB2, 0xC3, 0xD4] => (true, false),
         [0xD4, 0xC3, 0xB2, 0xA1] => (false, false),
@@ -108,7 +123,6 @@ fn read_pcap(file: &[u8], magic: [u8; 4]) -> Result<Vec<Packet>, CaptureError> {
     let bytes = Bytes { file, big };
     let link = bytes.u32(20)? & 0xFFFF;
     check_link(link, 20)?;
-    let mut packets = Vec::new();
     let mut at = 24;
     while at < file.len() {
         let (seconds, part) = (bytes.u32(at)?, bytes.u32(at + 4)?);
@@ -122,7 +136,7 @@ fn read_pcap(file: &[u8], magic: [u8; 4]) -> Result<Vec<Packet>, CaptureError> {
         packets.extend(packet(link, Duration::from_secs(seconds.into()) + part, data, at + 16)?);
         at += 16 + length;
     }
-    Ok(packets)
+    Ok(())
 }
 
 fn part_of(file: &[u8], from: usize, length: usize) -> Result<&[u8], CaptureError> {
@@ -171,10 +185,10 @@ struct Interface {
     ticks: u64,
 }
 
-fn read_pcapng(file: &[u8]) -> Result<Vec<Packet>, CaptureError> {
+fn read_pcapng(file: &[u8], packets: &mut Vec<Packet>) -> Result<(), CaptureError> {
     let mut bytes = Bytes { file, big: false };
     let mut interfaces: Vec<Interface> = Vec::new();
-    let mut packets = Vec::new();
+    let mut not_serial = None;
     let mut at = 0;
     while at < file.len() {
         let begins_section = file.get(at..at + 4) == Some(&[0x0A, 0x0D, 0x0D, 0x0A]);
@@ -203,6 +217,11 @@ fn read_pcapng(file: &[u8]) -> Result<Vec<Packet>, CaptureError> {
             PACKET => {
                 let of = interfaces.get(bytes.u32(at + 8)? as usize).copied();
                 let of = of.ok_or_else(|| error(at + 8, "a packet of an interface that there is not"))?;
+                if let Err(error) = check_link(of.link, at) {
+                    not_serial.get_or_insert(error);
+                    at += length;
+                    continue;
+                }
                 let ticks = u64::from(bytes.u32(at + 12)?) << 32 | u64::from(bytes.u32(at + 16)?);
                 let data = data_of(block, bytes.length(at + 20)?, 28, at)?;
                 packets.extend(packet(of.link, time(ticks, of.ticks), data, at + 28)?);
@@ -213,7 +232,8 @@ fn read_pcapng(file: &[u8]) -> Result<Vec<Packet>, CaptureError> {
         }
         at += length;
     }
-    Ok(packets)
+    // Of another interface beside the line nothing is said.
+    not_serial.filter(|_| packets.is_empty()).map_or(Ok(()), Err)
 }
 
 /// The data of a packet block, from `from` in it.
@@ -236,7 +256,6 @@ fn time(ticks: u64, in_a_second: u64) -> Duration {
 
 fn interface(bytes: Bytes<'_>, at: usize, length: usize) -> Result<Interface, CaptureError> {
     let link = u32::from(bytes.u16(at + 8)?);
-    check_link(link, at + 8)?;
     let mut ticks = 1_000_000;
     let (mut option, end) = (at + 16, at + length - 4);
     while option + 4 <= end {
@@ -293,8 +312,8 @@ mod tests {
             sent: true,
             bytes: vec![1, 3],
         };
-        assert_eq!(read(&file), Ok(vec![packet]));
-        let bare = read(&pcap(147, &[(1, 0, &[9])])).unwrap();
+        assert_eq!(read(&file).unwrap().packets, [packet]);
+        let bare = read(&pcap(147, &[(1, 0, &[9])])).unwrap().packets;
         assert_eq!((bare[0].sent, bare[0].bytes.as_slice()), (false, &[9][..]));
     }
 
@@ -323,7 +342,7 @@ mod tests {
             sent: false,
             bytes: vec![0xAB],
         };
-        assert_eq!(read(&file), Ok(vec![packet]));
+        assert_eq!(read(&file).unwrap().packets, [packet]);
         for end in 1..file.len() {
             if let Err(error) = read(&file[..end]) {
                 assert!(error.offset <= end, "{error}");
@@ -331,6 +350,54 @@ mod tests {
         }
         let cut = read(&file[..file.len() - 3]).unwrap_err();
         assert_eq!(cut.what, "the file ends in the middle of a block");
+    }
+
+    #[test]
+    fn a_capture_that_was_cut_off_is_read_up_to_there() {
+        let sent = [0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 3];
+        let file = pcap(250, &[(7, 0, &sent), (8, 0, &sent)]);
+        let read = read(&file[..file.len() - 1]).unwrap();
+        assert_eq!(read.packets.len(), 1);
+        assert_eq!(read.broken.unwrap().what, "the file ends in the middle of a packet");
+    }
+
+    #[test]
+    fn another_interface_beside_the_line_is_left_out() {
+        let magic = [
+            0x4D, 0x3C, 0x2B, 0x1A, 1, 0, 0, 0, 255, 255, 255, 255, 255, 255, 255, 255,
+        ];
+        let interface = |link: u8| block(INTERFACE, &[link, 0, 0, 0, 0, 0, 0, 0]);
+        let packet = |interface: u8| {
+            let data = [0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0xAB, 0, 0, 0];
+            block(
+                PACKET,
+                &[
+                    &[interface, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 13, 0, 0, 0, 13, 0, 0, 0][..],
+                    &data,
+                ]
+                .concat(),
+            )
+        };
+        let section = block(SECTION, &magic);
+        let both = [
+            section.clone(),
+            interface(1),
+            interface(250),
+            packet(0),
+            packet(1),
+            packet(0),
+        ]
+        .concat();
+        let found = read(&both).unwrap();
+        assert_eq!((found.packets.len(), found.broken), (1, None));
+        assert_eq!(found.packets[0].bytes, [0xAB]);
+        let none = [section, interface(1), packet(0)].concat();
+        assert!(
+            read(&none)
+                .unwrap_err()
+                .what
+                .starts_with("link type 1 is no serial line")
+        );
     }
 
     #[test]

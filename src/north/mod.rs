@@ -62,7 +62,8 @@ fn remedy(cause: &io::Error) -> &'static str {
     match cause.kind() {
         io::ErrorKind::AddrInUse => "another program uses it; stop that program or choose another port",
         io::ErrorKind::PermissionDenied => {
-            "ports below 1024 require CAP_NET_BIND_SERVICE; grant it or choose another port"
+            "ports below 1024 require CAP_NET_BIND_SERVICE: set CapabilityBoundingSet and AmbientCapabilities of the unit to it \
+             (systemctl edit drivegate), or choose another port"
         }
         io::ErrorKind::AddrNotAvailable => "this machine does not have that address; choose one that it has",
         _ => "choose another address",

@@ -118,12 +118,12 @@ fn offer(args: &Args, stop: &Stop, text: &str) -> Result<(), String> {
         return Ok(());
     }
     while !stop.is_wanted() {
-        let file = match ask(
-            "\nWrite this as a configuration? Name of a new file, or Enter for none:",
+        let answer = ask(
+            "\nWrite this as a configuration? Name of a new file, y for drivegate.toml, or Enter for none:",
             stop,
-        ) {
-            Some(name) if !name.is_empty() => PathBuf::from(name),
-            _ => return Ok(()),
+        );
+        let Some(file) = answer.and_then(|answer| wanted_file(&answer)) else {
+            return Ok(());
         };
         match write_new(&file, text) {
             Ok(()) => {
@@ -136,9 +136,38 @@ fn offer(args: &Args, stop: &Stop, text: &str) -> Result<(), String> {
     Ok(())
 }
 
+/// The file that an answer names; `None` where none is wanted. A yes or a no names no file.
+fn wanted_file(answer: &str) -> Option<PathBuf> {
+    match answer.to_lowercase().as_str() {
+        "" | "n" | "no" | "nein" => None,
+        "y" | "yes" | "j" | "ja" | "ok" => Some(PathBuf::from("drivegate.toml")),
+        _ => Some(PathBuf::from(answer)),
+    }
+}
+
 fn next_steps(file: &Path) -> String {
     let file = file.display();
     format!(
         "Configuration written to {file}. Next, after Ctrl-C:\n  drivegate check --config {file}\n  drivegate run --config {file}\n"
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_yes_is_no_name_of_a_file() {
+        for (answer, file) in [
+            ("", None),
+            ("n", None),
+            ("No", None),
+            ("y", Some("drivegate.toml")),
+            ("YES", Some("drivegate.toml")),
+            ("Pumps.toml", Some("Pumps.toml")),
+            ("yard.toml", Some("yard.toml")),
+        ] {
+            assert_eq!(wanted_file(answer), file.map(PathBuf::from), "{answer}");
+        }
+    }
 }

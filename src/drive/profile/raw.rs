@@ -1,6 +1,6 @@
 //! Raw values: address, format and conversion to engineering units.
 
-use super::super::model::{Kind, Value, tidy};
+use super::super::model::{Kind, Value, tidy, tidy_product};
 use crate::codec::Table;
 
 /// Address and format of a raw value.
@@ -159,7 +159,11 @@ impl Raw {
         if kind == Kind::Integer {
             return Some(Value::Integer(count as i64));
         }
-        Some(Value::Number(tidy(count * self.scale + self.offset)))
+        let scaled = count * self.scale;
+        Some(Value::Number(match self.offset == 0.0 {
+            true => tidy_product(scaled),
+            false => tidy(scaled + self.offset),
+        }))
     }
 
     /// The registers for `value`; bits are merged into `old`.
@@ -269,6 +273,12 @@ mod tests {
         let float = raw(Form::F32(HighFirst), 1.0);
         assert_eq!(float.decode(&[0x4248, 0], Kind::Number), Some(Value::Number(50.0)));
         assert_eq!(float.decode(&[0x3DCC, 0xCCCD], Kind::Number), Some(Value::Number(0.1)));
+        for small in [4.2e-7_f32, -1.5e-20, f32::MIN_POSITIVE, 16_777_215.0] {
+            let bits = small.to_bits();
+            let words = [(bits >> 16) as u16, bits as u16];
+            let wanted = small.to_string().parse().map(Value::Number).ok();
+            assert_eq!(float.decode(&words, Kind::Number), wanted, "{small}");
+        }
         assert_eq!(
             raw(Form::F32(LowFirst), 1.0).decode(&[0, 0x4248], Kind::Number),
             Some(Value::Number(50.0))

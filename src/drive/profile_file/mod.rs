@@ -178,11 +178,12 @@ impl Profile {
         base::change_points(&mut document);
         let profile = read_profile(&document.reader(), built_in, known);
         let tree = (!built_in).then(|| document.root().clone());
-        let problems = document.into_problems();
+        let (problems, warnings) = document.into_findings();
         match profile {
             Some(profile) if problems.is_empty() => Ok(Profile {
                 text: Cow::Owned(source.to_string()),
                 tree,
+                warnings,
                 ..profile
             }),
             _ => Err(problems),
@@ -272,6 +273,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         model,
         text: Cow::Borrowed(""),
         tree: None,
+        warnings: Vec::new(),
     };
     reader.finish();
     name.map(|_| profile)

@@ -15,12 +15,20 @@ pub(super) fn parse_address(text: &str) -> Option<u16> {
 
 /// `holding 2100.3`: table, PDU address, bit.
 pub(super) fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange], offsets: &Offsets) -> Option<Source> {
+    // They are keys of a point with an address, whatever is wrong with that.
+    for key in ["type", "words", "invert", "scale", "offset"] {
+        reader.raw(key);
+    }
     let at: String = reader.required("at")?;
-    let bad = || {
-        Finding::new(
+    let bad = || match of_reference(&at) {
+        Some((table, address)) => Finding::new(
+            format!("`{at}` is a reference number, which counts from 1"),
+            format!("write table and PDU address: \"{table} {address}\""),
+        ),
+        None => Finding::new(
             format!("`{at}` is not an address"),
             "write table and PDU address, such as \"holding 2103\" or \"holding 2100.3\"",
-        )
+        ),
     };
     let Some((table, place)) = at.split_once(' ') else {
         reader.finding("at", bad());
@@ -57,6 +65,21 @@ pub(super) fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange], offsets: &O
     }
     check_place(reader, &raw, ranges);
     Some(Source::Raw(raw))
+}
+
+/// The table and PDU address of a reference number of five or six digits, as manuals print it: 40003 is holding 2.
+fn of_reference(text: &str) -> Option<(Table, u16)> {
+    let digits = text.bytes().all(|byte| byte.is_ascii_digit()) && matches!(text.len(), 5 | 6);
+    let (table, number) = text.split_at_checked(1).filter(|_| digits)?;
+    let table = match table {
+        "0" => Table::Coil,
+        "1" => Table::DiscreteInput,
+        "3" => Table::Input,
+        "4" => Table::Holding,
+        _ => return None,
+    };
+    let address = number.parse::<u32>().ok()?.checked_sub(1)?;
+    Some((table, u16::try_from(address).ok()?))
 }
 
 /// `3` is one bit, `4-7` a field: the first bit and how many.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::super::Value;
 use super::super::derive::Derived;
 use super::super::model::{Kind, ModelPoint};
 use super::super::profile::{AddressRange, Blocks, Form, Point, PollClass, Source, WordOrder};
@@ -57,6 +58,13 @@ pub(super) fn read_point(
         reader.problem("name", format!("there are two points `{name}`"), "rename one of them");
     }
     let model = ModelPoint::from_name(&name);
+    if let Some(meant) = misspelt(&name).filter(|_| model.is_none()) {
+        reader.warning(
+            "name",
+            format!("`{name}` is a point of its own, and nearly `{meant}` of the common model"),
+            format!("write `{meant}` if that is meant, or a name that is less like it"),
+        );
+    }
     let source = if reader.has("derive") {
         read_derived(reader, names)
     } else {
@@ -104,6 +112,15 @@ pub(super) fn read_point(
     check_texts(reader, &point, names);
     reader.finish();
     point
+}
+
+/// The point of the common model that a name is a slip away from.
+fn misspelt(name: &str) -> Option<&'static str> {
+    let near = |model: &&'static str| {
+        let numbered = name.ends_with(|c: char| c.is_ascii_digit());
+        model.len() > 5 && !numbered && strsim::damerau_levenshtein(name, model) == 1
+    };
+    ModelPoint::ALL.iter().map(|point| point.name()).find(near)
 }
 
 fn read_class(reader: &Reader<'_>) -> PollClass {
@@ -291,6 +308,14 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
         .iter()
         .find(|r| r.table == raw.table && r.addresses.contains(&raw.address));
     let (most, items) = (range.map_or(0, |r| r.write), raw.form.items());
+    let ends = point.range.iter().flat_map(|range| [*range.start(), *range.end()]);
+    if let Some(why) = ends.filter_map(|end| raw.encode(Value::Number(end), 0).err()).next() {
+        reader.problem(
+            "range",
+            format!("an end of the range does not fit in the register: {why}"),
+            "write a range within the register, or correct `type`, `scale` or `offset`",
+        );
+    }
     if most == 0 {
         reader.problem(
             "write",

@@ -530,3 +530,50 @@ fn points_for_faults_are_read_by_their_registers() {
     let all = mistakes("p", &source("\"fault_code_id9\""));
     assert!(all.contains("p:3, on_fault; did you mean `fault_code_id99`?"), "{all}");
 }
+
+#[test]
+fn a_wrong_place_or_type_makes_no_other_key_unknown() {
+    for (at, kind, wanted) in [
+        ("holding 1", "u17", "unknown type `u17`"),
+        ("holdng 1", "u16", "unknown table `holdng`"),
+        ("40003", "u16", "write table and PDU address: \"holding 2\""),
+        ("300010", "u16", "write table and PDU address: \"input 9\""),
+        ("70003", "u16", "`70003` is not an address"),
+    ] {
+        let point =
+            format!("{HEAD}[[point]]\nname = \"a\"\nat = \"{at}\"\ntype = \"{kind}\"\nscale = 0.1\noffset = 1\n");
+        let found = mistakes("m.toml", &point);
+        assert!(found.contains(wanted) && found.lines().count() == 1, "{found}");
+    }
+}
+
+#[test]
+fn a_slip_in_the_name_of_a_model_point_is_a_warning() {
+    let warnings = |name: &str| {
+        let source = format!("{HEAD}[[point]]\nname = \"{name}\"\nat = \"holding 1\"\n");
+        let profile = Profile::parse("m.toml", &source, false).unwrap();
+        profile.warnings.iter().map(Problem::to_string).collect::<Vec<_>>()
+    };
+    let found = warnings("output_freqency");
+    assert!(
+        found.len() == 1 && found[0].contains("write `output_frequency`"),
+        "{found:?}"
+    );
+    assert_eq!(warnings("output_frequency"), Vec::<String>::new());
+    assert_eq!(warnings("output_frequency_2"), Vec::<String>::new());
+    assert!(Profiles::built_in().warnings().next().is_none());
+}
+
+#[test]
+fn a_range_ends_within_its_register() {
+    let range = |range: &str| {
+        let point = "[[point]]\nname = \"a\"\nat = \"holding 1\"\nscale = 0.01\nwrite = true\n";
+        mistakes("m.toml", &format!("{HEAD}{point}range = {range}\n"))
+    };
+    assert_eq!(range("[0, 655.35]"), "");
+    assert!(
+        range("[0, 5000]").contains("holds 0 to 655.35"),
+        "{}",
+        range("[0, 5000]")
+    );
+}
