@@ -74,7 +74,7 @@ impl Master {
                 }
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
-            Ended::Corrupt(_) if end.mangled && !self.late_before => {
+            Ended::Corrupt(_) if self.came_mangled(end) => {
                 // It may come once more, and sound.
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
@@ -93,6 +93,11 @@ impl Master {
             }
             Ended::Silent | Ended::Corrupt(_) => {}
         }
+    }
+
+    /// Whether a reply that cannot be believed was the drive's own, mangled.
+    fn came_mangled(&self, end: &TurnEnd) -> bool {
+        end.mangled && !self.late_before
     }
 
     /// The same on an N2 line. What waited for a late reply that will not come is due again.
@@ -124,7 +129,7 @@ impl Master {
                     n2_late.blocks_poll(address, read, now).is_none()
                 });
             }
-            Ended::Corrupt(_) if end.mangled && !self.late_before => {}
+            Ended::Corrupt(_) if self.came_mangled(end) => {}
             Ended::Corrupt(MAY_BE_LATE) => self.n2_late.doubted(asked, window, now),
             Ended::Silent | Ended::Corrupt(_) => self.n2_late.given_up(asked, window, now),
         }
