@@ -54,8 +54,10 @@ impl Master {
             // Nobody answers it.
             return;
         }
+        // The drive's own reply, unless a late one of an earlier exchange may have been that.
+        let came_mangled = end.mangled && !self.late_before;
         if !self.sessions.is_empty() {
-            self.note_late_on_n2(turn, end, now);
+            self.note_late_on_n2(turn, end, came_mangled, now);
         }
         let stranger = self.stranger(turn);
         let mut drive = self.drives.get_mut(turn.drive);
@@ -74,7 +76,7 @@ impl Master {
                 }
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
-            Ended::Corrupt(_) if self.came_mangled(end) => {
+            Ended::Corrupt(_) if came_mangled => {
                 // It may come once more, and sound.
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
@@ -95,13 +97,8 @@ impl Master {
         }
     }
 
-    /// Whether a reply that cannot be believed was the drive's own, mangled.
-    fn came_mangled(&self, end: &TurnEnd) -> bool {
-        end.mangled && !self.late_before
-    }
-
     /// The same on an N2 line. What waited for a late reply that will not come is due again.
-    fn note_late_on_n2(&mut self, turn: &Turn, end: &TurnEnd, now: Instant) {
+    fn note_late_on_n2(&mut self, turn: &Turn, end: &TurnEnd, came_mangled: bool, now: Instant) {
         let configured = self.bus.image.drives.get(turn.drive);
         let Some(address) = configured
             .map(|image| image.spec.address)
@@ -129,7 +126,7 @@ impl Master {
                     n2_late.blocks_poll(address, read, now).is_none()
                 });
             }
-            Ended::Corrupt(_) if self.came_mangled(end) => {}
+            Ended::Corrupt(_) if came_mangled => {}
             Ended::Corrupt(MAY_BE_LATE) => self.n2_late.doubted(asked, window, now),
             Ended::Silent | Ended::Corrupt(_) => self.n2_late.given_up(asked, window, now),
         }
