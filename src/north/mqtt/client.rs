@@ -516,7 +516,10 @@ impl Client {
         {
             if connection::packet_size(&message) > limits.max_packet {
                 let settled = self.outbox.give_up(key);
-                let why = format!("the broker accepts at most {} bytes per packet", limits.max_packet);
+                let why = format!(
+                    "the broker accepts at most {} bytes per packet; raise its limit",
+                    limits.max_packet
+                );
                 self.drop_refused(settled.as_ref(), &why);
                 self.settled(settled);
                 continue;
@@ -552,6 +555,7 @@ impl Client {
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
         self.stats.mqtt.configured.store(false, Ordering::Relaxed);
         self.keep_recorded();
+        self.count_unkept();
         let close = async { tokio::join!(self.store.close(), self.history.close()) };
         if tokio::time::timeout(LAST_WRITE, close).await.is_err() {
             tracing::warn!("the MQTT buffer is too slow: the last messages may be missing after a restart");

@@ -220,6 +220,18 @@ impl Journal {
         self.counted
     }
 
+    /// Number of messages that are not acknowledged and are on no disk: whoever ends now loses them.
+    pub(super) fn unkept(&self) -> u64 {
+        match self.place {
+            Some(_) => self
+                .unwritten
+                .iter()
+                .filter(|(number, _)| *number > self.acknowledged)
+                .count() as u64,
+            None => (self.last - self.acknowledged).saturating_sub(self.counted),
+        }
+    }
+
     /// Whether the files were deleted since the last call.
     pub(super) fn take_wiped(&mut self) -> bool {
         std::mem::take(&mut self.wiped)

@@ -10,7 +10,8 @@
 //! ```
 //!
 //! `payload`, `publisher`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and
-//! in which order; `offline` drives `commands` without a broker. `client` is the task that owns them. `connection` wraps
+//! in which order; `offline` drives `commands` without a broker. `broker_limits`, `silence`, `retry` and `takeover` judge what the broker does,
+//! without I/O as well. `client` is the task that owns them. `connection` wraps
 //! rumqttc, which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are
 //! sent again from the outbox. `sparkplug` is a client of its own, on a connection of its own.
 

@@ -330,6 +330,15 @@ impl Outbox {
         self.results.entries.len() + self.events.entries.len()
     }
 
+    /// Number of messages of that kind that are nowhere else.
+    pub(super) fn unkept(&self, kind: Kind) -> u64 {
+        self.queue(kind)
+            .entries
+            .iter()
+            .filter(|entry| entry.number.is_none())
+            .count() as u64
+    }
+
     /// Whether telemetry of that topic waits for its first attempt, or is in flight.
     pub(super) fn is_under_way(&self, topic: &str) -> bool {
         self.latest.get(topic).is_some_and(|slot| !slot.put_back)

@@ -371,6 +371,14 @@ impl Thread {
         }
         self.write();
         self.sync();
+        let unkept = self.journal.unkept();
+        if unkept > 0 {
+            self.lost.add(unkept);
+            tracing::error!(
+                "{unkept} messages that the broker did not take are lost: {} does not take them either; check mqtt.buffer",
+                self.dir.display()
+            );
+        }
     }
 
     /// A number of the journal as the client knows it.

@@ -69,14 +69,29 @@ impl Client {
     /// The broker refused a message. What must arrive, and what it refuses for now only, is published again.
     pub(super) fn refused(&mut self, packet: u16, why: PubAckReason) {
         let for_now = matches!(why, PubAckReason::QuotaExceeded | PubAckReason::PacketIdentifierInUse);
-        let now = Instant::now();
+        let (now, root) = (Instant::now(), self.topics.root());
+        let remedy = match for_now {
+            true => "raise its limits if that lasts".to_string(),
+            false => {
+                let discovery = self
+                    .announcer
+                    .as_ref()
+                    .map(|announcer| format!(", {}", announcer.own_topics()));
+                format!(
+                    "it must let client {} publish to {root}/#{} and to the response topics in use",
+                    self.options.client_id,
+                    discovery.unwrap_or_default()
+                )
+            }
+        };
+        let why = format!("{}; {remedy}", refusal(why));
         if let Some(topic) = self.outbox.put_back(packet, for_now) {
             let wait = self.retry.refused(now).saturating_duration_since(now);
             let what = format!("a message on {topic} is published again in {} s", wait.as_secs().max(1));
-            return self.log_refused(&what, &refusal(why), now);
+            return self.log_refused(&what, &why, now);
         }
         let settled = self.outbox.acked(packet);
-        self.drop_refused(settled.as_ref(), &refusal(why));
+        self.drop_refused(settled.as_ref(), &why);
         self.settled(settled);
     }
 
@@ -96,20 +111,11 @@ impl Client {
         let Some(omitted) = self.refused.permit(now) else {
             return;
         };
-        let root = self.topics.root();
-        let discovery = self
-            .announcer
-            .as_ref()
-            .map_or_else(String::new, |announcer| format!(", {}", announcer.own_topics()));
         let more = match omitted {
             0 => String::new(),
             omitted => format!(" ({omitted} more messages, on this or other topics, since the last such line)"),
         };
-        tracing::warn!(
-            "{what}: {why}; the broker must let client {} publish to {root}/#{discovery} and to the response topics in \
-             use{more}",
-            self.options.client_id
-        );
+        tracing::warn!("{what}: {why}{more}");
     }
 }
 

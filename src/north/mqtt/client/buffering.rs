@@ -128,6 +128,20 @@ impl Client {
         self.store.remember(topics);
     }
 
+    /// Counts what ends with this client, because there is no buffer.
+    pub(super) fn count_unkept(&mut self) {
+        let (events, history) = (self.outbox.unkept(Kind::Event), self.outbox.unkept(Kind::History));
+        self.stats.mqtt.lost(MqttLoss::Event, events);
+        self.stats.mqtt.lost(MqttLoss::History, history);
+        if events + history > 0 {
+            tracing::warn!(
+                "{} events or arrays of history that the broker did not take are lost with the end of the MQTT client; set \
+                 mqtt.buffer to keep them",
+                events + history
+            );
+        }
+    }
+
     /// Counts what the outbox lost, and logs it once a minute.
     pub(super) fn count_lost(&mut self, now: Instant) {
         let lost = self.outbox.take_lost();

@@ -199,3 +199,19 @@ async fn a_reload_while_the_broker_is_away_keeps_the_history_so_far() {
     client.update_plant();
     assert_eq!(waiting(&mut client), ["drivegate/hall/drive/p1/history"]);
 }
+
+#[tokio::test]
+async fn what_is_in_memory_only_is_counted_when_the_client_ends() {
+    let dir = tempfile::tempdir().unwrap();
+    let buffer = Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 1 << 20,
+    };
+    for (buffer, expected) in [(None, 5), (Some(buffer), 0)] {
+        let mut client = client(buffer).await;
+        burst(&mut client, 5).await;
+        let stats = client.stats.clone();
+        client.shut_down().await;
+        assert_eq!(stats.mqtt.losses().map(|(_, count)| count).sum::<u64>(), expected);
+    }
+}

@@ -253,9 +253,11 @@ fn a_full_disk_gets_no_segment_after_the_first_and_what_waits_can_be_taken() {
         journal.append(event(n), false);
         assert!(is_full(&journal.write().unwrap_err()));
     }
+    assert_eq!(journal.unkept(), 100, "they end with the process");
     assert!(journal.take(30).iter().map(|(_, m)| number(m)).eq(0..30));
     journal.append(event(100), true);
     journal.acknowledge(101);
+    assert_eq!(journal.unkept(), 0);
     assert!(
         !journal.write().unwrap(),
         "nothing is left to write: the disk may be full all the same"
@@ -363,7 +365,7 @@ fn messages_beyond_the_memory_are_lost_and_counted_once() {
 fn without_a_disk_messages_wait_in_memory() {
     let mut journal = Journal::in_memory();
     append(&mut journal, 0..10);
-    assert_eq!(journal.waiting(), 10);
+    assert_eq!((journal.waiting(), journal.unkept()), (10, 10));
     assert_eq!(numbers(&take_all(&mut journal)), (0..10).collect::<Vec<_>>());
     assert_eq!((journal.waiting(), journal.unwritten.len()), (0, 0));
     for n in 0..UNWRITTEN + 5 {
