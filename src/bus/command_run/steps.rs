@@ -153,8 +153,8 @@ pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool, 
                     let hold = Action::Hold(2 * profile.update_period);
                     let elsewhere = |run: &Raw| (run.table, run.address) != (raw.table, raw.address);
                     // A stop takes the run command away itself, before the reset.
-                    let is_armed = !stopped && !(stop && names_run(profile, values));
-                    let run = profile.run_bit().filter(|_| is_armed);
+                    let disarmed = stopped || (stop && names_run(profile, values));
+                    let run = profile.run_bit().filter(|_| !disarmed);
                     if let Some((run, bit, invert)) = run.filter(|(run, ..)| elsewhere(run)) {
                         let raw = run.clone();
                         pulses.push_back(Action::Disarm { raw, bit, invert });
