@@ -48,6 +48,8 @@ struct Late {
     /// When the first of the requests was sent that may be answered late.
     asked: Instant,
     until: Instant,
+    /// Replies that may still come: the request was sent so often in vain.
+    count: u32,
     /// The same request was answered since: by which of the replies, nobody knows.
     answered: bool,
 }
@@ -71,6 +73,7 @@ impl N2LateReplies {
         let until = now + window;
         if let Some(late) = self.of(asked.address, asked.pdu) {
             (late.until, late.answered) = (until, false);
+            late.count = late.count.saturating_add(1);
             return;
         }
         if self.0.len() >= KEPT {
@@ -83,6 +86,7 @@ impl N2LateReplies {
             device: asked.device,
             asked: asked.at,
             until,
+            count: 1,
             answered: false,
         });
     }
@@ -166,9 +170,17 @@ impl N2LateReplies {
             Answer::Nak(_) => Taken::Doubtful,
             answer if form(pdu).is_some_and(|form| has_form(form, &answer)) => Taken::Doubtful,
             _ => {
-                self.0.remove(index);
+                self.one_came(index);
                 Taken::Late(used)
             }
+        }
+    }
+
+    fn one_came(&mut self, index: usize) {
+        let Some(late) = self.0.get_mut(index) else { return };
+        late.count = late.count.saturating_sub(1);
+        if late.count == 0 {
+            self.0.remove(index);
         }
     }
 
@@ -177,7 +189,7 @@ impl N2LateReplies {
         let answer = self::frame(frame).map(|(_, answer)| answer);
         let index = answer.and_then(|answer| self.0.iter().position(|late| late.could_be(&answer)));
         if let Some(index) = index {
-            self.0.remove(index);
+            self.one_came(index);
         }
     }
 
@@ -349,6 +361,20 @@ mod tests {
         late.answered(1, &state, WINDOW, soon);
         assert_eq!(late.blocks(&float, soon), None);
         assert_eq!(late.owed(soon), 0);
+    }
+
+    #[test]
+    fn a_request_that_was_sent_twice_in_vain_may_be_answered_twice() {
+        let now = Instant::now();
+        let (float, state) = (read(Table::Input, 0, 2), read(Table::DiscreteInput, 0, 1));
+        let mut late = N2LateReplies::default();
+        late.given_up(asked(2, &float, now), WINDOW, now);
+        late.given_up(asked(2, &float, now), WINDOW, now);
+        for _ in 0..2 {
+            assert!(late.blocks(&float, now).is_some());
+            assert_eq!(late.take(1, &state, b"A4248000092\r", now), Taken::Late(12));
+        }
+        assert_eq!(late.blocks(&float, now), None);
     }
 
     #[test]

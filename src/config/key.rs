@@ -229,7 +229,8 @@ fn of_type<T: FromNode>(reader: &Reader<'_>, key: &str, range: &str) -> Option<T
     reader.accept(
         key,
         value.map_err(|error| match error {
-            ValueError::Type(..) | ValueError::NotAList(..) => {
+            // A range without an example says less than the type.
+            ValueError::Type(..) | ValueError::NotAList(..) if range.contains(['[', ',']) => {
                 Finding::new(error.to_string(), format!("write {range}"))
             }
             error => error.into(),

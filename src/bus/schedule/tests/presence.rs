@@ -339,3 +339,24 @@ fn a_drive_that_comes_and_goes_has_no_more_early_probes_than_it_saved_up() {
     let times = probes(&mut drive, now + Duration::from_secs(30), took, ms(2_500));
     assert_eq!(times[..3], [ms(500), ms(1_000), ms(2_000)], "saved up again");
 }
+
+#[test]
+fn what_a_bad_line_swallowed_is_due_once_process_data_was_sound_for_a_while() {
+    let (second, now) = (Duration::from_secs(1), Instant::now());
+    let read = read(PollClass::Slow, 2000, 3);
+    let put_off = Item {
+        failures: 8,
+        failed_at: Some(now),
+        due: now + 60 * second,
+        ..Item::new(read, read, COST, now)
+    };
+    let mut drive = DriveSchedule::new(vec![put_off.clone()], Vec::new(), now);
+    assert_eq!(drive.due(&put_off), now + 60 * second, "the drive is mute to it");
+    drive.troubled = Some(now + 3 * second);
+    assert_eq!(drive.due(&put_off), now + 13 * second);
+    drive.troubled = Some(now - 11 * second);
+    assert_eq!(drive.due(&put_off), now + 60 * second, "the line was sound by then");
+    let answered = Item { failures: 0, ..put_off };
+    drive.troubled = Some(now);
+    assert_eq!(drive.due(&answered), now + 60 * second);
+}
