@@ -59,7 +59,7 @@ pub const EXIT_DATA: u8 = 65;
 /// Exit code of a bad configuration (sysexits EX_CONFIG).
 pub const EXIT_CONFIG: u8 = 78;
 /// Default path of the configuration.
-pub const DEFAULT_CONFIG: &str = "/etc/drivegate/drivegate.toml";
+pub const DEFAULT_CONFIG: &str = crate::config::DEFAULT_FILE;
 
 /// Version and commit of the build.
 static VERSION: LazyLock<String> = LazyLock::new(|| match COMMIT {

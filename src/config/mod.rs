@@ -148,7 +148,7 @@ impl Settings {
             Err(mut problem) => Loaded {
                 settings: None,
                 errors: {
-                    if !path.exists() {
+                    if path == Path::new(DEFAULT_FILE) && !path.exists() {
                         problem.finding.remedy = NO_FILE.to_string();
                     }
                     vec![problem]
@@ -164,6 +164,8 @@ impl Settings {
     }
 }
 
+/// Default path of the configuration.
+pub const DEFAULT_FILE: &str = "/etc/drivegate/drivegate.toml";
 /// What to do where there is no configuration yet.
 const NO_FILE: &str = "name the file with --config; `drivegate try` finds drives and writes a configuration";
 

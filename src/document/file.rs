@@ -33,7 +33,9 @@ pub(crate) fn read_file(path: &Path) -> Result<String, Problem> {
             "check the path and its permissions",
         )
     })?;
-    if bytes.len() as u64 > LONGEST {
+    let is_long = bytes.len() as u64 > LONGEST;
+    // A program or an archive is told as such.
+    if is_long && !bytes.contains(&0) {
         return Err(of_file(
             format!("the file is longer than {} MiB", LONGEST >> 20),
             "name the intended file",

@@ -171,19 +171,18 @@ pub(crate) fn tidy(value: f64) -> f64 {
     if rounded.is_finite() { rounded } else { value }
 }
 
-/// The same of a count that was only multiplied, however small the product is: rounded to twelve significant digits.
+/// The same of a count that was only multiplied, so that a small product keeps nine digits.
 pub(crate) fn tidy_product(value: f64) -> f64 {
-    let places = 11 - value.abs().log10().floor().clamp(-300.0, 300.0) as i32;
-    // Beyond these powers of ten are not exact; a float has no such digits anyway.
-    if value == 0.0 || !(-22..=22).contains(&places) {
+    if value == 0.0 || value.abs() >= 1.0 {
+        return tidy(value);
+    }
+    let places = 8.0 - value.abs().log10().floor();
+    // Powers of ten beyond are not exact.
+    if places > 22.0 {
         return value;
     }
-    let power = 10f64.powi(places.abs());
-    let rounded = match places {
-        0.. => (value * power).round() / power,
-        _ => (value / power).round() * power,
-    };
-    if rounded.is_finite() { rounded } else { value }
+    let power = 10f64.powi(places as i32);
+    (value * power).round() / power
 }
 
 macro_rules! model_points {

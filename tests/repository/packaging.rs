@@ -12,7 +12,8 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 /// The metrics of the public contract; dashboards and alerts of users hang on these names.
-const METRICS: [&str; 52] = [
+const METRICS: [&str; 53] = [
+    "drivegate_listener_up",
     "drivegate_parameters_changed_total",
     "drivegate_drive_starts_total",
     "drivegate_drive_running_seconds_total",

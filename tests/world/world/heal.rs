@@ -259,6 +259,11 @@ impl World {
         for (bus, healed) in self.buses.iter().zip(&healed) {
             let sound = sound_ages(bus, window);
             let round = bus.round.max(bus.line.cycle);
+            // The probe of a dead N2 drive, and what waits for its late reply, come at other moments than in the sound world.
+            let probe = match bus.line.dead.is_empty() || bus.line.protocol != Protocol::N2 {
+                true => Duration::ZERO,
+                false => bus.line.response_timeout,
+            };
             for ((drive, healed), sound) in healed.iter().enumerate().zip(&sound) {
                 if !self.is_alive(bus.index, drive) {
                     continue;
@@ -266,7 +271,7 @@ impl World {
                 for ((read, age), (_, best)) in healed.iter().zip(sound) {
                     let Some(best) = best else { continue };
                     let most = match read.2 {
-                        PollClass::Fast => *best + round + self.exchange(bus) / 2 + STEP,
+                        PollClass::Fast => *best + round + probe + self.exchange(bus) / 2 + STEP,
                         _ => 2 * bus.slow_round.max(bus.line.slow_cycle) + 2 * round,
                     };
                     assert!(
