@@ -419,7 +419,9 @@ impl Schedule {
         for read in drive.behind_state.iter().rev().filter(|read| may_go(read)) {
             self.round.retain(|waiting| *waiting != (index, *read));
             self.round.push_front((index, *read));
-            self.state_first.push((index, *read));
+            if !self.state_first.contains(&(index, *read)) {
+                self.state_first.push((index, *read));
+            }
         }
     }
 
