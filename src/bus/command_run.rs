@@ -518,7 +518,7 @@ impl CommandRun {
             StepPurpose::ReadWord => self.urgency != Urgency::Stop && !self.ends_pulse(),
             _ => false,
         };
-        // A read that it still works on has changed nothing, and is asked for again.
+        // A read that the drive is still working on has changed nothing; it is repeated.
         let is_busy = matches!(reply, Reply::Exception(code) if code.is_busy()
             || (*code == Exception::ACKNOWLEDGE && step.purpose == StepPurpose::ReadWord));
         if !(is_busy && waits) || (self.only_ends && self.tries.busy >= MOST_BUSY) {
@@ -574,7 +574,7 @@ impl CommandRun {
     }
 
     fn word_refused(&mut self, step: &Step, code: Exception, words: &KnownWords) -> Option<Outcome> {
-        // What the drive says to a read tells nothing of a write that it may have taken.
+        // The answer to a read does not show whether an earlier write was taken.
         let refused = match self.tries.in_doubt {
             true => self.tries.unanswered.clone(),
             false => Outcome::Exception(code),

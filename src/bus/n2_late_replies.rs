@@ -95,8 +95,8 @@ impl N2LateReplies {
         self.0.iter_mut().find(|late| late.is_of(address, pdu))
     }
 
-    /// The drive answered a request: what it was asked before, and would answer in another form, is not to come any more.
-    /// Of the same request another reply may still come, within the time of `window`.
+    /// The drive answered a request. Replies of another form to earlier requests will not come any more; another reply to
+    /// the same request may, within `window`.
     pub fn answered(&mut self, address: u8, pdu: &RequestPdu, window: Duration, now: Instant) {
         let Some(form) = form(pdu) else { return };
         self.0
@@ -158,7 +158,7 @@ impl N2LateReplies {
         };
         let mut alike = self.0.iter().filter(|late| late.could_be(&answer));
         let is_own = match &answer {
-            // Whatever of it a drive refused because it waits for Identify, it does wait.
+            // Whichever request it refuses so, the drive waits for Identify.
             Answer::Nak(code) if Exception::n2(*code) == Exception::N2_RESTARTED => {
                 alike.all(|late| late.address == address)
             }

@@ -403,7 +403,7 @@ impl Schedule {
         self.state_first(index, None);
     }
 
-    /// What decides a drive's state, of which nothing is known, is read next, apart from what was read just now.
+    /// Puts the reads that decide a drive's state in front of the round, apart from the one that was just answered.
     fn state_first(&mut self, index: usize, just_read: Option<PlannedRead>) {
         let Some(drive) = self
             .drives

@@ -33,7 +33,7 @@ pub(super) struct Item {
     /// The read of the plan that this one is a part of.
     pub(super) origin: PlannedRead,
     pub(super) due: Instant,
-    /// It is due later than it would be, because another reply could pass for its own.
+    /// Put off, because a late reply to another request could pass for its own.
     pub(super) postponed: bool,
     pub(super) cost: Duration,
     pub(super) refused: bool,
@@ -64,7 +64,7 @@ pub(super) struct DriveSchedule {
     pub(super) presence: Presence,
     pub(super) early: EarlyProbes,
     pub(super) tried: bool,
-    /// It answered what is said to it before it is read, since it was probed last.
+    /// It answered a session step (Identify, poll of N2) since its last probe.
     pub(super) heard: bool,
     /// It did not answer a command: a fast poll shows whether it is there, before anything else is read.
     pub(super) doubted: bool,
@@ -82,7 +82,7 @@ pub(super) struct DriveSchedule {
 /// The probes of a drive soon after it went away.
 #[derive(Debug)]
 pub(super) struct EarlyProbes {
-    /// How many it has whatever they cost: all after it was sound for a while.
+    /// Probes that it may have at any cost: all of them again once it answered for [`SOUND_FOR`].
     free: usize,
     /// Time on the line that it has saved up for more of them.
     saved: Duration,

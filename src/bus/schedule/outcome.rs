@@ -69,7 +69,7 @@ impl Schedule {
         };
         if let Presence::Away(_, pause) = drive.presence {
             drive.failures += 1;
-            // One that has just said something is there.
+            // A drive that has just answered something is there: it is asked again at once.
             if (!drive.tried || drive.heard) && drive.failures <= retries {
                 drive.presence = Presence::Away(now, pause);
                 return Change::None;

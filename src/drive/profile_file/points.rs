@@ -61,8 +61,8 @@ pub(super) fn read_point(
     if let Some(meant) = misspelt(&name).filter(|_| model.is_none()) {
         reader.warning(
             "name",
-            format!("`{name}` is a point of its own, and nearly `{meant}` of the common model"),
-            format!("write `{meant}` if that is meant, or a name that is less like it"),
+            format!("`{name}` is not a point of the common model, but one letter away from `{meant}`"),
+            format!("write `{meant}`, or choose a name that cannot be mistaken for it"),
         );
     }
     let source = if reader.has("derive") {
@@ -312,7 +312,7 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
     if let Some(why) = ends.filter_map(|end| raw.encode(Value::Number(end), 0).err()).next() {
         reader.problem(
             "range",
-            format!("an end of the range does not fit in the register: {why}"),
+            format!("`range` goes beyond the register: {why}"),
             "write a range within the register, or correct `type`, `scale` or `offset`",
         );
     }
