@@ -4,7 +4,7 @@
 //! [`Problem`]s with file, line and key, so that one run reports every error of a file. A key is known once it was
 //! asked for: [`Reader::finish`] reports the others, each with the nearest known key.
 //!
-//! `tree` holds the values, `value` the types they can be read as.
+//! `tree` holds the values, `value` the types they can be read as, `mistakes` what is often written in place of TOML.
 
 mod file;
 mod mistakes;

@@ -5,6 +5,7 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
+use crate::codec::RequestPdu;
 use crate::codec::Table;
 use crate::command::{Admitted, Answer, Origin, SourceKind, WriteStats};
 use crate::drive::Value;

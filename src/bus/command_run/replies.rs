@@ -1,0 +1,253 @@
+//! What the drive's reply to a step of a command means, and what it means that none came. Pure.
+
+use std::time::Duration;
+
+use super::functions::other;
+use super::parameter::Then;
+use super::steps::{Action, Check};
+use super::{CommandRun, KnownWords, Step, StepPurpose};
+use crate::codec::{Exception, Reply, RequestPdu};
+use crate::command::{Outcome, Urgency};
+
+/// Pause before a parameter is read back once more.
+const LOOK_AGAIN: Duration = Duration::from_millis(100);
+/// First and longest pause before a step that the drive was too busy for is tried again.
+const BUSY_PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_millis(500));
+/// Tries in a row of the end of a pulse, which has no other end.
+const MOST_BUSY: u32 = 10;
+
+impl CommandRun {
+    /// The drive answered the step that [`CommandRun::next`] gave. The outcome, when the command is over.
+    pub fn answered(&mut self, step: &Step, reply: Reply, words: &mut KnownWords) -> Option<Outcome> {
+        if reply == Reply::Exception(Exception::FUNCTION) && self.has_another_function(step, words) {
+            return None;
+        }
+        if self.by_other_function && step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
+            words.functions.took(&step.pdu);
+            self.by_other_function = false;
+        }
+        if self.parameter().is_some() {
+            return self.parameter_answered(step, &reply, words);
+        }
+        // A read between the tries of a write does not make them more.
+        if !self.tries.in_doubt || step.purpose != StepPurpose::ReadWord {
+            self.tries.failures = 0;
+        }
+        // An exception shows nothing about an earlier try that was not answered.
+        if step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
+            self.tries.in_doubt = false;
+        }
+        if self.waits_while_busy(step, &reply) {
+            return None;
+        }
+        self.tries.busy = 0;
+        match (step.purpose, reply) {
+            (StepPurpose::Release, Reply::Exception(code)) => self.not_released(&code.to_string()),
+            (StepPurpose::Compare, reply) => {
+                self.check = learn(step, &reply, words);
+                None
+            }
+            (StepPurpose::ReadWord, Reply::Exception(code)) => self.word_refused(step, code, words),
+            (StepPurpose::ReadWord, reply) => match learn(step, &reply, words) {
+                Check::Read => {
+                    self.check = Check::Read;
+                    None
+                }
+                _ => Some(Outcome::Exception(Exception::DEVICE_FAILURE)),
+            },
+            (StepPurpose::Execute, Reply::Exception(code)) => Some(Outcome::Exception(code)),
+            (purpose, reply) => {
+                words.written(&step.pdu);
+                if purpose == StepPurpose::Execute {
+                    self.reply = reply;
+                }
+                self.pop();
+                self.actions.is_empty().then(|| self.success())
+            }
+        }
+    }
+
+    /// Whether the drive is too busy for the step, which is tried again: of a command as long as its time is not over. Nobody
+    /// waits for it at a read that a stop can do without, or that only spares a write; whoever reads waits as he likes.
+    fn waits_while_busy(&mut self, step: &Step, reply: &Reply) -> bool {
+        let waits = match step.purpose {
+            StepPurpose::Execute => self.urgency != Urgency::Read,
+            StepPurpose::ReadWord => self.urgency != Urgency::Stop && !self.ends_pulse(),
+            _ => false,
+        };
+        // A read that the drive is still working on has changed nothing; it is repeated.
+        let is_busy = matches!(reply, Reply::Exception(code) if code.is_busy()
+            || (*code == Exception::ACKNOWLEDGE && step.purpose == StepPurpose::ReadWord));
+        if !(is_busy && waits) || (self.only_ends && self.tries.busy >= MOST_BUSY) {
+            return false;
+        }
+        let (first, longest) = BUSY_PAUSE;
+        self.tries.pause = Some((first * (1 << self.tries.busy.min(5))).min(longest));
+        self.tries.busy = self.tries.busy.saturating_add(1);
+        if self.check == Check::Read {
+            // By the next try it may have changed again.
+            self.check = Check::NotYet;
+        }
+        true
+    }
+
+    fn ends_pulse(&self) -> bool {
+        matches!(self.actions.front(), Some(Action::PulseEnd { .. }))
+    }
+
+    /// The drive does not know the function of a write. Whether there is another one to try, once; nothing can stop a drive
+    /// that takes only functions 15 and 16 otherwise.
+    fn has_another_function(&mut self, step: &Step, words: &mut KnownWords) -> bool {
+        if matches!(step.pdu, RequestPdu::MaskWrite { .. }) {
+            words.functions.refused(&step.pdu);
+            return true;
+        }
+        let tries = step.purpose == StepPurpose::Execute && other(&step.pdu).is_some() && !self.by_other_function;
+        self.by_other_function |= tries;
+        tries
+    }
+
+    fn parameter_answered(&mut self, step: &Step, reply: &Reply, words: &mut KnownWords) -> Option<Outcome> {
+        if step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
+            words.written(&step.pdu);
+        }
+        let unanswered = self.tries.unanswered.clone();
+        let run = self.parameter()?;
+        let then = run.answered(reply, &unanswered);
+        if !run.is_in_doubt() {
+            (self.tries.failures, self.tries.in_doubt) = (0, false);
+        }
+        match then {
+            Then::Go => None,
+            Then::Pause => {
+                self.actions.push_front(Action::Hold(LOOK_AGAIN));
+                None
+            }
+            Then::Over(outcome) => {
+                self.actions.clear();
+                Some(outcome)
+            }
+        }
+    }
+
+    fn word_refused(&mut self, step: &Step, code: Exception, words: &KnownWords) -> Option<Outcome> {
+        // The answer to a read does not show whether an earlier write was taken.
+        let refused = match self.tries.in_doubt {
+            true => self.tries.unanswered.clone(),
+            false => Outcome::Exception(code),
+        };
+        if let Some((table, address)) = self.settings()
+            && words.is_reported(table, address)
+        {
+            // It reported its settings before: what was read then is no longer what it has.
+            return Some(refused);
+        }
+        let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
+        let known = matches!(&step.pdu, RequestPdu::Read { table, start, .. } if words.get(*table, *start).is_some());
+        if self.goes_on(kept_back && known) {
+            return None;
+        }
+        if kept_back || self.urgency == Urgency::Stop {
+            return self.without_word(refused);
+        }
+        Some(refused)
+    }
+
+    /// The value stands all the same: a supervisor that looks away does not see changes at the panel, no more.
+    fn not_released(&mut self, why: &str) -> Option<Outcome> {
+        tracing::warn!("an output was written but not released to the drive's own control: {why}");
+        self.tries.failures = 0;
+        self.pop();
+        self.actions.is_empty().then(|| self.success())
+    }
+
+    /// No believable answer came; `how` says which way. The outcome, when the tries are used up.
+    pub fn failed(&mut self, step: &Step, how: Outcome, retries: u32) -> Option<Outcome> {
+        self.tries.failures += 1;
+        self.tries.unanswered = how;
+        self.tries.in_doubt |= step.pdu.is_write();
+        let over = self.tries.failures > retries;
+        if let Some(run) = self.parameter() {
+            if step.purpose == StepPurpose::Release && over {
+                // The value stands all the same.
+                run.released();
+                self.tries.failures = 0;
+                return None;
+            }
+            run.begin_again();
+            return over.then(|| self.without_answer());
+        }
+        match step.purpose {
+            StepPurpose::Release if over => return self.not_released("no answer"),
+            StepPurpose::Compare if self.urgency == Urgency::Stop => {
+                self.check = Check::InVain;
+                return None;
+            }
+            StepPurpose::ReadWord if self.settings().is_some() => return over.then(|| self.without_answer()),
+            StepPurpose::ReadWord if self.goes_on(false) => return None,
+            StepPurpose::ReadWord if over || self.urgency == Urgency::Stop => {
+                return self.without_word(self.tries.unanswered.clone());
+            }
+            _ => {}
+        }
+        if step.pdu.is_write() && self.check == Check::Read {
+            // By the next try it may have changed again.
+            self.check = Check::NotYet;
+        }
+        over.then(|| self.without_answer())
+    }
+
+    fn without_answer(&self) -> Outcome {
+        self.cut.clone().unwrap_or_else(|| self.tries.unanswered.clone())
+    }
+
+    /// What was sent was acknowledged, perhaps by a late reply to something else.
+    pub fn doubted(&mut self) {
+        self.ask_before_repeating();
+        self.tries.in_doubt = true;
+    }
+
+    /// Whether the drive may have taken a write that it did not answer: its words are not known then.
+    pub fn in_doubt(&self) -> bool {
+        self.tries.in_doubt
+    }
+
+    /// The word was asked for in vain. Whether the command goes on with what is known all the same: where the drive never
+    /// reports it (`unreadable`), and at the end of a pulse, which no read stands in the way of.
+    fn goes_on(&mut self, unreadable: bool) -> bool {
+        let goes_on = self.check == Check::NotYet && (unreadable || self.ends_pulse());
+        if goes_on {
+            self.check = Check::InVain;
+            self.tries.failures = 0;
+        }
+        goes_on
+    }
+
+    /// The drive's own word cannot be read. A stop goes out all the same: no read stands in its way. So does a
+    /// command to a motor that stands, and one that sets every bit; another one could stop or turn a motor that runs,
+    /// and ends with `outcome`.
+    fn without_word(&mut self, outcome: Outcome) -> Option<Outcome> {
+        if self.urgency != Urgency::Stop && self.running && !self.scope.whole {
+            return Some(outcome);
+        }
+        self.blind = true;
+        self.check = Check::InVain;
+        self.tries.failures = 0;
+        None
+    }
+}
+
+/// What the drive has, as it says.
+fn learn(step: &Step, reply: &Reply, words: &mut KnownWords) -> Check {
+    let (RequestPdu::Read { table, start, count }, Some(read)) = (&step.pdu, reply.words()) else {
+        return Check::InVain;
+    };
+    for (address, word) in (*start..).zip(&read) {
+        words.learn(*table, address, *word);
+    }
+    if read.len() == usize::from(*count) {
+        Check::Read
+    } else {
+        Check::InVain
+    }
+}
