@@ -23,27 +23,27 @@ build: ## Build the optimised binary, target/release/drivegate
 TEST_THREADS ?= $(shell expr 2 \* "$$(getconf _NPROCESSORS_ONLN)")
 # Documentation tests first, so that the output ends with the count of a suite that tests the product.
 test: tools lint deny advisories check ## Run every check and every test; installs missing test tools first
-	cargo test --locked --doc
-	RUST_TEST_THREADS=$(TEST_THREADS) cargo test --locked --tests --no-fail-fast
+	cargo test --locked --workspace --doc
+	RUST_TEST_THREADS=$(TEST_THREADS) cargo test --locked --workspace --tests --no-fail-fast
 
 tools: ## Install what the tests need (apt, PyPI, cargo); quick when nothing is missing
 	@tests/tools/install.sh
 
 lint: ## Check formatting and lints; any warning fails
-	cargo fmt --check
-	cargo clippy --locked --all-targets --test world -- -D warnings
+	cargo fmt --all --check
+	cargo clippy --locked --workspace --all-targets --test world -- -D warnings
 
 fmt: ## Format the code
-	cargo fmt
+	cargo fmt --all
 
 deny: tools ## Check licences, bans and sources of all dependencies
-	cargo deny --locked --log-level error check licenses bans sources
+	cargo deny --locked --workspace --log-level error check licenses bans sources
 
 # A machine without access to the database says so and goes on: what cannot be looked up is no fault of the tree.
 ADVISORY_DB := https://github.com/rustsec/advisory-db
 advisories: tools ## Check dependencies for known vulnerabilities, where the advisory database can be reached
 	@if GIT_TERMINAL_PROMPT=0 timeout 10 git ls-remote --exit-code $(ADVISORY_DB) HEAD >/dev/null 2>&1; then \
-		cargo deny --locked check advisories; \
+		cargo deny --locked --workspace check advisories; \
 	else \
 		echo "advisories: NOT CHECKED, $(ADVISORY_DB) cannot be reached within 10 s" >&2; \
 	fi

@@ -17,6 +17,7 @@
 //!
 //! In the order in which they may use each other, a later one the earlier ones; `tests/repository/layering.rs` holds them to it.
 //!
+//! - [`version`]: which build this is.
 //! - [`document`]: TOML that knows the line of every key and collects all faults.
 //! - [`files`]: files that grow or are replaced while the gateway runs.
 //! - [`codec`]: requests and replies to and from bytes: Modbus RTU ([`codec::rtu`]) and ASCII ([`codec::ascii`]), Metasys N2
@@ -69,3 +70,4 @@ pub mod parameters;
 pub mod plant;
 pub mod process_image;
 pub mod sim;
+pub mod version;

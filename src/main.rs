@@ -3,5 +3,6 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
+    drivegate::version::set_commit(option_env!("DRIVEGATE_COMMIT"));
     drivegate::cli::main()
 }

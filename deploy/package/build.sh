@@ -17,9 +17,7 @@ target=$(rust_target "$architecture")
 # Panic messages name source files: they are named alike whatever folder the tree, the registry and the target
 # directory are in. The last prefix that fits counts.
 folder=$TARGET_FOLDER/$linkage
-# The names by which functions are ordered; RUSTFLAGS takes the place of .cargo/config.toml.
-flags="-Csymbol-mangling-version=v0"
-flags+=" --remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=/cargo"
+flags="--remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=/cargo"
 flags+=" --remap-path-prefix=$(rustc --print sysroot)=/rust"
 flags+=" --remap-path-prefix=$PWD=/drivegate --remap-path-prefix=$folder=/target"
 case $linkage in
@@ -39,7 +37,4 @@ export CARGO_INCREMENTAL=0 RUSTFLAGS=$flags
 export CFLAGS="-ffile-prefix-map=${CARGO_HOME:-$HOME/.cargo}=/cargo -ffile-prefix-map=$folder=/target"
 DRIVEGATE_COMMIT=$(commit) cargo "${build[@]}" --release --locked --bin drivegate --target-dir "$folder" >&2
 binary=$folder/$target/release/drivegate
-ordered=$(readelf --sections --wide "$binary" | sed -n 's/.* \.text\.executed  *PROGBITS  *[0-9a-f]* [0-9a-f]* \([0-9a-f]*\).*/\1/p')
-((16#${ordered:-0} > 1500000)) ||
-    echo "warning: only $((16#${ordered:-0})) bytes of code are laid out together; run deploy/function_order/record.py" >&2
 echo "$binary"

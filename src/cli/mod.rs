@@ -48,7 +48,7 @@ use std::sync::LazyLock;
 
 use clap::Parser;
 
-use crate::north::metrics::COMMIT;
+use crate::version;
 
 /// Exit code of a failure.
 pub const EXIT_FAILED: u8 = 1;
@@ -62,9 +62,9 @@ pub const EXIT_CONFIG: u8 = 78;
 pub const DEFAULT_CONFIG: &str = crate::config::DEFAULT_FILE;
 
 /// Version and commit of the build.
-static VERSION: LazyLock<String> = LazyLock::new(|| match COMMIT {
-    Some(commit) => format!("{} (commit {commit})", env!("CARGO_PKG_VERSION")),
-    None => env!("CARGO_PKG_VERSION").to_string(),
+static VERSION: LazyLock<String> = LazyLock::new(|| match version::commit() {
+    Some(commit) => format!("{} (commit {commit})", version::VERSION),
+    None => version::VERSION.to_string(),
 });
 
 /// Puts RS-485 drives (frequency converters) on Modbus TCP, MQTT and Prometheus.

@@ -9,7 +9,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The rooms from the bottom of the house to its door.
-const ROOMS: [&str; 19] = [
+const ROOMS: [&str; 20] = [
+    "version",
     "document",
     "files",
     "codec",

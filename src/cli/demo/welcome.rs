@@ -20,7 +20,7 @@ mbpoll and the mosquitto clients are separate programs: apt install mbpoll mosqu
 
 {}{}{configured}
 Ctrl-C ends the demo.",
-        env!("CARGO_PKG_VERSION"),
+        crate::version::VERSION,
         lines(&place.ports),
         look(&quoted(&program), sides),
         command(sides),

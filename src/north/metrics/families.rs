@@ -16,6 +16,7 @@ use crate::history::TriggerKind;
 use crate::north::{NorthStats, ServerKind};
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
+use crate::version::{self, VERSION};
 
 /// Label of a series: its name and value.
 type Label = (&'static str, Cow<'static, str>);
@@ -533,8 +534,8 @@ fn reload(stats: &NorthStats, all: &mut Families) {
 
 fn build(plant: &Plant, all: &mut Families) {
     let labels = Labels::of([
-        ("version", env!("CARGO_PKG_VERSION")),
-        ("commit", super::COMMIT.unwrap_or("unknown")),
+        ("version", VERSION),
+        ("commit", version::commit().unwrap_or("unknown")),
         ("gateway", &plant.gateway),
     ]);
     let family = all.family(

@@ -19,9 +19,6 @@ use self::families::{Families, Kind, SeriesValue};
 use super::NorthStats;
 use crate::plant::Plant;
 
-/// Commit of the build, set for releases.
-pub const COMMIT: Option<&str> = option_env!("DRIVEGATE_COMMIT");
-
 /// Text formats of an exposition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {

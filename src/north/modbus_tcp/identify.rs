@@ -40,7 +40,7 @@ impl Identity<'_> {
         let objects = [
             (0, VENDOR),
             (1, self.product),
-            (2, env!("CARGO_PKG_VERSION")),
+            (2, crate::version::VERSION),
             (4, self.title),
             (5, self.name),
         ];

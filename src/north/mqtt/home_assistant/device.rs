@@ -79,7 +79,7 @@ impl Device {
         (manufacturer, model): (&str, &str),
         gateway: Option<&str>,
     ) -> Map<String, Value> {
-        let version = env!("CARGO_PKG_VERSION");
+        let version = crate::version::VERSION;
         let mut device = match gateway {
             Some(gateway) => json!({ "ids": [self.id], "name": name, "mdl": model, "via_device": gateway }),
             None => json!({ "ids": [self.id], "name": name, "mdl": model, "sw": version }),
