@@ -54,7 +54,7 @@
 
 pub mod bus;
 pub mod cli;
-pub mod codec;
+pub use drivegate_proto as codec;
 pub mod command;
 pub mod config;
 pub mod daemon;

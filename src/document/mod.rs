@@ -21,7 +21,8 @@ use serde::{Serialize, Serializer};
 pub(crate) use file::read_file;
 pub(crate) use reader::{Reader, candidates, nearest};
 pub(crate) use tree::{Entry, Node, Raw};
-pub(crate) use value::{FromNode, ValueError, format_duration, parse_duration, parse_size};
+pub(crate) use crate::codec::duration::format as format_duration;
+pub(crate) use value::{FromNode, ValueError, parse_duration, parse_size};
 
 /// What is wrong and what to do about it.
 #[derive(Debug, Clone, PartialEq, Eq)]

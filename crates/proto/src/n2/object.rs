@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::codec::modbus::Table;
+use crate::modbus::Table;
 
 /// First input register of the internal integers.
 pub const ADI_BASE: u16 = 0x4000;

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::n2_words;
-use crate::codec::{Decoded, Protocol, Reply, Request, RequestPdu};
+use crate::{Decoded, Protocol, Reply, Request, RequestPdu};
 
 /// What some bytes of an exchange are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -142,9 +142,9 @@ impl FromStr for Silence {
         match text {
             "spec" => Ok(Silence::Spec),
             "chars" => Ok(Silence::Chars),
-            other => crate::document::parse_duration(other)
+            other => crate::duration::parse(other)
                 .map(Silence::Fixed)
-                .map_err(|_| format!("`{other}` is neither \"spec\" nor \"chars\" nor a duration such as \"2ms\"")),
+                .ok_or_else(|| format!("`{other}` is neither \"spec\" nor \"chars\" nor a duration such as \"2ms\"")),
         }
     }
 }

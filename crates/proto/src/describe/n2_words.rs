@@ -1,7 +1,7 @@
 //! Commands and answers of N2 in the words of its objects.
 
-use crate::codec::n2::{self, Command, Region};
-use crate::codec::{Reply, RequestPdu};
+use crate::n2::{self, Command, Region};
+use crate::{Reply, RequestPdu};
 
 /// A command of N2: `read AI 2 value`, `override AO 1 = 50`, `identify`.
 pub(super) fn command(pdu: &RequestPdu) -> Option<String> {

@@ -337,7 +337,7 @@ fn lengths_for_the_prediction() {
 
 #[test]
 fn modbus_never_says_what_only_n2_says() {
-    use crate::codec::Protocol;
+    use crate::Protocol;
     for session in [Session::Identify, Session::Poll { again: true }] {
         let request = asked(RequestPdu::N2(session));
         for protocol in [Protocol::ModbusRtu, Protocol::ModbusAscii] {
