@@ -252,25 +252,6 @@ impl Late {
     }
 }
 
-impl Form {
-    /// Whether a late reply of this form could pass for one of that. A late identity is distinguished from a state by its value.
-    fn is_like(self, wanted: Form) -> bool {
-        use Form::{Acknowledgement, Any, Changes, Float, Identity, Integer, State};
-        matches!(
-            (self, wanted),
-            (Acknowledgement | Changes, Acknowledgement | Changes)
-                | (Changes, Float | Integer)
-                | (Float | Integer, Changes)
-                | (State, State | Identity)
-                | (Identity, Identity)
-                | (Integer, Integer)
-                | (Float, Float)
-                | (Any, _)
-                | (_, Any)
-        )
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -10,15 +10,15 @@ use super::n2::{self, Command};
 use super::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu, ascii, rtu};
 
 /// As long as a USB adapter holds bytes back, and longer.
-pub(crate) const HELD_BACK: Duration = Duration::from_millis(30);
+pub const HELD_BACK: Duration = Duration::from_millis(30);
 /// Bytes that are kept while no frame is found among them; no frame is longer.
 const MOST_BYTES: usize = 1024;
 /// So few characters before a reply are the glitch of a line that changes direction, and no request that was mangled.
-pub(crate) const GLITCH: usize = 2;
+pub const GLITCH: usize = 2;
 
 /// What stands at the beginning of the bytes.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Cut {
+pub enum Cut {
     /// A request of the other master; the PDU is `None` where the codec has none for it.
     Request {
         /// Who is asked; 0 is the broadcast.
@@ -39,12 +39,12 @@ pub(crate) enum Cut {
 
 /// A piece of what was heard.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Piece {
-    pub(crate) cut: Cut,
-    pub(crate) bytes: Vec<u8>,
+pub struct Piece {
+    pub cut: Cut,
+    pub bytes: Vec<u8>,
     /// Beginning of its first and end of its last character on the wire, as far as arrival shows it.
-    pub(crate) began: Instant,
-    pub(crate) ended: Instant,
+    pub began: Instant,
+    pub ended: Instant,
 }
 
 /// What the bytes at one place are.
@@ -57,7 +57,7 @@ enum Look {
 
 /// The bytes that are not cut yet, with their times.
 #[derive(Debug)]
-pub(crate) struct Frames {
+pub struct Frames {
     protocol: Protocol,
     format: LineFormat,
     bytes: Vec<u8>,
@@ -70,7 +70,7 @@ pub(crate) struct Frames {
 impl Frames {
     /// Nothing was heard yet. Behind an incomplete frame that falls silent for `held_back`, on top of 3.5 characters, the rest is
     /// not expected any more.
-    pub(crate) fn new(protocol: Protocol, format: LineFormat, held_back: Duration) -> Frames {
+    pub fn new(protocol: Protocol, format: LineFormat, held_back: Duration) -> Frames {
         Frames {
             protocol,
             format,
@@ -83,7 +83,7 @@ impl Frames {
 
     /// Bytes arrived at `now`: the last of them just then, the others as much earlier as the wire takes, but not before those
     /// that came before.
-    pub(crate) fn add(&mut self, bytes: &[u8], now: Instant) {
+    pub fn add(&mut self, bytes: &[u8], now: Instant) {
         for (place, byte) in bytes.iter().enumerate() {
             let behind = self.format.chars(bytes.len() - 1 - place);
             let at = now.checked_sub(behind).unwrap_or(now);
@@ -95,7 +95,7 @@ impl Frames {
     }
 
     /// When the bytes that wait for more are given up: whole frames that are no request the codec knows, sooner.
-    pub(crate) fn patience(&self) -> Option<Instant> {
+    pub fn patience(&self) -> Option<Instant> {
         let last = self.last.filter(|_| !self.bytes.is_empty())?;
         let held_back = match self.protocol {
             Protocol::ModbusRtu if rtu::open_frame(&self.bytes).is_some() => self.held_back.min(HELD_BACK),
@@ -105,12 +105,12 @@ impl Frames {
     }
 
     /// The bytes that are not cut yet.
-    pub(crate) fn rest(&self) -> &[u8] {
+    pub fn rest(&self) -> &[u8] {
         &self.bytes
     }
 
     /// The next piece, if one can be cut by `now`; `open` is the request whose reply may come.
-    pub(crate) fn next(&mut self, open: Option<&Request>, now: Instant) -> Option<Piece> {
+    pub fn next(&mut self, open: Option<&Request>, now: Instant) -> Option<Piece> {
         if self.bytes.is_empty() {
             return None;
         }
@@ -274,7 +274,7 @@ fn rtu_request(bytes: &[u8]) -> Look {
 
 /// Whether bytes that are neither request nor reply are whole frames all the same: of a function that the codec does not know,
 /// or an answer that belongs to nobody.
-pub(crate) fn are_sound(protocol: Protocol, bytes: &[u8]) -> bool {
+pub fn are_sound(protocol: Protocol, bytes: &[u8]) -> bool {
     match protocol {
         Protocol::ModbusRtu => {
             let mut rest = bytes;
@@ -302,7 +302,7 @@ pub(crate) fn are_sound(protocol: Protocol, bytes: &[u8]) -> bool {
 
 /// Whether so much garbage may be a request that was mangled and got no reply: as much as half of the shortest one, and not as much
 /// as that and the shortest reply.
-pub(crate) fn may_be_request(protocol: Protocol, garbage: usize) -> bool {
+pub fn may_be_request(protocol: Protocol, garbage: usize) -> bool {
     let (request, reply) = match protocol {
         Protocol::ModbusRtu => (8, 5),
         Protocol::ModbusAscii => (17, 11),

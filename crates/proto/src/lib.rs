@@ -4,16 +4,14 @@
 //! [`Protocol::decode`] takes that request. Nothing can go stale between two exchanges.
 
 pub mod ascii;
-pub(crate) mod checksum;
+pub mod checksum;
 pub mod describe;
 pub mod duration;
-pub(crate) mod frames;
+pub mod frames;
 pub mod modbus;
 pub mod n2;
 pub mod rtu;
 pub mod wire;
-
-
 
 pub use checksum::{crc16, lrc};
 pub use modbus::{Exception, Reply, RequestPdu, Table};

@@ -157,6 +157,25 @@ pub enum Form {
     Any,
 }
 
+impl Form {
+    /// Whether a late reply of this form could pass for one of that. A late identity is distinguished from a state by its value.
+    pub fn is_like(self, wanted: Form) -> bool {
+        use Form::{Acknowledgement, Any, Changes, Float, Identity, Integer, State};
+        matches!(
+            (self, wanted),
+            (Acknowledgement | Changes, Acknowledgement | Changes)
+                | (Changes, Float | Integer)
+                | (Float | Integer, Changes)
+                | (State, State | Identity)
+                | (Identity, Identity)
+                | (Integer, Integer)
+                | (Float, Float)
+                | (Any, _)
+                | (_, Any)
+        )
+    }
+}
+
 /// The form of the regular reply to a request; none of one that means no object.
 pub fn form(pdu: &RequestPdu) -> Option<Form> {
     if matches!(pdu, RequestPdu::Other(_)) {

@@ -80,7 +80,7 @@ fn is_of_writable_point(profile: &Profile, table: Table, address: u16) -> bool {
 }
 
 /// Ranges of addresses in words: `holding 100 to 731, 734; coil 5`.
-pub(crate) fn in_words(ranges: &[(Table, RangeInclusive<u16>)]) -> String {
+pub fn in_words(ranges: &[(Table, RangeInclusive<u16>)]) -> String {
     let tables = ranges.chunk_by(|(one, _), (other, _)| one == other);
     let parts = tables.filter_map(|of_table| {
         let (table, _) = of_table.first()?;
@@ -90,7 +90,7 @@ pub(crate) fn in_words(ranges: &[(Table, RangeInclusive<u16>)]) -> String {
 }
 
 /// The same without the tables.
-pub(crate) fn addresses_in_words(ranges: &[(Table, RangeInclusive<u16>)]) -> String {
+pub fn addresses_in_words(ranges: &[(Table, RangeInclusive<u16>)]) -> String {
     let words = ranges.iter().map(|(_, range)| match range.clone().into_inner() {
         (first, last) if first == last => first.to_string(),
         (first, last) => format!("{first} to {last}"),

@@ -22,7 +22,7 @@ enum NotText {
 ///
 /// # Errors
 /// One problem with the file and, where it stops being text, the line.
-pub(crate) fn read_file(path: &Path) -> Result<String, Problem> {
+pub fn read_file(path: &Path) -> Result<String, Problem> {
     let of_file =
         |what: String, remedy: &str| Problem::of_file(path.display().to_string(), "", Finding::new(what, remedy));
     let mut bytes = Vec::new();

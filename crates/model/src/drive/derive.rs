@@ -104,12 +104,12 @@ impl Derived {
     }
 
     /// All points that it depends on, including the ends of a band.
-    pub(crate) fn rests_on(&self) -> Vec<usize> {
+    pub fn rests_on(&self) -> Vec<usize> {
         self.sources().chain(self.ends()).collect()
     }
 
     /// The points that are the ends of its band.
-    pub(crate) fn ends(&self) -> impl Iterator<Item = usize> {
+    pub fn ends(&self) -> impl Iterator<Item = usize> {
         let ends = self.band().map(|(_, low, high)| [low, high]);
         ends.into_iter().flatten().filter_map(|bound| match bound {
             Bound::Point(point) => Some(point),
@@ -118,7 +118,7 @@ impl Derived {
     }
 
     /// The value for these values of the sources; `None` if it cannot be computed.
-    pub(crate) fn value(&self, sources: impl IntoIterator<Item = Value>, band: Option<(f64, f64)>) -> Option<Value> {
+    pub fn value(&self, sources: impl IntoIterator<Item = Value>, band: Option<(f64, f64)>) -> Option<Value> {
         let mut sources = sources.into_iter();
         let first = sources.next()?;
         match self {
@@ -153,7 +153,7 @@ impl Derived {
 
     /// The value of the source for which this point is `value`; `None` if it cannot be commanded, as what is below a
     /// minimum above zero.
-    pub(crate) fn inverse(&self, value: f64, band: (f64, f64)) -> Option<f64> {
+    pub fn inverse(&self, value: f64, band: (f64, f64)) -> Option<f64> {
         match self {
             _ if band.1 <= band.0 => None,
             Derived::Band { .. } => percentage(value, band),
@@ -163,7 +163,7 @@ impl Derived {
     }
 
     /// The sample derived from those of the sources: the worst quality, the oldest time.
-    pub(crate) fn sample(&self, sources: impl Iterator<Item = Sample>, band: Option<(f64, f64)>) -> Sample {
+    pub fn sample(&self, sources: impl Iterator<Item = Sample>, band: Option<(f64, f64)>) -> Sample {
         let (mut quality, mut at, mut complete) = (Quality::Good, None::<Instant>, true);
         let values = sources.filter_map(|source| {
             quality = quality.worse(source.quality);

@@ -321,7 +321,7 @@ fn a_motor_that_is_enabled_at_zero_speed() {
 
 #[test]
 fn the_page_has_every_cause() {
-    let page = include_str!("../../../docs/why.md");
+    let page = include_str!("../../../../../docs/why.md");
     for family in FAMILIES {
         let profile = profile(family);
         for point in &profile.points {

@@ -9,7 +9,7 @@ use super::{Finding, Node, Raw};
 
 /// Why a value cannot be read: the value or its type, then what to write.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub(crate) enum ValueError {
+pub enum ValueError {
     #[error("`\"{0}\"` is a string")]
     Quoted(String, &'static str),
     #[error("`{0}` is not {1}")]
@@ -47,7 +47,7 @@ impl From<ValueError> for Finding {
 }
 
 /// A type that a value can be read as.
-pub(crate) trait FromNode: Sized {
+pub trait FromNode: Sized {
     /// What to write, for messages: `a string`.
     const WANTED: &'static str;
 
@@ -193,7 +193,7 @@ fn each<T: FromNode>() -> String {
 ///
 /// # Errors
 /// The text is not a duration.
-pub(crate) fn parse_duration(text: &str) -> Result<Duration, ValueError> {
+pub fn parse_duration(text: &str) -> Result<Duration, ValueError> {
     duration::parse(text).ok_or_else(|| ValueError::Duration(text.to_string()))
 }
 
@@ -201,7 +201,7 @@ pub(crate) fn parse_duration(text: &str) -> Result<Duration, ValueError> {
 ///
 /// # Errors
 /// The text is not a size.
-pub(crate) fn parse_size(text: &str) -> Result<u64, ValueError> {
+pub fn parse_size(text: &str) -> Result<u64, ValueError> {
     let bad = || ValueError::Size(text.to_string());
     let trimmed = text.trim();
     let digits = trimmed.find(|c: char| !c.is_ascii_digit()).ok_or_else(bad)?;

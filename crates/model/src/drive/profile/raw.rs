@@ -106,7 +106,7 @@ impl Form {
     }
 
     /// Which register of two comes first, if there are two.
-    pub(crate) fn word_order(self) -> Option<WordOrder> {
+    pub fn word_order(self) -> Option<WordOrder> {
         match self {
             Form::U32(order) | Form::I32(order) | Form::F32(order) => Some(order),
             _ => None,
@@ -202,7 +202,7 @@ impl Raw {
     }
 
     /// The addresses of its registers or bits.
-    pub(crate) fn addresses(&self) -> impl Iterator<Item = u16> + Clone + use<> {
+    pub fn addresses(&self) -> impl Iterator<Item = u16> + Clone + use<> {
         let start = self.address;
         (0..self.form.items()).filter_map(move |item| start.checked_add(item))
     }

@@ -57,7 +57,7 @@ pub enum Quality {
 
 impl Quality {
     /// The worse of two.
-    pub(crate) fn worse(self, other: Quality) -> Quality {
+    pub fn worse(self, other: Quality) -> Quality {
         let rank = |quality| match quality {
             Quality::Good => 0,
             Quality::Stale => 1,
@@ -89,7 +89,7 @@ pub struct Sample {
 
 impl Sample {
     /// Nothing is known.
-    pub(crate) const NONE: Sample = Sample {
+    pub const NONE: Sample = Sample {
         value: None,
         quality: Quality::Bad,
         at: None,
@@ -132,7 +132,7 @@ impl State {
     ];
 
     /// Code in the common block of Modbus TCP.
-    pub(crate) fn code(self) -> u16 {
+    pub fn code(self) -> u16 {
         match self {
             State::Offline => 0,
             State::NotReady => 1,
@@ -166,7 +166,7 @@ pub enum Kind {
 }
 
 /// Rounds away the error of binary fractions in a scaled count: 2500 * 0.01 is 25, not 25.000000000000004.
-pub(crate) fn tidy(value: f64) -> f64 {
+pub fn tidy(value: f64) -> f64 {
     let rounded = (value * 1e6).round() / 1e6;
     if rounded.is_finite() { rounded } else { value }
 }

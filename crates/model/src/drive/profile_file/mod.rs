@@ -29,17 +29,26 @@ use points::{check_object, check_target, read_point};
 use ranges::{Offsets, check_overlaps, read_functions, read_range};
 
 const BUILT_IN: [(&str, &str); 8] = [
-    ("eaton-hvx-n2.toml", include_str!("../../../profiles/eaton-hvx-n2.toml")),
-    ("eaton-hvx.toml", include_str!("../../../profiles/eaton-hvx.toml")),
-    ("eaton-svx.toml", include_str!("../../../profiles/eaton-svx.toml")),
+    (
+        "eaton-hvx-n2.toml",
+        include_str!("../../../../../profiles/eaton-hvx-n2.toml"),
+    ),
+    ("eaton-hvx.toml", include_str!("../../../../../profiles/eaton-hvx.toml")),
+    ("eaton-svx.toml", include_str!("../../../../../profiles/eaton-svx.toml")),
     (
         "teco-7300pa-n2.toml",
-        include_str!("../../../profiles/teco-7300pa-n2.toml"),
+        include_str!("../../../../../profiles/teco-7300pa-n2.toml"),
     ),
-    ("teco-7300pa.toml", include_str!("../../../profiles/teco-7300pa.toml")),
-    ("vacon-cx.toml", include_str!("../../../profiles/vacon-cx.toml")),
-    ("vacon-nx-n2.toml", include_str!("../../../profiles/vacon-nx-n2.toml")),
-    ("vacon-nx.toml", include_str!("../../../profiles/vacon-nx.toml")),
+    (
+        "teco-7300pa.toml",
+        include_str!("../../../../../profiles/teco-7300pa.toml"),
+    ),
+    ("vacon-cx.toml", include_str!("../../../../../profiles/vacon-cx.toml")),
+    (
+        "vacon-nx-n2.toml",
+        include_str!("../../../../../profiles/vacon-nx-n2.toml"),
+    ),
+    ("vacon-nx.toml", include_str!("../../../../../profiles/vacon-nx.toml")),
 ];
 
 /// Bases of bases that are followed; no sound set of files has so many.

@@ -120,7 +120,7 @@ pub struct WriteFunctions {
 
 impl WriteFunctions {
     /// The write of one register.
-    pub(crate) fn write_register(self, address: u16, value: u16) -> RequestPdu {
+    pub fn write_register(self, address: u16, value: u16) -> RequestPdu {
         match self.registers_by_16 {
             true => RequestPdu::WriteRegisters {
                 start: address,
@@ -131,7 +131,7 @@ impl WriteFunctions {
     }
 
     /// The write of one coil.
-    pub(crate) fn write_coil(self, address: u16, on: bool) -> RequestPdu {
+    pub fn write_coil(self, address: u16, on: bool) -> RequestPdu {
         match self.coils_by_15 {
             true => RequestPdu::WriteCoils {
                 start: address,
@@ -142,7 +142,7 @@ impl WriteFunctions {
     }
 
     /// What differs from the usual, in words; empty where nothing does.
-    pub(crate) fn notes(self) -> Vec<&'static str> {
+    pub fn notes(self) -> Vec<&'static str> {
         let notes = [
             (self.registers_by_16, "one register is written by function 16"),
             (self.coils_by_15, "one coil is written by function 15"),
@@ -177,7 +177,7 @@ pub struct Expected {
 
 impl Probe {
     /// The request.
-    pub(crate) fn pdu(&self) -> RequestPdu {
+    pub fn pdu(&self) -> RequestPdu {
         RequestPdu::Read {
             table: self.table,
             start: self.start,
@@ -285,7 +285,7 @@ impl Point {
     }
 
     /// What a value of an enumeration, or a bit with texts, means.
-    pub(crate) fn text_of(&self, value: Value) -> Option<&str> {
+    pub fn text_of(&self, value: Value) -> Option<&str> {
         let code = match value {
             Value::Integer(code) => code,
             Value::Bool(state) => i64::from(state),
@@ -327,7 +327,7 @@ impl Profile {
     }
 
     /// The profile with the points that are fast where the line carries it; `None` if it has none.
-    pub(crate) fn with_faster_points(&self) -> Option<Profile> {
+    pub fn with_faster_points(&self) -> Option<Profile> {
         if !self.points.iter().any(|point| point.fast_if_carried) {
             return None;
         }
@@ -344,14 +344,14 @@ impl Profile {
     }
 
     /// The range that holds `address`.
-    pub(crate) fn range(&self, table: Table, address: u16) -> Option<&AddressRange> {
+    pub fn range(&self, table: Table, address: u16) -> Option<&AddressRange> {
         self.ranges
             .iter()
             .find(|r| r.table == table && r.addresses.contains(&address))
     }
 
     /// The table that a read of `table` addresses in this family.
-    pub(crate) fn canonical(&self, table: Table) -> Table {
+    pub fn canonical(&self, table: Table) -> Table {
         if table == Table::Input && self.input_is_holding {
             Table::Holding
         } else {
@@ -360,7 +360,7 @@ impl Profile {
     }
 
     /// Text of a fault code; a code without text is shown as a plain number.
-    pub(crate) fn fault_text(&self, code: i64) -> String {
+    pub fn fault_text(&self, code: i64) -> String {
         let known = u16::try_from(code).ok().and_then(|c| self.faults.get(&c));
         match known {
             Some(fault) => fault.text.clone(),
@@ -380,7 +380,7 @@ impl Profile {
 
     /// Whether a write of these items is skipped if the drive has them already, because it stores them in EEPROM with
     /// limited write cycles. On N2 that includes addresses without a point, but never a stop or a pulse.
-    pub(crate) fn writes_on_change(&self, table: Table, items: &[(u16, u16)]) -> bool {
+    pub fn writes_on_change(&self, table: Table, items: &[(u16, u16)]) -> bool {
         let spared = |address: u16| {
             let covers = |p: &&Point| p.write && p.raw().is_some_and(|raw| raw.covers(table, address));
             let mut points = self.points.iter().filter(covers).peekable();
@@ -395,13 +395,13 @@ impl Profile {
 
     /// Whether a register holds settings besides a bit: it is not that of the run command, whose other bits nobody else
     /// changes unnoticed.
-    pub(crate) fn is_settings(&self, table: Table, address: u16) -> bool {
+    pub fn is_settings(&self, table: Table, address: u16) -> bool {
         let is_run = |(run, ..): (&Raw, u8, bool)| (run.table, run.address) == (table, address);
         table == Table::Holding && !self.protocols.contains(&Protocol::N2) && !self.run_bit().is_some_and(is_run)
     }
 
     /// Whether a write to that table is released afterwards: an analog output of N2.
-    pub(crate) fn releases(&self, table: Table) -> bool {
+    pub fn releases(&self, table: Table) -> bool {
         table == Table::Holding && self.n2.release && self.protocols.contains(&Protocol::N2)
     }
 
@@ -424,7 +424,7 @@ impl Profiles {
     }
 
     /// The warnings about all of them.
-    pub(crate) fn warnings(&self) -> impl Iterator<Item = &Problem> {
+    pub fn warnings(&self) -> impl Iterator<Item = &Problem> {
         self.0.values().flat_map(|profile| &profile.warnings)
     }
 

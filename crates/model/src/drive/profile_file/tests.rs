@@ -429,8 +429,8 @@ fn enumerations_have_texts() {
 /// The page names every key that the loader knows, and no other.
 #[test]
 fn the_page_names_every_key() {
-    let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/profiles.md")).unwrap();
-    let meter = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/energy-meter.toml")).unwrap();
+    let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/profiles.md")).unwrap();
+    let meter = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/energy-meter.toml")).unwrap();
     let choices = "[speed_reference]\nsigned = true\n[n2]\nstate_bit = 6\n";
     let mut known = std::collections::BTreeSet::new();
     for source in BUILT_IN

@@ -191,7 +191,7 @@ impl RawValue {
 
 impl Profile {
     /// Whether the parameter at that address can be written.
-    pub(crate) fn parameter_is_writable(&self, address: u16) -> bool {
+    pub fn parameter_is_writable(&self, address: u16) -> bool {
         let range = self.range(Table::Holding, address);
         range.is_some_and(|range| range.write >= self.parameter_words())
     }
@@ -202,7 +202,7 @@ impl Profile {
     }
 
     /// Most parameters in one read at `address`, and whether the read may cover addresses without one.
-    pub(crate) fn parameter_read(&self, address: u16) -> (u16, bool) {
+    pub fn parameter_read(&self, address: u16) -> (u16, bool) {
         let range = self.range(Table::Holding, address);
         range.map_or((1, false), |range| {
             ((range.read / self.parameter_words()).max(1), range.holes)
@@ -210,7 +210,7 @@ impl Profile {
     }
 
     /// The last address that may be read together with `address`.
-    pub(crate) fn parameter_range_end(&self, address: u16) -> u16 {
+    pub fn parameter_range_end(&self, address: u16) -> u16 {
         self.range(Table::Holding, address)
             .map_or(address, |range| *range.addresses.end())
     }

@@ -18,11 +18,11 @@ use std::fmt;
 
 use serde::{Serialize, Serializer};
 
-pub(crate) use file::read_file;
-pub(crate) use reader::{Reader, candidates, nearest};
-pub(crate) use tree::{Entry, Node, Raw};
-pub(crate) use crate::codec::duration::format as format_duration;
-pub(crate) use value::{FromNode, ValueError, parse_duration, parse_size};
+pub use crate::codec::duration::format as format_duration;
+pub use file::read_file;
+pub use reader::{Reader, candidates, nearest};
+pub use tree::{Entry, Node, Raw};
+pub use value::{FromNode, ValueError, parse_duration, parse_size};
 
 /// What is wrong and what to do about it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -35,7 +35,7 @@ pub struct Finding {
 
 impl Finding {
     /// Both parts.
-    pub(crate) fn new(what: impl Into<String>, remedy: impl Into<String>) -> Finding {
+    pub fn new(what: impl Into<String>, remedy: impl Into<String>) -> Finding {
         Finding {
             what: what.into(),
             remedy: remedy.into(),
@@ -72,7 +72,7 @@ pub struct Problem {
 
 impl Problem {
     /// A problem of a whole file, or of `key` in it, without a line.
-    pub(crate) fn of_file(file: impl Into<String>, key: &str, finding: Finding) -> Problem {
+    pub fn of_file(file: impl Into<String>, key: &str, finding: Finding) -> Problem {
         Problem {
             file: file.into(),
             line: None,
@@ -103,7 +103,7 @@ fn as_text<S: Serializer>(finding: &Finding, serializer: S) -> Result<S::Ok, S::
 
 /// Where a value comes from.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Place {
+pub struct Place {
     /// Line of the file, from 1.
     pub line: Option<usize>,
     /// Environment variable that set the value instead of the file.
@@ -114,7 +114,7 @@ pub(crate) struct Place {
 
 /// A parsed file and the problems found in it so far.
 #[derive(Debug, Clone)]
-pub(crate) struct Document {
+pub struct Document {
     file: String,
     root: Node,
     /// What is not TOML. Whatever else is found then may come of that alone.
@@ -126,7 +126,7 @@ pub(crate) struct Document {
 
 impl Document {
     /// Parses `source`, the text of `file`. The first syntax error becomes the one problem; whatever can be read is kept.
-    pub(crate) fn parse(file: impl Into<String>, source: &str) -> Document {
+    pub fn parse(file: impl Into<String>, source: &str) -> Document {
         let (root, errors) = tree::parse(source);
         let mut document = Document {
             file: file.into(),
@@ -152,7 +152,7 @@ impl Document {
     }
 
     /// Adds the section `name` of the top level if it is absent, so that variables can set its keys.
-    pub(crate) fn ensure_section(&mut self, name: &str) {
+    pub fn ensure_section(&mut self, name: &str) {
         let Raw::Table(entries) = &mut self.root.value else {
             return;
         };
@@ -163,7 +163,7 @@ impl Document {
 
     /// Lets variables `PREFIX__TABLE__KEY=value` (array elements by number, from 0) replace or add scalars.
     /// The table that the scalar is in must exist.
-    pub(crate) fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
+    pub fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
         let start = format!("{prefix}__");
         let mut variables: Vec<_> = variables
             .into_iter()
@@ -181,7 +181,7 @@ impl Document {
     }
 
     /// Renames the key `old` in all tables that the keys of `path` lead to, unless they have `new` too; where that was.
-    pub(crate) fn rename(&mut self, path: &[&str], old: &str, new: &str) -> Vec<Place> {
+    pub fn rename(&mut self, path: &[&str], old: &str, new: &str) -> Vec<Place> {
         let mut places = Vec::new();
         tree::rename(&mut self.root, String::new(), path, (old, new), &mut places);
         places
@@ -198,23 +198,23 @@ impl Document {
     }
 
     /// The reader of the whole document.
-    pub(crate) fn reader(&self) -> Reader<'_> {
+    pub fn reader(&self) -> Reader<'_> {
         Reader::of(self, &self.root, Place::default())
     }
 
     /// Its path.
-    pub(crate) fn file(&self) -> &str {
+    pub fn file(&self) -> &str {
         &self.file
     }
 
     /// Adds a problem.
-    pub(crate) fn problem(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
+    pub fn problem(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
         let problem = self.at(place, Finding::new(what, remedy));
         self.problems.borrow_mut().push(problem);
     }
 
     /// Adds a warning: the document can be used, but part of it will not do what it seems to.
-    pub(crate) fn warning(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
+    pub fn warning(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
         let warning = self.at(place, Finding::new(what, remedy));
         self.warnings.borrow_mut().push(warning);
     }
@@ -230,22 +230,22 @@ impl Document {
 
     /// Every key that a reader of this document asked for, as a path without the numbers of array elements:
     /// `bus[].drive[].address`.
-    pub(crate) fn known_keys(&self) -> BTreeSet<String> {
+    pub fn known_keys(&self) -> BTreeSet<String> {
         self.known.borrow().clone()
     }
 
     /// Whether no problem was found so far.
-    pub(crate) fn is_sound(&self) -> bool {
+    pub fn is_sound(&self) -> bool {
         self.is_toml() && self.problems.borrow().is_empty()
     }
 
     /// Whether the file is TOML.
-    pub(crate) fn is_toml(&self) -> bool {
+    pub fn is_toml(&self) -> bool {
         self.syntax.is_empty()
     }
 
     /// Problems and warnings, each in the order of the lines; of a file that is not TOML, only where it is not.
-    pub(crate) fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
+    pub fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
         if !self.is_toml() {
             return (self.syntax, Vec::new());
         }

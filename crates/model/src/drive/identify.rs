@@ -7,7 +7,7 @@ use super::profile::{Probe, Profile, Profiles};
 use crate::codec::Protocol;
 
 /// All probes of the profiles for `protocol`.
-pub(crate) fn probes(profiles: &Profiles, protocol: Protocol) -> Vec<Probe> {
+pub fn probes(profiles: &Profiles, protocol: Protocol) -> Vec<Probe> {
     let speaking = profiles.iter().filter(|p| p.protocols.contains(&protocol));
     let mut probes: Vec<Probe> = speaking.flat_map(|p| p.identify.iter().map(|e| e.probe)).collect();
     probes.sort();
@@ -17,7 +17,7 @@ pub(crate) fn probes(profiles: &Profiles, protocol: Protocol) -> Vec<Probe> {
 
 /// The profiles that fit all outcomes, reduced to those with the most probes. `outcomes` holds whether a probe was
 /// answered with values; a probe without an answer is absent and fits no profile.
-pub(crate) fn fitting(profiles: &Profiles, protocol: Protocol, outcomes: &BTreeMap<Probe, bool>) -> Vec<Arc<Profile>> {
+pub fn fitting(profiles: &Profiles, protocol: Protocol, outcomes: &BTreeMap<Probe, bool>) -> Vec<Arc<Profile>> {
     let fits = |profile: &&Arc<Profile>| {
         profile.protocols.contains(&protocol)
             && !profile.identify.is_empty()

@@ -5,11 +5,11 @@ use toml::de::{DeTable, DeValue};
 use super::Place;
 
 /// One key of a table: the key, its line, the value.
-pub(crate) type Entry = (String, Option<usize>, Node);
+pub type Entry = (String, Option<usize>, Node);
 
 /// A value and its place.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Node {
+pub struct Node {
     /// The value.
     pub value: Raw,
     pub(super) line: Option<usize>,
@@ -64,7 +64,7 @@ impl Node {
 
 /// A TOML value.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Raw {
+pub enum Raw {
     /// A string.
     Text(String),
     /// A 64-bit integer.
@@ -85,7 +85,7 @@ pub(crate) enum Raw {
 
 impl Raw {
     /// The type, for messages: `an integer`.
-    pub(crate) fn kind(&self) -> &'static str {
+    pub fn kind(&self) -> &'static str {
         match self {
             Raw::Text(_) | Raw::Env(_) => "a string",
             Raw::Integer(_) => "an integer",

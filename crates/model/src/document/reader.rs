@@ -7,7 +7,7 @@ use super::{Document, Entry, Finding, FromNode, Node, Place, Raw};
 
 /// Returns the keys of one table.
 #[derive(Debug)]
-pub(crate) struct Reader<'d> {
+pub struct Reader<'d> {
     document: &'d Document,
     entries: &'d [Entry],
     place: Place,
@@ -28,12 +28,12 @@ impl<'d> Reader<'d> {
     }
 
     /// The document it belongs to.
-    pub(crate) fn document(&self) -> &'d Document {
+    pub fn document(&self) -> &'d Document {
         self.document
     }
 
     /// The place of `key`, or of the table if the key is absent.
-    pub(crate) fn place_of(&self, key: &str) -> Place {
+    pub fn place_of(&self, key: &str) -> Place {
         let node = self.find(key);
         let env = node.and_then(|n| n.env.clone()).or_else(|| self.place.env.clone());
         let line = node.and_then(|n| n.line).or(self.place.line);
@@ -45,7 +45,7 @@ impl<'d> Reader<'d> {
     }
 
     /// Adds a problem at `key`.
-    pub(crate) fn problem(&self, key: &str, what: impl Into<String>, remedy: impl Into<String>) {
+    pub fn problem(&self, key: &str, what: impl Into<String>, remedy: impl Into<String>) {
         self.document.problem(&self.place_of(key), what, remedy);
     }
 
@@ -56,41 +56,41 @@ impl<'d> Reader<'d> {
     }
 
     /// The value, or `None` with its error as a problem at `key`.
-    pub(crate) fn accept<T, E: Into<Finding>>(&self, key: &str, outcome: Result<T, E>) -> Option<T> {
+    pub fn accept<T, E: Into<Finding>>(&self, key: &str, outcome: Result<T, E>) -> Option<T> {
         outcome.map_err(|error| self.finding(key, error)).ok()
     }
 
     /// Adds a warning at `key`.
-    pub(crate) fn warning(&self, key: &str, what: impl Into<String>, remedy: impl Into<String>) {
+    pub fn warning(&self, key: &str, what: impl Into<String>, remedy: impl Into<String>) {
         self.document.warning(&self.place_of(key), what, remedy);
     }
 
     /// All keys in the table, known or not.
-    pub(crate) fn keys(&self) -> Vec<&'d str> {
+    pub fn keys(&self) -> Vec<&'d str> {
         self.entries.iter().map(|(key, _, _)| key.as_str()).collect()
     }
 
     /// Whether the table has `key`; makes it known.
-    pub(crate) fn has(&self, key: &str) -> bool {
+    pub fn has(&self, key: &str) -> bool {
         self.know(key);
         self.find(key).is_some()
     }
 
     /// The untyped value of `key`.
-    pub(crate) fn raw(&self, key: &str) -> Option<&'d Node> {
+    pub fn raw(&self, key: &str) -> Option<&'d Node> {
         self.know(key);
         self.find(key)
     }
 
     /// The value of `key`, if it is present and valid.
-    pub(crate) fn optional<T: FromNode>(&self, key: &str) -> Option<T> {
+    pub fn optional<T: FromNode>(&self, key: &str) -> Option<T> {
         self.know(key);
         let node = self.find(key)?;
         self.accept(key, T::from_node(node))
     }
 
     /// The value of `key`; its absence is a problem.
-    pub(crate) fn required<T: FromNode>(&self, key: &str) -> Option<T> {
+    pub fn required<T: FromNode>(&self, key: &str) -> Option<T> {
         if !self.has(key) {
             self.problem(key, format!("`{key}` is missing"), format!("write {}", T::WANTED));
         }
@@ -103,13 +103,13 @@ impl<'d> Reader<'d> {
     }
 
     /// The value of `key` parsed from a string.
-    pub(crate) fn parsed<T, E: Into<Finding>>(&self, key: &str, parse: impl FnOnce(&str) -> Result<T, E>) -> Option<T> {
+    pub fn parsed<T, E: Into<Finding>>(&self, key: &str, parse: impl FnOnce(&str) -> Result<T, E>) -> Option<T> {
         let text: String = self.optional(key)?;
         self.accept(key, parse(&text))
     }
 
     /// The reader of the table `key`.
-    pub(crate) fn table(&self, key: &str) -> Option<Reader<'d>> {
+    pub fn table(&self, key: &str) -> Option<Reader<'d>> {
         self.know(key);
         let node = self.find(key)?;
         match node.value {
@@ -126,7 +126,7 @@ impl<'d> Reader<'d> {
     }
 
     /// The readers of the array of tables `key`; none when it is absent.
-    pub(crate) fn tables(&self, key: &str) -> Vec<Reader<'d>> {
+    pub fn tables(&self, key: &str) -> Vec<Reader<'d>> {
         self.know(key);
         let Some(node) = self.find(key) else { return Vec::new() };
         let items = match &node.value {
@@ -153,7 +153,7 @@ impl<'d> Reader<'d> {
     }
 
     /// Reports the keys that were never asked for, each with the nearest known key.
-    pub(crate) fn finish(&self) {
+    pub fn finish(&self) {
         if self.lenient.get() {
             return;
         }
@@ -225,7 +225,7 @@ fn without_numbers(path: &str) -> String {
 }
 
 /// The known word nearest to `word`, if one is close enough to be a misspelling, or the only one that has its parts.
-pub(crate) fn nearest<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+pub fn nearest<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     match candidates(word, known).as_slice() {
         [only] => Some(only),
         _ => None,
@@ -234,7 +234,7 @@ pub(crate) fn nearest<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> O
 
 /// The known words that `word` may stand for: the one it is a misspelling of, else those that have its parts (`speed_ref` is
 /// part of `speed_reference`), the shortest first, four at most.
-pub(crate) fn candidates<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
+pub fn candidates<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
     let known: Vec<&str> = known.collect();
     let mut best: Option<(usize, &str)> = None;
     for candidate in &known {

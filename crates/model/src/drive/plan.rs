@@ -33,7 +33,7 @@ impl PlannedRead {
     }
 
     /// Whether it includes that address.
-    pub(crate) fn covers(&self, table: Table, address: u16) -> bool {
+    pub fn covers(&self, table: Table, address: u16) -> bool {
         self.table == table
             && address >= self.start
             && u32::from(address) < u32::from(self.start) + u32::from(self.count)
@@ -55,7 +55,7 @@ impl Plan {
     /// Merges the points of a profile into few requests: neighbouring addresses of one class in one range of the drive,
     /// up to the limit of the range. A gap is read only where the range allows holes. An address that two classes need,
     /// or that the faster one reads as such a gap, is read in the faster one only.
-    pub(crate) fn of(profile: &Profile) -> Plan {
+    pub fn of(profile: &Profile) -> Plan {
         let mut taken: BTreeSet<(Table, u16)> = BTreeSet::new();
         let mut reads = Vec::new();
         for class in [PollClass::Fast, PollClass::Slow, PollClass::Once] {
@@ -100,7 +100,7 @@ impl Plan {
     }
 
     /// Whether these requests read a point of that profile: everything it is in or derived from.
-    pub(crate) fn shows(&self, profile: &Profile, point: usize) -> bool {
+    pub fn shows(&self, profile: &Profile, point: usize) -> bool {
         match profile.points.get(point).map(|point| &point.source) {
             Some(Source::Raw(raw)) => {
                 let is_read = |address| self.reads.iter().any(|read| read.covers(raw.table, address));
@@ -112,7 +112,7 @@ impl Plan {
     }
 
     /// Splits a refused request into halves, never within a value; a single value cannot be split.
-    pub(crate) fn halves(read: PlannedRead) -> Option<(PlannedRead, PlannedRead)> {
+    pub fn halves(read: PlannedRead) -> Option<(PlannedRead, PlannedRead)> {
         let middle = read.count / 2;
         let joint = |at: &u16| *at >= 1 && *at < read.count && !is_wide(read.wide, *at);
         let first = (middle..read.count).chain((0..middle).rev()).find(joint)?;
@@ -133,7 +133,7 @@ impl Plan {
 
 impl PlannedRead {
     /// Appends the read of the addresses that follow.
-    pub(crate) fn append(&mut self, next: &PlannedRead) {
+    pub fn append(&mut self, next: &PlannedRead) {
         self.wide |= next.wide.checked_shl(u32::from(self.count)).unwrap_or(0);
         self.count = self.count.saturating_add(next.count);
     }
@@ -185,7 +185,7 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<P
 
 /// Time an exchange takes on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct WireTime {
+pub struct WireTime {
     /// Characters of the request.
     pub request: Duration,
     /// Silence by which the drive detects the end of the request (Modbus RTU: 3.5 characters); its turnaround begins
@@ -197,7 +197,7 @@ pub(crate) struct WireTime {
 
 impl WireTime {
     /// Wire time of an exchange.
-    pub(crate) fn of(protocol: Protocol, format: &LineFormat, pdu: &RequestPdu) -> WireTime {
+    pub fn of(protocol: Protocol, format: &LineFormat, pdu: &RequestPdu) -> WireTime {
         WireTime {
             request: format.chars(protocol.request_chars(pdu)),
             recognition: protocol.recognition(format),
@@ -206,7 +206,7 @@ impl WireTime {
     }
 
     /// The whole transaction: request, recognition, turnaround, reply, silence.
-    pub(crate) fn total(&self, turnaround: Duration, silence: Duration) -> Duration {
+    pub fn total(&self, turnaround: Duration, silence: Duration) -> Duration {
         self.request + self.recognition + turnaround + self.reply + silence
     }
 }

@@ -3,26 +3,26 @@
 pub(crate) mod derive;
 #[cfg(test)]
 mod families_tests;
-pub(crate) mod identify;
+pub mod identify;
 pub mod model;
 pub mod parameters;
-pub(crate) mod plan;
+pub mod plan;
 pub mod profile;
 mod profile_file;
-pub(crate) mod raw_writes;
+pub mod raw_writes;
 pub mod why;
 
 pub use derive::{Bound, Derived};
-pub(crate) use model::tidy;
+pub use model::tidy;
 pub use model::{ModelPoint, Quality, Sample, State, Value};
-pub(crate) use plan::{Plan, PlannedRead};
+pub use plan::{Plan, PlannedRead};
 pub use profile::{Point, PollClass, Probe, Profile, Raw, Source};
 pub use raw_writes::RawWrites;
 
 /// Name of the point with the drive's own response to a silent master; 0 is no response. For Vacon NX parameter
 /// P2.7.22.
-pub(crate) const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";
+pub const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";
 
 /// Name of the point with the time without a request, in seconds, after which a drive responds to a silent master; 0 is
 /// never. For drives with a register for it.
-pub(crate) const COMMUNICATION_TIMEOUT: &str = "communication_timeout";
+pub const COMMUNICATION_TIMEOUT: &str = "communication_timeout";

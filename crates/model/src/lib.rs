@@ -1,0 +1,6 @@
+//! Points, profiles and quality of frequency converters; TOML that knows the line of every key.
+
+pub mod document;
+pub mod drive;
+
+use drivegate_proto as codec;
