@@ -4,7 +4,7 @@ use super::*;
 
 #[test]
 fn the_page_has_every_verdict() {
-    let page = include_str!("../../docs/diagnosis.md");
+    let page = include_str!("../../../../docs/diagnosis.md");
     let rows: Vec<&str> = page.lines().filter(|line| line.starts_with("| `")).collect();
     for (place, cause) in Cause::ALL.into_iter().enumerate() {
         let row = format!("| `{}` | {} |", cause.name(), cause.meaning());

@@ -26,7 +26,7 @@ use crate::process_image::{Access, BusImage, DriveImage, Machine, Reading};
 
 pub use self::exchange::{Exchange, Question, Target};
 pub use self::placed::{Placed, Shown};
-pub(crate) use self::why::explain;
+pub use self::why::explain;
 
 /// The plant as it is configured now; a reload puts a new one in its place.
 pub type SharedPlant = Arc<ArcSwap<Plant>>;
@@ -168,7 +168,7 @@ fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
 }
 
 /// Answers a command that is not taken; audited and counted.
-pub(crate) fn turn_away(
+pub fn turn_away(
     writes: &Arc<WriteStats>,
     drive: &str,
     what: &str,

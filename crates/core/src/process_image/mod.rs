@@ -246,7 +246,7 @@ impl DriveImage {
     }
 
     /// The drive took these values of holding registers: where they are parameters they did not change by themselves.
-    pub(crate) fn note_written(&self, items: &[(u16, u16)], now: Instant) {
+    pub fn note_written(&self, items: &[(u16, u16)], now: Instant) {
         let parameters = &self.spec.profile.parameters;
         let is_parameter = |address: u16| parameters.id(address).is_some();
         let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);

@@ -7,7 +7,7 @@ use crate::drive::why::{self, Contact, Explanation, Fate, Giver, RunOrder, RunWi
 use crate::process_image::{Access, BusImage, Hold, Link, Reading};
 
 /// Whether the drive of `reading`, on that bus, runs, and why not.
-pub(crate) fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {
+pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {
     let spec = reading.spec;
     let order = || {
         let (record, ended) = writes.audit().last_run(&spec.name)?;

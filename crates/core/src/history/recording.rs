@@ -413,7 +413,7 @@ fn add(bytes: &mut Vec<u8>, line: &impl Serialize) {
 }
 
 /// Two hexadecimal digits for each byte.
-pub(crate) fn hex(bytes: &[u8]) -> String {
+pub fn hex(bytes: &[u8]) -> String {
     let mut digits = String::with_capacity(2 * bytes.len());
     for byte in bytes {
         // Writing to a string cannot fail.

@@ -25,7 +25,7 @@ pub const AUDIT_KEPT: usize = 1000;
 /// Records of commands that were not sent, kept beside them.
 const UNSENT_KEPT: usize = 500;
 /// Name of the log events of commands that were sent: the log has a way of its own for them.
-pub(crate) const SENT: &str = "sent command";
+pub const SENT: &str = "sent command";
 
 /// One value that a command sets.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -88,12 +88,12 @@ fn bare_or_null<S: Serializer>(value: &Option<Value>, serializer: S) -> Result<S
 }
 
 /// Serializes a time as milliseconds with three decimals.
-pub(crate) fn milliseconds<S: Serializer>(time: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
+pub fn milliseconds<S: Serializer>(time: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_f64((time.as_secs_f64() * 1e6).round() / 1e3)
 }
 
 /// The same, `null` without a time.
-pub(crate) fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
+pub fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
     match time {
         Some(time) => milliseconds(time, serializer),
         None => serializer.serialize_none(),
@@ -296,7 +296,7 @@ impl Audit {
 
     /// A reload gave names to other drives: what the drives of those for which `is_same` does not hold were ordered last was ordered
     /// to others.
-    pub(crate) fn keep_orders_of(&self, is_same: impl Fn(&str) -> bool) {
+    pub fn keep_orders_of(&self, is_same: impl Fn(&str) -> bool) {
         let records = &mut *self.records();
         records.runs.retain(|drive, _| is_same(drive));
         records.ordered.retain(|drive, _| is_same(drive));

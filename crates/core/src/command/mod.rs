@@ -20,7 +20,7 @@ mod touched;
 
 pub use admit::{Admitted, admit, may_restore, sets_twice, written};
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
-pub(crate) use audit::{SENT, milliseconds, milliseconds_or_null};
+pub use audit::{SENT, milliseconds, milliseconds_or_null};
 pub use background::{
     BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background, BackgroundRequest, NO_DRIVE, Pace, PassedOn,
 };
@@ -561,7 +561,7 @@ mod tests {
 
     #[test]
     fn the_documentation_tells_every_answer() {
-        let page = include_str!("../../docs/commands.md");
+        let page = include_str!("../../../../docs/commands.md");
         let refusals = [
             Refusal::NotAllowed,
             Refusal::NotWritable,

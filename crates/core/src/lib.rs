@@ -1,0 +1,14 @@
+//! Process image, commands, events, history, diagnosis and parameters of drivegate.
+
+pub mod command;
+pub mod diagnosis;
+pub mod event;
+pub mod files;
+pub mod history;
+pub mod parameters;
+pub mod plant;
+pub mod process_image;
+pub mod version;
+
+use drivegate_model::drive;
+use drivegate_proto as codec;
