@@ -52,7 +52,7 @@
 //! `docs/architecture.md` follows one exchange, one command and one value through the files, says which file a change belongs
 //! to, and gives the reasons.
 
-pub mod bus;
+pub use drivegate_bus as bus;
 pub mod cli;
 pub use drivegate_core::command;
 pub use drivegate_proto as codec;
@@ -62,9 +62,9 @@ pub use drivegate_core::diagnosis;
 pub use drivegate_core::event;
 pub use drivegate_core::files;
 pub use drivegate_core::history;
+pub use drivegate_line as line;
 pub use drivegate_model::document;
 pub use drivegate_model::drive;
-pub mod line;
 pub mod north;
 pub use drivegate_core::parameters;
 pub use drivegate_core::plant;

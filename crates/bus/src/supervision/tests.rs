@@ -2,18 +2,18 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use super::*;
-use crate::bus::command_run::{CommandRun, Next, Step};
-use crate::bus::drive_state::{DriveState, Wanted};
-use crate::bus::master::supervise;
-use crate::bus::n2_late_replies::N2LateReplies;
 use crate::codec::n2::Session;
 use crate::codec::{Exception, LineFormat, Protocol, Reply, RequestPdu, Table};
 use crate::command::{
     Authority, Command, CommandQueue, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket,
     Urgency, WriteStats, admit, written,
 };
+use crate::command_run::{CommandRun, Next, Step};
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
+use crate::drive_state::{DriveState, Wanted};
+use crate::master::supervise;
+use crate::n2_late_replies::N2LateReplies;
 use crate::plant::BusHandle;
 use crate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
 

@@ -17,12 +17,12 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use crate::bus::late_replies::{FORGOTTEN_AFTER, LateReplies};
-use crate::bus::n2_late_replies::{Asked, N2LateReplies, Taken};
-use crate::bus::transaction::{Ended, MAY_BE_LATE};
 use crate::codec::frames::{Cut, Frames, GLITCH, HELD_BACK, Piece, are_sound, may_be_request};
 use crate::codec::n2::{self, N2Options};
 use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu};
+use crate::late_replies::{FORGOTTEN_AFTER, LateReplies};
+use crate::n2_late_replies::{Asked, N2LateReplies, Taken};
+use crate::transaction::{Ended, MAY_BE_LATE};
 
 /// A request without a reply is over after that time, unless the next request comes first: the longest `response_timeout`.
 const PATIENCE: Duration = Duration::from_secs(5);

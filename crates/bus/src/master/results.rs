@@ -3,16 +3,16 @@
 use std::time::{Duration, Instant};
 
 use super::{Before, Master, Purpose, Turn, TurnEnd};
-use crate::bus::command_run::{Step, StepPurpose};
-use crate::bus::n2_late_replies::Asked;
-use crate::bus::n2_session::Progress;
-use crate::bus::news::News;
-use crate::bus::schedule::{Change, Poll, Polled};
-use crate::bus::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, is_reference, written};
+use crate::command_run::{Step, StepPurpose};
 use crate::drive::{PlannedRead, Point, Raw};
+use crate::n2_late_replies::Asked;
+use crate::n2_session::Progress;
+use crate::news::News;
+use crate::schedule::{Change, Poll, Polled};
+use crate::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 
 impl Master {
     /// The exchange of a turn is over; what that changes.

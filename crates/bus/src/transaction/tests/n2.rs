@@ -1,8 +1,8 @@
 //! Answers on an N2 line that may be late ones.
 
 use super::*;
-use crate::bus::n2_late_replies::{Asked, N2LateReplies};
 use crate::codec::Table;
+use crate::n2_late_replies::{Asked, N2LateReplies};
 
 const WINDOW: Duration = Duration::from_millis(750);
 

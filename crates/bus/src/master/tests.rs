@@ -6,7 +6,6 @@ use std::time::SystemTime;
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
-use crate::bus::transaction::MAY_BE_LATE;
 use crate::codec::wire::Silence;
 use crate::codec::{Exception, LineFormat, Reply, Table};
 use crate::command::{Answer, Authority, Command, CommandQueue, Order, Ticket, admit};
@@ -16,6 +15,7 @@ use crate::line::LineOptions;
 use crate::process_image::{
     Access, BusImage, BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings,
 };
+use crate::transaction::MAY_BE_LATE;
 
 mod background;
 

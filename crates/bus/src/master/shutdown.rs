@@ -7,9 +7,9 @@ use tokio::sync::oneshot::Receiver;
 use tokio::sync::oneshot::error::TryRecvError;
 
 use super::Master;
-use crate::bus::drive_state::FRESH;
 use crate::command::{Answer, NotStopped, Origin, Outcome, SourceKind, Stopping, WriteStats};
 use crate::drive::{ModelPoint, Value};
+use crate::drive_state::FRESH;
 use crate::plant::BusHandle;
 use crate::process_image::{Access, OnShutdown};
 

@@ -15,15 +15,17 @@ mod rfc2217;
 mod rs485;
 mod sys;
 
+use drivegate_proto as codec;
+
 pub use arrival::Arrival;
 use clock::WakeUps;
 pub use clock::{poll_until, sharpen_timers, wait_until};
 pub use names::Names;
 pub use options::{Level, LineOptions, MOST_RTS_DELAY, Rs485, Spin};
-pub(crate) use pty::Pty;
+pub use pty::Pty;
 pub use receiver::Receiver;
 use remote::{Raw, Remote};
-pub(crate) use rfc2217::{ServedPort, escape as telnet_escaped};
+pub use rfc2217::{ServedPort, escape as telnet_escaped};
 
 use std::cell::Cell;
 use std::fmt;

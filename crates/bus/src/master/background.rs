@@ -5,13 +5,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::{Master, Purpose, Turn, TurnEnd};
-use crate::bus::drive_state::DriveState;
-use crate::bus::late_replies::LateReplies;
-use crate::bus::n2_late_replies::N2LateReplies;
-use crate::bus::n2_session::{N2Sessions, Progress};
-use crate::bus::news::News;
-use crate::bus::schedule::Admission;
-use crate::bus::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{
@@ -20,7 +13,14 @@ use crate::command::{
 };
 use crate::drive::plan::WireTime;
 use crate::drive::{PlannedRead, PollClass};
+use crate::drive_state::DriveState;
+use crate::late_replies::LateReplies;
+use crate::n2_late_replies::N2LateReplies;
+use crate::n2_session::{N2Sessions, Progress};
+use crate::news::News;
 use crate::process_image::DriveImage;
+use crate::schedule::Admission;
+use crate::transaction::{CONNECTION_CLOSED, Ended};
 
 /// Time of an exchange whose request is not decoded, at most.
 const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);

@@ -6,6 +6,6 @@ mod server;
 mod telnet;
 
 pub(super) use com_port::{Session, Settings, State};
-pub(crate) use server::ServedPort;
-pub(crate) use telnet::escape;
+pub use server::ServedPort;
+pub use telnet::escape;
 pub(super) use telnet::is_greeting;

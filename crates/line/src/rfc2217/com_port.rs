@@ -3,7 +3,7 @@
 
 use super::telnet::{Command, Decoder, IAC, SB, SE, Verb, escape};
 use crate::codec::{LineFormat, Parity};
-use crate::line::options::Level;
+use crate::options::Level;
 
 pub(super) const BINARY: u8 = 0;
 pub(super) const SUPPRESS_GO_AHEAD: u8 = 3;
@@ -27,15 +27,15 @@ const BOTH_BUFFERS: u8 = 3;
 
 /// What the port behind the server is to be.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(in crate::line) struct Settings {
-    pub(in crate::line) format: LineFormat,
-    pub(in crate::line) rts: Level,
-    pub(in crate::line) dtr: Level,
+pub(crate) struct Settings {
+    pub(crate) format: LineFormat,
+    pub(crate) rts: Level,
+    pub(crate) dtr: Level,
 }
 
 /// How far the negotiation is.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(in crate::line) enum State {
+pub(crate) enum State {
     /// The server has not said yet whether it has the option.
     Asked,
     /// The server has the option; answers to settings are missing.
@@ -48,7 +48,7 @@ pub(in crate::line) enum State {
 
 /// One connection.
 #[derive(Debug)]
-pub(in crate::line) struct Session {
+pub(crate) struct Session {
     settings: Settings,
     decoder: Decoder,
     state: State,
@@ -60,7 +60,7 @@ pub(in crate::line) struct Session {
 
 impl Session {
     /// A session and the first bytes for the server.
-    pub(in crate::line) fn new(settings: Settings) -> (Session, Vec<u8>) {
+    pub(crate) fn new(settings: Settings) -> (Session, Vec<u8>) {
         let mut first = Vec::new();
         for (verb, option) in [
             (Verb::Will, COM_PORT),
@@ -81,18 +81,18 @@ impl Session {
         (session, first)
     }
 
-    pub(in crate::line) fn state(&self) -> &State {
+    pub(crate) fn state(&self) -> &State {
         &self.state
     }
 
     /// What the server has not answered.
-    pub(in crate::line) fn missing(&self) -> String {
+    pub(crate) fn missing(&self) -> String {
         let names: Vec<&str> = self.missing.iter().map(|(_, name)| *name).collect();
         names.join(", ")
     }
 
     /// The format that the server says the port has.
-    pub(in crate::line) fn took(&self) -> String {
+    pub(crate) fn took(&self) -> String {
         let [baud, data_bits, parity, stop_bits] = self.took;
         let parity = match parity {
             1 => 'N',
@@ -104,7 +104,7 @@ impl Session {
     }
 
     /// Appends the data in `bytes` to `data`; what has to be sent to the server.
-    pub(in crate::line) fn take(&mut self, bytes: &[u8], data: &mut Vec<u8>) -> Vec<u8> {
+    pub(crate) fn take(&mut self, bytes: &[u8], data: &mut Vec<u8>) -> Vec<u8> {
         let mut commands = Vec::new();
         self.decoder.take(bytes, data, &mut commands);
         let mut replies = Vec::new();

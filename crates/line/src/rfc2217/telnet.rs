@@ -116,7 +116,7 @@ impl Decoder {
 }
 
 /// Data as it is sent: each 255 doubled.
-pub(crate) fn escape(data: &[u8]) -> Vec<u8> {
+pub fn escape(data: &[u8]) -> Vec<u8> {
     let mut escaped = Vec::with_capacity(data.len() + 4);
     for &byte in data {
         escaped.push(byte);
@@ -129,7 +129,7 @@ pub(crate) fn escape(data: &[u8]) -> Vec<u8> {
 
 /// Whether the first bytes of a connection are those of a telnet server: an option that it offers or asks for. No frame of any
 /// protocol begins with 255. `None` while that is open.
-pub(in crate::line) fn is_greeting(first: &[u8]) -> Option<bool> {
+pub(crate) fn is_greeting(first: &[u8]) -> Option<bool> {
     match first {
         [] | [IAC] => None,
         [IAC, second, rest @ ..] if Verb::of(*second).is_some() => (!rest.is_empty()).then_some(true),

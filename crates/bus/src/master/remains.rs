@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use super::Master;
-use crate::bus::drive_state::DriveState;
+use crate::drive_state::DriveState;
 
 /// What a bus still keeps of exchanges that failed and of commands that were begun. On a sound line on which nobody commands
 /// everything of it ends by itself: its `Default`.

@@ -5,12 +5,12 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use crate::bus::transaction::Ended;
 use crate::codec::{Protocol, Reply, RequestPdu, Table, describe};
 use crate::command::{Change, Outcome, written};
 use crate::drive::ModelPoint;
 use crate::drive::model::Kind;
 use crate::process_image::DriveSpec;
+use crate::transaction::Ended;
 
 /// Least time between two references of a drive that are told.
 const PAUSE: Duration = Duration::from_secs(1);

@@ -38,6 +38,16 @@ mod tap;
 pub mod transaction;
 mod vain_stops;
 
+use drivegate_core::command;
+use drivegate_core::diagnosis;
+use drivegate_core::event;
+use drivegate_core::plant;
+use drivegate_core::process_image;
+use drivegate_line as line;
+use drivegate_model::document;
+use drivegate_model::drive;
+use drivegate_proto as codec;
+
 pub use line_loop::BusTask;
 
 use std::time::Duration;

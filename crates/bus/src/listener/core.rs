@@ -7,17 +7,17 @@ use std::time::{Duration, Instant};
 
 use super::commands::{Commanded, Commands};
 use super::decoder::{Decoder, Exchange, Heard};
-use crate::bus::BusOptions;
-use crate::bus::core::Closed;
-use crate::bus::news::News;
-use crate::bus::report::Report;
-use crate::bus::transaction::Ended;
+use crate::BusOptions;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table};
 use crate::command::{Origin, Outcome, Refusal, SourceKind, Ticket, WriteStats};
+use crate::core::Closed;
 use crate::drive::Profile;
 use crate::event::{EventKind, Events};
+use crate::news::News;
 use crate::plant::BusHandle;
 use crate::process_image::{Cadence, Outcome as Counted};
+use crate::report::Report;
+use crate::transaction::Ended;
 
 /// A drive of which nothing was heard for that long, and for three of its usual pauses, is offline.
 const SILENT: Duration = Duration::from_secs(5);

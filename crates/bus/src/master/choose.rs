@@ -4,14 +4,14 @@ use std::time::{Duration, Instant};
 
 use super::background::{Late, drop_in_vain, may_go};
 use super::{Before, Master, Purpose, Turn};
-use crate::bus::command_run::{CommandRun, Step};
-use crate::bus::drive_state::{DriveState, Wanted};
-use crate::bus::schedule::{Decision, Poll};
 use crate::codec::RequestPdu;
 use crate::command::{
     Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Outcome, Refusal, StopEnd, Urgency,
     still_keeps_limits,
 };
+use crate::command_run::{CommandRun, Step};
+use crate::drive_state::{DriveState, Wanted};
+use crate::schedule::{Decision, Poll};
 
 /// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
 const IN_A_ROW: u32 = 8;

@@ -26,7 +26,7 @@ const OPTIONS: [(Verb, u8); 5] = [
 
 /// One connection of a program.
 #[derive(Debug)]
-pub(crate) struct ServedPort {
+pub struct ServedPort {
     format: LineFormat,
     decoder: Decoder,
     /// Whether the program was told that the server has the COM port option, too.
@@ -35,7 +35,7 @@ pub(crate) struct ServedPort {
 
 impl ServedPort {
     /// A connection to a line of that format, and the first bytes for the program.
-    pub(crate) fn new(format: LineFormat) -> (ServedPort, Vec<u8>) {
+    pub fn new(format: LineFormat) -> (ServedPort, Vec<u8>) {
         let first = OPTIONS.iter().flat_map(|(verb, option)| [IAC, verb.byte(), *option]);
         let port = ServedPort {
             format,
@@ -46,7 +46,7 @@ impl ServedPort {
     }
 
     /// Appends the data in `bytes` to `data`; what has to be sent to the program.
-    pub(crate) fn take(&mut self, bytes: &[u8], data: &mut Vec<u8>) -> Vec<u8> {
+    pub fn take(&mut self, bytes: &[u8], data: &mut Vec<u8>) -> Vec<u8> {
         let mut commands = Vec::new();
         self.decoder.take(bytes, data, &mut commands);
         let mut replies = Vec::new();
@@ -125,7 +125,7 @@ mod tests {
     use super::super::com_port::{Session, Settings, State};
     use super::super::telnet::{SB, SE, escape};
     use super::*;
-    use crate::line::options::Level;
+    use crate::options::Level;
 
     fn format() -> LineFormat {
         LineFormat::new(9600, "8N1").unwrap()

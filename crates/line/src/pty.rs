@@ -14,7 +14,7 @@ const TERMINALS: &str = "/dev/pts";
 
 /// A pseudo-terminal; dropping it takes path and link away. As a file descriptor it is its own end.
 #[derive(Debug)]
-pub(crate) struct Pty {
+pub struct Pty {
     /// The own end.
     master: OwnedFd,
     /// The other program's end, kept open: without it reads at the own end fail while no program has the port open.
@@ -29,7 +29,7 @@ impl Pty {
     /// # Errors
     /// No pseudo-terminal is available, or the link cannot be made. Anything but a symbolic link to a pseudo-terminal at its
     /// path is left alone and is an error.
-    pub(crate) fn open(link: Option<&Path>) -> io::Result<Pty> {
+    pub fn open(link: Option<&Path>) -> io::Result<Pty> {
         let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
         let master = openpt(flags)?;
         grantpt(&master)?;
@@ -56,7 +56,7 @@ impl Pty {
     ///
     /// # Errors
     /// The system refuses it.
-    pub(crate) fn share(&self) -> io::Result<()> {
+    pub fn share(&self) -> io::Result<()> {
         fchown(&self.slave, None, Some(rustix::process::getegid().as_raw()))?;
         fchmod(&self.slave, Mode::from_raw_mode(0o660))?;
         Ok(())
@@ -66,7 +66,7 @@ impl Pty {
     ///
     /// # Errors
     /// Nothing is there, or the system reports something else.
-    pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
+    pub fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         Ok(rustix::io::read(&self.master, buffer)?)
     }
 
@@ -74,23 +74,23 @@ impl Pty {
     ///
     /// # Errors
     /// There is no room, or the system reports something else.
-    pub(crate) fn write(&self, bytes: &[u8]) -> io::Result<usize> {
+    pub fn write(&self, bytes: &[u8]) -> io::Result<usize> {
         Ok(rustix::io::write(&self.master, bytes)?)
     }
 
     /// What the other program opens: the link when there is one.
-    pub(crate) fn path(&self) -> &Path {
+    pub fn path(&self) -> &Path {
         self.link.as_deref().unwrap_or(&self.path)
     }
 
     /// Discards what was written and not read yet.
-    pub(crate) fn discard_unread(&self) {
+    pub fn discard_unread(&self) {
         let _ = tcflush(&self.slave, QueueSelector::IFlush);
     }
 
     /// Does what the last close of a serial port does, which the open slave end prevents here: discards unread bytes, and
     /// releases the exclusive access of a program that was killed.
-    pub(crate) fn settle(&self) {
+    pub fn settle(&self) {
         self.discard_unread();
         let _ = ioctl_tiocnxcl(&self.slave);
     }
