@@ -23,7 +23,7 @@ use crate::config::{BusSettings, Settings};
 use crate::event::{Event, EventKind, Events};
 use crate::history::{History, Keeper, RecorderTask, Recordings};
 use crate::north::local::Control;
-use crate::north::parameters::{hold_unfinished, keep_reading};
+use crate::north::parameter_jobs::{hold_unfinished, keep_reading};
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt, slot};
 use crate::parameters::{Store, Vault};
 use crate::plant::{BusHandle, Plant, SharedPlant};

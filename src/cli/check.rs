@@ -17,7 +17,7 @@ use crate::drive::raw_writes;
 use crate::history::RecorderOptions;
 use crate::history::budget::Budget;
 use crate::history::{line, trend};
-use crate::north::parameters::orphans;
+use crate::north::parameter_jobs::orphans;
 use crate::north::slot::Slot;
 use crate::process_image::{Access, DriveSpec};
 

@@ -13,7 +13,7 @@ mod log_throttle;
 pub mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;
-pub mod parameters;
+pub mod parameter_jobs;
 mod pem;
 mod readiness;
 mod refusals;

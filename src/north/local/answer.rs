@@ -16,7 +16,7 @@ use crate::document::nearest;
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
 use crate::north::command_json::resolve;
-use crate::north::parameters::{Again, How, begin_reading, carry_out, prepare, release, take_up};
+use crate::north::parameter_jobs::{Again, How, begin_reading, carry_out, prepare, release, take_up};
 use crate::parameters::{Id, ParameterFile, Wishes};
 use crate::plant::{DriveHandle, Plant, SharedPlant, Shown};
 use crate::process_image::{Link, Reading, Unavailable, public_points};

@@ -1,3 +1,4 @@
+use drivegate_testkit::audited;
 use std::sync::Arc;
 
 use proptest::prelude::*;
@@ -74,9 +75,7 @@ impl Bench {
     }
 
     fn results(&self) -> Vec<serde_json::Value> {
-        self.stats
-            .audit()
-            .parsed()
+        audited(self.stats.audit())
             .iter()
             .map(|r| r["result"].clone())
             .collect()
@@ -105,7 +104,7 @@ fn only_a_read_after_the_acknowledgement_confirms() {
     assert!(bench.results().is_empty(), "the old sample proves nothing");
     bench.read(2100, &[2]);
     assert_eq!(bench.results(), ["confirmed"]);
-    assert_eq!(bench.stats.audit().parsed()[0]["confirmed_ms"], 10.0);
+    assert_eq!(audited(bench.stats.audit())[0]["confirmed_ms"], 10.0);
     assert!(bench.expired().is_empty());
 }
 
@@ -371,7 +370,7 @@ fn a_stop_is_not_confirmed_while_the_motor_may_be_fed_past_the_drive() {
             told.len() == 1 && told[0].contains("not known") && told[0].contains(point),
             "{told:?}"
         );
-        let audited = bench.stats.audit().parsed()[0]["text"].to_string();
+        let audited = audited(bench.stats.audit())[0]["text"].to_string();
         assert!(audited.contains(point), "{audited}");
     }
     let mut bench = Bench::of("eaton-hvx");

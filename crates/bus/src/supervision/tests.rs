@@ -1,3 +1,4 @@
+use drivegate_testkit::{audited, next_command};
 use std::sync::Arc;
 use std::time::SystemTime;
 
@@ -114,7 +115,7 @@ impl Bench {
 
     /// The command that has its turn.
     fn take(&self) -> Option<Command> {
-        self.bus.queue.lock().pop(Urgency::Read, self.now)
+        next_command(&mut self.bus.queue.lock(), Urgency::Read, self.now)
     }
 
     /// As [`Bench::look`]: the action that is written then, and where its answer goes.
@@ -161,7 +162,7 @@ impl Bench {
 
     /// Results of the gateway's own orders.
     fn own_results(&self) -> Vec<serde_json::Value> {
-        let audit = self.stats.audit().parsed();
+        let audit = audited(self.stats.audit());
         let own = audit.iter().filter(|r| r["source"] == SourceKind::Supervision.name());
         own.map(|r| r["result"].clone()).collect()
     }

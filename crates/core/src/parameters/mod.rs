@@ -1,6 +1,6 @@
 //! The parameter vault: the parameters of drives read, kept, compared and restored. What a reading asks next, what a restore
 //! writes next, files and differences are pure; `store` and `journal` have the files on disk, `vault` the readings and
-//! restores that go on; `north::parameters` does them.
+//! restores that go on; `north::parameter_jobs` does them.
 
 mod claims;
 mod difference;

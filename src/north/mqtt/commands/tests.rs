@@ -1,3 +1,4 @@
+use drivegate_testkit::audited;
 use std::time::Duration;
 
 use serde_json::Value as Json;
@@ -180,7 +181,7 @@ fn refusals_are_reported_audited_and_answered_and_nothing_is_queued() {
     );
     let unknown = (crate::command::SourceKind::Mqtt, "unknown_drive");
     assert_eq!(bench.plant.writes.results().get(&unknown), Some(&1));
-    let record = bench.plant.writes.audit().parsed().pop().unwrap();
+    let record = audited(bench.plant.writes.audit()).pop().unwrap();
     assert_eq!(
         (&record["result"], &record["drive"]),
         (&"unknown_drive".into(), &"p11".into())
@@ -627,7 +628,7 @@ fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
     let result = stop_alone(&mut bench, r#"{"run": false, "speed_reference": 10}"#);
     assert_eq!(result["rest"], "not_allowed");
     assert!(result["error"]["message"].as_str().unwrap().contains("require_id"));
-    let audit = bench.plant.writes.audit().parsed();
+    let audit = audited(bench.plant.writes.audit());
     let results: Vec<_> = audit.iter().map(|record| record["result"].as_str().unwrap()).collect();
     assert_eq!(
         results.iter().filter(|result| **result == "acknowledged").count(),

@@ -1,5 +1,6 @@
 //! Whatever a client does and when: the action comes when it falls silent, and only then.
 
+use drivegate_testkit::next_command;
 use proptest::prelude::*;
 
 use super::*;
@@ -101,7 +102,7 @@ proptest! {
             client.acts(&mut bench, event);
             let due = client.is_silent(bench.now);
             bench.look(0, true);
-            let action = bench.bus.queue.lock().pop(Urgency::Stop, bench.now);
+            let action = next_command(&mut bench.bus.queue.lock(), Urgency::Stop, bench.now);
             prop_assert_eq!(action.is_some(), due, "{:?}", event);
             if let Some(action) = action {
                 action.answer(&acknowledged(), bench.now);

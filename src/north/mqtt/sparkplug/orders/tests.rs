@@ -6,6 +6,7 @@ use crate::north::mqtt::fixture;
 use crate::north::mqtt::sparkplug::model;
 use crate::north::mqtt::sparkplug::session::Rules;
 use crate::north::mqtt::sparkplug::topics::Topics;
+use drivegate_testkit::audited;
 
 struct Bench {
     orders: Orders,
@@ -209,7 +210,7 @@ fn what_is_wrong_is_refused_with_its_reason() {
         None,
         "there is no such drive"
     );
-    let seen = bench.plant.writes.audit().parsed();
+    let seen = audited(bench.plant.writes.audit());
     assert!(seen.iter().all(|record| record["source"] == "sparkplug"));
 }
 
