@@ -53,21 +53,21 @@
 //! to, and gives the reasons.
 
 pub use drivegate_bus as bus;
-pub mod cli;
 pub use drivegate_core::command;
-pub use drivegate_proto as codec;
-pub mod config;
-pub mod daemon;
 pub use drivegate_core::diagnosis;
 pub use drivegate_core::event;
 pub use drivegate_core::files;
 pub use drivegate_core::history;
-pub use drivegate_line as line;
-pub use drivegate_model::document;
-pub use drivegate_model::drive;
-pub mod north;
 pub use drivegate_core::parameters;
 pub use drivegate_core::plant;
 pub use drivegate_core::process_image;
-pub mod sim;
 pub use drivegate_core::version;
+pub use drivegate_gateway::config;
+pub use drivegate_gateway::daemon;
+pub use drivegate_line as line;
+pub use drivegate_model::document;
+pub use drivegate_model::drive;
+pub use drivegate_north as north;
+pub use drivegate_proto as codec;
+pub use drivegate_sim as sim;
+pub use drivegate_tools as cli;

@@ -9,8 +9,8 @@ use drivegate::config::Settings;
 use drivegate::daemon::Daemon;
 use drivegate::plant::Plant;
 use drivegate::process_image::BusImage;
-use drivegate::sim::drive::DriveOptions;
 use drivegate::sim::half_duplex::LineRules;
+use drivegate::sim::simulated_drive::DriveOptions;
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use tokio::runtime::Runtime;
 

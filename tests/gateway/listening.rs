@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use drivegate::codec::{LineFormat, Protocol};
 use drivegate::drive::profile::Profiles;
-use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::half_duplex::LineRules;
+use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use serde_json::Value as Json;
 use tokio_modbus::client::{Reader as _, Writer as _};

@@ -13,9 +13,9 @@ use drivegate::event::Events;
 use drivegate::line::LineOptions;
 use drivegate::plant::{BusHandle, DriveHandle, Plant};
 use drivegate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
-use drivegate::sim::drive::DriveOptions;
 use drivegate::sim::endpoint::EndpointOptions;
 use drivegate::sim::half_duplex::LineRules;
+use drivegate::sim::simulated_drive::DriveOptions;
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 
 use crate::support::process::PATIENCE;

@@ -2,9 +2,9 @@
 //! proves the simulated drive, and the frames they send and get are the worked frames of the reference.
 
 use drivegate::codec::{LineFormat, Protocol};
-use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::nx::{NxOptions, StatusBits, UPDATE_PERIOD, status_word};
+use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use std::path::Path;
 use std::time::Duration;

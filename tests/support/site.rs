@@ -4,9 +4,9 @@ use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 
 use drivegate::codec::LineFormat;
-use drivegate::sim::drive::DriveOptions;
 use drivegate::sim::endpoint::EndpointOptions;
 use drivegate::sim::half_duplex::LineRules;
+use drivegate::sim::simulated_drive::DriveOptions;
 use drivegate::sim::statistics::Direction;
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use tempfile::TempDir;

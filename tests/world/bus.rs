@@ -16,10 +16,10 @@ use drivegate::event::Events;
 use drivegate::line::LineOptions;
 use drivegate::plant::BusHandle;
 use drivegate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
-use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::half_duplex::{Delivery, HalfDuplex, LineRules};
 use drivegate::sim::random::Random;
+use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
 use drivegate::sim::slave::Slaves;
 use drivegate::sim::statistics::Transcript;
 

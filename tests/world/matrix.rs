@@ -14,10 +14,10 @@ use drivegate::command::{Order, Outcome};
 use drivegate::drive::Point;
 use drivegate::drive::profile::{Profile, Profiles};
 use drivegate::plant::Placed;
-use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::faults::{Fault, FaultPlan};
 use drivegate::sim::half_duplex::Delivery;
 use drivegate::sim::nx::{NxOptions, Values};
+use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
 
 use super::bus::{Parts, Seen};
 use super::orders::unique_reference;

@@ -7,9 +7,9 @@ use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Refu
 use drivegate::drive::{ModelPoint, Quality, State, Value};
 use drivegate::event::EventKind;
 use drivegate::process_image::{Access, LeaseAction, Supervision};
-use drivegate::sim::drive::ModelOptions;
 use drivegate::sim::faults::{Fault, FaultPlan};
 use drivegate::sim::nx::NxOptions;
+use drivegate::sim::simulated_drive::ModelOptions;
 use drivegate::sim::statistics::Recorded;
 
 use super::bus::Parts;

@@ -11,8 +11,8 @@ use drivegate::event::Events;
 use drivegate::plant::{DriveHandle, Placed, Plant, SharedPlant};
 use drivegate::process_image::{OnShutdown, Outcome as Counted};
 use drivegate::sim::SimTime;
-use drivegate::sim::drive::SimulatedDrive;
 use drivegate::sim::faults::FaultPlan;
+use drivegate::sim::simulated_drive::SimulatedDrive;
 use drivegate::sim::statistics::{Direction, Recorded};
 
 use super::bus::{Parts, Seen, WorldBus};

@@ -12,8 +12,8 @@ use drivegate::drive::ModelPoint;
 use drivegate::north::slot::{Offline, Slot, SlotAccess};
 use drivegate::north::{NorthStats, SlotOutcome};
 use drivegate::process_image::Access;
-use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::random::Random;
+use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
 
 mod order;
 

@@ -45,8 +45,7 @@ enum State {
 
 impl Lease {
     /// One that runs since then.
-    #[cfg(test)]
-    pub(crate) fn held(since: Instant) -> Lease {
+    pub fn held(since: Instant) -> Lease {
         Lease(State::Held(since))
     }
 

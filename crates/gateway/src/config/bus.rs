@@ -1,0 +1,361 @@
+//! `[[bus]]`: the line and its drives.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use super::drive::{self, Surroundings};
+use super::keys::BUS;
+use super::{BusSettings, line, slot, values};
+use crate::bus::predict::faster_points;
+use crate::bus::{BusOptions, Mode};
+use crate::codec::wire::Silence;
+use crate::codec::{LineFormat, Protocol, n2};
+use crate::document::{Finding, Place, Reader, format_duration};
+use crate::drive::profile::Profiles;
+use crate::process_image::{Access, BusSpec, DriveSpec};
+
+/// A longer `response_timeout` causes a warning.
+const LONG_TIMEOUT: Duration = Duration::from_secs(1);
+/// Longest fixed silence.
+const MOST_SILENCE: Duration = Duration::from_secs(1);
+
+/// What is known of a bus even when a part of it is wrong.
+pub(super) struct Found {
+    pub(super) name: Option<(String, Place)>,
+    pub(super) port: Option<(String, Place)>,
+    pub(super) drives: Vec<drive::Found>,
+    pub(super) settings: Option<BusSettings>,
+    pub(super) slots: Vec<slot::Found>,
+    /// Places of `cycle` and `slow_cycle`.
+    pub(super) cadence: (Place, Place),
+}
+
+pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profiles_broken: bool) -> Found {
+    let name = BUS.name.placed(reader);
+    let port = BUS.port.read(reader);
+    let port = port.and_then(|text| reader.accept(BUS.port.name, check_port(&text, base)));
+    // A wrong protocol is an error already; the rest is checked as for the default.
+    let protocol = BUS.protocol.read(reader).unwrap_or(Protocol::ModbusRtu);
+    let format = read_format(reader, protocol);
+    let (cycle, slow_cycle) = read_cadence(reader);
+    let options = read_options(reader, protocol, format.as_ref(), port.as_deref());
+    let around = Surroundings {
+        bus: name.as_ref().map_or("", |(name, _)| name),
+        protocol,
+        profiles,
+        profiles_broken,
+    };
+    let tables = BUS.drive.tables(reader);
+    if !reader.has(BUS.drive.name) {
+        reader.warning(BUS.drive.name, "the bus has no drive", "write [[bus.drive]] for each");
+    }
+    let drives: Vec<drive::Found> = tables.iter().map(|table| drive::read(table, &around)).collect();
+    if options.mode == Mode::Listen {
+        check_listening(reader, &drives);
+    }
+    let slots = slot::read(
+        reader,
+        base,
+        &slot::Surroundings {
+            bus: name.as_ref().map(|(name, _)| name.as_str()),
+            protocol,
+            format,
+            mode: options.mode,
+            drives: drives.iter().map(|drive| drive.access.0).collect(),
+        },
+    );
+    reader.finish();
+    let access = |mut spec: DriveSpec| {
+        if options.mode == Mode::Listen {
+            spec.access = Access::Listen;
+        }
+        spec
+    };
+    let specs = drives.iter().map(|d| d.spec.clone().map(access));
+    let specs: Option<Vec<DriveSpec>> = specs.collect();
+    let settings = match (&name, &port, format, specs) {
+        (Some((name, _)), Some(port), Some(format), Some(drives)) => {
+            check_fit(reader, &format, &options, &drives);
+            let spec = BusSpec {
+                name: name.clone(),
+                port: port.clone(),
+                protocol,
+                format,
+                cycle,
+                slow_cycle,
+            };
+            let asks = options.mode == Mode::Master;
+            let faster = asks.then(|| faster_points(&spec, options.silence, &drives)).flatten();
+            let drives = faster.unwrap_or(drives);
+            Some(BusSettings { spec, options, drives })
+        }
+        _ => None,
+    };
+    Found {
+        port: port.map(|port| (port, BUS.port.place(reader))),
+        cadence: (BUS.cycle.place(reader), BUS.slow_cycle.place(reader)),
+        name,
+        drives,
+        settings,
+        slots,
+    }
+}
+
+fn read_cadence(reader: &Reader<'_>) -> (Duration, Duration) {
+    let (cycle, slow_cycle) = (BUS.cycle.get(reader), BUS.slow_cycle.get(reader));
+    if slow_cycle < cycle {
+        let [slow, fast] = [slow_cycle, cycle].map(format_duration);
+        reader.warning(
+            BUS.slow_cycle.name,
+            format!("slow_cycle = {slow} is shorter than cycle = {fast}"),
+            "swap them or raise slow_cycle",
+        );
+    }
+    (cycle, slow_cycle)
+}
+
+fn read_options(
+    reader: &Reader<'_>,
+    protocol: Protocol,
+    format: Option<&LineFormat>,
+    port: Option<&str>,
+) -> BusOptions {
+    let options = BusOptions {
+        response_timeout: BUS.response_timeout.written(reader).unwrap_or(protocol.usual_timeout()),
+        retries: BUS.retries.written(reader).unwrap_or(default_retries(protocol)),
+        silence: read_silence(reader, protocol, format),
+        line: line::read(reader, port),
+        mode: BUS.mode.get(reader),
+    };
+    if options.response_timeout > LONG_TIMEOUT {
+        let [timeout, limit] = [options.response_timeout, LONG_TIMEOUT].map(format_duration);
+        reader.warning(
+            BUS.response_timeout.name,
+            format!("each try to reach an absent drive takes the line for {timeout}"),
+            format!(
+                "write {limit} or less; drives begin their replies within milliseconds, device servers within 0.5 s"
+            ),
+        );
+    }
+    options
+}
+
+/// What asks for a frame of the gateway on a line where it sends none is an error; what only says how it would ask has no effect.
+fn check_listening(reader: &Reader<'_>, drives: &[drive::Found]) {
+    for drive in drives {
+        let name = drive.name.as_ref().map_or("?", |(name, _)| name);
+        let control = (drive.access.0 == Access::Control).then_some(&drive.access.1);
+        let wishes = [
+            (control, "access = \"control\"", "access"),
+            (drive.lease.as_ref(), "supervision", "supervision"),
+            (drive.shutdown_stop.as_ref(), "on_shutdown = \"stop\"", "on_shutdown"),
+        ];
+        for (place, wish, key) in wishes {
+            let Some(place) = place else { continue };
+            reader.document().problem(
+                place,
+                format!("`{wish}` of drive `{name}` needs a gateway that writes, and this bus only listens (mode = \"listen\")"),
+                format!("leave {key} out, or make the gateway the only master of the line and write mode = \"master\""),
+            );
+        }
+    }
+    let keys = [
+        BUS.cycle.name,
+        BUS.slow_cycle.name,
+        BUS.response_timeout.name,
+        BUS.silence.name,
+        BUS.rs485.name,
+        BUS.rts.name,
+        BUS.spin.name,
+    ];
+    for key in keys.into_iter().filter(|key| reader.has(key)) {
+        reader.warning(
+            key,
+            format!("`{key}` has no effect on a bus that only listens: the gateway sends nothing and leaves RTS low"),
+            "leave the key out",
+        );
+    }
+}
+
+/// Path of a device, relative to the directory of the file, or `tcp://host:port` or `rfc2217://host:port`.
+///
+/// # Errors
+/// The text is neither.
+pub fn check_port(text: &str, base: &Path) -> Result<String, Finding> {
+    match text.split_once("://") {
+        Some((scheme @ ("tcp" | "rfc2217"), server)) => match values::host_port(server, None) {
+            Some(_) => Ok(text.to_string()),
+            None => Err(Finding::new(
+                format!("`{text}` is not the address of a device server"),
+                format!("write \"{scheme}://host:port\""),
+            )),
+        },
+        Some((scheme, _)) => Err(Finding::new(
+            format!("`{scheme}://` is not a kind of port"),
+            "write the path of a serial device, \"tcp://host:port\" or \"rfc2217://host:port\"",
+        )),
+        None if text.is_empty() || text.contains('\0') => Err(Finding::new(
+            "the port has no path",
+            "write for example \"/dev/serial/by-id/usb-…\"",
+        )),
+        None if is_windows_name(text) => Err(Finding::new(
+            format!("`{text}` is the name of a port on Windows"),
+            "write the path of the adapter on this machine, such as \"/dev/serial/by-id/usb-…\"; `ls /dev/serial/by-id` lists them",
+        )),
+        None if values::host_port(text, None).is_some() => Err(Finding::new(
+            format!("`{text}` is no path of a serial device"),
+            format!(
+                "did you mean \"tcp://{text}\"? Or \"rfc2217://{text}\" for a server that sets up its port over the network"
+            ),
+        )),
+        None => Ok(values::resolved(base, PathBuf::from(text)).display().to_string()),
+    }
+}
+
+/// `COM3`.
+fn is_windows_name(text: &str) -> bool {
+    let number = text
+        .get(..3)
+        .filter(|start| start.eq_ignore_ascii_case("com"))
+        .and_then(|_| text.get(3..));
+    let number = number.map(|number| number.trim_end_matches(':')).unwrap_or_default();
+    !number.is_empty() && number.chars().all(|c| c.is_ascii_digit())
+}
+
+fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
+    let key = BUS.format.name;
+    let baud = BUS.baud.get(reader);
+    let text = match reader.has(key) {
+        true => BUS.format.read(reader)?,
+        false => default_format(protocol).to_string(),
+    };
+    let format = LineFormat::new(baud, &text).map_err(|_| {
+        Finding::new(
+            format!("`{text}` is not a character format"),
+            "write data bits 7 or 8, parity N, E or O, stop bits 1 or 2, such as 8N1",
+        )
+    });
+    let format = reader.accept(key, format)?;
+    if protocol == Protocol::N2 && !protocol.allows(&format) {
+        let key = if format.baud == n2::BAUD { key } else { BUS.baud.name };
+        reader.problem(
+            key,
+            format!("N2 is always {} {}, not {format}", n2::BAUD, n2::FORMAT),
+            "leave `baud` and `format` out",
+        );
+    }
+    if protocol == Protocol::ModbusRtu && format.data_bits != 8 {
+        reader.problem(
+            key,
+            "Modbus RTU needs 8 data bits",
+            "write for example \"8N1\" or \"8E1\"",
+        );
+    }
+    if protocol == Protocol::ModbusAscii && format.bits_per_char() < 10 {
+        reader.warning(
+            key,
+            "characters of 9 bits: Modbus ASCII drives use 10, with two stop bits if there is no parity",
+            "write \"7N2\"",
+        );
+    }
+    Some(format)
+}
+
+/// N2 tries three times (n2.md 4).
+fn default_retries(protocol: Protocol) -> u32 {
+    match protocol {
+        Protocol::ModbusRtu | Protocol::ModbusAscii => 1,
+        Protocol::N2 => n2::RETRIES,
+    }
+}
+
+/// Character format of a bus without `format`. That of Modbus ASCII is that of TECO's card with all switches off
+/// (drives.md 2).
+pub fn default_format(protocol: Protocol) -> &'static str {
+    match protocol {
+        Protocol::ModbusAscii => "7N2",
+        Protocol::ModbusRtu | Protocol::N2 => "8N1",
+    }
+}
+
+/// `spec`, `chars` or a duration.
+pub(super) fn parse_silence(text: &str) -> Result<Silence, Finding> {
+    match text.parse::<Silence>() {
+        Ok(Silence::Fixed(time)) if time > MOST_SILENCE => Err(Finding::new(
+            format!("{} of silence is out of range", format_duration(time)),
+            format!("write at most \"{}\"", format_duration(MOST_SILENCE)),
+        )),
+        Ok(silence) => Ok(silence),
+        Err(_) => Err(Finding::new(
+            format!("`{text}` is not a silence"),
+            "write \"spec\", \"chars\" or a duration such as \"2ms\"",
+        )),
+    }
+}
+
+fn read_silence(reader: &Reader<'_>, protocol: Protocol, format: Option<&LineFormat>) -> Silence {
+    let silence = BUS.silence.get(reader);
+    if let (Protocol::ModbusRtu, Silence::Fixed(time), Some(format)) = (protocol, silence, format)
+        && time < format.silence_chars()
+    {
+        let [time, least] = [time, format.silence_chars()].map(format_duration);
+        reader.warning(
+            BUS.silence.name,
+            format!("{time} is less than 3.5 characters at {format}, so drives may take two frames for one"),
+            format!("write \"chars\", or {least} or more"),
+        );
+    }
+    silence
+}
+
+/// A character format that the families on the line do not list. A drive that counts in longer characters takes requests
+/// for coming too early, and ignores some.
+fn check_format(reader: &Reader<'_>, format: &LineFormat, drives: &[DriveSpec]) {
+    let characters = format.characters();
+    let mut reported: Vec<&str> = Vec::new();
+    for profile in drives.iter().map(|drive| &drive.profile) {
+        let Some(usual) = profile.formats.first() else { continue };
+        if profile.formats.contains(&characters) || reported.contains(&profile.name.as_str()) {
+            continue;
+        }
+        reported.push(&profile.name);
+        reader.warning(
+            BUS.format.name,
+            format!("profile `{}` does not list the format {characters}", profile.name),
+            format!(
+                "write format = \"{usual}\", or what is set on the drives; the profile lists {}",
+                profile.formats.join(", ")
+            ),
+        );
+    }
+}
+
+/// What is valid but fits the drives badly.
+fn check_fit(reader: &Reader<'_>, format: &LineFormat, options: &BusOptions, drives: &[DriveSpec]) {
+    let mut reported: Vec<&str> = Vec::new();
+    check_format(reader, format, drives);
+    for drive in drives {
+        let profile = &drive.profile;
+        let listed = profile.bauds.is_empty() || profile.bauds.contains(&format.baud);
+        if !listed && !reported.contains(&profile.name.as_str()) {
+            reported.push(&profile.name);
+            let bauds: Vec<String> = profile.bauds.iter().map(u32::to_string).collect();
+            reader.warning(
+                BUS.baud.name,
+                format!("profile `{}` does not list {} baud", profile.name, format.baud),
+                format!("check the drives; the profile lists {}", bauds.join(", ")),
+            );
+        }
+        if drive.turnaround >= options.response_timeout {
+            let [turnaround, timeout] = [drive.turnaround, options.response_timeout].map(format_duration);
+            reader.warning(
+                BUS.response_timeout.name,
+                format!(
+                    "drive `{}` takes {turnaround} to begin its reply, and response_timeout is {timeout}",
+                    drive.name
+                ),
+                "raise response_timeout",
+            );
+        }
+    }
+}

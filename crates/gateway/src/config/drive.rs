@@ -1,0 +1,450 @@
+//! `[[bus.drive]]`: one drive, checked against its profile.
+
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
+use std::sync::Arc;
+
+use super::key::{Key, Number};
+use super::keys::{ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, SUPERVISION, TRIGGER};
+use super::raw_writes;
+use crate::codec::Protocol;
+use crate::document::{Finding, Place, Raw as Node, Reader, nearest};
+use crate::drive::model::Kind;
+use crate::drive::profile::Profiles;
+use crate::drive::{ModelPoint, Plan, PlannedRead, Point, PollClass, Profile, Value};
+use crate::process_image::{
+    Access, DriveSpec, LeaseAction, OnShutdown, ParamsAccess, PointTrigger, Supervision, TriggerLimit,
+};
+
+/// Points that a message names.
+const MOST_NAMED: usize = 4;
+
+type Limits = BTreeMap<String, RangeInclusive<f64>>;
+
+/// What is known of a drive even when a part of it is wrong.
+pub(super) struct Found {
+    pub(super) name: Option<(String, Place)>,
+    pub(super) address: Option<(u8, Place)>,
+    pub(super) unit: Option<(u8, Place)>,
+    /// The unit is the address, because none is written.
+    pub(super) unit_is_address: bool,
+    pub(super) access: (Access, Place),
+    /// Places of `limits`, of `supervision` and of a stop `on_shutdown`.
+    pub(super) limits: Place,
+    pub(super) lease: Option<Place>,
+    pub(super) shutdown_stop: Option<Place>,
+    pub(super) spec: Option<DriveSpec>,
+}
+
+/// What a drive takes from its surroundings.
+pub(super) struct Surroundings<'a> {
+    pub(super) bus: &'a str,
+    pub(super) protocol: Protocol,
+    pub(super) profiles: &'a Profiles,
+    pub(super) profiles_broken: bool,
+}
+
+pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
+    let name = DRIVE.name.placed(reader);
+    let address = Key {
+        form: address_form(around.protocol),
+        ..DRIVE.address
+    };
+    let address = address.read(reader);
+    let unit = read_unit(reader, address);
+    let profile = read_profile(reader, around, address);
+    let access = DRIVE.access.get(reader);
+    let frequency_range = read_frequencies(reader);
+    let limits = read_limits(reader, profile.as_deref(), frequency_range.as_ref());
+    let supervision = read_supervision(reader, profile.as_deref(), &limits);
+    let on_shutdown = read_on_shutdown(reader, profile.as_deref());
+    let turnaround = DRIVE.turnaround.read(reader);
+    let triggers = read_triggers(reader, profile.as_deref());
+    let raw_writes = raw_writes::read(reader, profile.as_deref());
+    let params = read_params(reader, access);
+    reader.finish();
+    let spec = match (&name, address, unit, profile) {
+        (Some((name, _)), Some(address), Some(unit), Some(profile)) => Some(DriveSpec {
+            name: name.clone(),
+            bus: around.bus.to_string(),
+            address,
+            unit,
+            turnaround: turnaround.unwrap_or(profile.turnaround),
+            profile,
+            access,
+            limits,
+            supervision,
+            on_shutdown,
+            frequency_range,
+            triggers,
+            raw_writes,
+            params,
+        }),
+        _ => None,
+    };
+    Found {
+        name,
+        address: address.map(|a| (a, DRIVE.address.place(reader))),
+        unit: unit.map(|u| (u, DRIVE.unit.place(reader))),
+        unit_is_address: !reader.has(DRIVE.unit.name),
+        access: (access, DRIVE.access.place(reader)),
+        limits: reader.place_of(DRIVE.limits.name),
+        lease: reader
+            .has(DRIVE.supervision.name)
+            .then(|| DRIVE.supervision.place(reader)),
+        shutdown_stop: (on_shutdown == OnShutdown::Stop).then(|| DRIVE.on_shutdown.place(reader)),
+        spec,
+    }
+}
+
+/// What the drive does when the gateway stops: it cannot be stopped where its profile does not write `run`.
+fn read_on_shutdown(reader: &Reader<'_>, profile: Option<&Profile>) -> OnShutdown {
+    let on_shutdown = DRIVE.on_shutdown.get(reader);
+    let stops = |profile: &Profile| profile.model_point(ModelPoint::Run).is_some_and(|run| run.write);
+    if on_shutdown == OnShutdown::Stop
+        && let Some(profile) = profile.filter(|profile| !stops(profile))
+    {
+        reader.problem(
+            DRIVE.on_shutdown.name,
+            format!(
+                "the profile `{}` writes no `run`, so nothing can stop the drive",
+                profile.name
+            ),
+            "write on_shutdown = \"hold\", or give the point `run` of the profile `write = true`",
+        );
+    }
+    on_shutdown
+}
+
+const fn address_form(protocol: Protocol) -> &'static Number {
+    match protocol {
+        Protocol::ModbusRtu | Protocol::ModbusAscii => &MODBUS_ADDRESSES,
+        Protocol::N2 => &N2_ADDRESSES,
+    }
+}
+
+/// Whether parameters may be restored, which is a command like any other.
+fn read_params(reader: &Reader<'_>, access: Access) -> ParamsAccess {
+    let params = DRIVE.params.get(reader);
+    if params == ParamsAccess::Write && access != Access::Control {
+        reader.problem(
+            DRIVE.params.name,
+            "params = \"write\" lets parameters be restored, and nothing is written to a drive that is only monitored",
+            "set access = \"control\" for the drive, or params = \"read\"",
+        );
+    }
+    params
+}
+
+/// Addresses that a drive can have on a line of that protocol.
+pub fn addresses(protocol: Protocol) -> RangeInclusive<u8> {
+    let Number(range, _) = address_form(protocol);
+    *range.start() as u8..=*range.end() as u8
+}
+
+/// The unit id; the address if there is none.
+fn read_unit(reader: &Reader<'_>, address: Option<u8>) -> Option<u8> {
+    if !reader.has(DRIVE.unit.name) && address == Some(255) {
+        reader.problem(
+            DRIVE.address.name,
+            "unit 255 is the gateway itself, so the drive needs another one",
+            "add `unit`, 1 to 254",
+        );
+    }
+    match reader.has(DRIVE.unit.name) {
+        true => DRIVE.unit.read(reader),
+        false => address,
+    }
+}
+
+fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<u8>) -> Option<Arc<Profile>> {
+    let key = DRIVE.profile.name;
+    let name = DRIVE.profile.read(reader)?;
+    let known = around.profiles.get(&name);
+    let profile = known.ok_or_else(|| unknown_profile(&name, around.profiles, around.profiles_broken));
+    let profile = reader.accept(key, profile)?;
+    if !profile.protocols.contains(&around.protocol) {
+        let spoken: Vec<&str> = profile.protocols.iter().map(|p| p.name()).collect();
+        reader.problem(
+            key,
+            format!(
+                "profile `{name}` is for {}, the bus uses {}",
+                spoken.join(", "),
+                around.protocol.name()
+            ),
+            "use another profile or put the drive on another bus",
+        );
+    }
+    if let Some(address) = address.filter(|a| !profile.addresses.contains(a)) {
+        let (least, most) = profile.addresses.clone().into_inner();
+        reader.problem(
+            DRIVE.address.name,
+            format!("a drive of profile `{name}` cannot have address {address}"),
+            format!("write {least} to {most}"),
+        );
+    }
+    let polled = |read: &PlannedRead| matches!(read.class, PollClass::Fast | PollClass::Slow);
+    if !Plan::of(profile).reads.iter().any(polled) {
+        reader.problem(
+            key,
+            format!("profile `{name}` has no polled point, so the gateway could not detect whether the drive answers"),
+            "give one of its points class = \"fast\" or \"slow\"",
+        );
+    }
+    Some(profile.clone())
+}
+
+/// ``unknown profile `x` ``, with the nearest one and all known ones.
+pub fn unknown_profile(name: &str, profiles: &Profiles, some_broken: bool) -> Finding {
+    let near = match nearest(name, profiles.names()) {
+        Some(near) => format!("did you mean `{near}`? "),
+        None => String::new(),
+    };
+    let known: Vec<&str> = profiles.names().collect();
+    let broken = if some_broken {
+        ", besides those of profile_dirs that have errors"
+    } else {
+        ""
+    };
+    Finding::new(
+        format!("unknown profile `{name}`"),
+        format!("{near}known profiles: {}{broken}", known.join(", ")),
+    )
+}
+
+/// `[[bus.drive.trigger]]`: values that make a recording.
+fn read_triggers(reader: &Reader<'_>, profile: Option<&Profile>) -> Vec<PointTrigger> {
+    let tables = DRIVE.trigger.tables(reader);
+    let triggers = tables.iter().filter_map(|table| {
+        let trigger = read_trigger(table, profile);
+        table.finish();
+        trigger
+    });
+    triggers.collect()
+}
+
+fn read_trigger(table: &Reader<'_>, profile: Option<&Profile>) -> Option<PointTrigger> {
+    let name = TRIGGER.point.read(table)?;
+    let hold = TRIGGER.r#for.get(table);
+    let limit = match (TRIGGER.above.written(table), TRIGGER.below.written(table)) {
+        (Some(limit), None) => Some(TriggerLimit::Above(limit)),
+        (None, Some(limit)) => Some(TriggerLimit::Below(limit)),
+        (None, None) if table.has(TRIGGER.above.name) || table.has(TRIGGER.below.name) => None,
+        _ => {
+            table.problem(
+                TRIGGER.above.name,
+                "a trigger has either `above` or `below`",
+                "write one of them; for both, write two triggers",
+            );
+            None
+        }
+    };
+    let profile = profile?;
+    let point = table.accept(TRIGGER.point.name, trigger_point(&name, profile))?;
+    Some(PointTrigger {
+        point,
+        limit: limit?,
+        hold,
+    })
+}
+
+/// A number that is read without being asked for.
+fn trigger_point(name: &str, profile: &Profile) -> Result<usize, Finding> {
+    let plan = Plan::of(profile);
+    let is_number = |index: usize| {
+        let point = profile.points.get(index);
+        point.is_some_and(|point| point.kind() != Kind::Bool) && plan.shows(profile, index)
+    };
+    let index = profile.point_index(name);
+    index.filter(|index| is_number(*index)).ok_or_else(|| {
+        let names = (0..).zip(&profile.points).filter(|(index, _)| is_number(*index));
+        let near = nearest(name, names.map(|(_, point)| point.name.as_str()));
+        let remedy = near.map(|near| format!("did you mean `{near}`?"));
+        let list = || {
+            format!(
+                "`drivegate profiles show {}` lists the points and their classes",
+                profile.name
+            )
+        };
+        Finding::new(
+            format!("profile `{}` has no number `{name}` that is polled", profile.name),
+            remedy.unwrap_or_else(list),
+        )
+    })
+}
+
+fn read_frequencies(reader: &Reader<'_>) -> Option<RangeInclusive<f64>> {
+    let key = DRIVE.frequency_range.name;
+    let pair: Vec<f64> = reader.optional(key)?;
+    let range = match pair.as_slice() {
+        [low, high] if *low >= 0.0 && low < high && *high <= MOST_HERTZ => Ok(*low..=*high),
+        _ => Err(Finding::new(
+            "not a range of frequencies in Hz",
+            format!("write [minimum, maximum] between 0 and {MOST_HERTZ}, the lower one first"),
+        )),
+    };
+    reader.accept(key, range)
+}
+
+fn read_limits(reader: &Reader<'_>, profile: Option<&Profile>, frequencies: Option<&RangeInclusive<f64>>) -> Limits {
+    let mut limits = Limits::new();
+    let Some(table) = DRIVE.limits.table(reader) else {
+        return limits;
+    };
+    for key in table.keys() {
+        let pair: Option<Vec<f64>> = table.optional(key);
+        let range = pair.and_then(|pair| table.accept(key, check_limits(&pair, key, profile, frequencies)));
+        limits.extend(range.map(|range| (key.to_string(), range)));
+    }
+    table.finish();
+    limits
+}
+
+fn check_limits(
+    pair: &[f64],
+    key: &str,
+    profile: Option<&Profile>,
+    frequencies: Option<&RangeInclusive<f64>>,
+) -> Result<RangeInclusive<f64>, Finding> {
+    let point = profile.map(|profile| limited_point(profile, key)).transpose()?;
+    let range = match pair {
+        [low, high] if low <= high => *low..=*high,
+        [low, high] => {
+            return Err(Finding::new(
+                format!("the limits {low} and {high} are in the wrong order"),
+                format!("write [{high}, {low}]"),
+            ));
+        }
+        _ => return Err(Finding::new("limits are two numbers", "write [lowest, highest]")),
+    };
+    let Some(point) = point else { return Ok(range) };
+    let own = match point.model {
+        Some(ModelPoint::FrequencyReference) => point.range.as_ref().or(frequencies),
+        _ => point.range.as_ref(),
+    };
+    if let Some(own) = own.filter(|own| !own.contains(range.start()) || !own.contains(range.end())) {
+        let (low, high) = own.clone().into_inner();
+        return Err(Finding::new(
+            format!("the limits of `{key}` exceed the drive's own range"),
+            format!("write [lowest, highest] within {low} and {high} {}", point.unit),
+        ));
+    }
+    for bound in [*range.start(), *range.end()] {
+        if let Some(Err(why)) = point.raw().map(|raw| raw.encode(Value::Number(bound), 0)) {
+            return Err(Finding::new(why.to_string(), "write limits that fit the register"));
+        }
+    }
+    Ok(range)
+}
+
+/// The point that limits can be set for.
+fn limited_point<'p>(profile: &'p Profile, key: &str) -> Result<&'p Point, Finding> {
+    let writable = || {
+        let points = profile.points.iter().filter(|p| p.write && p.kind() != Kind::Bool);
+        points.map(|p| p.name.as_str())
+    };
+    let known = || {
+        let first = writable().take(MOST_NAMED).collect::<Vec<_>>().join(", ");
+        let more = match writable().count().saturating_sub(MOST_NAMED) {
+            0 => String::new(),
+            more => format!(" and {more} more, see `drivegate profiles show {}`", profile.name),
+        };
+        format!("limits can be set for {first}{more}")
+    };
+    let Some(point) = profile.point_index(key).and_then(|i| profile.points.get(i)) else {
+        let near = nearest(key, writable()).map(|near| format!("did you mean `{near}`?"));
+        return Err(Finding::new(
+            format!("profile `{}` has no point `{key}`", profile.name),
+            near.unwrap_or_else(known),
+        ));
+    };
+    let what = match point {
+        _ if !point.write => "cannot be written",
+        _ if point.kind() == Kind::Bool => "is true or false",
+        _ => return Ok(point),
+    };
+    Err(Finding::new(format!("`{key}` {what}, so it has no limits"), known()))
+}
+
+fn read_supervision(reader: &Reader<'_>, profile: Option<&Profile>, limits: &Limits) -> Option<Supervision> {
+    let table = DRIVE.supervision.table(reader)?;
+    let timeout = SUPERVISION.timeout.read(&table);
+    let action = read_action(&table, profile, limits);
+    let adopt = SUPERVISION.adopt.get(&table);
+    table.finish();
+    if let Some(profile) = profile.filter(|profile| !shows_whether_it_runs(profile)) {
+        reader.problem(
+            DRIVE.supervision.name,
+            format!(
+                "profile `{}` has neither `running` nor a run command that is read, so the gateway could not detect whether a \
+                 drive runs when its lease runs out",
+                profile.name
+            ),
+            "add one of them to the profile, or leave supervision out",
+        );
+    }
+    Some(Supervision {
+        timeout: timeout?,
+        action: action?,
+        adopt,
+    })
+}
+
+/// Whether a drive of that profile shows that it runs, or at least that it has a run command.
+fn shows_whether_it_runs(profile: &Profile) -> bool {
+    let plan = Plan::of(profile);
+    let is_read = |point| {
+        let index = profile.model_index(point);
+        index.is_some_and(|index| plan.shows(profile, index))
+    };
+    is_read(ModelPoint::Running) || is_read(ModelPoint::Run)
+}
+
+fn read_action(table: &Reader<'_>, profile: Option<&Profile>, limits: &Limits) -> Option<LeaseAction> {
+    let key = SUPERVISION.action.name;
+    let action = match table.raw(key).map(|node| &node.value) {
+        None => LeaseAction::Stop,
+        Some(Node::Table(_)) => {
+            let inner = SUPERVISION.action.table(table)?;
+            let reference: Option<f64> = inner.required(REFERENCE.speed_reference.name);
+            inner.finish();
+            LeaseAction::SpeedReference(reference?)
+        }
+        Some(_) => table.parsed(key, |text| {
+            ACTIONS.find(text).map_err(|_| {
+                Finding::new(
+                    format!("unknown action `{text}`"),
+                    format!("write {}", SUPERVISION.action.form.range()),
+                )
+            })
+        })?,
+    };
+    let Some(profile) = profile else { return Some(action) };
+    table.accept(key, check_action(&action, profile, limits))?;
+    Some(action)
+}
+
+fn check_action(action: &LeaseAction, profile: &Profile, limits: &Limits) -> Result<(), Finding> {
+    let needed = match action {
+        LeaseAction::Hold => return Ok(()),
+        LeaseAction::Stop => ModelPoint::Run,
+        LeaseAction::SpeedReference(_) => ModelPoint::SpeedReference,
+    };
+    let Some(point) = profile.model_point(needed).filter(|p| p.write) else {
+        return Err(Finding::new(
+            format!("profile `{}` cannot write `{}`", profile.name, needed.name()),
+            "use \"hold\" or another action",
+        ));
+    };
+    let LeaseAction::SpeedReference(reference) = action else {
+        return Ok(());
+    };
+    let range = limits.get(&point.name).or(point.range.as_ref());
+    match range.filter(|range| !range.contains(reference)) {
+        Some(range) => Err(Finding::new(
+            format!("speed_reference = {reference} is outside the limits"),
+            format!("write {} to {} percent", range.start(), range.end()),
+        )),
+        None => Ok(()),
+    }
+}

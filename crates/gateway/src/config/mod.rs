@@ -1,0 +1,577 @@
+//! The configuration: a TOML file and environment variables become [`Settings`].
+//!
+//! One run reports every error with file, line and key. Nothing is opened but the file itself, the profiles and the
+//! secrets it names. Relative paths are relative to the directory of the file.
+
+mod bus;
+mod deprecated;
+mod drive;
+mod files;
+mod key;
+mod keys;
+mod line;
+mod log;
+mod modbus_tcp;
+mod mqtt;
+pub mod named_files;
+mod north;
+mod params;
+mod raw_writes;
+mod recordings;
+mod shutdown;
+mod slot;
+mod unique;
+mod values;
+
+pub use log::{LogFormat, LogSettings};
+
+pub use bus::{check_port, default_format};
+pub use drive::{addresses, unknown_profile};
+pub use keys::schema;
+pub use log::parse_level;
+pub use named_files::{FileKind, NamedFile, named_files};
+pub use params::ParamsSettings;
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use crate::bus::predict::{self, Prediction};
+use crate::bus::{BusOptions, Mode};
+use crate::command::AuditFileOptions;
+use crate::document::{self, Document, Finding, Place, Problem, Reader};
+use crate::drive::profile::Profiles;
+use crate::history::RecorderOptions;
+use crate::north::local::SocketPath;
+use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client, slot as slot_server};
+use crate::process_image::{Access, BusSpec, DriveSpec};
+use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
+
+/// Where the gateway keeps its state unless it is told otherwise.
+const STATE_DIR: &str = "/var/lib/drivegate";
+/// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.
+pub(crate) const ENVIRONMENT: &str = "DRIVEGATE";
+
+/// A valid configuration. Parts compare equal when a reload changes nothing in them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// Name of the gateway.
+    pub gateway: String,
+    /// Where `drivegate read` and `drivegate write` reach the gateway.
+    pub socket: SocketPath,
+    /// Directory of what the gateway keeps.
+    pub state_dir: PathBuf,
+    /// Whether events and counters are kept there: always true as configured, false where something less than a gateway runs.
+    pub keeps_history: bool,
+    /// What the recorder keeps.
+    pub recordings: RecorderOptions,
+    /// How parameters are read and kept.
+    pub params: ParamsSettings,
+    /// Directories of the user's profiles.
+    pub profile_dirs: Vec<PathBuf>,
+    /// Built-in profiles and the user's.
+    pub profiles: Profiles,
+    /// Age from which a sample of process data is stale.
+    pub stale_after: Duration,
+    /// `stale_after` is written, so it applies to slow lines too.
+    pub stale_after_written: bool,
+    /// In the order of the file.
+    pub buses: Vec<BusSettings>,
+    /// Slots of all buses; absent: there is none.
+    pub slots: Option<slot_server::Options>,
+    /// Absent: not started.
+    pub modbus_tcp: Option<modbus_tcp_server::Options>,
+    /// Absent: not started.
+    pub mqtt: Option<mqtt_client::Options>,
+    /// Absent: not started.
+    pub http: Option<http::Options>,
+    /// File of all commands; absent: not written.
+    pub audit: Option<AuditFileOptions>,
+    /// What is logged.
+    pub log: LogSettings,
+}
+
+/// One bus with its drives.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BusSettings {
+    /// What other rooms see of it.
+    pub spec: BusSpec,
+    /// What only the bus itself uses.
+    pub options: BusOptions,
+    /// In the order of the file.
+    pub drives: Vec<DriveSpec>,
+}
+
+impl BusSettings {
+    /// The fast and slow cadence that staleness is measured by: those of the configuration, or the best the line can
+    /// carry.
+    pub(crate) fn achievable(&self) -> (Duration, Duration) {
+        if self.listens() {
+            return (Duration::ZERO, Duration::ZERO);
+        }
+        let prediction = self.predict();
+        let spec = &self.spec;
+        (
+            spec.cycle.max(prediction.fast_cycle.unwrap_or_default()),
+            spec.slow_cycle.max(prediction.slow_cycle.unwrap_or_default()),
+        )
+    }
+
+    /// Expected wire times, cycles and load; nothing where the gateway sends nothing.
+    pub fn predict(&self) -> Prediction {
+        let asked: &[DriveSpec] = if self.listens() { &[] } else { &self.drives };
+        predict::predict(&self.spec, self.options.silence, asked)
+    }
+
+    /// Whether another master owns the line.
+    pub fn listens(&self) -> bool {
+        self.options.mode == Mode::Listen
+    }
+}
+
+/// The outcome of loading a configuration file.
+#[derive(Debug)]
+pub struct Loaded {
+    /// The settings; absent when there is any error.
+    pub settings: Option<Settings>,
+    /// What must be fixed.
+    pub errors: Vec<Problem>,
+    /// What works but probably not as intended.
+    pub warnings: Vec<Problem>,
+}
+
+impl Settings {
+    /// Reads the file `path`, applies the variables `DRIVEGATE__SECTION__KEY` of `env`, and checks everything.
+    pub fn load(path: impl AsRef<Path>, env: impl Iterator<Item = (String, String)>) -> Loaded {
+        let path = path.as_ref();
+        match document::read_file(path) {
+            Ok(source) => Settings::parse(path, &source, env),
+            Err(mut problem) => Loaded {
+                settings: None,
+                errors: {
+                    if path == Path::new(DEFAULT_FILE) && !path.exists() {
+                        problem.finding.remedy = NO_FILE.to_string();
+                    }
+                    vec![problem]
+                },
+                warnings: Vec::new(),
+            },
+        }
+    }
+
+    /// Like [`Settings::load`], with `source` as the text of the file.
+    pub fn parse(path: impl AsRef<Path>, source: &str, env: impl Iterator<Item = (String, String)>) -> Loaded {
+        parse(path.as_ref(), source, env).0
+    }
+}
+
+/// Default path of the configuration.
+pub const DEFAULT_FILE: &str = "/etc/drivegate/drivegate.toml";
+/// What to do where there is no configuration yet.
+const NO_FILE: &str = "name the file with --config; `drivegate try` finds drives and writes a configuration";
+
+impl Settings {
+    /// The local socket of the gateway that runs with the file `path`, also if the file is invalid since it started.
+    pub fn socket_of(path: &Path, env: impl Iterator<Item = (String, String)>) -> SocketPath {
+        let source = document::read_file(path).unwrap_or_default();
+        let mut document = Document::parse(path.display().to_string(), &source);
+        document.ensure_section(ROOT.gateway.name);
+        document.overlay(ENVIRONMENT, env);
+        let base = path.parent().unwrap_or(Path::new(""));
+        let gateway = ROOT.gateway.table(&document.reader());
+        gateway.map_or(SocketPath::Default, |gateway| read_socket(&gateway, base))
+    }
+}
+
+/// The variables of this process that override the configuration. Invalid UTF-8 in them becomes U+FFFD, which
+/// [`Settings::load`] refuses.
+pub fn environment() -> impl Iterator<Item = (String, String)> {
+    std::env::vars_os().filter_map(|(name, value)| {
+        let name = name.into_string().ok().filter(|name| name.starts_with(ENVIRONMENT))?;
+        Some((name, value.to_string_lossy().into_owned()))
+    })
+}
+
+fn not_text(name: &str) -> Problem {
+    Problem::of_file(name, "", Finding::new("the variable is not UTF-8 text", "set it again"))
+}
+
+/// The outcome, and every key the loader knows.
+fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>) -> (Loaded, Vec<String>) {
+    let mut document = Document::parse(path.display().to_string(), source);
+    for section in [ROOT.gateway.name, ROOT.recordings.name, ROOT.log.name] {
+        document.ensure_section(section);
+    }
+    let (variables, broken): (Vec<_>, Vec<_>) = env
+        .filter(|(name, _)| name.starts_with(ENVIRONMENT))
+        .partition(|(_, value)| !value.contains(char::REPLACEMENT_CHARACTER));
+    document.overlay(ENVIRONMENT, variables);
+    deprecated::rename(&mut document, deprecated::RENAMED);
+    let mut profile_errors = Vec::new();
+    let base = path.parent().unwrap_or(Path::new(""));
+    let settings = read(&document.reader(), base, &mut profile_errors);
+    let known = document.known_keys().into_iter().collect();
+    let is_toml = document.is_toml();
+    let (mut errors, mut warnings) = document.into_findings();
+    warnings.extend(
+        settings
+            .iter()
+            .flat_map(|settings| settings.profiles.warnings())
+            .cloned(),
+    );
+    if is_toml {
+        errors.extend(profile_errors);
+        errors.extend(broken.iter().map(|(name, _)| not_text(name)));
+    }
+    let loaded = Loaded {
+        settings: settings.filter(|_| errors.is_empty()),
+        errors,
+        warnings,
+    };
+    (loaded, known)
+}
+
+fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> Option<Settings> {
+    let gateway = ROOT.gateway.table(reader).map(|table| read_gateway(&table, base));
+    let mut gateway = gateway.unwrap_or_default();
+    profile_errors.append(&mut gateway.errors);
+    let Gateway {
+        name,
+        socket,
+        state_dir,
+        profile_dirs,
+        profiles,
+        ..
+    } = gateway;
+    let broken = !profile_errors.is_empty();
+    let tables = ROOT.bus.tables(reader);
+    let buses: Vec<bus::Found> = tables
+        .iter()
+        .map(|table| bus::read(table, base, &profiles, broken))
+        .collect();
+    let names: Vec<&str> = buses
+        .iter()
+        .filter_map(|bus| bus.name.as_ref())
+        .map(|(name, _)| name.as_str())
+        .collect();
+    let modbus_tcp = ROOT.modbus_tcp.table(reader);
+    let modbus_tcp = modbus_tcp.map(|table| modbus_tcp::read(&table, base, &names));
+    let mqtt = ROOT
+        .mqtt
+        .table(reader)
+        .map(|table| mqtt::read(&table, base, name.as_deref(), &state_dir));
+    let http = ROOT.http.table(reader).map(|table| north::read_http(&table, base));
+    let buffer = mqtt.as_ref().and_then(|mqtt| mqtt.as_ref()?.buffer.as_ref());
+    let buffer = buffer.map(|buffer| buffer.dir.as_path());
+    let audit = ROOT.audit.table(reader);
+    let audit = audit.map(|table| log::read_audit(&table, &state_dir, buffer));
+    let recordings = ROOT.recordings.table(reader);
+    let recordings = recordings.map(|table| recordings::read(&table, &state_dir));
+    let params = ROOT.params.table(reader);
+    let params = params.map(|table| params::read(&table, base, &state_dir, &profiles));
+    let log = ROOT.log.table(reader).map(|table| log::read(&table));
+    reader.finish();
+
+    judge(reader, &buses, modbus_tcp.as_ref(), mqtt.as_ref(), http.as_ref());
+
+    let slots = buses.iter().flat_map(|bus| &bus.slots).map(|slot| slot.slot.clone());
+    let slots: Vec<slot_server::Slot> = slots.collect::<Option<_>>()?;
+    Some(Settings {
+        gateway: name?,
+        socket,
+        params: params.unwrap_or_else(|| ParamsSettings::below(&state_dir)),
+        state_dir,
+        keeps_history: true,
+        recordings: recordings?,
+        profile_dirs,
+        profiles,
+        stale_after: match &modbus_tcp {
+            Some(modbus_tcp) => modbus_tcp.stale_after,
+            None => MODBUS_TCP.stale_after.read_default()?,
+        },
+        stale_after_written: modbus_tcp.as_ref().is_some_and(|m| m.stale_written),
+        buses: buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?,
+        slots: (!slots.is_empty()).then_some(slot_server::Options { slots }),
+        modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
+        mqtt: flipped(mqtt)?,
+        http: flipped(http.map(|http| http.options))?,
+        audit,
+        log: log?,
+    })
+}
+
+/// Reports what is wrong or doubtful about the sections together.
+fn judge(
+    reader: &Reader<'_>,
+    buses: &[bus::Found],
+    modbus_tcp: Option<&modbus_tcp::ModbusTcp>,
+    mqtt: Option<&Option<mqtt_client::Options>>,
+    http: Option<&north::Http>,
+) {
+    unique::check(reader.document(), buses);
+    // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
+    if let Some(modbus_tcp) = modbus_tcp {
+        unique::check_units(reader.document(), buses, &modbus_tcp.selections);
+    }
+    let http_listener = http.and_then(|http| http.listener.as_ref());
+    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http_listener);
+    let slots = || buses.iter().flat_map(|bus| &bus.slots);
+    let listeners = listeners.chain(slots().flat_map(|slot| &slot.listeners));
+    unique::check_listeners(reader.document(), listeners);
+    if mqtt.is_some_and(|m| m.as_ref().is_some_and(|m| m.commands && m.home_assistant.is_some())) {
+        check_numbers_of_home_assistant(reader, buses);
+    }
+    warn_of_emptiness(reader);
+    let commanded = modbus_tcp.is_some_and(|m| m.commands)
+        || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands))
+        || http.is_some_and(|http| http.commands)
+        || slots().any(|slot| slot.writes);
+    if !commanded {
+        warn_of_idle_control(reader, buses);
+    }
+    if reader.document().is_sound() {
+        // Besides errors, a default may stand in for a wrong value, or an unknown key for the one that is missed; a warning
+        // about it would mislead.
+        if commanded {
+            warn_of_missing_leases(reader, buses);
+        }
+        warn_of_idle_stops(reader, buses);
+        warn_of_long_shutdowns(reader, buses);
+        let written = modbus_tcp.filter(|m| m.stale_written);
+        warn_of_cadence(reader, buses, written.map(|m| (m.stale_after, &m.stale_place)));
+    }
+}
+
+/// Home Assistant takes no number whose lowest value is its highest, and would refuse the whole drive.
+fn check_numbers_of_home_assistant(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for drive in buses.iter().flat_map(|bus| &bus.drives) {
+        let Some(spec) = drive.spec.as_ref().filter(|_| drive.access.0 == Access::Control) else {
+            continue;
+        };
+        for (point, range) in spec.limits.iter().filter(|(_, range)| range.start() == range.end()) {
+            let only = range.start();
+            reader.document().problem(
+                &drive.limits,
+                format!("the limits of `{point}` leave only {only}, and Home Assistant takes no such number"),
+                "write a range, access = \"monitor\", or home_assistant = false",
+            );
+        }
+    }
+}
+
+/// An invalid section invalidates the whole; an absent one does not.
+fn flipped<T>(section: Option<Option<T>>) -> Option<Option<T>> {
+    match section {
+        None => Some(None),
+        Some(options) => options.map(Some),
+    }
+}
+
+struct Gateway {
+    name: Option<String>,
+    socket: SocketPath,
+    state_dir: PathBuf,
+    profile_dirs: Vec<PathBuf>,
+    profiles: Profiles,
+    errors: Vec<Problem>,
+}
+
+impl Default for Gateway {
+    fn default() -> Gateway {
+        Gateway {
+            name: None,
+            socket: SocketPath::Default,
+            state_dir: default_state_dir(),
+            profile_dirs: Vec::new(),
+            profiles: Profiles::built_in(),
+            errors: Vec::new(),
+        }
+    }
+}
+
+fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
+    let name = GATEWAY.name.read(reader);
+    let socket = read_socket(reader, base);
+    let state_dir = GATEWAY.state_dir.written(reader);
+    let state_dir = state_dir.map_or_else(default_state_dir, |dir| values::resolved(base, dir));
+    let mut profiles = Profiles::built_in();
+    let mut errors = Vec::new();
+    let dirs = GATEWAY.profile_dirs.get(reader);
+    let profile_dirs: Vec<PathBuf> = dirs.into_iter().map(|dir| values::resolved(base, dir)).collect();
+    for dir in &profile_dirs {
+        match std::fs::read_dir(dir) {
+            Ok(_) => errors.extend(profiles.load(dir)),
+            Err(error) => reader.problem(
+                GATEWAY.profile_dirs.name,
+                format!("cannot read {}: {error}", dir.display()),
+                "create the directory or remove it from profile_dirs",
+            ),
+        }
+    }
+    reader.finish();
+    Gateway {
+        name,
+        socket,
+        state_dir,
+        profile_dirs,
+        profiles,
+        errors,
+    }
+}
+
+fn read_socket(reader: &Reader<'_>, base: &Path) -> SocketPath {
+    match GATEWAY.socket.written(reader) {
+        None => SocketPath::Default,
+        Some(path) if path.as_os_str().is_empty() => SocketPath::Off,
+        Some(path) => SocketPath::At(values::resolved(base, path)),
+    }
+}
+
+/// The state directory of the systemd unit, else the usual one.
+fn default_state_dir() -> PathBuf {
+    let given = std::env::var("STATE_DIRECTORY").unwrap_or_default();
+    match given.split(':').next() {
+        Some(dir) if !dir.is_empty() => PathBuf::from(dir),
+        _ => PathBuf::from(STATE_DIR),
+    }
+}
+
+fn warn_of_emptiness(reader: &Reader<'_>) {
+    let of_file = |key: &str| Place {
+        key: key.to_string(),
+        ..Place::default()
+    };
+    if !reader.has(ROOT.bus.name) {
+        reader.document().warning(
+            &of_file(ROOT.bus.name),
+            "the configuration has no bus, so nothing is read",
+            "write [[bus]] with its drives",
+        );
+    }
+    let servers = [ROOT.modbus_tcp.name, ROOT.mqtt.name, ROOT.http.name];
+    if !servers.iter().any(|server| reader.has(server)) {
+        reader.document().warning(
+            &of_file(""),
+            "no server is configured, so nobody can see the drives",
+            "write [modbus_tcp], [mqtt] or [http]",
+        );
+    }
+}
+
+/// Cadences that the line cannot carry, and a written `stale_after` that is shorter than a cycle.
+fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Option<(Duration, &Place)>) {
+    for found in buses {
+        let Some(settings) = &found.settings else { continue };
+        let prediction = settings.predict();
+        if let Some(shortage) = &prediction.shortage {
+            let (fast, slow) = &found.cadence;
+            let place = if shortage.fast.is_some() { fast } else { slow };
+            let Finding { what, remedy } = shortage.finding();
+            reader.document().warning(place, what, remedy);
+        }
+        if let (Some(cycle), Some((limit, place))) = (prediction.fast_cycle, stale_after)
+            && cycle > limit
+        {
+            let [cycle, limit] = [cycle, limit].map(|time| time.as_secs_f64() * 1e3);
+            let bus = &settings.spec.name;
+            reader.document().warning(
+                place,
+                format!("process data of bus `{bus}` is read every {cycle:.0} ms and stale after {limit:.0} ms"),
+                "raise stale_after, leave it out, or reduce the load of the bus",
+            );
+        }
+    }
+}
+
+/// Stops at shutdown that take longer than the service manager waits.
+fn warn_of_long_shutdowns(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for found in buses {
+        let stops = found.drives.iter().find_map(|drive| drive.shutdown_stop.as_ref());
+        let (Some(settings), Some(place)) = (&found.settings, stops) else {
+            continue;
+        };
+        if let Some(Finding { what, remedy }) = settings.shutdown_time().beyond_unit(&settings.spec.name) {
+            reader.document().warning(place, what, remedy);
+        }
+    }
+}
+
+/// Writes configured for drives that are only monitored.
+fn warn_of_idle_stops(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for drive in buses.iter().flat_map(|bus| &bus.drives) {
+        let (Some((name, _)), Access::Monitor) = (&drive.name, drive.access.0) else {
+            continue;
+        };
+        let effects = [
+            (
+                &drive.lease,
+                "it has no lease that could run out",
+                DRIVE.supervision.name,
+            ),
+            (
+                &drive.shutdown_stop,
+                "it is not stopped with the gateway",
+                DRIVE.on_shutdown.name,
+            ),
+        ];
+        for (place, effect, key) in effects {
+            let Some(place) = place else { continue };
+            reader.document().warning(
+                place,
+                format!("drive `{name}` is only monitored, so nothing is ever written to it, and {effect}"),
+                format!("set access = \"control\", or leave {key} out"),
+            );
+        }
+    }
+}
+
+/// Drives that accept commands while no client may send any.
+fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for drive in buses.iter().flat_map(|bus| &bus.drives) {
+        let (Some((name, _)), (Access::Control, place)) = (&drive.name, &drive.access) else {
+            continue;
+        };
+        reader.document().warning(
+            place,
+            format!("drive `{name}` accepts commands but no client may send any"),
+            "set `write` of [modbus_tcp], or `commands = true` of [mqtt] or [http]",
+        );
+    }
+}
+
+/// Commanded drives that nothing stops when the commanding client falls silent.
+fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for drive in buses.iter().flat_map(|bus| &bus.drives) {
+        let (Some(spec), (Access::Control, place)) = (&drive.spec, &drive.access) else {
+            continue;
+        };
+        if spec.supervision.is_some() {
+            continue;
+        }
+        let known = [
+            crate::drive::FIELDBUS_FAULT_RESPONSE,
+            crate::drive::COMMUNICATION_TIMEOUT,
+        ];
+        let known: Vec<&str> = known
+            .into_iter()
+            .filter(|p| spec.profile.point_index(p).is_some())
+            .collect();
+        let own = match known.is_empty() {
+            true => "the profile has no parameter for the drive's own response to a silent master".to_string(),
+            false => format!(
+                "the drive's own response to a silent master ({}) may be off, and the gateway keeps polling",
+                known.join(" and ")
+            ),
+        };
+        reader.document().warning(
+            place,
+            format!(
+                "drive `{}` has no lease, so it runs on when its client falls silent",
+                spec.name
+            ),
+            format!("{own}; set supervision = {{ timeout = \"5s\", action = \"stop\" }}"),
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,99 @@
+//! How long stopping the drives of a bus takes when the gateway shuts down. Pure.
+
+use std::time::Duration;
+
+use super::BusSettings;
+use crate::codec::{RequestPdu, Table};
+use crate::document::Finding;
+use crate::drive::plan::WireTime;
+use crate::process_image::{Access, DriveSpec, OnShutdown};
+
+/// Time the service manager allows for shutdown: `TimeoutStopSec` of `systemd/drivegate.service`.
+pub(crate) const UNIT_STOP_TIME: Duration = Duration::from_secs(90);
+/// The part of it that servers, broker and ports may take.
+pub(crate) const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
+
+/// How long the stops of one bus take, one after another, from the end of the current exchange.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct ShutdownTime {
+    /// Drives to stop.
+    pub drives: usize,
+    /// Every one of them answers, after its turnaround.
+    pub answered: Duration,
+    /// None of them answers: each takes `response_timeout` and wire time for every try.
+    pub unanswered: Duration,
+}
+
+impl ShutdownTime {
+    /// The warning about that bus if the service manager may kill the gateway before every drive got its stop.
+    pub(crate) fn beyond_unit(&self, bus: &str) -> Option<Finding> {
+        let wanted = self.unanswered + OTHER_STOP_TIME;
+        let seconds = |time: Duration| time.as_secs_f64().ceil();
+        let drives = match self.drives {
+            0 => return None,
+            1 => "1 drive".to_string(),
+            drives => format!("{drives} drives"),
+        };
+        let what = format!(
+            "stopping {drives} of bus `{bus}` with the gateway takes {:.1} s, and {:.0} s if they do not answer, longer \
+             than TimeoutStopSec={}s of drivegate.service allows",
+            self.answered.as_secs_f64(),
+            seconds(self.unanswered),
+            UNIT_STOP_TIME.as_secs(),
+        );
+        let remedy = format!(
+            "raise it to {:.0}s or more in the unit (stop_grace_period in compose.yaml), lower response_timeout or \
+             retries, or split the bus",
+            seconds(wanted)
+        );
+        (wanted > UNIT_STOP_TIME).then(|| Finding::new(what, remedy))
+    }
+}
+
+impl BusSettings {
+    /// How long the stops of `on_shutdown = "stop"` take. A stop is one write; if the run command is a bit of a word, the
+    /// word may have to be read first. If a drive does not answer, the write is repeated, the read is not.
+    pub fn shutdown_time(&self) -> ShutdownTime {
+        let mut time = ShutdownTime::default();
+        for drive in self.drives.iter().filter(|drive| is_stopped(drive)) {
+            let Some((read, write)) = stop_of(drive) else { continue };
+            let tries = self.options.retries.saturating_add(1);
+            let timeout = self.options.response_timeout;
+            let exchange = |pdu: &RequestPdu, turnaround| self.exchange(pdu, turnaround);
+            let reading = |turnaround| read.as_ref().map_or(Duration::ZERO, |read| exchange(read, turnaround));
+            time.drives += 1;
+            time.answered += reading(drive.turnaround) + exchange(&write, drive.turnaround);
+            time.unanswered += reading(timeout) + exchange(&write, timeout).saturating_mul(tries);
+        }
+        time
+    }
+
+    /// A whole exchange whose reply begins after `turnaround`.
+    fn exchange(&self, pdu: &RequestPdu, turnaround: Duration) -> Duration {
+        let (protocol, format) = (self.spec.protocol, &self.spec.format);
+        let silence = protocol.silence(self.options.silence, format);
+        WireTime::of(protocol, format, pdu).total(turnaround, silence)
+    }
+}
+
+/// Whether the drive is stopped when the gateway shuts down.
+fn is_stopped(drive: &DriveSpec) -> bool {
+    drive.access == Access::Control && drive.on_shutdown == OnShutdown::Stop
+}
+
+/// The requests of a stop: the read of the control word, if there is one, and the write.
+fn stop_of(drive: &DriveSpec) -> Option<(Option<RequestPdu>, RequestPdu)> {
+    let (raw, _, invert) = drive.profile.run_bit()?;
+    let (table, address) = (raw.table, raw.address);
+    Some(match table {
+        Table::Coil | Table::DiscreteInput => (None, drive.profile.functions.write_coil(address, invert)),
+        Table::Input | Table::Holding => {
+            let (start, count) = (address, 1);
+            let read = RequestPdu::Read { table, start, count };
+            (Some(read), drive.profile.functions.write_register(address, 0))
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,18 @@
+//! Configuration and daemon of drivegate.
+
+pub mod config;
+pub mod daemon;
+
+use drivegate_bus as bus;
+use drivegate_core::command;
+use drivegate_core::event;
+use drivegate_core::files;
+use drivegate_core::history;
+use drivegate_core::parameters;
+use drivegate_core::plant;
+use drivegate_core::process_image;
+use drivegate_line as line;
+use drivegate_model::document;
+use drivegate_model::drive;
+use drivegate_north as north;
+use drivegate_proto as codec;

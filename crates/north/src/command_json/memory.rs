@@ -1,0 +1,252 @@
+//! Which commands were taken, so that a repetition is recognised. Time is an argument.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::hash::{BuildHasher, RandomState};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Number of recent commands whose results are kept, and whose repetition is recognised by the mark of the broker.
+const RECENT: usize = 1024;
+/// Least time for which a command with an `id` is remembered.
+pub(crate) const REMEMBERED: Duration = Duration::from_secs(600);
+/// Longest time, whatever the expiry of its message.
+const LONGEST: Duration = Duration::from_secs(86_400);
+/// Maximum number of commands with an `id` that are remembered.
+const MOST: usize = 1 << 18;
+
+/// A command, as far as its repetition is recognised by it.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Taken<'t> {
+    /// Where it came in: its topic, or the user and the drive.
+    pub(crate) topic: &'t str,
+    /// What it says.
+    pub(crate) payload: &'t [u8],
+    /// Where its result goes: response topic and correlation data.
+    pub(crate) answer_to: (Option<&'t str>, Option<&'t [u8]>),
+    /// The broker marks it as a repetition.
+    pub(crate) dup: bool,
+    /// Packet id, which identifies that repetition.
+    pub(crate) packet: u16,
+    /// Remaining life of its message, s.
+    pub(crate) expiry: Option<u32>,
+}
+
+/// The commands that were taken, and their results `R`.
+#[derive(Debug)]
+pub(crate) struct Memory<R> {
+    hasher: RandomState,
+    /// Oldest first.
+    recent: VecDeque<Recent<R>>,
+    /// By topic, `id` and payload. Trees, because entries come and go all day: a hash table doubles when removals have used up
+    /// its free places, and keeps the size that a flood needed.
+    known: BTreeMap<u64, Known>,
+    /// The same by the time until which they are remembered.
+    ends: BTreeMap<(Instant, u64), u64>,
+    /// The last command by topic and `id`.
+    last_of: BTreeMap<u64, u64>,
+    /// Number of commands taken so far.
+    taken: u64,
+    /// Commands up to this number get no result any more if they have none.
+    abandoned: u64,
+}
+
+/// What the clients of one broker, or the connections of the HTTP server, share, also with those that a reload starts in
+/// their place: the same commands come again over a new connection. Results by way of a broker are payloads.
+#[derive(Debug)]
+pub(crate) struct SharedMemory<R = Arc<[u8]>>(Arc<Mutex<Memory<R>>>);
+
+impl<R> Clone for SharedMemory<R> {
+    fn clone(&self) -> SharedMemory<R> {
+        SharedMemory(self.0.clone())
+    }
+}
+
+impl<R> Default for SharedMemory<R> {
+    fn default() -> SharedMemory<R> {
+        SharedMemory(Arc::default())
+    }
+}
+
+impl<R> SharedMemory<R> {
+    pub(crate) fn lock(&self) -> MutexGuard<'_, Memory<R>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<R> Default for Memory<R> {
+    fn default() -> Memory<R> {
+        Memory {
+            hasher: RandomState::default(),
+            recent: VecDeque::new(),
+            known: BTreeMap::new(),
+            ends: BTreeMap::new(),
+            last_of: BTreeMap::new(),
+            taken: 0,
+            abandoned: 0,
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Recent<R> {
+    number: u64,
+    packet: u16,
+    fingerprint: u64,
+    stops: u64,
+    answer_to: u64,
+    /// `None` until it is finished.
+    result: Option<R>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Known {
+    number: u64,
+    stops: u64,
+    /// Hash of topic and `id`.
+    identity: u64,
+    /// Hash of where its result goes.
+    answer_to: u64,
+}
+
+/// What is known of a message.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Fingerprint {
+    /// Of everything but the packet id.
+    whole: u64,
+    /// Hash of topic and `id`, if it has one; and with the payload.
+    identity: Option<(u64, u64)>,
+    answer_to: u64,
+}
+
+/// What a message repeats.
+#[derive(Debug, PartialEq)]
+pub(crate) enum Repetition<R> {
+    /// A command whose result is the same now.
+    Answered(R),
+    /// A command whose result is still to come, to the same address.
+    Pending,
+    /// A command whose result does not answer this message, and why.
+    Outdated(&'static str),
+}
+
+impl<R: Clone> Memory<R> {
+    /// The fingerprint of a command with this `id`.
+    pub(crate) fn fingerprint(&self, taken: &Taken<'_>, id: Option<&str>) -> Fingerprint {
+        let Taken { topic, payload, .. } = taken;
+        let answer_to = self.hasher.hash_one(taken.answer_to);
+        let identity = id.map(|id| self.hasher.hash_one((topic, id)));
+        Fingerprint {
+            whole: self.hasher.hash_one((topic, payload, answer_to)),
+            identity: identity.map(|identity| (identity, self.hasher.hash_one((identity, payload)))),
+            answer_to,
+        }
+    }
+
+    /// The command that a message repeats: one that the broker marks as repeated, or the same topic, payload and `id`.
+    /// `stops` is the number of stops of the drive now.
+    pub(crate) fn repeated(
+        &mut self,
+        taken: &Taken<'_>,
+        print: Fingerprint,
+        stops: u64,
+        now: Instant,
+    ) -> Option<Repetition<R>> {
+        self.forget(now);
+        let marked = |known: &&Recent<R>| taken.dup && known.packet == taken.packet && known.fingerprint == print.whole;
+        let by_id = print
+            .identity
+            .and_then(|(_, content)| self.known.get(&content).copied());
+        let by_mark = || {
+            let recent = self.recent.iter().rev().find(marked)?;
+            Some(Known {
+                number: recent.number,
+                stops: recent.stops,
+                identity: 0,
+                answer_to: recent.answer_to,
+            })
+        };
+        let known = by_id.or_else(by_mark)?;
+        let recent = self.recent.iter().find(|recent| recent.number == known.number);
+        let result = recent.map(|recent| &recent.result);
+        if matches!(result, Some(None)) && known.number > self.abandoned && known.answer_to == print.answer_to {
+            return Some(Repetition::Pending);
+        }
+        if known.stops != stops {
+            return Some(Repetition::Outdated(
+                "but the drive was stopped since, or added anew by a reload",
+            ));
+        }
+        if let Some(last) = self.last_of.get(&known.identity)
+            && *last != known.number
+        {
+            return Some(Repetition::Outdated("but its `id` was used for another command since"));
+        }
+        Some(match result {
+            Some(Some(result)) => Repetition::Answered(result.clone()),
+            Some(None) if known.number > self.abandoned => Repetition::Outdated("whose result is still to come"),
+            Some(None) | None => Repetition::Outdated("whose result is no longer known"),
+        })
+    }
+
+    /// Whether another command with an `id` can be remembered.
+    pub(crate) fn has_room(&mut self, now: Instant) -> bool {
+        self.forget(now);
+        self.known.len() < MOST
+    }
+
+    fn forget(&mut self, now: Instant) {
+        while let Some(end) = self.ends.first_entry().filter(|end| end.key().0 <= now) {
+            if let Some(known) = self.known.remove(&end.remove())
+                && self.last_of.get(&known.identity) == Some(&known.number)
+            {
+                self.last_of.remove(&known.identity);
+            }
+        }
+    }
+
+    /// Remembers a command that is taken at `now`; returns its number.
+    pub(crate) fn remember(&mut self, taken: &Taken<'_>, print: Fingerprint, stops: u64, now: Instant) -> u64 {
+        self.taken += 1;
+        let number = self.taken;
+        if self.recent.len() == RECENT {
+            self.recent.pop_front();
+        }
+        self.recent.push_back(Recent {
+            number,
+            packet: taken.packet,
+            fingerprint: print.whole,
+            stops,
+            answer_to: print.answer_to,
+            result: None,
+        });
+        if let Some((identity, content)) = print.identity {
+            let expiry = Duration::from_secs(taken.expiry.unwrap_or_default().into());
+            let until = now + expiry.clamp(REMEMBERED, LONGEST);
+            let known = Known {
+                number,
+                stops,
+                identity,
+                answer_to: print.answer_to,
+            };
+            self.known.insert(content, known);
+            self.ends.insert((until, number), content);
+            self.last_of.insert(identity, number);
+        }
+        number
+    }
+
+    /// Whoever waited for the results of the commands so far has gone; they do not come any more.
+    pub(crate) fn abandon(&mut self) {
+        self.abandoned = self.taken;
+    }
+
+    /// Keeps the result of a command.
+    pub(crate) fn finished(&mut self, number: u64, result: &R) {
+        // Numbers ascend without gaps.
+        let first = self.recent.front().map_or(0, |recent| recent.number);
+        let place = number.checked_sub(first).and_then(|place| usize::try_from(place).ok());
+        if let Some(recent) = place.and_then(|place| self.recent.get_mut(place)) {
+            recent.result = Some(result.clone());
+        }
+    }
+}

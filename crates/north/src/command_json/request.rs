@@ -1,0 +1,297 @@
+//! Reads the JSON of commands.
+
+use std::borrow::Cow;
+use std::collections::BTreeSet;
+use std::fmt;
+use std::time::Duration;
+
+use serde::Serialize;
+use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
+use serde_json::Value as Json;
+use serde_json::value::RawValue;
+
+use crate::command::{DEFAULT_EXPIRY, Refusal, stop_of};
+use crate::document::nearest;
+use crate::drive::model::Kind;
+use crate::drive::{Profile, Value};
+use crate::plant::Plant;
+
+/// Maximum size of a command, bytes.
+pub(crate) const MAX_PAYLOAD: usize = 64 * 1024;
+/// Maximum length of an `id`, bytes.
+pub(crate) const MAX_ID: usize = 256;
+/// Maximum of `expires_ms`.
+const MAX_EXPIRY_MS: u64 = 60_000;
+/// Maximum length of a name that is compared with the known ones, bytes.
+const MAX_NAME: usize = 64;
+
+/// Points to be set: index in the profile and value.
+pub(crate) type Points = Vec<(usize, Value)>;
+
+/// The `id` of a command: a number or a string, returned as it was written.
+#[derive(Debug, Clone, Serialize)]
+#[serde(transparent)]
+pub(crate) struct Id(Box<RawValue>);
+
+impl Id {
+    /// As it was written.
+    pub(crate) fn text(&self) -> &str {
+        self.0.get()
+    }
+
+    fn of(value: Box<RawValue>) -> Option<Id> {
+        let text = value.get();
+        let sound = match text.chars().next()? {
+            '"' => serde_json::from_str::<String>(text).is_ok_and(|text| text.len() <= MAX_ID),
+            '-' | '0'..='9' => text.len() <= MAX_ID,
+            _ => false,
+        };
+        sound.then_some(Id(value))
+    }
+}
+
+impl PartialEq for Id {
+    fn eq(&self, other: &Id) -> bool {
+        self.text() == other.text()
+    }
+}
+
+/// The payload for messages: printable and short.
+pub(crate) fn excerpt(payload: &[u8]) -> String {
+    let text = String::from_utf8_lossy(payload.get(..payload.len().min(200)).unwrap_or_default());
+    let mut short = String::new();
+    for c in text.chars().take(80) {
+        if c.is_control() {
+            short.extend(c.escape_default());
+        } else {
+            short.push(c);
+        }
+    }
+    let dots = if payload.len() > 80 { "…" } else { "" };
+    format!("`{short}{dots}`")
+}
+
+/// The `id` of an object, read before the rest, so that a client finds its request in the result whatever else is wrong.
+/// `None` if the payload is not JSON or contains several.
+pub(crate) fn find_id(payload: &[u8]) -> Option<Id> {
+    let OnlyId(id) = serde_json::from_slice(payload).ok()?;
+    Id::of(id?)
+}
+
+/// What a command asks for.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Asked {
+    pub(crate) points: Points,
+    pub(crate) expiry: Duration,
+    /// Why all else is refused; `points` are those of its stop then.
+    pub(crate) refused: Option<Refusal>,
+}
+
+impl Asked {
+    /// What is asked for by `points`, where `refused` says what else is not understood.
+    ///
+    /// # Errors
+    /// The refusal, unless there is a stop among the points, which is carried out all the same.
+    pub(crate) fn new(
+        points: Points,
+        expiry: Duration,
+        refused: Option<Refusal>,
+        profile: &Profile,
+    ) -> Result<Asked, Refusal> {
+        let points = match &refused {
+            None => points,
+            Some(refusal) => stop_of(&points, profile).ok_or_else(|| refusal.clone())?,
+        };
+        Ok(Asked {
+            points,
+            expiry,
+            refused,
+        })
+    }
+}
+
+/// The points and the expiry of a command.
+///
+/// # Errors
+/// The refusal; nothing of the command may be executed.
+pub(crate) fn order(payload: &[u8], profile: &Profile) -> Result<Asked, Refusal> {
+    points_of(object(payload)?, profile)
+}
+
+/// Refuses a payload that is too long.
+///
+/// # Errors
+/// It is longer than [`MAX_PAYLOAD`].
+pub(crate) fn check_size(size: usize) -> Result<(), Refusal> {
+    match size > MAX_PAYLOAD {
+        true => Err(Refusal::BadValue(format!(
+            "the payload has {size} bytes, {MAX_PAYLOAD} are allowed"
+        ))),
+        false => Ok(()),
+    }
+}
+
+fn points_of(fields: Fields, profile: &Profile) -> Result<Asked, Refusal> {
+    let mut expiry = DEFAULT_EXPIRY;
+    let mut points = Vec::new();
+    let twice = |name: String| format!("{} appears twice; nothing was written", excerpt(name.as_bytes()));
+    let mut refused = fields.twice.map(|name| Refusal::BadValue(twice(name)));
+    for (name, value) in fields.all {
+        let understood = match name.as_str() {
+            "id" if is_id(&value) => Ok(()),
+            "id" => Err(Refusal::BadValue(format!(
+                "`id` is a number or a string of at most {MAX_ID} bytes"
+            ))),
+            "expires_ms" => request_expiry(&value).map(|time| expiry = time),
+            name => resolve(profile, name, &value).map(|point| points.push(point)),
+        };
+        refused = refused.or(understood.err());
+    }
+    Asked::new(points, expiry, refused, profile)
+}
+
+fn is_id(value: &Json) -> bool {
+    match value {
+        Json::Number(_) => true,
+        Json::String(text) => text.len() <= MAX_ID,
+        _ => false,
+    }
+}
+
+fn request_expiry(value: &Json) -> Result<Duration, Refusal> {
+    let time = value.as_u64().filter(|ms| (1..=MAX_EXPIRY_MS).contains(ms));
+    time.map(Duration::from_millis).ok_or_else(|| {
+        Refusal::BadValue(format!(
+            "`expires_ms` = {value} is not a whole number from 1 to {MAX_EXPIRY_MS}"
+        ))
+    })
+}
+
+/// The point of that name with its value. Limits are checked with the command.
+pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(usize, Value), Refusal> {
+    let Some(index) = profile.point_index(name) else {
+        let writable = || profile.points.iter().filter(|p| p.write).map(|p| p.name.as_str());
+        let all = || profile.points.iter().map(|p| p.name.as_str());
+        let likely = || nearest(name, writable()).or_else(|| nearest(name, all()));
+        let hint = match (name.len() <= MAX_NAME).then(likely).flatten() {
+            Some(near) => format!("did you mean `{near}`?"),
+            None => format!("writable points: {}", writable().collect::<Vec<_>>().join(", ")),
+        };
+        let name = excerpt(name.as_bytes());
+        return Err(Refusal::NotWritable(format!("there is no point {name}; {hint}")));
+    };
+    let point = profile.points.get(index).filter(|p| p.write);
+    let Some(point) = point else {
+        return Err(Refusal::NotWritable(format!("`{name}` is read-only")));
+    };
+    let wrong = |wanted: &str| Refusal::BadValue(format!("`{name}` = {} is not {wanted}", brief(value)));
+    let value = match (point.kind(), value) {
+        (Kind::Bool, Json::Bool(b)) => Value::Bool(*b),
+        (Kind::Bool, Json::Number(n)) if n.as_f64() == Some(0.0) => Value::Bool(false),
+        (Kind::Bool, Json::Number(n)) if n.as_f64() == Some(1.0) => Value::Bool(true),
+        (Kind::Bool, _) => return Err(wrong("true or false")),
+        (Kind::Number | Kind::Integer, Json::Number(n)) => {
+            Value::Number(n.as_f64().filter(|n| n.is_finite()).ok_or_else(|| wrong("a number"))?)
+        }
+        (Kind::Number | Kind::Integer, Json::String(_)) => return Err(wrong("a number; remove the quotes")),
+        (Kind::Number | Kind::Integer, _) => return Err(wrong("a number")),
+    };
+    Ok((index, value))
+}
+
+fn brief(value: &Json) -> String {
+    let text = value.to_string();
+    match text.char_indices().nth(60) {
+        Some((end, _)) => format!("{}…", text.get(..end).unwrap_or_default()),
+        None => text,
+    }
+}
+
+fn object(payload: &[u8]) -> Result<Fields, Refusal> {
+    let shape = "send a JSON object such as {\"run\": true, \"speed_reference\": 50}";
+    let value: Json = serde_json::from_slice(payload)
+        .map_err(|e| Refusal::BadValue(format!("{} is not JSON: {e}; {shape}", excerpt(payload))))?;
+    if !value.is_object() {
+        return Err(Refusal::BadValue(format!(
+            "{} is not a JSON object; {shape}",
+            excerpt(payload)
+        )));
+    }
+    serde_json::from_slice(payload).map_err(|e| Refusal::BadValue(e.to_string()))
+}
+
+/// The fields of an object, and the first name that is repeated: that is an error, since it is ambiguous.
+#[derive(Debug, Default)]
+struct Fields {
+    all: Vec<(String, Json)>,
+    twice: Option<String>,
+}
+
+impl<'de> Deserialize<'de> for Fields {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Fields, D::Error> {
+        deserializer.deserialize_map(FieldsVisitor)
+    }
+}
+
+struct FieldsVisitor;
+
+impl<'de> Visitor<'de> for FieldsVisitor {
+    type Value = Fields;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a JSON object")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Fields, A::Error> {
+        let mut fields = Fields::default();
+        let mut names = BTreeSet::new();
+        while let Some((name, value)) = map.next_entry::<String, Json>()? {
+            if !names.insert(name.clone()) {
+                fields.twice.get_or_insert(name.clone());
+            }
+            fields.all.push((name, value));
+        }
+        Ok(fields)
+    }
+}
+
+/// The `id` of an object, if it has exactly one; other fields are ignored.
+struct OnlyId(Option<Box<RawValue>>);
+
+impl<'de> Deserialize<'de> for OnlyId {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<OnlyId, D::Error> {
+        deserializer.deserialize_map(IdVisitor)
+    }
+}
+
+struct IdVisitor;
+
+impl<'de> Visitor<'de> for IdVisitor {
+    type Value = OnlyId;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a JSON object")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<OnlyId, A::Error> {
+        let mut found = Vec::new();
+        while let Some(name) = map.next_key::<Cow<'de, str>>()? {
+            if name == "id" && found.len() < 2 {
+                found.push(map.next_value()?);
+            } else {
+                map.next_value::<IgnoredAny>()?;
+            }
+        }
+        Ok(OnlyId(found.pop().filter(|_| found.is_empty())))
+    }
+}
+
+/// That there is no such drive, and which one has the nearest name.
+pub(crate) fn unknown_drive(name: &str, plant: &Plant) -> String {
+    let drives: Vec<_> = plant.drives().map(|d| d.image.spec.name.clone()).collect();
+    let near = (name.len() <= MAX_NAME).then(|| nearest(name, drives.iter().map(String::as_str)));
+    let hint = near
+        .flatten()
+        .map_or(String::new(), |near| format!("; did you mean `{near}`?"));
+    format!("there is no drive {}{hint}", excerpt(name.as_bytes()))
+}

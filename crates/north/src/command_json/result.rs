@@ -1,0 +1,81 @@
+//! The result of a command as JSON.
+
+use std::time::{Duration, SystemTime};
+
+use serde::Serialize;
+
+use super::Id;
+use crate::command::{Answer, CONFIRMED, Outcome, milliseconds, milliseconds_or_null};
+use crate::plant::Shown;
+
+/// The one result of a command: `confirmed` if a read showed the effect in time, else the answer of the bus.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct CommandResult<'r> {
+    id: Option<&'r Id>,
+    drive: &'r str,
+    ok: bool,
+    result: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<ErrorObject>,
+    /// Of a command whose stop alone was carried out: the code of the rest.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    rest: Option<&'static str>,
+    #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
+    latency: Duration,
+    /// From acceptance to the read that showed the effect.
+    #[serde(
+        rename = "confirmed_ms",
+        serialize_with = "milliseconds_or_null",
+        skip_serializing_if = "Option::is_none"
+    )]
+    confirmed: Option<Duration>,
+    /// Why no read can show the effect of an acknowledged command.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    note: Option<String>,
+    #[serde(serialize_with = "crate::event::rfc3339")]
+    time: SystemTime,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct ErrorObject {
+    code: &'static str,
+    message: String,
+}
+
+impl<'r> CommandResult<'r> {
+    /// The result at `time` of the command with that `id`, of which reads showed so much.
+    pub(crate) fn new(
+        id: Option<&'r Id>,
+        drive: &'r str,
+        answer: &Answer,
+        shown: Shown,
+        time: SystemTime,
+    ) -> CommandResult<'r> {
+        let code = match shown.after {
+            Some(_) => CONFIRMED,
+            None => answer.outcome.code(),
+        };
+        let error = (!answer.outcome.is_ok()).then(|| answer.outcome.to_string());
+        CommandResult {
+            id,
+            drive,
+            ok: error.is_none(),
+            result: code,
+            error: error.map(|message| ErrorObject { code, message }),
+            rest: match &answer.outcome {
+                Outcome::StopOnly(rest) => Some(rest.code()),
+                _ => None,
+            },
+            latency: answer.latency,
+            confirmed: shown.after,
+            note: shown.unseen,
+            time,
+        }
+    }
+
+    /// As it is sent.
+    pub(crate) fn to_json(&self) -> Vec<u8> {
+        // Strings, numbers and previous JSON can always be serialized.
+        serde_json::to_vec(self).unwrap_or_default()
+    }
+}

@@ -1,0 +1,491 @@
+//! HTTP: status page, Prometheus metrics, health and the JSON interface; commands of users, where they are on.
+//!
+//! hyper serves the connections directly, because axum's own loop gives a client unlimited time to send its request.
+//! The cancellation ends everything, including open event streams.
+
+mod access;
+mod api;
+mod body;
+mod event_log;
+mod hosts;
+mod in_use;
+mod line;
+mod offline;
+mod operating;
+mod page;
+mod params;
+mod query;
+mod recordings;
+mod routes;
+mod streams;
+mod terms;
+mod tokens;
+mod trend;
+mod users;
+
+use std::net::{IpAddr, SocketAddr};
+use std::pin::pin;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use arc_swap::ArcSwap;
+use axum::Router;
+use hyper::body::Incoming;
+use hyper::server::conn::http1;
+use hyper::service::{Service, service_fn};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::TcpStream;
+use tokio::runtime::Handle;
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use self::hosts::Host;
+use self::in_use::InUse;
+use self::operating::Operating;
+pub(super) use self::operating::PostedCommands;
+use self::routes::Reached;
+use self::terms::{Terms, Tls};
+use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Limits, Newcomer};
+use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
+use super::log_throttle::LogThrottle;
+use super::refusals::Refusals;
+use super::{NorthStats, ServerError, ServerIdentity, ServerKind};
+use crate::history::History;
+use crate::plant::{DriveHandle, SharedPlant};
+
+pub use self::offline::Offline;
+pub use self::tokens::{Scope, Token, TokenError, Tokens};
+pub use self::users::{MAX_PASSWORD, MIN_PASSWORD, User, UserError, Users};
+
+/// Maximum number of open connections. A connection whose request is incomplete, and one between two requests, yields to
+/// a newer one.
+pub const MAX_CONNECTIONS: usize = 128;
+
+/// Maximum number of open event streams; each occupies a connection for a long time.
+pub const MAX_LISTENERS: usize = 32;
+
+/// Maximum number of open event streams of one address.
+pub const MAX_LISTENERS_PER_ADDRESS: usize = 16;
+
+/// Connections beyond the limits, which are served `/healthz` and `/readyz` only: whatever the others do, these two answer.
+const HEALTH: Limits = Limits {
+    total: 8,
+    reserved: 0,
+    per_address: 4,
+};
+
+/// Time limit for the head of a request on such a connection.
+const HEALTH_HEAD_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Time limit for the head of a request, from the connection or from the previous reply on. It bounds slow senders and
+/// idle connections.
+const HEAD_TIMEOUT: Duration = Duration::from_secs(30);
+
+/// Maximum length of the head of a request, bytes.
+const MAX_HEAD: usize = 16 * 1024;
+
+/// Time after which a client that acknowledges nothing or accepts no bytes is disconnected.
+const USER_TIMEOUT: Duration = Duration::from_secs(30);
+
+/// Time limit of a TLS handshake.
+const HANDSHAKE: Duration = Duration::from_secs(10);
+
+/// Time for pending replies when the gateway stops, and for streams when a reload ends their connection.
+const GRACE: Duration = Duration::from_millis(500);
+
+/// Time for the replies to commands when a reload ends their connection: longer than any of them waits for the bus.
+const ANSWERED_WITHIN: Duration = Duration::from_secs(60);
+
+/// Configuration of the HTTP server.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Address to listen on.
+    pub listen: SocketAddr,
+    /// Names and addresses that it answers under, besides its own and those of the loopback.
+    pub hosts: Vec<String>,
+    /// Who may read what; `None`: everybody everything.
+    pub tokens: Option<Tokens>,
+    /// Who may command; `None`: nobody, commands are off.
+    pub users: Option<Users>,
+    /// Certificate and key; `None`: without TLS.
+    pub identity: Option<ServerIdentity>,
+    /// Maximum number of open connections: [`MAX_CONNECTIONS`], or fewer where the system allows fewer open files.
+    pub max_connections: usize,
+}
+
+impl Options {
+    /// Listens on that address, open to everybody, without TLS.
+    pub fn at(listen: SocketAddr) -> Options {
+        Options {
+            listen,
+            hosts: Vec::new(),
+            tokens: None,
+            users: None,
+            identity: None,
+            max_connections: MAX_CONNECTIONS,
+        }
+    }
+
+    /// Files that the connections can have open at one time, with those that are being closed.
+    pub fn files(&self) -> usize {
+        self.limits().files() + HEALTH.files()
+    }
+
+    /// Half of the connections can be those of one address. Where commands are on, some are for addresses of users only.
+    fn limits(&self) -> Limits {
+        let limits = Limits::new(self.max_connections, self.max_connections.div_ceil(2));
+        match self.users {
+            Some(_) => limits.with_reserve(),
+            None => limits,
+        }
+    }
+}
+
+/// Whether `text` can stand in [`Options::hosts`]: a host name or an address, without a port.
+pub fn is_host(text: &str) -> bool {
+    Host::configured(text).is_some()
+}
+
+/// The running server.
+#[derive(Debug)]
+pub struct Http {
+    listeners: Listeners<HttpConnections>,
+    terms: Arc<ArcSwap<Terms>>,
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    operating: Arc<Operating>,
+    tasks: TaskTracker,
+    /// Cancelled when the server ends.
+    stopping: CancellationToken,
+}
+
+/// What [`Http::commit`] needs to apply new options: all that can fail is done.
+#[derive(Debug)]
+pub struct Change {
+    options: Options,
+    sockets: NewSockets,
+    terms: Terms,
+}
+
+impl Http {
+    /// The address it listens on, with the port that the system chose if port 0 was configured.
+    pub fn address(&self) -> Option<SocketAddr> {
+        let [plain, tls] = [false, true].map(|tls| self.listeners.addresses(tls));
+        plain.into_iter().chain(tls).next()
+    }
+
+    /// Prepares other options: binds a new address and checks new certificates. Nothing changes for any client.
+    ///
+    /// # Errors
+    /// The address cannot be bound, or the certificates cannot be used; everything is as before.
+    pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+        let terms = Terms::new(&options)?;
+        let spec = ListenerSpec {
+            address: options.listen,
+            tls: options.identity.is_some(),
+            section: "[http]".to_string(),
+        };
+        Ok(Change {
+            sockets: self.listeners.prepare(vec![spec]).await?,
+            terms,
+            options,
+        })
+    }
+
+    /// Forgets prepared options.
+    pub fn abort(&mut self, change: Change) {
+        self.listeners.abort(change.sockets);
+    }
+
+    /// Applies prepared options. Connections and streams end if hosts or tokens change, or the listener is another, those with a
+    /// command behind its reply; new certificates are for new connections.
+    pub fn commit(&mut self, change: Change) {
+        let Change {
+            options,
+            sockets,
+            terms,
+        } = change;
+        terms.replace(&self.terms);
+        self.operating.set_users(options.users.clone());
+        let (plant, stats, terms, operating) = (&self.plant, &self.stats, &self.terms, &self.operating);
+        let stopping = &self.stopping;
+        self.listeners.commit(sockets, |_, open, cancel| {
+            let handler = match open {
+                Some(handler) => handler.clone(),
+                None => {
+                    let tokens = (cancel, stopping);
+                    Arc::new(HttpConnections::new(&options, plant, stats, terms, operating, tokens))
+                }
+            };
+            handler.limit.set_limits(options.limits());
+            (handler, Handle::current())
+        });
+    }
+
+    /// Closes the listener and its connections, those with a command behind its reply.
+    pub async fn retire(&mut self) {
+        self.listeners.close().await;
+    }
+
+    /// Whether no connection is left after [`Http::retire`].
+    pub fn is_drained(&self) -> bool {
+        self.tasks.len() <= 1
+    }
+
+    /// Waits until the server has stopped: at most half a second after the token was cancelled.
+    pub async fn stopped(self) {
+        self.tasks.wait().await;
+    }
+}
+
+/// Starts the server. It runs until `cancel`.
+///
+/// # Errors
+/// The address cannot be bound, or the certificates cannot be used.
+pub async fn start(
+    options: Options,
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    cancel: CancellationToken,
+) -> Result<Http, ServerError> {
+    let tasks = TaskTracker::new();
+    // A reload can replace the listener, so the server ends with the token and not with its last task.
+    tasks.spawn(cancel.clone().cancelled_owned());
+    tasks.close();
+    let mut http = Http {
+        listeners: Listeners::new(ServerKind::Http, stats.clone(), tasks.clone(), cancel.clone()),
+        stopping: cancel,
+        terms: Arc::new(ArcSwap::from_pointee(Terms::new(&options)?)),
+        plant,
+        operating: Arc::new(Operating::new(stats.clone())),
+        stats,
+        tasks,
+    };
+    let change = http.prepare(options).await?;
+    http.commit(change);
+    Ok(http)
+}
+
+/// Serves the connections of a listener.
+#[derive(Debug)]
+struct HttpConnections {
+    router: Router,
+    terms: Arc<ArcSwap<Terms>>,
+    limit: Arc<ConnectionLimit>,
+    health: Arc<ConnectionLimit>,
+    refusals: Refusals,
+    /// Limits the log of requests without access.
+    no_access: Arc<LogThrottle>,
+    operating: Arc<Operating>,
+    cancel: CancellationToken,
+    stopping: CancellationToken,
+}
+
+/// The place of a connection, and what it is for.
+struct HttpPermit {
+    permit: ConnectionPermit,
+    coverage: Coverage,
+}
+
+/// What a connection is served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Coverage {
+    Everything,
+    /// `/healthz`, `/readyz` and commands of users; the rest is refused with 503.
+    Health,
+}
+
+impl Coverage {
+    /// Time limit for the head of a request.
+    fn head_timeout(self) -> Duration {
+        match self {
+            Coverage::Everything => HEAD_TIMEOUT,
+            Coverage::Health => HEALTH_HEAD_TIMEOUT,
+        }
+    }
+}
+
+impl HttpConnections {
+    fn new(
+        options: &Options,
+        plant: &SharedPlant,
+        stats: &Arc<NorthStats>,
+        terms: &Arc<ArcSwap<Terms>>,
+        operating: &Arc<Operating>,
+        (cancel, stopping): (&CancellationToken, &CancellationToken),
+    ) -> HttpConnections {
+        HttpConnections {
+            router: routes::router(plant.clone(), stats.clone(), operating.clone(), cancel.clone()),
+            operating: operating.clone(),
+            terms: terms.clone(),
+            limit: ConnectionLimit::new(options.limits()),
+            health: ConnectionLimit::new(HEALTH),
+            refusals: Refusals::new(ServerKind::Http, stats.clone()),
+            no_access: Arc::default(),
+            cancel: cancel.clone(),
+            stopping: stopping.clone(),
+        }
+    }
+}
+
+impl ConnectionHandler for HttpConnections {
+    type Permit = HttpPermit;
+
+    fn admit(&self, address: IpAddr) -> Option<HttpPermit> {
+        let newcomer = Newcomer {
+            address,
+            listener: 0,
+            cancel: &self.cancel,
+        };
+        let (limits, now) = (
+            [(&self.limit, Coverage::Everything), (&self.health, Coverage::Health)],
+            Instant::now(),
+        );
+        limits.into_iter().find_map(|(limit, coverage)| {
+            let permit = self.refusals.acquire(limit, newcomer, remedy, || {
+                Some(self.operating.authority_at(address, now))
+            })?;
+            permit.place().use_at(now, false);
+            Some(HttpPermit { permit, coverage })
+        })
+    }
+
+    async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, place: HttpPermit) {
+        set_socket_options(&stream);
+        let terms = self.terms.load_full();
+        // Without an own address the client is gone.
+        let Ok(local) = stream.local_addr() else { return };
+        let local = local.ip();
+        let Some(Tls(acceptor)) = &terms.tls else {
+            return self.serve_requests(stream, peer, local, &terms, &place).await;
+        };
+        let handshake = timeout(HANDSHAKE.min(place.coverage.head_timeout()), acceptor.accept(stream));
+        let closing = place.permit.place().closing();
+        match closing.run_until_cancelled(handshake).await {
+            Some(Ok(Ok(stream))) => self.serve_requests(stream, peer, local, &terms, &place).await,
+            Some(Ok(Err(error))) => {
+                tracing::debug!(target: "drivegate::http", %peer, "HTTP: TLS handshake failed: {error}");
+            }
+            Some(Err(_)) | None => {}
+        }
+    }
+}
+
+impl HttpConnections {
+    /// Answers the requests of a client that connected to the address `local` of this machine. After the cancellation,
+    /// or when the terms are replaced, the connection has [`GRACE`] to finish its reply; that to a command comes first, unless
+    /// the whole server ends.
+    async fn serve_requests(
+        &self,
+        stream: impl AsyncRead + AsyncWrite + Unpin,
+        peer: SocketAddr,
+        local: IpAddr,
+        terms: &Terms,
+        permit: &HttpPermit,
+    ) {
+        let (place, coverage) = (permit.permit.place(), permit.coverage);
+        let reached = Reached {
+            address: local,
+            peer,
+            refusals: self.no_access.clone(),
+            access: terms.access.clone(),
+            tls: terms.tls.is_some(),
+            place: Some(place.clone()),
+        };
+        let client = routes::Client {
+            address: peer.ip(),
+            coverage,
+        };
+        // One token for each command whose reply is to come.
+        let commands = TaskTracker::new();
+        let router = TowerToHyperService::new(self.router.clone());
+        let service = service_fn(|mut request: hyper::Request<Incoming>| {
+            let in_use = InUse::new(place.clone());
+            // Somebody may have logged in, or out, since the connection came.
+            place
+                .rights()
+                .set(self.operating.authority_at(peer.ip(), Instant::now()));
+            request.extensions_mut().insert(client);
+            request.extensions_mut().insert(reached.clone());
+            let command = (request.method() == hyper::Method::POST).then(|| commands.token());
+            let reply = router.call(request);
+            async move {
+                // Other clients have a turn between two pipelined requests.
+                tokio::task::yield_now().await;
+                let reply = reply.await;
+                drop(command);
+                reply.map(|reply| reply.map(|body| in_use.until_end_of(body)))
+            }
+        });
+        let mut connection = pin!(
+            http1::Builder::new()
+                .timer(TokioTimer::new())
+                .header_read_timeout(coverage.head_timeout())
+                .keep_alive(coverage == Coverage::Everything)
+                .max_buf_size(MAX_HEAD)
+                .serve_connection(TokioIo::new(stream), service)
+        );
+        let ended = tokio::select! {
+            ended = connection.as_mut() => ended,
+            () = ended(place.closing(), &terms.replaced) => match place.is_in_use() {
+                true => {
+                    connection.as_mut().graceful_shutdown();
+                    commands.close();
+                    let last = async {
+                        let answered = timeout(ANSWERED_WITHIN, commands.wait());
+                        // Whichever it was that ended the wait.
+                        let _ = self.stopping.run_until_cancelled(answered).await;
+                        tokio::time::sleep(GRACE).await;
+                    };
+                    tokio::select! {
+                        ended = connection => ended,
+                        () = last => Ok(()),
+                    }
+                }
+                // There is no reply to finish.
+                false => Ok(()),
+            }
+        };
+        // Clients that disconnect or send invalid data are normal operation.
+        if let Err(error) = ended {
+            tracing::debug!(target: "drivegate::http", %peer, "HTTP connection ended: {error}");
+        }
+    }
+}
+
+async fn ended(server: &CancellationToken, terms: &CancellationToken) {
+    tokio::select! {
+        () = server.cancelled() => {}
+        () = terms.cancelled() => {}
+    }
+}
+
+fn remedy(reached: LimitReached) -> String {
+    match reached {
+        LimitReached::Total(_) => "close unused connections".to_string(),
+        LimitReached::Address(_) => "close unused connections of this address".to_string(),
+    }
+}
+
+/// Sends small replies without delay and drops peers that disappeared. A socket works without either option.
+fn set_socket_options(stream: &TcpStream) {
+    let _ = stream.set_nodelay(true);
+    let millis = u32::try_from(USER_TIMEOUT.as_millis()).unwrap_or(u32::MAX);
+    let _ = rustix::net::sockopt::set_tcp_user_timeout(stream, millis);
+}
+
+/// What `/api/v1/drives/{name}` says of a drive at `now`, which is `wall` on the calendar. Pure.
+///
+/// # Errors
+/// None is known; a value that JSON cannot express would be one.
+pub fn drive_json(
+    drive: &DriveHandle,
+    history: &History,
+    now: Instant,
+    wall: SystemTime,
+) -> serde_json::Result<serde_json::Value> {
+    serde_json::to_value(api::Drive::new(drive, history, api::Clock::new(now, wall)))
+}

@@ -1,0 +1,379 @@
+//! Commands and heartbeats over HTTP. The body of a command is that of the MQTT set topics, and so is its result.
+
+use std::sync::Arc;
+use std::time::{Instant, SystemTime};
+
+use axum::Json;
+use axum::body::Body;
+use axum::extract::{Extension, Path, Request, State};
+use axum::http::{StatusCode, header, request};
+use axum::response::{IntoResponse, Response};
+use serde_json::{Value as Json_, json};
+use tokio::sync::{OwnedSemaphorePermit, watch};
+
+use super::super::api::ErrorReply;
+use super::super::body;
+use super::super::routes::{AppState, Reached, no_drive};
+use super::{Operating, Operator};
+use crate::command::{Answer, Authority, Order, Origin, Outcome, Parts, Refusal, SourceKind, stop_of};
+use crate::command_json::{
+    self, CommandResult, Id, MAX_PAYLOAD, Repetition, SharedMemory, Taken, excerpt, find_id, unknown_drive,
+};
+use crate::drive::model::Kind;
+use crate::plant::{DriveHandle, Placed, Plant, Shown};
+use crate::process_image::Access;
+
+/// The commands that came over HTTP, also to the server that a reload starts in the place of one that ended.
+pub(crate) type PostedCommands = SharedMemory<SharedReply>;
+
+/// The reply to a command.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct CommandReply {
+    status: StatusCode,
+    body: Vec<u8>,
+}
+
+/// The reply to a command, which may be still to come, for everybody who repeats it.
+pub(crate) type SharedReply = watch::Receiver<Option<CommandReply>>;
+
+/// A command that was understood, or not.
+enum Progress {
+    /// Its reply is known.
+    Known(CommandReply),
+    /// It repeats another one, whose reply is its own.
+    Repeated(SharedReply),
+    /// It is in the queue of the bus.
+    Placed(Waiting),
+}
+
+/// A command whose result is to come.
+struct Waiting {
+    placed: Placed,
+    id: Option<Id>,
+    drive: String,
+    /// For those who repeat it; none of a stop, which is always executed.
+    shared: Option<(watch::Sender<Option<CommandReply>>, OwnedSemaphorePermit)>,
+}
+
+impl CommandReply {
+    fn new(id: Option<&Id>, drive: &str, answer: &Answer, shown: Shown, time: SystemTime) -> CommandReply {
+        CommandReply {
+            status: status(&answer.outcome),
+            body: CommandResult::new(id, drive, answer, shown, time).to_json(),
+        }
+    }
+}
+
+impl IntoResponse for CommandReply {
+    fn into_response(self) -> Response {
+        let json = [(header::CONTENT_TYPE, "application/json")];
+        (self.status, json, self.body).into_response()
+    }
+}
+
+/// The status of a result (`docs/operating.md`).
+fn status(outcome: &Outcome) -> StatusCode {
+    match outcome {
+        Outcome::Acknowledged(_) => StatusCode::OK,
+        Outcome::Refused(Refusal::NotAllowed(_)) => StatusCode::FORBIDDEN,
+        Outcome::Refused(Refusal::UnknownDrive(_)) => StatusCode::NOT_FOUND,
+        Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
+        Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::NotStopped => StatusCode::CONFLICT,
+        // Of what was not carried out.
+        Outcome::StopOnly(part) | Outcome::StopFailed(part) => status(part),
+        Outcome::Exception(_) | Outcome::Garbled | Outcome::NotTaken(_) => StatusCode::BAD_GATEWAY,
+        Outcome::TimedOut | Outcome::Unknown(_) | Outcome::Interrupted(_) => StatusCode::GATEWAY_TIMEOUT,
+        Outcome::Expired | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull | Outcome::ShuttingDown => {
+            StatusCode::SERVICE_UNAVAILABLE
+        }
+    }
+}
+
+/// `POST /api/v1/drives/{name}/commands`
+pub(in crate::http) async fn command(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    Path(name): Path<String>,
+    request: Request,
+) -> Response {
+    // Passwords are compared, and the body is waited for, behind that.
+    let asked = Instant::now();
+    let (parts, body) = request.into_parts();
+    match commanded(&app, &reached, &name, &parts, body, asked).await {
+        Ok(reply) => reply.into_response(),
+        Err(response) => response,
+    }
+}
+
+async fn commanded(
+    app: &AppState,
+    reached: &Reached,
+    name: &str,
+    parts: &request::Parts,
+    body: Body,
+    asked: Instant,
+) -> Result<CommandReply, Response> {
+    let (operating, cookies, address) = (&app.operating, app.cookies(reached), reached.peer.ip());
+    let operator = operating.commander(&parts.headers, &cookies, address).await;
+    let operator = operator.map_err(IntoResponse::into_response)?;
+    let payload = body::read(body, reached, MAX_PAYLOAD).await?;
+    let plant = app.plant.load_full();
+    let times = (asked, Instant::now(), SystemTime::now());
+    let progress = operating.take(&plant, &operator, name, &payload, times);
+    match progress {
+        Progress::Known(reply) => Ok(reply),
+        Progress::Repeated(reply) => shared(reply).await,
+        Progress::Placed(mut waiting) => match waiting.shared.take() {
+            None => Ok(waiting.finished().await),
+            // The result is kept for whoever repeats the command, also if this client has gone.
+            Some((sender, permit)) => {
+                let reply = sender.subscribe();
+                tokio::spawn(async move {
+                    let reply = waiting.finished().await;
+                    sender.send_replace(Some(reply));
+                    drop(permit);
+                });
+                shared(reply).await
+            }
+        },
+    }
+}
+
+/// Waits for a reply that several may wait for.
+async fn shared(mut reply: SharedReply) -> Result<CommandReply, Response> {
+    let known = reply
+        .wait_for(Option::is_some)
+        .await
+        .ok()
+        .and_then(|reply| reply.clone());
+    // Its task ends without a reply only when the process does.
+    known.ok_or_else(|| StatusCode::SERVICE_UNAVAILABLE.into_response())
+}
+
+impl Waiting {
+    async fn finished(mut self) -> CommandReply {
+        let answer = self.placed.answered().await;
+        self.placed.confirmed().await;
+        let shown = self.placed.shown();
+        CommandReply::new(self.id.as_ref(), &self.drive, &answer, shown, SystemTime::now())
+    }
+}
+
+impl Operator {
+    /// As the audit shows it. All that a user does counts as one client.
+    fn origin(&self) -> Origin {
+        let client = format!("{} {}", SourceKind::Http.name(), self.user);
+        let who = format!("{} {}", self.user, self.address);
+        Origin::of(client.into(), SourceKind::Http, who).with_login(self.login.clone())
+    }
+}
+
+impl Operating {
+    /// Takes a command whose head came at `asked_at`, at `now`, which is `time` on the calendar: it is in the queue of its bus when this returns, or its
+    /// reply is known. A repeated command is not executed again, but has the reply of the first one, or is refused; a stop
+    /// is always executed, that of a command which does more without the rest.
+    fn take(
+        &self,
+        plant: &Plant,
+        operator: &Operator,
+        name: &str,
+        payload: &[u8],
+        (asked_at, now, time): (Instant, Instant, SystemTime),
+    ) -> Progress {
+        let (id, origin) = (find_id(payload), operator.origin());
+        let reply =
+            |answer: &Answer| Progress::Known(CommandReply::new(id.as_ref(), name, answer, Shown::default(), time));
+        let Some(drive) = plant.drive(name) else {
+            let shown = excerpt(name.as_bytes());
+            let why = unknown_drive(name, plant);
+            let answer = plant.refuse_unknown(shown.trim_matches('`'), &excerpt(payload), why, origin, now);
+            return reply(&answer);
+        };
+        let profile = &drive.image.spec.profile;
+        let refuse = |refusal, origin| reply(&drive.refuse(&excerpt(payload), refusal, origin, now));
+        let asked = match command_json::order(payload, profile) {
+            Ok(asked) => asked,
+            Err(refusal) => return refuse(refusal, origin),
+        };
+        let (stop, order) = (stop_of(&asked.points, profile), Order::Points(asked.points));
+        let only_stops = stop.is_some() && matches!(Parts::of(order.clone(), profile), Parts::One(_));
+        let (mut refused, mut shared) = (asked.refused, None);
+        if refused.is_none() && !only_stops {
+            match self.remember(&drive, operator, payload, id.as_ref(), now) {
+                Ok(remembered) => shared = Some(remembered),
+                Err(Known::Reply(reply)) if stop.is_none() => return Progress::Repeated(reply),
+                Err(Known::Reply(_)) => {
+                    let why = "it repeats an earlier command, and only its stop is carried out again; send it with another `id`";
+                    refused = Some(Refusal::NotAllowed(why.to_string()));
+                }
+                Err(Known::Refused(why)) => refused = Some(Refusal::NotAllowed(why)),
+            }
+        }
+        let (client, expiry) = (Authority::Write, asked.expiry);
+        let placed = match (refused, stop) {
+            (None, _) => drive.place_asked(order, origin, client, expiry, asked_at, now),
+            (Some(refusal), Some(stop)) => {
+                let rest = (excerpt(payload), refusal);
+                drive.place_stop(Order::Points(stop), (&rest.0, rest.1), origin, client, expiry, now)
+            }
+            (Some(refusal), None) => return refuse(refusal, origin),
+        };
+        Progress::Placed(Waiting {
+            placed,
+            drive: name.to_string(),
+            shared,
+            id,
+        })
+    }
+
+    /// Remembers a command that does more than stop.
+    ///
+    /// # Errors
+    /// It is not to be executed.
+    fn remember(
+        &self,
+        drive: &DriveHandle,
+        operator: &Operator,
+        payload: &[u8],
+        id: Option<&Id>,
+        now: Instant,
+    ) -> Result<(watch::Sender<Option<CommandReply>>, OwnedSemaphorePermit), Known> {
+        let refused = |why: &str| Known::Refused(format!("{why}; nothing was written"));
+        let busy = || refused("too many commands wait for their results");
+        let permit = self.in_progress.clone().try_acquire_owned().map_err(|_| busy())?;
+        let (sender, reply) = watch::channel(None);
+        let Some(id) = id else {
+            return Ok((sender, permit));
+        };
+        let mut memory = self.stats.posted.lock();
+        let topic = format!("{}/{}", operator.user, drive.image.spec.name);
+        let taken = Taken {
+            topic: &topic,
+            payload,
+            ..Taken::default()
+        };
+        let (print, stops) = (memory.fingerprint(&taken, Some(id.text())), drive.stops());
+        match memory.repeated(&taken, print, stops, now) {
+            None => {}
+            Some(Repetition::Answered(reply)) => return Err(Known::Reply(reply)),
+            // Replies are shared from the beginning, so none is pending.
+            Some(Repetition::Pending) => return Err(busy()),
+            Some(Repetition::Outdated(why)) => {
+                let why = format!("it repeats an earlier command, {why}; send it with another `id`");
+                return Err(Known::Refused(why));
+            }
+        }
+        if !memory.has_room(now) {
+            return Err(refused("too many commands with an `id` within ten minutes"));
+        }
+        let number = memory.remember(&taken, print, stops, now);
+        memory.finished(number, &reply);
+        Ok((sender, permit))
+    }
+}
+
+/// Why a command is not executed.
+enum Known {
+    /// It was, and this is its reply.
+    Reply(SharedReply),
+    Refused(String),
+}
+
+/// `GET /api/v1/drives/{name}/commands`: what can be commanded, and within which limits.
+pub(in crate::http) async fn commands_of(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    Path(name): Path<String>,
+    headers: header::HeaderMap,
+) -> Response {
+    let cookies = app.cookies(&reached);
+    let operator = match app.operating.operator(&headers, &cookies, reached.peer.ip()).await {
+        Ok(operator) => operator,
+        Err(denied) => return denied.into_response(),
+    };
+    match app.plant.load().drive(&name) {
+        Some(drive) => Json(description(&drive, &operator)).into_response(),
+        None => no_drive(&app.plant.load(), &name),
+    }
+}
+
+fn description(drive: &DriveHandle, operator: &Operator) -> Json_ {
+    let spec = &drive.image.spec;
+    let controlled = spec.access == Access::Control;
+    let writable = spec
+        .profile
+        .points
+        .iter()
+        .enumerate()
+        .filter(|(_, point)| controlled && point.write);
+    let points: Vec<Json_> = writable
+        .map(|(index, point)| {
+            let limits = spec.limits_of(index).map(std::ops::RangeInclusive::into_inner);
+            json!({
+                "name": point.name,
+                "kind": if point.kind() == Kind::Bool { "bool" } else { "number" },
+                "unit": point.unit,
+                "minimum": limits.map(|(low, _)| low).filter(|low| low.is_finite()),
+                "maximum": limits.map(|(_, high)| high).filter(|high| high.is_finite()),
+            })
+        })
+        .collect();
+    json!({
+        "drive": spec.name,
+        "points": points,
+        "lease_ms": spec.supervision.as_ref().map(|lease| u64::try_from(lease.timeout.as_millis()).unwrap_or(u64::MAX)),
+        "commanded_last": drive.commander().as_ref() == Some(&operator.login),
+    })
+}
+
+/// `POST /api/v1/drives/{name}/heartbeat`: renews the lease of a drive that this login commanded last.
+pub(in crate::http) async fn heartbeat(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    Path(name): Path<String>,
+    headers: header::HeaderMap,
+) -> Response {
+    let cookies = app.cookies(&reached);
+    let operator = match app.operating.commander(&headers, &cookies, reached.peer.ip()).await {
+        Ok(operator) => operator,
+        Err(denied) => return denied.into_response(),
+    };
+    let plant = app.plant.load();
+    let Some(drive) = plant.drive(&name) else {
+        return no_drive(&plant, &name);
+    };
+    match renew(&drive, &operator, Instant::now()) {
+        Ok(()) => StatusCode::NO_CONTENT.into_response(),
+        Err(why) => {
+            let error = ErrorReply {
+                error: why.to_string(),
+                known: Vec::new(),
+            };
+            (StatusCode::CONFLICT, Json(error)).into_response()
+        }
+    }
+}
+
+/// Renews the lease of a drive, if the login commanded it last.
+///
+/// # Errors
+/// Why not.
+fn renew(drive: &DriveHandle, operator: &Operator, now: Instant) -> Result<(), &'static str> {
+    let spec = &drive.image.spec;
+    if spec.access != Access::Control {
+        return Err("the drive is only monitored; nothing was renewed");
+    }
+    if spec.supervision.is_none() {
+        return Err("the drive has no `supervision`, so there is no lease to renew");
+    }
+    match drive.commander() {
+        Some(login) if login == operator.login => {
+            drive.image.renew_lease(now);
+            Ok(())
+        }
+        _ => Err("this login was not the last to command the drive; nothing was renewed"),
+    }
+}
+
+#[cfg(test)]
+mod tests;

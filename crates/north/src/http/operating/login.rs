@@ -1,0 +1,192 @@
+//! Logging in and out.
+
+use std::hash::BuildHasher;
+use std::sync::Arc;
+use std::time::Instant;
+
+use axum::Json;
+use axum::body::Body;
+use axum::extract::{Extension, Request, State};
+use axum::http::header::{self, HeaderMap, HeaderValue};
+use axum::http::{StatusCode, request};
+use axum::response::{IntoResponse, Response};
+use ring::rand::{SecureRandom, SystemRandom};
+use serde::Serialize;
+
+use super::super::api::ErrorReply;
+use super::super::body;
+use super::super::routes::{AppState, Reached};
+use super::cookies::{Cookies, known_as};
+use super::sessions::Session;
+use super::throttle::Source;
+use super::{Credentials, Denied, Operating, is_own_origin};
+
+/// Most bytes of a login.
+const MAX_LOGIN: usize = 4096;
+
+/// A session, for the page.
+#[derive(Debug, Serialize)]
+struct SessionReply<'s> {
+    user: &'s str,
+    /// For the header X-CSRF-Token.
+    csrf: &'s str,
+    /// s
+    expires_in: u64,
+}
+
+impl<'s> SessionReply<'s> {
+    fn new(session: &'s Session, now: Instant) -> SessionReply<'s> {
+        SessionReply {
+            user: &session.user,
+            csrf: &session.csrf,
+            expires_in: session.expires_in(now).as_secs(),
+        }
+    }
+}
+
+impl IntoResponse for Denied {
+    fn into_response(self) -> Response {
+        let error = ErrorReply {
+            error: self.to_string(),
+            known: Vec::new(),
+        };
+        let mut response = (self.status(), Json(error)).into_response();
+        let headers = response.headers_mut();
+        match self {
+            // No Basic here: a browser would ask for a password and then send it by itself, whatever page makes a request.
+            Denied::NotLoggedIn | Denied::SessionEnded | Denied::Wrong => {
+                headers.insert(
+                    header::WWW_AUTHENTICATE,
+                    HeaderValue::from_static("Session realm=\"drivegate\""),
+                );
+            }
+            Denied::TooMany(wait) => {
+                headers.insert(header::RETRY_AFTER, (wait.as_secs() + 1).into());
+            }
+            Denied::Busy => {
+                headers.insert(header::RETRY_AFTER, 1.into());
+            }
+            Denied::OtherOrigin | Denied::NoToken => {}
+        }
+        response
+    }
+}
+
+/// `POST /api/v1/login`
+pub(in crate::http) async fn log_in(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    request: Request,
+) -> Response {
+    let (parts, body) = request.into_parts();
+    match logged_in(&app, &reached, &parts, body).await {
+        Ok(response) | Err(response) => response,
+    }
+}
+
+async fn logged_in(
+    app: &AppState,
+    reached: &Reached,
+    parts: &request::Parts,
+    body: Body,
+) -> Result<Response, Response> {
+    let (operating, cookies) = (&app.operating, app.cookies(reached));
+    is_own_origin(&parts.headers).map_err(Denied::into_response)?;
+    let body = body::read(body, reached, MAX_LOGIN).await?;
+    let given = credentials(&parts.headers, &body).ok_or_else(|| {
+        let error = ErrorReply {
+            error: "send {\"user\": …, \"password\": …} as application/json".to_string(),
+            known: Vec::new(),
+        };
+        (StatusCode::BAD_REQUEST, Json(error)).into_response()
+    })?;
+    let address = reached.peer.ip();
+    let source = operating.source(&given, &cookies, &parts.headers, reached);
+    let user = match operating.verified(&given, address, source).await {
+        Ok(user) => user,
+        Err(denied) => {
+            if let Some(suppressed) = operating.failures.permit(Instant::now()) {
+                let user: String = given.user.chars().take(64).collect();
+                tracing::warn!(target: "drivegate::http", client = %address, user, suppressed, "HTTP: login refused: {denied}");
+            }
+            return Err(denied.into_response());
+        }
+    };
+    let now = Instant::now();
+    let unavailable = || StatusCode::INTERNAL_SERVER_ERROR.into_response();
+    let (session, cookie) = operating.begin(&user, address, now).ok_or_else(unavailable)?;
+    tracing::info!(target: "drivegate::http", client = %address, user = %user, "HTTP: logged in");
+    let mut response = Json(SessionReply::new(&session, now)).into_response();
+    let set = [cookies.set_session(&cookie), operating.mark_browser(&user, &cookies)];
+    for value in set.into_iter().flatten() {
+        response.headers_mut().append(header::SET_COOKIE, value);
+    }
+    Ok(response)
+}
+
+/// Of a form of another page the content type would be another.
+fn credentials(headers: &HeaderMap, body: &[u8]) -> Option<Credentials> {
+    let kind = headers.get(header::CONTENT_TYPE)?.to_str().ok()?;
+    let kind = kind.split(';').next()?.trim();
+    match kind.eq_ignore_ascii_case("application/json") {
+        true => serde_json::from_slice(body).ok(),
+        false => None,
+    }
+}
+
+impl Operating {
+    /// Whose failures count for a login: those of its browser if it has logged in as this user before, else those of its
+    /// address.
+    fn source(&self, given: &Credentials, cookies: &Cookies, headers: &HeaderMap, reached: &Reached) -> Source {
+        let known = cookies.known(headers).and_then(|mark| {
+            let users = self.users.load_full()?;
+            let number = known_as(&mark, users.find(&given.user)?)?;
+            Some(Source::Known(self.hasher.hash_one(number)))
+        });
+        known.unwrap_or_else(|| Source::of(reached.peer.ip()))
+    }
+
+    /// The cookie by which the browser is known from now on.
+    fn mark_browser(&self, user: &str, cookies: &Cookies) -> Option<HeaderValue> {
+        let mut number = [0; 16];
+        SystemRandom::new().fill(&mut number).ok()?;
+        cookies.set_known(self.users.load_full()?.find(user)?, &number)
+    }
+}
+
+/// `GET /api/v1/session`: who is logged in; `user` is null if nobody is.
+pub(in crate::http) async fn session(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    headers: HeaderMap,
+) -> Response {
+    let now = Instant::now();
+    let cookie = app.cookies(&reached).session(&headers);
+    match cookie.and_then(|cookie| app.operating.session(&cookie, now)) {
+        Some(session) => Json(SessionReply::new(&session, now)).into_response(),
+        None => Json(serde_json::json!({ "user": null })).into_response(),
+    }
+}
+
+/// `POST /api/v1/logout`: ends the session, if there is one.
+pub(in crate::http) async fn log_out(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    headers: HeaderMap,
+) -> Response {
+    let (operating, cookies) = (&app.operating, app.cookies(&reached));
+    if let Err(denied) = is_own_origin(&headers) {
+        return denied.into_response();
+    }
+    if let Some(cookie) = cookies.session(&headers) {
+        match operating.check_csrf(&headers, &cookie) {
+            Ok(()) => operating.state().sessions.end(&cookie),
+            Err(Denied::SessionEnded) => {}
+            Err(denied) => return denied.into_response(),
+        }
+    }
+    let mut response = StatusCode::NO_CONTENT.into_response();
+    let cleared = cookies.clear_session().map(|value| (header::SET_COOKIE, value));
+    response.headers_mut().extend(cleared);
+    response
+}

@@ -1,0 +1,95 @@
+//! The JSON object of the parameters of a drive. Fields are added, never renamed or removed.
+
+use serde::Serialize;
+
+use crate::local::protocol::RestoreOutcome;
+use crate::parameters::{ParameterFile, RestoreStatus, Status};
+
+/// The parameters of a drive.
+#[derive(Debug, Serialize)]
+pub(super) struct Parameters<'a> {
+    drive: &'a str,
+    /// The last reading; `null` where there is none.
+    last: Option<LastReading<'a>>,
+    /// The reading that goes on; `null` where none does.
+    reading: Option<RunningReading<'a>>,
+    /// Why the last try failed.
+    error: Option<&'a str>,
+    /// The last restore since the gateway started, or the one that goes on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    restore: Option<RestoreOutcome>,
+}
+
+#[derive(Debug, Serialize)]
+struct LastReading<'a> {
+    family: &'a str,
+    identification: &'a str,
+    application: String,
+    time: &'a str,
+    checksum: String,
+    missing: usize,
+    parameters: Vec<ParameterRow<'a>>,
+}
+
+#[derive(Debug, Serialize)]
+struct ParameterRow<'a> {
+    id: &'a str,
+    /// As the drive gives it; `null` where it was not read.
+    raw: Option<f64>,
+    /// Value in its unit and name, for people.
+    text: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    why: Option<&'a str>,
+}
+
+#[derive(Debug, Serialize)]
+struct RunningReading<'a> {
+    done: usize,
+    total: usize,
+    remaining_s: Option<f64>,
+    waits: Option<&'a str>,
+}
+
+impl<'a> Parameters<'a> {
+    pub(super) fn new(
+        drive: &'a str,
+        last: Option<&'a ParameterFile>,
+        status: Option<&'a Status>,
+        restore: Option<&RestoreStatus>,
+    ) -> Parameters<'a> {
+        let running = status.filter(|status| status.result.is_none());
+        let failed = status.and_then(|status| status.result.as_ref()?.as_ref().err());
+        Parameters {
+            drive,
+            last: last.map(LastReading::new),
+            reading: running.map(|status| RunningReading {
+                done: status.progress.0,
+                total: status.progress.1,
+                remaining_s: status.remaining.map(|time| time.as_secs_f64()),
+                waits: status.waits.as_deref(),
+            }),
+            error: failed.map(String::as_str),
+            restore: restore.map(RestoreOutcome::new),
+        }
+    }
+}
+
+impl<'a> LastReading<'a> {
+    fn new(file: &'a ParameterFile) -> LastReading<'a> {
+        let parameters = file.values.iter().map(|(id, entry)| ParameterRow {
+            id: id.name(),
+            raw: entry.value.as_ref().ok().map(|value| value.number()),
+            text: &entry.note,
+            why: entry.value.as_ref().err().map(String::as_str),
+        });
+        LastReading {
+            family: &file.family,
+            identification: &file.identification,
+            application: file.application(),
+            time: &file.time,
+            checksum: file.checksum(),
+            missing: file.missing(),
+            parameters: parameters.collect(),
+        }
+    }
+}

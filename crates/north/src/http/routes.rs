@@ -1,0 +1,380 @@
+//! The routes of the HTTP server.
+
+use std::fmt::Write as _;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::{Instant, SystemTime};
+
+use axum::Router;
+use axum::extract::{Extension, Path, RawQuery, Request, State};
+use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
+use axum::http::{Method, StatusCode, Uri};
+use axum::middleware::{self, Next};
+use axum::response::{Html, IntoResponse, Response};
+use axum::routing::{get, post};
+use axum::{Json, response};
+use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio_util::sync::CancellationToken;
+
+use super::access::{Access, AccessError};
+use super::operating::{self, Cookies, Operating};
+use super::params::Parameters;
+use super::{
+    Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, line, page, query, recordings, streams, trend,
+};
+use crate::connection_limit::{ConnectionLimit, Limits, Place};
+use crate::log_throttle::LogThrottle;
+use crate::parameters::ParameterFile;
+use crate::plant::{Plant, SharedPlant};
+use crate::{NorthStats, metrics, readiness};
+
+/// What all handlers share.
+#[derive(Debug)]
+pub(super) struct AppState {
+    pub(super) plant: SharedPlant,
+    pub(super) stats: Arc<NorthStats>,
+    pub(super) cancel: CancellationToken,
+    /// Open event streams.
+    pub(super) listeners: Arc<ConnectionLimit>,
+    /// Large replies are rendered one at a time: a client that asks for them without end has its turns like all others,
+    /// and `/healthz` does not wait for it.
+    rendering: Semaphore,
+    /// The permit for reading a recording: what waits for the disk holds up nothing else.
+    pub(super) files: Semaphore,
+    pub(super) operating: Arc<Operating>,
+}
+
+impl AppState {
+    /// A turn to render a large reply.
+    pub(super) async fn turn(&self) -> Option<SemaphorePermit<'_>> {
+        self.rendering.acquire().await.ok()
+    }
+
+    /// The cookies of this gateway, on a connection that came like that.
+    pub(super) fn cookies(&self, reached: &Reached) -> Cookies {
+        Cookies::of(&self.plant.load().gateway, reached.tls)
+    }
+}
+
+/// Who asks.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Client {
+    pub(super) address: IpAddr,
+    pub(super) coverage: Coverage,
+}
+
+/// How a request came, as an extension of it.
+#[derive(Debug, Clone)]
+pub(super) struct Reached {
+    /// The address of this machine that the client connected to.
+    pub(super) address: IpAddr,
+    pub(super) peer: SocketAddr,
+    pub(super) access: Arc<Access>,
+    /// Limits the log of refused requests.
+    pub(super) refusals: Arc<LogThrottle>,
+    /// The connection has TLS.
+    pub(super) tls: bool,
+    /// The place of the connection; `None` without a socket.
+    pub(super) place: Option<Arc<Place>>,
+}
+
+/// All routes.
+pub(super) fn router(
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    operating: Arc<Operating>,
+    cancel: CancellationToken,
+) -> Router {
+    let app = Arc::new(AppState {
+        plant,
+        stats,
+        cancel,
+        listeners: ConnectionLimit::new(Limits::new(MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS)),
+        rendering: Semaphore::new(1),
+        files: Semaphore::new(1),
+        operating,
+    });
+    Router::new()
+        .route("/", get(status_page))
+        .route("/assets/{name}", get(asset))
+        .route("/metrics", get(exposition))
+        .route("/healthz", get(|| async { "ok\n" }))
+        .route("/readyz", get(ready))
+        .route("/api/v1/drives", get(drives))
+        .route("/api/v1/drives/{name}", get(drive))
+        .route("/api/v1/drives/{name}/params", get(params))
+        .route("/api/v1/drives/{name}/trend", get(trend::trend))
+        .route("/api/v1/buses", get(buses))
+        .route("/api/v1/buses/{name}", get(line::bus))
+        .route("/api/v1/buses/{name}/diagnosis", get(diagnosis))
+        .route("/api/v1/audit", get(audit))
+        .route("/api/v1/recordings", get(recordings::list))
+        .route("/api/v1/recordings/{id}", get(recordings::one))
+        .route("/api/v1/events", get(streams::events))
+        .route("/api/v1/events/log", get(event_log::log))
+        .route("/api/v1/trace", get(streams::trace))
+        .route("/api/v1/login", post(operating::log_in))
+        .route("/api/v1/logout", post(operating::log_out))
+        .route("/api/v1/session", get(operating::session))
+        .route(
+            "/api/v1/drives/{name}/commands",
+            get(operating::commands_of).post(operating::command),
+        )
+        .route("/api/v1/drives/{name}/heartbeat", post(operating::heartbeat))
+        .fallback(unknown)
+        .with_state(app.clone())
+        .layer(middleware::from_fn_with_state(app, guard))
+}
+
+/// Refuses requests that are meant for another host or lack a token, and all methods that could change something, commands
+/// apart; sets the common headers of all replies.
+async fn guard(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    request: Request,
+    next: Next,
+) -> Response {
+    let coverage = request.extensions().get::<Client>().map(|client| client.coverage);
+    let (method, path) = (request.method(), request.uri().path());
+    let is_on = app.operating.is_on();
+    // A command of somebody who may give it is served on the last connection too.
+    let is_urgent = ["/healthz", "/readyz"].contains(&path) || (is_on && operating::is_command(method, path));
+    let access = reached.access.check(request.uri(), request.headers(), reached.address);
+    let refusal = match access {
+        Ok(()) => None,
+        Err(error) => refused(&app, &reached, error, request.uri().clone(), request.headers().clone()).await,
+    };
+    let mut response = if let Some(refusal) = refusal {
+        refusal
+    } else if coverage == Some(Coverage::Health) && !is_urgent {
+        let text = "too many connections are open; close some and try again\n";
+        (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "5")], text).into_response()
+    } else if is_on && operating::may_change(method, path) {
+        next.run(request).await
+    } else if !matches!(*method, Method::GET | Method::HEAD) {
+        let text = match is_on {
+            true => "this is read only: use GET or HEAD\n",
+            false => "this interface is read only: use GET or HEAD\n",
+        };
+        let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
+        (StatusCode::METHOD_NOT_ALLOWED, allow, text).into_response()
+    } else if !is_on && operating::is_operating(path) {
+        unknown(request.uri().clone()).await
+    } else {
+        next.run(request).await
+    };
+    const SET: [(HeaderName, &str); 3] = [
+        (header::CACHE_CONTROL, "no-store"),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+    ];
+    for (name, value) in SET {
+        response.headers_mut().insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+/// The reply to a request that is not answered because of its host or its token; `None` if it is answered all the same.
+async fn refused(
+    app: &AppState,
+    reached: &Reached,
+    refusal: AccessError,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Option<Response> {
+    let path = uri.path();
+    if refusal.is_for_want_of_a_token() && app.operating.is_on() && path != "/metrics" {
+        // Users read as bearers of tokens do, and have to get as far as the login.
+        if operating::is_operating(path) || path.starts_with("/assets/") {
+            return None;
+        }
+        let cookies = app.cookies(reached);
+        if app
+            .operating
+            .operator(&headers, &cookies, reached.peer.ip())
+            .await
+            .is_ok()
+        {
+            return None;
+        }
+        if path == "/" {
+            return Some(document(page::render_login(&app.plant.load())));
+        }
+    }
+    if let Some(suppressed) = reached.refusals.permit(Instant::now()) {
+        let peer = reached.peer;
+        tracing::warn!(target: "drivegate::http", %peer, suppressed, "HTTP: request refused: {refusal}");
+    }
+    Some(refusal.into_response())
+}
+
+async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
+    let _turn = app.turn().await;
+    document(page::render(&app.plant.load(), app.operating.is_on(), Instant::now()))
+}
+
+fn document(html: String) -> Response {
+    let policy = [(header::CONTENT_SECURITY_POLICY, page::SECURITY_POLICY)];
+    (policy, Html(html)).into_response()
+}
+
+async fn asset(Path(name): Path<String>, uri: Uri) -> Response {
+    match page::ASSETS.iter().find(|asset| asset.name == name) {
+        Some(asset) => ([(header::CONTENT_TYPE, asset.content_type)], asset.body).into_response(),
+        None => unknown(uri).await,
+    }
+}
+
+async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
+    let _turn = app.turn().await;
+    let accept: Vec<&str> = headers
+        .get_all(header::ACCEPT)
+        .iter()
+        .filter_map(|value| value.to_str().ok())
+        .collect();
+    let (format, content_type) = metrics::Format::accepted(&accept.join(","));
+    match metrics::encode(&app.plant.load(), &app.stats, Instant::now(), format) {
+        Ok(text) => {
+            let headers = [(header::CONTENT_TYPE, content_type), (header::VARY, "accept")];
+            (headers, text).into_response()
+        }
+        Err(error) => {
+            tracing::error!(target: "drivegate::http", "cannot encode the metrics: {error}; report this");
+            StatusCode::INTERNAL_SERVER_ERROR.into_response()
+        }
+    }
+}
+
+async fn ready(State(app): State<Arc<AppState>>) -> Response {
+    let reasons = readiness::reasons(&app.plant.load(), &app.stats);
+    if reasons.is_empty() {
+        return "ready\n".into_response();
+    }
+    let mut text = "not ready\n".to_string();
+    for reason in reasons {
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "{reason}");
+    }
+    (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
+}
+
+/// All drives; with `points=` only these points of each.
+async fn drives(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+    let shown = query::names(query.as_deref(), "points");
+    let _turn = app.turn().await;
+    let plant = app.plant.load();
+    let clock = api::Clock::new(Instant::now(), SystemTime::now());
+    let all: Vec<_> = plant.drives().collect();
+    let all: Vec<_> = all
+        .iter()
+        .map(|drive| api::Drive::new(drive, &plant.history, clock).only(shown.as_ref()))
+        .collect();
+    Json(all).into_response()
+}
+
+async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
+    let plant = app.plant.load();
+    match plant.drive(&name) {
+        Some(drive) => {
+            let clock = api::Clock::new(Instant::now(), SystemTime::now());
+            Json(api::Drive::new(&drive, &plant.history, clock)).into_response()
+        }
+        None => no_drive(&plant, &name),
+    }
+}
+
+/// The last reading of the parameters of a drive, and the one that goes on.
+async fn params(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
+    let plant = app.plant.load_full();
+    let Some(machine) = plant.drive(&name).map(|drive| drive.machine()) else {
+        return no_drive(&plant, &name);
+    };
+    let status = plant.parameters.status(&machine);
+    let last = match plant.parameters.last(&machine) {
+        Some(file) => Some(file),
+        None => match stored_params(&app, &plant, &name).await {
+            Ok(file) => file.map(Arc::new),
+            Err(response) => return response,
+        },
+    };
+    let restore = plant.parameters.restore(&machine);
+    Json(Parameters::new(
+        &name,
+        last.as_deref(),
+        status.as_ref(),
+        restore.as_ref(),
+    ))
+    .into_response()
+}
+
+/// The last reading on disk.
+async fn stored_params(app: &AppState, plant: &Plant, name: &str) -> Result<Option<ParameterFile>, Response> {
+    let Some(store) = plant.parameters.store() else {
+        return Ok(None);
+    };
+    let unavailable = || StatusCode::SERVICE_UNAVAILABLE.into_response();
+    let _permit = app.files.acquire().await.map_err(|_| unavailable())?;
+    let name = name.to_string();
+    let read = tokio::task::spawn_blocking(move || store.latest(&name)).await;
+    read.map_err(|_| unavailable())?.map_err(|error| {
+        let known = Vec::new();
+        (
+            StatusCode::INTERNAL_SERVER_ERROR,
+            Json(api::ErrorReply { error, known }),
+        )
+            .into_response()
+    })
+}
+
+async fn buses(State(app): State<Arc<AppState>>) -> Response {
+    let plant = app.plant.load();
+    let all: Vec<_> = plant.buses.iter().map(api::Bus::new).collect();
+    Json(all).into_response()
+}
+
+/// What is wrong with the line of a bus.
+async fn diagnosis(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
+    let plant = app.plant.load();
+    match plant.buses.iter().find(|bus| bus.image.spec.name == name) {
+        Some(bus) => Json(api::Diagnosis::new(&name, &bus.image.diagnosis.load())).into_response(),
+        None => {
+            let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
+            not_found(format!("there is no bus `{name}`"), known.collect())
+        }
+    }
+}
+
+/// The last commands, newest last; with `drive` those to one drive.
+async fn audit(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+    let [drive] = match query::parameters(query.as_deref(), &["drive"]) {
+        Ok(wanted) => wanted,
+        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
+    };
+    let plant = app.plant.load();
+    if let Some(drive) = drive.as_ref().filter(|drive| plant.drive(drive).is_none()) {
+        return no_drive(&plant, drive);
+    }
+    let _turn = app.turn().await;
+    let records = plant.writes.audit().recent(drive.as_deref());
+    let list = format!("[{}]", records.join(","));
+    ([(header::CONTENT_TYPE, "application/json")], list).into_response()
+}
+
+async fn unknown(uri: Uri) -> Response {
+    if uri.path().starts_with("/api/") {
+        return not_found(format!("there is nothing at {}", uri.path()), Vec::new());
+    }
+    let text = "there is nothing here; the status page is at /\n";
+    (StatusCode::NOT_FOUND, text).into_response()
+}
+
+/// The reply where there is no such drive.
+pub(super) fn no_drive(plant: &Plant, name: &str) -> Response {
+    let known = plant.drives().map(|drive| drive.image.spec.name.clone());
+    not_found(format!("there is no drive `{name}`"), known.collect())
+}
+
+/// A 404 reply that lists the known names.
+pub(super) fn not_found(error: String, known: Vec<String>) -> response::Response {
+    (StatusCode::NOT_FOUND, Json(api::ErrorReply { error, known })).into_response()
+}

@@ -1,0 +1,85 @@
+//! The north sides: Modbus TCP, MQTT, HTTP, the local socket and the tool slots. They read the process image and queue commands; they never
+//! name the bus.
+
+mod arrivals;
+mod certificate;
+mod command_json;
+mod connection_limit;
+pub mod http;
+mod identity;
+mod listener;
+pub mod local;
+mod log_throttle;
+pub mod metrics;
+pub mod modbus_tcp;
+pub mod mqtt;
+pub mod parameter_jobs;
+mod pem;
+mod readiness;
+mod refusals;
+pub mod register_map;
+pub mod slot;
+mod stats;
+
+use drivegate_core::command;
+use drivegate_core::diagnosis;
+use drivegate_core::event;
+use drivegate_core::files;
+use drivegate_core::history;
+use drivegate_core::parameters;
+use drivegate_core::plant;
+use drivegate_core::process_image;
+use drivegate_core::version;
+use drivegate_line as line;
+use drivegate_model::document;
+use drivegate_model::drive;
+use drivegate_proto as codec;
+
+use std::io;
+use std::net::SocketAddr;
+
+pub use identity::client_tls;
+pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
+pub use listener::ListenerStates;
+pub use stats::{
+    ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats, ServerKind,
+    SlotOutcome, SlotStats,
+};
+
+/// Why a server cannot start.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// An address cannot be listened on.
+    #[error("cannot listen for {protocol} on {address}: {cause}; {} in `listen` of {section}", remedy(.cause))]
+    Listen {
+        /// `Modbus TCP` or `HTTP`.
+        protocol: &'static str,
+        /// The address.
+        address: SocketAddr,
+        /// Section of the configuration, in brackets.
+        section: String,
+        /// What the system reports.
+        cause: io::Error,
+    },
+    /// The system does not provide a thread.
+    #[error("cannot start the Modbus TCP thread: {0}; free memory, threads or file descriptors")]
+    Thread(io::Error),
+    /// The local socket cannot be opened.
+    #[error("{0}")]
+    Local(io::Error),
+    /// The certificates of a server, named first, cannot be used.
+    #[error("TLS of {0}: {1}")]
+    Tls(&'static str, IdentityFault),
+}
+
+fn remedy(cause: &io::Error) -> &'static str {
+    match cause.kind() {
+        io::ErrorKind::AddrInUse => "another program uses it; stop that program or choose another port",
+        io::ErrorKind::PermissionDenied => {
+            "ports below 1024 require CAP_NET_BIND_SERVICE: set CapabilityBoundingSet and AmbientCapabilities of the unit to it \
+             (systemctl edit drivegate), or choose another port"
+        }
+        io::ErrorKind::AddrNotAvailable => "this machine does not have that address; choose one that it has",
+        _ => "choose another address",
+    }
+}

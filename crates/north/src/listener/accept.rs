@@ -1,0 +1,153 @@
+//! Accepts the connections to one socket, whatever errors the system reports, and binds it again when it is lost.
+
+use std::future::Future;
+use std::io;
+use std::net::SocketAddr;
+use std::os::fd::AsFd;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use rustix::io::Errno;
+use rustix::net::{Shutdown, shutdown};
+use tokio::net::{TcpListener, TcpStream};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use super::ConnectionHandler;
+use super::state::ListenerState;
+use crate::ServerKind;
+use crate::log_throttle::LogThrottle;
+
+/// Pause after an accept error of the machine: the usual one, too many open files, does not go away at once.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// First and longest pause before a lost socket is bound again.
+const REBIND: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
+
+/// Frees the address of a socket that is about to be closed, also while a copy of the socket is open: a process that
+/// was forked has one until it executes its program.
+pub(super) fn stop_listening(socket: &impl AsFd) {
+    // It fails for a socket that is lost, which listens no longer.
+    let _ = shutdown(socket, Shutdown::Both);
+}
+
+/// Accepts the connections to one socket.
+pub(super) struct AcceptLoop<H> {
+    pub(super) server: ServerKind,
+    pub(super) address: SocketAddr,
+    pub(super) handler: Arc<H>,
+    pub(super) state: ListenerState,
+    /// Where the connections run.
+    pub(super) tasks: TaskTracker,
+    pub(super) stop: CancellationToken,
+}
+
+impl<H: ConnectionHandler> AcceptLoop<H> {
+    /// Accepts until stopped, whatever errors the system reports. A socket that is lost, or missing at first, is bound
+    /// again with back-off; meanwhile the gateway is not ready.
+    pub(super) async fn run<A: Accept>(self, mut socket: Option<A>, bind: impl Fn() -> io::Result<A> + Send) {
+        let accept = async {
+            loop {
+                let open = match socket.take() {
+                    Some(socket) => socket,
+                    None => self.rebind(&bind).await,
+                };
+                let why = self.accept(open).await;
+                let (server, address) = (self.server, self.address);
+                tracing::error!(%address, "{}: the listener is lost: {why}; binding it again", server.title());
+                self.state.set(Some(why.to_string()));
+            }
+        };
+        self.stop.run_until_cancelled(accept).await;
+    }
+
+    async fn rebind<A>(&self, bind: &impl Fn() -> io::Result<A>) -> A {
+        let (server, address) = (self.server, self.address);
+        let (mut pause, longest) = REBIND;
+        loop {
+            match bind() {
+                Ok(socket) => {
+                    tracing::info!(%address, "{}: listening now", server.title());
+                    self.state.set(None);
+                    return socket;
+                }
+                Err(why) => self.state.set(Some(why.to_string())),
+            }
+            tokio::time::sleep(pause).await;
+            pause = (2 * pause).min(longest);
+        }
+    }
+
+    /// Accepts until the socket is lost; why.
+    async fn accept(&self, mut socket: impl Accept) -> io::Error {
+        let log = LogThrottle::default();
+        loop {
+            match socket.accept().await {
+                Ok((stream, peer)) => {
+                    self.admit(stream, peer);
+                    // Connections that yielded to this one close before the next comes.
+                    tokio::task::yield_now().await;
+                }
+                Err(error) if concerns_one_client(&error) => {}
+                Err(error) if is_lost(&error) => return error,
+                Err(error) => {
+                    if let Some(suppressed) = log.permit(Instant::now()) {
+                        let server = self.server.title();
+                        tracing::warn!(suppressed, "{server}: cannot accept a connection: {error}; retrying");
+                    }
+                    tokio::time::sleep(ACCEPT_PAUSE).await;
+                }
+            }
+        }
+    }
+
+    fn admit(&self, stream: TcpStream, peer: SocketAddr) {
+        // A listener on [::] sees IPv4 clients as ::ffff:a.b.c.d.
+        let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
+        if let Some(permit) = self.handler.admit(peer.ip()) {
+            self.tasks.spawn(self.handler.clone().serve(stream, peer, permit));
+        }
+    }
+}
+
+/// A socket that accepts connections.
+pub(super) trait Accept: Send {
+    /// The next connection; cancel safe.
+    fn accept(&mut self) -> impl Future<Output = io::Result<(TcpStream, SocketAddr)>> + Send;
+}
+
+/// Listens until it is dropped.
+pub(super) struct ListeningSocket(TcpListener);
+
+impl ListeningSocket {
+    pub(super) fn new(socket: std::net::TcpListener) -> io::Result<ListeningSocket> {
+        TcpListener::from_std(socket).map(ListeningSocket)
+    }
+}
+
+impl Drop for ListeningSocket {
+    fn drop(&mut self) {
+        stop_listening(&self.0);
+    }
+}
+
+impl Accept for ListeningSocket {
+    fn accept(&mut self) -> impl Future<Output = io::Result<(TcpStream, SocketAddr)>> + Send {
+        self.0.accept()
+    }
+}
+
+/// Errors of a connection that ended before it was accepted (accept(2)).
+fn concerns_one_client(error: &io::Error) -> bool {
+    matches!(
+        error.kind(),
+        io::ErrorKind::ConnectionAborted | io::ErrorKind::ConnectionReset | io::ErrorKind::Interrupted
+    )
+}
+
+/// Errors of a socket that does not listen any more (accept(2)).
+fn is_lost(error: &io::Error) -> bool {
+    let lost = [Errno::INVAL, Errno::BADF, Errno::NOTSOCK, Errno::OPNOTSUPP];
+    error
+        .raw_os_error()
+        .is_some_and(|code| lost.iter().any(|lost| lost.raw_os_error() == code))
+}

@@ -1,0 +1,72 @@
+//! Who a client is and what it may do.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use crate::command::{Origin, SourceKind};
+use crate::connection_limit::Rights;
+
+/// A connected client.
+#[derive(Debug, Clone)]
+pub(super) struct Client {
+    pub(super) rights: Rights,
+    /// Its name in the audit: its address, after the name in its certificate if it has one.
+    pub(super) who: String,
+    /// The same without the port: all connections of a client share it.
+    client: Arc<str>,
+}
+
+impl Client {
+    /// The client at `peer`, with the `name` in its certificate if it has one.
+    pub(super) fn new(peer: SocketAddr, name: Option<&str>, rights: impl Into<Rights>) -> Client {
+        let (kind, ip) = (SourceKind::ModbusTcp.name(), peer.ip());
+        let (who, client) = match name {
+            Some(name) => (format!("{name} at {peer}"), format!("{kind} {name} at {ip}")),
+            None => (peer.to_string(), format!("{kind} {ip}")),
+        };
+        Client {
+            rights: rights.into(),
+            who,
+            client: client.into(),
+        }
+    }
+
+    /// The origin of its commands.
+    pub(super) fn origin(&self) -> Origin {
+        Origin::of(self.client.clone(), SourceKind::ModbusTcp, self.who.as_str())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::command::Authority;
+
+    #[test]
+    fn the_connections_of_a_client_share_its_name() {
+        let client = |peer: &str, name: Option<&str>| {
+            let client = Client::new(peer.parse().unwrap(), name, Authority::ReadOnly);
+            client.origin().client().to_string()
+        };
+        assert_eq!(client("127.0.0.1:4711", None), client("127.0.0.1:4712", None));
+        assert_ne!(client("127.0.0.1:4711", None), client("127.0.0.2:4711", None));
+        assert_eq!(client("[::1]:5", None), "modbus_tcp ::1");
+        let op = Some("op");
+        assert_eq!(client("127.0.0.1:4711", op), client("127.0.0.1:4712", op));
+        assert_ne!(
+            client("127.0.0.1:4711", op),
+            client("127.0.0.2:4711", op),
+            "one certificate at two addresses"
+        );
+        assert_ne!(
+            client("127.0.0.1:4711", op),
+            client("127.0.0.1:4711", Some("vi")),
+            "two certificates at one address"
+        );
+        assert_ne!(client("127.0.0.1:4711", op), client("127.0.0.1:4711", None));
+        let who = Client::new("127.0.0.1:4711".parse().unwrap(), op, Authority::Write)
+            .origin()
+            .who;
+        assert_eq!(who, "op at 127.0.0.1:4711", "the audit names the connection");
+    }
+}

@@ -1,0 +1,371 @@
+//! Modbus TCP server: listeners and connections. What requests mean is decided in `session`; the public register map is
+//! in [`super::register_map`].
+//!
+//! Requests may be pipelined. Answers from the process image are sent in one write. A request that needs the bus does
+//! not delay the ones behind it, so replies can overtake one another; each has its transaction id.
+
+mod admission;
+mod client;
+mod command_words;
+mod connection;
+mod crl;
+mod dialogue;
+mod forwarded_request;
+pub(crate) mod frame;
+pub(crate) mod identify;
+mod offline;
+mod open_clients;
+mod routes;
+mod session;
+mod tls;
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use arc_swap::ArcSwap;
+use ipnet::IpNet;
+use tokio::runtime::{Builder, Handle};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use self::admission::{Admission, Policy, WriteAccess};
+use self::command_words::CommandWords;
+use self::routes::PlantView;
+use self::tls::{Requirements, TlsAuthenticator};
+use crate::connection_limit::{ConnectionLimit, Limits};
+use crate::listener::{ListenerSpec, Listeners, NewSockets};
+use crate::plant::SharedPlant;
+use crate::refusals::Refusals;
+use crate::{NorthStats, ServerError, ServerKind, certificate};
+
+pub use self::offline::Offline;
+pub use self::tls::{Identity, Role, Tls};
+
+/// The role in a client certificate in DER, for the fuzzer; `None` if it is no certificate, an error if the role is not
+/// accepted.
+pub fn certificate_role(der: &[u8]) -> Option<Result<Option<String>, String>> {
+    let certificate = certificate::read(der).ok()?;
+    Some(certificate.role.map_err(|why| why.to_string()))
+}
+
+/// Section of the TLS listener.
+const TLS_SECTION: &str = "[modbus_tcp.tls]";
+/// Maximum number of TLS handshakes at one time, and how many of them one address may have. A handshake that takes long
+/// yields to a newer one, so silent connections hold nobody up.
+const HANDSHAKES: Limits = Limits {
+    total: 64,
+    reserved: 0,
+    per_address: 16,
+};
+
+/// Configuration of the Modbus TCP server.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Listeners without TLS, with the rights of their clients.
+    pub listeners: Vec<Listener>,
+    /// The TLS listener.
+    pub tls: Option<Tls>,
+    /// Maximum number of open connections to all listeners.
+    pub max_connections: usize,
+    /// Maximum number of open connections from one address.
+    pub max_connections_per_address: usize,
+    /// Time without a request after which a connection is closed; `None` never closes it.
+    pub idle_timeout: Option<Duration>,
+    /// How raw reads outside the poll plan are handled.
+    pub uncached: Uncached,
+}
+
+impl Options {
+    /// Files that the connections can have open at one time, with those that are being closed.
+    pub fn files(&self) -> usize {
+        let handshakes = if self.tls.is_some() {
+            self.handshakes().files()
+        } else {
+            0
+        };
+        self.limits().files() + handshakes
+    }
+
+    fn handshakes(&self) -> Limits {
+        Limits {
+            total: HANDSHAKES.total.min(self.max_connections.max(8)),
+            ..HANDSHAKES
+        }
+    }
+
+    /// Connections, with some kept for those who may write if there are any.
+    fn limits(&self) -> Limits {
+        let limits = Limits::new(self.max_connections, self.max_connections_per_address);
+        let by_address = self.listeners.iter().any(|listener| !listener.write.is_empty());
+        let by_role = self
+            .tls
+            .iter()
+            .flat_map(|tls| tls.roles.values())
+            .any(|role| *role == Role::Control);
+        if by_address || by_role {
+            limits.with_reserve()
+        } else {
+            limits
+        }
+    }
+
+    fn listener_specs(&self) -> Vec<ListenerSpec> {
+        let spec = |address: &SocketAddr, tls, section: &str| ListenerSpec {
+            address: *address,
+            tls,
+            section: section.to_string(),
+        };
+        let plain = self.listeners.iter();
+        let plain = plain.flat_map(|l| l.listen.iter().map(move |address| spec(address, false, &l.section)));
+        let tls = self.tls.iter().flat_map(|tls| &tls.listen);
+        plain
+            .chain(tls.map(|address| spec(address, true, TLS_SECTION)))
+            .collect()
+    }
+}
+
+/// A listener without TLS.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Listener {
+    /// Section of the configuration, for messages: `[modbus_tcp]`.
+    pub section: String,
+    /// Addresses to listen on.
+    pub listen: Vec<SocketAddr>,
+    /// Networks that may connect.
+    pub allow: Vec<IpNet>,
+    /// Networks that may write.
+    pub write: Vec<IpNet>,
+    /// Names of the visible buses; `None` for all.
+    pub buses: Option<Vec<String>>,
+}
+
+/// How raw reads outside the poll plan are handled.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Uncached {
+    /// They are forwarded to the drive.
+    #[default]
+    Forward,
+    /// They are refused with exception 02.
+    Refuse,
+}
+
+/// A running server.
+#[derive(Debug)]
+pub struct Server {
+    listeners: Listeners<Admission>,
+    authenticator: Option<Arc<TlsAuthenticator>>,
+    state: Arc<ServerState>,
+    plant: SharedPlant,
+    /// Where clients without TLS are served.
+    own: Handle,
+    /// Listeners opened so far.
+    opened: usize,
+    tasks: TaskTracker,
+}
+
+/// What [`Server::commit`] needs to apply new options: all that can fail is done.
+#[derive(Debug)]
+pub struct Change {
+    options: Options,
+    sockets: NewSockets,
+    /// For the clients of the TLS listener, if it is new or its certificates, revocations or roles have changed.
+    requirements: Option<Requirements>,
+}
+
+impl Server {
+    /// The addresses without TLS, with the port that the system chose if port 0 was configured.
+    pub fn addresses(&self) -> Vec<SocketAddr> {
+        self.listeners.addresses(false)
+    }
+
+    /// The addresses with TLS.
+    pub fn tls_addresses(&self) -> Vec<SocketAddr> {
+        self.listeners.addresses(true)
+    }
+
+    /// Prepares other options: binds new addresses and checks new certificates. Nothing changes for any client.
+    ///
+    /// # Errors
+    /// An address cannot be bound, or the certificates cannot be used; everything is as before.
+    pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+        let before = self.state.options.load_full();
+        let requirements = match (&options.tls, &before.tls) {
+            (Some(tls), Some(before)) if self.authenticator.is_some() && tls.admits_like(before) => None,
+            (Some(tls), _) => {
+                let requirements = Requirements::new(tls);
+                Some(requirements.map_err(|fault| ServerError::Tls(ServerKind::ModbusTcp.title(), fault))?)
+            }
+            (None, _) => None,
+        };
+        Ok(Change {
+            requirements,
+            sockets: self.listeners.prepare(options.listener_specs()).await?,
+            options,
+        })
+    }
+
+    /// Forgets prepared options.
+    pub fn abort(&mut self, change: Change) {
+        self.listeners.abort(change.sockets);
+    }
+
+    /// Applies prepared options. Listeners that stay keep their connections, as far as the options allow them; their
+    /// rights are those of the new options from then on. TLS clients whose certificate is not admitted with the same
+    /// rights are disconnected.
+    pub fn commit(&mut self, change: Change) {
+        let Change {
+            options,
+            sockets,
+            requirements,
+        } = change;
+        match (&self.authenticator, requirements) {
+            (_, None) if options.tls.is_none() => self.authenticator = None,
+            (_, None) => {}
+            (Some(authenticator), Some(requirements)) => {
+                authenticator.renew(requirements);
+                tracing::info!("Modbus TCP: using the new certificates, revocations and roles");
+            }
+            (None, Some(requirements)) => self.authenticator = Some(Arc::new(TlsAuthenticator::new(requirements))),
+        }
+        let options = Arc::new(options);
+        self.state.connections.set_limits(options.limits());
+        self.state.handshakes.set_limits(options.handshakes());
+        self.state.options.store(options.clone());
+        let (plant, state, own, tls) = (&self.plant, &self.state, &self.own, &self.authenticator);
+        let mut plain = options.listeners.iter().flat_map(|l| l.listen.iter().map(move |_| l));
+        let opened = &mut self.opened;
+        self.listeners.commit(sockets, |spec, open, cancel| {
+            let (policy, buses) = match (spec.tls, tls, &options.tls) {
+                (true, Some(authenticator), Some(tls)) => (
+                    Policy {
+                        allow: tls.allow.clone(),
+                        write: WriteAccess::ByCertificate(authenticator.clone()),
+                    },
+                    tls.buses.clone(),
+                ),
+                // The plain listeners are first and in the same order.
+                _ => plain.next().map_or_else(Policy::nobody, |l| {
+                    let write = WriteAccess::ByAddress(l.write.clone());
+                    let allow = l.allow.clone();
+                    (Policy { allow, write }, l.buses.clone())
+                }),
+            };
+            let runtime = if spec.tls { Handle::current() } else { own.clone() };
+            let admission = match open {
+                Some(admission) => {
+                    admission.update(policy, buses);
+                    admission.clone()
+                }
+                None => {
+                    *opened += 1;
+                    let view = PlantView::new(plant.clone(), buses);
+                    Arc::new(Admission::new(*opened, policy, view, state.clone(), cancel.clone()))
+                }
+            };
+            (admission, runtime)
+        });
+    }
+
+    /// Closes all listeners and their connections; requests that wait for the bus are answered.
+    pub async fn retire(&mut self) {
+        self.listeners.close().await;
+    }
+
+    /// Whether no connection is left after [`Server::retire`].
+    pub fn is_drained(&self) -> bool {
+        self.tasks.len() <= 1
+    }
+
+    /// Waits until all listeners and connections have ended, after the cancellation.
+    pub async fn stopped(&self) {
+        self.tasks.wait().await;
+    }
+}
+
+/// What all connections share.
+#[derive(Debug)]
+struct ServerState {
+    options: ArcSwap<Options>,
+    stats: Arc<NorthStats>,
+    command_words: CommandWords,
+    connections: Arc<ConnectionLimit>,
+    /// TLS connections before they are admitted.
+    handshakes: Arc<ConnectionLimit>,
+    refusals: Refusals,
+    /// Cancelled when the server ends: its clients are not waited for any longer.
+    stopping: CancellationToken,
+}
+
+impl ServerState {
+    fn new(options: Options, stats: Arc<NorthStats>, stopping: CancellationToken) -> ServerState {
+        ServerState {
+            stopping,
+            connections: ConnectionLimit::new(options.limits()),
+            handshakes: ConnectionLimit::new(options.handshakes()),
+            refusals: Refusals::new(ServerKind::ModbusTcp, stats.clone()),
+            options: ArcSwap::from_pointee(options),
+            stats,
+            command_words: CommandWords::default(),
+        }
+    }
+}
+
+/// Opens the listeners and serves until `cancel`; then pending requests have half a second to be answered.
+///
+/// # Errors
+/// An address cannot be bound, the certificates cannot be used, or there is no thread. No socket stays open then.
+pub async fn start(
+    options: Options,
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    cancel: CancellationToken,
+) -> Result<Server, ServerError> {
+    let (tasks, cancel) = (TaskTracker::new(), cancel.child_token());
+    // The tasks, and with them the thread, end with the token.
+    tasks.spawn(cancel.clone().cancelled_owned());
+    tasks.close();
+    let own = start_thread(&tasks)?;
+    let mut server = Server {
+        listeners: Listeners::new(ServerKind::ModbusTcp, stats.clone(), tasks.clone(), cancel.clone()),
+        authenticator: None,
+        state: Arc::new(ServerState::new(options.clone(), stats, cancel.clone())),
+        plant,
+        own,
+        opened: 0,
+        tasks,
+    };
+    match server.prepare(options).await {
+        Ok(change) => {
+            server.commit(change);
+            Ok(server)
+        }
+        Err(error) => {
+            cancel.cancel();
+            Err(error)
+        }
+    }
+}
+
+/// Starts a thread that only serves clients without TLS, until all `tasks` have ended. Metrics and TLS handshakes,
+/// which take a millisecond of computing, do not delay these clients; and a single thread serves more of them than
+/// several that hand work to each other: a fifth more on two processors with 16 clients (`benches/modbus_tcp`).
+fn start_thread(tasks: &TaskTracker) -> Result<Handle, ServerError> {
+    let (sender, receiver) = std::sync::mpsc::sync_channel(1);
+    let tasks = tasks.clone();
+    let serve = move || match Builder::new_current_thread().enable_all().build() {
+        Ok(runtime) => {
+            let _ = sender.send(Ok(runtime.handle().clone()));
+            runtime.block_on(tasks.wait());
+        }
+        Err(error) => {
+            let _ = sender.send(Err(error));
+        }
+    };
+    let thread = std::thread::Builder::new().name("modbus-tcp".to_string());
+    let runtime = thread
+        .spawn(serve)
+        .and_then(|_| receiver.recv().map_err(io::Error::other)?);
+    runtime.map_err(ServerError::Thread)
+}

@@ -1,0 +1,419 @@
+//! Decides what the requests of one client mean and how they are answered.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use futures_util::FutureExt;
+
+use super::client::Client;
+use super::forwarded_request::{AnsweredRequest, BusWork, ForwardedRequest, PendingRequest, Progress, read_parts};
+use super::frame::{self, Frame, Header};
+use super::identify::Identity;
+use super::routes::{PlantView, Routes};
+use super::{ServerState, Uncached};
+use crate::ModbusTcpStats;
+use crate::codec::modbus::encode_exception;
+use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::command::{Authority, Order, Outcome};
+use crate::drive::{Profile, State};
+use crate::log_throttle::LogThrottle;
+use crate::plant::{BusHandle, DriveHandle};
+use crate::process_image::{Access, Unavailable};
+use crate::register_map::{self, BusFigures, BusState, CommandWrite, DriveView, FIRST, GATEWAY_UNIT};
+
+/// Function codes that write.
+const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
+/// Function codes that every drive supports, through the blocks from 0x8000 on and the device identification.
+const OWN_FUNCTIONS: [u8; 5] = [3, 4, 6, 16, 43];
+
+/// How a request is handled.
+enum Decision {
+    /// Answered at once.
+    Reply(RequestPdu, Reply),
+    /// Refused at once.
+    Exception(Exception),
+    /// Forwarded to the drive, or refused on the way.
+    Drive(ForwardedRequest, BusWork),
+}
+
+impl From<Exception> for Decision {
+    fn from(exception: Exception) -> Decision {
+        Decision::Exception(exception)
+    }
+}
+
+/// One connected client.
+#[derive(Debug)]
+pub(super) struct ClientSession {
+    state: Arc<ServerState>,
+    view: Arc<PlantView>,
+    client: Client,
+    routes: Arc<Routes>,
+    foreign_codes: LogThrottle,
+}
+
+impl Drop for ClientSession {
+    fn drop(&mut self) {
+        self.stats().disconnected();
+    }
+}
+
+impl ClientSession {
+    /// Counts the client as connected until the session is dropped.
+    pub(super) fn new(state: Arc<ServerState>, view: Arc<PlantView>, client: Client) -> ClientSession {
+        state.stats.modbus_tcp.connected();
+        let routes = view.routes();
+        ClientSession {
+            state,
+            view,
+            client,
+            routes,
+            foreign_codes: LogThrottle::default(),
+        }
+    }
+
+    /// A session for another client of the same server.
+    pub(super) fn beside(&self, client: Client) -> ClientSession {
+        ClientSession::new(self.state.clone(), self.view.clone(), client)
+    }
+
+    /// Name of the client for the log.
+    pub(super) fn who(&self) -> &str {
+        &self.client.who
+    }
+
+    fn stats(&self) -> &ModbusTcpStats {
+        &self.state.stats.modbus_tcp
+    }
+
+    /// Uses the current plant, which a reload may have replaced.
+    pub(super) fn refresh(&mut self) {
+        if !self.view.is_current(&self.routes) {
+            self.routes = self.view.routes();
+        }
+    }
+
+    /// Answers a request whose first byte came at `asked` into `out`, or returns the pending request. Its command is in the queue when this returns, so
+    /// commands reach the bus in the order of their frames.
+    pub(super) fn take(
+        &mut self,
+        frame: &Frame<'_>,
+        asked: Instant,
+        now: Instant,
+        out: &mut Vec<u8>,
+    ) -> Option<PendingRequest> {
+        match self.decide(frame, now) {
+            Decision::Reply(request, reply) => self.put(frame.header, &request, &reply, out),
+            Decision::Exception(code) if code > Exception::GATEWAY_TARGET => {
+                let drive = self.routes.drive(frame.header.unit);
+                let name = drive.map_or_else(String::new, |d| d.image.spec.name.clone());
+                self.log_foreign_code(&name, code, now);
+                self.put_exception(frame.header, frame.function, Exception::DEVICE_FAILURE, out);
+            }
+            Decision::Exception(code) => self.put_exception(frame.header, frame.function, code, out),
+            Decision::Drive(forwarded, work) => {
+                let step = forwarded.send(work, &self.client, asked, now);
+                return self.follow(step, now, out);
+            }
+        }
+        None
+    }
+
+    /// Appends the answer to a request that the bus has answered, or returns it if it waits for its next part, whose
+    /// command is in the queue when this returns.
+    pub(super) fn finish(
+        &mut self,
+        answered: AnsweredRequest,
+        now: Instant,
+        out: &mut Vec<u8>,
+    ) -> Option<PendingRequest> {
+        let step = answered.go_on(&self.client, now);
+        self.follow(step, now, out)
+    }
+
+    fn follow(&mut self, mut step: Progress, now: Instant, out: &mut Vec<u8>) -> Option<PendingRequest> {
+        loop {
+            match step {
+                Progress::Done(forwarded, outcome) => {
+                    self.answer(&forwarded, &outcome, now, out);
+                    return None;
+                }
+                Progress::Pending(mut waiting) => match (&mut waiting).now_or_never() {
+                    Some(answered) => step = answered.go_on(&self.client, now),
+                    None => return Some(waiting),
+                },
+            }
+        }
+    }
+
+    fn answer(&mut self, forwarded: &ForwardedRequest, outcome: &Outcome, now: Instant, out: &mut Vec<u8>) {
+        let ForwardedRequest { header, request, .. } = forwarded;
+        let drive = &forwarded.drive.image.spec.name;
+        if forwarded.resets && !outcome.is_ok() {
+            self.state
+                .command_words
+                .update(drive, |word| *word = word.map(register_map::without_reset));
+        }
+        if let Outcome::Exception(code) = outcome
+            && *code > Exception::GATEWAY_TARGET
+        {
+            self.log_foreign_code(drive, *code, now);
+        }
+        let exception = outcome.exception();
+        match (outcome, exception) {
+            (_, Some(code)) => self.put_exception(*header, request.function(), code, out),
+            (Outcome::Acknowledged(reply), None) if answers(request, reply) => self.put(*header, request, reply, out),
+            _ => self.put_exception(*header, request.function(), Exception::DEVICE_FAILURE, out),
+        }
+    }
+
+    fn put(&self, header: Header, request: &RequestPdu, reply: &Reply, out: &mut Vec<u8>) {
+        frame::encode(header, out, |out| reply.encode(request, out));
+        self.stats().answered(request.function(), 0);
+    }
+
+    fn put_exception(&self, header: Header, function: u8, code: Exception, out: &mut Vec<u8>) {
+        frame::encode(header, out, |out| encode_exception(function, code, out));
+        self.stats().answered(function, code.0);
+    }
+
+    /// Logs an exception code that only this drive uses; the client gets 04.
+    fn log_foreign_code(&self, drive: &str, code: Exception, now: Instant) {
+        if let Some(suppressed) = self.foreign_codes.permit(now) {
+            tracing::warn!(drive, client = %self.client.who, suppressed,
+                "Modbus TCP: the drive answered {code}; passed on as exception 04");
+        }
+    }
+
+    fn decide(&self, frame: &Frame<'_>, now: Instant) -> Decision {
+        if frame.header.unit == GATEWAY_UNIT {
+            return self.gateway(frame).unwrap_or_else(Decision::from);
+        }
+        let Some(drive) = self.routes.drive(frame.header.unit) else {
+            return Exception::GATEWAY_PATH.into();
+        };
+        let profile = &drive.image.spec.profile;
+        let decoded = RequestPdu::decode(frame.pdu);
+        // Authority is checked before anything else that could be wrong with the request.
+        if WRITES.contains(&frame.function) && !self.may_write(drive) {
+            return match decoded {
+                Ok(request) => forwarded(
+                    frame.header,
+                    drive,
+                    request.clone(),
+                    BusWork::Order(Order::Write(request)),
+                ),
+                Err(_) => Exception::FUNCTION.into(),
+            };
+        }
+        let has_function = has_function(profile, frame.function);
+        if !has_function && !OWN_FUNCTIONS.contains(&frame.function) {
+            return Exception::FUNCTION.into();
+        }
+        let request = match decoded {
+            Ok(request) => request,
+            Err(code) => return code.into(),
+        };
+        match request {
+            RequestPdu::Read { table, start, count } if !table.is_bits() && start >= FIRST => {
+                common(drive, request, start, count, now)
+            }
+            RequestPdu::WriteRegister { address, value } if address >= FIRST => {
+                self.command(frame.header, drive, request, address, &[value], now)
+            }
+            RequestPdu::WriteRegisters { start, ref values } if start >= FIRST => {
+                let values = values.clone();
+                self.command(frame.header, drive, request, start, &values, now)
+            }
+            RequestPdu::DeviceIdentification { code, object } => {
+                let identity = Identity {
+                    product: &profile.name,
+                    title: &profile.title,
+                    name: &drive.image.spec.name,
+                };
+                identity
+                    .reply(code, object)
+                    .map_or_else(Decision::from, |reply| Decision::Reply(request, reply))
+            }
+            RequestPdu::Read { .. } if has_function => self.raw_read(frame.header, drive, request, now),
+            _ if has_function => forwarded(
+                frame.header,
+                drive,
+                request.clone(),
+                BusWork::Order(Order::Write(request)),
+            ),
+            _ => Exception::FUNCTION.into(),
+        }
+    }
+
+    fn may_write(&self, drive: &DriveHandle) -> bool {
+        self.client.rights.authority() == Authority::Write && drive.image.spec.access == Access::Control
+    }
+
+    /// Unit 255: input registers, and the same as holding registers, since many clients read nothing else.
+    fn gateway(&self, frame: &Frame<'_>) -> Result<Decision, Exception> {
+        if WRITES.contains(&frame.function) {
+            return Err(Exception::FUNCTION);
+        }
+        let request = RequestPdu::decode(frame.pdu)?;
+        let plant = &self.routes.plant;
+        let reply = match request {
+            RequestPdu::Read { table, start, count } if !table.is_bits() => {
+                let bus = |place: usize| self.routes.bus(place).map(figures);
+                Reply::Registers(register_map::gateway(start, count, bus)?)
+            }
+            RequestPdu::DeviceIdentification { code, object } => {
+                let identity = Identity {
+                    product: "gateway",
+                    title: "drivegate",
+                    name: &plant.gateway,
+                };
+                identity.reply(code, object)?
+            }
+            _ => return Err(Exception::FUNCTION),
+        };
+        Ok(Decision::Reply(request, reply))
+    }
+
+    fn raw_read(&self, header: Header, drive: &DriveHandle, request: RequestPdu, now: Instant) -> Decision {
+        let RequestPdu::Read { table, start, count } = request else {
+            return Exception::FUNCTION.into();
+        };
+        let profile = &drive.image.spec.profile;
+        let beyond = !table.is_bits() && u32::from(start) + u32::from(count) > u32::from(FIRST);
+        if beyond {
+            return Exception::ADDRESS.into();
+        }
+        if !drive.bus_up() {
+            return Exception::GATEWAY_PATH.into();
+        }
+        let reading = drive.reading(now);
+        match reading.words(table, start, count) {
+            Ok(words) if table.is_bits() => {
+                Decision::Reply(request, Reply::Bits(words.iter().map(|w| *w != 0).collect()))
+            }
+            Ok(words) => Decision::Reply(request, Reply::Registers(words)),
+            Err(Unavailable::Refused(code)) => code.into(),
+            Err(Unavailable::Stale) => Exception::GATEWAY_TARGET.into(),
+            Err(Unavailable::NotPolled) if self.state.options.load().uncached == Uncached::Refuse => {
+                Exception::ADDRESS.into()
+            }
+            Err(Unavailable::NotPolled) => {
+                match read_parts(drive.bus.image.spec.protocol, &reading, table, start, count) {
+                    Err(code) => code.into(),
+                    Ok(Some(read_parts)) => forwarded(header, drive, request, BusWork::Parts(read_parts)),
+                    Ok(None) if count > read_limit(profile, table, start, count) => Exception::VALUE.into(),
+                    Ok(None) => forwarded(header, drive, request.clone(), BusWork::Order(Order::Read(request))),
+                }
+            }
+        }
+    }
+
+    /// A write to the blocks from 0x8000 on by a client that may write to the drive.
+    fn command(
+        &self,
+        header: Header,
+        drive: &DriveHandle,
+        request: RequestPdu,
+        start: u16,
+        values: &[u16],
+        now: Instant,
+    ) -> Decision {
+        let spec = &drive.image.spec;
+        let fault = drive.reading(now).state() == Some(State::Fault);
+        let write = self.state.command_words.update(&spec.name, |last| {
+            let before = register_map::CommandContext { word: *last, fault };
+            let write = register_map::command(&spec.profile, start, values, before)?;
+            let resets = write.refused.is_none() && write.word.is_some_and(|word| before.resets(word));
+            *last = write.word.or(*last);
+            Ok((write, resets))
+        });
+        let mut forwarded = ForwardedRequest::new(header, drive, request.clone());
+        let work = match write {
+            Ok((
+                CommandWrite {
+                    points,
+                    refused: Some(refusal),
+                    ..
+                },
+                _,
+            )) => BusWork::Stop(Order::Points(points), refusal),
+            // A heartbeat alone is not a command: it is answered at once and not audited.
+            Ok((CommandWrite { points, .. }, _)) if points.is_empty() => {
+                drive.image.renew_lease(now);
+                return Decision::Reply(request, Reply::Written);
+            }
+            Ok((CommandWrite { points, .. }, resets)) => {
+                forwarded.resets = resets;
+                BusWork::Order(Order::Points(points))
+            }
+            Err(refusal) => BusWork::Refused(refusal),
+        };
+        Decision::Drive(forwarded, work)
+    }
+}
+
+fn forwarded(header: Header, drive: &DriveHandle, request: RequestPdu, work: BusWork) -> Decision {
+    Decision::Drive(ForwardedRequest::new(header, drive, request), work)
+}
+
+fn common(drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
+    let reading = drive.reading(now);
+    let bus = if drive.bus_up() { BusState::Up } else { BusState::Down };
+    DriveView::new(&reading, bus)
+        .registers(start, count)
+        .map_or_else(Decision::from, |words| {
+            Decision::Reply(request, Reply::Registers(words))
+        })
+}
+
+/// Whether the family has the table that a function code accesses. No family supports 22 and 23.
+fn has_function(profile: &Profile, function: u8) -> bool {
+    let table = match function {
+        1 | 5 | 15 => Table::Coil,
+        2 => Table::DiscreteInput,
+        3 | 6 | 16 => Table::Holding,
+        4 => profile.canonical(Table::Input),
+        _ => return false,
+    };
+    profile.ranges.iter().any(|r| r.table == table)
+}
+
+/// Maximum number of items in one read of this span, by the ranges of the profile that it touches.
+fn read_limit(profile: &Profile, table: Table, start: u16, count: u16) -> u16 {
+    let table = profile.canonical(table);
+    let last = start.saturating_add(count.saturating_sub(1));
+    let touched = profile
+        .ranges
+        .iter()
+        .filter(|r| r.table == table && *r.addresses.start() <= last && start <= *r.addresses.end());
+    touched.map(|r| r.read).min().unwrap_or(table.max_read())
+}
+
+/// Whether the reply of a drive has the form that the request expects.
+fn answers(request: &RequestPdu, reply: &Reply) -> bool {
+    match (request, reply) {
+        (RequestPdu::Read { table, count, .. }, Reply::Bits(bits)) => {
+            table.is_bits() && bits.len() == usize::from(*count)
+        }
+        (RequestPdu::Read { table, count, .. }, Reply::Registers(words)) => {
+            !table.is_bits() && words.len() == usize::from(*count)
+        }
+        (_, Reply::Written) => request.is_write(),
+        _ => false,
+    }
+}
+
+fn figures(bus: &BusHandle) -> BusFigures {
+    let health = bus.image.health();
+    BusFigures {
+        up: health.up,
+        drives: bus.image.drives.len(),
+        online: bus.image.online(),
+        load: health.load,
+        cycle: health.fast.last,
+        transactions: bus.image.transactions_total(),
+        errors: bus.image.errors_total(),
+        queued: bus.queue.lock().writes(),
+    }
+}

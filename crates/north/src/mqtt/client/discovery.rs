@@ -1,0 +1,130 @@
+//! Discovery for Home Assistant, and what is subscribed to.
+
+use super::*;
+use crate::mqtt::connection::Subscribed;
+
+/// The discovery messages, if they are configured.
+pub(super) fn announcer(options: &Options, topics: &Topics) -> Option<Announcer> {
+    let prefix = options.home_assistant.as_deref()?;
+    let sources = Sources {
+        topics: topics.clone(),
+        telemetry: options.telemetry,
+        commands: options.commands,
+    };
+    Some(Announcer::new(prefix, sources))
+}
+
+/// The retained topics of discovery for this plant, which is announced from now on.
+pub(super) fn discovery_topics(announcer: Option<&mut Announcer>, plant: &Plant) -> Vec<Arc<str>> {
+    announcer.map_or_else(Vec::new, |announcer| {
+        announcer.adopt(plant);
+        announcer.topics().cloned().collect()
+    })
+}
+
+/// What a connection subscribes to; `plant` if the broker takes no wildcards.
+pub(super) fn subscriptions(
+    topics: &Topics,
+    commands: bool,
+    announcer: Option<&Announcer>,
+    leftovers_known: bool,
+    plant: Option<&Plant>,
+) -> Vec<Subscription> {
+    let subscription = |of| move |filter| Subscription { filter, of };
+    let sets = commands.then(|| match plant {
+        None => topics.set_filters().to_vec(),
+        Some(plant) => topics.set_topics(plant),
+    });
+    let leftovers = announcer.filter(|_| !leftovers_known && plant.is_none());
+    std::iter::once(topics.status())
+        .map(subscription(Subscribed::Status))
+        .chain(sets.into_iter().flatten().map(subscription(Subscribed::Commands)))
+        .chain(
+            announcer
+                .map(Announcer::birth_topic)
+                .map(subscription(Subscribed::Birth)),
+        )
+        .chain(
+            leftovers
+                .map(Announcer::own_filter)
+                .map(subscription(Subscribed::Leftovers)),
+        )
+        .collect()
+}
+
+/// Logs what the broker refuses, with the reason for each subscription that it refuses. The gateway can do without the
+/// status that others publish.
+pub(super) fn report_refused(subscriptions: &[Subscription], refused: &[Option<String>]) {
+    let of = |wanted: Subscribed| {
+        let mut pairs = subscriptions.iter().zip(refused).filter(move |(s, _)| s.of == wanted);
+        pairs.find_map(|(subscription, why)| Some((&subscription.filter, why.as_ref()?)))
+    };
+    if let Some((_, why)) = of(Subscribed::Commands) {
+        let refused = subscriptions.iter().zip(refused);
+        let filters: Vec<&str> = refused
+            .filter(|(subscription, why)| subscription.of == Subscribed::Commands && why.is_some())
+            .map(|(subscription, _)| subscription.filter.as_str())
+            .collect();
+        let more = match filters.len() {
+            0..=2 => String::new(),
+            all => format!(" and {} more", all - 2),
+        };
+        tracing::error!(
+            "the broker refuses set topics ({why}): no commands over MQTT there; allow the client to subscribe to {}{more}",
+            filters.get(..filters.len().min(2)).unwrap_or_default().join(" and ")
+        );
+    }
+    if let Some((filter, why)) = of(Subscribed::Birth) {
+        tracing::warn!(
+            "the broker refuses {filter} ({why}): the drives are not announced again when Home Assistant starts; allow \
+             the client to subscribe to it"
+        );
+    }
+    if let Some((filter, why)) = of(Subscribed::Leftovers) {
+        tracing::warn!(
+            "the broker refuses {filter} ({why}): drives removed before this start stay in Home Assistant; allow the \
+             client to subscribe to it, or set mqtt.buffer"
+        );
+    }
+}
+
+impl Client {
+    /// Clears what the client before a reload has published and this one does not.
+    pub(super) fn take_over(&mut self) {
+        let before = self.stats.mqtt.keep_retained(Vec::new());
+        self.clear_old(before);
+        self.stats.mqtt.keep_retained(self.retained_topics());
+    }
+
+    /// Whether a message is about discovery: it was one of Home Assistant, or one of an earlier run.
+    pub(super) fn on_discovery(&mut self, message: &Incoming) -> bool {
+        let Some(announcer) = &mut self.announcer else {
+            return false;
+        };
+        if message.topic == announcer.birth_topic() {
+            if message.payload == b"online" {
+                announcer.born(Instant::now());
+            }
+            return true;
+        }
+        let own = announcer.is_own(&message.topic);
+        if own && (!message.payload.is_empty() || message.oversized.is_some()) {
+            self.clear_old(vec![message.topic.clone()]);
+        }
+        own
+    }
+
+    /// Gives the next discovery message to the outbox, if the last ones are with the broker.
+    pub(super) fn announce(&mut self) {
+        let Some(announcer) = &mut self.announcer else { return };
+        let outbox = &self.outbox;
+        let updates = announcer.next(Instant::now(), |topic| outbox.is_under_way(topic));
+        for Update { topic, payload } in updates {
+            self.outbox.put_lasting(topic, payload);
+        }
+        if announcer.take_changed() {
+            self.publisher.publish_besides(announcer.topics().cloned().collect());
+            self.remember_topics();
+        }
+    }
+}

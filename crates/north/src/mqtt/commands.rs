@@ -1,0 +1,340 @@
+//! The set topics: turns a message into one command, and the answer to that command into one result. Time is an
+//! argument; a task only has to wait.
+
+use std::collections::VecDeque;
+use std::future::poll_fn;
+use std::sync::Arc;
+use std::task::{Context, Poll, Waker};
+use std::time::{Instant, SystemTime};
+
+use super::outbox::Message;
+use super::payload::Topics;
+use super::reply::{Reply, ResponseTopics};
+use super::request::{self, Incoming};
+use crate::command::{Answer, Authority, Order, Origin, Parts, Refusal, SourceKind, stop_of};
+use crate::command_json::{Id, Repetition, SharedMemory, excerpt, unknown_drive};
+use crate::plant::{Placed, Plant, Shown};
+
+/// Limits of the commands that wait for the bus. Only stops can be so many: the queues of the buses accept fewer other
+/// commands.
+const WAITING: QueueLimit = QueueLimit {
+    most: 4096,
+    bytes: 8 << 20,
+};
+/// Limits of the commands that the drive acknowledged and whose effect has not been read yet.
+const CONFIRMING: QueueLimit = QueueLimit {
+    most: 1024,
+    bytes: 8 << 20,
+};
+/// Processes commands and returns their results.
+#[derive(Debug)]
+pub(super) struct Commands {
+    topics: Topics,
+    /// Everything from the connection to the broker counts as one client.
+    client: Arc<str>,
+    /// In the order of acceptance.
+    waiting: PendingCommands,
+    /// In the order of acknowledgement.
+    confirming: PendingCommands,
+    memory: SharedMemory,
+    rules: Rules,
+}
+
+/// What the configuration says about commands.
+#[derive(Debug, Clone)]
+pub(super) struct Rules {
+    /// Where results may go.
+    pub(super) responses: ResponseTopics,
+    /// Commands without an `id` are refused, except stops.
+    pub(super) require_id: bool,
+}
+
+/// What a client leaves to its successor: who is owed a result has it from that.
+#[derive(Debug, Default)]
+pub(crate) struct OrdersLeft {
+    waiting: PendingCommands,
+    confirming: PendingCommands,
+    /// Those that the broker has not acknowledged.
+    pub(super) results: Vec<Message>,
+}
+
+/// A command that is not finished.
+#[derive(Debug)]
+struct PendingCommand {
+    number: u64,
+    id: Option<Id>,
+    reply: Reply,
+    placed: Placed,
+}
+
+/// A command whose result is known.
+#[derive(Debug)]
+pub(super) struct FinishedCommand {
+    number: u64,
+    id: Option<Id>,
+    reply: Reply,
+    answer: Answer,
+    shown: Shown,
+}
+
+impl Commands {
+    /// `memory` outlives this client, so that a command is recognised after a reload.
+    pub(super) fn new(topics: Topics, rules: Rules, memory: SharedMemory) -> Commands {
+        memory.lock().abandon();
+        Commands::after(topics, rules, memory, OrdersLeft::default())
+    }
+
+    /// Goes on with the commands that the client before has left.
+    pub(super) fn after(topics: Topics, rules: Rules, memory: SharedMemory, left: OrdersLeft) -> Commands {
+        Commands {
+            topics,
+            client: SourceKind::Mqtt.name().into(),
+            waiting: left.waiting,
+            confirming: left.confirming,
+            memory,
+            rules,
+        }
+    }
+
+    /// What the client that comes after goes on with, beside these results.
+    pub(super) fn leave(self, results: Vec<Message>) -> OrdersLeft {
+        OrdersLeft {
+            waiting: self.waiting,
+            confirming: self.confirming,
+            results,
+        }
+    }
+
+    /// Whether another message may be processed. If not, messages stay with the broker, so that no stop is refused for
+    /// lack of room.
+    pub(super) fn has_room(&self) -> bool {
+        !self.waiting.is_full(WAITING)
+    }
+
+    /// Processes a message at `now`, which is `time` on the calendar. Returns its result if that is known at once;
+    /// otherwise its command is in the queue of the bus. A repeated command is not executed again, but answered with the
+    /// previous result or refused; a stop is always executed, that of a command which does more without the rest. `crowded` says whether too many results wait on a topic: a
+    /// command that would be answered there is refused.
+    pub(super) fn take(
+        &mut self,
+        incoming: Incoming,
+        plant: &Plant,
+        crowded: impl Fn(&str) -> bool,
+        now: Instant,
+        time: SystemTime,
+    ) -> Option<Message> {
+        let target = self.topics.parse_set(&incoming.topic)?;
+        if incoming.retain && incoming.payload.is_empty() {
+            return None; // a retained message was cleared
+        }
+        let result = self.topics.drive(target.drive, "result");
+        let reply = Reply::to(&incoming, result, target.drive, &self.rules.responses);
+        let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
+        let who = who
+            .as_deref()
+            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
+        let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, who);
+        let what = || excerpt(&incoming.payload);
+        let Some(drive) = plant.drive(target.drive) else {
+            let name = excerpt(target.drive.as_bytes());
+            let why = unknown_drive(target.drive, plant);
+            let answer = plant.refuse_unknown(name.trim_matches('`'), &what(), why, origin, now);
+            return Some(reply.message(request::id(&incoming, target.point), &answer, Shown::default(), time));
+        };
+        let profile = &drive.image.spec.profile;
+        let request = request::read(&incoming, target.point, profile);
+        let refuse = |refusal, id, origin| {
+            Some(reply.message(id, &drive.refuse(&what(), refusal, origin, now), Shown::default(), time))
+        };
+        let asked = match request.order {
+            Err(refusal) => return refuse(refusal, request.id, origin),
+            Ok(asked) => asked,
+        };
+        let (stop, order) = (stop_of(&asked.points, profile), Order::Points(asked.points));
+        let only_stops = stop.is_some() && matches!(Parts::of(order.clone(), profile), Parts::One(_));
+        let (mut refused, mut number) = (asked.refused, 0);
+        if refused.is_none() && !only_stops {
+            let taken = incoming.taken();
+            let print = self
+                .memory
+                .lock()
+                .fingerprint(&taken, request.id.as_ref().map(Id::text));
+            let stops = drive.stops();
+            let repeated = self.memory.lock().repeated(&taken, print, stops, now);
+            let why = match repeated {
+                None => self.may_take(&reply, request.id.as_ref(), crowded, now).err(),
+                Some(Repetition::Outdated(why)) => Some(repeats(why)),
+                // Its stop is carried out once more, and answered once more.
+                Some(Repetition::Pending | Repetition::Answered(_)) if stop.is_some() => {
+                    Some(repeats("and only its stop is carried out again"))
+                }
+                Some(Repetition::Pending) => return None,
+                Some(Repetition::Answered(previous)) => return Some(reply.with(previous.to_vec())),
+            };
+            match why {
+                Some(why) => refused = Some(Refusal::NotAllowed(why)),
+                None => number = self.memory.lock().remember(&taken, print, stops, now),
+            }
+        }
+        let (client, expiry) = (Authority::Write, asked.expiry);
+        let placed = match (refused, stop) {
+            (None, _) => drive.place_asked(order, origin, client, expiry, incoming.asked.unwrap_or(now), now),
+            (Some(refusal), Some(stop)) => {
+                drive.place_stop(Order::Points(stop), (&what(), refusal), origin, client, expiry, now)
+            }
+            (Some(refusal), None) => return refuse(refusal, request.id, origin),
+        };
+        let pending = PendingCommand {
+            number,
+            id: request.id,
+            placed,
+            reply,
+        };
+        self.follow(pending, time)
+    }
+
+    /// Whether a command that does more than stop may be taken.
+    fn may_take(
+        &mut self,
+        reply: &Reply,
+        id: Option<&Id>,
+        crowded: impl Fn(&str) -> bool,
+        now: Instant,
+    ) -> Result<(), String> {
+        if id.is_none() && self.rules.require_id {
+            return Err("commands need an `id` here (mqtt.require_id), except stops; nothing was written".to_string());
+        }
+        if crowded(reply.topic()) {
+            let topic = excerpt(reply.topic().as_bytes());
+            return Err(format!(
+                "too many results wait for the broker on {topic}; wait for them; nothing was written"
+            ));
+        }
+        if id.is_some() && !self.memory.lock().has_room(now) {
+            return Err("too many commands with an `id` within ten minutes; nothing was written".to_string());
+        }
+        Ok(())
+    }
+
+    /// Returns the result of a refused command; any other waits.
+    fn follow(&mut self, mut pending: PendingCommand, time: SystemTime) -> Option<Message> {
+        match pending.placed.answer().filter(|answer| !answer.outcome.is_ok()) {
+            Some(answer) => Some(self.result(pending.end(answer, Shown::default()), time)),
+            None => {
+                self.waiting.push(pending);
+                None
+            }
+        }
+    }
+
+    /// The next command that finishes; pending while there is none. Cancel safe.
+    pub(super) async fn finished(&mut self) -> FinishedCommand {
+        poll_fn(|cx| self.poll_finished(cx)).await
+    }
+
+    /// A command that has finished, if there is one.
+    pub(super) fn try_finished(&mut self) -> Option<FinishedCommand> {
+        match self.poll_finished(&mut Context::from_waker(Waker::noop())) {
+            Poll::Ready(finished) => Some(finished),
+            Poll::Pending => None,
+        }
+    }
+
+    /// An acknowledged command no longer occupies the queue for the bus. If too many wait for confirmation, the oldest
+    /// finishes as "acknowledged".
+    fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<FinishedCommand> {
+        while let Some(mut pending) = self.waiting.take(|r| r.placed.poll_answer(cx).is_ready()) {
+            match pending.placed.answer() {
+                Some(answer) if !answer.outcome.is_ok() => return Poll::Ready(pending.end(answer, Shown::default())),
+                _ => self.confirming.push(pending),
+            }
+        }
+        let settled = |pending: &mut PendingCommand| pending.placed.poll_confirmation(cx).is_ready();
+        let next = self.confirming.take(settled).or_else(|| {
+            let full = self.confirming.is_full(CONFIRMING);
+            full.then(|| self.confirming.take(|_| true)).flatten()
+        });
+        let finished = next.and_then(|mut pending| {
+            let (answer, shown) = (pending.placed.answer()?, pending.placed.shown());
+            Some(pending.end(answer, shown))
+        });
+        finished.map_or(Poll::Pending, Poll::Ready)
+    }
+
+    /// The one result of a finished command, at `time`.
+    pub(super) fn result(&mut self, finished: FinishedCommand, time: SystemTime) -> Message {
+        let message = finished
+            .reply
+            .message(finished.id, &finished.answer, finished.shown, time);
+        self.memory
+            .lock()
+            .finished(finished.number, &message.payload.as_slice().into());
+        message
+    }
+
+    /// Whether all commands are finished.
+    pub(super) fn is_idle(&self) -> bool {
+        self.waiting.is_empty() && self.confirming.is_empty()
+    }
+}
+
+fn repeats(why: &str) -> String {
+    format!("it repeats an earlier command, {why}; send it with another `id`")
+}
+
+impl PendingCommand {
+    fn end(self, answer: Answer, shown: Shown) -> FinishedCommand {
+        FinishedCommand {
+            number: self.number,
+            id: self.id,
+            reply: self.reply,
+            answer,
+            shown,
+        }
+    }
+
+    /// Number of bytes whose length the client controls.
+    fn bytes(&self) -> usize {
+        self.reply.bytes() + self.id.as_ref().map_or(0, |id| id.text().len())
+    }
+}
+
+/// Limits of a queue.
+#[derive(Debug, Clone, Copy)]
+struct QueueLimit {
+    most: usize,
+    bytes: usize,
+}
+
+/// Commands in order.
+#[derive(Debug, Default)]
+struct PendingCommands {
+    commands: VecDeque<PendingCommand>,
+    bytes: usize,
+}
+
+impl PendingCommands {
+    fn push(&mut self, pending: PendingCommand) {
+        self.bytes += pending.bytes();
+        self.commands.push_back(pending);
+    }
+
+    /// Removes the first command for which `is_it` holds.
+    fn take(&mut self, is_it: impl FnMut(&mut PendingCommand) -> bool) -> Option<PendingCommand> {
+        let place = self.commands.iter_mut().position(is_it)?;
+        let pending = self.commands.remove(place)?;
+        self.bytes -= pending.bytes();
+        Some(pending)
+    }
+
+    fn is_full(&self, bound: QueueLimit) -> bool {
+        self.commands.len() >= bound.most || self.bytes >= bound.bytes
+    }
+
+    fn is_empty(&self) -> bool {
+        self.commands.is_empty()
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,460 @@
+//! The entities of a device: one for each published point, the state, the text of the fault and the events.
+//!
+//! A template yields `None` for a value that is not good, which Home Assistant shows as unknown.
+
+use serde_json::{Map, Value, json};
+
+use super::Sources;
+use crate::drive::model::Kind;
+use crate::drive::profile::Form;
+use crate::drive::{ModelPoint, Point, PollClass, State};
+use crate::event::EventKind;
+use crate::mqtt::payload;
+use crate::process_image::{Access, DriveSpec};
+
+/// Entities by their key in the message, in order.
+pub(super) type Entities = Vec<(String, Value)>;
+
+/// The points that can be commanded from Home Assistant, if the drive has them; others are only shown.
+const COMMANDS: [ModelPoint; 5] = [
+    ModelPoint::Run,
+    ModelPoint::Reverse,
+    ModelPoint::FaultReset,
+    ModelPoint::SpeedReference,
+    ModelPoint::FrequencyReference,
+];
+/// Limits of a command in percent where neither configuration nor profile has any.
+const PERCENT: (f64, f64) = (0.0, 100.0);
+
+/// Units of what is counted.
+const COUNTED: [&str; 7] = ["Wh", "kWh", "MWh", "varh", "kvarh", "kVAh", "m³"];
+/// Words that are written in capitals.
+const CAPITALS: [&str; 8] = ["ac", "dc", "id", "io", "pi", "pid", "pwm", "rms"];
+
+/// A platform of Home Assistant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Platform {
+    BinarySensor,
+    Button,
+    Event,
+    Number,
+    Sensor,
+    Switch,
+}
+
+impl Platform {
+    fn name(self) -> &'static str {
+        match self {
+            Platform::BinarySensor => "binary_sensor",
+            Platform::Button => "button",
+            Platform::Event => "event",
+            Platform::Number => "number",
+            Platform::Sensor => "sensor",
+            Platform::Switch => "switch",
+        }
+    }
+}
+
+/// Available while the gateway is connected to the broker.
+pub(super) fn of_gateway_availability(sources: &Sources) -> Value {
+    json!([{ "t": sources.topics.status() }])
+}
+
+/// Available while the gateway is connected and the drive is not offline.
+pub(super) fn of_drive_availability(sources: &Sources, spec: &DriveSpec) -> Value {
+    let (topic, template) = match sources.telemetry.points {
+        true => (
+            sources.topics.point(&spec.name, "state"),
+            "{{ 'offline' if value == 'offline' else 'online' }}",
+        ),
+        false => (
+            sources.topics.drive(&spec.name, "state"),
+            "{{ 'offline' if value_json is defined and value_json['state'] == 'offline' else 'online' }}",
+        ),
+    };
+    json!([{ "t": sources.topics.status() }, { "t": topic, "val_tpl": template }])
+}
+
+/// The health of the buses.
+pub(super) fn of_gateway(sources: &Sources, id: &str, buses: &[String]) -> Entities {
+    let bus_entities = |bus: &String| {
+        let entity = |platform: Platform, leaf: &str, name: &str, template: &str, more: Value| {
+            let mut entity = Map::new();
+            entity.insert("p".into(), platform.name().into());
+            entity.insert("name".into(), format!("{bus} {name}").into());
+            entity.insert(
+                "uniq_id".into(),
+                format!("{id}_bus_{}_{leaf}", super::id_of(bus)).into(),
+            );
+            entity.insert("ent_cat".into(), "diagnostic".into());
+            entity.insert("stat_t".into(), sources.topics.bus(bus).into());
+            let template = format!("{{{{ {template} if value_json is defined else none }}}}");
+            entity.insert("val_tpl".into(), template.into());
+            extend(&mut entity, more);
+            (format!("{}_{bus}_{leaf}", platform.name()), Value::from(entity))
+        };
+        let measured = |unit: &str| json!({ "unit_of_meas": unit, "stat_cla": "measurement" });
+        [
+            entity(
+                Platform::BinarySensor,
+                "up",
+                "connection",
+                "value_json['state']",
+                json!({ "dev_cla": "connectivity", "pl_on": "up", "pl_off": "down" }),
+            ),
+            entity(
+                Platform::Sensor,
+                "load",
+                "load",
+                "(value_json['load'] * 100) | round(1) if value_json['load'] is not none else none",
+                measured("%"),
+            ),
+            entity(
+                Platform::Sensor,
+                "online",
+                "drives online",
+                "value_json['online']",
+                json!({ "stat_cla": "measurement" }),
+            ),
+            entity(
+                Platform::Sensor,
+                "fast_cycle",
+                "fast cycle",
+                "value_json['fast_cycle_ms']",
+                json!({ "dev_cla": "duration", "unit_of_meas": "ms", "stat_cla": "measurement" }),
+            ),
+            entity(
+                Platform::Sensor,
+                "errors",
+                "errors",
+                "value_json['errors']",
+                json!({ "stat_cla": "total_increasing" }),
+            ),
+        ]
+    };
+    buses.iter().flat_map(bus_entities).collect()
+}
+
+/// The entities of a drive: one for each published point, and those beside them.
+pub(super) fn of_drive(sources: &Sources, id: &str, spec: &DriveSpec) -> Entities {
+    let drive = DriveEntities { sources, id, spec };
+    let published = payload::published_points(&spec.profile);
+    let points = published
+        .iter()
+        .filter_map(|(index, _)| spec.profile.points.get(*index));
+    let mut entities: Entities = points.map(|point| drive.of_point(point)).collect();
+    // A button needs no value, so it may belong to a point that is never read.
+    let reset = spec.profile.model_index(ModelPoint::FaultReset);
+    let hidden = reset.filter(|index| published.iter().all(|(shown, _)| shown != index));
+    let hidden = hidden.and_then(|index| spec.profile.points.get(index));
+    entities.extend(hidden.and_then(|point| drive.command(point)));
+    entities.push(drive.state());
+    if spec.profile.model_index(ModelPoint::FaultCode).is_some() {
+        entities.push(drive.fault_text());
+    }
+    entities.push(drive.events());
+    entities.extend(drive.withdrawn(&entities));
+    entities
+}
+
+struct DriveEntities<'d> {
+    sources: &'d Sources,
+    id: &'d str,
+    spec: &'d DriveSpec,
+}
+
+impl DriveEntities<'_> {
+    fn entity(&self, platform: Platform, name: &str) -> Map<String, Value> {
+        let mut entity = Map::new();
+        entity.insert("p".into(), platform.name().into());
+        entity.insert("name".into(), title(name).into());
+        entity.insert("uniq_id".into(), format!("{}_{name}", self.id).into());
+        entity
+    }
+
+    /// Whether it can be commanded from Home Assistant.
+    fn is_commanded(&self, point: &Point) -> bool {
+        let command = point.model.is_some_and(|model| COMMANDS.contains(&model)) && point.write;
+        command && self.sources.commands && self.spec.access == Access::Control
+    }
+
+    fn of_point(&self, point: &Point) -> (String, Value) {
+        self.command(point).unwrap_or_else(|| self.sensor(point))
+    }
+
+    /// The control of a point, if it is commanded.
+    fn command(&self, point: &Point) -> Option<(String, Value)> {
+        if !self.is_commanded(point) {
+            return None;
+        }
+        let name = &point.name;
+        let send = |value: &str| format!("{{\"id\": \"{{{{ now().timestamp() }}}}\", \"{name}\": {value} }}");
+        let (platform, more) = match point.kind() {
+            Kind::Bool if point.pulse => (
+                Platform::Button,
+                json!({ "pl_prs": "true", "cmd_tpl": send("{{ value }}") }),
+            ),
+            Kind::Bool => (
+                Platform::Switch,
+                json!({ "pl_on": "true", "pl_off": "false", "cmd_tpl": send("{{ value }}") }),
+            ),
+            Kind::Number | Kind::Integer => {
+                let (least, most) = self.limits(point)?;
+                let more = json!({
+                    "min": least, "max": most, "step": 0.01, "mode": "box", "unit_of_meas": point.unit,
+                    "cmd_tpl": send("{{ value }}"),
+                });
+                (Platform::Number, more)
+            }
+        };
+        let mut entity = self.entity(platform, name);
+        entity.insert("cmd_t".into(), self.sources.topics.drive(&self.spec.name, "set").into());
+        entity.insert("qos".into(), 1.into());
+        match platform {
+            Platform::Switch => self.show(&mut entity, name, &Shown::Bool),
+            Platform::Number => {
+                let (least, most) = self.limits(point)?;
+                self.show(&mut entity, name, &Shown::Within(least, most));
+                device_class(&mut entity, &point.unit);
+            }
+            _ => {}
+        }
+        extend(&mut entity, more);
+        Some((format!("{}_{name}", platform.name()), entity.into()))
+    }
+
+    /// Limits of a command; none where only the drive knows them, or where they leave one value only, of which Home Assistant
+    /// makes no number.
+    fn limits(&self, point: &Point) -> Option<(f64, f64)> {
+        let index = self.spec.profile.point_index(&point.name)?;
+        let limits = match self.spec.limits_of(index) {
+            Some(limits) => Some(limits.into_inner()),
+            None => (point.unit == "%").then_some(PERCENT),
+        };
+        limits.filter(|(least, most)| least < most)
+    }
+
+    fn sensor(&self, point: &Point) -> (String, Value) {
+        let name = &point.name;
+        let platform = sensor_platform(point);
+        let mut entity = self.entity(platform, name);
+        if point.model.is_none() {
+            entity.insert("ent_cat".into(), "diagnostic".into());
+        }
+        if !point.texts.is_empty() {
+            self.show(&mut entity, name, &Shown::Texts(point));
+            return (format!("{}_{name}", platform.name()), entity.into());
+        }
+        match point.kind() {
+            Kind::Bool => {
+                self.show(&mut entity, name, &Shown::Bool);
+                entity.insert("pl_on".into(), "true".into());
+                entity.insert("pl_off".into(), "false".into());
+                let class = match point.model {
+                    Some(ModelPoint::Running) => Some("running"),
+                    Some(ModelPoint::Fault | ModelPoint::Warning) => Some("problem"),
+                    _ => None,
+                };
+                entity.extend(class.map(|class| ("dev_cla".to_string(), class.into())));
+            }
+            Kind::Number => {
+                self.show(&mut entity, name, &Shown::Plain);
+                quantity(&mut entity, point);
+            }
+            Kind::Integer => self.show(&mut entity, name, &Shown::Plain),
+        }
+        (format!("{}_{name}", platform.name()), entity.into())
+    }
+
+    /// The topic of a published value and the template that shows it.
+    fn show(&self, entity: &mut Map<String, Value>, name: &str, shown: &Shown<'_>) {
+        let points = self.sources.telemetry.points;
+        let topic = match points {
+            true => self.sources.topics.point(&self.spec.name, name),
+            false => self.sources.topics.drive(&self.spec.name, "state"),
+        };
+        entity.insert("stat_t".into(), topic.into());
+        entity.insert("val_tpl".into(), shown.template(name, points).into());
+    }
+
+    fn state(&self) -> (String, Value) {
+        let mut entity = self.entity(Platform::Sensor, "state");
+        self.show(&mut entity, "state", &Shown::Plain);
+        let states: Vec<&str> = State::ALL.into_iter().map(State::name).collect();
+        extend(&mut entity, json!({ "dev_cla": "enum", "ops": states }));
+        self.available_with_gateway(&mut entity);
+        ("sensor_state".to_string(), entity.into())
+    }
+
+    /// The state has its text beside it even if the code is zero; a topic of its own is then empty.
+    fn fault_text(&self) -> (String, Value) {
+        let mut entity = self.entity(Platform::Sensor, "fault_text");
+        let topics = &self.sources.topics;
+        let (topic, template) = match self.sources.telemetry.state {
+            true => (
+                topics.drive(&self.spec.name, "state"),
+                "{{ (value_json['fault_text'] or 'no fault') if value_json is defined and value_json['fault_code'] is \
+                 not none else none }}",
+            ),
+            false => (topics.point(&self.spec.name, "fault_text"), "{{ value or none }}"),
+        };
+        extend(&mut entity, json!({ "stat_t": topic, "val_tpl": template }));
+        ("sensor_fault_text".to_string(), entity.into())
+    }
+
+    fn events(&self) -> (String, Value) {
+        let mut entity = self.entity(Platform::Event, "event");
+        let kinds: Vec<&str> = EventKind::ALL.into_iter().map(EventKind::name).collect();
+        let topic = self.sources.topics.drive(&self.spec.name, "event");
+        let template = "{{ dict(value_json, event_type=value_json['event']) | to_json }}";
+        extend(
+            &mut entity,
+            json!({ "stat_t": topic, "evt_typ": kinds, "val_tpl": template, "qos": 1 }),
+        );
+        self.available_with_gateway(&mut entity);
+        ("event_event".to_string(), entity.into())
+    }
+
+    /// It has something to say of a drive that is offline.
+    fn available_with_gateway(&self, entity: &mut Map<String, Value>) {
+        entity.insert("avty".into(), of_gateway_availability(self.sources));
+    }
+
+    /// Takes away what the points of `COMMANDS` were when the drive could be commanded, or could not: a component that is
+    /// named with its platform only.
+    fn withdrawn(&self, present: &Entities) -> Entities {
+        let both = COMMANDS.into_iter().flat_map(|model| {
+            let point = self.spec.profile.model_point(model);
+            point.into_iter().flat_map(|point| {
+                let control = match point.kind() {
+                    Kind::Bool if point.pulse => Platform::Button,
+                    Kind::Bool => Platform::Switch,
+                    Kind::Number | Kind::Integer => Platform::Number,
+                };
+                [control, sensor_platform(point)].map(|platform| (platform, point.name.as_str()))
+            })
+        });
+        let withdrawn = both.filter_map(|(platform, name)| {
+            let key = format!("{}_{name}", platform.name());
+            let absent = !present.iter().any(|(present, _)| *present == key);
+            absent.then(|| (key, json!({ "p": platform.name() })))
+        });
+        withdrawn.collect()
+    }
+}
+
+fn sensor_platform(point: &Point) -> Platform {
+    match point.kind() {
+        Kind::Bool if point.texts.is_empty() => Platform::BinarySensor,
+        _ => Platform::Sensor,
+    }
+}
+
+/// How a value is shown.
+enum Shown<'p> {
+    Plain,
+    Bool,
+    /// A number between limits; Home Assistant would refuse another one and keep the last.
+    Within(f64, f64),
+    /// An enumeration by its texts.
+    Texts(&'p Point),
+}
+
+impl Shown<'_> {
+    /// The template for a topic with the bare value, or for the object of the state.
+    fn template(&self, name: &str, bare: bool) -> String {
+        let value = match bare {
+            true => "value or none".to_string(),
+            false => format!("value_json['{name}'] if value_json is defined else none"),
+        };
+        let then = match self {
+            Shown::Plain => return format!("{{{{ {value} }}}}"),
+            Shown::Bool if bare => return format!("{{{{ {value} }}}}"),
+            Shown::Bool => "v | lower".to_string(),
+            Shown::Within(least, most) => {
+                return format!(
+                    "{{% set v = {value} %}}{{{{ v if v is not none and {least} <= v | float <= {most} else none }}}}"
+                );
+            }
+            Shown::Texts(point) => {
+                let key = |code: &i64| match point.kind() {
+                    Kind::Bool => (*code != 0).to_string(),
+                    Kind::Number | Kind::Integer => code.to_string(),
+                };
+                let texts: Map<String, Value> = point.texts.iter().map(|(c, t)| (key(c), t.as_str().into())).collect();
+                format!("{}.get(v | string | lower, v)", Value::from(texts))
+            }
+        };
+        format!("{{% set v = {value} %}}{{{{ {then} if v is not none else none }}}}")
+    }
+}
+
+/// Unit and kind of a quantity.
+fn quantity(entity: &mut Map<String, Value>, point: &Point) {
+    if !point.unit.is_empty() {
+        entity.insert("unit_of_meas".into(), point.unit.as_str().into());
+    }
+    device_class(entity, &point.unit);
+    let counts = matches!(point.model, Some(ModelPoint::Energy | ModelPoint::OperatingHours))
+        || COUNTED.contains(&point.unit.as_str());
+    let class = match point.class {
+        _ if counts && may_fall(point) => "total",
+        _ if counts => "total_increasing",
+        PollClass::Fast | PollClass::Slow => "measurement",
+        PollClass::Once | PollClass::Fault | PollClass::Never => return,
+    };
+    entity.insert("stat_cla".into(), class.into());
+}
+
+/// Whether a count may go down, as a balance does: Home Assistant would take that for a meter that begins anew.
+fn may_fall(point: &Point) -> bool {
+    match point.raw().map(|raw| raw.form) {
+        Some(Form::I16 | Form::I32(_)) => true,
+        // The energy of a drive on N2 is such a number, and never falls.
+        Some(Form::F32(_)) | None => {
+            point.model.is_none() && point.range.as_ref().is_none_or(|range| *range.start() < 0.0)
+        }
+        Some(_) => false,
+    }
+}
+
+/// The device class of Home Assistant that has this unit, if there is one in all versions from 2024.12 on: it refuses the
+/// whole device for a class that it does not know.
+fn device_class(entity: &mut Map<String, Value>, unit: &str) {
+    let class = match unit {
+        "A" | "mA" => "current",
+        "V" | "mV" => "voltage",
+        "Hz" | "kHz" => "frequency",
+        "°C" => "temperature",
+        "Wh" | "kWh" | "MWh" => "energy",
+        "W" | "kW" => "power",
+        "ms" | "s" | "min" | "h" | "d" => "duration",
+        "bar" | "mbar" | "Pa" | "kPa" => "pressure",
+        "VA" => "apparent_power",
+        "var" => "reactive_power",
+        "m³" => "volume",
+        "m³/h" => "volume_flow_rate",
+        _ => return,
+    };
+    entity.insert("dev_cla".into(), class.into());
+}
+
+fn extend(entity: &mut Map<String, Value>, more: Value) {
+    if let Value::Object(more) = more {
+        entity.extend(more);
+    }
+}
+
+/// A name for people: `dc_link_voltage` is `DC link voltage`.
+pub(super) fn title(name: &str) -> String {
+    let word = |(place, word): (usize, &str)| {
+        let mut letters = word.chars();
+        match letters.next() {
+            _ if CAPITALS.contains(&word) => word.to_uppercase(),
+            Some(first) if place == 0 => first.to_uppercase().chain(letters).collect(),
+            _ => word.to_string(),
+        }
+    };
+    let words: Vec<String> = name.split('_').enumerate().map(word).collect();
+    words.join(" ")
+}

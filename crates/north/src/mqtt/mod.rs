@@ -1,0 +1,207 @@
+//! MQTT client (`docs/mqtt.md`).
+//!
+//! ```text
+//! process image ──▶ publisher ──▶ ┌────────┐     connection        ┌────────┐
+//! events, history ──▶ store ────▶ │ outbox │ ──▶ (rumqttc, a task  │ broker │
+//! results ──────────────────────▶ └────────┘     of its own) ────▶ └────────┘
+//!                       │ ▲                                            │
+//!               journal (a thread, on disk)                            │
+//!                commands ◀──────────────────────── set topics ◀──────┘
+//! ```
+//!
+//! `payload`, `publisher`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and
+//! in which order; `offline` drives `commands` without a broker. `broker_limits`, `silence`, `retry` and `takeover` judge what the broker does,
+//! without I/O as well. `client` is the task that owns them. `connection` wraps
+//! rumqttc, which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are
+//! sent again from the outbox. `sparkplug` is a client of its own, on a connection of its own.
+
+mod back_off;
+mod broker_limits;
+mod client;
+mod commands;
+mod connection;
+#[cfg(test)]
+pub(super) mod fixture;
+mod history;
+mod home_assistant;
+mod journal;
+mod offline;
+mod outage_log;
+mod outbox;
+mod payload;
+mod publisher;
+mod record;
+mod reply;
+mod request;
+mod retry;
+mod silence;
+pub mod sparkplug;
+mod store;
+mod takeover;
+mod tls;
+
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+use super::NorthStats;
+use crate::plant::SharedPlant;
+
+pub(crate) use self::commands::OrdersLeft;
+pub use self::offline::{Offline, Published};
+pub use self::record::whole_records;
+pub use self::request::Incoming;
+pub(crate) use self::sparkplug::NodeOrdersLeft;
+
+/// A secret that is not printed in logs.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Secret(pub String);
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("(secret)")
+    }
+}
+
+/// Configuration of the MQTT client.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Host of the broker.
+    pub host: String,
+    /// Port of the broker.
+    pub port: u16,
+    /// TLS (`mqtts://`).
+    pub tls: bool,
+    /// Client id.
+    pub client_id: String,
+    /// User name, with password.
+    pub username: Option<String>,
+    /// Password.
+    pub password: Option<Secret>,
+    /// CA certificates (PEM) for the broker; those of the system if absent.
+    pub ca: Option<PathBuf>,
+    /// Client certificate chain and key (PEM).
+    pub identity: Option<(PathBuf, PathBuf)>,
+    /// First level of all topics.
+    pub base: String,
+    /// Which telemetry is published.
+    pub telemetry: Telemetry,
+    /// Quality of service of telemetry.
+    pub telemetry_qos: Qos,
+    /// Quality of service of events and history.
+    pub event_qos: Qos,
+    /// Time after which the broker drops telemetry; never if absent.
+    pub expiry: Option<Duration>,
+    /// Minimum time between two publications of a topic.
+    pub min_interval: Duration,
+    /// Maximum time between two publications of a topic.
+    pub max_interval: Duration,
+    /// Whether the set topics are served.
+    pub commands: bool,
+    /// Commands without an `id` are refused, except stops.
+    pub require_id: bool,
+    /// Filters of response topics that are allowed besides those outside of `base`.
+    pub response_topics: Vec<String>,
+    /// Disk buffer for events and history while the broker is not connected; in memory only if absent.
+    pub buffer: Option<Buffer>,
+    /// Discovery prefix of Home Assistant; no discovery if absent.
+    pub home_assistant: Option<String>,
+    /// The gateway as an edge node of Sparkplug B.
+    pub sparkplug: Option<sparkplug::Options>,
+}
+
+/// Which telemetry is published.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Telemetry {
+    /// The state of each drive as one object.
+    pub state: bool,
+    /// Each point as a bare value.
+    pub points: bool,
+    /// Values of an outage, afterwards.
+    pub history: History,
+}
+
+/// Quality of service of published messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Qos {
+    /// 0: sent once, not acknowledged.
+    AtMostOnce,
+    /// 1: sent until it is acknowledged.
+    AtLeastOnce,
+}
+
+/// Which values of an outage are published afterwards.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum History {
+    /// None.
+    #[default]
+    Off,
+    /// Those that changed.
+    Changes,
+    /// Those of every sample.
+    All,
+}
+
+/// Disk buffer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Buffer {
+    /// Directory.
+    pub dir: PathBuf,
+    /// Maximum size on disk, bytes.
+    pub max_bytes: u64,
+}
+
+impl Buffer {
+    /// The default in a service of systemd with a state directory; elsewhere there is none.
+    fn of_system() -> Option<Buffer> {
+        let dirs = std::env::var_os("STATE_DIRECTORY")?;
+        let dir = std::env::split_paths(&dirs).next()?;
+        Some(Buffer {
+            dir,
+            max_bytes: 64 << 20,
+        })
+    }
+}
+
+/// The running MQTT client.
+#[derive(Debug, Default)]
+pub struct Mqtt(Vec<JoinHandle<()>>);
+
+impl Mqtt {
+    /// Waits until the client has ended: at most about half a second after the cancellation, in which it publishes
+    /// `offline` and disconnects.
+    pub async fn stopped(self) {
+        for task in self.0 {
+            if let Err(error) = task.await {
+                tracing::error!("the MQTT client ended unexpectedly: {error}");
+            }
+        }
+    }
+}
+
+/// Starts the MQTT client; must be called within a Tokio runtime. It reconnects until it is cancelled. Events that are
+/// raised from now on, or were left unread by the client before, are published, so start it before the buses.
+pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Mqtt {
+    options.buffer = options.buffer.or_else(Buffer::of_system);
+    // Subscribed here and not in the task, so that no event after this call is missed. What the client before this one left
+    // unread comes first.
+    let events = plant.load().events.subscribe();
+    let unread = stats.mqtt.keep_unread(None);
+    let events = unread.filter(|unread| unread.same_channel(&events)).unwrap_or(events);
+    let node = options.sparkplug.clone().map(|node| {
+        let broker = options.clone();
+        tokio::spawn(sparkplug::run(
+            node,
+            broker,
+            plant.clone(),
+            stats.clone(),
+            cancel.clone(),
+        ))
+    });
+    let client = tokio::spawn(client::run(options, plant, stats, events, cancel));
+    Mqtt([client].into_iter().chain(node).collect())
+}

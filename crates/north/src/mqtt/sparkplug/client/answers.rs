@@ -1,0 +1,139 @@
+//! What the broker answers to the last will and to the subscriptions, and births that fit into its packets.
+
+use rumqttc::mqttbytes::QoS;
+use rumqttc::mqttbytes::v5::Filter;
+
+use super::*;
+use crate::mqtt::broker_limits::Lack;
+use crate::mqtt::connection::{NO_WILDCARDS, PACKET_OVERHEAD, commanding};
+use crate::mqtt::sparkplug::session::FIXED_METRICS;
+use crate::mqtt::sparkplug::topics::Kind;
+
+impl Client {
+    /// The broker refused the connection because of the last will: another one follows with less, at once, if there is less.
+    pub(super) fn lessen_will(&mut self, lack: Lack, now: Instant) {
+        if self.will.lessen(lack) {
+            tracing::debug!("Sparkplug: the broker refuses the last will ({lack:?}); trying a lesser one");
+            self.link = Link::Down { retry_at: now };
+        } else {
+            drop(self.lost("the broker refuses the last will in every form"));
+        }
+    }
+
+    pub(super) fn filters(&self, limits: BrokerLimits) -> Vec<Filter> {
+        let drives = self
+            .drives
+            .iter()
+            .map(|drive| drive.metrics.drive.image.spec.name.as_str());
+        filters(
+            &self.topics,
+            self.broker.commands,
+            (!limits.wildcards).then(|| drives.collect()),
+        )
+    }
+
+    pub(super) fn subscribe(&mut self) {
+        let Link::Up(Up {
+            limits: Some(limits), ..
+        }) = &self.link
+        else {
+            return;
+        };
+        let limits = *limits;
+        let filters = self.filters(limits);
+        if let Link::Up(up) = &mut self.link
+            && !up.connection.subscribe(filters, limits)
+        {
+            self.give_up("the subscription could not be sent");
+        }
+    }
+
+    /// The broker answered the subscriptions.
+    pub(super) fn subscribed(&mut self, refused: &[Option<String>]) {
+        let Link::Up(Up {
+            limits: Some(limits),
+            subscribed,
+            ..
+        }) = &mut self.link
+        else {
+            return;
+        };
+        if limits.wildcards && refused.iter().flatten().any(|why| why == NO_WILDCARDS) {
+            limits.wildcards = false;
+            return self.subscribe();
+        }
+        let (limits, again) = (*limits, std::mem::replace(subscribed, true));
+        self.report_refused(&self.filters(limits), refused);
+        if !again {
+            self.ready(limits);
+        }
+    }
+
+    pub(super) fn report_refused(&self, filters: &[Filter], refused: &[Option<String>]) {
+        for (filter, why) in filters.iter().zip(refused) {
+            // Most hosts do without the topic of version 2.2.
+            let spare = self.topics.old_state().is_some_and(|old| old == filter.path);
+            if let Some(why) = why
+                && !spare
+            {
+                tracing::error!(
+                    "the broker refuses a Sparkplug subscription ({why}); allow client {} to subscribe to {}",
+                    self.client_id,
+                    filter.path
+                );
+            }
+        }
+    }
+
+    /// A birth without the metrics for which the broker's packets are too small; the session leaves them out from now on.
+    pub(super) fn fitted(&mut self, mut packet: Packet) -> Packet {
+        let Link::Up(Up {
+            limits: Some(limits), ..
+        }) = &self.link
+        else {
+            return packet;
+        };
+        let (most, all) = (limits.max_packet, packet.payload.metrics.len());
+        let fixed = match packet.kind {
+            Kind::NodeBirth => FIXED_METRICS,
+            Kind::DeviceBirth => 0,
+            _ => return packet,
+        };
+        let topic = self.topics.of(packet.kind, packet.device.as_deref());
+        let room = most.saturating_sub(topic.len() + PACKET_OVERHEAD);
+        let mut omitted = Vec::new();
+        while packet.payload.encoded().len() > room && packet.payload.metrics.len() > fixed {
+            omitted.extend(packet.payload.metrics.pop().and_then(|metric| metric.name));
+        }
+        if !omitted.is_empty() {
+            self.session
+                .keep(packet.device.as_deref(), packet.payload.metrics.len() - fixed);
+            omitted.reverse();
+            tracing::warn!(
+                "Sparkplug: {topic} is too large for the broker, which accepts {most} bytes per packet: {} of {all} metrics \
+                 are left out until the next connection ({}); raise the broker's limit",
+                omitted.len(),
+                omitted.join(", ")
+            );
+        }
+        packet
+    }
+}
+
+/// What the node subscribes to: commands for itself, the primary host, commands for its devices.
+/// `drives` if the broker takes no wildcards.
+fn filters(topics: &Topics, commands: bool, drives: Option<Vec<&str>>) -> Vec<Filter> {
+    let plain = |path| Filter {
+        path,
+        qos: QoS::AtLeastOnce,
+        ..Filter::default()
+    };
+    let mut filters = vec![commanding(topics.node_commands())];
+    filters.extend(topics.state().into_iter().chain(topics.old_state()).map(plain));
+    match drives {
+        _ if !commands => {}
+        None => filters.push(commanding(topics.device_commands())),
+        Some(drives) => filters.extend(drives.into_iter().map(|drive| commanding(topics.commands_of(drive)))),
+    }
+    filters
+}

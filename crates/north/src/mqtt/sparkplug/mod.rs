@@ -1,0 +1,46 @@
+//! Sparkplug B 3.0: the gateway as an edge node, its drives as devices (`docs/sparkplug.md`).
+//!
+//! ```text
+//! process image ──▶ model ──▶ ┌─────────┐      client       ┌────────┐
+//!                             │ session │ ──▶ (a connection │ broker │
+//! STATE, NCMD ──────────────▶ └─────────┘     of its own)──▶└────────┘
+//!                 orders ◀──────────────────────────── DCMD ◀───┘
+//! ```
+//!
+//! `topics`, `wire`, `metric`, `host`, `history` and `session` are pure: the session is told what the drives are and what the
+//! broker says, and is asked for the next message. `model` makes metrics of drives and buses, `orders` makes orders of
+//! commands. `bd_seq` keeps the number of the session on disk. `client` is the task that owns them and the connection, which
+//! is apart from that of the MQTT topics, because its last will is the death of the node.
+
+mod bd_seq;
+mod client;
+mod history;
+mod host;
+mod metric;
+mod model;
+mod orders;
+mod session;
+mod topics;
+mod wire;
+
+use std::path::PathBuf;
+
+pub(super) use self::client::run;
+pub(crate) use self::orders::NodeOrdersLeft;
+
+/// Configuration of the edge node; broker and credentials are those of the MQTT client.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Group id.
+    pub group: String,
+    /// Edge node id.
+    pub node: String,
+    /// Id of the host that must be online before anything is published; empty: none.
+    pub primary_host: String,
+    /// Metrics have aliases.
+    pub alias: bool,
+    /// Values of an outage are published afterwards.
+    pub history: bool,
+    /// Directory of the file with the number of the session.
+    pub state_dir: PathBuf,
+}

@@ -1,0 +1,357 @@
+//! DCMD messages: each becomes one order, checked, audited and answered like any other. The session has no message for
+//! results, so they become metrics of the drive. Time is an argument.
+
+use std::collections::VecDeque;
+use std::future::poll_fn;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::{Duration, Instant};
+
+use serde_json::Value as Json;
+
+use super::super::request::Incoming;
+use super::model::DriveMetrics;
+use super::session::Session;
+use super::wire::{self, Metric, MetricValue, Payload};
+use crate::command::{
+    Answer, Authority, CONFIRMED, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, SourceKind, stop_of,
+};
+use crate::command_json::{SharedMemory, Taken, excerpt, resolve, unknown_drive};
+use crate::drive::{Profile, Value};
+use crate::plant::{Placed, Plant};
+
+/// Points with their values, and why another one is refused.
+type Understood = (Vec<(usize, Value)>, Option<Refusal>);
+
+/// Orders whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit only.
+const AWAITED: usize = 4096;
+/// Metrics in a command.
+const METRICS: usize = 64;
+
+/// The orders over Sparkplug.
+#[derive(Debug)]
+pub(super) struct Orders {
+    /// Everything from the connection to the broker counts as one client.
+    client: Arc<str>,
+    awaited: VecDeque<Awaited>,
+    memory: SharedMemory,
+}
+
+/// Orders whose results a node leaves to its successor.
+#[derive(Debug)]
+pub(crate) struct NodeOrdersLeft(VecDeque<Awaited>);
+
+#[derive(Debug)]
+struct Awaited {
+    drive: String,
+    metrics: Vec<usize>,
+    placed: Placed,
+}
+
+/// The result of an order.
+#[derive(Debug, PartialEq)]
+pub(super) struct Finished {
+    /// The drive by its name: a reload may have moved it.
+    pub(super) drive: String,
+    /// The metrics that were to be changed.
+    pub(super) metrics: Vec<usize>,
+    /// The code of the result, and why it failed; empty if it did not.
+    pub(super) code: &'static str,
+    pub(super) error: String,
+}
+
+impl Finished {
+    fn of(drive: &str, metrics: Vec<usize>, answer: &Answer, confirmed: Option<Duration>) -> Finished {
+        let ok = answer.outcome.is_ok();
+        Finished {
+            drive: drive.to_string(),
+            metrics,
+            code: if confirmed.is_some() {
+                CONFIRMED
+            } else {
+                answer.outcome.code()
+            },
+            error: if ok { String::new() } else { answer.outcome.to_string() },
+        }
+    }
+}
+
+impl Orders {
+    /// `memory` outlives this client, so that an order is recognised after a reload; `left` are those of the client before.
+    pub(super) fn new(memory: SharedMemory, left: Option<NodeOrdersLeft>) -> Orders {
+        Orders {
+            client: SourceKind::Sparkplug.name().into(),
+            awaited: left.map(|left| left.0).unwrap_or_default(),
+            memory,
+        }
+    }
+
+    /// What the client that comes after goes on with.
+    pub(super) fn leave(self) -> NodeOrdersLeft {
+        NodeOrdersLeft(self.awaited)
+    }
+
+    /// Takes a command for the device of that name. When this returns, its order is in the queue of the bus, or the result
+    /// is returned. `target` is the drive of that name, with its place in the session.
+    pub(super) fn take(
+        &mut self,
+        incoming: &Incoming,
+        device: &str,
+        target: Option<(usize, &DriveMetrics)>,
+        session: &Session,
+        plant: &Plant,
+        now: Instant,
+    ) -> Option<Finished> {
+        let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
+        let who = who
+            .as_deref()
+            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
+        let origin = Origin::of(self.client.clone(), SourceKind::Sparkplug, who);
+        let Some((place, metrics)) = target else {
+            let name = excerpt(device.as_bytes());
+            let why = unknown_drive(device, plant);
+            plant.refuse_unknown(name.trim_matches('`'), "a Sparkplug command", why, origin, now);
+            return None;
+        };
+        let drive = &metrics.drive;
+        let request = Request::read(incoming, |metric| {
+            session.metric(place, metric.name.as_deref(), metric.alias)
+        });
+        let touched = request.metrics();
+        let points = request.points(
+            &drive.image.spec.profile,
+            |metric| session.definition(place, metric).map(|d| d.name.clone()),
+            |metric| session.alias(place, metric),
+        );
+        let refuse = |refusal, origin| {
+            let answer = drive.refuse(&request.what(), refusal, origin, now);
+            Some(Finished::of(device, touched.clone(), &answer, None))
+        };
+        let (points, mut refused) = match points {
+            Err(refusal) => return refuse(refusal, origin),
+            Ok(points) => points,
+        };
+        let profile = &drive.image.spec.profile;
+        let (stop, order) = (stop_of(&points, profile), Order::Points(points));
+        let only_stops = stop.is_some() && matches!(Parts::of(order.clone(), profile), Parts::One(_));
+        if refused.is_none()
+            && !only_stops
+            && request.timestamp.is_some()
+            && let Err(why) = self.remember(incoming, now)
+        {
+            refused = Some(Refusal::NotAllowed(why.to_string()));
+        }
+        let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
+        let expiry = life.map_or(DEFAULT_EXPIRY, |life| life.min(DEFAULT_EXPIRY));
+        let mut placed = match (refused, stop) {
+            (None, _) => drive.place_asked(
+                order,
+                origin,
+                Authority::Write,
+                expiry,
+                incoming.asked.unwrap_or(now),
+                now,
+            ),
+            (Some(refusal), Some(stop)) => {
+                let (what, stop) = (request.what(), Order::Points(stop));
+                drive.place_stop(stop, (&what, refusal), origin, Authority::Write, expiry, now)
+            }
+            (Some(refusal), None) => return refuse(refusal, origin),
+        };
+        if let Some(answer) = placed.answer().filter(|answer| !answer.outcome.is_ok()) {
+            return Some(Finished::of(device, touched, &answer, None));
+        }
+        if self.awaited.len() < AWAITED {
+            self.awaited.push_back(Awaited {
+                drive: device.to_string(),
+                metrics: touched,
+                placed,
+            });
+        }
+        None
+    }
+
+    /// A bridge that loops cannot start a motor a second time: the same payload, with its time, is not executed again.
+    fn remember(&self, incoming: &Incoming, now: Instant) -> Result<(), &'static str> {
+        let taken = Taken {
+            topic: &incoming.topic,
+            payload: &incoming.payload,
+            ..Taken::default()
+        };
+        let mut memory = self.memory.lock();
+        // The payload with its time is all that identifies it.
+        let print = memory.fingerprint(&taken, Some(""));
+        if memory.repeated(&taken, print, 0, now).is_some() {
+            return Err(
+                "it repeats an earlier command: the same payload with the same time; send it with its own time",
+            );
+        }
+        if !memory.has_room(now) {
+            return Err("too many commands within ten minutes; nothing was written");
+        }
+        memory.remember(&taken, print, 0, now);
+        Ok(())
+    }
+
+    /// The next order that ends; pending while there is none. Cancel safe.
+    pub(super) async fn finished(&mut self) -> Finished {
+        poll_fn(|cx| self.poll_finished(cx)).await
+    }
+
+    fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<Finished> {
+        let ready = |awaited: &mut Awaited| match awaited.placed.poll_answer(cx) {
+            Poll::Ready(answer) if answer.outcome.is_ok() => awaited.placed.poll_confirmation(cx).is_ready(),
+            Poll::Ready(_) => true,
+            Poll::Pending => false,
+        };
+        let place = self.awaited.iter_mut().position(ready);
+        let ended = place.and_then(|place| self.awaited.remove(place));
+        let finished = ended.and_then(|mut awaited| {
+            let (answer, confirmed) = (awaited.placed.answer()?, awaited.placed.confirmation().flatten());
+            Some(Finished::of(&awaited.drive, awaited.metrics, &answer, confirmed))
+        });
+        finished.map_or(Poll::Pending, Poll::Ready)
+    }
+
+    /// Whether no order waits for its result.
+    pub(super) fn is_idle(&self) -> bool {
+        self.awaited.is_empty()
+    }
+}
+
+/// What a message asks for.
+struct Request {
+    /// The metrics as they came, and their place in the session.
+    metrics: Result<Vec<(Metric, Option<usize>)>, Refusal>,
+    timestamp: Option<u64>,
+}
+
+impl Request {
+    fn read(incoming: &Incoming, place: impl Fn(&Metric) -> Option<usize>) -> Request {
+        let refused = |refusal| Request {
+            metrics: Err(refusal),
+            timestamp: None,
+        };
+        if incoming.retain {
+            let why = "a retained message is never a command; publish it without the retain flag and clear the topic";
+            return refused(Refusal::NotAllowed(why.to_string()));
+        }
+        if let Some(bytes) = incoming.oversized {
+            return refused(Refusal::BadValue(format!(
+                "the payload has {bytes} bytes, 65536 are allowed"
+            )));
+        }
+        let payload = match Payload::decoded(&incoming.payload) {
+            Ok(payload) => payload,
+            Err(why) => return refused(Refusal::BadValue(format!("the payload is not Sparkplug B: {why}"))),
+        };
+        let count = payload.metrics.len();
+        if count > METRICS {
+            let why = format!("the command has {count} metrics, {METRICS} are allowed");
+            return refused(Refusal::BadValue(why));
+        }
+        let placed = |mut metric: Metric| {
+            // Some hosts send the field empty beside an alias.
+            metric.name = metric.name.filter(|name| !name.is_empty());
+            let place = place(&metric);
+            (metric, place)
+        };
+        Request {
+            metrics: Ok(payload.metrics.into_iter().map(placed).collect()),
+            timestamp: payload.timestamp,
+        }
+    }
+
+    fn metrics(&self) -> Vec<usize> {
+        self.metrics.iter().flatten().filter_map(|(_, place)| *place).collect()
+    }
+
+    /// For the audit, if it is refused before it becomes an order.
+    fn what(&self) -> String {
+        let Ok(metrics) = &self.metrics else {
+            return "a Sparkplug command".to_string();
+        };
+        let name = |(metric, _): &(Metric, Option<usize>)| {
+            let value = json(metric).map_or_else(|| "null".to_string(), |value| value.to_string());
+            match (&metric.name, metric.alias) {
+                (Some(name), _) => format!("{name}={value}"),
+                (None, Some(alias)) => format!("alias {alias}={value}"),
+                (None, None) => format!("?={value}"),
+            }
+        };
+        let all: Vec<String> = metrics.iter().take(8).map(name).collect();
+        excerpt(all.join(" ").as_bytes())
+    }
+
+    /// The points that are understood, and why another one is not.
+    fn points(
+        &self,
+        profile: &Profile,
+        name: impl Fn(usize) -> Option<String>,
+        alias: impl Fn(usize) -> Option<u64>,
+    ) -> Result<Understood, Refusal> {
+        let metrics = self.metrics.as_ref().map_err(Clone::clone)?;
+        let point = |(metric, place): &(Metric, Option<usize>)| {
+            if let (Some(name), Some(sent), Some(own)) = (&metric.name, metric.alias, place.and_then(&alias))
+                && sent != own
+                && sent != 0
+            {
+                let name = excerpt(name.as_bytes());
+                return Err(Refusal::BadValue(format!(
+                    "the metric {name} has the alias {own}, not {sent}; send the name or the alias, and ask for a birth with \
+                     `Node Control/Rebirth` if the aliases are old"
+                )));
+            }
+            let name = match (&metric.name, place.and_then(&name)) {
+                (Some(name), _) => name.clone(),
+                (None, Some(name)) => name,
+                (None, None) => {
+                    let alias = metric
+                        .alias
+                        .map_or_else(|| "none".to_string(), |alias| alias.to_string());
+                    return Err(Refusal::NotWritable(format!(
+                        "no metric of the drive has the alias {alias}; ask for a birth with `Node Control/Rebirth`"
+                    )));
+                }
+            };
+            let value = json(metric).ok_or_else(|| {
+                let name = excerpt(name.as_bytes());
+                Refusal::BadValue(format!(
+                    "{name} has no value that can be commanded (null, a text, not finite)"
+                ))
+            })?;
+            resolve(profile, &name, &value)
+        };
+        let (mut points, mut refused) = (Vec::new(), None);
+        for metric in metrics {
+            match point(metric) {
+                Ok(point) => points.push(point),
+                Err(refusal) => refused = refused.or(Some(refusal)),
+            }
+        }
+        Ok((points, refused))
+    }
+}
+
+/// The value of a metric, whatever type of number the host sends; `None` for null, for texts and for what is no number.
+fn json(metric: &Metric) -> Option<Json> {
+    if metric.is_null == Some(true) {
+        return None;
+    }
+    let unsigned = metric.datatype.is_some_and(wire::is_unsigned);
+    let number = |number: f64| serde_json::Number::from_f64(number).map(Json::Number);
+    match metric.value.as_ref()? {
+        MetricValue::Boolean(state) => Some(Json::Bool(*state)),
+        MetricValue::Int(word) if unsigned => Some(Json::from(*word)),
+        MetricValue::Int(word) => Some(Json::from(word.cast_signed())),
+        MetricValue::Long(word) if unsigned => Some(Json::from(*word)),
+        MetricValue::Long(word) => Some(Json::from(word.cast_signed())),
+        // As the decimal that the host meant: 33.3, not 33.29999923706055.
+        MetricValue::Float(value) => number(value.to_string().parse().ok()?),
+        MetricValue::Double(value) => number(*value),
+        MetricValue::String(_) => None,
+    }
+}
+
+#[cfg(test)]
+mod tests;

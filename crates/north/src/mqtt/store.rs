@@ -1,0 +1,462 @@
+//! Passes messages that must not be lost to the outbox and, by a thread of their own, to the disk: however slow the disk
+//! is, nothing else waits for it.
+//!
+//! While nothing waits on disk, a message goes to the outbox at once and to the disk for the case that the process ends
+//! before it is acknowledged. Otherwise it waits its turn behind what is on disk.
+
+use std::io;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, AtomicU64, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+use flume::{Receiver, RecvTimeoutError, Sender, TrySendError};
+use tokio::sync::mpsc;
+
+use super::Buffer;
+use super::journal::Journal;
+use super::outbox::{KEPT_BYTES, Message};
+use crate::files::names::MQTT_TOPICS;
+use crate::{MqttLoss, NorthStats};
+
+/// Jobs that wait for the disk: a burst of events and its acknowledgements. The size of their messages is at most
+/// [`KEPT_BYTES`].
+const JOBS: usize = 2 * crate::event::BURST;
+/// Messages that are written at a time.
+const BATCH: usize = 1024;
+/// Time after which messages on disk survive a power failure.
+const SYNC: Duration = Duration::from_secs(1);
+/// Attempts to lock the directory, and the wait between them: a process that is stopping may still hold it.
+const LOCK_ATTEMPTS: u32 = 20;
+const LOCK_WAIT: Duration = Duration::from_millis(50);
+
+/// Counts lost messages of one kind.
+#[derive(Debug, Clone)]
+pub(super) struct LostCount(pub(super) Arc<NorthStats>, pub(super) MqttLoss);
+
+impl LostCount {
+    pub(super) fn add(&self, count: u64) {
+        self.0.mqtt.lost(self.1, count);
+    }
+}
+
+/// Number of a message: from 1 in this run, 0 and less for those of earlier runs.
+pub(super) type Number = i64;
+
+enum Job {
+    /// A message, and whether it is in the outbox already.
+    Append(Message, bool),
+    /// All messages up to this one are acknowledged.
+    Acknowledge(Number),
+    /// Load up to so many messages.
+    Load(usize),
+    /// The retained topics that the gateway publishes from now on.
+    Topics(Vec<String>),
+}
+
+/// What the disk reports.
+#[derive(Debug)]
+pub(super) enum Loaded {
+    /// Messages of earlier runs, and the topics published then.
+    Opened { waiting: u64, topics: Vec<String> },
+    /// The next messages; nothing up to `through` is left on disk.
+    Messages {
+        messages: Vec<(Number, Message)>,
+        through: Number,
+    },
+}
+
+/// What keeps the messages of one kind.
+#[derive(Debug, Default)]
+pub(super) struct Store {
+    disk: Option<Disk>,
+    /// Messages given to the disk.
+    pushed: Number,
+    /// Up to here nothing waits on disk.
+    through: Number,
+    /// Up to here all are acknowledged; `told` of it is what the disk knows.
+    acknowledged: Number,
+    told: Number,
+    opened: bool,
+    loading: bool,
+}
+
+#[derive(Debug)]
+struct Disk {
+    lost: LostCount,
+    jobs: Sender<Job>,
+    /// Size of the messages among them.
+    bytes: Arc<AtomicUsize>,
+    gone: Arc<Gone>,
+    loaded: mpsc::Receiver<Loaded>,
+    ended: tokio::sync::oneshot::Receiver<()>,
+}
+
+/// What the disk gave up because the buffer was full.
+#[derive(Debug)]
+struct Gone {
+    /// Up to this message nothing is kept.
+    through: AtomicI64,
+    /// Number of lost messages among those behind it.
+    missing: AtomicU64,
+}
+
+impl Default for Gone {
+    fn default() -> Gone {
+        Gone {
+            through: AtomicI64::new(Number::MIN),
+            missing: AtomicU64::new(0),
+        }
+    }
+}
+
+impl Store {
+    /// Opens the buffer of that name, without waiting for it; without a buffer, messages are not kept. If it cannot be
+    /// used, that is logged and messages wait in memory.
+    pub(super) fn open(buffer: Option<Buffer>, name: &'static str, lost: LostCount) -> Store {
+        let Some(buffer) = buffer else {
+            return Store::default();
+        };
+        // Takes memory as it fills: the channel of the standard library would hold the space of all jobs from the start.
+        let (jobs, todo) = flume::bounded(JOBS);
+        let (sender, loaded) = mpsc::channel(4);
+        let (end, ended) = tokio::sync::oneshot::channel();
+        let of_thread = lost.clone();
+        let bytes: Arc<AtomicUsize> = Arc::default();
+        let gone: Arc<Gone> = Arc::default();
+        let (waiting, given_up) = (bytes.clone(), gone.clone());
+        let work = move || {
+            Thread::open(&buffer, name, sender, of_thread, given_up).work(&todo, &waiting);
+            // The client may be gone.
+            let _ = end.send(());
+        };
+        match std::thread::Builder::new().name(name.to_string()).spawn(work) {
+            Ok(_) => Store {
+                disk: Some(Disk {
+                    lost,
+                    jobs,
+                    bytes,
+                    gone,
+                    loaded,
+                    ended,
+                }),
+                ..Store::default()
+            },
+            Err(error) => {
+                tracing::error!("the system provides no thread for the MQTT buffer: {error}; it is not used");
+                Store::default()
+            }
+        }
+    }
+
+    /// Keeps a message. Returns it with its number if it is to be sent now, or if nothing keeps it; `room` says whether
+    /// the outbox has room.
+    pub(super) fn push(&mut self, message: Message, room: bool) -> Option<(Option<Number>, Message)> {
+        let Some(disk) = &self.disk else {
+            return Some((None, message));
+        };
+        let now = self.opened && room && self.through == self.pushed;
+        if disk.append(&message, now) {
+            self.pushed += 1;
+        } else if now {
+            return Some((None, message));
+        } else {
+            disk.lost.add(1);
+            return None;
+        }
+        if now {
+            self.through = self.pushed;
+        }
+        now.then_some((Some(self.pushed), message))
+    }
+
+    /// Asks for messages on disk, if there are any that are not under way.
+    pub(super) fn load(&mut self, room: usize) {
+        let Some(disk) = &self.disk else { return };
+        if room > 0 && self.opened && !self.loading && self.through < self.pushed {
+            self.loading = disk.jobs.try_send(Job::Load(room)).is_ok();
+        }
+    }
+
+    /// What the disk reports next; pending while there is nothing. Cancel safe.
+    pub(super) async fn next(&mut self) -> Loaded {
+        let report = match &mut self.disk {
+            Some(disk) => disk.loaded.recv().await,
+            None => None,
+        };
+        match report {
+            Some(report) => report,
+            None => std::future::pending().await,
+        }
+    }
+
+    /// Takes a report; returns the messages to be sent, and the topics of earlier runs.
+    pub(super) fn take(&mut self, loaded: Loaded) -> (Vec<(Number, Message)>, Vec<String>) {
+        match loaded {
+            Loaded::Opened { waiting, topics } => {
+                let older = Number::try_from(waiting).unwrap_or(Number::MAX);
+                // Messages of this run may wait already.
+                (self.opened, self.through) = (true, -older);
+                (self.acknowledged, self.told) = (-older, -older);
+                (Vec::new(), topics)
+            }
+            Loaded::Messages { messages, through } => {
+                (self.loading, self.through) = (false, through);
+                (messages, Vec::new())
+            }
+        }
+    }
+
+    /// All messages before `oldest`, which waits in the outbox, are acknowledged; all that were loaded if none waits.
+    pub(super) fn acknowledge(&mut self, oldest: Option<Number>) {
+        let acknowledged = oldest.map_or(self.through, |oldest| oldest - 1);
+        self.acknowledged = self.acknowledged.max(acknowledged);
+        if let Some(disk) = &self.disk
+            && self.opened
+            && self.told < self.acknowledged
+            && disk.jobs.try_send(Job::Acknowledge(self.acknowledged)).is_ok()
+        {
+            self.told = self.acknowledged;
+        }
+    }
+
+    /// Keeps the topics that are published, for the next run.
+    pub(super) fn remember(&self, topics: Vec<String>) {
+        if let Some(disk) = &self.disk {
+            let kept = disk.jobs.try_send(Job::Topics(topics));
+            if let Err(TrySendError::Full(_)) = kept {
+                tracing::warn!("the MQTT buffer is too slow; topics removed before the next start are not cleared");
+            }
+        }
+    }
+
+    /// Up to this message nothing is kept any more, because the buffer was full; what of it is in the outbox is lost.
+    pub(super) fn gone(&self) -> Number {
+        let gone = self.disk.as_ref().map(|disk| disk.gone.through.load(Ordering::Relaxed));
+        gone.unwrap_or(Number::MIN)
+    }
+
+    /// Number of messages on disk that are not in the outbox.
+    pub(super) fn waiting(&self) -> u64 {
+        let Some(disk) = &self.disk else { return 0 };
+        let kept = u64::try_from(self.pushed - self.through.max(self.gone())).unwrap_or_default();
+        kept.saturating_sub(disk.gone.missing.load(Ordering::Relaxed))
+    }
+
+    /// Writes what waits and ends; the caller limits the time.
+    pub(super) async fn close(self) {
+        if let Some(Disk { jobs, ended, .. }) = self.disk {
+            drop(jobs);
+            // An error means that the thread has ended.
+            let _ = ended.await;
+        }
+    }
+}
+
+impl Disk {
+    /// Gives a message to the disk, unless too much waits for it.
+    fn append(&self, message: &Message, sent: bool) -> bool {
+        let bytes = message.bytes();
+        if self.bytes.load(Ordering::Relaxed) + bytes > KEPT_BYTES {
+            return false;
+        }
+        // Before the thread can subtract it.
+        self.bytes.fetch_add(bytes, Ordering::Relaxed);
+        let given = self.jobs.try_send(Job::Append(message.clone(), sent)).is_ok();
+        if !given {
+            self.bytes.fetch_sub(bytes, Ordering::Relaxed);
+        }
+        given
+    }
+}
+
+/// The thread that owns the files.
+struct Thread {
+    dir: PathBuf,
+    journal: Journal,
+    report: mpsc::Sender<Loaded>,
+    lost: LostCount,
+    gone: Arc<Gone>,
+    /// The topics to be kept for the next run.
+    topics: Vec<String>,
+    /// The last number of earlier runs.
+    base: u64,
+    /// Whether the last write failed; logged once.
+    failing: bool,
+    synced: Instant,
+}
+
+impl Thread {
+    fn open(
+        buffer: &Buffer,
+        name: &'static str,
+        report: mpsc::Sender<Loaded>,
+        lost: LostCount,
+        gone: Arc<Gone>,
+    ) -> Thread {
+        let dir = buffer.dir.clone();
+        let mut attempts = LOCK_ATTEMPTS;
+        let journal = loop {
+            attempts -= 1;
+            match Journal::open(&dir, name, buffer.max_bytes) {
+                Ok(journal) => break journal,
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock && attempts > 0 => {
+                    std::thread::sleep(LOCK_WAIT);
+                }
+                Err(error) => {
+                    tracing::error!(
+                        "cannot keep {name} in {}: {error}; keeping them in memory; check mqtt.buffer",
+                        dir.display()
+                    );
+                    break Journal::in_memory();
+                }
+            }
+        };
+        let waiting = journal.waiting();
+        if waiting > 0 {
+            tracing::info!(
+                "{waiting} earlier {name} in {} are waiting for the broker",
+                dir.display()
+            );
+        }
+        let thread = Thread {
+            base: journal.last(),
+            dir,
+            journal,
+            report,
+            lost,
+            gone,
+            topics: Vec::new(),
+            failing: false,
+            synced: Instant::now(),
+        };
+        let topics = thread.read_topics();
+        thread.tell(Loaded::Opened { waiting, topics });
+        thread
+    }
+
+    /// Works until nobody sends jobs any more; `bytes` is the size of the messages that wait.
+    fn work(mut self, jobs: &Receiver<Job>, bytes: &AtomicUsize) {
+        loop {
+            let mut load = None;
+            let mut next = match jobs.recv_timeout(SYNC) {
+                Ok(job) => Some(job),
+                Err(RecvTimeoutError::Timeout) => None,
+                Err(RecvTimeoutError::Disconnected) => break,
+            };
+            let mut count = 0;
+            while let Some(job) = next.take() {
+                match job {
+                    Job::Append(message, sent) => {
+                        bytes.fetch_sub(message.bytes(), Ordering::Relaxed);
+                        self.journal.append(message, sent);
+                    }
+                    Job::Acknowledge(number) => self.journal.acknowledge(self.base.saturating_add_signed(number)),
+                    Job::Load(most) => load = Some(most),
+                    Job::Topics(topics) => {
+                        self.topics = topics;
+                        self.write_topics();
+                    }
+                }
+                count += 1;
+                // The answer tells what is there when it is given: nothing that comes later.
+                if count < BATCH && load.is_none() {
+                    next = jobs.try_recv().ok();
+                }
+            }
+            if let Some(most) = load {
+                self.load(most);
+            }
+            self.write();
+        }
+        self.write();
+        self.sync();
+        let unkept = self.journal.unkept();
+        if unkept > 0 {
+            self.lost.add(unkept);
+            tracing::error!(
+                "{unkept} messages that the broker did not take are lost: {} does not take them either; check mqtt.buffer",
+                self.dir.display()
+            );
+        }
+    }
+
+    /// A number of the journal as the client knows it.
+    fn number(&self, number: u64) -> Number {
+        number as Number - self.base as Number
+    }
+
+    fn load(&mut self, most: usize) {
+        let taken = self.journal.take(most);
+        let messages: Vec<_> = taken.into_iter().map(|(n, m)| (self.number(n), m)).collect();
+        let through = self.number(self.journal.through());
+        self.tell(Loaded::Messages { messages, through });
+    }
+
+    fn tell(&self, loaded: Loaded) {
+        // At most two reports are under way; the client may be gone.
+        let _ = self.report.try_send(loaded);
+    }
+
+    fn write(&mut self) {
+        let written = self.journal.write();
+        match written {
+            Ok(true) if std::mem::take(&mut self.failing) => {
+                tracing::info!("{} takes the MQTT buffer again", self.dir.display());
+            }
+            Err(error) if !std::mem::replace(&mut self.failing, true) => {
+                tracing::error!(
+                    "cannot write to {}: {error}; the newest messages wait in memory; check mqtt.buffer",
+                    self.dir.display()
+                );
+            }
+            _ => {}
+        }
+        if self.journal.take_wiped() && !self.topics.is_empty() {
+            self.write_topics();
+        }
+        let lost = self.journal.take_lost();
+        if lost > 0 {
+            self.lost.add(lost);
+        }
+        let (gone, missing) = (self.number(self.journal.gone()), self.journal.missing());
+        self.gone.through.store(gone, Ordering::Relaxed);
+        self.gone.missing.store(missing, Ordering::Relaxed);
+        if self.synced.elapsed() >= SYNC {
+            self.sync();
+        }
+    }
+
+    fn sync(&mut self) {
+        if let Some(file) = self.journal.unsynced()
+            && let Err(error) = file.sync_data()
+        {
+            let dir = self.dir.display();
+            tracing::warn!("{dir}: {error}; buffered messages may not survive a power failure");
+        }
+        self.synced = Instant::now();
+    }
+
+    fn topics_file(&self) -> PathBuf {
+        self.dir.join(MQTT_TOPICS)
+    }
+
+    fn read_topics(&self) -> Vec<String> {
+        let text = std::fs::read_to_string(self.topics_file()).unwrap_or_default();
+        text.lines().map(str::to_string).collect()
+    }
+
+    fn write_topics(&self) {
+        let (file, new) = (self.topics_file(), self.dir.join(format!("{MQTT_TOPICS}.new")));
+        let written = std::fs::write(&new, self.topics.join("\n")).and_then(|()| std::fs::rename(&new, &file));
+        if let Err(error) = written {
+            // A part of it would only take room from the messages.
+            let _ = std::fs::remove_file(&new);
+            let file = file.display();
+            tracing::warn!("{file}: {error}; topics removed before the next start are not cleared");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,291 @@
+//! What one tool says and is answered, bytes in and out, with the time as an argument.
+//!
+//! A line has one request at a time: a tool that asks again has given the request before up, whose answer is dropped, however it
+//! ends. What was accepted for the bus is done all the same.
+
+use std::future::poll_fn;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::{Duration, Instant};
+
+use super::framing::{Framing, Said};
+use super::request::{Meaning, Refused, ToolRequest};
+use super::terms::{Decision, Tool, Work};
+use crate::SlotOutcome;
+use crate::codec::{Protocol, Reply, RequestPdu};
+use crate::command::Outcome;
+
+/// A tool is answered within this time from the end of its request, or not at all.
+pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(1);
+/// Time that a byte of a tool takes at least: no line of 460,800 baud brings more, so a tool that floods costs little.
+const BYTE_TIME: Duration = Duration::from_micros(20);
+/// A tool that asks again before it is answered gets no more than one request to the bus in this time, stops apart.
+const IMPATIENT: Duration = Duration::from_millis(20);
+
+/// A request that waits for its answer.
+#[derive(Debug)]
+struct Pending {
+    request: ToolRequest,
+    pdu: RequestPdu,
+    work: Work,
+    deadline: Instant,
+}
+
+/// A request that has not been given to the bus yet.
+#[derive(Debug)]
+struct Held {
+    request: ToolRequest,
+    /// When its first byte came.
+    asked: Instant,
+    /// Stops that its drives had been given when it was whole.
+    stops: u64,
+    until: Instant,
+    deadline: Instant,
+}
+
+/// One tool.
+#[derive(Debug)]
+pub(super) struct Dialogue {
+    tool: Arc<Tool>,
+    framing: Framing,
+    pending: Option<Pending>,
+    held: Option<Held>,
+    /// When the last request was given to the bus.
+    asked: Option<Instant>,
+    /// When more of the tool is read, while that is not now.
+    reads_at: Option<Instant>,
+    /// What the tool is answered.
+    pub(super) output: Vec<u8>,
+}
+
+impl Dialogue {
+    pub(super) fn new(tool: Arc<Tool>) -> Dialogue {
+        Dialogue {
+            framing: Framing::new(tool.protocol(), tool.format()),
+            tool,
+            pending: None,
+            held: None,
+            asked: None,
+            reads_at: None,
+            output: Vec::new(),
+        }
+    }
+
+    /// Name of the tool for the log.
+    pub(super) fn who(&self) -> &str {
+        self.tool.who()
+    }
+
+    /// Whether an answer is due.
+    pub(super) fn is_waiting(&self) -> bool {
+        self.pending.is_some() || self.held.is_some()
+    }
+
+    /// Bytes of the tool came in at `now`. Requests that it makes are in the queue of the bus when this returns, or held until
+    /// [`Dialogue::wake_at`]. Whether there were any.
+    pub(super) fn received(&mut self, bytes: &[u8], now: Instant) -> bool {
+        let count = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
+        self.reads_at = now.checked_add(BYTE_TIME.saturating_mul(count));
+        self.framing.add(bytes, now);
+        self.on_time(now)
+    }
+
+    /// Whether more of the tool is read now; if not, from [`Dialogue::wake_at`] on.
+    pub(super) fn reads(&self) -> bool {
+        self.reads_at.is_none()
+    }
+
+    /// Time went by. Whether the tool made a request by that.
+    pub(super) fn on_time(&mut self, now: Instant) -> bool {
+        self.reads_at = self.reads_at.filter(|at| *at > now);
+        let mut any = false;
+        while let Some(said) = self.framing.next(now) {
+            match said {
+                Said::Request(request) => {
+                    any = true;
+                    let asked = self.framing.asked().unwrap_or(now);
+                    self.asked_for(request, asked, now);
+                }
+                Said::Broken => self.tool.count(SlotOutcome::Broken),
+            }
+        }
+        if self.held.as_ref().is_some_and(|held| held.until <= now)
+            && let Some(held) = self.held.take()
+        {
+            self.go(held, now);
+        }
+        if self.pending.as_ref().is_some_and(|pending| pending.deadline <= now) {
+            self.give_up(SlotOutcome::Late);
+        }
+        any
+    }
+
+    /// When [`Dialogue::on_time`] has something to do.
+    pub(super) fn wake_at(&self) -> Option<Instant> {
+        let pending = self.pending.as_ref().map(|pending| pending.deadline);
+        let held = self.held.as_ref().map(|held| held.until);
+        [pending, held, self.framing.patience(), self.reads_at]
+            .into_iter()
+            .flatten()
+            .min()
+    }
+
+    /// Waits until nothing is due any more: the answer to what was asked last is in the output, or its time is over.
+    pub(super) async fn finished(&mut self) {
+        while self.is_waiting() {
+            let wake_at = self.wake_at().map(tokio::time::Instant::from_std);
+            let timer = async {
+                match wake_at {
+                    Some(at) => tokio::time::sleep_until(at).await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                biased;
+                () = poll_fn(|cx| self.poll(cx, Instant::now())) => {}
+                () = timer => drop(self.on_time(Instant::now())),
+            }
+        }
+    }
+
+    /// The tool is not there any more.
+    pub(super) fn ended(&mut self) {
+        self.give_up(SlotOutcome::Abandoned);
+    }
+
+    /// What was asked before is not wanted any more.
+    fn give_up(&mut self, outcome: SlotOutcome) {
+        if self.is_waiting() {
+            (self.pending, self.held) = (None, None);
+            self.tool.count(outcome);
+        }
+    }
+
+    fn asked_for(&mut self, request: ToolRequest, asked: Instant, now: Instant) {
+        let impatient = self.is_waiting() && self.asked.is_some_and(|at| now < at + IMPATIENT);
+        self.give_up(SlotOutcome::Abandoned);
+        let deadline = now + ANSWER_WITHIN;
+        let pace = self.tool.pace(&request, now);
+        let haste = impatient.then_some(self.asked).flatten().map(|at| at + IMPATIENT);
+        let until = if pace.is_stop {
+            now
+        } else {
+            pace.not_before.max(haste.unwrap_or(now))
+        };
+        let held = Held {
+            asked,
+            stops: pace.stops,
+            request,
+            until,
+            deadline,
+        };
+        if until <= now {
+            self.go(held, now);
+        } else if until < deadline {
+            self.held = Some(held);
+        } else {
+            self.tool.count(SlotOutcome::Late);
+        }
+    }
+
+    /// A request goes to the bus, or is answered here.
+    fn go(&mut self, held: Held, now: Instant) {
+        let Held {
+            request,
+            asked,
+            stops,
+            deadline,
+            ..
+        } = held;
+        self.asked = Some(now);
+        match self.tool.decide(&request, (asked, stops), deadline, now) {
+            Decision::Refuse(why) => {
+                self.tool.count(SlotOutcome::Refused);
+                if !request.is_broadcast(self.tool.protocol()) {
+                    self.output.extend(request.refusal(self.tool.protocol(), why));
+                }
+            }
+            Decision::Silent => self.tool.count(SlotOutcome::NoAnswer),
+            Decision::Wait(work) => {
+                let pdu = match &request.meaning {
+                    Meaning::Read(pdu) | Meaning::Write(pdu) | Meaning::Unchecked(pdu) => pdu.clone(),
+                    Meaning::Faulty(_) => return,
+                };
+                self.pending = Some(Pending {
+                    request,
+                    pdu,
+                    work,
+                    deadline,
+                });
+            }
+        }
+    }
+
+    /// Takes the answer of the bus, if it is there at `now`, into the output.
+    pub(super) fn poll(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<()> {
+        let Some(pending) = &mut self.pending else {
+            return Poll::Pending;
+        };
+        let Poll::Ready((outcome, frame)) = pending.work.poll(cx) else {
+            return Poll::Pending;
+        };
+        if let Some(pending) = self.pending.take() {
+            self.answer(&pending, &outcome, frame, now);
+        }
+        Poll::Ready(())
+    }
+
+    fn answer(&mut self, pending: &Pending, outcome: &Outcome, frame: Option<Vec<u8>>, now: Instant) {
+        let protocol = self.tool.protocol();
+        if pending.request.is_broadcast(protocol) {
+            // A broadcast that was sent is answered by nobody.
+            let sent = outcome.is_ok();
+            return self.tool.count(if sent {
+                SlotOutcome::Answered
+            } else {
+                SlotOutcome::NoAnswer
+            });
+        }
+        let answer = match (outcome, frame) {
+            (Outcome::Acknowledged(_) | Outcome::Exception(_) | Outcome::Unknown(_), Some(frame)) => Some(frame),
+            _ => frame_of(protocol, pending, outcome),
+        };
+        let Some(answer) = answer else {
+            // As on a line: whatever the reason, nothing comes.
+            return self.tool.count(SlotOutcome::NoAnswer);
+        };
+        if now >= pending.deadline {
+            return self.tool.count(SlotOutcome::Late);
+        }
+        if self.framing.has_begun() {
+            return self.tool.count(SlotOutcome::Abandoned);
+        }
+        self.tool.count(match outcome {
+            Outcome::Acknowledged(_) => SlotOutcome::Answered,
+            Outcome::Refused(_) => SlotOutcome::Refused,
+            _ => SlotOutcome::Exception,
+        });
+        self.output.extend(answer);
+    }
+}
+
+/// The frame of an answer whose bytes were not kept: to a command that may have taken several exchanges. An acknowledgement is
+/// the same whoever makes it.
+fn frame_of(protocol: Protocol, pending: &Pending, outcome: &Outcome) -> Option<Vec<u8>> {
+    let request = &pending.request;
+    match outcome {
+        Outcome::Acknowledged(Reply::Written) if protocol == Protocol::N2 => Some(b"A\r".to_vec()),
+        Outcome::Acknowledged(reply) if protocol != Protocol::N2 => {
+            let (mut pdu, mut frame) = (Vec::new(), Vec::new());
+            reply.encode(&pending.pdu, &mut pdu);
+            protocol.encode_frame(request.address, &pdu, &mut frame);
+            Some(frame)
+        }
+        Outcome::Exception(code) if protocol == Protocol::N2 => {
+            Some(request.refusal(protocol, Refused::Nak(code.n2_code()?)))
+        }
+        Outcome::Exception(code) | Outcome::Unknown(code) => Some(request.refusal(protocol, Refused::Exception(*code))),
+        Outcome::Refused(refusal) => Some(request.refusal(protocol, Refused::Exception(refusal.exception()))),
+        _ => None,
+    }
+}

@@ -1,0 +1,283 @@
+//! The bytes of a tool cut into its requests. Pure: time is an argument.
+//!
+//! A serial program writes a frame in pieces, and a network hands it over in lumps, so pauses within a frame decide nothing: a
+//! request is known by function, length and check code, in Modbus ASCII and N2 by its end. Only what stays incomplete is given up
+//! by silence. A frame of a function that is not decoded here is whole when its check code is right and nothing follows.
+
+use std::time::{Duration, Instant};
+
+use super::request::ToolRequest;
+use crate::arrivals::Arrivals;
+use crate::codec::frames::Frames;
+use crate::codec::{LineFormat, Protocol};
+
+/// Silence behind half a frame after which the rest is not expected any more: longer than the pauses of serial programs and the
+/// delayed acknowledgements of TCP, shorter than tools wait before they ask again.
+const HALF_FRAME: Duration = Duration::from_millis(250);
+
+/// What a tool said.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Said {
+    /// A sound request.
+    Request(ToolRequest),
+    /// Bytes that nobody answers: a wrong check code, half a frame, no frame at all.
+    Broken,
+}
+
+/// The bytes that are not cut yet.
+#[derive(Debug)]
+pub(super) struct Framing {
+    protocol: Protocol,
+    frames: Frames,
+    arrivals: Arrivals,
+    /// When the first byte came of what was said last.
+    asked: Option<Instant>,
+}
+
+impl Framing {
+    pub(super) fn new(protocol: Protocol, format: LineFormat) -> Framing {
+        Framing {
+            protocol,
+            frames: Frames::new(protocol, format, HALF_FRAME),
+            arrivals: Arrivals::default(),
+            asked: None,
+        }
+    }
+
+    /// Bytes came in at `now`.
+    pub(super) fn add(&mut self, bytes: &[u8], now: Instant) {
+        self.frames.add(bytes, now);
+        self.arrivals.came(bytes.len(), now);
+    }
+
+    /// What the tool said next, as far as that is clear at `now`.
+    pub(super) fn next(&mut self, now: Instant) -> Option<Said> {
+        loop {
+            let piece = self.frames.next(None, now)?;
+            self.asked = self.arrivals.first();
+            self.arrivals.taken(piece.bytes.len());
+            if !self.is_blank(&piece.bytes) {
+                return Some(match ToolRequest::of(self.protocol, &piece.bytes) {
+                    Some(request) => Said::Request(request),
+                    None => Said::Broken,
+                });
+            }
+        }
+    }
+
+    /// When the first byte came of what the tool said last.
+    pub(super) fn asked(&self) -> Option<Instant> {
+        self.asked
+    }
+
+    /// Between two lines there may be blanks and line feeds.
+    fn is_blank(&self, bytes: &[u8]) -> bool {
+        self.protocol.is_text() && bytes.iter().all(u8::is_ascii_whitespace)
+    }
+
+    /// When incomplete bytes are given up.
+    pub(super) fn patience(&self) -> Option<Instant> {
+        self.frames.patience()
+    }
+
+    /// Whether a request has begun.
+    pub(super) fn has_begun(&self) -> bool {
+        let rest = self.frames.rest();
+        !rest.is_empty() && !self.is_blank(rest)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::super::request::{Meaning, Refused};
+    use super::*;
+    use crate::codec::{Exception, RequestPdu, Table, ascii, rtu};
+
+    fn framing(protocol: Protocol) -> Framing {
+        Framing::new(protocol, LineFormat::new(9600, "8N1").unwrap())
+    }
+
+    fn all(framing: &mut Framing, now: Instant) -> Vec<Said> {
+        std::iter::from_fn(|| framing.next(now)).collect()
+    }
+
+    fn read(start: u16, count: u16) -> RequestPdu {
+        let table = Table::Holding;
+        RequestPdu::Read { table, start, count }
+    }
+
+    fn asks(address: u8, start: u16, count: u16) -> Said {
+        Said::Request(ToolRequest {
+            address,
+            function: 3,
+            meaning: Meaning::Read(read(start, count)),
+        })
+    }
+
+    fn framed(address: u8, pdu: &[u8]) -> Vec<u8> {
+        let mut frame = Vec::new();
+        rtu::encode_frame(address, pdu, &mut frame);
+        frame
+    }
+
+    #[test]
+    fn pauses_within_a_frame_decide_nothing() {
+        let now = Instant::now();
+        let mut framing = framing(Protocol::ModbusRtu);
+        let frame = framed(1, &[3, 8, 52, 0, 11]);
+        let mut at = now;
+        for byte in &frame {
+            assert_eq!(framing.next(at), None);
+            framing.add(&[*byte], at);
+            at += Duration::from_millis(100);
+        }
+        assert_eq!(all(&mut framing, at), [asks(1, 2100, 11)]);
+        assert!(!framing.has_begun());
+    }
+
+    #[test]
+    fn half_and_broken_frames_are_given_up_and_the_next_request_is_found() {
+        let now = Instant::now();
+        let mut framing = framing(Protocol::ModbusRtu);
+        let frame = framed(1, &[3, 8, 52, 0, 11]);
+        framing.add(&frame[..5], now);
+        assert_eq!(framing.next(now), None);
+        assert!(framing.has_begun());
+        let until = framing.patience().unwrap();
+        assert!(until >= now + HALF_FRAME && until < now + 2 * HALF_FRAME);
+        assert_eq!(all(&mut framing, until), [Said::Broken]);
+        let mut broken = frame.clone();
+        broken[7] ^= 1;
+        // Behind a broken frame and behind half of one, without a pause.
+        framing.add(&[broken.as_slice(), &frame, &frame[..4], &frame].concat(), until);
+        let said = all(&mut framing, until);
+        assert_eq!(said, [Said::Broken, asks(1, 2100, 11), Said::Broken, asks(1, 2100, 11)]);
+    }
+
+    #[test]
+    fn a_function_that_is_not_decoded_is_whole_by_silence() {
+        let now = Instant::now();
+        let mut framing = framing(Protocol::ModbusRtu);
+        framing.add(&framed(1, &[0x41, 1, 2, 3]), now);
+        assert_eq!(framing.next(now), None);
+        let until = framing.patience().unwrap();
+        assert!(until < now + Duration::from_millis(40), "sooner than half a frame");
+        let Some(Said::Request(request)) = framing.next(until) else {
+            panic!("no request")
+        };
+        assert_eq!(
+            (request.address, request.meaning),
+            (1, Meaning::Unchecked(RequestPdu::Other(vec![0x41, 1, 2, 3])))
+        );
+    }
+
+    #[test]
+    fn lines_of_ascii_and_n2() {
+        let now = Instant::now();
+        let mut framing = framing(Protocol::ModbusAscii);
+        let mut line = Vec::new();
+        ascii::encode_frame(3, &[3, 0, 32, 0, 4], &mut line);
+        framing.add(&[b"\r\n".as_slice(), &line[..7]].concat(), now);
+        assert!(all(&mut framing, now).is_empty());
+        framing.add(&line[7..], now);
+        framing.add(&line, now);
+        let mut broken = line.clone();
+        broken[5] = b'7';
+        framing.add(&broken, now);
+        assert_eq!(all(&mut framing, now), [asks(3, 32, 4), asks(3, 32, 4), Said::Broken]);
+        // Lower case, and a function that is not decoded.
+        framing.add(&line.to_ascii_lowercase(), now);
+        let mut unknown = Vec::new();
+        ascii::encode_frame(3, &[0x41, 7], &mut unknown);
+        framing.add(&unknown, now);
+        let said = all(&mut framing, now);
+        assert_eq!(said[0], asks(3, 32, 4));
+        assert!(
+            matches!(&said[1], Said::Request(request) if request.function == 0x41),
+            "{said:?}"
+        );
+
+        let mut framing = self::framing(Protocol::N2);
+        framing.add(b">0111020388\r\n", now);
+        let input = RequestPdu::Read {
+            table: Table::Input,
+            start: 2,
+            count: 2,
+        };
+        let said = all(&mut framing, now);
+        assert!(
+            matches!(&said[..], [Said::Request(ToolRequest { address: 1, meaning: Meaning::Read(pdu), .. })] if *pdu == input),
+            "{said:?}"
+        );
+        assert!(!framing.has_begun(), "a line feed begins no request");
+        framing.add(b">0111020389\r", now);
+        assert_eq!(
+            all(&mut framing, now),
+            [Said::Broken],
+            "nobody answers a wrong checksum"
+        );
+    }
+
+    #[test]
+    fn what_a_drive_could_not_do_is_refused_as_a_drive_refuses_it() {
+        for (pdu, code) in [
+            (&[3, 0, 0, 0, 126][..], Exception::VALUE),
+            (&[3, 255, 255, 0, 2], Exception::ADDRESS),
+            (&[22, 0, 4, 0, 242, 0, 37], Exception::FUNCTION),
+            (&[5, 0, 0, 1, 0], Exception::VALUE),
+        ] {
+            let request = ToolRequest::of(Protocol::ModbusRtu, &framed(7, pdu)).unwrap();
+            assert_eq!(request.meaning, Meaning::Faulty(Refused::Exception(code)), "{pdu:?}");
+            let refusal = request.refusal(Protocol::ModbusRtu, Refused::Exception(code));
+            assert_eq!(refusal, framed(7, &[pdu[0] | 0x80, code.0]));
+        }
+        for (pdu, reads) in [
+            (&[8, 0, 0, 1, 2][..], true),
+            (&[8, 0, 11, 0, 0], true),
+            (&[8, 0, 1, 0, 0], false),
+            (&[8, 0, 4, 0, 0], false),
+            (&[43, 14, 1, 0], true),
+            (&[43, 13, 1, 0], false),
+            (&[17], false),
+        ] {
+            let request = ToolRequest::of(Protocol::ModbusRtu, &framed(7, pdu)).unwrap();
+            assert_eq!(matches!(request.meaning, Meaning::Read(_)), reads, "{pdu:?}");
+            assert_eq!(matches!(request.meaning, Meaning::Unchecked(_)), !reads, "{pdu:?}");
+        }
+        let exception = ToolRequest::of(Protocol::ModbusRtu, &framed(7, &[0x83, 2]));
+        assert_eq!(exception, None, "a reply is no request");
+    }
+
+    proptest! {
+        /// Whatever comes in whatever pieces: nothing is kept without bound, and a sound request behind it is found.
+        #[test]
+        fn any_bytes_are_borne(
+            bytes in prop::collection::vec(any::<u8>(), 0..600),
+            size in 1..40usize,
+            protocol in 0..3usize,
+        ) {
+            let protocol = Protocol::ALL[protocol];
+            let mut framing = framing(protocol);
+            let mut now = Instant::now();
+            for piece in bytes.chunks(size) {
+                framing.add(piece, now);
+                all(&mut framing, now);
+                prop_assert!(framing.frames.rest().len() <= 1100);
+                now += Duration::from_millis(3);
+            }
+            now += 2 * HALF_FRAME;
+            all(&mut framing, now);
+            prop_assert!(!framing.has_begun());
+            let mut frame = Vec::new();
+            match protocol {
+                Protocol::N2 => frame.extend(*b">0111020388\r"),
+                _ => protocol.encode_frame(9, &[3, 0, 1, 0, 2], &mut frame),
+            }
+            framing.add(&frame, now);
+            let said = all(&mut framing, now);
+            prop_assert!(matches!(&said[..], [Said::Request(_)]), "{:?}", said);
+        }
+    }
+}

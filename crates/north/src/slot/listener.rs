@@ -1,0 +1,112 @@
+//! Who may connect to an address of a slot, and how its connections are served.
+
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+
+use arc_swap::ArcSwapOption;
+use tokio::net::TcpStream;
+use tokio_util::sync::CancellationToken;
+
+use super::terms::{Terms, Tool};
+use super::{MAX_TOOLS, connection, limits};
+use crate::command::Authority;
+use crate::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer};
+use crate::line::ServedPort;
+use crate::listener::ConnectionHandler;
+use crate::refusals::Refusals;
+
+/// What an address serves.
+#[derive(Debug, Clone)]
+pub(super) struct Served {
+    pub(super) terms: Arc<Terms>,
+    /// A COM port by RFC 2217, not the bare bytes.
+    pub(super) telnet: bool,
+}
+
+impl Served {
+    fn allows(&self, client: IpAddr) -> Option<Authority> {
+        let allow = &self.terms.slot.allow;
+        allow
+            .iter()
+            .any(|network| network.contains(&client))
+            .then_some(Authority::ReadOnly)
+    }
+}
+
+/// The handler of one address.
+#[derive(Debug)]
+pub(super) struct SlotListener {
+    number: usize,
+    served: ArcSwapOption<Served>,
+    limit: Arc<ConnectionLimit>,
+    refusals: Arc<Refusals>,
+    cancel: CancellationToken,
+    /// Cancelled when the gateway stops.
+    stopping: CancellationToken,
+}
+
+impl SlotListener {
+    pub(super) fn new(
+        number: usize,
+        served: Option<Served>,
+        refusals: Arc<Refusals>,
+        (cancel, stopping): (CancellationToken, CancellationToken),
+    ) -> SlotListener {
+        SlotListener {
+            number,
+            served: ArcSwapOption::from_pointee(served),
+            limit: ConnectionLimit::new(limits()),
+            refusals,
+            cancel,
+            stopping,
+        }
+    }
+
+    /// Serves otherwise from now on. Connections stay where nothing changes for them and their address is still allowed.
+    pub(super) fn update(&self, served: Served) {
+        let before = self.served.load_full();
+        let alike = before
+            .is_some_and(|before| before.telnet == served.telnet && before.terms.slot.serves_like(&served.terms.slot));
+        self.served.store(Some(Arc::new(served.clone())));
+        self.limit
+            .review(self.number, |place| served.allows(place.address()).filter(|_| alike));
+    }
+}
+
+impl ConnectionHandler for SlotListener {
+    type Permit = ConnectionPermit;
+
+    fn admit(&self, client: IpAddr) -> Option<ConnectionPermit> {
+        let newcomer = Newcomer {
+            address: client,
+            listener: self.number,
+            cancel: &self.cancel,
+        };
+        let judge = || self.served.load().as_ref().and_then(|served| served.allows(client));
+        self.refusals.acquire(&self.limit, newcomer, remedy, judge)
+    }
+
+    async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, permit: ConnectionPermit) {
+        let Some(served) = self.served.load_full() else { return };
+        if let Err(error) = stream.set_nodelay(true) {
+            tracing::debug!("tool slot: cannot set TCP_NODELAY: {error}");
+        }
+        let slot = &served.terms.slot;
+        let (port, greeting) = match served.telnet {
+            true => {
+                let (port, greeting) = ServedPort::new(slot.format);
+                (Some(port), greeting)
+            }
+            false => (None, Vec::new()),
+        };
+        let tool = Tool::new(served.terms.clone(), &peer.to_string(), &peer.ip().to_string());
+        let connection = connection::Connection::new(stream, Arc::new(tool), port, greeting);
+        connection
+            .serve(slot.idle_timeout, permit.place(), &self.stopping)
+            .await;
+    }
+}
+
+fn remedy(_: LimitReached) -> String {
+    format!("an address of a slot serves {MAX_TOOLS} tools at one time; close one, or open another slot")
+}

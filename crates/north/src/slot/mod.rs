@@ -1,0 +1,307 @@
+//! The tool slot: a program that speaks the drives' own protocol sees the line as if it were alone on it, over TCP, over a
+//! COM port by RFC 2217 or over a pseudo-terminal.
+//!
+//! `request` says what a frame asks for, `framing` cuts bytes into requests, `terms` decides what a slot lets its tools do,
+//! `dialogue` puts it together; all of them are pure. `connection` and `pty` do the I/O.
+
+mod connection;
+mod dialogue;
+mod framing;
+mod listener;
+mod offline;
+mod pty;
+mod request;
+mod terms;
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ipnet::IpNet;
+use tokio::runtime::Handle;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use self::listener::{Served, SlotListener};
+use self::terms::{Terms, WritePaces};
+use super::connection_limit::Limits;
+use super::listener::{ListenerSpec, Listeners, NewSockets};
+use super::refusals::Refusals;
+use super::{NorthStats, ServerError, ServerKind};
+use crate::codec::{LineFormat, Protocol};
+use crate::plant::SharedPlant;
+
+pub use self::offline::Offline;
+
+/// Tools that one address of a slot serves at one time, in turns.
+pub const MAX_TOOLS: usize = 4;
+
+/// What the tools of a slot may do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum SlotAccess {
+    /// Read.
+    #[default]
+    Read,
+    /// Write what a client of Modbus TCP could write, too.
+    Write,
+    /// Also what cannot be checked: broadcasts, functions that are not decoded, addresses of no configured drive.
+    Raw,
+}
+
+impl SlotAccess {
+    /// In words.
+    pub fn meaning(self) -> &'static str {
+        match self {
+            SlotAccess::Read => "tools read only",
+            SlotAccess::Write => "tools may write what Modbus TCP clients may",
+            SlotAccess::Raw => "tools may write, broadcast and send what cannot be checked",
+        }
+    }
+}
+
+/// One slot of a bus.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Slot {
+    /// Name of the bus.
+    pub bus: String,
+    /// What its line speaks.
+    pub protocol: Protocol,
+    /// Its characters.
+    pub format: LineFormat,
+    /// Where frames are taken as they are on the line.
+    pub listen: Option<SocketAddr>,
+    /// Where a COM port is served by RFC 2217.
+    pub rfc2217: Option<SocketAddr>,
+    /// Link to a pseudo-terminal.
+    pub pty: Option<PathBuf>,
+    /// What its tools may do.
+    pub access: SlotAccess,
+    /// Who may connect.
+    pub allow: Vec<IpNet>,
+    /// A connection without a request for that time is closed; `None`: never.
+    pub idle_timeout: Option<Duration>,
+}
+
+impl Slot {
+    /// The addresses that it listens on, and whether each serves a COM port.
+    fn addresses(&self) -> impl Iterator<Item = (SocketAddr, bool)> {
+        let raw = self.listen.map(|address| (address, false));
+        raw.into_iter().chain(self.rfc2217.map(|address| (address, true)))
+    }
+
+    /// Whether tools that are connected notice nothing of a change to `other`.
+    fn serves_like(&self, other: &Slot) -> bool {
+        let alike = Slot {
+            listen: self.listen,
+            rfc2217: self.rfc2217,
+            pty: self.pty.clone(),
+            allow: self.allow.clone(),
+            idle_timeout: self.idle_timeout,
+            ..other.clone()
+        };
+        alike == *self
+    }
+}
+
+/// All slots of the gateway.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Options {
+    /// In the order of the file.
+    pub slots: Vec<Slot>,
+}
+
+impl Options {
+    /// Files that the slots can have open at one time.
+    pub fn files(&self) -> usize {
+        let files =
+            |slot: &Slot| slot.addresses().count() * (1 + limits().files()) + 2 * usize::from(slot.pty.is_some());
+        self.slots.iter().map(files).sum()
+    }
+
+    fn listener_specs(&self) -> Vec<ListenerSpec> {
+        let specs = self.slots.iter().flat_map(|slot| {
+            slot.addresses().map(move |(address, _)| ListenerSpec {
+                address,
+                tls: false,
+                section: format!("[[bus.slot]] of bus `{}`", slot.bus),
+            })
+        });
+        specs.collect()
+    }
+}
+
+fn limits() -> Limits {
+    Limits::new(MAX_TOOLS, MAX_TOOLS)
+}
+
+/// The running slots.
+#[derive(Debug)]
+pub struct Server {
+    listeners: Listeners<SlotListener>,
+    ptys: Vec<RunningPty>,
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    paces: Arc<WritePaces>,
+    refusals: Arc<Refusals>,
+    /// Listeners opened so far.
+    opened: usize,
+    tasks: TaskTracker,
+    cancel: CancellationToken,
+}
+
+#[derive(Debug)]
+struct RunningPty {
+    slot: Slot,
+    cancel: CancellationToken,
+}
+
+/// What [`Server::commit`] needs to apply new options: all that can fail is done.
+#[derive(Debug)]
+pub struct Change {
+    options: Options,
+    sockets: NewSockets,
+}
+
+impl Server {
+    /// The addresses of the slots, with the port that the system chose if port 0 was configured.
+    pub fn addresses(&self) -> Vec<SocketAddr> {
+        self.listeners.addresses(false)
+    }
+
+    /// Prepares other slots: binds new addresses. Nothing changes for any tool.
+    ///
+    /// # Errors
+    /// An address cannot be bound; everything is as before.
+    pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+        let sockets = self.listeners.prepare(options.listener_specs()).await?;
+        Ok(Change { options, sockets })
+    }
+
+    /// Forgets prepared slots.
+    pub fn abort(&mut self, change: Change) {
+        self.listeners.abort(change.sockets);
+    }
+
+    /// Applies prepared slots. Tools of a slot that serves as before stay connected.
+    pub fn commit(&mut self, change: Change) {
+        let Change { options, sockets } = change;
+        let terms = |slot: &Slot| {
+            Arc::new(Terms {
+                slot: slot.clone(),
+                plant: self.plant.clone(),
+                stats: self.stats.clone(),
+                paces: self.paces.clone(),
+            })
+        };
+        let all: Vec<Arc<Terms>> = options.slots.iter().map(terms).collect();
+        // In the order of the listeners.
+        let mut served = all.iter().flat_map(|terms| {
+            let addresses = terms.slot.addresses();
+            addresses.map(|(_, telnet)| Served {
+                terms: terms.clone(),
+                telnet,
+            })
+        });
+        let (opened, refusals, stopping) = (&mut self.opened, &self.refusals, &self.cancel);
+        let mut first = None;
+        self.listeners.commit(sockets, |_, open, cancel| {
+            let served = served.next().or_else(|| first.clone());
+            first = first.take().or_else(|| served.clone());
+            let listener = match (open, served) {
+                (Some(listener), Some(served)) => {
+                    listener.update(served);
+                    listener.clone()
+                }
+                (Some(listener), None) => listener.clone(),
+                (None, served) => {
+                    *opened += 1;
+                    Arc::new(SlotListener::new(
+                        *opened,
+                        served,
+                        refusals.clone(),
+                        (cancel.clone(), stopping.clone()),
+                    ))
+                }
+            };
+            (listener, Handle::current())
+        });
+        self.commit_ptys(&all);
+    }
+
+    fn commit_ptys(&mut self, all: &[Arc<Terms>]) {
+        let wanted = |slot: &Slot| all.iter().any(|terms| terms.slot == *slot);
+        self.ptys.retain(|pty| {
+            let stays = wanted(&pty.slot);
+            if !stays {
+                pty.cancel.cancel();
+            }
+            stays
+        });
+        for terms in all {
+            let Some(path) = terms.slot.pty.clone() else { continue };
+            if self.ptys.iter().any(|pty| pty.slot == terms.slot) {
+                continue;
+            }
+            let cancel = self.cancel.child_token();
+            self.tasks
+                .spawn(pty::serve(path, terms.clone(), cancel.clone(), self.cancel.clone()));
+            self.ptys.push(RunningPty {
+                slot: terms.slot.clone(),
+                cancel,
+            });
+        }
+    }
+
+    /// Closes all slots; what tools have asked is answered.
+    pub async fn retire(&mut self) {
+        self.listeners.close().await;
+        self.ptys.drain(..).for_each(|pty| pty.cancel.cancel());
+    }
+
+    /// Whether no tool is left after [`Server::retire`].
+    pub fn is_drained(&self) -> bool {
+        self.tasks.len() <= 1
+    }
+
+    /// Waits until all listeners, connections and pseudo-terminals have ended, after the cancellation.
+    pub async fn stopped(&self) {
+        self.tasks.wait().await;
+    }
+}
+
+/// Opens the slots and serves until `cancel`.
+///
+/// # Errors
+/// An address cannot be bound. No socket stays open then.
+pub async fn start(
+    options: Options,
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    cancel: CancellationToken,
+) -> Result<Server, ServerError> {
+    let (tasks, cancel) = (TaskTracker::new(), cancel.child_token());
+    tasks.spawn(cancel.clone().cancelled_owned());
+    tasks.close();
+    let mut server = Server {
+        listeners: Listeners::new(ServerKind::Slot, stats.clone(), tasks.clone(), cancel.clone()),
+        ptys: Vec::new(),
+        plant,
+        paces: Arc::default(),
+        refusals: Arc::new(Refusals::new(ServerKind::Slot, stats.clone())),
+        stats,
+        opened: 0,
+        tasks,
+        cancel: cancel.clone(),
+    };
+    match server.prepare(options).await {
+        Ok(change) => {
+            server.commit(change);
+            Ok(server)
+        }
+        Err(error) => {
+            cancel.cancel();
+            Err(error)
+        }
+    }
+}

@@ -1,0 +1,65 @@
+//! A slot without sockets and runtime, for tests in virtual time.
+
+use std::sync::Arc;
+use std::task::{Context, Waker};
+use std::time::Instant;
+
+use super::Slot;
+use super::dialogue::Dialogue;
+use super::terms::{Terms, Tool};
+use crate::NorthStats;
+use crate::plant::SharedPlant;
+
+/// One tool of a slot without sockets.
+#[derive(Debug)]
+pub struct Offline {
+    terms: Arc<Terms>,
+    dialogue: Dialogue,
+}
+
+impl Offline {
+    /// The tool at `peer`.
+    pub fn new(slot: Slot, plant: SharedPlant, stats: Arc<NorthStats>, peer: &str) -> Offline {
+        Offline::of(
+            Arc::new(Terms {
+                slot,
+                plant,
+                stats,
+                paces: Arc::default(),
+            }),
+            peer,
+        )
+    }
+
+    /// Another tool of the same slot.
+    pub fn beside(&self, peer: &str) -> Offline {
+        Offline::of(self.terms.clone(), peer)
+    }
+
+    fn of(terms: Arc<Terms>, peer: &str) -> Offline {
+        let tool = Arc::new(Tool::new(terms.clone(), peer, peer));
+        Offline {
+            terms,
+            dialogue: Dialogue::new(tool),
+        }
+    }
+
+    /// Takes the bytes of the tool, if any, and returns what it is answered by `now`. What it asks for is in the queue of the
+    /// bus when this returns, or waits until [`Offline::wake_at`].
+    pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
+        self.dialogue.received(bytes, now);
+        let mut cx = Context::from_waker(Waker::noop());
+        while self.dialogue.poll(&mut cx, now).is_ready() {}
+        std::mem::take(&mut self.dialogue.output)
+    }
+
+    /// When the next call is due at the latest.
+    pub fn wake_at(&self) -> Option<Instant> {
+        self.dialogue.wake_at()
+    }
+
+    /// Whether an answer is due.
+    pub fn is_waiting(&self) -> bool {
+        self.dialogue.is_waiting()
+    }
+}

@@ -1,0 +1,338 @@
+//! What a slot lets its tools do, and the way of their requests to the bus.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Context, Poll};
+use std::time::{Duration, Instant};
+
+use super::request::{Meaning, Refused, ToolRequest};
+use super::{Slot, SlotAccess};
+use crate::codec::{LineFormat, Protocol, RequestPdu, describe};
+use crate::command::{self, Authority, Order, Origin, Outcome, Parts, Refusal, SourceKind, Urgency};
+use crate::drive::plan::WireTime;
+use crate::plant::{BusHandle, DriveHandle, Exchange, Placed, Plant, Question, SharedPlant, Target, turn_away};
+use crate::process_image::Access;
+use crate::{NorthStats, SlotOutcome};
+
+/// Share of the time of a line that writes of tools take at most, stops apart.
+const SHARE_OF_WRITES: f64 = 0.1;
+/// A command of a tool is not sent later than that.
+const EXPIRY: Duration = super::dialogue::ANSWER_WITHIN;
+
+/// What becomes of a request.
+#[derive(Debug)]
+pub(super) enum Decision {
+    /// It is refused.
+    Refuse(Refused),
+    /// Nothing is sent and nothing answered.
+    Silent,
+    /// The bus answers.
+    Wait(Work),
+}
+
+/// What the bus was given.
+#[derive(Debug)]
+pub(super) enum Work {
+    Exchange(Exchange),
+    Command(Placed),
+}
+
+impl Work {
+    /// How it ended, and the frame of the drive where it was kept.
+    pub(super) fn poll(&mut self, cx: &mut Context<'_>) -> Poll<(Outcome, Option<Vec<u8>>)> {
+        match self {
+            Work::Exchange(exchange) => exchange.poll(cx),
+            Work::Command(placed) => placed.poll_answer(cx).map(|answer| (answer.outcome, None)),
+        }
+    }
+}
+
+/// When a request may go.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Pace {
+    pub(super) not_before: Instant,
+    /// It stops a drive: it goes at once.
+    pub(super) is_stop: bool,
+    /// Stops that its drives were given so far.
+    pub(super) stops: u64,
+}
+
+/// When tools may write next, by bus.
+#[derive(Debug, Default)]
+pub(super) struct WritePaces(Mutex<BTreeMap<String, Instant>>);
+
+impl WritePaces {
+    fn not_before(&self, bus: &str) -> Option<Instant> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).get(bus).copied()
+    }
+
+    fn wrote(&self, bus: &str, took: Duration, now: Instant) {
+        let pause = took.mul_f64(1.0 / SHARE_OF_WRITES);
+        let mut paces = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        paces.insert(bus.to_string(), now + pause);
+    }
+}
+
+/// A slot as it is configured now, with the plant behind it.
+#[derive(Debug)]
+pub(super) struct Terms {
+    pub(super) slot: Slot,
+    pub(super) plant: SharedPlant,
+    pub(super) stats: Arc<NorthStats>,
+    pub(super) paces: Arc<WritePaces>,
+}
+
+/// One tool that is connected to a slot.
+#[derive(Debug)]
+pub(super) struct Tool {
+    terms: Arc<Terms>,
+    origin: Origin,
+}
+
+impl Tool {
+    /// The tool at `peer`; all connections of a `client` share its turns in the queues.
+    pub(super) fn new(terms: Arc<Terms>, peer: &str, client: &str) -> Tool {
+        let (kind, bus) = (SourceKind::Slot, &terms.slot.bus);
+        let client: Arc<str> = format!("{} {bus} {client}", kind.name()).into();
+        let origin = Origin::of(client, kind, format!("{peer} at {bus}"));
+        Tool { terms, origin }
+    }
+
+    pub(super) fn protocol(&self) -> Protocol {
+        self.terms.slot.protocol
+    }
+
+    pub(super) fn format(&self) -> LineFormat {
+        self.terms.slot.format
+    }
+
+    pub(super) fn who(&self) -> &str {
+        &self.origin.who
+    }
+
+    pub(super) fn count(&self, outcome: SlotOutcome) {
+        self.terms.stats.slots.count(&self.terms.slot.bus, outcome);
+    }
+
+    fn writes(&self) -> bool {
+        self.terms.slot.access != SlotAccess::Read
+    }
+
+    /// When the request may go: writes one after the other, in a share of the line; stops at once.
+    pub(super) fn pace(&self, request: &ToolRequest, now: Instant) -> Pace {
+        let mut pace = Pace {
+            not_before: now,
+            is_stop: false,
+            stops: 0,
+        };
+        if matches!(request.meaning, Meaning::Read(_) | Meaning::Faulty(_)) {
+            return pace;
+        }
+        let plant = self.terms.plant.load();
+        let drives = self.asked(&plant, request);
+        pace.stops = drives.iter().map(DriveHandle::stops).sum();
+        let Meaning::Write(pdu) = &request.meaning else {
+            return pace;
+        };
+        pace.is_stop = self.writes() && drives.iter().any(|drive| stop_in(drive, pdu, now).is_some());
+        // What is refused anyway, is at once.
+        let admitted = drives
+            .iter()
+            .all(|drive| command::admit(Order::Write(pdu.clone()), &drive.reading(now), Authority::Write).is_ok());
+        if self.writes() && !pace.is_stop && admitted {
+            pace.not_before = self
+                .terms
+                .paces
+                .not_before(&self.terms.slot.bus)
+                .unwrap_or(now)
+                .max(now);
+        }
+        pace
+    }
+
+    /// The configured drives that a request asks: one, none, or all.
+    fn asked(&self, plant: &Plant, request: &ToolRequest) -> Vec<DriveHandle> {
+        let broadcast = request.is_broadcast(self.protocol());
+        let on_bus = plant
+            .drives()
+            .filter(|drive| drive.image.spec.bus == self.terms.slot.bus);
+        on_bus
+            .filter(|drive| broadcast || drive.image.spec.address == request.address)
+            .collect()
+    }
+
+    /// What becomes of a request whose first byte came at `asked`, and whose drives had been given so many `stops` when it was
+    /// whole: behind a stop that came in since it is not sent. What is given to the bus is in its queue when this returns, and
+    /// is not sent after `deadline`.
+    pub(super) fn decide(
+        &self,
+        request: &ToolRequest,
+        (asked, stops): (Instant, u64),
+        deadline: Instant,
+        now: Instant,
+    ) -> Decision {
+        let plant = self.terms.plant.load();
+        let bus = plant
+            .buses
+            .iter()
+            .find(|bus| bus.image.spec.name == self.terms.slot.bus);
+        let Some(bus) = bus else { return Decision::Silent };
+        let drives = self.asked(&plant, request);
+        let broadcast = request.is_broadcast(self.protocol());
+        // A stop that came in while it was held may have come at the same time by the clock.
+        let stopped = drives.iter().map(DriveHandle::stops).sum::<u64>() != stops;
+        let before = asked.checked_sub(Duration::from_nanos(1)).filter(|_| stopped);
+        let asked = before.unwrap_or(asked);
+        let case = Case {
+            plant: &plant,
+            bus,
+            asked,
+            deadline,
+            now,
+        };
+        match &request.meaning {
+            Meaning::Faulty(why) => Decision::Refuse(*why),
+            Meaning::Read(pdu) if !broadcast => {
+                let target = target(request, drives.first());
+                Decision::Wait(self.exchange(&case, target, pdu, false))
+            }
+            Meaning::Write(pdu) if !broadcast && drives.len() == 1 => match drives.first() {
+                Some(drive) => self.write(drive, pdu, asked, now),
+                None => Decision::Silent,
+            },
+            Meaning::Read(pdu) | Meaning::Write(pdu) | Meaning::Unchecked(pdu) => {
+                self.raw(&case, request, &drives, pdu)
+            }
+        }
+    }
+
+    /// A write to a configured drive: the same checks as those of a Modbus TCP client.
+    fn write(&self, drive: &DriveHandle, pdu: &RequestPdu, asked: Instant, now: Instant) -> Decision {
+        if !self.writes() {
+            let text = format!("the slot of bus `{}` has access = \"read\"", self.terms.slot.bus);
+            return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
+        }
+        let cost = cost(drive, pdu);
+        self.terms.paces.wrote(&self.terms.slot.bus, cost, now);
+        let order = Order::Write(pdu.clone());
+        Decision::Wait(Work::Command(drive.place_asked(
+            order,
+            self.origin.clone(),
+            Authority::Write,
+            EXPIRY,
+            asked,
+            now,
+        )))
+    }
+
+    /// What only `access = "raw"` admits: broadcasts, functions that are not decoded, writes to addresses of no configured drive.
+    fn raw(&self, case: &Case<'_>, request: &ToolRequest, drives: &[DriveHandle], pdu: &RequestPdu) -> Decision {
+        let now = case.now;
+        let why = match request.is_broadcast(self.protocol()) {
+            true => "it is a broadcast",
+            false if drives.is_empty() => "no drive is configured at its address",
+            false => "what it writes cannot be checked",
+        };
+        if self.terms.slot.access != SlotAccess::Raw {
+            let text = format!("{why}; only a slot with access = \"raw\" passes it on");
+            return self.refuse_any(case, request, drives, pdu, Refusal::NotAllowed(text));
+        }
+        for drive in drives {
+            let spec = &drive.image.spec;
+            if spec.access != Access::Control {
+                let text = format!(
+                    "drive `{}` is only monitored; set access = \"control\" for it",
+                    spec.name
+                );
+                return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
+            }
+        }
+        for drive in drives {
+            // Its answer is nobody's: the broadcast has none.
+            if let Some(stop) = stop_in(drive, pdu, now) {
+                drop(drive.place(stop, self.origin.clone(), Authority::Write, EXPIRY, now));
+            }
+        }
+        for drive in drives {
+            let whole = Order::Write(pdu.clone());
+            let only_stops = stop_in(drive, pdu, now).is_some_and(|stop| stop == whole);
+            // While its parameters are restored nothing else reaches it but what stops it.
+            if let Some(why) = drive.image.hold.why().filter(|_| !only_stops) {
+                return self.refuse(drive, pdu, Refusal::NotAllowed(why.to_string()), now);
+            }
+            // Limits hold for each of them.
+            if let Meaning::Write(_) = &request.meaning
+                && let Err(refusal) = command::admit(whole, &drive.reading(now), Authority::Write)
+            {
+                return self.refuse(drive, pdu, refusal, now);
+            }
+        }
+        let first = drives.first().filter(|_| !request.is_broadcast(self.protocol()));
+        Decision::Wait(self.exchange(case, target(request, first), pdu, true))
+    }
+
+    fn exchange(&self, case: &Case<'_>, target: Target, pdu: &RequestPdu, may_write: bool) -> Work {
+        let question = Question {
+            target,
+            pdu: pdu.clone(),
+            may_write,
+            asked: case.asked,
+            expires: case.deadline,
+            origin: self.origin.clone(),
+        };
+        Work::Exchange(case.bus.ask(question, &case.plant.writes, case.now))
+    }
+
+    /// Refuses what concerns no drive, one or all of them: audited and published once.
+    fn refuse_any(
+        &self,
+        case: &Case<'_>,
+        request: &ToolRequest,
+        drives: &[DriveHandle],
+        pdu: &RequestPdu,
+        refusal: Refusal,
+    ) -> Decision {
+        if let Some(drive) = drives.first() {
+            return self.refuse(drive, pdu, refusal, case.now);
+        }
+        let what = describe::request_on(self.protocol(), pdu);
+        let name = format!("address {} of {}", request.address, self.terms.slot.bus);
+        let outcome = Outcome::Refused(refusal.clone());
+        turn_away(&case.plant.writes, &name, &what, outcome, self.origin.clone(), case.now);
+        Decision::Refuse(Refused::Exception(refusal.exception()))
+    }
+
+    fn refuse(&self, drive: &DriveHandle, pdu: &RequestPdu, refusal: Refusal, now: Instant) -> Decision {
+        let what = describe::request_on(self.protocol(), pdu);
+        let why = Refused::Exception(refusal.exception());
+        drive.refuse(&what, refusal, self.origin.clone(), now);
+        Decision::Refuse(why)
+    }
+}
+
+/// What a decision rests on.
+struct Case<'c> {
+    plant: &'c Plant,
+    bus: &'c BusHandle,
+    asked: Instant,
+    deadline: Instant,
+    now: Instant,
+}
+
+fn target(request: &ToolRequest, drive: Option<&DriveHandle>) -> Target {
+    drive.map_or(Target::Address(request.address), |drive| Target::Drive(drive.index))
+}
+
+/// The stop of a write that takes the run command of the drive away, if it is admitted: the write itself, or the part of it.
+fn stop_in(drive: &DriveHandle, pdu: &RequestPdu, now: Instant) -> Option<Order> {
+    let (Parts::One(stop) | Parts::Two(stop, _)) = Parts::of(Order::Write(pdu.clone()), &drive.image.spec.profile);
+    let admitted = command::admit(stop.clone(), &drive.reading(now), Authority::Write).ok()?;
+    (admitted.urgency == Urgency::Stop).then_some(stop)
+}
+
+/// What a write takes of the line, with the read that shows its effect.
+fn cost(drive: &DriveHandle, pdu: &RequestPdu) -> Duration {
+    let line = &drive.bus.image.spec;
+    let silence = line.protocol.silence(Default::default(), &line.format);
+    2 * WireTime::of(line.protocol, &line.format, pdu).total(drive.image.spec.turnaround, silence)
+}

@@ -1,0 +1,384 @@
+//! Counters of the north sides, for the metrics.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::SystemTime;
+
+use tokio::sync::broadcast::Receiver;
+
+use super::command_json::SharedMemory;
+use super::http::PostedCommands;
+use super::listener::ListenerStates;
+use super::mqtt::{NodeOrdersLeft, OrdersLeft};
+use crate::event::Event;
+
+/// What outlives the servers that a reload replaces: counters of all north sides, and which commands were taken.
+#[derive(Debug, Default)]
+pub struct NorthStats {
+    /// Of the Modbus TCP server.
+    pub modbus_tcp: ModbusTcpStats,
+    /// Of the MQTT client.
+    pub mqtt: MqttStats,
+    /// Of the tool slots.
+    pub slots: SlotStats,
+    /// Refused connections of all servers.
+    pub refused: RefusalStats,
+    /// The listeners of all servers, and whether they listen.
+    pub listeners: Arc<ListenerStates>,
+    /// The last time the configuration was read.
+    pub reload: ReloadStats,
+    /// Commands that came by way of the broker in the last minutes, and their results as payloads.
+    pub(super) taken: SharedMemory,
+    /// Commands that came over HTTP.
+    pub(super) posted: PostedCommands,
+}
+
+/// How the last reload ended; the start counts as one.
+#[derive(Debug)]
+pub struct ReloadStats(Mutex<(bool, SystemTime)>);
+
+impl Default for ReloadStats {
+    fn default() -> ReloadStats {
+        ReloadStats(Mutex::new((true, SystemTime::now())))
+    }
+}
+
+impl ReloadStats {
+    /// A reload was applied, or refused, at `at`.
+    pub fn ended(&self, applied: bool, at: SystemTime) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = (applied, at);
+    }
+
+    /// Whether the last one was applied, and when it ended.
+    pub fn last(&self) -> (bool, SystemTime) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+const FUNCTIONS: [u8; 11] = [1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43];
+const OUTCOMES: [(u8, &str); 8] = [
+    (0x00, "ok"),
+    (0x01, "illegal_function"),
+    (0x02, "illegal_address"),
+    (0x03, "illegal_value"),
+    (0x04, "device_failure"),
+    (0x06, "busy"),
+    (0x0A, "no_path"),
+    (0x0B, "no_answer"),
+];
+const OTHER: &str = "other";
+
+/// The servers that refuse connections.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ServerKind {
+    /// Modbus TCP, with and without TLS.
+    ModbusTcp,
+    /// HTTP.
+    Http,
+    /// The tool slots.
+    Slot,
+}
+
+impl ServerKind {
+    /// All servers.
+    pub const ALL: [ServerKind; 3] = [ServerKind::ModbusTcp, ServerKind::Http, ServerKind::Slot];
+
+    /// Name in the metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            ServerKind::ModbusTcp => "modbus_tcp",
+            ServerKind::Http => "http",
+            ServerKind::Slot => "slot",
+        }
+    }
+
+    /// Name in messages.
+    pub fn title(self) -> &'static str {
+        match self {
+            ServerKind::ModbusTcp => "Modbus TCP",
+            ServerKind::Http => "HTTP",
+            ServerKind::Slot => "tool slot",
+        }
+    }
+}
+
+/// Why a connection was refused, or closed in favour of another one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ConnectionRefusal {
+    /// Its address is not in `allow`.
+    NotAllowed,
+    /// The server has as many connections as it may have.
+    Full,
+    /// Its address has as many connections as it may have.
+    AddressFull,
+    /// It was closed in favour of another connection.
+    Displaced,
+    /// The handshake failed: no certificate, an untrusted or expired one, a malformed role, or no TLS at all.
+    Tls,
+}
+
+impl ConnectionRefusal {
+    /// All reasons.
+    pub const ALL: [ConnectionRefusal; 5] = [
+        ConnectionRefusal::NotAllowed,
+        ConnectionRefusal::Full,
+        ConnectionRefusal::AddressFull,
+        ConnectionRefusal::Displaced,
+        ConnectionRefusal::Tls,
+    ];
+
+    /// Name in the metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            ConnectionRefusal::NotAllowed => "not_allowed",
+            ConnectionRefusal::Full => "full",
+            ConnectionRefusal::AddressFull => "address_full",
+            ConnectionRefusal::Displaced => "displaced",
+            ConnectionRefusal::Tls => "tls",
+        }
+    }
+}
+
+/// Counters of refused connections.
+#[derive(Debug, Default)]
+pub struct RefusalStats([[AtomicU64; ConnectionRefusal::ALL.len()]; ServerKind::ALL.len()]);
+
+impl RefusalStats {
+    /// Counts a refused connection.
+    pub(crate) fn add(&self, server: ServerKind, why: ConnectionRefusal) {
+        if let Some(counter) = self.0.get(server as usize).and_then(|row| row.get(why as usize)) {
+            counter.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Connections to `server` that were refused so far, by reason.
+    pub fn of(&self, server: ServerKind) -> impl Iterator<Item = (ConnectionRefusal, u64)> {
+        let row = self.0.get(server as usize).into_iter().flatten();
+        ConnectionRefusal::ALL
+            .into_iter()
+            .zip(row.map(|c| c.load(Ordering::Relaxed)))
+    }
+}
+
+/// Counters of the Modbus TCP server.
+#[derive(Debug, Default)]
+pub struct ModbusTcpStats {
+    connections: AtomicU64,
+    requests: [[AtomicU64; OUTCOMES.len() + 1]; FUNCTIONS.len() + 1],
+}
+
+impl ModbusTcpStats {
+    /// A client connected.
+    pub fn connected(&self) {
+        self.connections.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// A client disconnected.
+    pub(crate) fn disconnected(&self) {
+        self.connections.fetch_sub(1, Ordering::Relaxed);
+    }
+
+    /// Clients connected now.
+    pub fn connections(&self) -> u64 {
+        self.connections.load(Ordering::Relaxed)
+    }
+
+    /// Counts an answer; `exception` is 0 for a regular one.
+    pub fn answered(&self, function: u8, exception: u8) {
+        let row = FUNCTIONS.iter().position(|f| *f == function).unwrap_or(FUNCTIONS.len());
+        let column = OUTCOMES
+            .iter()
+            .position(|(code, _)| *code == exception)
+            .unwrap_or(OUTCOMES.len());
+        if let Some(counter) = self.requests.get(row).and_then(|r| r.get(column)) {
+            counter.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Answers so far by function and outcome, without zeros.
+    pub fn requests(&self) -> Vec<(String, &'static str, u64)> {
+        let functions = FUNCTIONS.iter().map(u8::to_string).chain([OTHER.to_string()]);
+        let mut all = Vec::new();
+        for (function, row) in functions.zip(&self.requests) {
+            let outcomes = OUTCOMES.iter().map(|(_, name)| *name).chain([OTHER]);
+            for (outcome, counter) in outcomes.zip(row) {
+                let count = counter.load(Ordering::Relaxed);
+                if count > 0 {
+                    all.push((function.clone(), outcome, count));
+                }
+            }
+        }
+        all
+    }
+}
+
+/// How a request of a tool ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum SlotOutcome {
+    /// Answered with what the drive said; a broadcast: sent.
+    Answered,
+    /// The drive refused it.
+    Exception,
+    /// The gateway refused it.
+    Refused,
+    /// There was no answer to pass on: the drive is silent or away, or the request was not sent.
+    NoAnswer,
+    /// The tool asked again before it was answered.
+    Abandoned,
+    /// No answer came within a second.
+    Late,
+    /// No sound frame.
+    Broken,
+}
+
+impl SlotOutcome {
+    /// All outcomes.
+    pub const ALL: [SlotOutcome; 7] = [
+        SlotOutcome::Answered,
+        SlotOutcome::Exception,
+        SlotOutcome::Refused,
+        SlotOutcome::NoAnswer,
+        SlotOutcome::Abandoned,
+        SlotOutcome::Late,
+        SlotOutcome::Broken,
+    ];
+
+    /// Name in the metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            SlotOutcome::Answered => "answered",
+            SlotOutcome::Exception => "exception",
+            SlotOutcome::Refused => "refused",
+            SlotOutcome::NoAnswer => "no_answer",
+            SlotOutcome::Abandoned => "abandoned",
+            SlotOutcome::Late => "late",
+            SlotOutcome::Broken => "broken",
+        }
+    }
+}
+
+/// Counters of the tool slots, by bus.
+#[derive(Debug, Default)]
+pub struct SlotStats(Mutex<BTreeMap<String, [u64; SlotOutcome::ALL.len()]>>);
+
+impl SlotStats {
+    /// Counts a request of a tool.
+    pub fn count(&self, bus: &str, outcome: SlotOutcome) {
+        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if !all.contains_key(bus) {
+            all.insert(bus.to_string(), Default::default());
+        }
+        if let Some(counter) = all.get_mut(bus).and_then(|counts| counts.get_mut(outcome as usize)) {
+            *counter += 1;
+        }
+    }
+
+    /// Requests so far by bus and outcome, without zeros.
+    pub fn requests(&self) -> Vec<(String, SlotOutcome, u64)> {
+        let all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let of_bus = |(bus, counts): (&String, &[u64; SlotOutcome::ALL.len()])| {
+            let named = SlotOutcome::ALL.into_iter().zip(*counts);
+            let bus = bus.clone();
+            named
+                .filter(|(_, count)| *count > 0)
+                .map(move |(outcome, count)| (bus.clone(), outcome, count))
+        };
+        all.iter().flat_map(of_bus).collect()
+    }
+}
+
+/// Counters of the MQTT client.
+#[derive(Debug, Default)]
+pub struct MqttStats {
+    /// Whether a broker is configured: a client runs.
+    pub configured: AtomicBool,
+    /// Whether the client is connected to the broker.
+    pub connected: AtomicBool,
+    /// Messages that the broker acknowledged.
+    pub published: AtomicU64,
+    /// Messages waiting for the broker.
+    pub buffered: AtomicU64,
+    lost: [AtomicU64; MqttLoss::ALL.len()],
+    /// The retained topics of the client that runs, for the one that a reload puts in its place.
+    retained: Mutex<Vec<String>>,
+    /// The events that the last client left unread when it ended, for the one that a reload puts in its place.
+    unread_events: Mutex<Option<Receiver<Arc<Event>>>>,
+    /// The orders whose results the last client still owed when it ended, for the one that a reload puts in its place.
+    orders: Mutex<Option<OrdersLeft>>,
+    /// Those of the last edge node.
+    node_orders: Mutex<Option<NodeOrdersLeft>>,
+}
+
+/// What the MQTT client lost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MqttLoss {
+    /// Events.
+    Event,
+    /// Results of commands.
+    Result,
+    /// Values of an outage.
+    History,
+}
+
+impl MqttLoss {
+    /// All kinds.
+    pub const ALL: [MqttLoss; 3] = [MqttLoss::Event, MqttLoss::Result, MqttLoss::History];
+
+    /// Name in the metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            MqttLoss::Event => "event",
+            MqttLoss::Result => "result",
+            MqttLoss::History => "history",
+        }
+    }
+}
+
+impl MqttStats {
+    /// Keeps the retained topics that are published; returns those kept before.
+    pub(crate) fn keep_retained(&self, topics: Vec<String>) -> Vec<String> {
+        let mut kept = self.retained.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut kept, topics)
+    }
+
+    /// Keeps the events that a client leaves when it ends, or forgets them; returns those kept before.
+    pub fn keep_unread(&self, events: Option<Receiver<Arc<Event>>>) -> Option<Receiver<Arc<Event>>> {
+        let mut kept = self.unread_events.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut kept, events)
+    }
+
+    /// Keeps the orders whose results a client owes when it ends, or forgets them; returns those kept before.
+    pub(crate) fn keep_orders(&self, orders: Option<OrdersLeft>) -> Option<OrdersLeft> {
+        let mut kept = self.orders.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut kept, orders)
+    }
+
+    /// As [`MqttStats::keep_orders`], of an edge node.
+    pub(crate) fn keep_node_orders(&self, orders: Option<NodeOrdersLeft>) -> Option<NodeOrdersLeft> {
+        let mut kept = self.node_orders.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut kept, orders)
+    }
+
+    /// There is no client that goes on with what the last one left.
+    pub fn forget_what_is_left(&self) {
+        drop((
+            self.keep_unread(None),
+            self.keep_orders(None),
+            self.keep_node_orders(None),
+        ));
+    }
+
+    /// Counts lost messages.
+    pub(crate) fn lost(&self, kind: MqttLoss, count: u64) {
+        if let Some(counter) = self.lost.get(kind as usize) {
+            counter.fetch_add(count, Ordering::Relaxed);
+        }
+    }
+
+    /// Messages lost so far, by kind.
+    pub fn losses(&self) -> impl Iterator<Item = (MqttLoss, u64)> {
+        let counts = self.lost.iter().map(|c| c.load(Ordering::Relaxed));
+        MqttLoss::ALL.into_iter().zip(counts)
+    }
+}

@@ -1,0 +1,54 @@
+//! Simulated drives and the simulated wire, for `demo`, `simulate`, tests and benches.
+//!
+//! The pieces, from the drive to the port:
+//!
+//! - `motor`, `parameter_set`, `model`: what all drives have, and what a drive is to the line.
+//! - [`nx`] (Vacon NX, Eaton SVX and HVX), `cx` (Vacon CX), `teco` (TECO 7300PA): what the drives with their boards
+//!   do, asked by Modbus PDUs (pure); and `autopilot`, which runs one in a demo.
+//! - [`simulated_drive`]: a drive of any model with its autopilot and its power switch; [`slave`]: all drives of a line, frames
+//!   in and replies out.
+//! - `n2`: the N2 board that a drive may have in the place of its Modbus board.
+//! - [`faults`]: faults on a line, random or scripted.
+//! - `framing`: where a frame begins and ends, by protocol (pure).
+//! - [`half_duplex`]: the wire itself (pure): when which character is on it, silence, collisions.
+//! - [`wire`]: the thread that puts all this behind a pseudo-terminal, a serial port or a TCP listener.
+//! - [`broker`]: a small MQTT broker for the demo and for tests.
+//!
+//! Everything but [`wire`], its endpoints, the measuring rod and the broker is pure and takes the time as an argument,
+//! so the same requests at the same times give the same bytes.
+
+use std::time::Duration;
+
+pub(crate) mod autopilot;
+pub mod broker;
+pub mod cx;
+pub mod endpoint;
+pub mod faults;
+pub(crate) mod framing;
+pub mod half_duplex;
+pub(crate) mod model;
+pub(crate) mod motor;
+pub(crate) mod n2;
+pub mod nx;
+pub(crate) mod parameter_set;
+#[cfg(test)]
+mod parameter_tests;
+pub mod random;
+pub mod simulated_drive;
+pub mod slave;
+pub mod statistics;
+pub(crate) mod teco;
+pub mod wire;
+
+#[cfg(test)]
+use drivegate_core::command;
+#[cfg(test)]
+use drivegate_core::parameters;
+use drivegate_line as line;
+use drivegate_model::document;
+#[cfg(test)]
+use drivegate_model::drive;
+use drivegate_proto as codec;
+
+/// Time since the simulated line was switched on.
+pub type SimTime = Duration;

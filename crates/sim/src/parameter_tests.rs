@@ -1,0 +1,261 @@
+//! Random parameters of one drive restored to another of its family, frame by frame, write by write.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use super::model::Command;
+use super::random::Random;
+use super::simulated_drive::{DriveOptions, ModelOptions, SimulatedDrive, Writes};
+use super::slave::{Heard, Slaves};
+use super::*;
+use crate::codec::n2::Session;
+use crate::codec::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
+use crate::command::Outcome;
+use crate::drive::Profile;
+use crate::drive::parameters::RawValue;
+use crate::drive::profile::Profiles;
+use crate::parameters::{Names, Next, ParameterFile, ParameterWrite, Plan, Reading, Wishes, differences, plan};
+
+const ADDRESS: u8 = 1;
+const SEEDS: u64 = 6;
+const FORCED: Wishes = Wishes {
+    only: Vec::new(),
+    force: true,
+};
+
+/// A drive of a family alone on its line.
+struct Bench {
+    profile: Arc<Profile>,
+    slaves: Slaves,
+    now: SimTime,
+}
+
+impl Bench {
+    fn new(profile: &Arc<Profile>) -> Bench {
+        let model = ModelOptions::by_name(profile.simulator.as_deref().unwrap()).unwrap();
+        let mut bench = Bench {
+            profile: profile.clone(),
+            slaves: Slaves::new([DriveOptions::new(ADDRESS, model)], SimTime::ZERO),
+            now: SimTime::ZERO,
+        };
+        if bench.is_n2() {
+            bench.ask(RequestPdu::N2(Session::Identify));
+        }
+        bench
+    }
+
+    /// With random parameters, in the mode in which it takes them.
+    fn filled(profile: &Arc<Profile>, seed: u64) -> Bench {
+        let mut bench = Bench::new(profile);
+        bench.drive().fill_parameters(seed);
+        bench.drive().set_programming(true);
+        bench
+    }
+
+    fn is_n2(&self) -> bool {
+        self.profile.protocols.contains(&Protocol::N2)
+    }
+
+    fn drive(&mut self) -> &mut SimulatedDrive {
+        self.slaves.drive(ADDRESS).unwrap()
+    }
+
+    fn ask(&mut self, pdu: RequestPdu) -> Reply {
+        let protocol = self.profile.protocols[0];
+        let request = Request::new(ADDRESS, pdu);
+        let (mut frame, mut reply) = (Vec::new(), Vec::new());
+        protocol.encode(&request, &mut frame);
+        self.now += Duration::from_millis(1);
+        match self.slaves.hear(protocol, &frame, self.now) {
+            Heard::Request(asked) => self.slaves.answer(&asked, self.now, &mut reply),
+            other => panic!("{request:?}: {other:?}"),
+        }
+        match protocol.decode(&request, &reply) {
+            Decoded::Reply { reply, .. } => reply,
+            other => panic!("{request:?}: {other:?}"),
+        }
+    }
+
+    fn read(&mut self, known: BTreeSet<u16>) -> ParameterFile {
+        let mut reading = Reading::new(self.profile.clone(), known);
+        while let Some(pdu) = reading.request() {
+            let outcome = match self.ask(pdu) {
+                Reply::Exception(exception) => Outcome::Exception(exception),
+                reply => Outcome::Acknowledged(reply),
+            };
+            assert_eq!(reading.answered(&outcome), Next::Go);
+        }
+        reading.file("d", "none", "2026-03-02T07:40:12Z", &Names::default())
+    }
+
+    fn write(&mut self, write: &ParameterWrite) -> Reply {
+        let address = write.address;
+        self.ask(match write.to {
+            RawValue::Word(value) => RequestPdu::WriteRegister { address, value },
+            RawValue::Float(bits) => RequestPdu::WriteRegisters {
+                start: address,
+                values: vec![(bits >> 16) as u16, bits as u16],
+            },
+        })
+    }
+
+    /// All of them taken, and saved.
+    fn carry_out(&mut self, plan: &Plan) {
+        for write in &plan.writes {
+            assert_eq!(
+                self.write(write),
+                Reply::Written,
+                "{}: {}",
+                self.profile.name,
+                write.line
+            );
+        }
+        if let Some((address, value)) = plan.handling.save {
+            assert_eq!(self.ask(RequestPdu::WriteRegister { address, value }), Reply::Written);
+        }
+    }
+}
+
+/// The families with parameters, and where those of their simulated drives lie.
+fn families() -> Vec<(Arc<Profile>, BTreeSet<u16>)> {
+    let all = Profiles::built_in();
+    let all = all.iter().filter(|profile| !profile.parameters.is_empty());
+    let families: Vec<_> = all
+        .map(|profile| {
+            let file = Bench::new(profile).read(BTreeSet::new());
+            (profile.clone(), Reading::addresses_of(profile, &file))
+        })
+        .collect();
+    assert_eq!(families.len(), 8);
+    families
+}
+
+#[test]
+fn the_parameters_of_any_drive_go_to_any_other_of_its_family_and_back() {
+    let mut written = 0;
+    for ((profile, known), seed) in families()
+        .into_iter()
+        .flat_map(|family| (1..=SEEDS).map(move |seed| (family.clone(), seed)))
+    {
+        let wanted = Bench::filled(&profile, seed).read(known.clone());
+        let mut bench = Bench::filled(&profile, seed + 1000);
+        let present = bench.read(known.clone());
+        let (plan, _) = plan(&profile, &wanted, &present, &FORCED).unwrap();
+        let half = plan.writes.len() / 2;
+        written += plan.writes.len();
+        bench.carry_out(&plan);
+        let left: BTreeSet<_> = differences(&wanted, &bench.read(known.clone()))
+            .into_iter()
+            .map(|difference| difference.id)
+            .collect();
+        let left_out: BTreeSet<_> = plan.left_out.iter().map(|(id, _)| id.clone()).collect();
+        assert_eq!(left, left_out, "{}", profile.name);
+        check_wear(&mut bench, &plan);
+
+        // The same, cut half way, is taken back.
+        let mut bench = Bench::filled(&profile, seed + 1000);
+        for write in &plan.writes[..half] {
+            assert_eq!(bench.write(write), Reply::Written);
+        }
+        bench.carry_out(&plan.back(half));
+        assert_eq!(differences(&present, &bench.read(known)), [], "{}", profile.name);
+    }
+    assert!(written > 1000, "{written}");
+}
+
+/// Each parameter was written once, and the memory that keeps it as often.
+fn check_wear(bench: &mut Bench, plan: &Plan) {
+    let (profile, is_n2) = (bench.profile.clone(), bench.is_n2());
+    let writes = bench.drive().parameter_writes();
+    let taken: u32 = writes.values().map(|writes| writes.taken).sum();
+    assert_eq!(taken as usize, plan.writes.len(), "{}", profile.name);
+    assert!(
+        writes
+            .values()
+            .all(|writes| writes.taken <= 1 && writes.kept <= 1 && writes.while_fed == 0)
+    );
+    // The addresses of objects are others.
+    for write in plan.writes.iter().filter(|_| !is_n2) {
+        let expected = Writes {
+            taken: 1,
+            while_fed: 0,
+            kept: u32::from(!write.volatile),
+        };
+        assert_eq!(writes[&write.address], expected, "{}", write.line);
+    }
+}
+
+/// What the profile says of PRGM and DRIVE is what the drive does.
+#[test]
+fn a_locked_drive_refuses_what_the_plan_says_it_will() {
+    for (profile, known) in families() {
+        let wanted = Bench::filled(&profile, 1).read(known.clone());
+        let mut bench = Bench::filled(&profile, 2);
+        bench.drive().set_programming(false);
+        let (plan, _) = plan(&profile, &wanted, &bench.read(known), &FORCED).unwrap();
+        let lock = profile.parameters.rules.lock.clone();
+        let code = plan
+            .handling
+            .needs
+            .clone()
+            .and_then(|need| need.exception)
+            .map(Exception);
+        assert_eq!(lock.is_some(), profile.name.starts_with("teco"));
+        for write in &plan.writes {
+            let is_locked = lock
+                .as_ref()
+                .is_some_and(|lock| crate::drive::parameters::has(&lock.of, write.address));
+            let reply = bench.write(write);
+            match (is_locked, code) {
+                (true, Some(code)) => assert_eq!(reply, Reply::Exception(code), "{}", write.line),
+                (true, None) => panic!("the plan does not say what the lock returns"),
+                (false, _) => assert_eq!(reply, Reply::Written, "{}", write.line),
+            }
+        }
+    }
+}
+
+#[test]
+fn a_write_while_the_motor_is_fed_is_recorded() {
+    let mut random = Random::new(3);
+    for (profile, known) in families() {
+        let mut bench = Bench::new(&profile);
+        bench.drive().command(Command {
+            run: true,
+            reverse: false,
+            reference: 5000,
+        });
+        bench.now += Duration::from_secs(2);
+        let wanted = bench.read(known);
+        let parameters = &profile.parameters;
+        let free = wanted
+            .read_values()
+            .filter_map(|(id, value)| Some((parameters.address(id.name())?, value)));
+        let locked = |address| {
+            parameters
+                .rules
+                .lock
+                .as_ref()
+                .is_some_and(|lock| crate::drive::parameters::has(&lock.of, address))
+        };
+        let free: Vec<(u16, RawValue)> = free.filter(|(address, _)| !locked(*address)).collect();
+        let (address, value) = free[random.within(0..=free.len() as u64 - 1) as usize];
+        let write = ParameterWrite {
+            id: crate::parameters::Id::new("any"),
+            address,
+            from: value,
+            to: value,
+            line: String::new(),
+            volatile: false,
+        };
+        assert!(bench.drive().state().running, "{}", profile.name);
+        assert_eq!(bench.write(&write), Reply::Written);
+        let fed: u32 = bench
+            .drive()
+            .parameter_writes()
+            .values()
+            .map(|writes| writes.while_fed)
+            .sum();
+        assert_eq!(fed, 1, "{}", profile.name);
+    }
+}

@@ -1,0 +1,202 @@
+//! The command line, one file a command.
+//!
+//! A command is a module with `Args` (its options, its help, an example) and `run(&Args) -> ExitCode`, and a
+//! line in `commands!` below.
+
+mod adapters;
+mod addresses;
+mod archive;
+mod audit;
+mod backup;
+mod check;
+mod client;
+mod credentials_file;
+mod demo;
+mod diagnose;
+mod drive_access;
+mod health;
+mod listen;
+mod loading;
+mod local_client;
+mod log;
+mod map;
+mod params;
+mod printable;
+mod profiles;
+mod read;
+mod record;
+mod recordings;
+mod reload;
+mod replay;
+mod report;
+mod restore;
+mod run;
+mod scan;
+mod schema;
+mod simulate;
+mod token;
+mod trace;
+mod trial;
+mod user;
+mod watch;
+mod why;
+mod write;
+
+use drivegate_bus as bus;
+use drivegate_core::command;
+use drivegate_core::diagnosis;
+use drivegate_core::event;
+use drivegate_core::files;
+use drivegate_core::history;
+use drivegate_core::parameters;
+use drivegate_core::plant;
+use drivegate_core::process_image;
+use drivegate_core::version;
+use drivegate_gateway::config;
+use drivegate_gateway::daemon;
+use drivegate_line as line;
+use drivegate_model::document;
+use drivegate_model::drive;
+use drivegate_north as north;
+use drivegate_proto as codec;
+use drivegate_sim as sim;
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::LazyLock;
+
+use clap::Parser;
+
+/// Exit code of a failure.
+pub const EXIT_FAILED: u8 = 1;
+/// Exit code of a wrong command line, the same as clap's.
+pub const EXIT_USAGE: u8 = 2;
+/// Exit code of input data that cannot be read as what it should be (sysexits EX_DATAERR).
+pub const EXIT_DATA: u8 = 65;
+/// Exit code of a bad configuration (sysexits EX_CONFIG).
+pub const EXIT_CONFIG: u8 = 78;
+/// Default path of the configuration.
+pub const DEFAULT_CONFIG: &str = crate::config::DEFAULT_FILE;
+
+/// Version and commit of the build.
+static VERSION: LazyLock<String> = LazyLock::new(|| match version::commit() {
+    Some(commit) => format!("{} (commit {commit})", version::VERSION),
+    None => version::VERSION.to_string(),
+});
+
+/// Puts RS-485 drives (frequency converters) on Modbus TCP, MQTT and Prometheus.
+#[derive(Debug, Parser)]
+#[command(name = "drivegate", version = VERSION.as_str(), max_term_width = 100)]
+#[command(
+    after_help = "Example:\n  drivegate check --config /etc/drivegate/drivegate.toml\n\n\
+    Exit codes: 0 success, 1 failure, 2 wrong command line, 78 invalid configuration."
+)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+macro_rules! commands {
+    ($($variant:ident => $module:ident,)*) => {
+        #[derive(Debug, clap::Subcommand)]
+        enum Command {
+            $($variant($module::Args),)*
+        }
+
+        impl Command {
+            fn run(&self) -> ExitCode {
+                match self {
+                    $(Command::$variant(args) => $module::run(args),)*
+                }
+            }
+        }
+    };
+}
+
+// In the order of the help.
+commands! {
+    Run => run,
+    Reload => reload,
+    Health => health,
+    Demo => demo,
+    Try => trial,
+    Check => check,
+    Scan => scan,
+    Listen => listen,
+    Read => read,
+    Write => write,
+    Why => why,
+    Diagnose => diagnose,
+    Record => record,
+    Recordings => recordings,
+    Params => params,
+    Watch => watch,
+    Trace => trace,
+    Replay => replay,
+    Simulate => simulate,
+    Profiles => profiles,
+    Map => map,
+    Audit => audit,
+    Token => token,
+    User => user,
+    Backup => backup,
+    Restore => restore,
+    Schema => schema,
+}
+
+/// The option that names the configuration.
+#[derive(Debug, clap::Args)]
+struct ConfigFile {
+    /// Configuration file.
+    #[arg(long = "config", value_name = "FILE", default_value = DEFAULT_CONFIG)]
+    path: PathBuf,
+}
+
+/// The option that names the configuration, or the configuration itself.
+#[derive(Debug, clap::Args)]
+struct NamedConfig {
+    #[command(flatten)]
+    config: ConfigFile,
+    /// Configuration file, as with --config.
+    #[arg(value_name = "FILE", conflicts_with = "path")]
+    file: Option<PathBuf>,
+}
+
+impl NamedConfig {
+    fn path(&self) -> &Path {
+        self.file.as_deref().unwrap_or(&self.config.path)
+    }
+}
+
+/// The whole command line, from which manual pages and completions are made.
+#[must_use]
+pub fn command_line() -> clap::Command {
+    <Cli as clap::CommandFactory>::command()
+}
+
+/// Runs the command of the command line and returns its exit code.
+pub fn main() -> ExitCode {
+    Cli::parse().command.run()
+}
+
+/// The runtime of a command that has one thing to do.
+fn runtime() -> Result<tokio::runtime::Runtime, String> {
+    let built = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build();
+    built.map_err(|why| format!("cannot start: {why}; the runtime; free memory, threads or file descriptors"))
+}
+
+/// Runs `command` on a runtime of its own.
+pub fn block_on(command: impl Future<Output = ExitCode>) -> ExitCode {
+    match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime.block_on(command),
+        Err(why) => {
+            report::error(&format!(
+                "cannot start: {why}; the runtime; free memory, threads or file descriptors"
+            ));
+            ExitCode::from(EXIT_FAILED)
+        }
+    }
+}

@@ -1,0 +1,155 @@
+//! The map as text: tables for people.
+
+use std::fmt::Write as _;
+
+use comfy_table::{Table as TextTable, presets};
+
+use super::rows::{COLUMNS, Row, drive_rows};
+use super::{Listener, Map};
+use crate::codec::Table;
+use crate::drive::raw_writes;
+use crate::north::register_map::GATEWAY_UNIT;
+use crate::printable;
+use crate::process_image::{Access, DriveSpec};
+
+/// The whole map as tables.
+pub(super) fn render(map: &Map<'_>) -> String {
+    let specs: Vec<&DriveSpec> = map.drives.iter().map(|d| &d.image.spec).collect();
+    let mut out = format!("Modbus TCP register map of {}\n\nUnits\n", map.plant.gateway);
+    out += &units(&specs);
+    if map.listeners.len() > 1 {
+        out += "\nListeners\n";
+        out += &listeners(map.listeners);
+    }
+    out += "\nAddresses are PDU addresses, from 0. Functions 03 and 04 read both tables of the blocks from 0x8000 on;\n\
+            32-bit values lie high word first; age and state show why a value is not available.\n";
+    let mut seen: Vec<&DriveSpec> = Vec::new();
+    for drive in &map.drives {
+        let spec = &drive.image.spec;
+        let profile = &spec.profile;
+        let is_same = |other: &DriveSpec| other.profile.name == profile.name && other.raw_writes == spec.raw_writes;
+        if seen.iter().any(|other| is_same(other)) {
+            continue;
+        }
+        seen.push(spec);
+        let units: Vec<String> = specs
+            .iter()
+            .filter(|other| is_same(other))
+            .map(|s| s.unit.to_string())
+            .collect();
+        let _ = write!(
+            out,
+            "\nProfile {} ({}), units {}\n",
+            profile.name,
+            printable::line(&profile.title),
+            units.join(", ")
+        );
+        // What a unit of this profile can have; the table above shows which units can be written.
+        out += &rows(&drive_rows(
+            profile,
+            &drive.image.plan,
+            Access::Control,
+            &spec.raw_writes,
+        ));
+        let _ = write!(out, "\nAddresses of the drive itself, profile {}\n", profile.name);
+        out += &ranges(spec);
+    }
+    out += "\nThe gateway itself, unit 255\n";
+    out += &rows(&map.gateway);
+    out
+}
+
+fn units(specs: &[&DriveSpec]) -> String {
+    let units = specs.iter().map(|s| {
+        let access = match s.access {
+            Access::Monitor => "monitor: every write is refused",
+            Access::Control => "control",
+            Access::Listen => "listens only: every write is refused",
+        };
+        let address = s.address.to_string();
+        vec![
+            s.unit.to_string(),
+            s.name.clone(),
+            s.bus.clone(),
+            address,
+            s.profile.name.clone(),
+            access.to_string(),
+        ]
+    });
+    let gateway = vec![GATEWAY_UNIT.to_string(), "the gateway itself".to_string()];
+    table(
+        &["unit", "drive", "bus", "address", "profile", "access"],
+        units.chain([gateway]),
+    )
+}
+
+fn listeners(listeners: &[Listener]) -> String {
+    let cells = listeners.iter().map(|listener| {
+        let addresses: Vec<String> = listener.addresses.iter().map(ToString::to_string).collect();
+        let buses = listener
+            .buses
+            .as_ref()
+            .map_or_else(|| "all".to_string(), |names| names.join(", "));
+        let tls = if listener.tls { "yes" } else { "no" };
+        vec![addresses.join(", "), tls.to_string(), buses, listener.writers.clone()]
+    });
+    table(&["address", "TLS", "buses", "who may write"], cells)
+}
+
+fn rows(rows: &[Row]) -> String {
+    table(&COLUMNS, rows.iter().map(|r| r.cells().to_vec()))
+}
+
+fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
+    let mut table = TextTable::new();
+    table
+        .load_preset(presets::NOTHING)
+        .set_header(header.iter().map(|h| h.replace('_', " ")));
+    table.add_rows(rows.map(|row| row.into_iter().map(|cell| printable::line(&cell))));
+    let mut out: String = table.trim_fmt();
+    out.push('\n');
+    out
+}
+
+/// Addresses of the raw view beyond the points.
+fn ranges(spec: &DriveSpec) -> String {
+    let header = [
+        "table",
+        "first",
+        "last",
+        "read at once",
+        "written at once",
+        "raw writes refused",
+        "note",
+    ];
+    let profile = &spec.profile;
+    let refused = spec.raw_writes.refused_ranges(profile);
+    let rows = profile.ranges.iter().map(|range| {
+        let table = match range.table {
+            Table::Holding if profile.input_is_holding => "holding, input",
+            table => table.name(),
+        };
+        let written = if range.write == 0 {
+            "read only".to_string()
+        } else {
+            range.write.to_string()
+        };
+        let (first, last) = range.addresses.clone().into_inner();
+        let note = range.note.clone();
+        let refused: Vec<_> = refused
+            .iter()
+            .filter(|(table, lost)| *table == range.table && lost.start() <= &last && &first <= lost.end())
+            .map(|(table, lost)| (*table, first.max(*lost.start())..=last.min(*lost.end())))
+            .collect();
+        vec![
+            table.to_string(),
+            first.to_string(),
+            last.to_string(),
+            range.read.to_string(),
+            written,
+            raw_writes::addresses_in_words(&refused),
+            note,
+        ]
+    });
+    table(&header, rows)
+}

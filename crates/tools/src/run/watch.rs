@@ -1,0 +1,147 @@
+//! What the service manager, the metrics and the events are told of the gateway as a whole.
+
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use sd_notify::NotifyState;
+use tokio::time::Interval;
+
+use super::notify;
+use crate::daemon::{Daemon, Pulse};
+use crate::event::{Event, EventKind};
+use crate::log::LogHandle;
+use crate::north::NorthStats;
+use crate::north::local::protocol::ReloadOutcome;
+use crate::plant::{Plant, SharedPlant};
+use crate::printable;
+
+/// Longest status, in characters: it is one line of `systemctl status`.
+const LONGEST_STATUS: usize = 300;
+
+/// Serves the watchdog and keeps the status of the service.
+#[derive(Debug)]
+pub(super) struct Watch<'l> {
+    log: &'l LogHandle,
+    pulse: Pulse,
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    is_watched: bool,
+    feed: Interval,
+    /// When the last reload was refused, and why.
+    refused: Option<(SystemTime, String)>,
+    /// What was told last.
+    status: String,
+}
+
+impl Watch<'_> {
+    /// That of a gateway.
+    pub(super) fn new<'l>(daemon: &Daemon, log: &'l LogHandle) -> Watch<'l> {
+        let watchdog = sd_notify::watchdog_enabled();
+        let every = watchdog.map_or(Duration::from_secs(5), |time| time / 2);
+        Watch {
+            log,
+            pulse: daemon.pulse(),
+            plant: daemon.plant(),
+            stats: daemon.stats(),
+            is_watched: watchdog.is_some(),
+            feed: tokio::time::interval(every.max(Duration::from_millis(500))),
+            refused: None,
+            status: String::new(),
+        }
+    }
+
+    /// Waits for the next beat of the watchdog and serves it; cancel safe.
+    pub(super) async fn tick(&mut self) {
+        self.feed.tick().await;
+        self.log.report_lost();
+        if self.pulse.is_moving() && self.is_watched {
+            notify(&[NotifyState::Watchdog]);
+        }
+        let status = status(&self.plant.load(), self.refused.as_ref());
+        if status != self.status {
+            notify(&[NotifyState::Status(&status)]);
+            self.status = status;
+        }
+    }
+
+    /// A reload begins.
+    pub(super) fn reloading(&mut self) {
+        let mut states = vec![NotifyState::Reloading];
+        states.extend(NotifyState::monotonic_usec_now());
+        notify(&states);
+    }
+
+    /// A reload is over.
+    pub(super) fn reloaded(&mut self, outcome: &ReloadOutcome) {
+        let now = SystemTime::now();
+        let why = summary(&outcome.errors);
+        self.stats.reload.ended(why.is_none(), now);
+        if let Some(why) = &why {
+            self.plant.load().events.publish(Event::new(
+                EventKind::ReloadRefused,
+                now,
+                format!("the configuration was not applied, the former one goes on: {why}"),
+            ));
+        }
+        self.refused = why.map(|why| (now, why));
+        self.status = status(&self.plant.load(), self.refused.as_ref());
+        notify(&[NotifyState::Ready, NotifyState::Status(&self.status)]);
+    }
+}
+
+/// The first error, and how many there are besides.
+fn summary(errors: &[String]) -> Option<String> {
+    let (first, others) = errors.split_first()?;
+    Some(match others.len() {
+        0 => first.clone(),
+        more => format!("{first} (and {more} more)"),
+    })
+}
+
+/// The gateway in one line.
+fn status(plant: &Plant, refused: Option<&(SystemTime, String)>) -> String {
+    let up = plant.buses.iter().filter(|bus| bus.image.health().up).count();
+    let images = || plant.buses.iter().flat_map(|bus| &bus.image.drives);
+    let online = images().filter(|drive| drive.snapshot().link.is_online()).count();
+    let mut text = format!(
+        "{up} of {} buses up, {online} of {} drives online",
+        plant.buses.len(),
+        images().count()
+    );
+    if let Some((at, why)) = refused {
+        let at = humantime::format_rfc3339_seconds(*at);
+        text += &format!("; reload refused at {at}: {why}");
+    }
+    printable::line(&text).chars().take(LONGEST_STATUS).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_refused_reload_stays_in_the_status() {
+        let errors = ["`baud` is missing\nx", "b", "c"].map(str::to_string);
+        assert_eq!(summary(&errors[1..2]), Some("b".to_string()));
+        let plant = Plant {
+            gateway: "test".to_string(),
+            stale_after: Duration::from_secs(1),
+            buses: Vec::new(),
+            events: Default::default(),
+            writes: Default::default(),
+            recordings: Default::default(),
+            parameters: Default::default(),
+            history: Default::default(),
+        };
+        assert_eq!(status(&plant, None), "0 of 0 buses up, 0 of 0 drives online");
+        let refused = (SystemTime::UNIX_EPOCH, summary(&errors).unwrap());
+        let text = status(&plant, Some(&refused));
+        assert!(
+            text.contains("; reload refused at 1970-01-01T00:00:00Z: `baud`"),
+            "{text}"
+        );
+        assert!(text.ends_with("(and 2 more)") && !text.contains('\n'), "{text}");
+        let endless = (SystemTime::UNIX_EPOCH, "x".repeat(1000));
+        assert_eq!(status(&plant, Some(&endless)).chars().count(), LONGEST_STATUS);
+    }
+}

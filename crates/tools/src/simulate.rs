@@ -1,0 +1,343 @@
+//! `drivegate simulate`: simulated drives on a pseudo-terminal, a real port or a TCP port, with wire timing and faults.
+
+mod watch;
+
+use super::addresses::{Addresses, parse_addresses};
+use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use crate::codec::{LineFormat, Protocol};
+use crate::config::{self, BusSettings, Settings, default_format};
+use crate::document::nearest;
+use crate::drive::profile::{Profile, Profiles};
+use crate::process_image::DriveSpec;
+use crate::sim::cx::AddressOffset;
+use crate::sim::endpoint::EndpointOptions;
+use crate::sim::faults::{FaultPlan, NAMES, Rates};
+use crate::sim::half_duplex::{Delivery, LineRules, Wire};
+use crate::sim::simulated_drive::{DriveOptions, ModelOptions};
+use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use std::net::{SocketAddr, ToSocketAddrs};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Duration;
+
+/// Simulates drives on a pseudo-terminal, a real port or a TCP port, with wire timing and faults
+#[derive(Debug, clap::Args)]
+#[command(after_help = format!("Examples:
+  drivegate simulate --addresses 1-10 --link /tmp/line1 --baud 38400
+  drivegate simulate --addresses 1,2 --link /tmp/line1 --fault drop=0.01,late:150ms=0.01 --seed 7
+  drivegate simulate --profile teco-7300pa --addresses 1-3 --link /tmp/line2
+  drivegate simulate --config drivegate.toml
+
+Faults: {NAMES}.
+
+A simulated drive obeys the bus. Writing a fault, as its registers show it, to a holding register that no real drive \
+has trips it; PDU address by the key `simulator` of the profile: {}.", trip_registers()))]
+pub(super) struct Args {
+    /// Simulate every bus of a gateway configuration, each under its own `port`
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "protocol", "baud", "format"])]
+    pub config: Option<PathBuf>,
+    /// Profile of the drives
+    #[arg(long, value_name = "PROFILE", default_value = "vacon-nx")]
+    pub profile: String,
+    /// Their addresses, such as 1-10 or 1,2,7
+    #[arg(long, value_name = "LIST", default_value = "1", value_parser = parse_addresses)]
+    pub addresses: Addresses,
+    /// Symbolic link to the pseudo-terminal; removed at the end
+    #[arg(long, value_name = "PATH", conflicts_with_all = ["port", "listen"])]
+    pub link: Option<PathBuf>,
+    /// Real serial port to simulate the drives on
+    #[arg(long, value_name = "DEVICE", conflicts_with = "listen")]
+    pub port: Option<PathBuf>,
+    /// Serve the line raw over TCP, as a serial device server does
+    #[arg(long, value_name = "HOST:PORT", value_parser = parse_listen)]
+    pub listen: Option<SocketAddr>,
+    /// modbus-rtu, modbus-ascii or n2 [default: the first of the profile]
+    #[arg(long, value_name = "PROTOCOL", value_parser = parse_protocol)]
+    pub protocol: Option<Protocol>,
+    /// Bits a second [default: 38400, or the next lower rate that the drives support]
+    #[arg(long, value_name = "BAUD", value_parser = clap::value_parser!(u32).range(300..=4_000_000))]
+    pub baud: Option<u32>,
+    /// Data bits, parity and stop bits [default: the usual one of the profile]
+    #[arg(long, value_name = "FORMAT")]
+    pub format: Option<String>,
+    /// Time between the end of a request and the reply [default: that of the drive's manual, else 0.5ms]
+    #[arg(long, value_name = "TIME", value_parser = report::duration)]
+    pub turnaround: Option<Duration>,
+    /// Faults and their probabilities, such as drop=0.01,corrupt=0.02
+    #[arg(long, value_name = "LIST", default_value = "")]
+    pub fault: Rates,
+    /// Seed of the faults and of what the drives do on their own
+    #[arg(long, value_name = "NUMBER", default_value_t = 1)]
+    pub seed: u64,
+    /// Let the drives start, stop and fault on their own until a master writes to them
+    #[arg(long)]
+    pub autopilot: bool,
+    /// Also answer Modbus RTU requests that are not preceded by 3.5 characters of silence
+    #[arg(long)]
+    pub lenient: bool,
+    /// Send a status byte before the values read over N2, as some devices do
+    #[arg(long)]
+    pub n2_leading_byte: bool,
+    /// Add an offset to the addresses of each Vacon CX, as boards that count from 1 do: holding=1,discrete-input=1
+    #[arg(long, value_name = "LIST")]
+    pub cx_address_offset: Option<AddressOffset>,
+    /// Let each TECO 7300PA answer a request with a wrong check code with error 00H, as in its error table, instead of not at all
+    #[arg(long)]
+    pub teco_answer_check_error: bool,
+    /// Characters delivered to the master at once: 0 the whole reply, 14 like a UART's FIFO, 1 one by one
+    #[arg(long, value_name = "CHARACTERS", default_value_t = 0)]
+    pub chunk: u8,
+    /// True wire times, or as fast as the programs are
+    #[arg(long, value_enum, default_value_t = Speed::Real)]
+    pub speed: Speed,
+}
+
+/// Default baud rate, if the drives support it.
+const USUAL_BAUD: u32 = 38_400;
+
+/// `nx, svx, hvx 1998; cx 9999; ...`
+fn trip_registers() -> String {
+    let mut registers: Vec<(u16, Vec<&str>)> = Vec::new();
+    for name in ModelOptions::NAMES {
+        let Some(address) = ModelOptions::by_name(name).map(|model| model.trip_address()) else {
+            continue;
+        };
+        match registers.iter_mut().find(|(known, _)| *known == address) {
+            Some((_, names)) => names.push(name),
+            None => registers.push((address, vec![name])),
+        }
+    }
+    let text = |(address, names): &(u16, Vec<&str>)| format!("{} {address}", names.join(", "));
+    registers.iter().map(text).collect::<Vec<String>>().join("; ")
+}
+
+fn parse_protocol(text: &str) -> Result<Protocol, String> {
+    let known: Vec<&str> = Protocol::ALL.iter().map(|protocol| protocol.name()).collect();
+    Protocol::from_name(text).ok_or_else(|| format!("unknown protocol `{text}`; write {}", known.join(", ")))
+}
+
+/// The simulated drive that a profile names.
+fn model_of(profile: &Profile) -> Option<ModelOptions> {
+    profile.simulator.as_deref().and_then(ModelOptions::by_name)
+}
+
+/// How fast the simulated lines are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum Speed {
+    /// Every character takes its time.
+    Real,
+    /// No time on the wire.
+    Max,
+}
+
+/// The endpoint that stands in for a bus's `port`: a link in the place of the device, or a listener.
+///
+/// # Errors
+/// A `tcp://` address that is not an address to listen on; `rfc2217://`, which is not simulated.
+fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
+    if port.starts_with("rfc2217://") {
+        return Err(format!(
+            "`{port}` cannot be simulated; write it as tcp://127.0.0.1:4001, or as a path"
+        ));
+    }
+    let Some(address) = port.strip_prefix("tcp://") else {
+        return Ok(EndpointOptions::Pty {
+            link: Some(PathBuf::from(port)),
+        });
+    };
+    socket_address(address)
+        .map(|listen| EndpointOptions::Tcp { listen })
+        .ok_or_else(|| format!("`{port}` is not an address to listen on; write it as tcp://127.0.0.1:4001"))
+}
+
+fn socket_address(text: &str) -> Option<SocketAddr> {
+    text.to_socket_addrs().ok().and_then(|mut found| found.next())
+}
+
+fn parse_listen(text: &str) -> Result<SocketAddr, String> {
+    socket_address(text)
+        .ok_or_else(|| format!("`{text}` is not an address to listen on; write host:port, such as 127.0.0.1:4001"))
+}
+
+/// The simulated lines of a configuration file, each in the place of its bus's port.
+fn configured(file: &Path) -> Result<Vec<SimulatedBusOptions>, ExitCode> {
+    let loaded = Settings::load(file, config::environment());
+    report::problems(&loaded);
+    let settings = loaded.settings.ok_or(ExitCode::from(EXIT_CONFIG))?;
+    let lines: Result<Vec<SimulatedBusOptions>, String> = settings.buses.iter().map(line_of).collect();
+    lines.map_err(|message| failed(EXIT_CONFIG, &message))
+}
+
+fn line_of(bus: &BusSettings) -> Result<SimulatedBusOptions, String> {
+    let drive = |spec: &DriveSpec| {
+        let model = model_of(&spec.profile).ok_or_else(|| {
+            let (name, profile) = (&spec.name, &spec.profile.name);
+            format!("drives of the profile `{profile}` cannot be simulated; drive `{name}`; give it another profile")
+        })?;
+        Ok(DriveOptions::new(spec.address, model))
+    };
+    let drives = bus.drives.iter().map(drive).collect::<Result<_, String>>()?;
+    let mut line = SimulatedBusOptions::new(
+        &bus.spec.name,
+        LineRules::of(bus.spec.protocol, bus.spec.format),
+        drives,
+    );
+    line.endpoint = endpoint_for(&bus.spec.port)?;
+    Ok(line)
+}
+
+/// Simulates until Ctrl-C or SIGTERM.
+pub(super) fn run(args: &Args) -> ExitCode {
+    let lines = match &args.config {
+        Some(file) => match configured(file) {
+            Ok(lines) => lines,
+            Err(code) => return code,
+        },
+        None => match args.line() {
+            Ok(line) => vec![line],
+            Err(message) => return failed(EXIT_USAGE, &message),
+        },
+    };
+    let start = |line: SimulatedBusOptions| {
+        let name = line.name.clone();
+        SimulatedBus::start(args.applied_to(line)).map_err(|error| match &args.config {
+            Some(file) => {
+                let file = file.display();
+                format!("cannot simulate bus `{name}` at its `port` in {file}: {error}")
+            }
+            None => format!("cannot simulate: {error}"),
+        })
+    };
+    let started: Result<Vec<SimulatedBus>, String> = lines.into_iter().map(start).collect();
+    let served = started.and_then(|lines| watch::serve(&lines).map_err(|error| format!("cannot simulate: {error}")));
+    match served {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(message) => failed(EXIT_FAILED, &message),
+    }
+}
+
+fn failed(code: u8, message: &str) -> ExitCode {
+    report::error(message);
+    ExitCode::from(code)
+}
+
+impl Args {
+    /// The line of the command line.
+    fn line(&self) -> Result<SimulatedBusOptions, String> {
+        let profiles = Profiles::built_in();
+        let profile = profiles.get(&self.profile).ok_or_else(|| {
+            let near = nearest(&self.profile, profiles.names()).map(|name| format!("; did you mean `{name}`?"));
+            let known: Vec<&str> = profiles.names().collect();
+            let known = format!("; known profiles: {}", known.join(", "));
+            format!(
+                "unknown profile `{}`; in --profile{}",
+                self.profile,
+                near.unwrap_or(known)
+            )
+        })?;
+        let model = model_of(profile).ok_or_else(|| {
+            format!(
+                "drives of the profile `{}` cannot be simulated; in --profile; choose another",
+                self.profile
+            )
+        })?;
+        if self.cx_address_offset.is_some() && !matches!(model, ModelOptions::Cx(_)) {
+            return Err(format!(
+                "drives of the profile `{}` have no address offset; in --cx-address-offset; omit it, or choose \
+                 vacon-cx in --profile",
+                self.profile
+            ));
+        }
+        let protocol = self.protocol_of(profile, &profiles)?;
+        if let Some(address) = self
+            .addresses
+            .0
+            .iter()
+            .find(|address| !profile.addresses.contains::<u8>(address))
+        {
+            let (first, last) = profile.addresses.clone().into_inner();
+            return Err(format!(
+                "`{}` has no address {address}; in --addresses; its drives have {first} to {last}",
+                self.profile
+            ));
+        }
+        let usual = profile.bauds.iter().copied().filter(|baud| *baud <= USUAL_BAUD).max();
+        let baud = self.baud.or(usual).unwrap_or(USUAL_BAUD);
+        let usual = profile.formats.first().map_or(default_format(protocol), String::as_str);
+        let format = self.format.as_deref().unwrap_or(usual);
+        let format = LineFormat::new(baud, format).map_err(|error| format!("{error}; in --format"))?;
+        let drives = self.addresses.0.iter();
+        let drives = drives.map(|&address| DriveOptions::new(address, model.clone()));
+        let mut line = SimulatedBusOptions::new("line", LineRules::of(protocol, format), drives.collect());
+        line.endpoint = match (&self.port, self.listen) {
+            (Some(path), _) => EndpointOptions::Port { path: path.clone() },
+            (None, Some(listen)) => EndpointOptions::Tcp { listen },
+            (None, None) => EndpointOptions::Pty {
+                link: self.link.clone(),
+            },
+        };
+        Ok(line)
+    }
+
+    /// Protocol of the drives: as requested, or the first of the profile.
+    fn protocol_of(&self, profile: &Profile, profiles: &Profiles) -> Result<Protocol, String> {
+        let spoken: Vec<&str> = profile.protocols.iter().map(|protocol| protocol.name()).collect();
+        match (self.protocol, profile.protocols.first()) {
+            (Some(wanted), _) if !profile.protocols.contains(&wanted) => {
+                let mut others = profiles.names().filter_map(|name| profiles.get(name));
+                let other = others
+                    .find(|other| other.simulator == profile.simulator && other.protocols.contains(&wanted))
+                    .map(|other| format!("; for {} choose the profile `{}`", wanted.name(), other.name));
+                Err(format!(
+                    "drives of the profile `{}` speak {}; in --protocol{}",
+                    profile.name,
+                    spoken.join(", "),
+                    other.unwrap_or_default()
+                ))
+            }
+            (Some(wanted), _) => Ok(wanted),
+            (None, first) => Ok(first.copied().unwrap_or(Protocol::ModbusRtu)),
+        }
+    }
+
+    /// Applies the options that concern every line.
+    fn applied_to(&self, mut line: SimulatedBusOptions) -> SimulatedBusOptions {
+        line.faults = FaultPlan::new(self.fault.clone(), self.seed);
+        // An explicit time applies to all drives.
+        let turnaround = match self.speed {
+            Speed::Max => Some(Duration::ZERO),
+            Speed::Real => self.turnaround,
+        };
+        if let Some(turnaround) = turnaround {
+            line.rules.turnaround = turnaround;
+            for drive in &mut line.drives {
+                drive.model.take_turnaround_of_line();
+            }
+        }
+        line.rules.strict = !self.lenient;
+        line.boards.leading_byte = self.n2_leading_byte;
+        line.rules.delivery = if self.chunk == 0 {
+            Delivery::Whole
+        } else {
+            Delivery::Chunks(self.chunk)
+        };
+        if self.speed == Speed::Max {
+            line.rules.wire = Wire::Instant;
+        }
+        for drive in &mut line.drives {
+            match (&mut drive.model, self.cx_address_offset) {
+                (ModelOptions::Cx(cx), Some(offset)) => cx.offset = offset,
+                (ModelOptions::Teco(teco), _) => teco.answer_check_error = self.teco_answer_check_error,
+                _ => {}
+            }
+            drive.model.set_trip_register(true);
+            if self.autopilot {
+                drive.autopilot = Some(self.seed.wrapping_mul(1000).wrapping_add(u64::from(drive.address)));
+            }
+        }
+        line
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,173 @@
+//! The drives that were found, read and shown until a signal.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use super::dialog::{ask, is_terminal, write_new};
+use super::{Args, Stop, failed};
+use crate::config::{LogFormat, LogSettings, Settings};
+use crate::daemon::Daemon;
+use crate::drive::{ModelPoint, Quality, State};
+use crate::north::http;
+use crate::north::local::SocketPath;
+use crate::plant::SharedPlant;
+use crate::{EXIT_FAILED, demo, report};
+
+/// Preferred port of the status page.
+const HTTP: u16 = 9488;
+/// Time for the first values of all drives.
+const FIRST_VALUES: Duration = Duration::from_secs(10);
+
+/// Reads the drives of the configuration `text` and serves the status page until a signal.
+pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Result<ExitCode, ExitCode> {
+    let fail = |message: &str| failed(EXIT_FAILED, message);
+    let loaded = Settings::parse("drivegate.toml", text, std::iter::empty());
+    report::errors(&loaded.errors);
+    let mut settings = loaded.settings.ok_or(ExitCode::from(EXIT_FAILED))?;
+    if settings.buses.iter().all(|bus| bus.drives.is_empty()) {
+        report::print(text);
+        return Err(fail(
+            "devices answer, but no profile matches any of them, so there is nothing to show; the configuration above; write a \
+             profile (docs/profiles.md) and pass its directory with --profile-dir",
+        ));
+    }
+    // What a gateway keeps on disk, and its socket, are not for a trial.
+    settings.socket = SocketPath::Off;
+    settings.recordings.max_count = 0;
+    settings.keeps_history = false;
+    settings.http = Some(http::Options::at(
+        demo::free_port("the status page", HTTP).map_err(|e| fail(&e))?,
+    ));
+    let _log = crate::log::start(&LogSettings {
+        level: "error".to_string(),
+        format: LogFormat::Auto,
+    });
+    let runtime = crate::runtime().map_err(|message| fail(&message))?;
+    let daemon = runtime
+        .block_on(Daemon::start(settings))
+        .map_err(|error| fail(&error.to_string()))?;
+    runtime.block_on(first_values(&daemon.plant(), stop));
+    report::print(&values(&daemon.plant()));
+    if let Some(address) = daemon.http_address() {
+        report::print(&format!(
+            "\nStatus page, from this machine only: http://{address}/\nThe drives are only read. Ctrl-C ends it.\n"
+        ));
+    }
+    let code = match offer(args, stop, text) {
+        Ok(()) => {
+            runtime.block_on(stop.token.cancelled());
+            ExitCode::SUCCESS
+        }
+        Err(message) => fail(&message),
+    };
+    runtime.block_on(daemon.stop());
+    Ok(code)
+}
+
+/// Waits until each drive that answers has values.
+async fn first_values(plant: &SharedPlant, stop: &Stop) {
+    let deadline = Instant::now() + FIRST_VALUES;
+    let settled = || {
+        plant.load().drives().all(|drive| {
+            let link = drive.image.snapshot().link;
+            link.is_tried() && (!link.is_online() || drive.reading(Instant::now()).state().is_some())
+        })
+    };
+    while !settled() && !stop.is_wanted() && Instant::now() < deadline {
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+fn values(plant: &SharedPlant) -> String {
+    let mut table = report::table(["drive", "address", "profile", "state", "Hz", "rpm", "A", "fault"]);
+    for drive in plant.load().drives() {
+        let (spec, reading) = (&drive.image.spec, drive.reading(Instant::now()));
+        // Only good values are shown.
+        let good = |point: ModelPoint| {
+            let sample = reading.model(point);
+            let value = sample.value.filter(|_| sample.quality == Quality::Good);
+            crate::process_image::value_or_null(value).as_f64()
+        };
+        let fixed = |point: ModelPoint, digits: usize| {
+            good(point).map_or_else(String::new, |value| format!("{value:.digits$}"))
+        };
+        table.add_row([
+            spec.name.clone(),
+            spec.address.to_string(),
+            spec.profile.name.clone(),
+            reading.state().map_or("unknown", State::name).to_string(),
+            fixed(ModelPoint::OutputFrequency, 2),
+            fixed(ModelPoint::MotorSpeed, 0),
+            fixed(ModelPoint::MotorCurrent, 1),
+            reading.fault_text(),
+        ]);
+    }
+    format!("\n{}", report::lines(&table))
+}
+
+/// Writes the configuration where that is wanted.
+fn offer(args: &Args, stop: &Stop, text: &str) -> Result<(), String> {
+    if let Some(file) = &args.write {
+        write_new(file, text)?;
+        report::print(&next_steps(file));
+        return Ok(());
+    }
+    if !is_terminal() {
+        report::note("no configuration is written; --write FILE writes one");
+        return Ok(());
+    }
+    while !stop.is_wanted() {
+        let answer = ask(
+            "\nWrite this as a configuration? Name of a new file, y for drivegate.toml, or Enter for none:",
+            stop,
+        );
+        let Some(file) = answer.and_then(|answer| wanted_file(&answer)) else {
+            return Ok(());
+        };
+        match write_new(&file, text) {
+            Ok(()) => {
+                report::print(&next_steps(&file));
+                return Ok(());
+            }
+            Err(message) => report::error(&message),
+        }
+    }
+    Ok(())
+}
+
+/// The file that an answer names; `None` where none is wanted. A yes or a no names no file.
+fn wanted_file(answer: &str) -> Option<PathBuf> {
+    match answer.to_lowercase().as_str() {
+        "" | "n" | "no" | "nein" => None,
+        "y" | "yes" | "j" | "ja" | "ok" => Some(PathBuf::from("drivegate.toml")),
+        _ => Some(PathBuf::from(answer)),
+    }
+}
+
+fn next_steps(file: &Path) -> String {
+    let file = file.display();
+    format!(
+        "Configuration written to {file}. Next, after Ctrl-C:\n  drivegate check --config {file}\n  drivegate run --config {file}\n"
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_yes_is_no_name_of_a_file() {
+        for (answer, file) in [
+            ("", None),
+            ("n", None),
+            ("No", None),
+            ("y", Some("drivegate.toml")),
+            ("YES", Some("drivegate.toml")),
+            ("Pumps.toml", Some("Pumps.toml")),
+            ("yard.toml", Some("yard.toml")),
+        ] {
+            assert_eq!(wanted_file(answer), file.map(PathBuf::from), "{answer}");
+        }
+    }
+}
