@@ -1,4 +1,4 @@
-//! What ships: every configuration, the documents, the house of the sources, what is packaged around the program.
+//! What ships: every configuration, the documents, what is packaged around the program.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -13,7 +13,6 @@ mod repository {
     mod config;
     mod documents;
     mod fuzz_seeds;
-    mod layering;
     mod packages;
     mod packaging;
 }

@@ -98,7 +98,8 @@ fn every_configuration_that_ships_is_valid() {
 fn the_tests_of_the_threat_model_exist() {
     let text = read(&root().join("docs/threat-model.md"));
     let table = text.split("## Defences").nth(1).unwrap().split("\n## ").next().unwrap();
-    let code: String = [files(&root().join("src"), "rs"), files(&root().join("tests"), "rs")]
+    let code: String = ["src", "crates", "tests"]
+        .map(|folder| files(&root().join(folder), "rs"))
         .iter()
         .flatten()
         .map(|file| read(file))

@@ -20,7 +20,10 @@ import tomllib
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 COPY = ROOT / "target/mutants"
-VERSION = rb'name = "drivegate"\nversion = "[0-9.]+'
+# Below `[workspace.package]`, and of the own packages in the lock file.
+VERSION = re.compile(rb'((?:\[workspace\.package\]|name = "drivegate[a-z-]*")\nversion = "[0-9.]+)')
+# Where the switch stands; every other crate that has faults takes it from there.
+LOWEST = "crates/proto/src/lib.rs"
 SWITCH = """
 /// Whether that fault is switched on.
 pub fn mutant(name: &str) -> bool {
@@ -76,10 +79,14 @@ def put_in(tree, mutants):
         for begin, end, new, _ in reversed(places):
             text = text[:begin] + new + text[end:]
         tree[name] = text.encode()
-    tree["src/lib.rs"] += SWITCH.encode()
+    tree[LOWEST] += SWITCH.encode()
+    crates = {"/".join(name.split("/")[:2]) for name in edits}
+    for crate in crates:
+        if crate != "crates/proto":
+            tree[f"{crate}/src/lib.rs"] += b"\npub(crate) use drivegate_proto::mutant;\n"
     # A version of its own: cargo, which shares the built dependencies, must not take one tree's program for the other's.
     for name in ("Cargo.toml", "Cargo.lock"):
-        tree[name] = re.sub(VERSION, rb'\g<0>-mutants', tree[name], count=1)
+        tree[name] = VERSION.sub(rb'\1-mutants', tree[name])
 
 
 def build():

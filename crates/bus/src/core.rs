@@ -296,7 +296,7 @@ impl BusCore {
             return &[];
         };
         if self.line.babbles(since) {
-            tracing::warn!(bus = %self.bus.image.spec.name, "the line does not fall silent; speaking all the same");
+            tracing::warn!(target: "drivegate::bus::core", bus = %self.bus.image.spec.name, "the line does not fall silent; speaking all the same");
         }
         let quiet_since = self.line.quiet_since();
         self.report

@@ -149,7 +149,7 @@ fn or_end_the_process<T>(work: impl FnOnce() -> T) -> T {
     std::panic::catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| {
         let bus = std::thread::current().name().unwrap_or_default().to_string();
         tracing::error!(
-            "the thread {bus} panicked, which is a fault of drivegate; the process ends to be started again"
+            target: "drivegate::bus::line_loop", "the thread {bus} panicked, which is a fault of drivegate; the process ends to be started again"
         );
         // Log lines are written by a thread of their own.
         std::thread::sleep(LAST_WORDS);
@@ -226,7 +226,7 @@ impl Worker {
                 Ok((line, warnings)) => {
                     drop(watching);
                     for warning in warnings {
-                        tracing::warn!(bus = %spec.name, "{warning}");
+                        tracing::warn!(target: "drivegate::bus::line_loop", bus = %spec.name, "{warning}");
                     }
                     let opened = Instant::now();
                     core.opened(opened);
@@ -517,7 +517,7 @@ mod tests {
             let _ = bus.join();
             return;
         }
-        let test = "bus::line_loop::tests::a_bus_that_panics_ends_the_process";
+        let test = "line_loop::tests::a_bus_that_panics_ends_the_process";
         let mut same = Command::new(std::env::current_exe().unwrap());
         let ended = same.args([test, "--exact"]).env(DIES, "1").output().unwrap();
         assert_eq!(ended.status.signal(), Some(6), "{ended:?}");

@@ -384,7 +384,7 @@ impl Report {
         };
         drive.update(|s| s.refuse(read.table, read.start, read.count, exception));
         tracing::warn!(
-            bus = %self.image.spec.name, drive = %drive.spec.name,
+            target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
             "the drive refuses {} {} with {exception}; its points are bad; asked again after 2 s, later every minute",
             read.table, read.start
         );
@@ -409,7 +409,7 @@ impl Report {
         }
         if drive.spec.supervision.is_some() {
             tracing::warn!(
-                bus = %self.image.spec.name, drive = %drive.spec.name,
+                target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
                 "the drive does not respond to a silent master ({point} = 0), its lease stops it only while the gateway \
                  works; set the parameter to a stop if the process allows it"
             );

@@ -293,7 +293,7 @@ impl Daemon {
         // Last: whoever hears of a bus finds it in the plant.
         for (bus, task) in &mut kept {
             if let Some(before) = handovers.remove(&bus.spec.name) {
-                tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "starting the bus");
+                tracing::info!(target: "drivegate::daemon", bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "starting the bus");
                 task.begin(before);
             }
         }
@@ -394,7 +394,7 @@ impl Daemon {
             Ok(keeper) => self.keeper = Some(keeper),
             Err(error) => {
                 tracing::error!(
-                    "cannot start the thread that keeps events and counters: {error}; free memory or threads"
+                    target: "drivegate::daemon", "cannot start the thread that keeps events and counters: {error}; free memory or threads"
                 );
             }
         }
@@ -492,7 +492,7 @@ impl Daemon {
         match started {
             Ok(file) => audit.write_to(Some(Arc::new(file))),
             Err(error) => tracing::error!(
-                "cannot start the thread of the audit file: {error}; the audit stays where it was; free memory or threads"
+                target: "drivegate::daemon", "cannot start the thread of the audit file: {error}; the audit stays where it was; free memory or threads"
             ),
         }
     }
@@ -566,7 +566,7 @@ impl Daemon {
             .collect();
         if !missing.is_empty() {
             tracing::error!(
-                "not every drive acknowledged its stop command in time; shutting down anyway: {}",
+                target: "drivegate::daemon", "not every drive acknowledged its stop command in time; shutting down anyway: {}",
                 missing.iter().map(NotStopped::to_string).collect::<Vec<_>>().join(", ")
             );
         }
@@ -592,7 +592,7 @@ async fn at_once<T: Send + 'static>(
     end: fn(BusTask) -> T,
 ) -> Vec<(BusSettings, T)> {
     let stop = |(settings, task): (BusSettings, BusTask)| {
-        tracing::info!(bus = %settings.spec.name, "stopping the bus");
+        tracing::info!(target: "drivegate::daemon", bus = %settings.spec.name, "stopping the bus");
         tokio::task::spawn_blocking(move || (settings, end(task)))
     };
     let stopping: Vec<_> = buses.into_iter().map(stop).collect();

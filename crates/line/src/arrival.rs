@@ -40,7 +40,7 @@ impl Arrival {
             Ok(Arrival { inotify, watched })
         };
         watch()
-            .inspect_err(|error| tracing::debug!(port, "cannot watch for the device: {error}; trying in pauses"))
+            .inspect_err(|error| tracing::debug!(target: "drivegate::line::arrival", port, "cannot watch for the device: {error}; trying in pauses"))
             .ok()
     }
 

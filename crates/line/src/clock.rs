@@ -23,15 +23,17 @@ const NICE: i32 = -10;
 /// is busy. Where everything is refused, waits are later and nothing else changes.
 pub fn sharpen_timers() {
     if let Err(error) = rustix::thread::set_current_timer_slack(NonZeroU64::new(1)) {
-        tracing::debug!("timer slack stays as it is: {error}");
+        tracing::debug!(target: "drivegate::line::clock", "timer slack stays as it is: {error}");
     }
     let Err(refused) = real_time() else {
         return;
     };
     // Linux takes "this process" for the calling thread alone.
     match rustix::process::setpriority_process(None, NICE) {
-        Ok(()) => tracing::debug!("no real time, but nice {NICE}: {refused}"),
-        Err(error) => tracing::debug!("no precedence over other threads: no real time: {refused}; no nice: {error}"),
+        Ok(()) => tracing::debug!(target: "drivegate::line::clock", "no real time, but nice {NICE}: {refused}"),
+        Err(error) => {
+            tracing::debug!(target: "drivegate::line::clock", "no precedence over other threads: no real time: {refused}; no nice: {error}")
+        }
     }
 }
 
@@ -46,7 +48,7 @@ fn real_time() -> Result<(), String> {
 /// Takes back what a thread has from the thread of a line that started it.
 pub(super) fn be_ordinary() {
     if let Err(error) = ordinary() {
-        tracing::debug!("a thread keeps the precedence of its line: {error}");
+        tracing::debug!(target: "drivegate::line::clock", "a thread keeps the precedence of its line: {error}");
     }
 }
 

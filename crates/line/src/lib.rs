@@ -303,7 +303,7 @@ impl Drop for Exclusive {
     fn drop(&mut self) {
         if let Err(error) = rustix::termios::ioctl_tiocnxcl(&self.0) {
             // An adapter that was unplugged.
-            tracing::debug!("the exclusive mode of the port is not taken back: {error}");
+            tracing::debug!(target: "drivegate::line", "the exclusive mode of the port is not taken back: {error}");
         }
     }
 }
@@ -434,7 +434,7 @@ fn open_serial(port: &str, format: &LineFormat, options: &LineOptions) -> Result
         });
     }
     if let Err(error) = sys::low_latency(&fd) {
-        tracing::debug!(port, "no low-latency mode: {error}");
+        tracing::debug!(target: "drivegate::line", port, "no low-latency mode: {error}");
     }
     if let Some(read_back) = read_back(&fd).filter(|f| f != &format.to_string()) {
         warnings.push(format!(

@@ -87,7 +87,7 @@ impl Names {
             Err(error) if self.known.is_empty() || error.kind() == io::ErrorKind::Interrupted => return Err(error),
             Err(error) => {
                 if !std::mem::replace(&mut self.doubtful, true) {
-                    tracing::warn!("no address of {address}: {error}; going on with the last ones known");
+                    tracing::warn!(target: "drivegate::line::names", "no address of {address}: {error}; going on with the last ones known");
                 }
             }
         }

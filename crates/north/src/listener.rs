@@ -260,9 +260,11 @@ impl<H: ConnectionHandler> Listeners<H> {
             };
             let (server, tls) = (self.server.title(), listener.spec.tls);
             match &socket {
-                Ok(_) => tracing::info!(address = %bound, tls, "{server}: listening"),
+                Ok(_) => {
+                    tracing::info!(target: "drivegate::north::listener", address = %bound, tls, "{server}: listening")
+                }
                 Err(why) => tracing::error!(
-                    address = %bound,
+                    target: "drivegate::north::listener", address = %bound,
                     "{server}: not listening: {why}; the drives are polled, and the address is tried again until the machine has it"
                 ),
             }
@@ -270,7 +272,7 @@ impl<H: ConnectionHandler> Listeners<H> {
             self.open.push(listener);
         }
         for listener in before {
-            tracing::info!(address = %listener.bound, "{}: no longer listening", self.server.title());
+            tracing::info!(target: "drivegate::north::listener", address = %listener.bound, "{}: no longer listening", self.server.title());
             listener.stop.cancel();
             listener.cancel.cancel();
         }
@@ -279,7 +281,7 @@ impl<H: ConnectionHandler> Listeners<H> {
     /// Closes all listeners; what their connections have begun is answered as if a reload closed each of them.
     pub(super) async fn close(&mut self) {
         for mut listener in std::mem::take(&mut self.open) {
-            tracing::info!(address = %listener.bound, "{}: no longer listening", self.server.title());
+            tracing::info!(target: "drivegate::north::listener", address = %listener.bound, "{}: no longer listening", self.server.title());
             listener.stop.cancel();
             listener.cancel.cancel();
             if let Some(stopped) = listener.stopped.take() {

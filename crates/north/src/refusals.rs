@@ -71,7 +71,7 @@ impl Refusals {
         let log = self.logs.get(why as usize);
         if let Some(suppressed) = log.and_then(|log| log.permit(Instant::now())) {
             let server = self.server.title();
-            tracing::warn!(%client, suppressed, "{server}: {text}");
+            tracing::warn!(target: "drivegate::north::refusals", %client, suppressed, "{server}: {text}");
         }
     }
 }

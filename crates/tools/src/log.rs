@@ -42,7 +42,7 @@ impl LogHandle {
     /// Sets the level; a format change needs a restart.
     pub(super) fn set_level(&self, level: &str) {
         if let Err(error) = self.filter.reload(filter(level)) {
-            tracing::error!("cannot set the log level, keeping the current one: {error}");
+            tracing::error!(target: "drivegate::cli::log", "cannot set the log level, keeping the current one: {error}");
         }
     }
 
@@ -51,7 +51,7 @@ impl LogHandle {
         let lost = self.lost.iter().map(ErrorCounter::dropped_lines).sum::<usize>();
         let more = lost.saturating_sub(self.reported.swap(lost, Ordering::Relaxed));
         if more > 0 {
-            tracing::warn!("dropped {more} log lines: the reader of the log is too slow or has stopped");
+            tracing::warn!(target: "drivegate::cli::log", "dropped {more} log lines: the reader of the log is too slow or has stopped");
         }
     }
 }
@@ -142,7 +142,7 @@ fn subscribe(level: &str, form: Form, writer: BoxMakeWriter) -> reload::Handle<E
         .try_init()
         .is_err()
     {
-        tracing::debug!("logging was started before");
+        tracing::debug!(target: "drivegate::cli::log", "logging was started before");
     }
     handle
 }

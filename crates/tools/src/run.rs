@@ -51,8 +51,11 @@ fn run_from(path: &Path) -> io::Result<ExitCode> {
         return Ok(ExitCode::from(EXIT_CONFIG));
     };
     let log = super::log::start(&settings.log);
-    tracing::info!(version = VERSION.as_str(), config = %path.display(), "drivegate starts");
-    loaded.warnings.iter().for_each(|problem| tracing::warn!("{problem}"));
+    tracing::info!(target: "drivegate::cli::run", version = VERSION.as_str(), config = %path.display(), "drivegate starts");
+    loaded
+        .warnings
+        .iter()
+        .for_each(|problem| tracing::warn!(target: "drivegate::cli::run", "{problem}"));
     let runtime = Builder::new_multi_thread().enable_all().build()?;
     let mut signals = Signals::within(&runtime)?;
     // What these ones came too late for.
@@ -87,19 +90,19 @@ async fn serve(settings: Settings, path: &Path, log: &LogHandle, signals: Signal
             return ExitCode::from(EXIT_FAILED);
         }
     };
-    tracing::info!(gateway, buses, "drivegate runs");
+    tracing::info!(target: "drivegate::cli::run", gateway, buses, "drivegate runs");
     notify(&[NotifyState::Ready]);
     let daemon = serving::until_stopped(daemon, orders, path, log, signals).await;
     notify(&[NotifyState::Stopping]);
     daemon.stop().await;
-    tracing::info!("drivegate has stopped");
+    tracing::info!(target: "drivegate::cli::run", "drivegate has stopped");
     ExitCode::SUCCESS
 }
 
 /// Tells systemd, if it started this process.
 fn notify(states: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(states) {
-        tracing::debug!("cannot notify systemd: {error}");
+        tracing::debug!(target: "drivegate::cli::run", "cannot notify systemd: {error}");
     }
 }
 

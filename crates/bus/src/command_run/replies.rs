@@ -155,7 +155,7 @@ impl CommandRun {
 
     /// The value stands all the same: a supervisor that looks away does not see changes at the panel, no more.
     fn not_released(&mut self, why: &str) -> Option<Outcome> {
-        tracing::warn!("an output was written but not released to the drive's own control: {why}");
+        tracing::warn!(target: "drivegate::bus::command_run", "an output was written but not released to the drive's own control: {why}");
         self.tries.failures = 0;
         self.pop();
         self.actions.is_empty().then(|| self.success())

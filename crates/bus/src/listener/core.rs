@@ -232,7 +232,7 @@ impl ListenCore {
         });
         if new {
             tracing::info!(
-                bus = %self.bus.image.spec.name, address,
+                target: "drivegate::bus::listener", bus = %self.bus.image.spec.name, address,
                 "a drive without an entry answers the other master at address {address}; write [[bus.drive]] for it to see its \
                  values, `drivegate listen` shows what is read of it"
             );

@@ -23,7 +23,7 @@ pub(super) fn fit(mut settings: Settings) -> Settings {
     }
     let (before, fitted) = (wanted.connections(), wanted.within(limit));
     tracing::warn!(
-        "the configuration can require {} open files, but the limit is {limit}; at most {} instead of {before} connections \
+        target: "drivegate::daemon::file_limit", "the configuration can require {} open files, but the limit is {limit}; at most {} instead of {before} connections \
          are served: raise LimitNOFILE of the service or lower `max_connections` of [modbus_tcp]",
         wanted.files(),
         fitted.connections(),

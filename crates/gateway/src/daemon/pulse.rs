@@ -32,7 +32,7 @@ impl Pulse {
         for watched in self.watched().iter_mut() {
             let beats = watched.beats.load(Ordering::Relaxed);
             if watched.before.replace(beats) == Some(beats) {
-                tracing::error!(bus = %watched.bus, "bus thread stalled; withholding the watchdog keep-alive");
+                tracing::error!(target: "drivegate::daemon::pulse", bus = %watched.bus, "bus thread stalled; withholding the watchdog keep-alive");
                 moving = false;
             }
         }

@@ -217,7 +217,7 @@ where
 /// Waits for `end`; logs a warning when it takes longer than `limit`.
 pub(super) async fn within(limit: Duration, what: &str, end: impl Future<Output = ()>) {
     if tokio::time::timeout(limit, end).await.is_err() {
-        tracing::warn!("{what} did not stop within {limit:?}; continuing without waiting");
+        tracing::warn!(target: "drivegate::daemon::server", "{what} did not stop within {limit:?}; continuing without waiting");
     }
 }
 

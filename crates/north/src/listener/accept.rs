@@ -53,7 +53,7 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
                 };
                 let why = self.accept(open).await;
                 let (server, address) = (self.server, self.address);
-                tracing::error!(%address, "{}: the listener is lost: {why}; binding it again", server.title());
+                tracing::error!(target: "drivegate::north::listener", %address, "{}: the listener is lost: {why}; binding it again", server.title());
                 self.state.set(Some(why.to_string()));
             }
         };
@@ -66,7 +66,7 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
         loop {
             match bind() {
                 Ok(socket) => {
-                    tracing::info!(%address, "{}: listening now", server.title());
+                    tracing::info!(target: "drivegate::north::listener", %address, "{}: listening now", server.title());
                     self.state.set(None);
                     return socket;
                 }
@@ -92,7 +92,7 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
                 Err(error) => {
                     if let Some(suppressed) = log.permit(Instant::now()) {
                         let server = self.server.title();
-                        tracing::warn!(suppressed, "{server}: cannot accept a connection: {error}; retrying");
+                        tracing::warn!(target: "drivegate::north::listener", suppressed, "{server}: cannot accept a connection: {error}; retrying");
                     }
                     tokio::time::sleep(ACCEPT_PAUSE).await;
                 }

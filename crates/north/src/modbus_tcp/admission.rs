@@ -247,7 +247,7 @@ fn contains(networks: &[IpNet], address: IpAddr) -> bool {
 /// either.
 fn set_socket_options(stream: &TcpStream) {
     use rustix::net::sockopt;
-    let failed = |what: &str, error: &dyn std::fmt::Display| tracing::debug!("Modbus TCP: cannot set {what}: {error}");
+    let failed = |what: &str, error: &dyn std::fmt::Display| tracing::debug!(target: "drivegate::north::modbus_tcp", "Modbus TCP: cannot set {what}: {error}");
     if let Err(error) = stream.set_nodelay(true) {
         failed("TCP_NODELAY", &error);
     }

@@ -60,7 +60,7 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     place: &Place,
     stopping: &CancellationToken,
 ) {
-    tracing::debug!(client = session.who(), "Modbus TCP: connected");
+    tracing::debug!(target: "drivegate::north::modbus_tcp", client = session.who(), "Modbus TCP: connected");
     let now = Instant::now();
     let mut connection = Connection {
         now,
@@ -85,7 +85,7 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     if matches!(end, End::NotModbus(_)) {
         let _ = tokio::time::timeout(CLOSE_TIMEOUT, connection.discard_input()).await;
     }
-    tracing::debug!(client = connection.dialogue.who(), "Modbus TCP: {end}");
+    tracing::debug!(target: "drivegate::north::modbus_tcp", client = connection.dialogue.who(), "Modbus TCP: {end}");
 }
 
 /// Closes the connection of a client that is not served.

@@ -225,7 +225,7 @@ impl Server {
             (_, None) => {}
             (Some(authenticator), Some(requirements)) => {
                 authenticator.renew(requirements);
-                tracing::info!("Modbus TCP: using the new certificates, revocations and roles");
+                tracing::info!(target: "drivegate::north::modbus_tcp", "Modbus TCP: using the new certificates, revocations and roles");
             }
             (None, Some(requirements)) => self.authenticator = Some(Arc::new(TlsAuthenticator::new(requirements))),
         }

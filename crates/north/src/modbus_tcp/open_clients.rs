@@ -48,7 +48,7 @@ impl OpenClient {
     }
 
     fn disconnect(&self, why: &str) {
-        tracing::warn!(client = %self.who, "Modbus TCP: disconnecting a client: {why}");
+        tracing::warn!(target: "drivegate::north::modbus_tcp", client = %self.who, "Modbus TCP: disconnecting a client: {why}");
         self.refused.cancel();
     }
 }

@@ -180,7 +180,7 @@ impl ClientSession {
     /// Logs an exception code that only this drive uses; the client gets 04.
     fn log_foreign_code(&self, drive: &str, code: Exception, now: Instant) {
         if let Some(suppressed) = self.foreign_codes.permit(now) {
-            tracing::warn!(drive, client = %self.client.who, suppressed,
+            tracing::warn!(target: "drivegate::north::modbus_tcp", drive, client = %self.client.who, suppressed,
                 "Modbus TCP: the drive answered {code}; passed on as exception 04");
         }
     }

@@ -278,9 +278,9 @@ impl Client {
         session.phase = Phase::Ready { limits, since };
         self.stats.mqtt.connected.store(true, Ordering::Relaxed);
         let (host, port) = (&self.options.host, self.options.port);
-        tracing::info!("connected to the broker at {host}:{port}");
+        tracing::info!(target: "drivegate::north::mqtt", "connected to the broker at {host}:{port}");
         for lost in limits.losses() {
-            tracing::warn!("the broker at {host}:{port} {lost}");
+            tracing::warn!(target: "drivegate::north::mqtt", "the broker at {host}:{port} {lost}");
         }
         self.outages.end();
         self.repair.forget();
@@ -333,13 +333,13 @@ impl Client {
             } else {
                 ""
             };
-            tracing::warn!("no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
+            tracing::warn!(target: "drivegate::north::mqtt", "no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
         } else {
-            tracing::debug!("no connection to the broker: {why}");
+            tracing::debug!(target: "drivegate::north::mqtt", "no connection to the broker: {why}");
         }
         if why == CLOSED && self.takeovers.closed(now) {
             let words = Takeovers::words(&self.options.client_id);
-            tracing::warn!("{}:{}: {words}", self.options.host, self.options.port);
+            tracing::warn!(target: "drivegate::north::mqtt", "{}:{}: {words}", self.options.host, self.options.port);
         }
         before
     }
@@ -398,7 +398,7 @@ impl Client {
                     self.outbox.put(topic, payload);
                 }
                 for line in self.publisher.take_reduced() {
-                    tracing::warn!("broker {}:{}: {line}", self.options.host, self.options.port);
+                    tracing::warn!(target: "drivegate::north::mqtt", "broker {}:{}: {line}", self.options.host, self.options.port);
                 }
                 next
             }
@@ -550,7 +550,7 @@ impl Client {
         // After that time the connection is closed, and the broker publishes the last will.
         let in_time = tokio::time::timeout_at(begun + DISCONNECT_TIMEOUT, self.disconnect(begun + LAST_RESULTS)).await;
         if in_time.is_err() {
-            tracing::warn!("the orderly disconnect from the broker timed out; the broker publishes the last will");
+            tracing::warn!(target: "drivegate::north::mqtt", "the orderly disconnect from the broker timed out; the broker publishes the last will");
         }
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
         self.stats.mqtt.configured.store(false, Ordering::Relaxed);
@@ -558,7 +558,7 @@ impl Client {
         self.count_unkept();
         let close = async { tokio::join!(self.store.close(), self.history.close()) };
         if tokio::time::timeout(LAST_WRITE, close).await.is_err() {
-            tracing::warn!("the MQTT buffer is too slow: the last messages may be missing after a restart");
+            tracing::warn!(target: "drivegate::north::mqtt", "the MQTT buffer is too slow: the last messages may be missing after a restart");
         }
         // The client that a reload puts in its place goes on with them.
         self.stats.mqtt.keep_unread(Some(self.events));

@@ -145,7 +145,7 @@ impl Journal {
         let bytes = fs::read(&path)?;
         if let Some(version) = record::other_version(&bytes) {
             tracing::warn!(
-                "{} was written by another version of drivegate (form {:?}, this one reads 'J'); it is left as it is; that \
+                target: "drivegate::north::mqtt", "{} was written by another version of drivegate (form {:?}, this one reads 'J'); it is left as it is; that \
                  version publishes what is in it, or remove it",
                 path.display(),
                 char::from(version),
@@ -169,7 +169,7 @@ impl Journal {
             {
                 // Nothing in it is understood, and nothing of it could be kept elsewhere.
                 let path = path.display();
-                tracing::warn!("{path}: none of it is valid; it is left as it is, and nothing of it is published");
+                tracing::warn!(target: "drivegate::north::mqtt", "{path}: none of it is valid; it is left as it is, and nothing of it is published");
                 return Ok(());
             }
             self.lost += 1;
@@ -309,7 +309,7 @@ impl Journal {
         let mut bytes = vec![0; (end - from) as usize];
         let read = segment.file.read_exact_at(&mut bytes, from);
         if let Err(error) = read {
-            tracing::error!("{}: {error}; its messages are lost", segment.path.display());
+            tracing::error!(target: "drivegate::north::mqtt", "{}: {error}; its messages are lost", segment.path.display());
             bytes.clear();
         }
         for found in record::records(&bytes) {
@@ -494,7 +494,7 @@ impl Journal {
         }
         (self.wiped, self.unsynced) = (true, true);
         tracing::error!(
-            "the files of {} in {} were deleted while the gateway runs: written again, {kept} bytes; do not clean this \
+            target: "drivegate::north::mqtt", "the files of {} in {} were deleted while the gateway runs: written again, {kept} bytes; do not clean this \
              directory, or stop the gateway before",
             place.name,
             place.dir.display()
@@ -546,7 +546,7 @@ impl Journal {
             Ok(()) => format!("kept in {}", path.display()),
         };
         tracing::warn!(
-            "{} bytes of {name} in {} are damaged; {shown}; the other records are read",
+            target: "drivegate::north::mqtt", "{} bytes of {name} in {} are damaged; {shown}; the other records are read",
             bytes.len(),
             dir.display()
         );

@@ -177,7 +177,7 @@ impl Mqtt {
     pub async fn stopped(self) {
         for task in self.0 {
             if let Err(error) = task.await {
-                tracing::error!("the MQTT client ended unexpectedly: {error}");
+                tracing::error!(target: "drivegate::north::mqtt", "the MQTT client ended unexpectedly: {error}");
             }
         }
     }

@@ -143,7 +143,7 @@ impl Store {
                 ..Store::default()
             },
             Err(error) => {
-                tracing::error!("the system provides no thread for the MQTT buffer: {error}; it is not used");
+                tracing::error!(target: "drivegate::north::mqtt", "the system provides no thread for the MQTT buffer: {error}; it is not used");
                 Store::default()
             }
         }
@@ -225,7 +225,7 @@ impl Store {
         if let Some(disk) = &self.disk {
             let kept = disk.jobs.try_send(Job::Topics(topics));
             if let Err(TrySendError::Full(_)) = kept {
-                tracing::warn!("the MQTT buffer is too slow; topics removed before the next start are not cleared");
+                tracing::warn!(target: "drivegate::north::mqtt", "the MQTT buffer is too slow; topics removed before the next start are not cleared");
             }
         }
     }
@@ -305,7 +305,7 @@ impl Thread {
                 }
                 Err(error) => {
                     tracing::error!(
-                        "cannot keep {name} in {}: {error}; keeping them in memory; check mqtt.buffer",
+                        target: "drivegate::north::mqtt", "cannot keep {name} in {}: {error}; keeping them in memory; check mqtt.buffer",
                         dir.display()
                     );
                     break Journal::in_memory();
@@ -315,7 +315,7 @@ impl Thread {
         let waiting = journal.waiting();
         if waiting > 0 {
             tracing::info!(
-                "{waiting} earlier {name} in {} are waiting for the broker",
+                target: "drivegate::north::mqtt", "{waiting} earlier {name} in {} are waiting for the broker",
                 dir.display()
             );
         }
@@ -375,7 +375,7 @@ impl Thread {
         if unkept > 0 {
             self.lost.add(unkept);
             tracing::error!(
-                "{unkept} messages that the broker did not take are lost: {} does not take them either; check mqtt.buffer",
+                target: "drivegate::north::mqtt", "{unkept} messages that the broker did not take are lost: {} does not take them either; check mqtt.buffer",
                 self.dir.display()
             );
         }
@@ -402,11 +402,11 @@ impl Thread {
         let written = self.journal.write();
         match written {
             Ok(true) if std::mem::take(&mut self.failing) => {
-                tracing::info!("{} takes the MQTT buffer again", self.dir.display());
+                tracing::info!(target: "drivegate::north::mqtt", "{} takes the MQTT buffer again", self.dir.display());
             }
             Err(error) if !std::mem::replace(&mut self.failing, true) => {
                 tracing::error!(
-                    "cannot write to {}: {error}; the newest messages wait in memory; check mqtt.buffer",
+                    target: "drivegate::north::mqtt", "cannot write to {}: {error}; the newest messages wait in memory; check mqtt.buffer",
                     self.dir.display()
                 );
             }
@@ -432,7 +432,7 @@ impl Thread {
             && let Err(error) = file.sync_data()
         {
             let dir = self.dir.display();
-            tracing::warn!("{dir}: {error}; buffered messages may not survive a power failure");
+            tracing::warn!(target: "drivegate::north::mqtt", "{dir}: {error}; buffered messages may not survive a power failure");
         }
         self.synced = Instant::now();
     }
@@ -453,7 +453,7 @@ impl Thread {
             // A part of it would only take room from the messages.
             let _ = std::fs::remove_file(&new);
             let file = file.display();
-            tracing::warn!("{file}: {error}; topics removed before the next start are not cleared");
+            tracing::warn!(target: "drivegate::north::mqtt", "{file}: {error}; topics removed before the next start are not cleared");
         }
     }
 }

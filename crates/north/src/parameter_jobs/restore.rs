@@ -235,7 +235,7 @@ pub async fn release(plant: &SharedPlant, drive: &DriveHandle, origin: &Origin) 
         Ok(Some(aside)) => {
             drive.image.hold.set(None);
             tracing::warn!(
-                bus = %spec.bus, drive = %spec.name, source = origin.kind.name(), client = %origin.who,
+                target: "drivegate::north::parameter_jobs", bus = %spec.bus, drive = %spec.name, source = origin.kind.name(), client = %origin.who,
                 "the restore of its parameters was released half done; the journal is {}", aside.display()
             );
             RestoreStage::Ended(format!(
@@ -329,7 +329,7 @@ struct Run {
 impl Run {
     async fn carry_on(mut self) {
         tracing::warn!(
-            drive = %self.name, source = self.origin.kind.name(), client = %self.origin.who,
+            target: "drivegate::north::parameter_jobs", drive = %self.name, source = self.origin.kind.name(), client = %self.origin.who,
             "its parameters are being restored: {}", self.restoration.journal().phase.name()
         );
         loop {
@@ -470,8 +470,12 @@ impl Run {
             }
         };
         match &stage {
-            RestoreStage::Failed(why) => tracing::error!(drive = %name, "its parameters were not restored: {why}"),
-            RestoreStage::Ended(text) => tracing::warn!(drive = %name, "the restore of its parameters is over: {text}"),
+            RestoreStage::Failed(why) => {
+                tracing::error!(target: "drivegate::north::parameter_jobs", drive = %name, "its parameters were not restored: {why}")
+            }
+            RestoreStage::Ended(text) => {
+                tracing::warn!(target: "drivegate::north::parameter_jobs", drive = %name, "the restore of its parameters is over: {text}")
+            }
             _ => {}
         }
         if let Some(why) = &held {

@@ -215,7 +215,7 @@ pub async fn hold_unfinished<'a>(
     let looked = tokio::task::spawn_blocking(move || look(&vault, &events, store.dir(), &drives));
     if tokio::time::timeout(LOOK, looked).await.is_err() {
         tracing::warn!(
-            "the disk is slow: the drives take no orders but stops before the journals of restores are read"
+            target: "drivegate::north::parameter_jobs", "the disk is slow: the drives take no orders but stops before the journals of restores are read"
         );
     }
 }
@@ -255,14 +255,14 @@ fn look(vault: &Vault, events: &Events, params: &Path, drives: &[Configured]) {
     let news = vault.new_orphans(orphans.iter().map(|(path, ..)| path.clone()).collect());
     for (path, what, remedy) in orphans.into_iter().filter(|(path, ..)| news.contains(path)) {
         let text = format!("{what}; {}; {remedy}", path.display());
-        tracing::error!("{text}");
+        tracing::error!(target: "drivegate::north::parameter_jobs", "{text}");
         events.publish(unfinished_event("", None, text));
     }
 }
 
 fn hold(vault: &Vault, events: &Events, drive: &Configured, why: String) {
     let spec = &drive.spec;
-    tracing::error!(bus = %spec.bus, drive = %spec.name, "{why}");
+    tracing::error!(target: "drivegate::north::parameter_jobs", bus = %spec.bus, drive = %spec.name, "{why}");
     events.publish(unfinished_event(&spec.bus, Some(&spec.name), why.clone()));
     vault.hold(&drive.machine).set(Some(why));
 }

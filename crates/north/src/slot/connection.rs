@@ -64,7 +64,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     /// Serves the tool until it goes, is idle for `idle_timeout`, or must yield its `place`.
     /// What it has asked is answered then, unless the gateway is `stopping`.
     pub(super) async fn serve(mut self, idle_timeout: Option<Duration>, place: &Place, stopping: &CancellationToken) {
-        tracing::info!(tool = self.dialogue.who(), "tool slot: connected");
+        tracing::info!(target: "drivegate::north::slot", tool = self.dialogue.who(), "tool slot: connected");
         let end = loop {
             if let Err(end) = self.turn(idle_timeout, place).await {
                 break end;
@@ -76,7 +76,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         }
         self.dialogue.ended();
         let _ = tokio::time::timeout(CLOSE_TIMEOUT, self.stream.shutdown()).await;
-        tracing::info!(tool = self.dialogue.who(), "tool slot: {end}");
+        tracing::info!(target: "drivegate::north::slot", tool = self.dialogue.who(), "tool slot: {end}");
     }
 
     /// Waits for the answer to what the tool asked last, which comes within a second or not at all.

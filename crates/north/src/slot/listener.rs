@@ -89,7 +89,7 @@ impl ConnectionHandler for SlotListener {
     async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, permit: ConnectionPermit) {
         let Some(served) = self.served.load_full() else { return };
         if let Err(error) = stream.set_nodelay(true) {
-            tracing::debug!("tool slot: cannot set TCP_NODELAY: {error}");
+            tracing::debug!(target: "drivegate::north::slot", "tool slot: cannot set TCP_NODELAY: {error}");
         }
         let slot = &served.terms.slot;
         let (port, greeting) = match served.telnet {

@@ -31,7 +31,7 @@ pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: Cancellation
     loop {
         let why = match open(&path) {
             Ok(pty) => {
-                tracing::info!(%bus, path = %path.display(), "tool slot: open");
+                tracing::info!(target: "drivegate::north::slot", %bus, path = %path.display(), "tool slot: open");
                 told.clear();
                 let tool = Tool::new(terms.clone(), &path.display().to_string(), "pty");
                 match Port::new(pty, Arc::new(tool)) {
@@ -49,7 +49,7 @@ pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: Cancellation
         };
         let why = why.to_string();
         if why != told {
-            tracing::warn!(%bus, "tool slot: no pseudo-terminal: {why}; trying again every {} s", AGAIN.as_secs());
+            tracing::warn!(target: "drivegate::north::slot", %bus, "tool slot: no pseudo-terminal: {why}; trying again every {} s", AGAIN.as_secs());
             told = why;
         }
         if cancel.run_until_cancelled(tokio::time::sleep(AGAIN)).await.is_none() {

@@ -42,22 +42,24 @@ pub(super) async fn serve(shared: &Shared, mut stream: TcpStream, peer: SocketAd
     let connect = match connect {
         Ok(Some(Ok(connect))) => connect,
         Ok(Some(Err(fault))) => {
-            tracing::debug!(%peer, "connection closed: {}", fault.what);
+            tracing::debug!(target: "drivegate::sim::broker", %peer, "connection closed: {}", fault.what);
             if fault.reason == reason::UNSUPPORTED_VERSION {
                 farewell(&mut stream, &packet::UNSUPPORTED_CONNACK).await;
             }
             return;
         }
-        Ok(None) | Err(_) => return tracing::debug!(%peer, "connection closed: no CONNECT"),
+        Ok(None) | Err(_) => {
+            return tracing::debug!(target: "drivegate::sim::broker", %peer, "connection closed: no CONNECT");
+        }
     };
     if let Some(code) = connect.refused {
-        tracing::debug!(%peer, "CONNECT refused with reason code {code:#04x}");
+        tracing::debug!(target: "drivegate::sim::broker", %peer, "CONNECT refused with reason code {code:#04x}");
         return farewell(&mut stream, &packet::connack(connect.version, code, None)).await;
     }
     let (end, ended) = oneshot::channel();
     let wake = Arc::new(Notify::new());
     let client = Client::attach(shared, connect, input, Arc::clone(&wake), end);
-    tracing::debug!(%peer, client = client.id, "connected");
+    tracing::debug!(target: "drivegate::sim::broker", %peer, client = client.id, "connected");
     client.run(stream, &wake, ended).await;
 }
 
@@ -157,7 +159,7 @@ impl<'a> Client<'a> {
             End::Left { with_will: false } => self.leave = Leave::Clean,
             End::Left { with_will: true } | End::Lost => {}
             End::Closed(fault) => {
-                tracing::debug!(client = self.id, "connection closed: {}", fault.what);
+                tracing::debug!(target: "drivegate::sim::broker", client = self.id, "connection closed: {}", fault.what);
                 self.send(&packet::disconnect(self.version, fault.reason));
             }
         }

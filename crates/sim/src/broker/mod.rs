@@ -126,13 +126,13 @@ async fn accept(shared: Arc<Shared>, listener: TcpListener, tasks: TaskTracker) 
         let (stream, peer) = match accepted {
             Ok(accepted) => accepted,
             Err(error) => {
-                tracing::debug!("cannot accept an MQTT connection: {error}");
+                tracing::debug!(target: "drivegate::sim::broker", "cannot accept an MQTT connection: {error}");
                 tokio::time::sleep(ACCEPT_PAUSE).await;
                 continue;
             }
         };
         let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
-            tracing::warn!(%peer, "MQTT connection closed: {MAX_CONNECTIONS} are open already");
+            tracing::warn!(target: "drivegate::sim::broker", %peer, "MQTT connection closed: {MAX_CONNECTIONS} are open already");
             continue;
         };
         let shared = Arc::clone(&shared);

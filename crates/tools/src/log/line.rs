@@ -19,7 +19,7 @@ const INTERVAL: Duration = Duration::from_secs(60);
 /// Kinds that are told apart; they are places in sources, so this is never reached.
 const KINDS: usize = 1024;
 /// Own targets begin with this.
-const OWN: &str = env!("CARGO_PKG_NAME");
+const OWN: &str = "drivegate";
 
 /// What is made of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -34,7 +34,7 @@ impl Reloads<'_> {
     /// Begins to read the configuration, or does so after the one that is being read.
     pub(super) fn begin(&mut self, order: Option<ReloadOrder>, watch: &mut Watch<'_>) {
         if let Some(order) = &order {
-            tracing::info!(who = order.who, "a local client asks for a reload");
+            tracing::info!(target: "drivegate::cli::run", who = order.who, "a local client asks for a reload");
         }
         let [current, next] = &mut self.waiting;
         if self.loads.is_loading() {
@@ -85,17 +85,23 @@ pub(super) async fn apply(
         warnings: logged(&loaded.warnings),
         changes: Vec::new(),
     };
-    outcome.errors.iter().for_each(|problem| tracing::error!("{problem}"));
-    outcome.warnings.iter().for_each(|problem| tracing::warn!("{problem}"));
+    outcome
+        .errors
+        .iter()
+        .for_each(|problem| tracing::error!(target: "drivegate::cli::run", "{problem}"));
+    outcome
+        .warnings
+        .iter()
+        .for_each(|problem| tracing::warn!(target: "drivegate::cli::run", "{problem}"));
     let Some(settings) = loaded.settings else {
-        tracing::error!("reload rejected; keeping the current configuration");
+        tracing::error!(target: "drivegate::cli::run", "reload rejected; keeping the current configuration");
         return outcome;
     };
     let level = settings.log.level.clone();
     match daemon.reload(settings).await {
         Ok(changes) => {
             log.set_level(&level);
-            tracing::info!(config = %path.display(), "configuration reloaded");
+            tracing::info!(target: "drivegate::cli::run", config = %path.display(), "configuration reloaded");
             outcome.changes = changes;
             outcome
         }
@@ -104,7 +110,7 @@ pub(super) async fn apply(
 }
 
 fn refused(why: &dyn std::fmt::Display) -> ReloadOutcome {
-    tracing::error!("reload rejected: {why}; keeping the current configuration");
+    tracing::error!(target: "drivegate::cli::run", "reload rejected: {why}; keeping the current configuration");
     ReloadOutcome {
         errors: vec![why.to_string()],
         ..ReloadOutcome::default()

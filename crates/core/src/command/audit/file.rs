@@ -266,7 +266,7 @@ impl Writer {
             self.write(&Entry::Lost { time, sent, not_sent })?;
             self.shared.queues().recorded = lost;
             tracing::warn!(
-                "audit file: {sent} records of commands that were sent and {not_sent} others were lost; the log has them"
+                target: "drivegate::command::audit", "audit file: {sent} records of commands that were sent and {not_sent} others were lost; the log has them"
             );
         }
         if !self.file.is_open() {
@@ -281,14 +281,14 @@ impl Writer {
         let path = path.display();
         match done {
             Ok(()) if std::mem::replace(&mut self.failing, false) => {
-                tracing::warn!("audit file: {path} is written again");
+                tracing::warn!(target: "drivegate::command::audit", "audit file: {path} is written again");
             }
             Ok(()) => {}
             Err(error) => {
                 self.file.close();
                 if !std::mem::replace(&mut self.failing, true) {
                     tracing::error!(
-                        "audit file: cannot write {path}: {error}; commands are carried out all the same and are in the log; \
+                        target: "drivegate::command::audit", "audit file: cannot write {path}: {error}; commands are carried out all the same and are in the log; \
                          {} records wait in memory; check [audit] and the disk",
                         WAITING.0
                     );
@@ -297,7 +297,7 @@ impl Writer {
                 if end && queues.end {
                     let (sent, others) = (queues.sent.len(), queues.unsent.len());
                     tracing::error!(
-                        "audit file: {sent} records of commands that were sent and {others} others are not written"
+                        target: "drivegate::command::audit", "audit file: {sent} records of commands that were sent and {others} others are not written"
                     );
                 }
             }
@@ -354,7 +354,7 @@ impl Writer {
         }
         if let Some((bytes, sha256)) = fragment {
             tracing::warn!(
-                "audit file: {} ends with {bytes} bytes of a line that was cut; they are kept and named",
+                target: "drivegate::command::audit", "audit file: {} ends with {bytes} bytes of a line that was cut; they are kept and named",
                 self.file.path().display()
             );
             let time = SystemTime::now();

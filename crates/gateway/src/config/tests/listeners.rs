@@ -24,7 +24,7 @@ pub(super) fn certificates() -> &'static Path {
 
 /// Runs the script of the documentation.
 pub(super) fn certificate(dir: &Path, arguments: &[&str], days: &str) {
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/modbus-tls-ca.sh");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/modbus-tls-ca.sh");
     let output = std::process::Command::new(script)
         .arg(dir)
         .args(arguments)

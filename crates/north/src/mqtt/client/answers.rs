@@ -57,7 +57,7 @@ impl Client {
     /// The broker refused the connection because of the last will: another one follows with less, at once, if there is less.
     pub(super) fn lessen_will(&mut self, lack: Lack) {
         if self.will.lessen(lack) {
-            tracing::debug!("the broker refuses the last will ({lack:?}); trying a lesser one");
+            tracing::debug!(target: "drivegate::north::mqtt", "the broker refuses the last will ({lack:?}); trying a lesser one");
             self.link = BrokerLink::Disconnected {
                 retry_at: Instant::now(),
             };
@@ -115,7 +115,7 @@ impl Client {
             0 => String::new(),
             omitted => format!(" ({omitted} more messages, on this or other topics, since the last such line)"),
         };
-        tracing::warn!("{what}: {why}{more}");
+        tracing::warn!(target: "drivegate::north::mqtt", "{what}: {why}{more}");
     }
 }
 

@@ -38,7 +38,7 @@ impl Client {
         self.missed += lost;
         self.stats.mqtt.lost(MqttLoss::Event, lost);
         tracing::error!(
-            "{lost} events arrived too fast and were not published, {} since the start; they are in the log",
+            target: "drivegate::north::mqtt", "{lost} events arrived too fast and were not published, {} since the start; they are in the log",
             self.missed
         );
     }
@@ -135,7 +135,7 @@ impl Client {
         self.stats.mqtt.lost(MqttLoss::History, history);
         if events + history > 0 {
             tracing::warn!(
-                "{} events or arrays of history that the broker did not take are lost with the end of the MQTT client; set \
+                target: "drivegate::north::mqtt", "{} events or arrays of history that the broker did not take are lost with the end of the MQTT client; set \
                  mqtt.buffer to keep them",
                 events + history
             );
@@ -157,7 +157,7 @@ impl Client {
         let (logged, at) = self.lost_logged;
         if total > logged && at.is_none_or(|at| now.saturating_duration_since(at) >= LOST_LOGGED) {
             tracing::warn!(
-                "{} events, results or arrays of history were lost since the last such line: the buffer is full or \
+                target: "drivegate::north::mqtt", "{} events, results or arrays of history were lost since the last such line: the buffer is full or \
                  damaged, or the broker refuses them",
                 total - logged
             );

@@ -70,19 +70,19 @@ pub(super) fn report_refused(subscriptions: &[Subscription], refused: &[Option<S
             all => format!(" and {} more", all - 2),
         };
         tracing::error!(
-            "the broker refuses set topics ({why}): no commands over MQTT there; allow the client to subscribe to {}{more}",
+            target: "drivegate::north::mqtt", "the broker refuses set topics ({why}): no commands over MQTT there; allow the client to subscribe to {}{more}",
             filters.get(..filters.len().min(2)).unwrap_or_default().join(" and ")
         );
     }
     if let Some((filter, why)) = of(Subscribed::Birth) {
         tracing::warn!(
-            "the broker refuses {filter} ({why}): the drives are not announced again when Home Assistant starts; allow \
+            target: "drivegate::north::mqtt", "the broker refuses {filter} ({why}): the drives are not announced again when Home Assistant starts; allow \
              the client to subscribe to it"
         );
     }
     if let Some((filter, why)) = of(Subscribed::Leftovers) {
         tracing::warn!(
-            "the broker refuses {filter} ({why}): drives removed before this start stay in Home Assistant; allow the \
+            target: "drivegate::north::mqtt", "the broker refuses {filter} ({why}): drives removed before this start stay in Home Assistant; allow the \
              client to subscribe to it, or set mqtt.buffer"
         );
     }

@@ -333,7 +333,7 @@ impl Client {
             Ok(()) => self.bd_seq_fails = false,
             Err(why) if !std::mem::replace(&mut self.bd_seq_fails, true) => {
                 tracing::warn!(
-                    "{}: {why}; the session number of Sparkplug (bdSeq) begins with 0 after a restart; make the \
+                    target: "drivegate::north::mqtt", "{}: {why}; the session number of Sparkplug (bdSeq) begins with 0 after a restart; make the \
                      directory writable, or set gateway.state_dir",
                     self.bd_seq.path().display()
                 );
@@ -365,10 +365,10 @@ impl Client {
 
     fn ready(&mut self, limits: BrokerLimits) {
         for lost in limits.losses() {
-            tracing::warn!("Sparkplug: the broker {lost}");
+            tracing::warn!(target: "drivegate::north::mqtt", "Sparkplug: the broker {lost}");
         }
         tracing::info!(
-            "Sparkplug: connected to the broker at {}:{} as {}",
+            target: "drivegate::north::mqtt", "Sparkplug: connected to the broker at {}:{} as {}",
             self.broker.host,
             self.broker.port,
             self.topics.node()
@@ -379,7 +379,7 @@ impl Client {
             let state = self.topics.state().unwrap_or_default();
             let old = self.topics.old_state().unwrap_or_default();
             tracing::info!(
-                "Sparkplug: waiting for the primary host to be online, on {state}, or {old} as in version 2.2"
+                target: "drivegate::north::mqtt", "Sparkplug: waiting for the primary host to be online, on {state}, or {old} as in version 2.2"
             );
         }
     }
@@ -389,7 +389,7 @@ impl Client {
             Some(Received::State(form)) => match self.session.host_state(form, &message.payload) {
                 Ok(false) => {}
                 Ok(true) => {
-                    tracing::info!("Sparkplug: the primary host is offline; values are kept until it is back");
+                    tracing::info!(target: "drivegate::north::mqtt", "Sparkplug: the primary host is offline; values are kept until it is back");
                     self.end_connection().await;
                 }
                 Err(why) => self.not_understood(&message.topic, &why),
@@ -444,7 +444,7 @@ impl Client {
     fn not_understood(&mut self, topic: &str, why: &str) {
         if let Some(omitted) = self.not_understood.permit(Instant::now()) {
             tracing::warn!(
-                "Sparkplug: a message on {topic} is ignored: {why} ({omitted} more since the last such line)"
+                target: "drivegate::north::mqtt", "Sparkplug: a message on {topic} is ignored: {why} ({omitted} more since the last such line)"
             );
         }
     }
@@ -542,13 +542,13 @@ impl Client {
                 true => "; another client has the same client id: give each gateway a name or a `client_id` of its own",
                 false => "",
             };
-            tracing::warn!("Sparkplug: no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
+            tracing::warn!(target: "drivegate::north::mqtt", "Sparkplug: no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
         } else {
-            tracing::debug!("Sparkplug: no connection to the broker: {why}");
+            tracing::debug!(target: "drivegate::north::mqtt", "Sparkplug: no connection to the broker: {why}");
         }
         if why == CLOSED && self.takeovers.closed(now) {
             let words = Takeovers::words(&self.client_id);
-            tracing::warn!("Sparkplug: {}:{}: {words}", self.broker.host, self.broker.port);
+            tracing::warn!(target: "drivegate::north::mqtt", "Sparkplug: {}:{}: {words}", self.broker.host, self.broker.port);
         }
         self.down(now)
     }
@@ -574,7 +574,7 @@ impl Client {
     /// Declares the node dead and disconnects, within half a second; after that time the broker publishes the last will.
     async fn end_connection(&mut self) {
         if tokio::time::timeout(END, self.disconnect()).await.is_err() {
-            tracing::warn!("Sparkplug: the orderly disconnect timed out; the broker publishes the last will");
+            tracing::warn!(target: "drivegate::north::mqtt", "Sparkplug: the orderly disconnect timed out; the broker publishes the last will");
         }
         drop(self.down(Instant::now()));
     }

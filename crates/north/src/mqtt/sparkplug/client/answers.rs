@@ -13,7 +13,7 @@ impl Client {
     /// The broker refused the connection because of the last will: another one follows with less, at once, if there is less.
     pub(super) fn lessen_will(&mut self, lack: Lack, now: Instant) {
         if self.will.lessen(lack) {
-            tracing::debug!("Sparkplug: the broker refuses the last will ({lack:?}); trying a lesser one");
+            tracing::debug!(target: "drivegate::north::mqtt", "Sparkplug: the broker refuses the last will ({lack:?}); trying a lesser one");
             self.link = Link::Down { retry_at: now };
         } else {
             drop(self.lost("the broker refuses the last will in every form"));
@@ -77,7 +77,7 @@ impl Client {
                 && !spare
             {
                 tracing::error!(
-                    "the broker refuses a Sparkplug subscription ({why}); allow client {} to subscribe to {}",
+                    target: "drivegate::north::mqtt", "the broker refuses a Sparkplug subscription ({why}); allow client {} to subscribe to {}",
                     self.client_id,
                     filter.path
                 );
@@ -110,7 +110,7 @@ impl Client {
                 .keep(packet.device.as_deref(), packet.payload.metrics.len() - fixed);
             omitted.reverse();
             tracing::warn!(
-                "Sparkplug: {topic} is too large for the broker, which accepts {most} bytes per packet: {} of {all} metrics \
+                target: "drivegate::north::mqtt", "Sparkplug: {topic} is too large for the broker, which accepts {most} bytes per packet: {} of {all} metrics \
                  are left out until the next connection ({}); raise the broker's limit",
                 omitted.len(),
                 omitted.join(", ")
