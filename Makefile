@@ -82,7 +82,7 @@ CHECKS ?=
 interop: ## Run the gateway with Home Assistant, pysparkplug and Node-RED; installs them, which takes minutes. CHECKS=name runs one
 	tests/interop/run.sh $(CHECKS)
 
-# What ships, in dist/; docs/releasing.md. ARCHITECTURES="amd64" for one of them.
+# What ships, in dist/; docs/development.md. ARCHITECTURES="amd64" for one of them.
 ARCHITECTURES ?= amd64 arm64 armhf
 package-tools: ## Install what the packages need (apt, PyPI, cargo, rustup); quick when nothing is missing
 	@deploy/package/tools.sh
