@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use drivegate::codec::{N2Options, Protocol, Table, n2};
 use drivegate::drive::profile::{Form, Profile, Profiles};
-use drivegate::drive::{Bound, Derived, ModelPoint, Point, Source};
+use drivegate::drive::{Bound, Derived, ModelPoint, Point, Source, Value};
 
 /// The families, Modbus first.
 const MODBUS: [&str; 5] = ["vacon-nx", "eaton-svx", "eaton-hvx", "vacon-cx", "teco-7300pa"];
@@ -174,7 +174,12 @@ fn family(profile: &Profile) -> String {
             .iter()
             .map(|(value, text)| format!("{value} {text}"))
             .collect();
-        let mut note = vec![texts.join(", "), point.note.clone()];
+        let blocks = point.blocks.as_ref().map_or_else(String::new, |blocks| {
+            let state = point.text_of(Value::Bool(blocks.when));
+            let state = state.unwrap_or(if blocks.when { "on" } else { "off" });
+            format!("*blocks* while {state}: `{}`", blocks.cause)
+        });
+        let mut note = vec![texts.join(", "), blocks, point.note.clone()];
         note.retain(|text| !text.is_empty());
         let _ = writeln!(
             text,
