@@ -199,12 +199,6 @@ fn the_page_of_drives_says_what_the_profiles_deliver() {
 }
 
 #[test]
-fn the_readme_quotes_the_shipped_configuration() {
-    let quoted = blocks(&read(&root().join("README.md")), "toml");
-    assert_eq!(quoted, [read(&root().join("deploy/drivegate.toml"))]);
-}
-
-#[test]
 fn the_two_commands_of_the_readme_exist() {
     let readme = read(&root().join("README.md"));
     assert!(readme.contains("\ncargo run --release -- demo "));

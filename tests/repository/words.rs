@@ -143,9 +143,5 @@ fn the_pages_are_spelled_right() {
         .current_dir(root())
         .output()
         .unwrap_or_else(|error| panic!("{}: {error}; run `make tools`", typos.display()));
-    assert!(
-        checked.status.success(),
-        "{}",
-        String::from_utf8_lossy(&checked.stdout)
-    );
+    assert!(checked.status.success(), "{}", String::from_utf8_lossy(&checked.stdout));
 }

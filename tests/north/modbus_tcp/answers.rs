@@ -742,8 +742,8 @@ async fn answers_byte_by_byte() {
 }
 
 fn hex(bytes: &[u8]) -> String {
-    let shown: Vec<String> = bytes.iter().take(16).map(|byte| format!("{byte:02X}")).collect();
-    let more = if bytes.len() > 16 { " …" } else { "" };
+    let shown: Vec<String> = bytes.iter().take(10).map(|byte| format!("{byte:02X}")).collect();
+    let more = if bytes.len() > 10 { " …" } else { "" };
     format!("`{}`{more}", shown.join(" "))
 }
 

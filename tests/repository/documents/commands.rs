@@ -14,6 +14,9 @@ pub(crate) fn table() -> String {
     text
 }
 
+/// What the text above the table explains for all commands.
+const SHARED: [&str; 6] = ["help", "version", "config", "url", "ca", "token-file"];
+
 /// A row for the command, or one for each command below it.
 fn rows(text: &mut String, path: &str, command: &Command) {
     let path = format!("{path} {}", command.get_name());
@@ -34,7 +37,10 @@ fn rows(text: &mut String, path: &str, command: &Command) {
 
 /// A position or an option, in brackets where it may be left out.
 fn argument(arg: &Arg) -> Option<String> {
-    if arg.is_hide_set() || ["help", "version"].contains(&arg.get_id().as_str()) {
+    let is_shared = arg
+        .get_long()
+        .is_some_and(|long| SHARED.contains(&long) && !arg.is_required_set());
+    if arg.is_hide_set() || is_shared {
         return None;
     }
     let names = arg.get_value_names().unwrap_or_default();
