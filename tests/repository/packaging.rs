@@ -376,7 +376,14 @@ fn the_image_is_small_and_not_root() {
     assert!(last.contains("CMD [\"run\", \"--config\", \"/etc/drivegate/drivegate.toml\"]"));
     // What the build needs is let in.
     let ignored = read(".dockerignore");
-    for needed in ["Cargo.toml", "Cargo.lock", "crates", "src", "profiles", "deploy/package"] {
+    for needed in [
+        "Cargo.toml",
+        "Cargo.lock",
+        "crates",
+        "src",
+        "profiles",
+        "deploy/package",
+    ] {
         assert!(ignored.lines().any(|line| line == format!("!{needed}")), "{needed}");
     }
 }
