@@ -121,8 +121,8 @@ fn read_options(
     port: Option<&str>,
 ) -> BusOptions {
     let options = BusOptions {
-        response_timeout: BUS.response_timeout.written(reader).unwrap_or(protocol.usual_timeout()),
-        retries: BUS.retries.written(reader).unwrap_or(default_retries(protocol)),
+        response_timeout: BUS.response_timeout.get_on(reader, protocol),
+        retries: BUS.retries.get_on(reader, protocol),
         silence: read_silence(reader, protocol, format),
         line: line::read(reader, port),
         mode: BUS.mode.get(reader),
@@ -225,10 +225,7 @@ fn is_windows_name(text: &str) -> bool {
 fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
     let key = BUS.format.name;
     let baud = BUS.baud.get(reader);
-    let text = match reader.has(key) {
-        true => BUS.format.read(reader)?,
-        false => default_format(protocol).to_string(),
-    };
+    let text = BUS.format.read_on(reader, protocol)?;
     let format = LineFormat::new(baud, &text).map_err(|_| {
         Finding::new(
             format!("`{text}` is not a character format"),
@@ -262,7 +259,7 @@ fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
 }
 
 /// N2 tries three times (n2.md 4).
-fn default_retries(protocol: Protocol) -> u32 {
+pub(super) fn default_retries(protocol: Protocol) -> u32 {
     match protocol {
         Protocol::ModbusRtu | Protocol::ModbusAscii => 1,
         Protocol::N2 => n2::RETRIES,

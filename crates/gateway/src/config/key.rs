@@ -7,6 +7,7 @@ use std::time::Duration;
 use serde_json::{Map, Value, json};
 
 use super::values::{self, NAME_LENGTH};
+use crate::codec::Protocol;
 use crate::document::{Document, Finding, FromNode, Place, Reader, ValueError, format_duration};
 
 /// A number and a unit, as [`crate::document::parse_duration`] reads it.
@@ -29,6 +30,8 @@ pub(super) enum Preset {
     Required,
     /// This value, in notation that is both TOML and JSON.
     Value(&'static str),
+    /// The value on a bus of this protocol, in notation that is both TOML and JSON.
+    ByProtocol(fn(Protocol) -> String),
     /// What the loader decides, in words.
     Words(&'static str),
 }
@@ -60,9 +63,35 @@ impl<T> Key<T> {
 
     /// The default, if there is one.
     pub(super) fn read_default(&self) -> Option<T> {
-        let Preset::Value(text) = self.default else { return None };
+        match self.default {
+            Preset::Value(text) => self.read_text(text),
+            _ => None,
+        }
+    }
+
+    fn read_text(&self, text: &str) -> Option<T> {
         let document = Document::parse("default", &format!("{} = {text}", self.name));
         self.form.read(&document.reader(), self.name)
+    }
+
+    /// The value of a key whose default depends on the protocol of the bus; `None` if the value is invalid, which is reported.
+    pub(super) fn read_on(&self, reader: &Reader<'_>, protocol: Protocol) -> Option<T> {
+        match self.default {
+            Preset::ByProtocol(default) if !reader.has(self.name) => self.read_text(&default(protocol)),
+            _ => self.read(reader),
+        }
+    }
+
+    /// The same, the default standing in for an invalid value.
+    pub(super) fn get_on(&self, reader: &Reader<'_>, protocol: Protocol) -> T
+    where
+        T: Default,
+    {
+        let default = || match self.default {
+            Preset::ByProtocol(default) => self.read_text(&default(protocol)),
+            _ => self.read_default(),
+        };
+        self.read_on(reader, protocol).or_else(default).unwrap_or_default()
     }
 
     /// The value of a key with a default, which also stands in for an invalid value.
@@ -97,6 +126,7 @@ impl<T> Key<T> {
                 Preset::Value(text) => {
                     schema.insert("default".into(), serde_json::from_str(text).unwrap_or_default());
                 }
+                Preset::ByProtocol(default) => description += &format!(" Default: {}.", by_protocol(default)),
                 Preset::Words(text) => description += &format!(" Default: {text}."),
             }
             schema.insert("description".into(), description.into());
@@ -110,6 +140,7 @@ impl<T> Key<T> {
         let default = match self.default {
             Preset::Required => "required".to_string(),
             Preset::Value(text) => format!("`{text}`"),
+            Preset::ByProtocol(default) => by_protocol(default),
             Preset::Words(text) => text.to_string(),
         };
         let range = match self.form.range() {
@@ -123,6 +154,19 @@ impl<T> Key<T> {
             self.meaning.trim().to_string(),
         ]
     }
+}
+
+/// A default that depends on the protocol, in words: that of Modbus RTU, then those that differ from it.
+fn by_protocol(default: fn(Protocol) -> String) -> String {
+    let usual = default(Protocol::ModbusRtu);
+    let mut text = format!("`{usual}`");
+    for (protocol, name) in [(Protocol::ModbusAscii, "Modbus ASCII"), (Protocol::N2, "N2")] {
+        let own = default(protocol);
+        if own != usual {
+            text += &format!("; {name}: `{own}`");
+        }
+    }
+    text
 }
 
 /// Markdown without the targets of links.

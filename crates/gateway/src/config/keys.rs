@@ -18,6 +18,7 @@ use super::{bus, modbus_tcp, mqtt, north, recordings, values};
 use crate::bus::Mode;
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
+use crate::document::format_duration;
 use crate::line::{Level, MOST_RTS_DELAY, Rs485, Spin};
 use crate::north::modbus_tcp::{Role, Uncached};
 use crate::north::mqtt::History;
@@ -60,6 +61,7 @@ macro_rules! keys {
         }
     };
     (@ required) => { Preset::Required };
+    (@ by_protocol $default:expr) => { Preset::ByProtocol($default) };
     (@ or $words:expr) => { Preset::Words($words) };
     (@ default $value:expr) => { Preset::Value(stringify!($value)) };
 }
@@ -220,7 +222,7 @@ keys! {
         /// Modbus ASCII usually has 7, so that a character has 10 bits: `"7N2"` (a TECO card with all switches off),
         /// `"7E1"`, `"7O1"`; devices with 8 exist. A format that the profile does not list causes a warning.
         format: String = Text("^[78][NEOneo][12]$", "a format such as \"8N1\""),
-            or "`\"8N1\"`; Modbus ASCII: `\"7N2\"`";
+            by_protocol |protocol| format!("\"{}\"", bus::default_format(protocol));
         /// What switches the direction of the line: `"off"`: the adapter itself, as nearly all do; `"kernel"`: the port
         /// driver, with RTS high while sending; `"kernel-inverted"`: the same with RTS low while sending.
         rs485: Rs485 = Words(&[
@@ -250,11 +252,12 @@ keys! {
         /// Target poll cycle of class slow: temperatures and other slowly changing values. A motor
         /// speed that is slow in its profile is read every `cycle` where the line has time for it (`fast_if_carried`).
         slow_cycle: Duration = TIMES, default "1s";
-        /// Time a drive may take to begin its reply; the time on the wire is added. N2: `"250ms"`. Above `"1s"` causes a
+        /// Time a drive may take to begin its reply; the time on the wire is added. Above `"1s"` causes a
         /// warning: each try to reach an absent drive takes the line for that time.
-        response_timeout: Duration = RESPONSE_TIMEOUT, default "100ms";
-        /// Retries after the first attempt before a drive counts as offline. N2: `2`.
-        retries: u32 = Number(0..=10, None), default 1;
+        response_timeout: Duration = RESPONSE_TIMEOUT,
+            by_protocol |protocol| format!("\"{}\"", format_duration(protocol.usual_timeout()));
+        /// Retries after the first attempt before a drive counts as offline.
+        retries: u32 = Number(0..=10, None), by_protocol |protocol| bus::default_retries(protocol).to_string();
         /// Silence before each request. `"spec"`: 3.5 characters, fixed at 1.75 ms above 19200 baud, as in the Modbus
         /// specification. `"chars"`: 3.5 characters at any baud rate, which is faster at 38400 and above and still more
         /// than most drives need. A duration: for drives that need more. Modbus ASCII frames need no silence between
