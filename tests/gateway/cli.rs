@@ -159,11 +159,17 @@ fn json(ran: &Ran) -> Value {
 fn the_report_of_a_sound_configuration() {
     let (_dir, path) = sound();
     let report = json(&run(&["check", "--json", "--config", &path]));
-    assert_eq!(keys(&report), ["buses", "errors", "ok", "warnings"]);
+    assert_eq!(keys(&report), ["buses", "errors", "memory_bytes", "ok", "warnings"]);
     assert_eq!(
         (&report["ok"], &report["errors"], &report["warnings"]),
         (&true.into(), &Value::Array(vec![]), &Value::Array(vec![]))
     );
+    let memory = report["memory_bytes"].as_u64().unwrap();
+    let past: u64 = ["recorder_bytes", "trend_bytes"]
+        .iter()
+        .map(|key| report["buses"][0][key].as_u64().unwrap())
+        .sum();
+    assert!((past..64 << 20).contains(&memory), "{memory}");
     let bus = &report["buses"][0];
     assert_eq!(
         keys(bus),

@@ -11,12 +11,11 @@ use serde::Serialize;
 
 use super::{EXIT_CONFIG, NamedConfig, report};
 use crate::bus::predict::{PredictedRequest, Prediction};
+use crate::config::memory::{BusMemory, Memory};
 use crate::config::{BusSettings, Loaded, Settings, environment};
 use crate::document::{Finding, Problem};
 use crate::drive::raw_writes;
-use crate::history::RecorderOptions;
-use crate::history::budget::Budget;
-use crate::history::{line, trend};
+use crate::history::trend::Reach;
 use crate::north::parameter_jobs::orphans;
 use crate::north::slot::Slot;
 use crate::process_image::{Access, DriveSpec};
@@ -47,6 +46,8 @@ struct Report<'a> {
     ok: bool,
     errors: &'a [Problem],
     warnings: &'a [Problem],
+    /// Memory that the gateway takes at most, with every ring full.
+    memory_bytes: Option<usize>,
     buses: Vec<Bus<'a>>,
 }
 
@@ -126,19 +127,26 @@ fn orphaned_journals(settings: &Settings) -> Vec<Problem> {
 }
 
 fn json(loaded: &Loaded) -> String {
-    let settings = loaded.settings.iter();
-    let buses = settings.flat_map(|settings| settings.buses.iter().map(|bus| bus_report(bus, &settings.recordings)));
+    let memory = loaded
+        .settings
+        .as_ref()
+        .map(|settings| (settings, Memory::of(settings)));
+    let buses = memory.iter().flat_map(|(settings, memory)| {
+        let buses = settings.buses.iter().zip(&memory.buses);
+        buses.map(|(bus, memory)| bus_report(bus, memory))
+    });
     let report = Report {
         ok: loaded.settings.is_some(),
         errors: &loaded.errors,
         warnings: &loaded.warnings,
+        memory_bytes: memory.as_ref().map(|(settings, memory)| memory.total(settings)),
         buses: buses.collect(),
     };
     // Only maps with keys that are not strings fail, and there are none.
     serde_json::to_string_pretty(&report).unwrap_or_default() + "\n"
 }
 
-fn bus_report<'a>(bus: &'a BusSettings, recorder: &RecorderOptions) -> Bus<'a> {
+fn bus_report<'a>(bus: &'a BusSettings, memory: &BusMemory) -> Bus<'a> {
     let (prediction, shutdown) = (bus.predict(), bus.shutdown_time());
     let request = |request: &PredictedRequest| Request {
         drive: drive_name(bus, request),
@@ -155,8 +163,8 @@ fn bus_report<'a>(bus: &'a BusSettings, recorder: &RecorderOptions) -> Bus<'a> {
         slow_cycle_ms: prediction.slow_cycle.map(milliseconds),
         shutdown_ms: milliseconds(shutdown.answered),
         shutdown_worst_ms: milliseconds(shutdown.unanswered),
-        recorder_bytes: Budget::of(&bus.spec, &bus.drives, recorder).total(),
-        trend_bytes: trend_bytes(bus).0,
+        recorder_bytes: memory.recorder.total(),
+        trend_bytes: memory.trends,
         raw_writes_refused: commanded(bus).flat_map(refused).collect(),
         requests: prediction.requests.iter().map(request).collect(),
     }
@@ -223,10 +231,13 @@ fn milliseconds(time: Duration) -> f64 {
 fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
     // Writing to a String cannot fail.
     let mut text = String::new();
-    for bus in &settings.buses {
-        text += &bus_text(bus, settings);
+    let taken = Memory::of(settings);
+    for (bus, past) in settings.buses.iter().zip(&taken.buses) {
+        text += &bus_text(bus, settings, &memory(past, taken.reach));
         text.push('\n');
     }
+    let total = taken.total(settings).div_ceil(1 << 20);
+    let _ = writeln!(text, "memory at most {total} MiB for the gateway\n");
     let drives: usize = settings.buses.iter().map(|bus| bus.drives.len()).sum();
     if let Some(prefix) = settings.mqtt.as_ref().and_then(|mqtt| mqtt.home_assistant.as_ref()) {
         let drives = counted(drives, "drive", "drives");
@@ -251,7 +262,7 @@ fn counted(count: usize, one: &str, many: &str) -> String {
     format!("{count} {}", if count == 1 { one } else { many })
 }
 
-fn bus_text(bus: &BusSettings, settings: &Settings) -> String {
+fn bus_text(bus: &BusSettings, settings: &Settings, memory: &str) -> String {
     let spec = &bus.spec;
     let there = spec.port.contains("://") || Path::new(&spec.port).exists();
     let mut text = format!(
@@ -264,9 +275,7 @@ fn bus_text(bus: &BusSettings, settings: &Settings) -> String {
         milliseconds(spec.protocol.silence(bus.options.silence, &spec.format)),
     );
     if bus.listens() {
-        return text
-            + "  listens only: another master asks these drives, and the gateway sends nothing\n"
-            + &memory(bus, &settings.recordings);
+        return text + "  listens only: another master asks these drives, and the gateway sends nothing\n" + memory;
     }
     let prediction = bus.predict();
     let mut table = report::table(["drive", "class", "function", "address", "count", "wire ms"]);
@@ -284,11 +293,7 @@ fn bus_text(bus: &BusSettings, settings: &Settings) -> String {
     (3..6).for_each(|column| table.align_right(column));
     text += &report::lines(&table);
     text.push('\n');
-    text + &summary(bus, &prediction)
-        + &memory(bus, &settings.recordings)
-        + &slots(bus, settings)
-        + &raw_writes(bus, settings)
-        + &functions(bus)
+    text + &summary(bus, &prediction) + memory + &slots(bus, settings) + &raw_writes(bus, settings) + &functions(bus)
 }
 
 /// The functions by which drives that may be commanded are written where they are not the usual ones.
@@ -344,26 +349,16 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
         + behind
 }
 
-/// Memory of trends and the last hour of a line, bytes: all of it, and of the drive with most points.
-fn trend_bytes(bus: &BusSettings) -> (usize, usize) {
-    let drives = bus
-        .drives
-        .iter()
-        .map(|drive| trend::bytes_of(&drive.profile) + line::BYTES.1);
-    let most = drives.clone().max().unwrap_or(0);
-    (drives.sum::<usize>() + line::BYTES.0, most)
-}
-
 /// Memory of trends and of the recorder, which may be off.
-fn memory(bus: &BusSettings, recorder: &RecorderOptions) -> String {
+fn memory(memory: &BusMemory, reach: Reach) -> String {
     let kilobytes = |bytes: usize| bytes.div_ceil(1000);
-    let (all, drive) = trend_bytes(bus);
     let trends = format!(
-        "  trends      {} kB of memory at most: {} kB a drive\n",
-        kilobytes(all),
-        kilobytes(drive)
+        "  trends      {} kB of memory at most: {} kB a drive{}\n",
+        kilobytes(memory.trends),
+        kilobytes(memory.drive_trends),
+        reaches(reach)
     );
-    let budget = Budget::of(&bus.spec, &bus.drives, recorder);
+    let budget = &memory.recorder;
     if budget.total() == 0 {
         return trends;
     }
@@ -375,6 +370,15 @@ fn memory(bus: &BusSettings, recorder: &RecorderOptions) -> String {
             kilobytes(drive),
             kilobytes(budget.frames)
         )
+}
+
+/// How far back trends reach where that is less than usual.
+fn reaches(reach: Reach) -> String {
+    if reach == Reach::FULL {
+        return String::new();
+    }
+    let spans = reach.ranges().map(|range| format!("{} min", range.span.as_secs() / 60));
+    format!("; they reach back {} (many drives share the memory)", spans.join(", "))
 }
 
 /// Duration of the stops at shutdown; empty where there are none.

@@ -19,6 +19,23 @@ impl<T: Copy + Default> Buckets<T> {
         }
     }
 
+    /// Keeps so many steps from now on; the newest stay.
+    pub(super) fn resize(&mut self, steps: usize) {
+        let mut new = Buckets::new(steps);
+        let oldest = (self.newest + 1).saturating_sub(self.len());
+        for number in oldest..=self.newest {
+            if let (Some(kept), Some(slot)) = (self.get(number), new.at(number)) {
+                *slot = kept;
+            }
+        }
+        *self = new;
+    }
+
+    /// Steps that are kept.
+    pub(super) fn steps(&self) -> usize {
+        self.slots.len()
+    }
+
     fn len(&self) -> u64 {
         self.slots.len() as u64
     }
@@ -57,5 +74,30 @@ impl<T: Copy + Default> Buckets<T> {
     pub(super) fn get(&self, number: u64) -> Option<T> {
         let slot = self.slots.get(self.place(number)).copied();
         slot.filter(|_| self.holds(number))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_newest_steps_stay_when_there_is_room_for_fewer_or_more() {
+        let mut buckets = Buckets::new(10);
+        for number in 0..25_u64 {
+            *buckets.at(number).unwrap() = number;
+        }
+        buckets.resize(4);
+        assert_eq!(
+            (19..26).map(|n| buckets.get(n)).collect::<Vec<_>>(),
+            [None, None, Some(21), Some(22), Some(23), Some(24), None]
+        );
+        buckets.resize(8);
+        assert_eq!(
+            (buckets.get(17), buckets.get(21), buckets.steps()),
+            (Some(0), Some(21), 8)
+        );
+        *buckets.at(25).unwrap() = 25;
+        assert_eq!((buckets.get(24), buckets.get(25)), (Some(24), Some(25)));
     }
 }

@@ -3,17 +3,22 @@
 use std::time::Duration;
 
 use super::RecorderOptions;
-use super::packed_ring::{packed_frame, packed_read};
+use super::packed_ring::{self, packed_frame, packed_read};
 use crate::drive::plan::WireTime;
 use crate::drive::{Plan, PlannedRead, PollClass};
 use crate::process_image::{BusSpec, DriveSpec};
 
-/// Bytes of events and commands of a drive.
+/// Memory that the recorder takes for all buses together at most, bytes.
+pub const MOST_BYTES: usize = 24 << 20;
+/// Bytes of events and commands of a drive, where there is room for it.
 pub const NOTES: usize = 64 << 10;
 /// Room beside the planned reads: retries, reads that commands ask for, reads after a fault.
 const RESERVE: f64 = 1.25;
 /// Rings below that size are not worth while.
 const LEAST: usize = 16 << 10;
+
+/// Part of [`MOST_BYTES`] that samples and frames may take before notes become fewer.
+const RINGS: usize = MOST_BYTES / 4 * 3;
 
 /// Memory that the recorder takes for a bus at most.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -27,6 +32,27 @@ pub struct Budget {
 }
 
 impl Budget {
+    /// What each of these buses gets: all that it needs, or less where that is more than [`MOST_BYTES`] together. Notes become fewer
+    /// first, then all rings shorter by the same part.
+    pub fn shared(mut needs: Vec<Budget>) -> Vec<Budget> {
+        let total: usize = needs.iter().map(Budget::total).sum();
+        if total <= MOST_BYTES {
+            return needs;
+        }
+        let notes: usize = needs.iter().map(|need| need.notes * need.samples.len()).sum();
+        let rings = total - notes;
+        let left = MOST_BYTES - rings.min(RINGS);
+        let (notes_part, rings_part) = (part(left, notes), part(MOST_BYTES - left.min(notes), rings));
+        for need in &mut needs {
+            need.notes = scaled(need.notes, notes_part);
+            need.frames = scaled(need.frames, rings_part);
+            for samples in &mut need.samples {
+                *samples = scaled(*samples, rings_part);
+            }
+        }
+        needs
+    }
+
     /// What the drives of a bus need so that nothing is left out of a recording: as often as they are to be read or, where the
     /// line cannot carry that, as often as it can at best. A bus whose recorder is off needs nothing.
     pub fn of(bus: &BusSpec, drives: &[DriveSpec], options: &RecorderOptions) -> Budget {
@@ -76,9 +102,59 @@ impl Budget {
         let drives: usize = self.samples.iter().map(|samples| samples + self.notes).sum();
         drives + self.frames
     }
+
+    /// All of it with the room by which rings grow, bytes.
+    pub fn with_growth(&self) -> usize {
+        self.total() / packed_ring::STEPS * (packed_ring::STEPS + 1)
+    }
+}
+
+/// The part of `wanted` that fits, in millionths.
+fn part(room: usize, wanted: usize) -> usize {
+    (room.saturating_mul(1_000_000) / wanted.max(1)).min(1_000_000)
+}
+
+fn scaled(bytes: usize, part: usize) -> usize {
+    bytes.saturating_mul(part) / 1_000_000
 }
 
 /// Time of an exchange with a drive that answers at once, on a line without silence: no line is faster.
 fn least_wire(bus: &BusSpec, read: &PlannedRead) -> Duration {
     WireTime::of(bus.protocol, &bus.format, &read.pdu()).total(Duration::ZERO, Duration::ZERO)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn budget(drives: usize, samples: usize, frames: usize) -> Budget {
+        Budget {
+            samples: vec![samples; drives],
+            notes: NOTES,
+            frames,
+        }
+    }
+
+    #[test]
+    fn what_fits_is_left_as_it_is_and_the_rest_is_shared() {
+        let few = vec![budget(31, 40 << 10, 300 << 10); 4];
+        assert_eq!(Budget::shared(few.clone()), few);
+        for (buses, samples, frames) in [
+            (32, 16 << 10, 300 << 10),
+            (32, 200 << 10, 1 << 20),
+            (200, 16 << 10, 16 << 10),
+        ] {
+            let shared = Budget::shared(vec![budget(31, samples, frames); buses]);
+            let total: usize = shared.iter().map(Budget::total).sum();
+            assert!(
+                (MOST_BYTES / 10 * 9..=MOST_BYTES).contains(&total),
+                "{buses} buses take {total}"
+            );
+            let least = shared.iter().map(|bus| bus.notes.min(bus.samples[0])).min();
+            assert!(
+                least.is_some_and(|bytes| bytes >= 1000),
+                "{buses} buses: {least:?} bytes"
+            );
+        }
+    }
 }

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use super::Clock;
 use super::counters::{Counters, Totals};
 use super::line::LineHistory;
-use super::trend::DriveTrend;
+use super::trend::{DriveTrend, Reach};
 use crate::drive::Profile;
 use crate::process_image::{BusImage, DriveSpec, Reading, TapedRead};
 
@@ -85,7 +85,7 @@ impl History {
 
     /// The past of a drive, which it keeps over a reload: its counters for ever, its trends as long as bus, address and
     /// profile are the same.
-    pub(super) fn of(&self, spec: &DriveSpec, clock: Clock) -> Arc<DriveHistory> {
+    pub(super) fn of(&self, spec: &DriveSpec, reach: Reach, clock: Clock) -> Arc<DriveHistory> {
         let mut known = lock(&self.known);
         let before = known.drives.get(&spec.name).cloned();
         if let Some(same) = before.as_ref().filter(|before| before.is_of(spec)) {
@@ -97,7 +97,7 @@ impl History {
             bus: spec.bus.clone(),
             address: spec.address,
             profile: spec.profile.clone(),
-            trend: Mutex::new(DriveTrend::new(&spec.profile, clock)),
+            trend: Mutex::new(DriveTrend::new(&spec.profile, reach, clock)),
             counters: Mutex::new(Counters::from(counted.unwrap_or_default())),
         });
         known.drives.insert(spec.name.clone(), new.clone());

@@ -12,7 +12,7 @@ use crate::process_image::{TapedFrame, TapedRead, Verdict};
 /// Bytes in front of each entry: its length, and its time.
 const HEAD: usize = 4 + 8;
 /// The memory grows by this part of what it may be.
-const STEPS: usize = 16;
+pub(super) const STEPS: usize = 16;
 /// The place of no drive.
 const NO_DRIVE: u32 = u32::MAX;
 
@@ -126,6 +126,27 @@ impl<T: Packed> PackedRing<T> {
             return;
         };
         let size = HEAD + self.entry.len();
+        self.make_room(size, now, &mut gone);
+        if self.bytes.capacity() - self.bytes.len() < size {
+            self.bytes.reserve_exact(size.max(self.most_bytes / STEPS));
+        }
+        self.bytes.extend(length.to_le_bytes());
+        self.bytes.extend(nanoseconds(start, now).to_le_bytes());
+        self.bytes.extend(&self.entry);
+    }
+
+    /// Keeps at most so many bytes from now on; `gone` gets the entries that have to go for it, packed.
+    pub(super) fn limit(&mut self, most_bytes: usize, mut gone: impl FnMut(Instant, &[u8])) {
+        self.most_bytes = most_bytes;
+        if let Some(start) = self.start {
+            self.make_room(0, start, &mut gone);
+        }
+        self.bytes.shrink_to(most_bytes);
+    }
+
+    /// Removes the oldest entries until none is older at `now` than the window and `size` more bytes fit.
+    fn make_room(&mut self, size: usize, now: Instant, gone: &mut impl FnMut(Instant, &[u8])) {
+        let Some(start) = self.start else { return };
         while let Some((oldest, at)) = self.head(0, start) {
             let is_old = now.saturating_duration_since(at) > self.window;
             if !is_old && self.bytes.len() + size <= self.most_bytes {
@@ -134,12 +155,6 @@ impl<T: Packed> PackedRing<T> {
             gone(at, &self.slice(HEAD, oldest));
             self.bytes.drain(..(HEAD + oldest).min(self.bytes.len()));
         }
-        if self.bytes.capacity() - self.bytes.len() < size {
-            self.bytes.reserve_exact(size.max(self.most_bytes / STEPS));
-        }
-        self.bytes.extend(length.to_le_bytes());
-        self.bytes.extend(nanoseconds(start, now).to_le_bytes());
-        self.bytes.extend(&self.entry);
     }
 
     /// Oldest first.
@@ -259,6 +274,24 @@ mod tests {
         let newest = (100_000 - kept as u64..100_000)
             .map(|count| read(start + Duration::from_millis(count), &[count as u16; 11]));
         assert!(ring.iter().eq(newest), "entries that wrap around, too");
+    }
+
+    #[test]
+    fn a_smaller_limit_gives_memory_back_and_keeps_the_newest() {
+        let start = Instant::now();
+        let mut ring = PackedRing::new(1 << 20, Duration::from_secs(3600));
+        for count in 0..10_000 {
+            ring.push(&read(start + Duration::from_millis(count), &[count as u16]), |_, _| ());
+        }
+        let mut gone = 0;
+        ring.limit(100 * packed_read(1), |_, _| gone += 1);
+        assert_eq!((ring.iter().count(), gone), (100, 9900));
+        assert_eq!(ring.iter().next().map(|entry| entry.words[0]), Some(9900));
+        assert!(
+            ring.bytes.capacity() <= 200 * packed_read(1),
+            "{}",
+            ring.bytes.capacity()
+        );
     }
 
     proptest! {

@@ -10,6 +10,7 @@ use super::drives::{DriveHistory, History};
 use super::line::LineHistory;
 use super::packed_ring::{Packed, PackedRing};
 use super::ring::{Ring, Timed};
+use super::trend::Reach;
 use super::trigger::{LineErrors, Trigger, TriggerKind, Watch};
 use super::{Clock, RecorderOptions};
 use crate::drive::Plan;
@@ -78,6 +79,13 @@ pub(super) fn empty_snapshot(spec: &DriveSpec) -> Snapshot {
     // What is not answered is not in the samples, so whatever is there was said.
     snapshot.link = Link::Online(std::time::SystemTime::UNIX_EPOCH);
     snapshot
+}
+
+/// A sample leaves its ring: what it said is known from before the oldest one.
+fn leave(base: &mut Arc<Snapshot>, at: Instant, packed: &[u8]) {
+    if let Some(gone) = TapedRead::unpack(at, packed) {
+        Arc::make_mut(base).store(gone.table, gone.start, &gone.words, at);
+    }
 }
 
 /// How a drive reads at that time, by its samples.
@@ -152,6 +160,8 @@ struct LineRing {
     last_hour: Arc<Mutex<LineHistory>>,
     drives: Vec<DriveRing>,
     frames: PackedRing<TapedFrame>,
+    /// Memory that the rings need so that nothing is left out.
+    need: Budget,
     errors: LineErrors,
     lost: u64,
 }
@@ -183,16 +193,28 @@ impl Recorder {
         self.stale_after = stale_after;
         let captures = self.leave_all_but(buses, clock);
         self.history.keep_only(buses);
+        let profiles = buses.iter().flat_map(|bus| &bus.drives);
+        let reach = Reach::of(profiles.map(|drive| &*drive.spec.profile));
         for bus in buses {
             if !self.lines.iter().any(|line| Arc::ptr_eq(bus, &line.bus)) {
-                self.lines.push(LineRing::new(bus, &self.options, &self.history, clock));
+                self.lines
+                    .push(LineRing::new(bus, &self.options, (&self.history, reach), clock));
                 bus.tape.switch(match self.options.is_on() {
                     true => Taping::Everything,
                     false => Taping::Reads,
                 });
             }
         }
+        self.share_memory(reach);
         captures
+    }
+
+    /// What all buses together may take is shared by them anew: there may be more of them, or fewer.
+    fn share_memory(&mut self, reach: Reach) {
+        let shares = Budget::shared(self.lines.iter().map(|line| line.need.clone()).collect());
+        for (line, share) in self.lines.iter_mut().zip(shares) {
+            line.limit(&share, reach);
+        }
     }
 
     fn leave_all_but(&mut self, buses: &[Arc<BusImage>], clock: Clock) -> Vec<Capture> {
@@ -253,18 +275,23 @@ impl Recorder {
 }
 
 impl LineRing {
-    fn new(bus: &Arc<BusImage>, options: &RecorderOptions, history: &History, clock: Clock) -> LineRing {
+    /// Rings without room, to be given their share by [`LineRing::limit`].
+    fn new(
+        bus: &Arc<BusImage>,
+        options: &RecorderOptions,
+        (history, reach): (&History, Reach),
+        clock: Clock,
+    ) -> LineRing {
         let specs: Vec<DriveSpec> = bus.drives.iter().map(|drive| drive.spec.clone()).collect();
-        let budget = Budget::of(&bus.spec, &specs, options);
         let window = options.window();
-        let ring = |(image, samples): (&Arc<DriveImage>, &usize)| {
+        let ring = |image: &Arc<DriveImage>| {
             let base = Arc::new(empty_snapshot(&image.spec));
             DriveRing {
                 image: image.clone(),
-                history: history.of(&image.spec, clock),
+                history: history.of(&image.spec, reach, clock),
                 link: image.snapshot().link,
-                samples: PackedRing::new(*samples, window),
-                notes: Ring::new(budget.notes, window),
+                samples: PackedRing::new(0, window),
+                notes: Ring::new(0, window),
                 now: base.clone(),
                 base,
                 watch: Watch::default(),
@@ -273,12 +300,24 @@ impl LineRing {
             }
         };
         LineRing {
-            drives: bus.drives.iter().zip(&budget.samples).map(ring).collect(),
-            frames: PackedRing::new(budget.frames, window),
+            drives: bus.drives.iter().map(ring).collect(),
+            frames: PackedRing::new(0, window),
+            need: Budget::of(&bus.spec, &specs, options),
             errors: LineErrors::default(),
             lost: 0,
             last_hour: history.of_line(bus, clock),
             bus: bus.clone(),
+        }
+    }
+
+    /// Takes at most `share` of memory from now on, and trends reach back as far as `reach`.
+    fn limit(&mut self, share: &Budget, reach: Reach) {
+        self.frames.limit(share.frames, |_, _| ());
+        for (drive, samples) in self.drives.iter_mut().zip(&share.samples) {
+            drive.notes.limit(share.notes);
+            let base = &mut drive.base;
+            drive.samples.limit(*samples, |at, packed| leave(base, at, packed));
+            drive.history.trend().set_reach(reach);
         }
     }
 
@@ -374,11 +413,7 @@ impl DriveRing {
             return None;
         }
         let base = &mut self.base;
-        self.samples.push(&read, |at, packed| {
-            if let Some(gone) = TapedRead::unpack(at, packed) {
-                Arc::make_mut(base).store(gone.table, gone.start, &gone.words, at);
-            }
-        });
+        self.samples.push(&read, |at, packed| leave(base, at, packed));
         self.watch.look(&reading, at, options.warnings)
     }
 

@@ -47,6 +47,11 @@ impl<T: Timed> Ring<T> {
         }
     }
 
+    /// Keeps at most so many bytes from the next entry on.
+    pub(super) fn limit(&mut self, most_bytes: usize) {
+        self.most_bytes = most_bytes;
+    }
+
     pub(super) fn iter(&self) -> impl Iterator<Item = &T> {
         self.entries.iter()
     }

@@ -50,15 +50,58 @@ pub const POINTS: [ModelPoint; 9] = [
     ModelPoint::HeatsinkTemperature,
 ];
 
-/// Memory of the trend of a point, from its first value on, bytes.
+/// Memory of the trend of a point that reaches back as far as [`RANGES`], from its first value on, bytes.
 pub const POINT_BYTES: usize = {
     let [fine, middle, coarse] = RANGES;
     (fine.buckets() + middle.buckets() + coarse.buckets()) * size_of::<Bucket>()
 };
 
-/// Memory of the trends of a drive at most, bytes.
+/// Memory of all trends of the gateway at most, bytes: about 300 drives of nine points with all of [`RANGES`].
+pub const MOST_BYTES: usize = 64 << 20;
+
+/// Memory of the trends of a drive that reach back as far as [`RANGES`], bytes.
 pub fn bytes_of(profile: &Profile) -> usize {
     points_of(profile).count() * POINT_BYTES
+}
+
+/// How far back trends reach, in thousandths of [`RANGES`]: less where there are so many drives that all of it would take more
+/// than [`MOST_BYTES`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Reach(u16);
+
+impl Reach {
+    /// As far as [`RANGES`].
+    pub const FULL: Reach = Reach(1000);
+    const LEAST: u16 = 10;
+
+    /// What all drives of these profiles can have.
+    pub fn of<'p>(profiles: impl IntoIterator<Item = &'p Profile>) -> Reach {
+        let wanted: usize = profiles.into_iter().map(bytes_of).sum();
+        let share = MOST_BYTES.saturating_mul(1000) / wanted.max(1);
+        Reach(share.try_into().unwrap_or(u16::MAX).clamp(Reach::LEAST, Reach::FULL.0))
+    }
+
+    /// The ranges that are kept, in the order of [`RANGES`].
+    pub fn ranges(self) -> [Range; RANGES.len()] {
+        RANGES.map(|range| {
+            let steps = range.buckets() * usize::from(self.0) / usize::from(Reach::FULL.0);
+            Range {
+                span: range.step * u32::try_from(steps.max(1)).unwrap_or(u32::MAX),
+                step: range.step,
+            }
+        })
+    }
+
+    /// Memory of the trend of a point, from its first value on, bytes.
+    pub fn point_bytes(self) -> usize {
+        let buckets: usize = self.ranges().into_iter().map(Range::buckets).sum();
+        buckets * size_of::<Bucket>()
+    }
+
+    /// Memory of the trends of a drive at most, bytes.
+    pub fn bytes_of(self, profile: &Profile) -> usize {
+        points_of(profile).count() * self.point_bytes()
+    }
 }
 
 fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, usize)> {
@@ -153,12 +196,13 @@ struct Kept {
 pub struct DriveTrend {
     /// Time that the numbers of the buckets are counted from.
     epoch: Instant,
+    reach: Reach,
     points: Vec<PointTrend>,
 }
 
 impl DriveTrend {
     /// The trends of a drive of that profile, empty.
-    pub fn new(profile: &Profile, clock: Clock) -> DriveTrend {
+    pub fn new(profile: &Profile, reach: Reach, clock: Clock) -> DriveTrend {
         let trend = |(point, index): (ModelPoint, usize)| PointTrend {
             point,
             index,
@@ -168,8 +212,26 @@ impl DriveTrend {
         };
         DriveTrend {
             epoch: epoch(clock),
+            reach,
             points: points_of(profile).map(trend).collect(),
         }
+    }
+
+    /// Reaches back so far from now on; the newest steps stay.
+    pub fn set_reach(&mut self, reach: Reach) {
+        if std::mem::replace(&mut self.reach, reach) == reach {
+            return;
+        }
+        for kept in self.points.iter_mut().filter_map(|point| point.kept.as_mut()) {
+            for (buckets, range) in kept.ranges.iter_mut().zip(reach.ranges()) {
+                buckets.resize(range.buckets());
+            }
+        }
+    }
+
+    /// The ranges that are kept, finest first.
+    pub fn ranges(&self) -> [Range; RANGES.len()] {
+        self.reach.ranges()
     }
 
     /// Takes in the values that `read` shows, of a drive that reads as `reading` right after it. `known` is the drive as its
@@ -190,7 +252,7 @@ impl DriveTrend {
                 continue;
             }
             let since = read.at.saturating_duration_since(self.epoch);
-            let kept = point.kept.get_or_insert_with(Kept::new);
+            let kept = point.kept.get_or_insert_with(|| Kept::new(self.reach));
             kept.add(since, value.as_f64() as f32, || known.good_for(point.index));
         }
     }
@@ -204,7 +266,7 @@ impl DriveTrend {
 
     /// The points, and the memory of each in bytes.
     pub fn points(&self) -> impl Iterator<Item = (ModelPoint, usize)> {
-        let bytes = |point: &PointTrend| point.kept.as_ref().map_or(0, |_| POINT_BYTES);
+        let bytes = |point: &PointTrend| point.kept.as_ref().map_or(0, |_| self.reach.point_bytes());
         self.points.iter().map(move |point| (point.point, bytes(point)))
     }
 
@@ -213,9 +275,10 @@ impl DriveTrend {
     pub fn part(&self, point: ModelPoint, from: Instant, to: Instant, clock: Clock) -> Option<Part> {
         let trend = self.points.iter().find(|trend| trend.point == point)?;
         let age = clock.now.saturating_duration_since(from);
-        let last = RANGES.len() - 1;
-        let chosen = RANGES.iter().position(|range| age <= range.span).unwrap_or(last);
-        let range = RANGES.get(chosen)?;
+        let ranges = self.ranges();
+        let last = ranges.len() - 1;
+        let chosen = ranges.iter().position(|range| age <= range.span).unwrap_or(last);
+        let range = ranges.get(chosen)?;
         let number = |at: Instant| number(at.saturating_duration_since(self.epoch), range.step);
         let now = number(clock.now);
         let oldest = (now + 1).saturating_sub(range.buckets() as u64);
@@ -245,9 +308,9 @@ impl DriveTrend {
 }
 
 impl Kept {
-    fn new() -> Kept {
+    fn new(reach: Reach) -> Kept {
         Kept {
-            ranges: RANGES.map(|range| Buckets::new(range.buckets())),
+            ranges: reach.ranges().map(|range| Buckets::new(range.buckets())),
             last: None,
         }
     }
@@ -263,7 +326,7 @@ impl Kept {
             let number = number(since, range.step);
             let between = before.map(|(at, before)| (self::number(at, range.step), before));
             if let Some((at, before)) = between.filter(|(at, _)| at + 1 < number) {
-                let first = at.max(number.saturating_sub(range.buckets() as u64)) + 1;
+                let first = at.max(number.saturating_sub(buckets.steps() as u64)) + 1;
                 for between in first..number {
                     if let Some(bucket) = buckets.at(between) {
                         bucket.add(before);

@@ -11,6 +11,7 @@ mod key;
 mod keys;
 mod line;
 mod log;
+pub mod memory;
 mod modbus_tcp;
 mod mqtt;
 pub mod named_files;

@@ -13,7 +13,7 @@ use serde::{Serialize, Serializer};
 use super::query::{self, QueryError};
 use super::routes::{AppState, no_drive, not_found};
 use crate::drive::ModelPoint;
-use crate::history::trend::{DriveTrend, POINTS, Part, RANGES, Range, Step};
+use crate::history::trend::{DriveTrend, POINTS, Part, RANGES, Range, Reach, Step};
 use crate::history::{Clock, DriveHistory};
 
 /// Shown without `from`.
@@ -110,7 +110,7 @@ pub(super) async fn trend(
         }
         // Its bus is being started.
         None => {
-            let nothing = DriveTrend::new(profile, clock);
+            let nothing = DriveTrend::new(profile, Reach::FULL, clock);
             points.iter().filter_map(|point| part(&nothing, point)).collect()
         }
     };
@@ -153,6 +153,7 @@ struct KeptPoint {
 impl<'d> Kept<'d> {
     fn new(drive: &'d str, history: Option<&DriveHistory>, known: &[ModelPoint]) -> Kept<'d> {
         let bytes: Vec<_> = history.map_or_else(Vec::new, |history| history.trend().points().collect());
+        let ranges = history.map_or(RANGES, |history| history.trend().ranges());
         let of = |point: ModelPoint| bytes.iter().find(|(known, _)| *known == point).map_or(0, |(_, b)| *b);
         let range = |range: Range| KeptRange {
             span_s: range.span.as_secs(),
@@ -165,7 +166,7 @@ impl<'d> Kept<'d> {
         };
         Kept {
             drive,
-            ranges: RANGES.into_iter().map(range).collect(),
+            ranges: ranges.into_iter().map(range).collect(),
             points: known.iter().map(point).collect(),
         }
     }

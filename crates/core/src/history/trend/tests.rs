@@ -27,7 +27,7 @@ impl Rig {
         let clock = clock();
         let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
         Rig {
-            trend: DriveTrend::new(&nx, clock),
+            trend: DriveTrend::new(&nx, Reach::FULL, clock),
             clock,
             fed: Vec::new(),
         }
@@ -40,9 +40,13 @@ impl Rig {
 
     fn feed(&mut self, value: f32, good_for: Duration) {
         let since = self.clock.now.saturating_duration_since(self.trend.epoch);
+        let reach = self.trend.reach;
         let of = |trend: &&mut PointTrend| trend.point == ModelPoint::MotorCurrent;
         let trend = self.trend.points.iter_mut().find(of).unwrap();
-        trend.kept.get_or_insert_with(Kept::new).add(since, value, || good_for);
+        trend
+            .kept
+            .get_or_insert_with(|| Kept::new(reach))
+            .add(since, value, || good_for);
         self.fed.push((self.clock.now, value, good_for));
     }
 
@@ -78,7 +82,7 @@ impl Rig {
     }
 
     fn check(&self) {
-        for range in RANGES {
+        for range in self.trend.ranges() {
             let part = self.part(range, self.clock);
             assert_eq!(part.step, range.step);
             assert!(part.steps.len() <= range.buckets());
@@ -242,4 +246,33 @@ fn memory_is_as_stated_and_only_for_what_is_read() {
     assert_eq!(rig.trend.points().map(|(_, bytes)| bytes).sum::<usize>(), POINT_BYTES);
     assert_eq!((POINT_BYTES, bytes_of(&nx)), (24_480, 9 * 24_480));
     const { assert!(6 * POINT_BYTES <= 150 << 10) };
+}
+
+#[test]
+fn many_drives_share_the_memory_and_what_they_keep_is_right() {
+    let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let of = |drives| Reach::of(std::iter::repeat_n(&*nx, drives));
+    assert_eq!(of(304), Reach::FULL);
+    let reach = of(992);
+    let all = 992 * reach.bytes_of(&nx);
+    assert!((MOST_BYTES / 10 * 9..=MOST_BYTES).contains(&all), "{all}");
+    let mut rig = Rig::new();
+    let feed = |rig: &mut Rig, seconds: u64| {
+        for second in 0..seconds {
+            rig.pass(SECOND);
+            rig.feed((second % 97) as f32, SECOND);
+        }
+    };
+    feed(&mut rig, 1500);
+    rig.trend.set_reach(reach);
+    rig.check();
+    feed(&mut rig, 700);
+    rig.check();
+    // Room for more: what was forgotten does not come back, what comes is kept.
+    rig.trend.set_reach(Reach::FULL);
+    let [fine, ..] = RANGES;
+    let shown = rig.part(fine, rig.clock).steps.iter().flatten().count();
+    assert_eq!(shown, reach.ranges()[0].buckets());
+    feed(&mut rig, 24 * 3600);
+    rig.check();
 }

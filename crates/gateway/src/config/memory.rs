@@ -1,0 +1,72 @@
+//! Memory that the gateway takes at most, with every ring full.
+
+use super::{BusSettings, Settings};
+use crate::history::budget::Budget;
+use crate::history::line;
+use crate::history::trend::Reach;
+
+/// The program, its libraries, its threads and what its servers keep for the clients they allow, bytes; measured.
+const PROGRAM: usize = 20 << 20;
+/// A bus: queue, trace, tape and thread, bytes; measured.
+const BUS: usize = 256 << 10;
+/// A drive: plan, image, health and what the servers remember of it, bytes; measured.
+const DRIVE: usize = 28 << 10;
+
+/// Memory of a gateway at most.
+#[derive(Debug)]
+pub struct Memory {
+    /// How far back trends reach.
+    pub reach: Reach,
+    /// In the order of the buses.
+    pub buses: Vec<BusMemory>,
+}
+
+/// Memory of the past of a bus at most.
+#[derive(Debug)]
+pub struct BusMemory {
+    /// Trends of its drives and the last hour of the line, bytes.
+    pub trends: usize,
+    /// Those of the drive with most points, bytes.
+    pub drive_trends: usize,
+    /// The recorder.
+    pub recorder: Budget,
+}
+
+impl Memory {
+    /// Of a gateway with these settings.
+    pub fn of(settings: &Settings) -> Memory {
+        let buses = &settings.buses;
+        let drives = buses.iter().flat_map(|bus| &bus.drives);
+        let reach = Reach::of(drives.map(|drive| &*drive.profile));
+        let needs = buses
+            .iter()
+            .map(|bus| Budget::of(&bus.spec, &bus.drives, &settings.recordings));
+        let recorders = Budget::shared(needs.collect());
+        let of = |(bus, recorder): (&BusSettings, Budget)| {
+            let each = bus
+                .drives
+                .iter()
+                .map(|drive| reach.bytes_of(&drive.profile) + line::BYTES.1);
+            BusMemory {
+                trends: each.clone().sum::<usize>() + line::BYTES.0,
+                drive_trends: each.max().unwrap_or(0),
+                recorder,
+            }
+        };
+        Memory {
+            reach,
+            buses: buses.iter().zip(recorders).map(of).collect(),
+        }
+    }
+
+    /// All of it, bytes.
+    pub fn total(&self, settings: &Settings) -> usize {
+        let drives: usize = settings.buses.iter().map(|bus| bus.drives.len()).sum();
+        let past: usize = self
+            .buses
+            .iter()
+            .map(|bus| bus.trends + bus.recorder.with_growth())
+            .sum();
+        PROGRAM + BUS * settings.buses.len() + DRIVE * drives + past
+    }
+}
