@@ -3,7 +3,7 @@
 import os
 import time
 
-# Codes that say that nothing was sent to the drive (docs/commands.md, every answer).
+# Codes that say that nothing was sent to the drive (docs/commands.md, Results).
 NOT_SENT = {
     "not_allowed", "not_writable", "bad_value", "queue_full", "replaced", "purged", "bus_down", "shutting_down",
     "unknown_drive", "offline", "expired",

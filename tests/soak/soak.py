@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Runs a gateway for hours under everything that goes wrong in a plant: see docs/development.md, The soak.
+"""Runs a gateway for hours under everything that goes wrong in a plant: see docs/development.md.
 
 soak.py --hours N [--binary PATH] [--dir DIR] [--seed N]: a line a minute, the result at the end; exit code 1 after any violation.
 Touches nothing but its directory, and the loopback. As root it works in a mount namespace of its own, for the small disk.

@@ -560,7 +560,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_documentation_tells_every_answer() {
+    fn the_page_has_every_result() {
         let page = include_str!("../../../../docs/commands.md");
         let refusals = [
             Refusal::NotAllowed,
