@@ -3,6 +3,7 @@
 
 mod arrivals;
 mod certificate;
+mod certificate_kind;
 mod command_json;
 mod connection_limit;
 pub mod http;
@@ -18,8 +19,10 @@ mod pem;
 mod readiness;
 mod refusals;
 pub(crate) mod register_map;
+mod server_trust;
 pub mod slot;
 mod stats;
+mod tls_words;
 
 use std::io;
 use std::net::SocketAddr;
@@ -27,10 +30,12 @@ use std::net::SocketAddr;
 pub(crate) use identity::client_tls;
 pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
 pub use listener::ListenerStates;
+pub(crate) use pem::unreadable;
 pub use stats::{
     ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats, ServerKind,
     SlotOutcome, SlotStats,
 };
+pub(crate) use tls_words::{GATEWAY, explain};
 
 /// Why a server cannot start.
 #[derive(Debug, thiserror::Error)]

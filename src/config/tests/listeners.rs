@@ -168,7 +168,7 @@ fn errors_of_certificates_name_file_and_key() {
         (
             "gateway.crt",
             file("gateway.key"),
-            "gateway.key contains no certificate; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; specify a PEM file",
+            "gateway.key contains no certificate, but a private key; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; specify the certificate: are certificate and key swapped?",
         ),
         (
             "gateway.crt",
