@@ -16,4 +16,5 @@ mod repository {
     mod layering;
     mod packages;
     mod packaging;
+    mod tools;
 }
