@@ -15,4 +15,5 @@ mod repository {
     mod fuzz_seeds;
     mod packages;
     mod packaging;
+    mod tools;
 }
