@@ -15,7 +15,7 @@ IN_OWN_TMP := tests/tools/in_own_tmp.sh
 
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
-.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak fleet interop clean
+.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak fleet interop book clean
 .PHONY: package-tools deb image release test-package test-static test-image
 
 help: ## Show this list
@@ -89,7 +89,11 @@ CHECKS ?=
 interop: ## Run the gateway with Home Assistant, pysparkplug and Node-RED; installs them, which takes minutes. CHECKS=name runs one
 	tests/interop/run.sh $(CHECKS)
 
-# What ships, in dist/; docs/releasing.md. ARCHITECTURES="amd64" for one of them.
+book: ## Build the pages of docs as a site with search, target/book; installs mdbook, which takes a minute
+	@tests/tools/mdbook.sh
+	tests/tools/book.py
+
+# What ships, in dist/; docs/development.md. ARCHITECTURES="amd64" for one of them.
 ARCHITECTURES ?= amd64 arm64 armhf
 package-tools: ## Install what all packages need for ARCHITECTURES (apt, PyPI, cargo, rustup); quick when nothing is missing
 	@deploy/package/tools.sh all $(ARCHITECTURES)

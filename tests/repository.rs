@@ -16,4 +16,5 @@ mod repository {
     mod packages;
     mod packaging;
     mod tools;
+    mod words;
 }

@@ -1,7 +1,4 @@
-//! Bytes on the wire to and from requests and replies: pure, without I/O and without a clock.
-//!
-//! On a half-duplex line a reply means something only against the outstanding request, so
-//! [`Protocol::decode`] takes that request. Nothing can go stale between two exchanges.
+#![doc = include_str!("../README.md")]
 
 pub mod ascii;
 pub mod checksum;

@@ -10,7 +10,7 @@ use super::{DEFAULT_CONFIG, EXIT_FAILED, report};
 use crate::config::{Settings, environment};
 use crate::north::local::protocol::{HealthOutcome, Outcome, Request};
 
-/// Tells whether the running gateway is ready, for containers and scripts.
+/// Says whether the running gateway is ready, for containers and scripts.
 ///
 /// Exit code 0 if every bus is open, each drive was tried and every server listens, as `/readyz` says; else 1 with
 /// the reasons. Asks through the local socket; with `socket = ""` or --url, through HTTP.

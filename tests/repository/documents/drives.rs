@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use drivegate::codec::{N2Options, Protocol, Table, n2};
 use drivegate::drive::profile::{Form, Profile, Profiles};
-use drivegate::drive::{Bound, Derived, ModelPoint, Point, Source};
+use drivegate::drive::{Bound, Derived, ModelPoint, Point, Source, Value};
 
 /// The families, Modbus first.
 const MODBUS: [&str; 5] = ["vacon-nx", "eaton-svx", "eaton-hvx", "vacon-cx", "teco-7300pa"];
@@ -33,8 +33,8 @@ pub(crate) fn tables() -> String {
 
 fn model(profiles: &Profiles, names: &[&str]) -> String {
     let mut text = format!(
-        "| point | unit | `{}` |\n|---|---|{}\n",
-        names.join("` | `"),
+        "|point|unit|`{}`|\n|---|---|{}\n",
+        names.join("`|`"),
         "---|".repeat(names.len())
     );
     for point in ModelPoint::ALL {
@@ -47,13 +47,7 @@ fn model(profiles: &Profiles, names: &[&str]) -> String {
                     .map_or_else(|| "-".to_string(), |p| cell(profile, p))
             })
             .collect();
-        let _ = writeln!(
-            text,
-            "| `{}` | {} | {} |",
-            point.name(),
-            point.unit(),
-            cells.join(" | ")
-        );
+        let _ = writeln!(text, "|`{}`|{}|{}|", point.name(), point.unit(), cells.join("|"));
     }
     text
 }
@@ -165,7 +159,7 @@ fn family(profile: &Profile) -> String {
     if doubtful > 0 {
         let _ = write!(text, " Not verified: {doubtful} of {} points.", profile.points.len());
     }
-    text += "\n\n| point | unit | address | class | commands | note |\n|---|---|---|---|---|---|\n";
+    text += "\n\n|point|unit|address|class|commands|note|\n|---|---|---|---|---|---|\n";
     for point in profile.points.iter().filter(|p| p.model.is_none()) {
         let class = if point.raw().is_some() { point.class.name() } else { "" };
         let range = point.range.as_ref().map(|r| format!("{} to {}", r.start(), r.end()));
@@ -180,11 +174,16 @@ fn family(profile: &Profile) -> String {
             .iter()
             .map(|(value, text)| format!("{value} {text}"))
             .collect();
-        let mut note = vec![texts.join(", "), point.note.clone()];
+        let blocks = point.blocks.as_ref().map_or_else(String::new, |blocks| {
+            let state = point.text_of(Value::Bool(blocks.when));
+            let state = state.unwrap_or(if blocks.when { "on" } else { "off" });
+            format!("*blocks* while {state}: `{}`", blocks.cause)
+        });
+        let mut note = vec![texts.join(", "), blocks, point.note.clone()];
         note.retain(|text| !text.is_empty());
         let _ = writeln!(
             text,
-            "| `{}` | {} | {} | {class} | {write} | {doubt}{} |",
+            "|`{}`|{}|{}|{class}|{write}|{doubt}{}|",
             point.name,
             point.unit,
             place(profile, point),
@@ -213,12 +212,12 @@ fn family(profile: &Profile) -> String {
 fn assumptions() -> String {
     let mut text = String::from(
         "\n## Assumptions about Metasys N2\n\nNone of these has been verified on hardware. Those with a key can be changed \
-         in `[n2]` of a profile.\n\n| key | value | assumption | basis |\n|---|---|---|---|\n",
+         in `[n2]` of a profile.\n\n|key|value|assumption|basis|\n|---|---|---|---|\n",
     );
     for one in n2::ASSUMPTIONS {
         let key = one.key.map(|key| format!("`{key}`")).unwrap_or_default();
         let value = one.value(&N2Options::DEFAULT);
-        let _ = writeln!(text, "| {key} | {value} | {} | {} |", one.what, one.why);
+        let _ = writeln!(text, "|{key}|{value}|{}|{}|", one.what, one.why);
     }
     text
 }

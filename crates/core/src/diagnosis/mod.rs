@@ -51,7 +51,7 @@ pub enum Cause {
     Echo,
     /// A USB adapter delivers in steps of 16 ms.
     LatencyTimer,
-    /// Requests that follow a reply closely are not heard.
+    /// Requests sent soon after a reply are ignored.
     SilenceTooShort,
     /// The port was lost again and again.
     PortResets,

@@ -18,7 +18,7 @@ impl Cause {
             Cause::RequestEndLost => "requests do not arrive whole",
             Cause::Echo => "the adapter hears its own requests",
             Cause::LatencyTimer => "the adapter hands replies over in steps of 16 ms",
-            Cause::SilenceTooShort => "requests that follow a reply closely are not heard",
+            Cause::SilenceTooShort => "requests sent soon after a reply are ignored",
             Cause::PortResets => "the adapter goes and comes back",
             Cause::ConnectionCloses => "the device server closes its connection again and again",
             Cause::FasterThanBaud => "replies come sooner than the configured baud rate allows",

@@ -1,4 +1,4 @@
-//! A recording and the form of its file (`docs/recordings.md`): a JSON object a line, the header first, the end last. Pure.
+//! A recording and the form of its file (`docs/history.md`): a JSON object a line, the header first, the end last. Pure.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;

@@ -193,7 +193,7 @@ keys! {
         /// running gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
         /// the gateway runs without it.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
-        /// Directory of what the gateway keeps: [recordings](recordings.md), [events, run hours and starts](history.md),
+        /// Directory of what the gateway keeps: [recordings](history.md#recordings), [events, run hours and starts](history.md),
         /// [parameters](parameters.md), and the [audit file](commands.md#the-audit-file).
         state_dir: PathBuf = PATH, or "the state directory of the systemd unit, else `/var/lib/drivegate`";
         /// Directories with custom [profiles](profiles.md), `*.toml`; a file with the name of a built-in profile
@@ -211,7 +211,7 @@ keys! {
         /// opened; if that fails, the last known addresses are used. Each port belongs to one bus.
         port: String = Text("", "a path, \"tcp://host:port\" or \"rfc2217://host:port\""), required;
         /// `"master"`: the gateway asks the drives. `"listen"`: another master owns the line; the gateway sends nothing and shows what
-        /// that master reads, see [Listening](listening.md). Its drives cannot have `access = "control"`, `supervision` or
+        /// that master reads, see [Listening](troubleshooting.md#listening-to-a-line-that-another-master-owns). Its drives cannot have `access = "control"`, `supervision` or
         /// `on_shutdown = "stop"`.
         mode: Mode = Words(&[("master", Mode::Master), ("listen", Mode::Listen)]), default "master";
         /// Protocol of the drives; every drive's profile must support it.
@@ -261,7 +261,7 @@ keys! {
         /// Silence before each request. `"spec"`: 3.5 characters, fixed at 1.75 ms above 19200 baud, as in the Modbus
         /// specification. `"chars"`: 3.5 characters at any baud rate, which is faster at 38400 and above and still more
         /// than most drives need. A duration: for drives that need more. Modbus ASCII frames need no silence between
-        /// them; it is kept all the same, for drives that release the line late.
+        /// them; it is kept all the same, for drives that release the line late. N2: `"5ms"`.
         silence: Silence = Parsed {
             parse: bus::parse_silence, words: &["spec", "chars"], pattern: DURATION,
             range: "\"spec\", \"chars\" or a duration up to \"1s\"",
@@ -317,7 +317,7 @@ keys! {
         /// Lease of the drive. Not a safety function.
         supervision: Present = Own { schema: Supervision::schema, range: "[bus.drive.supervision]" }, or "none";
         /// What is written at shutdown: nothing, or a stop. `check` reports how long the stops of a line take, and
-        /// warns if that is longer than the systemd unit allows (`TimeoutStopSec=90s`, of which 10 s are reserved for
+        /// warns if that is longer than the systemd unit allows (`TimeoutStopSec=90s`, 10 s of it reserved for
         /// everything else). Nothing is ever written to a monitored drive: `check` warns about a stop there, and about
         /// `supervision`.
         on_shutdown: OnShutdown = Words(&[("hold", OnShutdown::Hold), ("stop", OnShutdown::Stop)]), default "hold";
@@ -330,7 +330,7 @@ keys! {
             schema: || number_pair(Some(0.0), Some(MOST_HERTZ)),
             range: "[lowest, highest], Hz",
         }, or "none";
-        /// What raw writes may set beside the registers of writable points: nothing (`false`), everything that the profile
+        /// What raw writes may set besides the registers of writable points: nothing (`false`), everything that the profile
         /// lets write (`true`), or ranges of PDU addresses, of registers and coils alike. A write that contains the control
         /// word is [always admitted](modbus-tcp.md#what-raw-writes-may-set).
         raw_writes: Present = Own {
@@ -343,7 +343,7 @@ keys! {
         /// What may be done with its [parameters](parameters.md#restoring): `"read"`, or `"write"`: they may be restored, too, which
         /// needs `access = "control"`.
         params: ParamsAccess = Words(&[("read", ParamsAccess::Read), ("write", ParamsAccess::Write)]), default "read";
-        /// Values that make a [recording](recordings.md), beside faults.
+        /// Values that trigger a [recording](history.md#recordings), besides faults.
         trigger: Present = Own { schema: || each(Trigger::schema()), range: "[[bus.drive.trigger]]" }, or "none";
     }
 
@@ -578,7 +578,7 @@ keys! {
         /// File of access [tokens](http.md#tokens), made by `drivegate token add`. With it, all paths except `/healthz`
         /// and `/readyz` require a token.
         tokens_file: PathBuf = PATH, or "none";
-        /// Whether [users](operating.md) may command drives with `access = "control"`, from the status page and by
+        /// Whether [users](commands.md#over-http) may command drives with `access = "control"`, from the status page and by
         /// programs. Needs `users_file`, and `certificate` or a `listen` on the loopback.
         commands: bool = Flag, default false;
         /// File of the users who may command, made by `drivegate user add`.
@@ -593,13 +593,13 @@ keys! {
     AUDIT: AuditTable {
         /// The file, none of the others that the gateway keeps; a relative path is relative to `state_dir` of `[gateway]`.
         file: PathBuf = PATH, default "audit.jsonl";
-        /// Size of the file and the seven older ones beside it; the oldest is removed.
+        /// Size of the file and the seven older ones; the oldest is removed.
         max_bytes: u64 = Parsed {
             parse: mqtt::parse_buffer_size, words: &[], pattern: SIZE, range: "\"64KiB\" to \"1024GiB\"",
         }, default "64MiB";
     }
 
-    /// What the recorder keeps: [recordings](recordings.md) of the time around faults.
+    /// What the recorder keeps: [recordings](history.md#recordings) of the time around faults.
     RECORDINGS: Recordings {
         /// How much is kept from before the trigger.
         before: Duration = Time(Duration::from_secs(1)..=Duration::from_secs(600)), default "30s";

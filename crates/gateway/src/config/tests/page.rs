@@ -33,8 +33,8 @@ fn with_tables(page: &str) -> String {
         let heading = page.find(&format!("## `{section}`")).expect(section);
         let start = heading + page[heading..].find("\n|").expect(section) + 1;
         let end = start + page[start..].find("\n\n").map_or(page.len() - start, |end| end + 1);
-        let rows: String = rows.iter().map(|row| format!("| {} |\n", row.join(" | "))).collect();
-        let table = format!("| key | default | what to write | meaning |\n|---|---|---|---|\n{rows}");
+        let rows: String = rows.iter().map(|row| format!("|{}|\n", row.join("|"))).collect();
+        let table = format!("|key|default|what to write|meaning|\n|---|---|---|---|\n{rows}");
         page.replace_range(start..end, &table);
     }
     page
@@ -51,7 +51,7 @@ fn the_page_is_made_from_the_keys() {
     } else {
         assert!(
             page == wanted,
-            "docs/configuration.md is out of date; run DRIVEGATE_WRITE_DOCS=1 cargo test --lib the_page_is_made"
+            "docs/configuration.md is out of date; run DRIVEGATE_WRITE_DOCS=1 cargo test -p drivegate-gateway the_page_is_made"
         );
     }
 }

@@ -71,7 +71,7 @@ impl IntoResponse for CommandReply {
     }
 }
 
-/// The status of a result (`docs/operating.md`).
+/// The status of a result (`docs/commands.md`).
 fn status(outcome: &Outcome) -> StatusCode {
     match outcome {
         Outcome::Acknowledged(_) => StatusCode::OK,

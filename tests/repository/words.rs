@@ -1,0 +1,147 @@
+//! The documents are in the words that engineers of the field use, and spelled right.
+
+use std::fs;
+use std::path::PathBuf;
+use std::process::Command;
+
+use crate::support::tools::root;
+
+/// What no page says, and what to say instead.
+const INSTEAD: [(&str, &str); 19] = [
+    ("told", "reported, shown"),
+    ("tells", "reports, shows, says"),
+    ("tell apart", "distinguish"),
+    ("heard", "received"),
+    ("begun", "started"),
+    ("anew", "again"),
+    ("beside", "next to, besides"),
+    ("whoever", "anyone who, the client that"),
+    ("is no", "is not a"),
+    ("are no", "are not"),
+    ("of which", "two sentences"),
+    ("that there is", "fewer words"),
+    ("reckon", "calculate"),
+    ("reckoned", "calculated"),
+    ("reckons", "calculates"),
+    ("at hand", "available"),
+    ("as ever", "as usual"),
+    ("exchange", "transaction"),
+    ("exchanges", "transactions"),
+];
+
+/// What is right although a part of it is not.
+const RIGHT: [&str; 6] = [
+    "there is no",
+    "there are no",
+    "is no longer",
+    "are no longer",
+    "is no better",
+    "are no better",
+];
+
+/// README, CONTRIBUTING and all pages below docs.
+fn pages() -> Vec<PathBuf> {
+    let mut found = vec![root().join("README.md"), root().join("CONTRIBUTING.md")];
+    for folder in ["docs", "docs/decisions", "crates/proto"] {
+        let entries = fs::read_dir(root().join(folder)).unwrap();
+        let paths = entries.map(|entry| entry.unwrap().path());
+        found.extend(paths.filter(|path| path.extension().is_some_and(|extension| extension == "md")));
+    }
+    found.sort();
+    found
+}
+
+/// The prose of a page with the number of each line: without fenced blocks and without what stands between backticks.
+fn prose(text: &str) -> Vec<(usize, String)> {
+    let (mut inside, mut found) = (false, Vec::new());
+    for (number, line) in text.lines().enumerate() {
+        if line.starts_with("```") {
+            inside = !inside;
+        } else if !inside {
+            let plain: Vec<&str> = line.split('`').step_by(2).collect();
+            found.push((number + 1, plain.join("`")));
+        }
+    }
+    found
+}
+
+/// The words of a line in lower case, with a blank at each end; a sign is a word, so that nothing matches across it.
+fn words(line: &str) -> String {
+    let mut apart = String::new();
+    for c in line.to_lowercase().chars() {
+        if c.is_alphanumeric() || c.is_whitespace() {
+            apart.push(c);
+        } else {
+            apart.push_str(" . ");
+        }
+    }
+    let words: Vec<&str> = apart.split_whitespace().collect();
+    let line = format!(" {} ", words.join(" "));
+    let without = |line: String, right: &&str| line.replace(&format!(" {right} "), " . ");
+    RIGHT.iter().fold(line, without)
+}
+
+fn unwanted(line: &str) -> Option<(&'static str, &'static str)> {
+    let words = words(line);
+    INSTEAD
+        .into_iter()
+        .find(|(word, _)| words.contains(&format!(" {word} ")))
+}
+
+#[test]
+fn the_pages_are_in_plain_words() {
+    let mut found = Vec::new();
+    for page in pages() {
+        for (number, line) in prose(&fs::read_to_string(&page).unwrap()) {
+            if let Some((word, instead)) = unwanted(&line) {
+                found.push(format!("{}:{number}: \"{word}\"; instead: {instead}", page.display()));
+            }
+        }
+    }
+    assert!(found.is_empty(), "{found:#?}");
+}
+
+#[test]
+fn unwanted_words_are_noticed() {
+    for line in [
+        "It is told once.",
+        "| Begun | x |",
+        "that is no number",
+        "Whoever asks",
+        "(beside it)",
+    ] {
+        assert!(unwanted(line).is_some(), "{line}");
+    }
+    for line in [
+        "besides it",
+        "this is not a number",
+        "stole and untold",
+        "if there is no value",
+        "as it is; no more",
+    ] {
+        assert_eq!(unwanted(line), None, "{line}");
+    }
+    let text = "a `told` b\n```text\ntold\n```\nend";
+    assert_eq!(prose(text), [(1, "a ` b".to_string()), (5, "end".to_string())]);
+}
+
+/// Spelling, by an independent program; `typos.toml` has the names that it does not know.
+#[test]
+fn the_pages_are_spelled_right() {
+    let typos = root().join(".tools/venv/bin/typos");
+    let checked = Command::new(&typos)
+        .args(["--config", "typos.toml", "--format", "brief"])
+        .args([
+            "docs",
+            "README.md",
+            "CONTRIBUTING.md",
+            "SECURITY.md",
+            "CHANGELOG.md",
+            "crates",
+            "src",
+        ])
+        .current_dir(root())
+        .output()
+        .unwrap_or_else(|error| panic!("{}: {error}; run `make tools`", typos.display()));
+    assert!(checked.status.success(), "{}", String::from_utf8_lossy(&checked.stdout));
+}
