@@ -8,6 +8,11 @@ SHELL := /bin/bash
 # which is not on the PATH of an ordinary user.
 export PATH := $(CURDIR)/.tools/venv/bin:$(CURDIR)/.tools/bin:$(PATH):/usr/sbin:/sbin
 
+# Temporary files of the tests go into a directory of their own, so that nothing of a test that was killed is left. Its name is short,
+# as there are sockets in it.
+export PYTHONDONTWRITEBYTECODE := 1
+IN_OWN_TMP := tests/tools/in_own_tmp.sh
+
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
 .PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak fleet interop book clean
@@ -21,10 +26,12 @@ build: ## Build the optimised binary, target/release/drivegate
 
 # Most tests wait for other programs and for real time, so twice as many as there are cores run at once.
 TEST_THREADS ?= $(shell expr 2 \* "$$(getconf _NPROCESSORS_ONLN)")
+# What makes the next build after an edit faster takes a gigabyte, and whoever runs everything edits nothing meanwhile.
+test: export CARGO_INCREMENTAL = 0
 # Documentation tests first, so that the output ends with the count of a suite that tests the product.
 test: tools lint deny advisories check ## Run every check and every test; installs missing test tools first
-	cargo test --locked --workspace --doc
-	RUST_TEST_THREADS=$(TEST_THREADS) cargo test --locked --workspace --tests --no-fail-fast
+	$(IN_OWN_TMP) cargo test --locked --workspace --doc
+	RUST_TEST_THREADS=$(TEST_THREADS) $(IN_OWN_TMP) cargo test --locked --workspace --tests --no-fail-fast
 
 tools: ## Install what the tests need (apt, PyPI, cargo); quick when nothing is missing
 	@tests/tools/install.sh
@@ -88,26 +95,32 @@ book: ## Build the pages of docs as a site with search, target/book; installs md
 
 # What ships, in dist/; docs/development.md. ARCHITECTURES="amd64" for one of them.
 ARCHITECTURES ?= amd64 arm64 armhf
-package-tools: ## Install what the packages need (apt, PyPI, cargo, rustup); quick when nothing is missing
-	@deploy/package/tools.sh
+package-tools: ## Install what all packages need for ARCHITECTURES (apt, PyPI, cargo, rustup); quick when nothing is missing
+	@deploy/package/tools.sh all $(ARCHITECTURES)
 
-deb: package-tools ## Build the Debian packages into dist/ for ARCHITECTURES (amd64 arm64 armhf)
+deb: ## Build the Debian packages into dist/ for ARCHITECTURES (amd64 arm64 armhf)
+	@deploy/package/tools.sh deb $(ARCHITECTURES)
 	deploy/package/deb.sh $(ARCHITECTURES)
 
-image: package-tools ## Build the container images into dist/ for ARCHITECTURES
+image: ## Build the container images into dist/ for ARCHITECTURES
+	@deploy/package/tools.sh image $(ARCHITECTURES)
 	deploy/package/image.sh $(ARCHITECTURES)
 
-release: package-tools ## Build all that a release consists of into dist/
+release: ## Build all that a release consists of into dist/
+	@deploy/package/tools.sh release $(ARCHITECTURES)
 	deploy/package/release.sh $(ARCHITECTURES)
 
-test-package: package-tools ## Install, upgrade, downgrade, remove and purge the packages in a booted Debian, ARM under qemu; wants root
+test-package: ## Install, upgrade, downgrade, remove and purge the packages in a booted Debian, ARM under qemu; wants root
+	@deploy/package/tools.sh test-package $(ARCHITECTURES)
 	deploy/package/deb.sh $(ARCHITECTURES)
 	for each in $(ARCHITECTURES); do deploy/package/test/package.sh dist/drivegate_*_"$$each".deb; done
 
-test-static: package-tools ## Start the static binaries of ARCHITECTURES, ARM under qemu: the demo and one command
+test-static: ## Start the static binaries of ARCHITECTURES, ARM under qemu: the demo and one command
+	@deploy/package/tools.sh test-static $(ARCHITECTURES)
 	deploy/package/test/static.sh $(ARCHITECTURES)
 
-test-image: package-tools ## Build the images and run them by runc, ARM under qemu; wants root
+test-image: ## Build the images and run them by runc, ARM under qemu; wants root
+	@deploy/package/tools.sh test-image $(ARCHITECTURES)
 	deploy/package/image.sh $(ARCHITECTURES)
 	for each in $(ARCHITECTURES); do deploy/package/test/image.sh dist/drivegate_*_image_"$$each".tar; done
 

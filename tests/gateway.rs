@@ -32,4 +32,5 @@ mod gateway {
     mod trace;
     mod trying;
     mod user_profiles;
+    mod wrong_protocol;
 }

@@ -15,5 +15,6 @@ mod repository {
     mod fuzz_seeds;
     mod packages;
     mod packaging;
+    mod tools;
     mod words;
 }

@@ -1,36 +1,81 @@
 #!/usr/bin/env bash
 # Installs what packaging needs and this machine lacks: Debian packages, Python packages and cargo commands in .tools,
 # standard libraries of other targets. Takes a moment when nothing is missing.
+#   deploy/package/tools.sh PURPOSE [ARCHITECTURE...]
+# PURPOSE: deb, image, release, test-package, test-static, test-image, or all. Only what it needs for these architectures is installed;
+# `--print` before it says what that is, and installs nothing.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
+
+print=
+[ "${1:-}" != --print ] || { print=yes; shift; }
+purpose=${1:-all}
+[ $# = 0 ] || shift
+[ $# -gt 0 ] || set -- amd64 arm64 armhf
+architectures=("$@")
+
+say() { echo "packaging tools: $*" >&2; }
+fail() { echo "error: $*" >&2; exit 1; }
+
+for architecture; do
+    case $architecture in
+        amd64 | arm64 | armhf) ;;
+        *) fail "unknown architecture \"$architecture\"; the command line; amd64, arm64 or armhf" ;;
+    esac
+done
+
+# What it comes down to: Debian packages, static binaries, images, a release, and their tests.
+case $purpose in
+    deb) parts="deb" ;;
+    image) parts="static image" ;;
+    release) parts="deb static image release" ;;
+    test-package) parts="deb test-package emulator" ;;
+    test-static) parts="static emulator" ;;
+    test-image) parts="static image test-image emulator" ;;
+    all) parts="deb static image release test-package test-image emulator" ;;
+    *) fail "unknown purpose \"$purpose\"; the command line; deb, image, release, test-package, test-static, test-image or all" ;;
+esac
+is_for() { [[ " $parts " = *" $1 "* ]]; }
+has() { [[ " ${architectures[*]} " = *" $1 "* ]]; }
+# Whether any of them is not this machine's.
+is_foreign() {
+    local own architecture
+    own=$(dpkg --print-architecture 2>/dev/null || true)
+    for architecture in "${architectures[@]}"; do
+        [ "$architecture" = "$own" ] || return 0
+    done
+    return 1
+}
 
 # What must be on the PATH (or, with a slash, on disk), and the Debian package that brings it.
 needed=(
     "git git"
     "python3 python3"
     "dpkg-deb dpkg"
-    "lintian lintian"
     "readelf binutils"
-    "debootstrap debootstrap"
-    "systemd-nspawn systemd-container"
-    "buildah buildah"
-    "runc runc"
-    "jq jq"
-    "/usr/share/ca-certificates/mozilla ca-certificates"
-    "aarch64-linux-gnu-gcc gcc-aarch64-linux-gnu"
-    "/usr/aarch64-linux-gnu/lib/libc.a libc6-dev-arm64-cross"
-    "arm-linux-gnueabihf-gcc gcc-arm-linux-gnueabihf"
-    "/usr/arm-linux-gnueabihf/lib/libc.a libc6-dev-armhf-cross"
 )
+! is_for image || needed+=("buildah buildah" "/usr/share/ca-certificates/mozilla ca-certificates")
+! is_for test-image || needed+=("runc runc" "jq jq")
+! is_for test-package || needed+=("lintian lintian" "debootstrap debootstrap" "systemd-nspawn systemd-container")
+# Packages are linked by zig, for whatever architecture.
+if is_for static && has arm64; then
+    needed+=(
+        "aarch64-linux-gnu-gcc gcc-aarch64-linux-gnu"
+        "/usr/aarch64-linux-gnu/lib/libc.a libc6-dev-arm64-cross"
+    )
+fi
+if is_for static && has armhf; then
+    needed+=(
+        "arm-linux-gnueabihf-gcc gcc-arm-linux-gnueabihf"
+        "/usr/arm-linux-gnueabihf/lib/libc.a libc6-dev-armhf-cross"
+    )
+fi
 cargo_deb=3.8.0
 cargo_cyclonedx=0.5.9
 # Older ones refuse pseudo-terminals, which the demo needs.
 qemu_at_least=8
 qemu_suite=trixie
 export PATH="$PWD/.tools/bin:$PATH:/usr/sbin:/sbin"
-
-say() { echo "packaging tools: $*" >&2; }
-fail() { echo "error: $*" >&2; exit 1; }
 
 . tests/tools/packages.sh
 
@@ -90,15 +135,31 @@ install_qemu() {
     rm -rf "$apt"
 }
 
+targets() {
+    ! has amd64 || echo x86_64-unknown-linux-gnu
+    ! has arm64 || echo aarch64-unknown-linux-gnu
+    ! has armhf || echo armv7-unknown-linux-gnueabihf
+}
+
 install_targets() {
     local target
-    for target in x86_64-unknown-linux-gnu aarch64-unknown-linux-gnu armv7-unknown-linux-gnueabihf; do
+    for target in $(targets); do
         [ -d "$(rustc --print sysroot)/lib/rustlib/$target/lib" ] && continue
         say "adding the standard library for $target"
         { command -v rustup && rustup target add "$target"; } >&2 ||
             say "no standard library for $target; its packages cannot be built here (docs/development.md#the-standard-library-of-other-targets)"
     done
 }
+
+if [ -n "$print" ]; then
+    echo "Debian packages: $(printf '%s\n' "${needed[@]#* }" | sort -u | tr '\n' ' ')"
+    echo "Rust targets: $(targets | tr '\n' ' ')"
+    ! is_for deb || echo "PyPI: $(tr '\n' ' ' <deploy/package/requirements.txt)"
+    ! is_for deb || echo "cargo: cargo-deb $cargo_deb"
+    ! is_for release || echo "cargo: cargo-cyclonedx $cargo_cyclonedx"
+    if is_for emulator && is_foreign; then echo "Debian $qemu_suite: qemu-user"; fi
+    exit 0
+fi
 
 mkdir -p .tools
 exec 9>.tools/lock-package
@@ -111,7 +172,9 @@ if [ ${#packages[@]} -gt 0 ]; then
     [ ${#packages[@]} = 0 ] || fail "still missing after the installation: ${packages[*]}"
 fi
 install_targets
-install_python_packages
-install_qemu
-install_cargo_command cargo-deb $cargo_deb
-install_cargo_command cargo-cyclonedx $cargo_cyclonedx
+if is_for deb; then
+    install_python_packages
+    install_cargo_command cargo-deb $cargo_deb
+fi
+! is_for release || install_cargo_command cargo-cyclonedx $cargo_cyclonedx
+if is_for emulator && is_foreign; then install_qemu; fi

@@ -100,15 +100,19 @@ impl Drop for Running {
 pub(crate) fn drivegate(arguments: &[&str]) -> Command {
     static STARTED: AtomicU32 = AtomicU32::new(0);
     let number = STARTED.fetch_add(1, Ordering::Relaxed);
-    let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("state/{number}"));
+    let own = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{}/{number}", env!("CARGO_CRATE_NAME")));
     // Of an earlier run of the tests.
-    let _ = std::fs::remove_dir_all(&state);
+    let _ = std::fs::remove_dir_all(&own);
+    let (state, temporary) = (own.join("state"), own.join("tmp"));
+    // What a demo that is killed leaves stays out of the machine's own.
+    std::fs::create_dir_all(&temporary).expect("a directory in that of the tests");
     let mut command = Command::new(env!("CARGO_BIN_EXE_drivegate"));
     command
         .args(arguments)
         .env_remove("RUNTIME_DIRECTORY")
         .env("XDG_RUNTIME_DIR", env!("CARGO_TARGET_TMPDIR"))
-        .env("STATE_DIRECTORY", state);
+        .env("STATE_DIRECTORY", state)
+        .env("TMPDIR", temporary);
     command
 }
 

@@ -382,10 +382,18 @@ fn nothing_is_told_of_a_sound_line() {
         let mut parts = Parts::of(0, &sound.line, 5);
         (sound.parts)(&mut parts);
         let mut rig = Rig::new(&sound.line, parts);
+        // A drive that was never there is no fault of the line, and is told as what it is.
+        let never: Told = sound
+            .line
+            .dead
+            .iter()
+            .map(|dead| (Cause::NeverAnswered, *dead))
+            .collect();
         for second in 0..minutes * 60 {
             (sound.each)(&mut rig, second);
             rig.run(SECOND);
-            if !told(&rig).is_empty() {
+            let (told, late) = (told(&rig), second > TOLD.as_secs());
+            if !told.is_subset(&never) || (late && told != never) {
                 let diagnosis = rig.bus.handle.image.diagnosis.load();
                 wrong.push(format!(
                     "{} after {second} s: {:?}\n    {:?}",
@@ -397,4 +405,31 @@ fn nothing_is_told_of_a_sound_line() {
         }
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+#[test]
+fn a_drive_that_never_answered_is_told_until_it_answers() {
+    for line in lines() {
+        let mut rig = Rig::new(&line, Parts::of(0, &line, 5));
+        rig.with_drive(2, |drive, _| drive.power_off());
+        let never: Told = [(Cause::NeverAnswered, 2)].into();
+        rig.run(TOLD);
+        assert_eq!(told(&rig), never, "{}", line.family);
+        let diagnosis = rig.bus.handle.image.diagnosis.load();
+        let verdict = &diagnosis.verdicts[0];
+        assert!(
+            verdict
+                .evidence
+                .contains("(address 2) has never answered since the bus was started"),
+            "{verdict:?}"
+        );
+        assert!(verdict.remedy.contains("drivegate scan"), "{verdict:?}");
+        // It is switched on, and off again: it has answered.
+        rig.with_drive(2, |drive, now| drive.power_on(now));
+        rig.run(2 * TOLD);
+        assert_eq!(told(&rig), Told::new(), "{}", line.family);
+        rig.with_drive(2, |drive, _| drive.power_off());
+        rig.run(2 * TOLD);
+        assert_eq!(told(&rig), Told::new(), "{}", line.family);
+    }
 }

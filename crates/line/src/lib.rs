@@ -6,8 +6,10 @@
 
 mod arrival;
 mod clock;
+mod first_bytes;
 mod names;
 mod options;
+mod other_server;
 mod pty;
 mod receiver;
 mod remote;
@@ -182,7 +184,7 @@ impl Line {
         let (opened, warnings) = match port.split_once("://") {
             Some(("tcp", address)) => {
                 let stream = connect(names, port, address, go_on)?;
-                (Port::Tcp(Raw::new(stream)), Vec::new())
+                (Port::Tcp(Raw::open(stream, port, &names.other)?), Vec::new())
             }
             Some(("rfc2217", address)) => {
                 let stream = connect(names, port, address, go_on)?;
@@ -215,7 +217,7 @@ impl Line {
     fn fd(&self) -> BorrowedFd<'_> {
         match &self.port {
             Port::Serial(fd) => fd.as_fd(),
-            Port::Tcp(raw) => raw.stream.as_fd(),
+            Port::Tcp(raw) => raw.as_fd(),
             Port::Rfc2217(remote) => remote.stream.as_fd(),
         }
     }
@@ -227,7 +229,7 @@ impl Line {
     pub fn send(&self, frame: &[u8]) -> Result<(), Lost> {
         match &self.port {
             Port::Serial(fd) => write_all(fd.as_fd(), frame).map_err(Lost::of_adapter),
-            Port::Tcp(raw) => write_all(raw.stream.as_fd(), frame),
+            Port::Tcp(raw) => raw.send(frame),
             Port::Rfc2217(remote) => remote.send(frame),
         }
     }
@@ -235,15 +237,11 @@ impl Line {
     /// Reads what is there, without waiting; 0 is nothing.
     ///
     /// # Errors
-    /// When the port is gone (an unplugged adapter reads end of file or EIO), or turns out to be a telnet port.
+    /// When the port is gone (an unplugged adapter reads end of file or EIO), or turns out to be no raw port.
     pub fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         match &self.port {
             Port::Serial(fd) => read(fd.as_fd(), buffer).map_err(Lost::of_adapter),
-            Port::Tcp(raw) => {
-                let count = read(raw.stream.as_fd(), buffer)?;
-                raw.look_at(buffer.get(..count).unwrap_or_default())?;
-                Ok(count)
-            }
+            Port::Tcp(raw) => raw.receive(buffer),
             Port::Rfc2217(remote) => remote.receive(buffer),
         }
     }

@@ -8,6 +8,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
 use super::clock;
+use super::other_server::OtherServer;
 
 /// Longest wait for an answer.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -28,6 +29,8 @@ pub struct Names {
     failure: Option<String>,
     /// The last answer was none.
     doubtful: bool,
+    /// What the server turned out to be.
+    pub(super) other: OtherServer,
 }
 
 impl std::fmt::Debug for Names {
@@ -53,6 +56,7 @@ impl Names {
             asked: None,
             failure: None,
             doubtful: false,
+            other: OtherServer::default(),
         }
     }
 

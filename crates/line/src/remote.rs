@@ -1,14 +1,16 @@
-//! A device server behind TCP: its port set up over the network (`rfc2217://`), and a telnet port that passes for a raw
-//! one (`tcp://`) recognised by its first bytes.
+//! A device server behind TCP: its port set up over the network (`rfc2217://`), and what passes for a raw port (`tcp://`)
+//! recognised by its first bytes.
 
-use std::cell::{Cell, RefCell};
+use std::cell::RefCell;
 use std::net::TcpStream;
-use std::os::fd::AsFd;
+use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags};
 
-use super::rfc2217::{Session, Settings, State, escape, is_greeting};
+use super::first_bytes::{FirstBytes, Server};
+use super::other_server::OtherServer;
+use super::rfc2217::{Session, Settings, State, escape};
 use super::{Lost, OpenError, poll_port, read, write_all};
 
 /// Time for the server to agree and to set up its port.
@@ -19,42 +21,74 @@ const STEP: Duration = Duration::from_millis(100);
 /// A raw connection.
 #[derive(Debug)]
 pub(super) struct Raw {
-    pub(super) stream: TcpStream,
-    /// The first bytes that came, up to three, and how many; `None` once it is known that they are no telnet.
-    first: Cell<Option<([u8; 3], usize)>>,
+    stream: TcpStream,
+    opened: Instant,
+    /// What came first; `None` once it is known to be of a line.
+    first: RefCell<Option<FirstBytes>>,
+    other: OtherServer,
 }
 
 impl Raw {
-    pub(super) fn new(stream: TcpStream) -> Raw {
-        Raw {
-            stream,
-            first: Cell::new(Some(([0; 3], 0))),
-        }
-    }
-
-    /// Looks at bytes that came.
+    /// `other` is what is known of the server by connections before.
     ///
     /// # Errors
-    /// When they are those of a telnet server. It would take a byte 255 in a request for a command and double it in a reply:
-    /// frames with that byte, stops among them, would never arrive.
-    pub(super) fn look_at(&self, bytes: &[u8]) -> Result<(), Lost> {
-        let Some((mut first, mut count)) = self.first.get() else {
-            return Ok(());
-        };
-        for (place, byte) in first.iter_mut().skip(count).zip(bytes) {
-            *place = *byte;
-            count += 1;
+    /// It is a Modbus TCP server.
+    pub(super) fn open(stream: TcpStream, port: &str, other: &OtherServer) -> Result<Raw, OpenError> {
+        if other.is_found() && !other.is_gone(&stream) {
+            return Err(OpenError::Remote {
+                port: port.to_string(),
+                reason: Server::ModbusTcp.words().to_string(),
+            });
         }
-        match is_greeting(first.get(..count).unwrap_or_default()) {
-            None => self.first.set(Some((first, count))),
-            Some(false) => self.first.set(None),
-            Some(true) => {
-                return Err(Lost::new(
-                    "the device server speaks telnet on this port; write rfc2217:// instead of tcp://, or the server's raw TCP port",
-                ));
+        Ok(Raw {
+            stream,
+            opened: Instant::now(),
+            first: RefCell::new(Some(FirstBytes::default())),
+            other: other.clone(),
+        })
+    }
+
+    /// Gives a whole frame to the server.
+    pub(super) fn send(&self, frame: &[u8]) -> Result<(), Lost> {
+        if let Some(first) = self.first.borrow_mut().as_mut() {
+            first.asked(frame);
+            if first.is_empty() {
+                self.other.nothing_came(&self.stream, self.opened, frame);
             }
         }
-        Ok(())
+        write_all(self.stream.as_fd(), frame)
+    }
+
+    /// Reads the data that is there; 0 is nothing.
+    ///
+    /// # Errors
+    /// When the port is gone, or no raw one: frames would never arrive, stops among them.
+    pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
+        let count = read(self.stream.as_fd(), buffer).map_err(|lost| match self.other.is_found() {
+            true => Lost::new(Server::ModbusTcp.words()),
+            false => lost,
+        })?;
+        let mut first = self.first.borrow_mut();
+        let Some(seen) = first.as_mut() else { return Ok(count) };
+        match seen.came(buffer.get(..count).unwrap_or_default()) {
+            None => Ok(count),
+            Some(Server::Raw) => {
+                *first = None;
+                Ok(count)
+            }
+            Some(server) => {
+                if server == Server::ModbusTcp {
+                    self.other.recognised(seen.unit());
+                }
+                Err(Lost::new(server.words()))
+            }
+        }
+    }
+}
+
+impl AsFd for Raw {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.stream.as_fd()
     }
 }
 

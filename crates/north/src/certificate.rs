@@ -65,7 +65,7 @@ pub(super) fn subject_name(certificate: &Certificate) -> String {
 
 fn name_of(certificate: &TbsCertificate) -> String {
     let serial = || format!("serial {}", hex(certificate.serial_number().as_bytes()));
-    common_name(certificate.subject()).unwrap_or_else(serial)
+    common_name(certificate.subject()).map_or_else(serial, |name| printable(&name))
 }
 
 fn role(extensions: &[x509_cert::ext::Extension]) -> Result<Option<String>, RoleError> {
@@ -82,10 +82,11 @@ fn role(extensions: &[x509_cert::ext::Extension]) -> Result<Option<String>, Role
     Ok(Some(role.to_string()))
 }
 
-fn common_name(subject: &Name) -> Option<String> {
+/// The common name as it stands, not for messages.
+pub(super) fn common_name(subject: &Name) -> Option<String> {
     let value = &subject.iter().find(|attribute| attribute.oid == COMMON_NAME)?.value;
     let is_text = matches!(value.tag(), Tag::Utf8String | Tag::PrintableString | Tag::Ia5String);
-    is_text.then(|| printable(&String::from_utf8_lossy(value.value())))
+    is_text.then(|| String::from_utf8_lossy(value.value()).into_owned())
 }
 
 /// For the log and the audit: without characters that could imitate another line or another field.

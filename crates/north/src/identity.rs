@@ -4,13 +4,16 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use rustls::client::WantsClientCert;
 use rustls::crypto::CryptoProvider;
 use rustls::server::danger::ClientCertVerifier;
-use rustls::{ClientConfig, RootCertStore, ServerConfig, crypto};
+use rustls::{CertificateError, ClientConfig, ConfigBuilder, OtherError, RootCertStore, ServerConfig, crypto};
 use rustls_pki_types::{CertificateDer, PrivateKeyDer};
 
 use super::certificate;
+use super::certificate_kind::{Kind, SUPPORTED_KEYS};
 use super::pem::{self, PemError};
+use super::server_trust::ServerTrust;
 
 /// How long before its end a certificate or a CRL causes a warning.
 const SOON: Duration = Duration::from_secs(30 * 86_400);
@@ -63,7 +66,35 @@ pub(super) enum FileProblem {
     #[error("the key does not match the certificate; specify the key of the certificate")]
     KeyMismatch,
     #[error("certificate and key cannot be used: {0}; specify a certificate and its key in PEM format")]
-    Unusable(rustls::Error),
+    Unusable(String),
+    #[error(
+        "certificate `{name}` is of X.509 version 1, which TLS libraries refuse; have it issued anew as version 3, for which \
+         openssl x509 -req needs -extfile with a subjectAltName"
+    )]
+    OldVersion { name: String },
+    #[error("certificate `{name}` has a key of {kind}, which the gateway does not support; use {SUPPORTED_KEYS}")]
+    UnsupportedKey { name: String, kind: String },
+    #[error("the private key is of a kind that the gateway does not support; use {SUPPORTED_KEYS}")]
+    UnknownKey,
+    #[error(
+        "certificate `{name}` in {file} names no host (subjectAltName), and most clients ignore its common name; have it issued \
+         anew with subjectAltName"
+    )]
+    NoNames { name: String, file: String },
+    #[error(
+        "certificate `{name}` in {file} has a key of {kind}, which the gateway does not support: who shows it, or one \
+         signed by it, is refused; use {SUPPORTED_KEYS}"
+    )]
+    UnsupportedCaKey { name: String, file: String, kind: String },
+    #[error(
+        "certificate `{name}` in {file} is no CA and is for {difference}, so the server with it is refused; \
+         write a name that is in the certificate into the url"
+    )]
+    OtherHost {
+        name: String,
+        file: String,
+        difference: String,
+    },
     #[error("{file} contains no usable CRL: {cause}; specify a PEM or DER file with CRLs of version 2")]
     UnusableCrl { file: String, cause: String },
     #[error("a CRL cannot be used: {0:?}; specify CRLs of version 2")]
@@ -95,12 +126,27 @@ impl TlsFile {
 }
 
 impl ServerIdentity {
-    /// Reads both files and checks that they fit together. A certificate that has ended or will soon is a warning:
-    /// its clients will refuse it, but the drives must still be polled after a restart.
+    /// Reads both files of a server and checks that they fit together. A certificate that has ended or will soon is a warning:
+    /// its clients will refuse it, but the drives must still be polled after a restart. So is one that names no host.
     ///
     /// # Errors
     /// All faults of the files.
     pub fn load(
+        certificate: &Path,
+        key: &Path,
+        now: SystemTime,
+    ) -> Result<(ServerIdentity, Vec<IdentityFault>), Vec<IdentityFault>> {
+        let (identity, mut warnings) = ServerIdentity::load_of_client(certificate, key, now)?;
+        let nameless = identity.chain.first().and_then(|own| nameless(certificate, own));
+        warnings.extend(nameless.map(|problem| TlsFile::Certificate.fault(problem)));
+        Ok((identity, warnings))
+    }
+
+    /// As [`ServerIdentity::load`], of a client, which needs no names.
+    ///
+    /// # Errors
+    /// All faults of the files.
+    pub fn load_of_client(
         certificate: &Path,
         key: &Path,
         now: SystemTime,
@@ -111,7 +157,10 @@ impl ServerIdentity {
         let (Ok(chain), Ok(key)) = (chain, key) else {
             return Err(errors);
         };
-        let own = chain.iter().take(1).filter_map(|own| validity(certificate, own, now));
+        let own = chain
+            .first()
+            .into_iter()
+            .filter_map(|own| validity(certificate, own, now));
         let warnings = own.map(|problem| TlsFile::Certificate.fault(problem)).collect();
         let identity = ServerIdentity {
             chain,
@@ -131,10 +180,7 @@ impl ServerIdentity {
         &self,
         clients: Option<Arc<dyn ClientCertVerifier>>,
     ) -> Result<ServerConfig, IdentityFault> {
-        let unusable = |error: rustls::Error| match error {
-            rustls::Error::InconsistentKeys(_) => TlsFile::Key.fault(FileProblem::KeyMismatch),
-            error => TlsFile::Certificate.fault(FileProblem::Unusable(error)),
-        };
+        let unusable = |error: rustls::Error| unusable(&error, &self.chain);
         let builder = ServerConfig::builder_with_provider(provider())
             .with_safe_default_protocol_versions()
             .map_err(unusable)?;
@@ -148,6 +194,25 @@ impl ServerIdentity {
     }
 }
 
+/// Why a chain and a key cannot be used together, in words of who chose them.
+pub(super) fn unusable(error: &rustls::Error, chain: &[CertificateDer<'_>]) -> IdentityFault {
+    let own = chain.first().and_then(|own| Kind::of(own));
+    let Some(Kind { name, is_old, key, .. }) = own else {
+        return TlsFile::Certificate.fault(FileProblem::Unusable(error.to_string()));
+    };
+    match error {
+        rustls::Error::InconsistentKeys(_) => TlsFile::Key.fault(FileProblem::KeyMismatch),
+        _ if is_old => TlsFile::Certificate.fault(FileProblem::OldVersion { name }),
+        _ if !key.signs => TlsFile::Certificate.fault(FileProblem::UnsupportedKey { name, kind: key.name }),
+        // All that is said of a key that cannot be read.
+        rustls::Error::General(_) => TlsFile::Key.fault(FileProblem::UnknownKey),
+        rustls::Error::InvalidCertificate(CertificateError::Other(OtherError(cause))) => {
+            TlsFile::Certificate.fault(FileProblem::Unusable(cause.to_string()))
+        }
+        error => TlsFile::Certificate.fault(FileProblem::Unusable(error.to_string())),
+    }
+}
+
 /// The one cryptographic provider of the gateway.
 pub(super) fn provider() -> Arc<CryptoProvider> {
     Arc::new(crypto::ring::default_provider())
@@ -158,57 +223,107 @@ pub(super) fn provider() -> Arc<CryptoProvider> {
 pub(super) enum RootsError {
     #[error(transparent)]
     Pem(#[from] PemError),
-    #[error("{file}: not a usable CA certificate: {cause}; specify the PEM file of the CA")]
-    UnusableCa { file: String, cause: rustls::Error },
+    #[error("{file} contains data that is not a certificate; specify the PEM file of the CA")]
+    UnusableCa { file: String },
     #[error("the system has no CA certificates; install them or name a file with `ca`")]
     NoSystemRoots,
+    #[error("TLS: {0}")]
+    Protocol(rustls::Error),
 }
 
-/// The CA certificates of a file, or those of the system.
-pub(super) fn roots(ca: Option<&Path>) -> Result<RootCertStore, RootsError> {
+/// The servers to trust: those with a certificate of a CA in a file, or with one that is itself in it; or those with one of a
+/// CA of the system.
+pub(super) fn trusted_servers(ca: Option<&Path>) -> Result<ServerTrust, RootsError> {
     let mut store = RootCertStore::empty();
+    let mut named = Vec::new();
     match ca {
-        Some(file) => {
-            for certificate in pem::certificates(file)? {
-                store.add(certificate).map_err(|cause| RootsError::UnusableCa {
-                    file: file.display().to_string(),
-                    cause,
-                })?;
+        Some(path) => {
+            let file = || path.display().to_string();
+            named = pem::certificates(path)?;
+            for certificate in &named {
+                store
+                    .add(certificate.clone())
+                    .map_err(|_| RootsError::UnusableCa { file: file() })?;
             }
         }
         None => {
             // One certificate of the system that rustls cannot parse must not disable TLS.
             store.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
-            if store.is_empty() {
-                return Err(RootsError::NoSystemRoots);
-            }
         }
     }
-    Ok(store)
+    ServerTrust::new(store, named).map_err(|_| RootsError::NoSystemRoots)
 }
 
-/// TLS towards a gateway, verified by the CA certificates of a file or by those of the system.
+/// What to build the TLS of a client from, which trusts such servers.
+pub(super) fn client_builder(ca: Option<&Path>) -> Result<ConfigBuilder<ClientConfig, WantsClientCert>, RootsError> {
+    let builder = ClientConfig::builder_with_provider(provider())
+        .with_safe_default_protocol_versions()
+        .map_err(RootsError::Protocol)?;
+    let trust = Arc::new(trusted_servers(ca)?);
+    Ok(builder.dangerous().with_custom_certificate_verifier(trust))
+}
+
+/// TLS towards a gateway, verified by the certificates of a file or by the CAs of the system.
 ///
 /// # Errors
 /// What is wrong with them, and what to do.
 pub fn client_tls(ca: Option<&Path>) -> Result<Arc<ClientConfig>, String> {
-    let roots = roots(ca).map_err(|error| error.to_string())?;
-    let config = ClientConfig::builder_with_provider(provider())
-        .with_safe_default_protocol_versions()
-        .map_err(|error| format!("TLS: {error}"))?
-        .with_root_certificates(roots)
-        .with_no_client_auth();
-    Ok(Arc::new(config))
+    let builder = client_builder(ca).map_err(|error| error.to_string())?;
+    Ok(Arc::new(builder.with_no_client_auth()))
 }
 
-/// Certificates of a PEM file that have ended, or end within 30 days of `now`; each as what is wrong and what to do.
+/// What will or may keep the server `host` from being trusted by the certificates of a PEM file: those that have ended, or end
+/// within 30 days of `now`, whose keys are not supported, or that are its own and for another host. Each as what is wrong and
+/// what to do.
 ///
 /// # Errors
 /// The file cannot be read, or contains no certificate.
-pub fn certificate_warnings(file: &Path, now: SystemTime) -> Result<Vec<String>, String> {
+pub fn certificate_warnings(file: &Path, host: &str, now: SystemTime) -> Result<Vec<String>, String> {
     let certificates = pem::certificates(file).map_err(|error| error.to_string())?;
-    let problems = certificates.iter().filter_map(|der| validity(file, der, now));
+    let problems = certificates.iter().flat_map(|der| {
+        let shown = file.display().to_string();
+        let unfit = Kind::of(der).and_then(|kind| unfit_for(kind, shown, host));
+        validity(file, der, now).into_iter().chain(unfit)
+    });
     Ok(problems.map(|problem| problem.to_string()).collect())
+}
+
+fn unfit_for(kind: Kind, file: String, host: &str) -> Option<FileProblem> {
+    if !kind.key.verifies {
+        return Some(unsupported_key(kind, file));
+    }
+    let name = kind.name.clone();
+    // One of version 1 does not say whether it is a CA.
+    let is_own = !kind.is_ca && !kind.is_old;
+    let other = is_own && !kind.is_for(host);
+    other.then(|| FileProblem::OtherHost {
+        name,
+        file,
+        difference: format!("{}, not for `{host}`", kind.shown_names()),
+    })
+}
+
+/// Warns of a CA whose signatures cannot be verified.
+pub(super) fn unsupported_ca(file: &Path, der: &CertificateDer<'_>) -> Option<FileProblem> {
+    let kind = Kind::of(der).filter(|kind| !kind.key.verifies)?;
+    Some(unsupported_key(kind, file.display().to_string()))
+}
+
+fn unsupported_key(kind: Kind, file: String) -> FileProblem {
+    FileProblem::UnsupportedCaKey {
+        name: kind.name,
+        file,
+        kind: kind.key.name,
+    }
+}
+
+/// Warns of a server's own certificate that has no names.
+fn nameless(file: &Path, der: &CertificateDer<'_>) -> Option<FileProblem> {
+    let kind = Kind::of(der)?;
+    kind.names.is_empty().then(|| FileProblem::NoNames {
+        name: kind.name,
+        file: file.display().to_string(),
+    })
 }
 
 /// What is wrong with the period of validity of a certificate.

@@ -3,6 +3,7 @@
 
 mod arrivals;
 mod certificate;
+mod certificate_kind;
 mod command_json;
 mod connection_limit;
 pub mod http;
@@ -18,8 +19,10 @@ mod pem;
 mod readiness;
 mod refusals;
 pub mod register_map;
+mod server_trust;
 pub mod slot;
 mod stats;
+mod tls_words;
 
 use drivegate_core::command;
 use drivegate_core::diagnosis;
@@ -41,10 +44,12 @@ use std::net::SocketAddr;
 pub use identity::client_tls;
 pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
 pub use listener::ListenerStates;
+pub use pem::unreadable;
 pub use stats::{
     ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats, ServerKind,
     SlotOutcome, SlotStats,
 };
+pub use tls_words::{GATEWAY, Peer, explain};
 
 /// Why a server cannot start.
 #[derive(Debug, thiserror::Error)]

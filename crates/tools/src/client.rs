@@ -84,8 +84,8 @@ pub(super) enum ClientError {
     #[error("{0}")]
     File(String),
     /// The TLS handshake failed.
-    #[error("no TLS connection: {1}; {0}; pass the CA of the gateway's certificate with --ca, or use http://")]
-    Tls(Url, String),
+    #[error("no TLS connection: {0}")]
+    Tls(String),
     /// The gateway refused, with a reason.
     #[error("{error}; {url}; {remedy}")]
     Refused {

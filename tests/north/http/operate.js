@@ -16,7 +16,8 @@ class Browser {
     this.profile = fs.mkdtempSync(path.join(os.tmpdir(), "operate-"));
     const options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
       "--disable-component-update", "--disable-sync", `--user-data-dir=${this.profile}`, "--remote-debugging-pipe", "about:blank"];
-    this.process = spawn("chromium", options, { stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"] });
+    const env = { ...process.env, TMPDIR: this.profile };
+    this.process = spawn("chromium", options, { env, stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"] });
     this.waiting = new Map();
     this.number = 0;
     this.messages = [];

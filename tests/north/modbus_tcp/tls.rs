@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -52,7 +52,7 @@ fn sign_with_printable_role(dir: &Path, name: &str) {
 }
 
 /// Two CAs; below the first a server and clients of all kinds.
-pub(super) struct Works(TempDir);
+pub(super) struct Works(TempDir, #[expect(dead_code, reason = "holds the pipe")] Child);
 
 pub(super) static WORKS: LazyLock<Works> = LazyLock::new(|| {
     let dir = tempfile::tempdir().unwrap();
@@ -69,7 +69,15 @@ pub(super) static WORKS: LazyLock<Works> = LazyLock::new(|| {
     make(&own, &["client", "late", "operator"], "-1");
     make(&own, &["client", "malformed", "operator"], "30");
     sign_with_printable_role(&own, "malformed");
-    Works(dir)
+    // Nothing drops what is static: it is removed when this process ends and with it the pipe.
+    let mut sweeper = Command::new("sh");
+    sweeper.args(["-c", "cat >/dev/null; rm -rf \"$0\""]).arg(dir.path());
+    let sweeper = sweeper
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn();
+    Works(dir, sweeper.unwrap())
 });
 
 impl Works {

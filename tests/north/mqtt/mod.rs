@@ -1,6 +1,7 @@
 //! The MQTT client against Debian's Mosquitto and its clients.
 
 mod bench;
+mod certificates;
 mod commands;
 mod delivery;
 mod home_assistant;

@@ -61,10 +61,16 @@ fn mutual_tls() {
     let mut system_roots = good.clone();
     system_roots.ca = None;
     for (bad, why) in [
-        (foreign_ca, "UnknownIssuer"),
-        (no_certificate, "CertificateRequired"),
+        (
+            foreign_ca,
+            "is signed by `ca`, which is not among the certificates of mqtt.ca",
+        ),
+        (
+            no_certificate,
+            "it requires a client certificate (alert CertificateRequired); set mqtt.certificate and mqtt.key",
+        ),
         (missing_file, "nowhere.crt: No such file or directory"),
-        (system_roots, "UnknownIssuer"),
+        (system_roots, "is signed by `ca`, which is not among"),
     ] {
         let gateway = Gateway::start(bad, plant(&["p1"]));
         gateway.publish_event("p1", EventKind::Fault, "not delivered");

@@ -131,6 +131,8 @@ pub struct Drive {
     run_paused: [u16; 2],
     silent_at: Option<Instant>,
     mains: InPhase,
+    /// Requests to a drive of which nothing was ever heard; `None` once there was something.
+    in_vain: Option<u16>,
 }
 
 impl Drive {
@@ -156,6 +158,11 @@ impl Drive {
     /// Slowest beginning of a reply in the last minute, ms.
     pub fn slowest_ms(&self) -> f64 {
         f64::from(self.slowest.each(0).max().unwrap_or_default()) / 10.0
+    }
+
+    /// How often a drive was asked of which nothing was ever heard.
+    pub fn in_vain(&self) -> Option<u16> {
+        self.in_vain
     }
 
     fn was_silent(&self, at: Instant) -> bool {
@@ -205,6 +212,7 @@ impl Figures {
             run_paused: [0; 2],
             silent_at: None,
             mains: InPhase::default(),
+            in_vain: Some(0),
         };
         Figures {
             line,
@@ -340,6 +348,7 @@ impl Figures {
             End::Silent => {
                 drive.add(Sign::Tried);
                 drive.run = drive.run.saturating_add(1);
+                drive.in_vain = drive.in_vain.map(|asked| asked.saturating_add(1));
                 if let Some(count) = condition.and_then(|condition| drive.run_paused.get_mut(condition)) {
                     *count = count.saturating_add(1);
                 }
@@ -448,6 +457,7 @@ impl Figures {
         let Some(drive) = self.drives.get_mut(drive) else {
             return;
         };
+        drive.in_vain = None;
         let (run, paused) = (std::mem::take(&mut drive.run), std::mem::take(&mut drive.run_paused));
         if run == 0 || run > ABSENCE {
             return;

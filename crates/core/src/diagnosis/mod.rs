@@ -33,6 +33,8 @@ pub enum Cause {
     OneDrive,
     /// All drives are bad from one address on.
     FromAddress,
+    /// A drive has never answered, others do.
+    NeverAnswered,
     /// Two drives answer to one address.
     AddressTwice,
     /// Errors only while drives run.
@@ -63,10 +65,11 @@ pub enum Cause {
 
 impl Cause {
     /// All causes, in the order of the documentation.
-    pub const ALL: [Cause; 16] = [
+    pub const ALL: [Cause; 17] = [
         Cause::AllSilent,
         Cause::OneDrive,
         Cause::FromAddress,
+        Cause::NeverAnswered,
         Cause::AddressTwice,
         Cause::WhileRunning,
         Cause::Mains,
@@ -88,6 +91,7 @@ impl Cause {
             Cause::AllSilent => "all_silent",
             Cause::OneDrive => "one_drive",
             Cause::FromAddress => "from_address",
+            Cause::NeverAnswered => "never_answered",
             Cause::AddressTwice => "address_twice",
             Cause::WhileRunning => "while_running",
             Cause::Mains => "mains",

@@ -9,6 +9,10 @@ use super::{Cause, Certainty, Finding};
 
 /// The same of what would be told of the whole line.
 const FEW_OF_LINE: u32 = 10;
+/// Requests after which a drive that never answered is told.
+const IN_VAIN: u16 = 6;
+/// Most such drives that are told one by one.
+const NAMED: usize = 6;
 /// Share of exchanges below which a drive is good.
 const GOOD: f64 = 0.003;
 
@@ -61,6 +65,7 @@ impl Rules<'_> {
         self.while_running();
         self.mains();
         self.single_drives();
+        self.never_answered();
         self.silence_too_short();
         self.bias();
         self.reply_start_lost();
@@ -291,6 +296,41 @@ impl Rules<'_> {
             self.bad_tail(&bad, (failed, asked));
         } else if bad.len() * 2 < self.known.len() && bad.len() <= 3 {
             bad.iter().for_each(|one| self.one_drive(one, (failed, asked)));
+        }
+    }
+
+    /// A drive that is configured and not there, or set up otherwise. It is asked every ten seconds, so it is not compared.
+    fn never_answered(&mut self) {
+        let silent = |(place, drive): (usize, &super::Drive)| {
+            let asked = drive.in_vain().filter(|asked| *asked >= IN_VAIN)?;
+            Some((place, asked, drive.address))
+        };
+        let silent: Vec<_> = self.figures.drives.iter().enumerate().filter_map(silent).collect();
+        let answering = self
+            .figures
+            .drives
+            .iter()
+            .filter(|drive| drive.sum(Sign::Answered) > 0)
+            .count();
+        if silent.is_empty() || answering == 0 || self.has(Cause::FromAddress) {
+            return;
+        }
+        let others = format!("{answering} of {} drives of the line do", self.figures.drives.len());
+        if silent.len() > NAMED {
+            let names = self.names_of(silent.iter().map(|(place, ..)| *place));
+            let evidence = format!("{names} have never answered since the bus was started; {others}");
+            self.add(Cause::NeverAnswered, None, Certainty::Certain, evidence);
+            return;
+        }
+        for (place, asked, address) in silent {
+            if self.is_told(place) {
+                continue;
+            }
+            let evidence = format!(
+                "{} (address {address}) has never answered since the bus was started, {asked} requests so far; {others}",
+                self.name(place)
+            );
+            self.add(Cause::NeverAnswered, Some(place), Certainty::Certain, evidence);
         }
     }
 

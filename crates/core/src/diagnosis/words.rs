@@ -9,6 +9,7 @@ impl Cause {
             Cause::AllSilent => "no drive answers",
             Cause::OneDrive => "one drive is badly connected or slow, the others are good",
             Cause::FromAddress => "all drives are bad from one address on",
+            Cause::NeverAnswered => "it has never answered, and other drives do",
             Cause::AddressTwice => "two drives answer to one address",
             Cause::WhileRunning => "errors come only while drives run",
             Cause::Mains => "errors come in step with the mains",
@@ -39,6 +40,10 @@ impl Cause {
             Cause::FromAddress => {
                 "check the cable and terminals before the first of these drives, if addresses follow the cable, and the \
                  termination at both ends of the line"
+            }
+            Cause::NeverAnswered => {
+                "check its supply and that its bus is enabled, and, at its panel, address, protocol, baud and format; `drivegate scan` shows \
+                 which addresses answer; then its cable and terminals; take it out of the configuration if it is not there"
             }
             Cause::AddressTwice => {
                 "switch this drive off: if its address still answers, give the other drive another one"

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::SystemTime;
 
 use crate::document::{Finding, Reader};
-use crate::north::{IdentityFault, TlsFile, certificate_warnings};
+use crate::north::{IdentityFault, TlsFile, certificate_warnings, unreadable};
 
 /// Permissions of users who are neither owner nor in the group: to read, and to write.
 const OTHERS: u32 = 0o006;
@@ -28,10 +28,8 @@ pub(super) fn warn_of_readers(reader: &Reader<'_>, key: &str, path: &Path) {
 
 /// A file that the configuration names cannot be read.
 pub(super) fn cannot_read(path: &Path, error: &std::io::Error) -> Finding {
-    Finding::new(
-        format!("cannot read {}: {error}", path.display()),
-        "check the path and its permissions",
-    )
+    let (what, remedy) = unreadable(path, error);
+    Finding::new(what, remedy)
 }
 
 /// Reports what is wrong with the files of an identity at the key of each, by `name`.
@@ -60,9 +58,9 @@ pub(super) fn reported<T>(
     }
 }
 
-/// Warns of certificates in a PEM file that have expired or will soon; reports a file without certificates.
-pub(super) fn check_certificates(reader: &Reader<'_>, key: &str, path: &Path) {
-    match certificate_warnings(path, SystemTime::now()) {
+/// Warns of certificates in a PEM file by which the server `host` may not be trusted; reports a file without certificates.
+pub(super) fn check_certificates(reader: &Reader<'_>, key: &str, path: &Path, host: &str) {
+    match certificate_warnings(path, host, SystemTime::now()) {
         Ok(warnings) => {
             for text in &warnings {
                 let (what, remedy) = parts(text);

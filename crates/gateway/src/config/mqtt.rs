@@ -70,8 +70,8 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
             "write mqtts:// for TLS",
         );
     }
-    if tls {
-        check_certificates(reader, ca.as_deref(), identity.as_ref());
+    if let Some(broker) = broker.as_ref().filter(|broker| broker.tls) {
+        check_certificates(reader, &broker.host, ca.as_deref(), identity.as_ref());
     }
     let topics = MQTT.base.read(reader);
     let (min_interval, max_interval) = read_publish(reader)?;
@@ -253,19 +253,25 @@ fn warn_of_clear_text(reader: &Reader<'_>, host: &str, password: bool, commands:
     }
 }
 
-/// Whether the certificates are valid, and whether the key is that of its certificate.
-fn check_certificates(reader: &Reader<'_>, ca: Option<&Path>, identity: Option<&(PathBuf, PathBuf)>) {
-    if let Some(ca) = ca.filter(|ca| ca.is_file()) {
-        files::check_certificates(reader, MQTT.ca.name, ca);
+/// Whether the certificates are valid and of use for the broker at `host`, and whether the key is that of its certificate.
+fn check_certificates(reader: &Reader<'_>, host: &str, ca: Option<&Path>, identity: Option<&(PathBuf, PathBuf)>) {
+    if let Some(ca) = ca.filter(|ca| is_readable(ca)) {
+        files::check_certificates(reader, MQTT.ca.name, ca, host);
     }
-    if let Some((certificate, key)) = identity.filter(|(certificate, key)| certificate.is_file() && key.is_file()) {
+    if let Some((certificate, key)) = identity.filter(|(certificate, key)| is_readable(certificate) && is_readable(key))
+    {
         files::warn_of_readers(reader, MQTT.key.name, key);
-        let loaded = ServerIdentity::load(certificate, key, SystemTime::now());
+        let loaded = ServerIdentity::load_of_client(certificate, key, SystemTime::now());
         let _ = files::reported(reader, loaded, |file| match file {
             TlsFile::Key => MQTT.key.name,
             _ => MQTT.certificate.name,
         });
     }
+}
+
+/// What cannot be read was reported by [`read_pem`].
+fn is_readable(path: &Path) -> bool {
+    path.is_file() && File::open(path).is_ok()
 }
 
 /// Path of a PEM file that can be read now.

@@ -6,6 +6,7 @@ use std::sync::LazyLock;
 use super::*;
 use crate::process_image::TriggerLimit;
 
+mod certificates;
 mod files;
 mod listeners;
 mod page;

@@ -52,7 +52,7 @@ use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, L
 use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
 use super::log_throttle::LogThrottle;
 use super::refusals::Refusals;
-use super::{NorthStats, ServerError, ServerIdentity, ServerKind};
+use super::{NorthStats, ServerError, ServerIdentity, ServerKind, tls_words};
 use crate::history::History;
 use crate::plant::{DriveHandle, SharedPlant};
 
@@ -367,7 +367,8 @@ impl ConnectionHandler for HttpConnections {
         match closing.run_until_cancelled(handshake).await {
             Some(Ok(Ok(stream))) => self.serve_requests(stream, peer, local, &terms, &place).await,
             Some(Ok(Err(error))) => {
-                tracing::debug!(target: "drivegate::http", %peer, "HTTP: TLS handshake failed: {error}");
+                let why = tls_words::explain(&error, tls_words::Peer::Client).unwrap_or_else(|| error.to_string());
+                tracing::debug!(target: "drivegate::http", %peer, "HTTP: TLS handshake failed: {why}");
             }
             Some(Err(_)) | None => {}
         }

@@ -3,7 +3,7 @@
 use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use futures_util::future::{Either, select};
@@ -14,6 +14,7 @@ use tokio_rustls::server::TlsStream;
 use tokio_util::sync::CancellationToken;
 
 use super::client::Client;
+use super::frame::NotModbus;
 use super::routes::PlantView;
 use super::session::ClientSession;
 use super::tls::{AuthenticatedClient, Role, TlsAuthenticator};
@@ -208,7 +209,12 @@ impl Admission {
         let client = Client::new(peer, name, permit.place().rights().clone());
         let session = ClientSession::new(self.state.clone(), self.view.clone(), client);
         let idle_timeout = self.state.options.load().idle_timeout;
-        connection::serve(stream, session, idle_timeout, permit.place(), &self.state.stopping).await;
+        let spoken = connection::serve(stream, session, idle_timeout, permit.place(), &self.state.stopping).await;
+        if let Some(spoken @ NotModbus::Serial(_)) = spoken
+            && let Some(suppressed) = self.state.serial_clients.permit(Instant::now())
+        {
+            tracing::warn!(target: "drivegate::north::modbus_tcp", client = %peer.ip(), suppressed, "Modbus TCP: connection closed: {spoken}");
+        }
     }
 
     fn acquire(

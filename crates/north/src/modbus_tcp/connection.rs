@@ -52,14 +52,14 @@ enum End {
 }
 
 /// Serves a client until it disconnects, violates the protocol, is idle for `idle_timeout`, or must yield its `place`. Requests that
-/// wait for the bus are answered then, unless the whole server is `stopping`.
+/// wait for the bus are answered then, unless the whole server is `stopping`. Returns what it spoke instead of Modbus TCP.
 pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
     session: ClientSession,
     idle_timeout: Option<Duration>,
     place: &Place,
     stopping: &CancellationToken,
-) {
+) -> Option<NotModbus> {
     tracing::debug!(target: "drivegate::north::modbus_tcp", client = session.who(), "Modbus TCP: connected");
     let now = Instant::now();
     let mut connection = Connection {
@@ -86,6 +86,10 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
         let _ = tokio::time::timeout(CLOSE_TIMEOUT, connection.discard_input()).await;
     }
     tracing::debug!(target: "drivegate::north::modbus_tcp", client = connection.dialogue.who(), "Modbus TCP: {end}");
+    match end {
+        End::NotModbus(spoken) => Some(spoken),
+        _ => None,
+    }
 }
 
 /// Closes the connection of a client that is not served.

@@ -36,6 +36,8 @@ pub(super) struct Dialogue {
     input: Vec<u8>,
     /// Bytes in `input` that are not processed yet.
     filled: usize,
+    /// Whether any frame came.
+    begun: bool,
     /// When they came.
     arrivals: Arrivals,
     pub(super) output: Vec<u8>,
@@ -48,6 +50,7 @@ impl Dialogue {
             waiting: FuturesUnordered::new(),
             input: vec![0; INPUT_FIRST],
             filled: 0,
+            begun: false,
             arrivals: Arrivals::default(),
             output: Vec::new(),
         }
@@ -94,8 +97,15 @@ impl Dialogue {
             if self.is_full() || self.output.len() >= OUTPUT || consumed.frames >= TURN {
                 break None;
             }
-            match frame::decode(self.input.get(consumed.bytes..self.filled).unwrap_or_default()) {
+            let bytes = self.input.get(consumed.bytes..self.filled).unwrap_or_default();
+            if !self.begun
+                && let Some(misfit) = frame::of_serial_line(bytes)
+            {
+                break Some(misfit);
+            }
+            match frame::decode(bytes) {
                 Ok(Some(frame)) => {
+                    self.begun = true;
                     consumed.bytes += frame.used;
                     consumed.frames += 1;
                     let asked = self.arrivals.first().unwrap_or(now);

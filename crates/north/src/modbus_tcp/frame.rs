@@ -1,6 +1,7 @@
 //! MBAP framing: transaction id, protocol id 0, length, unit id, PDU.
 
 use crate::codec::modbus::MAX_PDU;
+use crate::codec::{ascii, rtu};
 
 /// Bytes before the PDU: transaction id, protocol id, length, unit id.
 pub(crate) const HEADER: usize = 7;
@@ -37,7 +38,29 @@ pub(crate) enum NotModbus {
     Protocol(u16),
     #[error("length {0} instead of 2 to 254")]
     Length(u16),
+    /// As from a client of a serial line that a device server would pass on.
+    #[error(
+        "the client speaks Modbus {0} over TCP; set it to Modbus TCP (MBAP), or let it use a tool slot of the bus ([[bus.slot]]), \
+         which takes frames of the line"
+    )]
+    Serial(&'static str),
 }
+
+/// What a connection begins with that never sent a frame of Modbus TCP, if it is a whole request of a serial line.
+pub(crate) fn of_serial_line(bytes: &[u8]) -> Option<NotModbus> {
+    if bytes.first() == Some(&b':') {
+        let whole = bytes.get(..ascii::request_len(bytes)?)?;
+        return ascii::decode_request(whole).map(|_| NotModbus::Serial("ASCII"));
+    }
+    // A read from address 0 has the protocol id of Modbus TCP, and its number of registers passes for the length: of a frame that
+    // is not complete yet, or of the shortest that there is. A complete longer one is no RTU, whatever its bytes add up to.
+    let whole = bytes.get(..rtu::request_len(bytes)?)?;
+    let is_rtu = bytes.get(1).is_some_and(|function| rtu::is_known(*function)) && rtu::decode_request(whole).is_some();
+    (is_rtu && !matches!(decode(bytes), Ok(Some(frame)) if frame.used > SHORTEST)).then_some(NotModbus::Serial("RTU"))
+}
+
+/// A frame with a function code and nothing else: what an RTU request for two registers from 0 passes for.
+const SHORTEST: usize = HEADER + 1;
 
 /// The frame at the beginning of `bytes`; `None` while it is incomplete.
 ///
@@ -126,9 +149,64 @@ mod tests {
         assert_eq!(decode(&[0, 1, 0, 0, 0, 254]), Ok(None));
     }
 
+    #[test]
+    fn requests_of_serial_lines() {
+        let rtu = |address: u8, pdu: &[u8]| {
+            let mut frame = Vec::new();
+            rtu::encode_frame(address, pdu, &mut frame);
+            frame
+        };
+        for frame in [
+            // From 0, where the beginning is one of Modbus TCP: 10 registers, 2 registers, 1 register.
+            rtu(1, &[3, 0, 0, 0, 10]),
+            rtu(1, &[3, 0, 0, 0, 2]),
+            rtu(1, &[3, 0, 0, 0, 1]),
+            rtu(17, &[4, 0x08, 0x34, 0, 11]),
+            rtu(5, &[16, 0, 0, 0, 1, 2, 0, 1]),
+            rtu(5, &[6, 0x07, 0xD0, 0, 1]),
+        ] {
+            for end in 0..frame.len() {
+                assert_eq!(of_serial_line(&frame[..end]), None, "{end} bytes of {frame:02X?}");
+            }
+            assert_eq!(of_serial_line(&frame), Some(NotModbus::Serial("RTU")), "{frame:02X?}");
+            let twice = [frame.clone(), frame].concat();
+            assert_eq!(
+                of_serial_line(&twice[..twice.len() - 1]),
+                Some(NotModbus::Serial("RTU"))
+            );
+        }
+        let mut line = Vec::new();
+        ascii::encode_frame(1, &[3, 0, 0, 0, 2], &mut line);
+        assert_eq!(of_serial_line(&line), Some(NotModbus::Serial("ASCII")));
+        assert_eq!(of_serial_line(&line[..line.len() - 1]), None);
+        assert_eq!(of_serial_line(b":\r\n"), None);
+        assert_eq!(of_serial_line(b"GET / HTTP/1.1\r\n"), None);
+    }
+
+    #[test]
+    fn no_request_of_modbus_tcp_is_taken_for_one_of_a_serial_line() {
+        for transaction in 0..=u16::MAX {
+            for unit in [0, 1, 17, 247, 255] {
+                for pdu in [
+                    &[3, 0, 0, 0, 1][..],
+                    &[4, 0x80, 0, 0, 125],
+                    &[6, 0, 1, 0, 1],
+                    &[1, 0, 0, 0, 16],
+                ] {
+                    let mut frame = Vec::new();
+                    encode(Header { transaction, unit }, &mut frame, |out| {
+                        out.extend_from_slice(pdu)
+                    });
+                    assert_eq!(of_serial_line(&frame), None, "{frame:02X?}");
+                }
+            }
+        }
+    }
+
     proptest! {
         #[test]
         fn any_bytes(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+            let _ = of_serial_line(&bytes);
             if let Ok(Some(frame)) = decode(&bytes) {
                 prop_assert!(frame.used <= bytes.len().min(MAX_FRAME));
             }

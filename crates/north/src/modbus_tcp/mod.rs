@@ -36,6 +36,7 @@ use self::routes::PlantView;
 use self::tls::{Requirements, TlsAuthenticator};
 use crate::connection_limit::{ConnectionLimit, Limits};
 use crate::listener::{ListenerSpec, Listeners, NewSockets};
+use crate::log_throttle::LogThrottle;
 use crate::plant::SharedPlant;
 use crate::refusals::Refusals;
 use crate::{NorthStats, ServerError, ServerKind, certificate};
@@ -50,6 +51,8 @@ pub fn certificate_role(der: &[u8]) -> Option<Result<Option<String>, String>> {
     Some(certificate.role.map_err(|why| why.to_string()))
 }
 
+/// Clients that speak as on a serial line connect again and again: a line this often.
+const SERIAL_LOGGED: Duration = Duration::from_secs(600);
 /// Section of the TLS listener.
 const TLS_SECTION: &str = "[modbus_tcp.tls]";
 /// Maximum number of TLS handshakes at one time, and how many of them one address may have. A handshake that takes long
@@ -294,6 +297,8 @@ struct ServerState {
     /// TLS connections before they are admitted.
     handshakes: Arc<ConnectionLimit>,
     refusals: Refusals,
+    /// Log lines about clients that speak as on a serial line.
+    serial_clients: LogThrottle,
     /// Cancelled when the server ends: its clients are not waited for any longer.
     stopping: CancellationToken,
 }
@@ -305,6 +310,7 @@ impl ServerState {
             connections: ConnectionLimit::new(options.limits()),
             handshakes: ConnectionLimit::new(options.handshakes()),
             refusals: Refusals::new(ServerKind::ModbusTcp, stats.clone()),
+            serial_clients: LogThrottle::every(SERIAL_LOGGED),
             options: ArcSwap::from_pointee(options),
             stats,
             command_words: CommandWords::default(),

@@ -19,8 +19,9 @@ use tokio_rustls::server::TlsStream;
 use super::crl::{self, Crls};
 use super::open_clients::{CertificateGuard, OpenClients};
 use crate::certificate::{self, RoleError};
-use crate::identity::{FileProblem, IdentityFault, ServerIdentity, TlsFile, provider, validity};
+use crate::identity::{FileProblem, IdentityFault, ServerIdentity, TlsFile, provider, unsupported_ca, validity};
 use crate::pem;
+use crate::tls_words::{self, Peer};
 
 /// Time limit of a handshake.
 const HANDSHAKE: Duration = Duration::from_secs(10);
@@ -80,10 +81,10 @@ impl Identity {
         let server = ServerIdentity::load(certificate, key, now).map_err(|faults| errors.extend(faults));
         let ca = pem::certificates(client_ca).map_err(|error| errors.push(TlsFile::ClientCa.fault(error)));
         // An expired CA is still a trust anchor (RFC 5280, 6.1.1), so it refuses nobody.
-        let anchors = ca
-            .iter()
-            .flatten()
-            .filter_map(|anchor| validity(client_ca, anchor, now));
+        let anchors = ca.iter().flatten().flat_map(|anchor| {
+            let unsupported = unsupported_ca(client_ca, anchor);
+            validity(client_ca, anchor, now).into_iter().chain(unsupported)
+        });
         warnings.extend(anchors.map(|problem| TlsFile::ClientCa.fault(problem)));
         let lists = client_crl.map(|file| crl::load(file, ca.as_deref().unwrap_or_default(), now));
         let lists = lists
@@ -109,18 +110,18 @@ impl Identity {
     /// Verifies the certificates of clients. Once there are revocation lists, each CA in the chain of a client must
     /// have one; a list remains in force when it is out of date.
     fn verifier(&self) -> Result<Arc<dyn ClientCertVerifier>, IdentityFault> {
-        let unusable_ca =
-            |error: &dyn std::fmt::Display| TlsFile::ClientCa.fault(FileProblem::UnusableCa(error.to_string()));
+        let unusable_ca = |why: &str| TlsFile::ClientCa.fault(FileProblem::UnusableCa(why.to_string()));
         let mut roots = RootCertStore::empty();
         for anchor in &self.client_ca {
-            roots.add(anchor.clone()).map_err(|error| unusable_ca(&error))?;
+            let added = roots.add(anchor.clone());
+            added.map_err(|_| unusable_ca("it is not valid X.509"))?;
         }
         WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider())
             .with_crls(self.client_crl.clone())
             .build()
             .map_err(|error| match error {
                 VerifierBuilderError::InvalidCrl(error) => TlsFile::ClientCrl.fault(FileProblem::UnsupportedCrl(error)),
-                error => unusable_ca(&error),
+                error => unusable_ca(&error.to_string()),
             })
     }
 
@@ -197,12 +198,16 @@ pub(super) struct AuthenticatedClient {
 pub(super) enum AuthenticationError {
     #[error("the handshake took longer than {HANDSHAKE:?}")]
     Timeout,
-    #[error(transparent)]
+    #[error("{}", in_words(.0))]
     Handshake(#[from] io::Error),
     #[error(transparent)]
     Role(#[from] RoleError),
-    #[error("a reload during the handshake: {0}")]
+    #[error("a reload during the handshake: {}", in_words(.0))]
     Renewed(#[from] rustls::Error),
+}
+
+fn in_words(error: &(dyn std::error::Error + 'static)) -> String {
+    tls_words::explain(error, Peer::Client).unwrap_or_else(|| error.to_string())
 }
 
 impl TlsAuthenticator {

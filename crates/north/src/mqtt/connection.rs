@@ -26,6 +26,7 @@ use super::broker_limits::{BrokerLimits, Lack};
 use super::outbox::Message;
 use super::request::Incoming;
 use super::silence::{KEEP_ALIVE_S, Silence, Verdict};
+use crate::tls_words;
 
 /// Why a broker refuses filters with wildcards.
 pub(super) const NO_WILDCARDS: &str = "WildcardSubscriptionsNotSupported";
@@ -498,6 +499,10 @@ const MQTT_5: &str = "the gateway requires MQTT 5: use Mosquitto 1.6 or later, o
 /// The broker ended an accepted connection, and did not say why.
 pub(super) const CLOSED: &str = "the broker closed the connection";
 
+/// The broker ended the connection before TLS was there, and did not say why.
+const HANDSHAKE_END: &str = "the broker closed the connection during the TLS handshake: it does perhaps not speak TLS on this port, \
+    or refuses the gateway; check the port in mqtt.url, usually 8883, and the broker's log";
+
 /// Whether the other end closed the connection.
 fn is_closed(error: &ConnectionError) -> bool {
     let io = match error {
@@ -522,7 +527,8 @@ fn reason(error: &ConnectionError) -> String {
             ConnectionError::Timeout(_) => "timed out".to_string(),
             ConnectionError::MqttState(StateError::AwaitPingResp) => "the broker no longer responds".to_string(),
             ConnectionError::MqttState(StateError::ConnectionAborted) => CLOSED.to_string(),
-            _ => error.to_string(),
+            ConnectionError::Tls(tls) if tls_words::is_handshake_end(tls) => HANDSHAKE_END.to_string(),
+            _ => tls_words::explain(error, tls_words::BROKER).unwrap_or_else(|| error.to_string()),
         };
     };
     if *code == UnsupportedProtocolVersion {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use rustls::ClientConfig;
 
 use super::Options;
-use crate::identity::{self, RootsError, provider};
+use crate::identity::{self, IdentityFault, RootsError};
 use crate::pem::{self, PemError};
 
 /// Why TLS towards the broker cannot be set up, and what to do.
@@ -15,10 +15,8 @@ pub(super) enum TlsConfigError {
     Pem(#[from] PemError),
     #[error(transparent)]
     Roots(#[from] RootsError),
-    #[error("{file}: certificate and key cannot be used: {cause}")]
-    UnusableIdentity { file: String, cause: rustls::Error },
-    #[error("TLS: {0}")]
-    Protocol(rustls::Error),
+    #[error("{file}: {cause}")]
+    UnusableIdentity { file: String, cause: Box<IdentityFault> },
 }
 
 /// Reads the certificates and keys of `options`; `None` without TLS. Blocking: it reads files.
@@ -29,18 +27,18 @@ pub(super) fn client_config(options: &Options) -> Result<Option<Arc<ClientConfig
     if !options.tls {
         return Ok(None);
     }
-    let builder = ClientConfig::builder_with_provider(provider())
-        .with_safe_default_protocol_versions()
-        .map_err(TlsConfigError::Protocol)?
-        .with_root_certificates(identity::roots(options.ca.as_deref())?);
+    let builder = identity::client_builder(options.ca.as_deref())?;
     let config = match &options.identity {
         None => builder.with_no_client_auth(),
-        Some((certificate, key)) => builder
-            .with_client_auth_cert(pem::certificates(certificate)?, pem::private_key(key)?)
-            .map_err(|cause| TlsConfigError::UnusableIdentity {
-                file: certificate.display().to_string(),
-                cause,
-            })?,
+        Some((certificate, key)) => {
+            let chain = pem::certificates(certificate)?;
+            builder
+                .with_client_auth_cert(chain.clone(), pem::private_key(key)?)
+                .map_err(|cause| TlsConfigError::UnusableIdentity {
+                    file: certificate.display().to_string(),
+                    cause: Box::new(identity::unusable(&cause, &chain)),
+                })?
+        }
     };
     Ok(Some(Arc::new(config)))
 }

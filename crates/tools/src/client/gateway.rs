@@ -9,7 +9,10 @@ use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
 use super::{ClientError, Url};
-use crate::north::client_tls;
+use crate::north::{GATEWAY, client_tls, explain};
+
+/// What to do about a handshake that says nothing of its own.
+const NO_TLS: &str = "pass the CA of the gateway's certificate with --ca, or use http://";
 
 /// The options that say which gateway is asked, and how.
 #[derive(Debug, Clone, clap::Args)]
@@ -68,9 +71,14 @@ impl Gateway {
 
     async fn with_tls(&self, socket: TcpStream) -> Result<TlsStream<TcpStream>, ClientError> {
         let config = client_tls(self.ca.as_deref()).map_err(ClientError::File)?;
-        let failed = |why: String| ClientError::Tls(self.url.clone(), why);
+        let failed = |why: String| {
+            let (what, remedy) = why.split_once("; ").unwrap_or((&why, NO_TLS));
+            ClientError::Tls(format!("{what}; {}; {remedy}", self.url))
+        };
         let name = ServerName::try_from(self.url.host.clone()).map_err(|error| failed(error.to_string()))?;
         let handshake = TlsConnector::from(config).connect(name, socket);
-        handshake.await.map_err(|error| failed(error.to_string()))
+        handshake
+            .await
+            .map_err(|error| failed(explain(&error, GATEWAY).unwrap_or_else(|| error.to_string())))
     }
 }

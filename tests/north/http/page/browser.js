@@ -13,7 +13,13 @@ const KEYS = { Tab: 9, Enter: 13, Home: 36, End: 35, ArrowLeft: 37, ArrowRight: 
 class Browser {
   constructor() {
     this.profile = fs.mkdtempSync(path.join(os.tmpdir(), "drivegate-chromium-"));
-    this.child = spawn("chromium", [...FLAGS, `--user-data-dir=${this.profile}`], { stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"] });
+    // Its own temporary files are removed with the profile, however this process ends.
+    const env = { ...process.env, TMPDIR: this.profile };
+    this.child = spawn("chromium", [...FLAGS, `--user-data-dir=${this.profile}`], { env, stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"] });
+    process.on("exit", () => {
+      this.child.kill("SIGKILL");
+      fs.rmSync(this.profile, { recursive: true, force: true });
+    });
     this.child.on("error", (error) => this.fail(new Error(`${error.message}: is Debian's package chromium installed?`)));
     this.child.on("exit", (code) => this.fail(new Error(`Chromium ended with ${code}`)));
     this.waiting = new Map();

@@ -104,7 +104,10 @@ fn revocations_are_checked_before_they_refuse_everybody() {
     let old = "-crl_lastupdate 20260101000000Z -crl_nextupdate 20260102000000Z";
     for (file, wanted) in [
         (dir.join("no.crl"), "cannot read "),
-        (certificates().join("gateway.crt"), "gateway.crt contains no CRL; "),
+        (
+            certificates().join("gateway.crt"),
+            "gateway.crt contains no CRL, but a certificate; ",
+        ),
         (dir.join("cut.crl"), "contains no usable CRL: "),
         (revocations(dir, "v1.crl", BOOK, "-crldays 30"), "CRLs of version 2"),
         (dir.join("same/ca.crl"), "is not signed by the CA in client_ca"),

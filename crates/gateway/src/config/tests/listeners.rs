@@ -1,6 +1,7 @@
 //! Listeners and certificates.
 
 use std::path::Path;
+use std::process::{Child, Command, Stdio};
 use std::sync::LazyLock;
 use std::time::Duration;
 
@@ -8,8 +9,16 @@ use super::{FORM, FULL, load, settings};
 
 /// Directory of a CA and a server certificate, made by the script of the documentation.
 pub(super) fn certificates() -> &'static Path {
-    static DIR: LazyLock<tempfile::TempDir> = LazyLock::new(|| {
+    static DIR: LazyLock<(tempfile::TempDir, Child)> = LazyLock::new(|| {
         let dir = tempfile::tempdir().unwrap();
+        // Nothing drops what is static: it is removed when this process ends and with it the pipe.
+        let mut sweeper = Command::new("sh");
+        sweeper.args(["-c", "cat >/dev/null; rm -rf \"$0\""]).arg(dir.path());
+        let sweeper = sweeper
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn();
         for arguments in [&["ca"][..], &["server", "gateway"], &["server", "other"]] {
             // A day less than the thirty from which a warning is given, at any second.
             certificate(dir.path(), arguments, "29");
@@ -17,15 +26,15 @@ pub(super) fn certificates() -> &'static Path {
         certificate(dir.path(), &["server", "expired"], "-1");
         certificate(dir.path(), &["crl"], "30");
         std::fs::write(dir.path().join("tokens"), "").unwrap();
-        dir
+        (dir, sweeper.unwrap())
     });
-    DIR.path()
+    DIR.0.path()
 }
 
 /// Runs the script of the documentation.
 pub(super) fn certificate(dir: &Path, arguments: &[&str], days: &str) {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/modbus-tls-ca.sh");
-    let output = std::process::Command::new(script)
+    let output = Command::new(script)
         .arg(dir)
         .args(arguments)
         .env("DAYS", days)
@@ -168,7 +177,7 @@ fn errors_of_certificates_name_file_and_key() {
         (
             "gateway.crt",
             file("gateway.key"),
-            "gateway.key contains no certificate; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; specify a PEM file",
+            "gateway.key contains no certificate, but a private key; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; specify the certificate: are certificate and key swapped?",
         ),
         (
             "gateway.crt",

@@ -67,8 +67,9 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         .acquire(newcomer, Instant::now().into_std(), || Some(Authority::ReadOnly))
         .unwrap();
     let place = permit.place().clone();
-    let server =
-        tokio::spawn(async move { serve(end, session, idle_timeout, permit.place(), &CancellationToken::new()).await });
+    let server = tokio::spawn(async move {
+        serve(end, session, idle_timeout, permit.place(), &CancellationToken::new()).await;
+    });
     Bench {
         client,
         server,
