@@ -68,7 +68,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         .unwrap();
     let place = permit.place().clone();
     let server = tokio::spawn(async move {
-        drop(serve(end, session, idle_timeout, permit.place(), &CancellationToken::new()).await)
+        let _ = serve(end, session, idle_timeout, permit.place(), &CancellationToken::new()).await;
     });
     Bench {
         client,
