@@ -7,7 +7,7 @@ from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient
 
 port, framer, baud, count = sys.argv[1], FramerType(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
-client = ModbusSerialClient(port, framer=framer, baudrate=baud, timeout=30, retries=0)
+client = ModbusSerialClient(port, framer=framer, baudrate=baud, timeout=10, retries=5)
 if not client.connect():
     sys.exit(f"cannot open {port}")
 client.write_registers(2000, [1, 0, 4000], device_id=1)

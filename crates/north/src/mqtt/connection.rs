@@ -518,6 +518,10 @@ fn is_closed(error: &ConnectionError) -> bool {
     )
 }
 
+fn in_words(error: &(dyn std::error::Error + 'static)) -> String {
+    tls_words::explain(error, tls_words::BROKER).unwrap_or_else(|| error.to_string())
+}
+
 fn reason(error: &ConnectionError) -> String {
     use ConnectReturnCode::{
         BadUserNamePassword, Banned, ClientIdentifierNotValid, NotAuthorized, UnsupportedProtocolVersion,
@@ -528,7 +532,9 @@ fn reason(error: &ConnectionError) -> String {
             ConnectionError::MqttState(StateError::AwaitPingResp) => "the broker no longer responds".to_string(),
             ConnectionError::MqttState(StateError::ConnectionAborted) => CLOSED.to_string(),
             ConnectionError::Tls(tls) if tls_words::is_handshake_end(tls) => HANDSHAKE_END.to_string(),
-            _ => tls_words::explain(error, tls_words::BROKER).unwrap_or_else(|| error.to_string()),
+            // What cannot be decoded hides that it could not be read, as after an alert of TLS 1.3.
+            ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(io))) => in_words(io),
+            _ => in_words(error),
         };
     };
     if *code == UnsupportedProtocolVersion {

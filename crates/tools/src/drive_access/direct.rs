@@ -13,8 +13,9 @@ use crate::north::local::{SocketPath, answer};
 use crate::plant::DriveHandle;
 use crate::process_image::{OnShutdown, Reading};
 
-/// Time to open the port.
-const OPEN: Duration = Duration::from_millis(1500);
+/// Time to open the port, on a machine however busy; and how long one that cannot be opened is tried.
+const OPEN: Duration = Duration::from_secs(10);
+const TRIED: Duration = Duration::from_millis(750);
 /// Time until the drive answers, beyond that of its tries.
 const ANSWERS: Duration = Duration::from_secs(2);
 /// Time for all points of a slow line.
@@ -78,7 +79,7 @@ impl Direct {
     async fn reach(&self, target: &Target, not_found: &NotFound) -> Result<(), String> {
         let health = || self.drive.bus.image.health();
         let begun = Instant::now();
-        until(OPEN, || health().up || (health().tried && begun.elapsed() > OPEN / 2)).await;
+        until(OPEN, || health().up || (health().tried && begun.elapsed() > TRIED)).await;
         if !health().up {
             let why = health().reason;
             return Err(format!(

@@ -18,7 +18,8 @@ class Browser {
     this.child = spawn("chromium", [...FLAGS, `--user-data-dir=${this.profile}`], { env, stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"] });
     process.on("exit", () => {
       this.child.kill("SIGKILL");
-      fs.rmSync(this.profile, { recursive: true, force: true });
+      // Its children write for a moment longer.
+      fs.rmSync(this.profile, { recursive: true, force: true, maxRetries: 50, retryDelay: 100 });
     });
     this.child.on("error", (error) => this.fail(new Error(`${error.message}: is Debian's package chromium installed?`)));
     this.child.on("exit", (code) => this.fail(new Error(`Chromium ended with ${code}`)));
@@ -117,6 +118,26 @@ class Page {
       if (found) return found;
       if (Date.now() > end) throw new Error(`waited for ${code} ${JSON.stringify(args)} in\n${await this.eval("document.body.innerText")}\n${this.problems.join("\n")}`);
       await new Promise((resolve) => setTimeout(resolve, 50));
+    }
+  }
+
+  /// What axe-core, the source of which is `axe`, finds in the page. On a busy machine a connection may be lost, which greys the
+  /// page: it is looked at again then.
+  async violations(axe) {
+    if (!(await this.eval("Boolean(window.axe)"))) await this.eval(`${axe}; true`);
+    for (;;) {
+      await this.until(() => !document.body.classList.contains("lost"));
+      const { lost, found } = await this.eval(async () => {
+        let lost = false;
+        const watcher = new MutationObserver(() => (lost ||= document.body.classList.contains("lost")));
+        watcher.observe(document.body, { attributes: true, attributeFilter: ["class"] });
+        const { violations } = await window.axe.run(document, { resultTypes: ["violations"] });
+        watcher.disconnect();
+        const shown = (node) => `${node.html.slice(0, 200)} ${node.any.concat(node.all, node.none).map((each) => each.message).join("; ")}`;
+        const found = violations.map(({ id, help, nodes }) => `${id}: ${help}: ${nodes.slice(0, 3).map(shown).join("\n")}`);
+        return { lost: lost || document.body.classList.contains("lost"), found };
+      });
+      if (!lost || found.length === 0) return found;
     }
   }
 

@@ -43,10 +43,7 @@ async function opened(gateway, page, address = "#/", more = {}) {
 }
 
 async function accessible(page, state) {
-  // On a busy machine a connection may be lost, which greys the page.
-  await page.until(() => !document.body.classList.contains("lost"));
-  if (!(await page.eval("Boolean(window.axe)"))) await page.eval(`${AXE}; true`);
-  const violations = await page.eval(async () => (await window.axe.run(document, { resultTypes: ["violations"] })).violations.map(({ id, nodes }) => `${id}: ${nodes.map(({ html }) => html).join("\n")}`));
+  const violations = await page.violations(AXE);
   assert.deepEqual(violations, [], state);
 }
 

@@ -32,11 +32,7 @@ async function looks(page, [hash, sign, wanted], base, check) {
   const width = await page.eval("[document.documentElement.scrollWidth, innerWidth]");
   assert.ok(width[0] <= width[1], `${hash} is ${width[0]} px wide in a window of ${width[1]} px`);
   if (!check) return;
-  if (!(await page.eval("Boolean(window.axe)"))) await page.eval(`${AXE}; true`);
-  const violations = await page.eval(async () => {
-    const { violations } = await window.axe.run(document, { resultTypes: ["violations"] });
-    return violations.map(({ id, help, nodes }) => `${id}: ${help}: ${nodes.slice(0, 3).map((node) => `${node.html.slice(0, 200)} ${node.any.concat(node.all, node.none).map((each) => each.message).join("; ")}`).join("\n")}`);
-  });
+  const violations = await page.violations(AXE);
   assert.equal(violations.join("\n"), "", `${hash} at ${width[1]} px`);
 }
 
