@@ -155,8 +155,8 @@ async function operate(browser) {
   await browser.press("button[aria-label='Start now: pump-1']");
   await browser.until("the start", result("Start forward: confirmed"));
   await browser.until("it runs", "document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
-  // The lease of 4 s is renewed while the person is active.
-  for (let turn = 0; turn < 12; turn += 1) {
+  // The lease of 8 s is renewed while the person is active.
+  for (let turn = 0; turn < 24; turn += 1) {
     await browser.key("Tab");
     await new Promise((done) => setTimeout(done, 500));
   }

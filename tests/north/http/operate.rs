@@ -12,7 +12,7 @@ const COMMANDS: &str = "commands = true\nusers_file = \"users\"\n";
 
 /// A gateway with commands, of a drive whose lease is short, and one that is monitored.
 fn site() -> Site {
-    let keys = "limits = { speed_reference = [0.0, 80.0] }\nsupervision = { timeout = \"4s\", action = \"stop\" }";
+    let keys = "limits = { speed_reference = [0.0, 80.0] }\nsupervision = { timeout = \"8s\", action = \"stop\" }";
     let drives = [controlled("pump-1", 1, keys), drive("fan-2", 2, "")].concat();
     let site = Site::of(&[LINE1, &drives, HTTP, COMMANDS]);
     user(&site, &["add"], "alice", "correct horse\n");
