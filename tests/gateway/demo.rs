@@ -104,8 +104,15 @@ fn pasted(line: &str) -> Output {
 
 /// Examples that read from a gateway at its usual ports, or need none; without the programs that only arrange what is printed.
 fn examples_of_the_pages() -> Vec<String> {
-    let pages = ["http", "history", "modbus-tcp", "profiles", "troubleshooting", "commands"]
-        .map(|page| root().join(format!("docs/{page}.md")));
+    let pages = [
+        "http",
+        "history",
+        "modbus-tcp",
+        "profiles",
+        "troubleshooting",
+        "commands",
+    ]
+    .map(|page| root().join(format!("docs/{page}.md")));
     let text = pages.map(|page| std::fs::read_to_string(page).unwrap()).concat();
     let reads = |line: &&str| {
         ["curl -s ", "mbpoll -m tcp ", "drivegate profiles"]
