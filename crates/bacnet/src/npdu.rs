@@ -39,7 +39,7 @@ pub mod message {
     pub const INITIALIZE_TABLE_ACK: u8 = 0x07;
 }
 
-fn address<'a>(bytes: &'a [u8], may_be_all: bool) -> Option<((u16, Mac), &'a [u8])> {
+fn address(bytes: &[u8], may_be_all: bool) -> Option<((u16, Mac), &[u8])> {
     let [high, low, len, rest @ ..] = bytes else {
         return None;
     };

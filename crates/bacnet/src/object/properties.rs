@@ -169,9 +169,8 @@ fn of_object(object: &Object) -> (Vec<P>, Vec<P>) {
             }
         }
         Kind::Binary { .. } => {
-            match object.id.kind {
-                ObjectType::BINARY_INPUT => required.push(P::POLARITY),
-                _ => {}
+            if object.id.kind == ObjectType::BINARY_INPUT {
+                required.push(P::POLARITY);
             }
             optional.extend([P::INACTIVE_TEXT, P::ACTIVE_TEXT]);
         }
