@@ -239,6 +239,12 @@ impl Address {
         *self.host.ip()
     }
 
+    /// Network and station behind the host, in words; empty for the host itself.
+    pub fn remote_text(&self) -> String {
+        let text = self.to_string();
+        text.split_once(' ').map_or(String::new(), |(_, rest)| rest.to_string())
+    }
+
     /// The host as six octets.
     pub fn host_octets(host: SocketAddrV4) -> [u8; 6] {
         let [a, b, c, d] = host.ip().octets();

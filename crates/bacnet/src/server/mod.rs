@@ -231,6 +231,18 @@ impl Server {
         self.exchanges.is_busy()
     }
 
+    /// Devices to which somebody subscribes.
+    pub fn subscribed(&self) -> Vec<u32> {
+        self.cov.devices()
+    }
+
+    /// Registers at that BBMD from now on.
+    pub fn set_bbmd(&mut self, bbmd: Option<SocketAddrV4>, now: Instant) {
+        self.options.bbmd = bbmd;
+        self.environment.port.bbmd = bbmd.map(|bbmd| (bbmd, bbmd::LIFETIME));
+        self.foreign = Foreign::new(bbmd, now);
+    }
+
     /// What became of the registration at the BBMD.
     pub fn registration(&self) -> Registration {
         self.foreign.state

@@ -19,7 +19,7 @@ mod standing;
 mod ticket;
 mod touched;
 
-pub use admit::{Admitted, admit, may_restore, sets_twice, written};
+pub use admit::{Admitted, admit, converted, may_restore, sets_twice, written};
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
 pub use audit::{SENT, milliseconds, milliseconds_or_null};
 pub use background::{
