@@ -11,6 +11,7 @@ mod support;
 
 mod gateway {
     mod audit;
+    mod bacnet;
     mod bad_commands;
     mod cli;
     mod commands;

@@ -375,7 +375,7 @@ impl Task {
 
     async fn save(&mut self) {
         let Some(path) = self.keep_file() else { return };
-        let slots = self.kept.clone();
+        let slots = kept::of_plant(&self.plant.load());
         // A thread that panicked has logged that.
         let _ = tokio::task::spawn_blocking(move || kept::save(&path, &slots)).await;
     }

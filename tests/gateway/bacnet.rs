@@ -1,0 +1,497 @@
+//! BACnet/IP from outside: bacpypes3 and node-bacnet, which know nothing of each other, against the real gateway with simulated
+//! drives; tshark reads what they say.
+
+use std::io::Write as _;
+use std::net::UdpSocket;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use serde_json::{Value as Json, json};
+
+use crate::support::process::{Running, api, get, mbpoll_write, until};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled, drive};
+use crate::support::tools::{python, root, run, tool};
+
+/// A port that no UDP socket of this machine has.
+fn free_udp_port() -> u16 {
+    UdpSocket::bind("0.0.0.0:0").unwrap().local_addr().unwrap().port()
+}
+
+/// A gateway with BACnet/IP, at 127.0.0.10.
+struct Plant {
+    site: Site,
+    gateway: Running,
+    _drives: Running,
+    port: u16,
+}
+
+/// `parts` are the buses and drives, `keys` further lines of `[bacnet]`.
+fn plant(parts: &[&str], keys: &str, simulate: impl Fn(&Site) -> Running) -> Plant {
+    let port = free_udp_port();
+    let bacnet =
+        format!("[bacnet]\nlisten = \"127.0.0.10:{port}\"\ncommands = true\nwrite = [\"127.0.0.16/28\"]\n{keys}\n");
+    let site = Site::of(&[&parts.concat(), MODBUS_TCP, HTTP, &bacnet]);
+    let drives = simulate(&site);
+    let gateway = site.run_ready();
+    Plant {
+        site,
+        gateway,
+        _drives: drives,
+        port,
+    }
+}
+
+/// Drives 1 and 2 on `line1`; only the first takes commands.
+fn pumps(keys: &str) -> Plant {
+    let drives = controlled("pump-1", 1, "limits = { speed_reference = [0.0, 80.0] }") + &drive("pump-2", 2, "");
+    let line = LINE1.replace("profile_dirs", "state_dir = \"state\"\nprofile_dirs");
+    plant(&[&line, &drives], keys, |site| {
+        site.simulate(&["--addresses", "1-2", "--baud", "38400"])
+    })
+}
+
+impl Plant {
+    fn address(&self) -> String {
+        format!("127.0.0.10:{}", self.port)
+    }
+
+    /// The answers of bacpypes3, whose client is at that address.
+    fn bacpypes(&self, host: u8, orders: &[Json]) -> Vec<Json> {
+        let own = format!("127.0.0.{host}/8:{}", free_udp_port());
+        let script = root().join("tests/peers/bacnet_client.py").display().to_string();
+        let mut command = Command::new(python());
+        command.args([&script, &own, &self.address(), "1001"]);
+        asked(&mut command, orders)
+    }
+
+    /// Those of node-bacnet. It sends to its own port, so the gateway must have the same.
+    fn node(&self, host: u8, orders: &[Json]) -> Vec<Json> {
+        let script = root().join("tests/peers/bacnet_node.js").display().to_string();
+        let mut command = Command::new(tool("node"));
+        command.env("NODE_PATH", root().join(".tools/node/node_modules"));
+        let (own, port) = (format!("127.0.0.{host}"), self.port.to_string());
+        command.args([&script, &own, &port, &self.address(), "1001"]);
+        asked(&mut command, orders)
+    }
+
+    fn value(&self, object: &str, property: &str) -> Json {
+        self.bacpypes(20, &[json!(["read", 1, object, property])]).remove(0)
+    }
+}
+
+fn started(command: &mut Command, orders: &[Json]) -> Child {
+    let mut child = command
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let lines: String = orders.iter().map(|order| format!("{order}\n")).collect();
+    child.stdin.take().unwrap().write_all(lines.as_bytes()).unwrap();
+    child
+}
+
+fn answers(child: Child, count: usize) -> Vec<Json> {
+    let output = child.wait_with_output().unwrap();
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    let all: Vec<Json> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(all.len(), count, "{text}{}", String::from_utf8_lossy(&output.stderr));
+    all
+}
+
+fn asked(command: &mut Command, orders: &[Json]) -> Vec<Json> {
+    answers(started(command, orders), orders.len())
+}
+
+const RUN: &str = "binary-value,1";
+const PV: &str = "present-value";
+
+/// A write to `run` of the first drive.
+fn run_at(priority: u8, value: impl Into<Json>) -> Json {
+    json!(["write", 1, RUN, PV, value.into(), priority])
+}
+
+fn slots(plant: &Plant) -> Vec<(usize, Json)> {
+    let all = plant.value(RUN, "priority-array");
+    let all = all.as_array().unwrap().iter().enumerate();
+    all.filter(|(_, value)| !value.is_null())
+        .map(|(place, value)| (place + 1, value.clone()))
+        .collect()
+}
+
+#[test]
+fn every_family_shows_what_http_tells() {
+    let families = [
+        ("vacon-nx", "modbus-rtu", 38_400, "8N1"),
+        ("eaton-svx", "modbus-rtu", 38_400, "8N1"),
+        ("eaton-hvx", "modbus-rtu", 38_400, "8N1"),
+        ("vacon-cx", "modbus-rtu", 19_200, "8N2"),
+        ("teco-7300pa", "modbus-ascii", 19_200, "7N2"),
+        ("vacon-nx-n2", "n2", 9600, "8N1"),
+        ("eaton-hvx-n2", "n2", 9600, "8N1"),
+        ("teco-7300pa-n2", "n2", 9600, "8N1"),
+    ];
+    let mut buses = "[gateway]\nname = \"test\"\n".to_string();
+    for (unit, (profile, protocol, baud, format)) in (1..).zip(families) {
+        buses += &format!(
+            "[[bus]]\nname = \"{profile}\"\nport = \"{profile}\"\nprotocol = \"{protocol}\"\nbaud = {baud}\nformat = \"{format}\"\n\
+             response_timeout = \"2s\"\n[[bus.drive]]\nname = \"d{unit}\"\naddress = {unit}\nprofile = \"{profile}\"\n"
+        );
+    }
+    let plant = plant(&[&buses], "", |site| {
+        let simulator = Running::drivegate(&["simulate", "--config", &site.config()]);
+        simulator.until_printed("Ctrl-C ends");
+        simulator
+    });
+    let ids: Vec<u32> = (100..=108).collect();
+    let heard = plant.bacpypes(
+        20,
+        &[
+            json!(["who_is", null, null, "global"]),
+            json!(["who_is", 103, 104, "global"]),
+        ],
+    );
+    assert_eq!(heard, [json!(ids), json!([103, 104])]);
+    for (unit, (profile, ..)) in (1..).zip(families) {
+        let name = format!("d{unit}");
+        until(&format!("{profile} was read"), || {
+            (api(plant.site.http, &name)["state"] != "offline").then_some(())
+        });
+        let objects = plant
+            .bacpypes(
+                20,
+                &[json!(["read", unit, format!("device,{}", 100 + unit), "object-list"])],
+            )
+            .remove(0);
+        let objects: Vec<String> = objects
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|id| id.as_str().unwrap().to_string())
+            .collect();
+        assert!(objects.len() > 15, "{profile}: {objects:?}");
+        // What a motor that stands shows does not move; a value may be read between two looks all the same.
+        until(&format!("all of {profile} is as HTTP tells"), || {
+            let before = api(plant.site.http, &name);
+            let order = [
+                vec![json!("all"), json!(unit)],
+                objects.iter().map(|id| json!(id)).collect(),
+            ]
+            .concat();
+            let all = plant.bacpypes(20, &[Json::Array(order)]).remove(0);
+            let mut compared = 0;
+            for (id, properties) in all.as_object().unwrap() {
+                let Some(point) = before["points"].get(properties["object-name"].as_str().unwrap()) else {
+                    continue;
+                };
+                let (shown, told) = (&properties[PV], &point["value"]);
+                let good = point["quality"] == "good";
+                assert_eq!(
+                    properties["reliability"] == 0,
+                    good,
+                    "{profile} {id}: {properties} {point}"
+                );
+                assert_eq!(
+                    properties["status-flags"],
+                    json!([0, u8::from(!good), 0, 0]),
+                    "{profile} {id}"
+                );
+                let told = match told {
+                    Json::Bool(on) => f64::from(u8::from(*on)),
+                    told => told.as_f64().unwrap_or(0.0),
+                };
+                let is_state = id.starts_with("multi-state");
+                let shown = shown.as_f64().unwrap_or(f64::NAN);
+                if !is_state && (shown - told).abs() > 1e-4 * told.abs().max(1.0) {
+                    return None;
+                }
+                compared += 1;
+            }
+            (compared > 10).then_some(())
+        });
+        let numbers = plant.node(
+            21,
+            &[
+                json!(["objects", unit]),
+                json!(["read", unit, 0, 2, 85]),
+                json!(["read", unit, 13, 1, 110]),
+            ],
+        );
+        assert_eq!(numbers[0].as_array().unwrap().len(), objects.len(), "{profile}");
+        assert_eq!(numbers[1], json!([0]), "{profile}");
+        assert_eq!(numbers[2][4], "fault", "{profile}");
+    }
+}
+
+#[test]
+fn a_write_is_answered_when_the_drive_has_done_it() {
+    let plant = pumps("");
+    let done = plant.bacpypes(
+        20,
+        &[
+            json!(["write", 1, "analog-value,1", PV, 50.0, 8]),
+            run_at(8, true),
+            json!(["read", 1, RUN, "current-command-priority"]),
+            json!(["read", 1, "analog-value,2", PV]),
+        ],
+    );
+    assert_eq!(done, [json!("done"), json!("done"), json!(8), json!(25.0)]);
+    plant.site.until_state("pump-1", "running");
+    let ran = plant
+        .site
+        .audit()
+        .into_iter()
+        .find(|r| r["source"] == "bacnet" && r["command"] == "run=true")
+        .unwrap();
+    assert!(ran["client"].as_str().unwrap().starts_with("127.0.0.20:"), "{ran}");
+    let told = plant.bacpypes(
+        20,
+        &[
+            json!(["cov", 1, "analog-input,2", true, 60, 1]),
+            json!(["cov", 1, "binary-input,2", false, 60, 1]),
+        ],
+    );
+    assert!(told[0][0].as_f64().unwrap() > 0.0 && told[1] == json!([1]), "{told:?}");
+    let refused = [
+        (json!(["write", 1, "analog-value,1", PV, 90.0, 8]), [2, 37]),
+        (run_at(6, false), [2, 40]),
+        (run_at(17, true), [5, 80]),
+        (json!(["write", 1, "analog-input,2", PV, 1.0, 8]), [2, 40]),
+        (json!(["write", 1, RUN, "out-of-service", true, 8]), [2, 40]),
+        (json!(["write", 2, RUN, PV, true, 8]), [1, 31]),
+    ];
+    let orders: Vec<Json> = refused.iter().map(|(order, _)| order.clone()).collect();
+    for ((order, error), answer) in refused.iter().zip(plant.bacpypes(20, &orders)) {
+        assert_eq!(answer, json!({ "error": error }), "{order}");
+    }
+    let real = plant.node(21, &[json!(["write", 1, 5, 1, 1.5, 8])]).remove(0);
+    assert!(real["error"].as_str().unwrap().contains("INVALID_DATA_TYPE"), "{real}");
+    // An address that may ask but not write; and of several writes a stop is carried out though another one is refused.
+    assert_eq!(plant.bacpypes(40, &[run_at(8, false)]), [json!({ "error": [2, 40] })]);
+    assert_eq!(plant.site.point("pump-1", "running"), true);
+    let several = json!(["several", 1, ["analog-value,1", PV, 500.0, 8], [RUN, PV, false, 8]]);
+    assert_eq!(plant.bacpypes(20, &[several]), [json!({ "error": [2, 37] })]);
+    plant.site.until_state("pump-1", "ready");
+    plant
+        .site
+        .until_metric("drivegate_writes_total{source=\"bacnet\",result=\"acknowledged\"} 3");
+}
+
+#[test]
+fn slots_and_other_sides_see_each_other() {
+    let plant = pumps("");
+    let start = || {
+        until("a start by Modbus TCP", || {
+            mbpoll_write(plant.site.modbus, 1, 33_024, &[1]).ok()
+        })
+    };
+    assert_eq!(plant.bacpypes(20, &[run_at(8, true)]), [json!("done")]);
+    assert_eq!(
+        plant.node(21, &[json!(["write", 1, 5, 1, false, 5])]),
+        [json!("done")],
+        "over the other one's 8"
+    );
+    assert_eq!(slots(&plant), [(5, json!(0)), (8, json!(1))]);
+    plant.site.until_state("pump-1", "ready");
+    let refused = mbpoll_write(plant.site.modbus, 1, 33_024, &[1]).unwrap_err();
+    assert!(refused.contains("busy"), "{refused}");
+    let record = plant
+        .site
+        .audit()
+        .into_iter()
+        .find(|r| r["result"] == "held_by_other")
+        .unwrap();
+    assert!(
+        record["text"].as_str().unwrap().contains("127.0.0.21")
+            && record["text"].as_str().unwrap().contains("priority 5")
+    );
+    assert_eq!(plant.node(21, &[json!(["write", 1, 5, 1, null, 5])]), [json!("done")]);
+    plant.site.until_state("pump-1", "running");
+    mbpoll_write(plant.site.modbus, 1, 33_024, &[0]).unwrap();
+    plant.site.until_state("pump-1", "ready");
+    assert_eq!(slots(&plant), [], "a stop from elsewhere empties every active");
+    start();
+    plant.site.until_state("pump-1", "running");
+    assert_eq!(plant.value(RUN, PV), 1, "without a slot it is what the drive has");
+    assert_eq!(plant.value(RUN, "current-command-priority"), Json::Null);
+    assert_eq!(plant.bacpypes(20, &[run_at(16, false)]), [json!("done")]);
+    plant.site.until_state("pump-1", "ready");
+    start();
+    assert_eq!(slots(&plant), [], "a start withdraws the inactives that protect nobody");
+}
+
+#[test]
+fn a_drive_that_is_away_is_silent_or_shows_its_fault() {
+    let mut plant = pumps("");
+    let present = |plant: &Plant| plant.bacpypes(20, &[json!(["who_is", 101, 102, "global"])]).remove(0);
+    assert_eq!(present(&plant), json!([101, 102]));
+    // It takes its link away; another test might get the same pseudo-terminal.
+    plant._drives.signal("TERM");
+    plant._drives.ended();
+    plant.site.until_state("pump-1", "offline");
+    until("silence", || (present(&plant) == json!([])).then_some(()));
+    plant.site.change("[bacnet]\n", "[bacnet]\noffline = \"fault\"\n");
+    plant.gateway.signal("HUP");
+    until("they answer again", || {
+        (present(&plant) == json!([101, 102])).then_some(())
+    });
+    let asked =
+        ["status-flags", "reliability", "event-state"].map(|property| json!(["read", 1, "analog-input,2", property]));
+    assert_eq!(plant.bacpypes(20, &asked), [json!([0, 1, 0, 0]), json!(12), json!(1)]);
+    assert_eq!(plant.value("multi-state-input,1", PV), 1);
+}
+
+#[test]
+fn inactives_that_protect_outlive_a_restart() {
+    let mut plant = pumps("keep_priorities = true");
+    assert_eq!(
+        plant.bacpypes(20, &[run_at(3, false), run_at(9, true)]),
+        [json!("done"), json!("done")]
+    );
+    plant.gateway.signal("TERM");
+    assert!(plant.gateway.ended().success());
+    plant.gateway = plant.site.run_ready();
+    assert_eq!(slots(&plant), [(3, json!(0))]);
+    let refused = mbpoll_write(plant.site.modbus, 1, 33_024, &[1]).unwrap_err();
+    assert!(refused.contains("busy"), "{refused}");
+    assert_eq!(plant.bacpypes(20, &[run_at(3, Json::Null)]), [json!("done")]);
+    until("a start", || mbpoll_write(plant.site.modbus, 1, 33_024, &[1]).ok());
+}
+
+/// Datagrams as a capture without a link layer: each an IPv4 packet with UDP.
+fn capture(file: &Path, datagrams: &[(u8, u8, Vec<u8>)]) {
+    let mut bytes = Vec::new();
+    bytes.extend(0xA1B2_C3D4_u32.to_le_bytes());
+    bytes.extend([2, 0, 4, 0]);
+    bytes.extend([0; 8]);
+    bytes.extend(65_535_u32.to_le_bytes());
+    bytes.extend(228_u32.to_le_bytes());
+    for (from, to, datagram) in datagrams {
+        let length = u16::try_from(datagram.len() + 28).unwrap();
+        bytes.extend([0; 8]);
+        bytes.extend(u32::from(length).to_le_bytes());
+        bytes.extend(u32::from(length).to_le_bytes());
+        bytes.extend([0x45, 0]);
+        bytes.extend(length.to_be_bytes());
+        bytes.extend([
+            0, 0, 0, 0, 64, 17, 0, 0, 127, 0, 0, *from, 127, 0, 0, *to, 0xBA, 0xC0, 0xBA, 0xC0,
+        ]);
+        bytes.extend((length - 20).to_be_bytes());
+        bytes.extend([0, 0]);
+        bytes.extend(datagram);
+    }
+    std::fs::write(file, bytes).unwrap();
+}
+
+#[test]
+fn tshark_finds_nothing_wrong_with_any_frame() {
+    let plant = pumps("");
+    let socket = UdpSocket::bind("127.0.0.22:0").unwrap();
+    socket.set_read_timeout(Some(Duration::from_millis(700))).unwrap();
+    let routed = |apdu: &[u8]| [&[1, 0x24, 3, 0xE9, 1, 1, 0xFF][..], apdu].concat();
+    let requests = [
+        vec![1, 0x20, 0xFF, 0xFF, 0, 0xFF, 0x10, 8],
+        vec![1, 0x80, 0],
+        vec![1, 0x80, 6, 0],
+        vec![1, 0x20, 0, 77, 0, 0xFF, 0x10, 8],
+        vec![1, 0x20, 0xFF, 0xFF, 0, 0xFF, 0x10, 7, 0x3D, 4, 0, b'r', b'u', b'n'],
+        // All of every kind of object, and of one that is not there.
+        routed(
+            &[
+                &[2, 5, 1, 14][..],
+                &[0x0C, 2, 0, 0, 101, 0x1E, 0x09, 8, 0x1F],
+                &[0x0C, 0, 0, 0, 2, 0x1E, 0x09, 8, 0x1F],
+            ]
+            .concat(),
+        ),
+        routed(
+            &[
+                &[2, 5, 2, 14][..],
+                &[0x0C, 1, 0x40, 0, 1, 0x1E, 0x09, 8, 0x1F],
+                &[0x0C, 3, 0x40, 0, 1, 0x1E, 0x09, 8, 0x1F],
+            ]
+            .concat(),
+        ),
+        routed(
+            &[
+                &[2, 5, 3, 14][..],
+                &[0x0C, 0, 0x80, 0, 1, 0x1E, 0x09, 8, 0x1F],
+                &[0x0C, 10, 0, 0, 1, 0x1E, 0x09, 8, 0x1F],
+            ]
+            .concat(),
+        ),
+        routed(
+            &[
+                &[2, 5, 4, 14][..],
+                &[0x0C, 14, 0, 0, 1, 0x1E, 0x09, 8, 0x1F],
+                &[0x0C, 0, 0, 0, 77, 0x1E, 0x09, 85, 0x1F],
+            ]
+            .concat(),
+        ),
+        // Subscriptions, writes, an error, a reject, an abort.
+        routed(&[2, 5, 5, 5, 0x09, 7, 0x1C, 0, 0, 0, 2, 0x29, 1, 0x39, 60]),
+        routed(&[
+            2, 5, 6, 28, 0x09, 7, 0x1C, 0, 0, 0, 2, 0x29, 0, 0x39, 60, 0x4E, 0x09, 85, 0x4F, 0x5C, 0x3F, 0x80, 0, 0,
+        ]),
+        routed(&[2, 5, 7, 15, 0x0C, 1, 0x40, 0, 1, 0x19, 85, 0x3E, 0x91, 1, 0x3F, 0x49, 8]),
+        routed(&[
+            2, 5, 8, 16, 0x0C, 0, 0, 0, 2, 0x1E, 0x09, 85, 0x2E, 0x44, 0, 0, 0, 0, 0x2F, 0x1F,
+        ]),
+        routed(&[2, 5, 9, 14, 0x0C, 1, 0x40, 0, 1, 0x1E, 0x09, 8, 0x1F]),
+        routed(&[2, 5, 10, 12, 0x0C, 2, 0, 0, 101, 0x1A, 0, 152]),
+        routed(&[2, 5, 11, 17, 0x19, 2]),
+        routed(&[2, 5, 12, 99]),
+        routed(&[0, 0, 13, 14, 0x0C, 2, 0, 0, 101, 0x1E, 0x09, 8, 0x1F]),
+        routed(&[2, 0x70, 14, 14, 0x0C, 2, 0, 0, 101, 0x1E, 0x09, 8, 0x1F]),
+        routed(&[0x40, 14, 0, 4]),
+        routed(&[0x40, 14, 4, 4]),
+    ];
+    let mut datagrams = Vec::new();
+    for npdu in requests {
+        let length = u16::try_from(npdu.len() + 4).unwrap().to_be_bytes();
+        let datagram = [&[0x81, 0x0A][..], &length, &npdu].concat();
+        socket.send_to(&datagram, plant.address()).unwrap();
+        datagrams.push((22, 10, datagram));
+        let mut buffer = [0; 2048];
+        while let Ok(length) = socket.recv(&mut buffer) {
+            datagrams.push((10, 22, buffer[..length].to_vec()));
+            socket.set_read_timeout(Some(Duration::from_millis(150))).unwrap();
+        }
+    }
+    let answers = datagrams.iter().filter(|(from, ..)| *from == 10).count();
+    assert!(answers > 25, "{answers}");
+    let file = plant.site.file("bacnet.pcap");
+    capture(&file, &datagrams);
+    let file = file.display().to_string();
+    let arguments = [
+        "-r",
+        &file,
+        "-T",
+        "fields",
+        "-e",
+        "bvlc.function",
+        "-e",
+        "_ws.malformed",
+        "-e",
+        "_ws.expert.message",
+        "-e",
+        "frame.number",
+    ];
+    let output = run(&tool("tshark"), &arguments);
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert_eq!(text.lines().count(), datagrams.len(), "{text}");
+    for line in text.lines() {
+        let fields: Vec<&str> = line.split('\t').collect();
+        assert!(
+            fields[0].starts_with("0x") && fields[1].is_empty() && fields[2].is_empty(),
+            "{line}: {:02x?}",
+            datagrams[fields[3].parse::<usize>().unwrap() - 1]
+        );
+    }
+    let metrics = get(plant.site.http, "/metrics").unwrap().1;
+    assert!(
+        metrics.contains("drivegate_bacnet_datagrams_total{fate=\"discarded\"} "),
+        "{metrics}"
+    );
+}
