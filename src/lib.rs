@@ -1,4 +1,4 @@
-//! drivegate: RS-485 frequency converters on one side, Modbus TCP, MQTT and HTTP on the other.
+//! drivegate: RS-485 frequency converters on one side, Modbus TCP, MQTT, BACnet/IP and HTTP on the other.
 //!
 //! ```text
 //!  drives ──line──▶ codec ──▶ bus (transaction, schedule) ──▶ process image ──▶ north (Modbus TCP, MQTT, HTTP)
@@ -11,7 +11,7 @@
 //! ([`mod@command`]) and queues it for the bus; the client gets exactly one result.
 //!
 //! This package holds `main` and gives every crate of `crates/` the name of its room; Cargo enforces which may use which.
-//! From the bottom: [`codec`] (`drivegate-proto`), [`drive`] and [`document`] (`-model`), [`command`], [`process_image`],
+//! From the bottom: [`codec`] (`drivegate-proto`), [`bacnet`] (`-bacnet`), [`drive`] and [`document`] (`-model`), [`command`], [`process_image`],
 //! [`history`], [`parameters`], [`diagnosis`], [`event`], [`files`], [`plant`], [`version`] (`-core`), [`mod@line`], [`bus`],
 //! [`north`], [`sim`], [`config`] and [`daemon`] (`-gateway`), [`cli`] (`-tools`).
 //!
@@ -26,6 +26,7 @@
 //!
 //! `docs/architecture.md` follows one transaction, one command and one value through the files.
 
+pub use drivegate_bacnet as bacnet;
 pub use drivegate_bus as bus;
 pub use drivegate_core::command;
 pub use drivegate_core::diagnosis;

@@ -14,6 +14,7 @@ macro_rules! targets {
 targets! {
     ascii "../../fuzz/cases/ascii.rs",
     audit_file "../../fuzz/cases/audit_file.rs",
+    bacnet "../../fuzz/cases/bacnet.rs",
     capture "../../fuzz/cases/capture.rs",
     certificate "../../fuzz/cases/certificate.rs",
     configuration "../../fuzz/cases/configuration.rs",

@@ -539,15 +539,8 @@ pub enum Refusal {
     #[error("{0}")]
     BadValue(String),
     /// Somebody else has a right to the drive that goes before that of the client.
-    #[error("{holder} ({rank}) {keeps}; it was not sent")]
-    HeldByOther {
-        /// Who.
-        holder: String,
-        /// By which right.
-        rank: String,
-        /// What is kept, and how that ends.
-        keeps: String,
-    },
+    #[error("{0}")]
+    HeldByOther(Box<Holder>),
     /// There is no drive of that name.
     #[error("{0}")]
     UnknownDrive(String),
@@ -559,6 +552,24 @@ pub enum Refusal {
     OtherValue(String),
 }
 
+/// Who keeps others from a drive.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Holder {
+    /// Who.
+    pub who: String,
+    /// By which right.
+    pub rank: String,
+    /// What is kept, and how that ends.
+    pub keeps: String,
+}
+
+impl fmt::Display for Holder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Holder { who, rank, keeps } = self;
+        write!(f, "{who} ({rank}) {keeps}; it was not sent")
+    }
+}
+
 impl Refusal {
     const UNKNOWN_DRIVE: &str = "unknown_drive";
 
@@ -568,7 +579,7 @@ impl Refusal {
             Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => "not_allowed",
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => "not_writable",
             Refusal::BadValue(_) => "bad_value",
-            Refusal::HeldByOther { .. } => "held_by_other",
+            Refusal::HeldByOther(_) => "held_by_other",
             Refusal::UnknownDrive(_) => Refusal::UNKNOWN_DRIVE,
         }
     }
@@ -579,7 +590,7 @@ impl Refusal {
             Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => Exception::FUNCTION,
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => Exception::ADDRESS,
             Refusal::BadValue(_) => Exception::VALUE,
-            Refusal::HeldByOther { .. } => Exception::BUSY,
+            Refusal::HeldByOther(_) => Exception::BUSY,
             Refusal::UnknownDrive(_) => Exception::GATEWAY_PATH,
         }
     }
@@ -608,11 +619,7 @@ mod tests {
             Refusal::UnknownDrive,
         ];
         let mut outcomes: Vec<Outcome> = refusals.iter().map(|r| Outcome::Refused(r(String::new()))).collect();
-        let held = Refusal::HeldByOther {
-            holder: String::new(),
-            rank: String::new(),
-            keeps: String::new(),
-        };
+        let held = Refusal::HeldByOther(Box::default());
         outcomes.extend([
             Outcome::Refused(held),
             Outcome::Acknowledged(Reply::Written),

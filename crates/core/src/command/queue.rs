@@ -13,7 +13,7 @@ use rustix::event::{EventfdFlags, eventfd};
 use tokio::sync::oneshot;
 
 use super::background::{Background, BackgroundRequest};
-use super::{Command, Effect, Order, Origin, Outcome, Priorities, Refusal, SourceKind, Urgency};
+use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal, SourceKind, Urgency};
 
 /// Commands and forwarded reads that may wait on one bus, besides two stops for each drive.
 pub const CAPACITY: usize = 64;
@@ -170,11 +170,11 @@ impl Pending {
     pub fn held_back(&self, drive: usize, origin: &Origin, effect: Effect) -> Option<Refusal> {
         let protects = self.priorities.get(&drive)?.refuses(origin, effect)?;
         let (what, priority) = (protects.what.name(), protects.priority);
-        Some(Refusal::HeldByOther {
-            holder: format!("the BACnet client {}", protects.client),
+        Some(Refusal::HeldByOther(Box::new(Holder {
+            who: format!("the BACnet client {}", protects.client),
             rank: format!("priority {priority}"),
             keeps: format!("keeps `{what}` until it gives that slot back"),
-        })
+        })))
     }
 
     /// The priority arrays of a drive.

@@ -207,7 +207,7 @@ impl Task {
         while let Some(job) = self.server.take_job() {
             match writes::begin(&self.view, &job, now) {
                 Begun::Answered(result) => self.server.written(job.token, result, &self.view, now),
-                Begun::Waits(waiting) => self.writes.push(Box::pin(ending(job.token, waiting))),
+                Begun::Waits(waiting) => self.writes.push(Box::pin(ending(job.token, *waiting))),
             }
         }
         self.busy.store(!self.writes.is_empty(), Ordering::Relaxed);

@@ -23,7 +23,7 @@ pub(super) enum Begun {
     /// It is answered.
     Answered(Result<(), Error>),
     /// It waits for the drive.
-    Waits(Waiting),
+    Waits(Box<Waiting>),
 }
 
 /// A write that waits for the drive.
@@ -82,11 +82,11 @@ pub(super) fn begin(view: &View, job: &Job, now: Instant) -> Begun {
 }
 
 fn waits(handle: &DriveHandle, placed: Placed, slot: Option<u64>) -> Begun {
-    Begun::Waits(Waiting {
+    Begun::Waits(Box::new(Waiting {
         machine: handle.machine(),
         placed,
         slot,
-    })
+    }))
 }
 
 fn value_of(datum: &Datum) -> Option<Value> {
@@ -212,6 +212,6 @@ fn of_refusal(refusal: &Refusal) -> Error {
         | Refusal::NotKnown(_)
         | Refusal::MotorRuns(_)
         | Refusal::OtherValue(_)
-        | Refusal::HeldByOther { .. } => Error::SERVICE_REQUEST_DENIED,
+        | Refusal::HeldByOther(_) => Error::SERVICE_REQUEST_DENIED,
     }
 }

@@ -28,7 +28,8 @@ fn who_is_concerns_those_that_it_is_for() {
     let mut bench = Bench::new();
     let all = Some((npdu::GLOBAL, Mac::ALL));
     let network = Some((NETWORK, Mac::ALL));
-    let cases: [(Option<(u16, Mac)>, Option<(u64, u64)>, &[u32]); 7] = [
+    type Case<'c> = (Option<(u16, Mac)>, Option<(u64, u64)>, &'c [u32]);
+    let cases: [Case<'_>; 7] = [
         (None, None, &[100]),
         (all, None, &[100, 101, 102, 103]),
         (network, None, &[101, 102, 103]),
