@@ -79,7 +79,7 @@ fn device(instance: u32, station: Option<u8>) -> Arc<Device> {
     Arc::new(Device::new(instance, station, format!("d{instance}"), ("m".to_string(), "".to_string()), objects))
 }
 
-pub fn run(data: &[u8]) {
+pub(crate) fn run(data: &[u8]) {
     let mut now = Instant::now();
     let options = Options {
         address: GATEWAY,

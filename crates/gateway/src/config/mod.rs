@@ -474,12 +474,12 @@ fn warn_of_emptiness(reader: &Reader<'_>) {
             "write [[bus]] with its drives",
         );
     }
-    let servers = [ROOT.modbus_tcp.name, ROOT.mqtt.name, ROOT.http.name];
+    let servers = [ROOT.modbus_tcp.name, ROOT.mqtt.name, ROOT.http.name, ROOT.bacnet.name];
     if !servers.iter().any(|server| reader.has(server)) {
         reader.document().warning(
             &of_file(""),
             "no server is configured, so nobody can see the drives",
-            "write [modbus_tcp], [mqtt] or [http]",
+            "write [modbus_tcp], [mqtt], [http] or [bacnet]",
         );
     }
 }

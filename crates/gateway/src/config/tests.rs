@@ -50,6 +50,19 @@ hosts = ["gateway.example.com"]
 tokens_file = "DIR/tokens"
 certificate = "DIR/gateway.crt"
 key = "DIR/gateway.key"
+[bacnet]
+listen = "127.0.0.1:47808"
+device = 200
+network = 2000
+offline = "fault"
+commands = true
+allow = ["127.0.0.0/8"]
+write = ["127.0.0.1"]
+keep_priorities = true
+bbmd = "bbmd.example.com"
+vendor = 999
+dcc_password_file = ""
+buses = []
 [audit]
 [params]
 [log]

@@ -21,6 +21,7 @@ fn with_tables(page: &str) -> String {
         ("[mqtt.home_assistant]", "MqttHomeAssistant"),
         ("[mqtt.sparkplug]", "Sparkplug"),
         ("[http]", "Http"),
+        ("[bacnet]", "Bacnet"),
         ("[audit]", "AuditTable"),
         ("[recordings]", "Recordings"),
         ("[params]", "Params"),
