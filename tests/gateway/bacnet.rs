@@ -343,6 +343,23 @@ fn a_drive_that_is_away_is_silent_or_shows_its_fault() {
 }
 
 #[test]
+fn a_client_that_falls_silent_loses_its_slots_with_its_lease() {
+    let keys = "supervision = { timeout = \"3s\", action = \"stop\" }";
+    let drives = controlled("pump-1", 1, keys);
+    let plant = plant(&[LINE1, &drives], "", |site| {
+        site.simulate(&["--addresses", "1", "--baud", "38400"])
+    });
+    let orders = [json!(["write", 1, "analog-value,1", PV, 20.0, 8]), run_at(8, true)];
+    assert_eq!(plant.bacpypes(20, &orders), [json!("done"), json!("done")]);
+    plant
+        .site
+        .until_metric("drivegate_supervision_actions_total{bus=\"line1\",drive=\"pump-1\"} 1");
+    plant.site.until_state("pump-1", "ready");
+    assert_eq!(slots(&plant), []);
+    assert_eq!(plant.value("analog-value,1", "current-command-priority"), Json::Null);
+}
+
+#[test]
 fn inactives_that_protect_outlive_a_restart() {
     let mut plant = pumps("keep_priorities = true");
     assert_eq!(

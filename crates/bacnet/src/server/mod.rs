@@ -69,6 +69,9 @@ pub trait Application {
     /// Its priorities.
     fn commands(&self, device: u32, place: usize) -> Option<Commands>;
 
+    /// A host that may not write tried to.
+    fn denied(&self, _from: &Address, _device: u32, _write: &WriteItem) {}
+
     /// Whether a write is a stop, which passes where nothing else does.
     fn stops(&self, device: u32, write: &WriteItem) -> bool;
 

@@ -10,7 +10,7 @@ const WINDOW: u8 = 4;
 const WAIT: Duration = Duration::from_secs(3);
 const TRIES: u8 = 3;
 /// Answers under way: in all, and to one host.
-const MOST: usize = 64;
+const MOST: usize = 32;
 const MOST_OF_ONE: usize = 8;
 
 /// One answer under way.

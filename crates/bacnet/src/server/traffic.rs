@@ -10,6 +10,8 @@ const FACTOR: u64 = 8;
 const GRANT: u64 = 16 * 1024;
 /// Octets that may wait for an address, or for a broadcast.
 const WAITING: usize = 64 * 1024;
+/// Octets that may wait for all addresses together.
+const WAITING_IN_ALL: usize = 1024 * 1024;
 /// Broadcasts within a second.
 const BROADCASTS: u64 = 100;
 /// Addresses that are known at once.
@@ -83,6 +85,8 @@ impl Known {
 pub(super) struct Traffic {
     begun: Instant,
     known: HashMap<Ipv4Addr, Known>,
+    /// Octets that wait for addresses.
+    held: usize,
     broadcasts: VecDeque<Vec<u8>>,
     waiting: HashSet<Vec<u8>>,
     octets: usize,
@@ -97,6 +101,7 @@ impl Traffic {
         Traffic {
             begun: now,
             known: HashMap::new(),
+            held: 0,
             broadcasts: VecDeque::new(),
             waiting: HashSet::new(),
             octets: 0,
@@ -148,7 +153,7 @@ impl Traffic {
 
     /// Sends an answer, now or later, or drops it.
     pub(super) fn answer(&mut self, to: SocketAddrV4, bytes: Vec<u8>, now: Instant) {
-        let step = self.step(now);
+        let (step, held) = (self.step(now), self.held);
         let len = bytes.len();
         let Some(known) = self.known(*to.ip(), step) else {
             self.dropped += 1;
@@ -157,9 +162,10 @@ impl Traffic {
         if known.waiting.is_empty() && known.may(len, step) {
             known.left.add(step, u32::try_from(len).unwrap_or(u32::MAX));
             self.ready.push_back((To::Host(to), bytes));
-        } else if known.octets + len <= WAITING {
+        } else if known.octets + len <= WAITING && held + len <= WAITING_IN_ALL {
             known.octets += len;
             known.waiting.push_back((to, bytes));
+            self.held += len;
         } else {
             self.dropped += 1;
         }
@@ -205,6 +211,7 @@ impl Traffic {
             {
                 known.left.add(step, u32::try_from(len).unwrap_or(u32::MAX));
                 known.octets -= len;
+                self.held -= len;
                 self.ready.push_back((To::Host(to), bytes));
             }
         }
@@ -271,6 +278,24 @@ mod tests {
         traffic.poll(start + Duration::from_millis(1200));
         assert_eq!(octets(&mut traffic), 200, "those that waited, once");
         assert_eq!(traffic.dropped, 0);
+    }
+
+    #[test]
+    fn what_waits_is_bounded_in_all() {
+        let start = Instant::now();
+        let mut traffic = Traffic::new(start);
+        for n in 0..100_u8 {
+            (0..100).for_each(|_| traffic.answer(host(n), vec![0; 1000], start));
+        }
+        assert!(
+            traffic.held <= WAITING_IN_ALL && traffic.held > WAITING_IN_ALL - 1000,
+            "{}",
+            traffic.held
+        );
+        for second in 1..200 {
+            traffic.poll(start + Duration::from_millis(1200 * second));
+        }
+        assert_eq!(traffic.held, 0);
     }
 
     #[test]

@@ -183,6 +183,9 @@ impl Server {
         };
         if !app.may_write(from.ip()) {
             let failed = items.front().map(|item| (item.object, item.property));
+            if let Some(first) = items.front() {
+                app.denied(&from, instance, first);
+            }
             let apdu = failure(invoke, service, Error::WRITE_ACCESS_DENIED.into(), failed);
             self.counters.refused += 1;
             return self.send(from, instance, &apdu, now);

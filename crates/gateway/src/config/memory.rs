@@ -12,6 +12,9 @@ const BUS: usize = 256 << 10;
 /// A drive: plan, image, health, what the servers remember of it and its part of the longest answers, bytes; measured with 992 drives.
 const DRIVE: usize = 42 << 10;
 
+/// BACnet: subscriptions, writes, answers that wait; and what it shows of a drive, bytes.
+const BACNET: (usize, usize) = (7 << 20, 24 << 10);
+
 /// Memory of a gateway at most.
 #[derive(Debug)]
 pub struct Memory {
@@ -67,6 +70,7 @@ impl Memory {
             .iter()
             .map(|bus| bus.trends + bus.recorder.with_growth())
             .sum();
-        PROGRAM + BUS * settings.buses.len() + DRIVE * drives + past
+        let bacnet = settings.bacnet.as_ref().map_or(0, |_| BACNET.0 + BACNET.1 * drives);
+        PROGRAM + bacnet + BUS * settings.buses.len() + DRIVE * drives + past
     }
 }

@@ -209,6 +209,7 @@ pub async fn start(
 ) -> Result<Server, ServerError> {
     let sockets = bind(options.listen).await?;
     let address = SocketAddr::V4(sockets.address);
+    tracing::info!(target: "drivegate::bacnet", %address, network = options.network, device = options.device, "BACnet/IP: listening");
     let (to_task, from_server) = mpsc::unbounded_channel();
     let (busy, tasks) = (Arc::new(AtomicBool::new(false)), TaskTracker::new());
     let task = Task::new(options.clone(), sockets, plant, stats.clone(), busy.clone());

@@ -2,17 +2,18 @@
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::future::Future;
-use std::net::SocketAddr;
+use std::net::{SocketAddr, SocketAddrV4};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_bacnet::{Application as _, Options as ServerOptions, Server, To};
-use futures_util::StreamExt as _;
 use futures_util::stream::FuturesUnordered;
+use futures_util::{FutureExt as _, StreamExt as _};
 use tokio::net::UdpSocket;
 use tokio::sync::{Notify, mpsc};
+use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
@@ -36,6 +37,8 @@ const LOOK: Duration = Duration::from_millis(5);
 const BATCH: usize = 64;
 /// How often a BBMD whose name is not found is looked up again.
 const RESOLVE: Duration = Duration::from_secs(30);
+/// How long what was begun is waited for at the end.
+const LAST_ANSWERS: Duration = Duration::from_millis(1500);
 /// The name of the vendor without an identifier of one's own.
 const VENDOR: &str = "drivegate";
 
@@ -82,6 +85,8 @@ pub(super) struct Task {
     /// Devices with a slot of before the restart against which the motor may run.
     watched: BTreeSet<u32>,
     resolved: Option<Instant>,
+    /// Looks up the BBMD.
+    lookup: Option<JoinHandle<Option<SocketAddrV4>>>,
     retired: bool,
 }
 
@@ -125,6 +130,7 @@ impl Task {
             kept: Vec::new(),
             watched: BTreeSet::new(),
             resolved: None,
+            lookup: None,
             retired: false,
         }
     }
@@ -138,9 +144,9 @@ impl Task {
         let mut ticks = interval(TICK);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut buffer = vec![0; 2048];
-        let mut next_look = Instant::now();
+        let (mut next_look, mut due) = (Instant::now(), false);
         loop {
-            self.flush().await;
+            self.flush();
             let subscribed = self.stats.bacnet.get().is_some_and(|f| f.counters.subscriptions > 0);
             let waits = !self.writes.is_empty();
             tokio::select! {
@@ -157,16 +163,26 @@ impl Task {
                 }
                 () = heard(self.sockets.broadcast.as_ref()), if !self.retired => self.take(&mut buffer, true),
                 Some(ended) = self.writes.next(), if waits => self.ended(ended),
-                () = self.news.notified(), if subscribed => {
-                    tokio::time::sleep_until(next_look.into()).await;
+                () = self.news.notified(), if subscribed && !due => due = true,
+                () = tokio::time::sleep_until(next_look.into()), if due => {
                     self.look();
-                    next_look = Instant::now() + LOOK;
+                    (next_look, due) = (Instant::now() + LOOK, false);
                 }
             }
             self.take_up_jobs();
         }
+        self.answer_what_was_begun().await;
         self.save().await;
         self.stats.bacnet.set(None);
+    }
+
+    /// Whoever waits for a drive is answered, as long as the gateway waits.
+    async fn answer_what_was_begun(&mut self) {
+        let until = tokio::time::Instant::now() + LAST_ANSWERS;
+        while let Ok(Some(ended)) = tokio::time::timeout_at(until, self.writes.next()).await {
+            self.ended(ended);
+            self.flush();
+        }
     }
 
     /// Takes up what came.
@@ -187,14 +203,14 @@ impl Task {
         }
     }
 
-    /// Sends what is to be sent. What the system does not take is lost, as datagrams may be.
-    async fn flush(&mut self) {
+    /// Sends what is to be sent. What the system does not take at once is lost, as datagrams may be.
+    fn flush(&mut self) {
         while let Some((to, datagram)) = self.server.transmit() {
             let to = match to {
                 To::Host(host) => host,
                 To::Broadcast => self.sockets.broadcast_to,
             };
-            if let Err(error) = self.sockets.unicast.send_to(&datagram, to).await {
+            if let Err(error) = self.sockets.unicast.try_send_to(&datagram, SocketAddr::V4(to)) {
                 tracing::debug!(target: "drivegate::bacnet", "cannot send to {to}: {error}");
             }
         }
@@ -250,6 +266,7 @@ impl Task {
                 .map(|(host, port)| (format!("{host}:{port}"), self.server.registration())),
         }));
         self.find_bbmd(now);
+        self.take_bbmd(now);
         self.keep();
     }
 
@@ -429,7 +446,7 @@ impl Task {
                 }
                 if !continues || !same_bbmd {
                     self.server.set_bbmd(None, now);
-                    self.resolved = None;
+                    (self.resolved, self.lookup) = (None, None);
                 }
             }
         }
@@ -448,17 +465,26 @@ impl Task {
             return;
         }
         self.resolved = Some(now);
-        // A short wait twice a minute, while the BBMD is not found.
-        let found = std::net::ToSocketAddrs::to_socket_addrs(&(host.as_str(), port));
-        let address = found.ok().and_then(|mut all| {
-            all.find_map(|address| match address {
+        self.lookup = Some(tokio::spawn(async move {
+            let mut found = tokio::net::lookup_host((host.as_str(), port)).await.ok()?;
+            found.find_map(|address| match address {
                 SocketAddr::V4(address) => Some(address),
                 SocketAddr::V6(_) => None,
             })
-        });
-        match address {
-            Some(address) => self.server.set_bbmd(Some(address), now),
-            None => tracing::warn!(
+        }));
+    }
+
+    /// The BBMD was found, or not.
+    fn take_bbmd(&mut self, now: Instant) {
+        let Some(lookup) = self.lookup.take_if(|lookup| lookup.is_finished()) else {
+            return;
+        };
+        let Some((host, port)) = self.options.bbmd.clone() else {
+            return;
+        };
+        match lookup.now_or_never() {
+            Some(Ok(Some(address))) => self.server.set_bbmd(Some(address), now),
+            _ => tracing::warn!(
                 target: "drivegate::bacnet", "cannot find the BBMD {host}:{port}; trying again every 30 s; check `bbmd` of [bacnet]"
             ),
         }

@@ -16,7 +16,7 @@ use subtle::ConstantTimeEq as _;
 use super::objects::{self, Meaning, Shown};
 use super::{Options, WhenOffline};
 use crate::codec::Table;
-use crate::command::{self, Commanded, Entry, Origin, Priorities, SourceKind};
+use crate::command::{self, Commanded, Entry, Origin, Priorities, Refusal, SourceKind};
 use crate::drive::{ModelPoint, Quality, Source, Value};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{Reading, Unavailable};
@@ -333,6 +333,18 @@ impl Application for View {
                 at: by.map(|(_, at)| self.wall(at)),
             }
         }))
+    }
+
+    fn denied(&self, from: &Address, device: u32, write: &WriteItem) {
+        let Some(drive) = self.drives.get(&device) else { return };
+        let why = match self.options.commands {
+            true => "the address is not in `write` of [bacnet]",
+            false => "`commands` of [bacnet] is off",
+        };
+        let (what, now) = (write.object.to_string(), self.now.get().0);
+        let refusal = Refusal::NotAllowed(why.to_string());
+        // Its answer says no more than that.
+        drive.handle.refuse(&what, refusal, super::writes::origin(from), now);
     }
 
     fn stops(&self, device: u32, write: &WriteItem) -> bool {
