@@ -109,7 +109,8 @@ impl Pending {
         if command.urgency == Urgency::Stop
             && let Some((queue, place)) = self.heirs.get(&command.drive)
         {
-            command.drive = *place;
+            let effect = command.effect(command.drive);
+            (command.drive, command.effects) = (*place, vec![(*place, effect)]);
             queue.submit(command, now);
             return;
         }

@@ -10,6 +10,7 @@ use crate::codec::Table;
 use crate::drive::Value;
 
 mod order;
+mod slots;
 mod stops;
 
 const EXPIRY: Duration = Duration::from_secs(2);

@@ -1,0 +1,121 @@
+//! Orders of other sides and the slots of BACnet's clients: accepted, refused and withdrawn in one order.
+
+use super::*;
+use crate::codec::RequestPdu;
+use crate::command::{Commanded, Effect, Entry, NO_DRIVE, Pace, PassedOn, Settled, SlotWrite};
+
+fn effect(run: bool) -> Effect {
+    Effect {
+        run: Some(run),
+        ..Effect::default()
+    }
+}
+
+/// A value of `run` stands at that priority.
+fn stand(pending: &mut Pending, drive: usize, priority: u8, run: bool, now: Instant) {
+    let origin = Origin::new(SourceKind::Bacnet, "10.0.0.5:47808");
+    let write = SlotWrite::new(
+        Commanded::Run,
+        priority,
+        Some(Entry::new(Value::Bool(run), origin, now)),
+    );
+    let all = pending.priorities(drive);
+    all.ask(&write);
+    all.settle(write.id, Settled::Done, now);
+}
+
+fn stands(pending: &mut Pending, drive: usize) -> Vec<u8> {
+    let all = pending.priorities(drive);
+    (1..=16)
+        .filter(|priority| all.stands(Commanded::Run, *priority).is_some())
+        .collect()
+}
+
+fn order(kind: SourceKind, drive: usize, run: bool, now: Instant) -> (Command, Receiver<Answer>) {
+    let stats = Arc::default();
+    let (ticket, receiver) = Ticket::new(Origin::new(kind, "x"), "d", String::new(), true, now, stats);
+    let admitted = Admitted {
+        order: points(&[1]),
+        urgency: if run { Urgency::Command } else { Urgency::Stop },
+        reference_only: false,
+        ranges: Vec::new(),
+    };
+    let mut command = Command::new(drive, admitted, now + EXPIRY, ticket);
+    command.effects = vec![(drive, effect(run))];
+    (command, receiver)
+}
+
+#[test]
+fn a_start_is_judged_when_it_is_accepted_and_a_stop_passes() {
+    let mut bench = Bench::new();
+    let now = bench.now;
+    stand(&mut bench.pending, 1, 3, false, now);
+    let (start, mut answer) = order(SourceKind::Mqtt, 1, true, now);
+    bench.pending.push(start, now);
+    let refused = outcome(&mut answer).unwrap();
+    assert_eq!(refused.code(), "held_by_other");
+    assert!(refused.to_string().contains("10.0.0.5"), "{refused}");
+    let (elsewhere, mut answer) = order(SourceKind::Mqtt, 2, true, now);
+    bench.pending.push(elsewhere, now);
+    assert_eq!(outcome(&mut answer), None, "another drive");
+    for kind in [SourceKind::Mqtt, SourceKind::Supervision] {
+        let (stop, mut answer) = order(kind, 1, false, now);
+        bench.pending.push(stop, now);
+        assert_eq!(outcome(&mut answer), None);
+    }
+    assert_eq!(bench.pending.priorities(1).orders(), 2, "what was refused is no order");
+}
+
+#[test]
+fn what_a_tool_sends_to_all_is_refused_for_one_and_its_stop_withdraws() {
+    let mut bench = Bench::new();
+    let now = bench.now;
+    stand(&mut bench.pending, 1, 3, false, now);
+    stand(&mut bench.pending, 2, 8, true, now);
+    let broadcast = |run: bool| {
+        let (ticket, answer) = ticket(&Arc::default(), now);
+        let request = BackgroundRequest {
+            drive: NO_DRIVE,
+            pdu: RequestPdu::WriteRegister { address: 1, value: 0 },
+            pace: Pace::Brisk,
+            expires: now + EXPIRY,
+            ticket,
+            passed_on: Some(PassedOn {
+                address: 0,
+                may_write: true,
+                reach: vec![1, 2],
+                stops: if run { Vec::new() } else { vec![1, 2] },
+                effects: vec![(1, effect(run)), (2, effect(run))],
+                frame: oneshot::channel().0,
+            }),
+        };
+        (request.into_command(Touched::Anything), answer)
+    };
+    let (start, mut answer) = broadcast(true);
+    bench.pending.push(start, now);
+    assert_eq!(outcome(&mut answer).unwrap().code(), "held_by_other");
+    assert_eq!(stands(&mut bench.pending, 2), [8]);
+    let (stop, mut answer) = broadcast(false);
+    bench.pending.push(stop, now);
+    assert_eq!(outcome(&mut answer), None);
+    assert_eq!(
+        (stands(&mut bench.pending, 1), stands(&mut bench.pending, 2)),
+        (vec![3], vec![])
+    );
+}
+
+#[test]
+fn a_stop_that_another_bus_takes_over_withdraws_there() {
+    let now = Instant::now();
+    let (old, new) = (CommandQueue::new().unwrap(), Arc::new(CommandQueue::new().unwrap()));
+    stand(&mut old.lock(), 3, 8, true, now);
+    old.begin_handover(now);
+    let priorities = old.lock().priorities(3).clone();
+    new.lock().take_over(0, None, 0, priorities);
+    old.hand_over(3, &new, 0, now);
+    assert_eq!(stands(&mut new.lock(), 0), [8]);
+    let (stop, mut answer) = order(SourceKind::Mqtt, 3, false, now);
+    old.submit(stop, now);
+    assert_eq!(outcome(&mut answer), None);
+    assert_eq!(stands(&mut new.lock(), 0), Vec::<u8>::new());
+}
