@@ -376,10 +376,14 @@ impl BusCore {
 
     fn report_all(&mut self, mut news: Vec<News>, now: Instant) {
         for one in news.drain(..) {
-            if let Some(drive) = self.report.apply(&one, now)
+            let wanted = self.report.apply(&one, now);
+            if let Some(drive) = wanted.fault
                 && self.bus.image.tape.takes(Taping::Everything)
             {
                 self.master.fault_came(drive, now);
+            }
+            for (drive, point, at) in wanted.monitors {
+                self.master.monitor(drive, point, at);
             }
         }
         self.news = news;

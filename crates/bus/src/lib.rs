@@ -33,6 +33,7 @@ pub mod predict;
 pub mod prober;
 mod report;
 pub mod schedule;
+mod selection;
 pub mod supervision;
 mod tap;
 pub mod transaction;

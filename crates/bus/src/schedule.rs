@@ -163,8 +163,7 @@ impl Schedule {
         now: Instant,
     ) -> Self {
         let drives = plans.iter().enumerate().map(|(index, plan)| {
-            let reads = plan.reads.iter().chain(&plan.on_fault);
-            let items = reads.map(|read| Item::new(*read, *read, cost(index, read), now));
+            let items = plan.all().map(|read| Item::new(*read, *read, cost(index, read), now));
             DriveSchedule::new(items.collect(), plan.behind_state.clone(), now)
         });
         let drives: Vec<DriveSchedule> = drives.collect();
@@ -435,9 +434,25 @@ impl Schedule {
                     (item.wanted, item.refused, item.failures) = (true, false, 0);
                     item.due = now;
                 }
+                PollClass::Monitor if covers(&item.read) && !item.refused => {
+                    item.wanted = true;
+                    item.due = item.due.min(now);
+                }
                 PollClass::Slow if covers(&item.read) && !item.refused => item.due = item.due.min(now),
                 _ => {}
             }
+        }
+    }
+
+    /// Monitoring registers are to be read again at `due`, as far as the drive has them.
+    pub fn monitor(&mut self, drive: usize, covers: impl Fn(&PlannedRead) -> bool, due: Instant) {
+        let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
+        let monitors = items
+            .into_iter()
+            .flatten()
+            .filter(|item| item.read.class == PollClass::Monitor && !item.refused && !item.wanted);
+        for item in monitors.filter(|item| covers(&item.read)) {
+            (item.wanted, item.due) = (true, due);
         }
     }
 
@@ -448,7 +463,7 @@ impl Schedule {
             .into_iter()
             .flatten()
             .filter(|item| !item.refused && item.failures == 0);
-        if let Some(item) = sound.find(|item| !matches!(item.read.class, PollClass::Fast | PollClass::Fault)) {
+        if let Some(item) = sound.find(|item| !matches!(item.read.class, PollClass::Fast | PollClass::Fault | PollClass::Monitor)) {
             item.wanted = true;
             item.due = item.due.min(now);
         }

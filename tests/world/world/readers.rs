@@ -62,7 +62,7 @@ fn check_json(drive: &DriveHandle, plant: &Plant, json: &Json, now: Instant) {
                 let most = match point.class {
                     PollClass::Fast => plant.stale_after,
                     PollClass::Slow => slow,
-                    PollClass::Once | PollClass::Fault | PollClass::Never => Duration::MAX,
+                    PollClass::Once | PollClass::Fault | PollClass::Monitor | PollClass::Never => Duration::MAX,
                 };
                 let age = Duration::from_millis(reported["age_ms"].as_u64().unwrap());
                 assert!(json["online"] == true, "{name}: `{own}` is good, and the drive is away");

@@ -47,6 +47,16 @@ impl Master {
         self.schedule.fault_came(drive, covers, now);
     }
 
+    /// Monitoring points are to be read then.
+    pub fn monitor(&mut self, drive: usize, point: usize, at: Instant) {
+        let Some(image) = self.bus.image.drives.get(drive) else {
+            return;
+        };
+        let raw = image.spec.profile.points.get(point).and_then(Point::raw);
+        let covers = |read: &PlannedRead| raw.is_some_and(|raw| read.covers(raw.table, raw.address));
+        self.schedule.monitor(drive, covers, at);
+    }
+
     /// What may still come of the exchange: nothing where the drive's own reply came mangled, unless a late reply of an
     /// earlier exchange may have been that.
     fn note_late(&mut self, turn: &Turn, end: &TurnEnd, now: Instant) {

@@ -148,7 +148,7 @@ impl Item {
             failures: 0,
             failed_at: None,
             wanted: read.class != PollClass::Fault,
-            unread: read.class != PollClass::Fault,
+            unread: !matches!(read.class, PollClass::Fault | PollClass::Monitor),
             asked: None,
             whole_again: None,
         }
@@ -157,7 +157,7 @@ impl Item {
     pub(super) fn is_slow(&self) -> bool {
         match self.read.class {
             PollClass::Slow => true,
-            PollClass::Once | PollClass::Fault => self.wanted,
+            PollClass::Once | PollClass::Fault | PollClass::Monitor => self.wanted,
             PollClass::Fast | PollClass::Never => false,
         }
     }
@@ -255,7 +255,7 @@ impl DriveSchedule {
                 false => Change::Unavailable(read, exception),
             };
             item.refused = true;
-            item.wanted = item.read.class != PollClass::Fault;
+            item.wanted = !matches!(item.read.class, PollClass::Fault | PollClass::Monitor);
             item.due = now + (REFUSED_PAUSE.0 * (1 << item.refusals.min(5))).min(REFUSED_PAUSE.1);
             item.refusals = item.refusals.saturating_add(1);
             let origin = item.origin;

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant, SystemTime};
 use super::{DriveSpec, Hold};
 use crate::codec::{Exception, Table};
 use crate::drive::model::Kind;
-use crate::drive::{Bound, ModelPoint, Plan, PollClass, Quality, Raw, Sample, Source, State, Value};
+use crate::drive::{Bound, ModelPoint, Plan, Point, PollClass, Quality, Raw, Sample, Source, State, Value};
 
 /// Oldest age of a parameter of the drive on which a command may rest, where the line can renew it faster.
 const PARAMETER_AGE: Duration = Duration::from_secs(5);
@@ -104,6 +104,9 @@ pub struct Snapshot {
     pub fast_at: Option<Instant>,
     /// Filled by what another master reads: how often it reads process data.
     pub heard: Option<Cadence>,
+    /// Points whose value is that of their monitoring register, because a selector of the drive gives them another content
+    /// than the profile states: see [`crate::drive::Point::monitor`].
+    pub monitored: Vec<usize>,
     /// Shared with the snapshots before, as far as nothing in them changed.
     spans: Vec<Arc<Span>>,
 }
@@ -122,7 +125,7 @@ pub enum Unavailable {
 impl Snapshot {
     /// Nothing is known of the plan's addresses yet.
     pub fn empty(plan: &Plan) -> Snapshot {
-        let spans = plan.reads.iter().map(|read| {
+        let spans = plan.reads.iter().chain(&plan.monitors).map(|read| {
             Arc::new(Span {
                 table: read.table,
                 start: read.start,
@@ -134,6 +137,7 @@ impl Snapshot {
             link: Link::Untried,
             fast_at: None,
             heard: None,
+            monitored: Vec::new(),
             spans: spans.collect(),
         }
     }
@@ -256,7 +260,7 @@ impl Reading<'_> {
     fn age_limit(&self, class: PollClass) -> Option<Duration> {
         match class {
             PollClass::Fast => Some(self.stale_after),
-            PollClass::Slow => Some(self.stale_after + 2 * self.slow_cycle),
+            PollClass::Slow | PollClass::Monitor => Some(self.stale_after + 2 * self.slow_cycle),
             PollClass::Once | PollClass::Fault | PollClass::Never => None,
         }
     }
@@ -264,7 +268,7 @@ impl Reading<'_> {
     /// For how long a value of that point is good once it was read, as long as the drive answers: that of its registers that
     /// age first.
     pub fn good_for(&self, point: usize) -> Duration {
-        let Some(point) = self.spec.profile.points.get(point) else {
+        let Some(point) = self.selected(point) else {
             return Duration::ZERO;
         };
         let limit = |raw: &Raw| {
@@ -316,6 +320,10 @@ impl Reading<'_> {
         for offset in 0..count {
             let address = start.checked_add(offset).ok_or(Unavailable::NotPolled)?;
             let (class, cell) = self.snapshot.cell(table, address).ok_or(Unavailable::NotPolled)?;
+            if class == PollClass::Monitor {
+                // Read now and then: what it is now only the drive knows.
+                return Err(Unavailable::NotPolled);
+            }
             let quality = match last {
                 Some((of, alike, quality)) if of == class && alike.is_like(cell) => quality,
                 _ => self.quality(class, cell),
@@ -333,11 +341,27 @@ impl Reading<'_> {
         worst.map_or(Ok(words), Err)
     }
 
+    /// The point that a value is taken from: the point itself, or its monitoring register.
+    fn selected(&self, point: usize) -> Option<&Point> {
+        let points = &self.spec.profile.points;
+        match self.snapshot.monitored.contains(&point) {
+            true => points.get(points.get(point)?.monitor?),
+            false => points.get(point),
+        }
+    }
+
     /// The sample of a point.
     pub fn sample(&self, point: usize) -> Sample {
-        let Some(point) = self.spec.profile.points.get(point) else {
-            return Sample::NONE;
-        };
+        self.selected(point).map_or(Sample::NONE, |point| self.sample_of(point))
+    }
+
+    /// The sample of a point's own register, whatever a selector of the drive puts there.
+    pub fn own_sample(&self, point: usize) -> Sample {
+        let point = self.spec.profile.points.get(point);
+        point.map_or(Sample::NONE, |point| self.sample_of(point))
+    }
+
+    fn sample_of(&self, point: &Point) -> Sample {
         match &point.source {
             Source::Raw(raw) => self.raw_sample(raw, point.kind()),
             Source::Derived(derived) => {

@@ -47,6 +47,8 @@ pub struct Plan {
     pub reads: Vec<PlannedRead>,
     /// What a drive with a new fault is asked for, as far as no fast read has it: once a fault, among its slow reads.
     pub on_fault: Vec<PlannedRead>,
+    /// What process data is compared with, as far as no other read has it: see [`super::profile::Point::monitor`].
+    pub monitors: Vec<PlannedRead>,
     /// The reads of process data that decide the drive's state: fault, running, ready.
     pub behind_state: Vec<PlannedRead>,
 }
@@ -71,6 +73,16 @@ impl Plan {
             }
             reads.extend(merged);
         }
+        let monitors = profile.points.iter().filter_map(|point| point.monitor);
+        let monitors = monitors.filter_map(|monitor| profile.points.get(monitor)?.raw());
+        let monitors: BTreeSet<Piece> = monitors
+            .filter(|raw| raw.addresses().any(|a| !taken.contains(&(raw.table, a))))
+            .map(|raw| (raw.table, raw.address, raw.form.items()))
+            .collect();
+        let monitors = merge(profile, PollClass::Monitor, &monitors);
+        for read in &monitors {
+            taken.extend((read.start..).take(usize::from(read.count)).map(|a| (read.table, a)));
+        }
         let on_fault = profile.on_fault.iter().filter_map(|index| profile.points.get(*index));
         let on_fault: BTreeSet<Piece> = on_fault
             .filter(|point| point.class == PollClass::Never)
@@ -82,6 +94,7 @@ impl Plan {
         let mut plan = Plan {
             reads,
             on_fault,
+            monitors,
             behind_state: Vec::new(),
         };
         plan.behind_state = plan.behind_state(profile);
@@ -97,6 +110,11 @@ impl Plan {
             |read: &&PlannedRead| raws().any(|raw| raw.addresses().any(|address| read.covers(raw.table, address)));
         let fast = self.reads.iter().filter(|read| read.class == PollClass::Fast);
         fast.filter(decides).copied().collect()
+    }
+
+    /// All requests: those of the poll classes, those after a fault and those of comparisons.
+    pub fn all(&self) -> impl Iterator<Item = &PlannedRead> {
+        self.reads.iter().chain(&self.monitors).chain(&self.on_fault)
     }
 
     /// Whether these requests read a point of that profile: everything it is in or derived from.

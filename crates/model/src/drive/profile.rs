@@ -197,6 +197,8 @@ pub enum PollClass {
     Once,
     /// Once after a fault came up: see [`Profile::on_fault`].
     Fault,
+    /// When the drive comes online and when a comparison needs it: see [`Point::monitor`].
+    Monitor,
     /// Never by itself.
     Never,
 }
@@ -209,6 +211,7 @@ impl PollClass {
             PollClass::Slow => "slow",
             PollClass::Once => "once",
             PollClass::Fault => "fault",
+            PollClass::Monitor => "monitor",
             PollClass::Never => "never",
         }
     }
@@ -229,6 +232,9 @@ pub struct Point {
     pub class: PollClass,
     /// A slow point that is read in the fast class on lines that carry it.
     pub fast_if_carried: bool,
+    /// The point that always has the same value, where a selector of the drive decides what this one has: the two are compared
+    /// when the drive comes online.
+    pub monitor: Option<usize>,
     /// Whether it can be commanded.
     pub write: bool,
     /// The point that receives the commands, in the same unit, if the drive reports the value elsewhere.

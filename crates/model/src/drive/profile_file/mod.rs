@@ -25,7 +25,7 @@ use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
 use crate::codec::{LineFormat, Protocol};
 use crate::document::{self, Document, Finding, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
-use points::{check_object, check_target, read_point};
+use points::{check_monitor, check_object, check_target, read_point};
 use ranges::{Offsets, check_overlaps, read_functions, read_range};
 
 const BUILT_IN: [(&str, &str); 8] = [
@@ -241,6 +241,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     for (index, table) in tables.iter().enumerate() {
         check_derived(table, index, &points);
         check_target(table, index, &points);
+        check_monitor(table, index, &points);
         if protocols.contains(&Protocol::N2) {
             check_object(table, index, &points);
         }

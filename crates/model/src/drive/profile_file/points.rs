@@ -92,6 +92,9 @@ pub(super) fn read_point(
         unit,
         class,
         fast_if_carried: reader.or("fast_if_carried", false) && class == PollClass::Slow,
+        monitor: reader
+            .optional::<String>("monitor")
+            .and_then(|name| point_of(reader, "monitor", &name, names)),
         write: reader.or("write", false),
         write_to: reader
             .optional::<String>("write_to")
@@ -157,6 +160,36 @@ pub(super) fn check_target(reader: &Reader<'_>, index: usize, points: &[Point]) 
             "write_to",
             format!("`{}` has another type", target.name),
             "name a point with values of the same type",
+        );
+    }
+}
+
+/// Checks `monitor`: both are registers of their own with values of the same type.
+pub(super) fn check_monitor(reader: &Reader<'_>, index: usize, points: &[Point]) {
+    let Some(point) = points.get(index) else { return };
+    let Some(monitor) = point.monitor.and_then(|monitor| points.get(monitor)) else {
+        return;
+    };
+    if point.class != PollClass::Fast || point.raw().is_none() {
+        reader.problem(
+            "monitor",
+            "only a register of process data is compared",
+            "set `class = \"fast\"`, or leave `monitor` out",
+        );
+    }
+    let registers = monitor.raw().map(|raw| raw.addresses().collect::<Vec<_>>());
+    let same = registers == point.raw().map(|raw| raw.addresses().collect());
+    if registers.is_none() || same || monitor.monitor.is_some() {
+        reader.problem(
+            "monitor",
+            format!("`{}` is not a register of its own", monitor.name),
+            "name a point that is read from another register",
+        );
+    } else if monitor.kind() != point.kind() || monitor.unit != point.unit {
+        reader.problem(
+            "monitor",
+            format!("`{}` has another type or unit", monitor.name),
+            "name a point with values of the same type and unit",
         );
     }
 }

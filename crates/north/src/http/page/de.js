@@ -280,7 +280,7 @@ const words = {
   // Events and triggers of recordings.
   fault_end: "Störung behoben", warning_end: "Warnung beendet", online: "online", started: "gestartet", stopped: "gestoppt", control_place: "Steuerplatz",
   supervision: "Überwachung", supervision_failed: "Überwachung fehlgeschlagen", unsupervised: "nicht überwacht", refused_command: "Befehl abgelehnt",
-  not_confirmed: "nicht bestätigt", restarted: "neu gestartet", unlike_profile: "anders als Profil", foreign_command: "fremder Befehl",
+  not_confirmed: "nicht bestätigt", restarted: "neu gestartet", unlike_profile: "anders als Profil", selection_differs: "Prozessdaten anders als Profil", foreign_command: "fremder Befehl",
   parameters_changed: "Parameter geändert", restore_unfinished: "Rückspielen unvollendet", recording: "Aufzeichnung", bus_up: "Leitung verbunden",
   bus_down: "Leitung unterbrochen", diagnosis: "Diagnose", reload_refused: "Neuladen abgelehnt", lost: "verloren", refused_stop: "Stopp abgelehnt",
   line_errors: "Leitungsfehler", point: "Grenzwert", command: "Befehl",

@@ -401,7 +401,7 @@ fn quantity(entity: &mut Map<String, Value>, point: &Point) {
         _ if counts && may_fall(point) => "total",
         _ if counts => "total_increasing",
         PollClass::Fast | PollClass::Slow => "measurement",
-        PollClass::Once | PollClass::Fault | PollClass::Never => return,
+        PollClass::Once | PollClass::Fault | PollClass::Monitor | PollClass::Never => return,
     };
     entity.insert("stat_cla".into(), class.into());
 }
