@@ -1,6 +1,13 @@
 //! How causes are told to people.
 
+use std::collections::BTreeSet;
+
 use super::Cause;
+use crate::drive::commissioning::{Shared, gather};
+use crate::drive::{Profile, Step};
+
+/// Most steps that are told with a verdict.
+const MOST_STEPS: usize = 24;
 
 impl Cause {
     /// What it means, in a few words.
@@ -92,4 +99,39 @@ impl Cause {
             }
         }
     }
+
+    /// The steps of the commissioning that it questions.
+    pub const fn steps(self) -> &'static [Step] {
+        match self {
+            Cause::AllSilent | Cause::NeverAnswered => &[Step::Lamps, Step::Connect, Step::Settings],
+            Cause::OneDrive | Cause::WhileRunning => &[Step::Connect],
+            Cause::FromAddress | Cause::Bias | Cause::RequestEndLost | Cause::Noise => &[Step::Terminate],
+            Cause::AddressTwice
+            | Cause::Mains
+            | Cause::ReplyStartLost
+            | Cause::Echo
+            | Cause::LatencyTimer
+            | Cause::SilenceTooShort
+            | Cause::PortResets
+            | Cause::ConnectionCloses
+            | Cause::FasterThanBaud => &[],
+        }
+    }
+
+    /// Those steps in the words of these profiles: what to look at and to set at their drives.
+    pub fn steps_of<'p>(self, profiles: impl IntoIterator<Item = &'p Profile>) -> Vec<String> {
+        told(profiles, self.steps())
+    }
+}
+
+/// The lines of these steps, each behind the names of its profiles, without repetition.
+pub fn told<'p>(profiles: impl IntoIterator<Item = &'p Profile>, steps: &[Step]) -> Vec<String> {
+    let mut seen = BTreeSet::new();
+    let profiles: Vec<&Profile> = profiles.into_iter().filter(|one| seen.insert(&one.name)).collect();
+    let line = |Shared { profiles, line }: Shared<'_>| format!("{}: {line}", profiles.join(", "));
+    gather(&profiles, steps)
+        .into_iter()
+        .take(MOST_STEPS)
+        .map(line)
+        .collect()
 }
