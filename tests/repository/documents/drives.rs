@@ -8,6 +8,15 @@ use drivegate::drive::{Bound, Derived, ModelPoint, Point, Source, Value};
 
 /// The families, Modbus first.
 const MODBUS: [&str; 5] = ["vacon-nx", "eaton-svx", "eaton-hvx", "vacon-cx", "teco-7300pa"];
+/// Profiles of one application, each based on one of them.
+const APPLICATIONS: [&str; 6] = [
+    "vacon-nx-multipurpose",
+    "vacon-nx-pid",
+    "vacon-nx-pump-fan",
+    "eaton-svx-multipurpose",
+    "eaton-svx-pid",
+    "eaton-svx-pump-fan",
+];
 const N2: [&str; 3] = ["vacon-nx-n2", "eaton-hvx-n2", "teco-7300pa-n2"];
 
 pub(crate) fn tables() -> String {
@@ -21,11 +30,12 @@ pub(crate) fn tables() -> String {
             text += &family(profile);
         }
     }
+    text += &applications(&profiles);
     text += &assumptions();
     text.push('\n');
     assert_eq!(
         profiles.iter().count(),
-        MODBUS.len() + N2.len(),
+        MODBUS.len() + N2.len() + APPLICATIONS.len(),
         "a family is missing here"
     );
     text
@@ -149,7 +159,11 @@ fn family(profile: &Profile) -> String {
     let mut verified: Vec<String> = Vec::new();
     let mut unverified: Vec<String> = Vec::new();
     for (code, fault) in &profile.faults {
-        let text = format!("{code} {}", fault.text);
+        let panel = match fault.panel.as_str() {
+            "" => String::new(),
+            panel => format!(" (panel: {panel})"),
+        };
+        let text = format!("{code} {}{panel}", fault.text);
         if fault.verified {
             verified.push(text)
         } else {
@@ -204,6 +218,29 @@ fn family(profile: &Profile) -> String {
     }
     if !unverified.is_empty() {
         let _ = write!(text, "\nUnverified fault texts: {}.\n", unverified.join(", "));
+    }
+    text
+}
+
+/// The points by which profiles of an application differ from their base.
+fn applications(profiles: &Profiles) -> String {
+    let mut text = String::from(
+        "\n## Profiles of one application\n\nProcess data in means something else in each application, and no read shows \
+         which one a drive has: choose the profile. All other points are those of the base, without `process_data_in_1` to \
+         `process_data_in_8`.\n\n|profile|base|point|unit|address|note|\n|---|---|---|---|---|---|\n",
+    );
+    for name in APPLICATIONS {
+        let profile = profiles.get(name).unwrap();
+        let base = profiles.get(profile.base.as_deref().unwrap()).unwrap();
+        let same = |point: &&Point| base.points.iter().any(|other| other.name == point.name);
+        for point in profile.points.iter().filter(|point| !same(point)) {
+            let (base, place) = (&base.name, place(profile, point));
+            let _ = writeln!(
+                text,
+                "|`{name}`|`{base}`|`{}`|{}|{place}|{}|",
+                point.name, point.unit, point.note
+            );
+        }
     }
     text
 }

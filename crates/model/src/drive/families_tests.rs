@@ -625,13 +625,9 @@ fn steps_at_the_cabinet() {
     let nx = profile("vacon-nx");
     for name in ["vacon-nx-n2", "eaton-svx", "eaton-hvx", "eaton-hvx-n2"] {
         let other = profile(name);
-        for step in [Step::Terminate, Step::Lamps] {
+        for step in [Step::Connect, Step::Terminate, Step::Lamps] {
             assert_eq!(other.commissioning.lines(step), nx.commissioning.lines(step), "{name}");
         }
-        assert_eq!(
-            other.commissioning.lines(Step::Connect)[1..],
-            nx.commissioning.lines(Step::Connect)[1..]
-        );
     }
     let lamps = nx.commissioning.lines(Step::Lamps);
     assert!(lamps[0].starts_with("green LED (FS) steady: the board is active and has seen no message yet"));

@@ -77,7 +77,7 @@ mod tests {
         assert!(board.ends_with("a Vacon NX, or an Eaton with a newer board"), "{board}");
         let board = title(&["eaton-hvx", "eaton-svx"], 0);
         assert!(
-            board.starts_with("eaton-hvx or eaton-svx (indistinguishable by reading): an OPT-C2 board"),
+            board.starts_with("eaton-hvx or eaton-svx (indistinguishable by reading): an older OPT-C2 board"),
             "{board}"
         );
     }
