@@ -10,7 +10,7 @@ const FAMILIES: [(&str, Option<&str>); 8] = [
     ("vacon-nx", None),
     ("vacon-nx-n2", Some("vacon-nx")),
     ("eaton-svx", Some("vacon-nx")),
-    ("eaton-hvx", Some("vacon-nx")),
+    ("eaton-hvx", Some("eaton-svx")),
     ("eaton-hvx-n2", Some("eaton-hvx")),
     ("vacon-cx", None),
     ("teco-7300pa", None),
@@ -31,25 +31,32 @@ pub(crate) fn lists() -> String {
     text + "\n"
 }
 
-/// All lines, or those that the other family does not have.
+/// All steps, or those that differ from the other family; of such a step the lines that it lacks, or all where it has
+/// lines that do not hold here.
 fn family(profile: &Profile, other: Option<&Profile>) -> String {
     let but = other.map_or(String::new(), |other| format!(", as `{}` except", other.name));
     let mut text = format!("\n### `{}`{but}\n\n", profile.name);
     for step in Step::ALL {
         let known = other.map_or(&[][..], |other| other.commissioning.lines(step));
-        let lines = profile
-            .commissioning
-            .lines(step)
-            .iter()
-            .filter(|line| !known.contains(line));
+        let own = profile.commissioning.lines(step);
+        // A line takes the place of one with the same beginning.
+        let beginning = |line: &String| line.split(':').next().map(str::to_string);
+        let is_replaced = |line: &String| own.iter().any(|one| beginning(one) == beginning(line));
+        let all_hold = known.iter().all(is_replaced);
+        let lines = own.iter().filter(|line| !all_hold || !known.contains(line));
         for (place, line) in lines.enumerate() {
-            let head = if place == 0 {
-                format!("**{}**: ", step.title())
-            } else {
-                String::new()
+            let head = match place {
+                0 => format!("**{}**: ", step.title()),
+                _ => String::new(),
             };
             let _ = writeln!(text, "- {head}{line}");
         }
+        assert!(
+            known.is_empty() || !own.is_empty(),
+            "{}: {} is lost",
+            profile.name,
+            step.name()
+        );
     }
     text
 }

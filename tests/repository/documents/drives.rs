@@ -28,6 +28,7 @@ pub(crate) fn tables() -> String {
     for name in MODBUS.iter().chain(&N2) {
         if let Some(profile) = profiles.get(name) {
             text += &family(profile);
+            text += &faults(&profiles, profile);
         }
     }
     text += &applications(&profiles);
@@ -156,20 +157,6 @@ fn family(profile: &Profile) -> String {
         "\n## `{}`: {}\n\nSource: {}.",
         profile.name, profile.title, profile.source
     );
-    let mut verified: Vec<String> = Vec::new();
-    let mut unverified: Vec<String> = Vec::new();
-    for (code, fault) in &profile.faults {
-        let panel = match fault.panel.as_str() {
-            "" => String::new(),
-            panel => format!(" (panel: {panel})"),
-        };
-        let text = format!("{code} {}{panel}", fault.text);
-        if fault.verified {
-            verified.push(text)
-        } else {
-            unverified.push(text)
-        }
-    }
     if doubtful > 0 {
         let _ = write!(text, " Not verified: {doubtful} of {} points.", profile.points.len());
     }
@@ -213,6 +200,33 @@ fn family(profile: &Profile) -> String {
     if !rules.is_empty() {
         let _ = write!(text, "\nWrites: {}.\n", rules.join("; "));
     }
+    text
+}
+
+/// The fault texts of a family, or which other family has the same.
+fn faults(profiles: &Profiles, profile: &Profile) -> String {
+    let earlier = MODBUS.iter().chain(&N2).take_while(|name| **name != profile.name);
+    let same = earlier
+        .filter_map(|name| profiles.get(name))
+        .find(|one| one.faults == profile.faults);
+    if let Some(same) = same {
+        return format!("\nFault texts: as `{}`.\n", same.name);
+    }
+    let mut text = String::new();
+    let mut verified: Vec<String> = Vec::new();
+    let mut unverified: Vec<String> = Vec::new();
+    for (code, fault) in &profile.faults {
+        let panel = match fault.panel.as_str() {
+            "" => String::new(),
+            panel => format!(" (panel: {panel})"),
+        };
+        let text = format!("{code} {}{panel}", fault.text);
+        if fault.verified {
+            verified.push(text)
+        } else {
+            unverified.push(text)
+        }
+    }
     if !verified.is_empty() {
         let _ = write!(text, "\nFault texts: {}.\n", verified.join(", "));
     }
@@ -225,22 +239,25 @@ fn family(profile: &Profile) -> String {
 /// The points by which profiles of an application differ from their base.
 fn applications(profiles: &Profiles) -> String {
     let mut text = String::from(
-        "\n## Profiles of one application\n\nProcess data in means something else in each application, and no read shows \
-         which one a drive has: choose the profile. All other points are those of the base, without `process_data_in_1` to \
-         `process_data_in_8`.\n\n|profile|base|point|unit|address|note|\n|---|---|---|---|---|---|\n",
+        "\n## Profiles of one application\n\nWhat process data in means depends on the application, and no read shows which one \
+         a drive has: choose the profile. It is its base without `process_data_in_1` to `process_data_in_8`, and with\n\n\
+         |point|unit|address|profiles|\n|---|---|---|---|\n",
     );
+    let mut rows: Vec<(String, Vec<&str>)> = Vec::new();
     for name in APPLICATIONS {
         let profile = profiles.get(name).unwrap();
         let base = profiles.get(profile.base.as_deref().unwrap()).unwrap();
         let same = |point: &&Point| base.points.iter().any(|other| other.name == point.name);
         for point in profile.points.iter().filter(|point| !same(point)) {
-            let (base, place) = (&base.name, place(profile, point));
-            let _ = writeln!(
-                text,
-                "|`{name}`|`{base}`|`{}`|{}|{place}|{}|",
-                point.name, point.unit, point.note
-            );
+            let row = format!("|`{}`|{}|{}|", point.name, point.unit, place(profile, point));
+            match rows.iter_mut().find(|(known, _)| *known == row) {
+                Some((_, names)) => names.push(name),
+                None => rows.push((row, vec![name])),
+            }
         }
+    }
+    for (row, names) in rows {
+        let _ = writeln!(text, "{row}`{}`|", names.join("`, `"));
     }
     text
 }
