@@ -138,7 +138,13 @@ fn show(profile: &Profile) -> String {
                 format_duration(profile.confirm_within)
             ),
         ),
-        ("identified", profile.identified.clone()),
+        (
+            "scan says",
+            match profile.identify.is_empty() {
+                true => String::new(),
+                false => profile.identified.clone(),
+            },
+        ),
         (
             "simulator",
             profile.simulator.clone().unwrap_or_else(|| "none".to_string()),

@@ -23,14 +23,17 @@ pub(crate) struct Found {
 impl Found {
     /// For people.
     pub(crate) fn title(&self, profiles: &Profiles) -> String {
-        let meaning = self
-            .identified(profiles)
-            .map_or(String::new(), |text| format!(": {text}"));
-        match self.profiles.as_slice() {
-            [] if self.unanswered > 0 => format!("family not known, because {}", self.silence()),
-            [] => "no known profile".to_string(),
-            [one] => format!("{one}{meaning}"),
-            some => format!("{} (indistinguishable by reading){meaning}", some.join(" or ")),
+        let names = self.profiles.join(" or ");
+        let more = [
+            (self.profiles.len() > 1).then(|| "indistinguishable by reading".to_string()),
+            self.identified(profiles),
+        ];
+        let more: Vec<String> = more.into_iter().flatten().collect();
+        match (names.as_str(), more.as_slice()) {
+            ("", _) if self.unanswered > 0 => format!("family not known, because {}", self.silence()),
+            ("", _) => "no known profile".to_string(),
+            (names, []) => names.to_string(),
+            (names, more) => format!("{names} ({})", more.join("; ")),
         }
     }
 
@@ -74,10 +77,13 @@ mod tests {
         assert_eq!(title(&["vacon-cx"], 1), "vacon-cx");
         // The board's answers do not prove the make of the drive.
         let board = title(&["vacon-nx"], 0);
-        assert!(board.ends_with("a Vacon NX, or an Eaton with a newer board"), "{board}");
+        assert!(
+            board.ends_with("nx (an OPT-C2 board of 2012 or later: a Vacon NX, or an Eaton with a newer board)"),
+            "{board}"
+        );
         let board = title(&["eaton-hvx", "eaton-svx"], 0);
         assert!(
-            board.starts_with("eaton-hvx or eaton-svx (indistinguishable by reading): an older OPT-C2 board"),
+            board.starts_with("eaton-hvx or eaton-svx (indistinguishable by reading; an older OPT-C2 board: "),
             "{board}"
         );
     }
