@@ -104,6 +104,9 @@ fn text(diagnosis: &Diagnosis) -> String {
             printable::line(&verdict.meaning),
             verdict.certainty.name()
         );
+        if !verdict.steps.is_empty() {
+            text += "      at the drives; `drivegate profiles show NAME` has all steps:\n";
+        }
         for step in &verdict.steps {
             let _ = writeln!(text, "        - {}", printable::line(step));
         }
@@ -166,7 +169,7 @@ mod tests {
             since: String::new(),
         });
         diagnosis.drives[0].silent = 7;
-        let expected = "line1:\n\n  one_drive pump-1: one is bad (likely)\n      seen: 7 of 9\n      do: look\n        - vacon-nx: green LED steady\n\n  in the last minute";
+        let expected = "line1:\n\n  one_drive pump-1: one is bad (likely)\n      seen: 7 of 9\n      do: look\n      at the drives; `drivegate profiles show NAME` has all steps:\n        - vacon-nx: green LED steady\n\n  in the last minute";
         assert!(text(&diagnosis).starts_with(expected), "{}", text(&diagnosis));
     }
 }
