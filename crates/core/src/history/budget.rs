@@ -9,7 +9,7 @@ use crate::drive::{Plan, PlannedRead, PollClass};
 use crate::process_image::{BusSpec, DriveSpec};
 
 /// Memory that the recorder takes for all buses together at most, bytes.
-pub const MOST_BYTES: usize = 24 << 20;
+pub const MOST_BYTES: usize = 20 << 20;
 /// Bytes of events and commands of a drive, where there is room for it.
 pub const NOTES: usize = 64 << 10;
 /// Room beside the planned reads: retries, reads that commands ask for, reads after a fault.
@@ -152,7 +152,7 @@ mod tests {
             );
             let least = shared.iter().map(|bus| bus.notes.min(bus.samples[0])).min();
             assert!(
-                least.is_some_and(|bytes| bytes >= 1000),
+                least.is_some_and(|bytes| bytes >= 800),
                 "{buses} buses: {least:?} bytes"
             );
         }

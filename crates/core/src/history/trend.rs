@@ -56,8 +56,8 @@ pub const POINT_BYTES: usize = {
     (fine.buckets() + middle.buckets() + coarse.buckets()) * size_of::<Bucket>()
 };
 
-/// Memory of all trends of the gateway at most, bytes: about 300 drives of nine points with all of [`RANGES`].
-pub const MOST_BYTES: usize = 64 << 20;
+/// Memory of all trends of the gateway at most, bytes: about 150 drives of nine points with all of [`RANGES`].
+pub const MOST_BYTES: usize = 32 << 20;
 
 /// Memory of the trends of a drive that reach back as far as [`RANGES`], bytes.
 pub fn bytes_of(profile: &Profile) -> usize {

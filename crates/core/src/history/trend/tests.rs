@@ -252,7 +252,7 @@ fn memory_is_as_stated_and_only_for_what_is_read() {
 fn many_drives_share_the_memory_and_what_they_keep_is_right() {
     let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
     let of = |drives| Reach::of(std::iter::repeat_n(&*nx, drives));
-    assert_eq!(of(304), Reach::FULL);
+    assert_eq!(of(152), Reach::FULL);
     let reach = of(992);
     let all = 992 * reach.bytes_of(&nx);
     assert!((MOST_BYTES / 10 * 9..=MOST_BYTES).contains(&all), "{all}");
