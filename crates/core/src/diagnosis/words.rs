@@ -139,9 +139,10 @@ pub fn told<'p>(profiles: impl IntoIterator<Item = &'p Profile>, steps: &[Step])
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::codec::Protocol;
     use crate::drive::profile::Profiles;
 
-    /// Of every family on a line, what a silent one has to be looked at for, and nothing is cut off.
+    /// Of every family that a line can have, what a silent one has to be looked at for, and nothing is cut off.
     #[test]
     fn steps_are_those_of_the_families_on_the_line() {
         let all = Profiles::built_in();
@@ -150,8 +151,11 @@ mod tests {
                 .map(AsRef::as_ref)
                 .filter(|one: &&Profile| one.base.is_none())
         };
-        for cause in Cause::ALL {
-            let steps = cause.steps_of(families());
+        for (cause, protocol) in Cause::ALL
+            .into_iter()
+            .flat_map(|cause| Protocol::ALL.map(|protocol| (cause, protocol)))
+        {
+            let steps = cause.steps_of(families().filter(|one| one.protocols.contains(&protocol)));
             assert!(steps.len() < MOST_STEPS, "{cause:?}: {}", steps.len());
             assert_eq!(steps.is_empty(), cause.steps().is_empty(), "{cause:?}");
         }

@@ -117,7 +117,7 @@ mod tests {
             (Exception::n2(0x05), "N2 error 05 (field size wrong for the command)"),
             (
                 Exception::n2(0x11),
-                "N2 error 11 (invalid command for the data type, or only in PRGM mode (TECO))",
+                "N2 error 11 (invalid command for the data type, or only in PRGM mode (TECO, assumed))",
             ),
             (
                 Exception::N2_RESTARTED,
