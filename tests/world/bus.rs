@@ -10,8 +10,8 @@ use drivegate::bus::predict::predict;
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
 use drivegate::command::{CommandQueue, WriteStats};
-use drivegate::drive::Profile;
 use drivegate::drive::profile::Profiles;
+use drivegate::drive::{PollClass, Profile};
 use drivegate::event::Events;
 use drivegate::line::LineOptions;
 use drivegate::plant::BusHandle;
@@ -69,6 +69,8 @@ pub struct WorldBus {
     pub round: Duration,
     /// The slow cycle of the line, as predicted.
     pub slow_round: Duration,
+    /// The same while drives come online, whose process data is compared with its monitoring registers.
+    pub first_slow_round: Duration,
     /// Share of what comes to the gateway in which one bit is wrong, faults of the line apart.
     pub flips: f64,
     dice: Random,
@@ -143,6 +145,12 @@ impl WorldBus {
         let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();
         let predicted = predict(&handle.image.spec, parts.silence, &specs);
         let (round, slow_round) = (predicted.fast_cycle, predicted.slow_cycle);
+        let (mut slow, mut monitors) = (0, 0);
+        for plan in handle.image.drives.iter().map(|drive| &drive.plan) {
+            slow += plan.reads.iter().filter(|read| read.class == PollClass::Slow).count() as u32;
+            monitors += plan.monitors.len() as u32;
+        }
+        let first_slow_round = slow_round.map(|round| round * (slow + monitors) / slow.max(1));
         let wire_format = LineFormat::new(line.baud * parts.wire_speed, line.format).unwrap();
         let mut rules = LineRules::of(line.protocol, wire_format);
         rules.turnaround = line.turnaround;
@@ -173,6 +181,7 @@ impl WorldBus {
             exchanges: 0,
             round: round.unwrap_or_default(),
             slow_round: slow_round.unwrap_or_default(),
+            first_slow_round: first_slow_round.unwrap_or_default(),
             flips: parts.flips,
             dice: Random::new(index as u64 ^ 0xF11B),
             began: now,

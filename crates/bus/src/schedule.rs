@@ -463,7 +463,9 @@ impl Schedule {
             .into_iter()
             .flatten()
             .filter(|item| !item.refused && item.failures == 0);
-        if let Some(item) = sound.find(|item| !matches!(item.read.class, PollClass::Fast | PollClass::Fault | PollClass::Monitor)) {
+        if let Some(item) =
+            sound.find(|item| !matches!(item.read.class, PollClass::Fast | PollClass::Fault | PollClass::Monitor))
+        {
             item.wanted = true;
             item.due = item.due.min(now);
         }

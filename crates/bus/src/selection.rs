@@ -108,7 +108,13 @@ impl Selections {
     }
 
     /// The drive refuses that read: a monitoring register that it does not have proves nothing.
-    pub(super) fn refused(&mut self, drive: usize, read: &PlannedRead, reading: &Reading<'_>, now: Instant) -> Findings {
+    pub(super) fn refused(
+        &mut self,
+        drive: usize,
+        read: &PlannedRead,
+        reading: &Reading<'_>,
+        now: Instant,
+    ) -> Findings {
         let points = &reading.spec.profile.points;
         for compared in self.points(drive) {
             let raw = points.get(compared.monitor).and_then(Point::raw);
@@ -133,7 +139,11 @@ impl Selections {
         let value = |point: usize| reading.own_sample(point).good().map(|value| value.as_f64());
         let (mut wanted, mut differ, mut restored) = (Vec::new(), Vec::new(), Vec::new());
         for compared in self.points(drive) {
-            let Some((point, monitor)) = profile.points.get(compared.point).zip(profile.points.get(compared.monitor)) else {
+            let Some((point, monitor)) = profile
+                .points
+                .get(compared.point)
+                .zip(profile.points.get(compared.monitor))
+            else {
                 continue;
             };
             if monitor.raw().is_some_and(|raw| covers(read, raw)) {
@@ -252,7 +262,11 @@ fn compare(of: (&Point, &Point), around: (f64, f64), monitored: f64) -> Verdict 
     };
     if (low - slack..=high + slack).contains(&monitored) {
         let least = low.abs().min(high.abs()).min(monitored.abs());
-        return if least > slack { Verdict::Agrees } else { Verdict::Nothing };
+        return if least > slack {
+            Verdict::Agrees
+        } else {
+            Verdict::Nothing
+        };
     }
     // A register that only other documents name, and that reads 0, is perhaps not there.
     match monitored == 0.0 && !monitor.verified {

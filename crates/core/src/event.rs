@@ -85,7 +85,7 @@ pub enum EventKind {
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 24] = [
+    pub const ALL: [EventKind; 25] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -477,8 +477,8 @@ mod tests {
         for (place, kind) in EventKind::ALL.into_iter().enumerate() {
             let last = match kind {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
-                | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised | RefusedCommand
-                | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
+                | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised
+                | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
                 ParametersChanged | RestoreUnfinished => false,
                 Diagnosis => true,
             };

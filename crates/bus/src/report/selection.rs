@@ -56,7 +56,10 @@ impl Report {
             );
         }
         let differ = |(point, own, monitored): &(usize, f64, f64)| {
-            format!("{} reads {own} there and {monitored} in its monitoring register", name(*point))
+            format!(
+                "{} reads {own} there and {monitored} in its monitoring register",
+                name(*point)
+            )
         };
         let differ: Vec<String> = findings.differ.iter().map(differ).collect();
         if differ.is_empty() {

@@ -77,6 +77,14 @@ fn modbus_families() {
         ("trip_hours", "-", "-", "IR 9 x 0.01", "-"),
         ("fault_code", "HR 2110", "HR 2110", "IR 100", "derive lowest_bit"),
         ("fault_code_id99", "HR 98", "HR 98", "-", "-"),
+        // Documents of relatives [X7]: compared with process data.
+        ("output_frequency_id1", "HR 0 x 0.01", "HR 0 x 0.01", "-", "-"),
+        ("motor_speed_id2", "HR 1", "HR 1", "-", "-"),
+        ("motor_torque_id4", "HR 3 x 0.1", "HR 3 x 0.1", "-", "-"),
+        ("motor_power_id5", "HR 4 x 0.1", "HR 4 x 0.1", "-", "-"),
+        ("motor_voltage_id6", "HR 5 x 0.1", "HR 5 x 0.1", "-", "-"),
+        ("dc_link_voltage_id7", "HR 6", "HR 6", "-", "-"),
+        ("motor_current_id45", "HR 44 x 0.1", "HR 44 x 0.1", "-", "-"),
         ("fault_mask", "-", "-", "-", "HR 33"),
         (
             "speed_reference",
@@ -108,10 +116,16 @@ fn modbus_families() {
         ),
     ];
     for (point, nx, eaton, cx, teco) in rows {
+        // The default selection of process data out 8 of HVX is in another manual [E table 5-3].
+        let hvx = match point {
+            "fault_code" => "HR 98",
+            "fault_code_id99" => "-",
+            _ => eaton,
+        };
         for (name, wanted) in [
             ("vacon-nx", nx),
             ("eaton-svx", eaton),
-            ("eaton-hvx", eaton),
+            ("eaton-hvx", hvx),
             ("vacon-cx", cx),
             ("teco-7300pa", teco),
         ] {

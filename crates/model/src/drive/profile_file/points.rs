@@ -185,7 +185,7 @@ pub(super) fn check_monitor(reader: &Reader<'_>, index: usize, points: &[Point])
             format!("`{}` is not a register of its own", monitor.name),
             "name a point that is read from another register",
         );
-    } else if monitor.kind() != point.kind() || monitor.unit != point.unit {
+    } else if (monitor.kind() == Kind::Bool) != (point.kind() == Kind::Bool) || monitor.unit != point.unit {
         reader.problem(
             "monitor",
             format!("`{}` has another type or unit", monitor.name),

@@ -526,15 +526,11 @@ fn points_for_faults_are_read_by_their_registers() {
         .map(|i| profile.points[*i].name.as_str())
         .collect();
     assert_eq!(names, ["fault_code_id99", "heatsink_temperature"]);
-    // What is polled anyway needs no read of its own.
+    // What is polled anyway, or is compared with process data, needs no read of its own.
     let plan = crate::drive::Plan::of(&profile);
-    assert_eq!(
-        plan.on_fault
-            .iter()
-            .map(|read| (read.start, read.count))
-            .collect::<Vec<_>>(),
-        [(98, 1)]
-    );
+    assert_eq!(plan.on_fault, []);
+    let monitors: Vec<_> = plan.monitors.iter().map(|read| (read.start, read.count)).collect();
+    assert_eq!(monitors, [(0, 7), (44, 1), (98, 1)]);
     // A derived point is read by what it is made of; what is removed is not read.
     let derived = Profile::parse("p", &source("\"frequency_reference\""), false).unwrap();
     let names: Vec<&str> = derived
