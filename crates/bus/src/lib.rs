@@ -34,6 +34,7 @@ pub mod prober;
 mod report;
 pub mod schedule;
 mod selection;
+pub mod stop_of_line;
 pub mod supervision;
 mod tap;
 pub mod transaction;

@@ -60,6 +60,8 @@ pub struct Profile {
     /// All points, in the order of the file.
     pub points: Vec<Point>,
     /// Points that a drive with a new fault is asked for at once.
+    /// A broadcast that clears the whole control word stops every drive of the family on the line.
+    pub broadcast_stop: bool,
     pub on_fault: Vec<usize>,
     /// Its parameters.
     pub parameters: ParameterList,
@@ -416,6 +418,18 @@ impl Profile {
     /// Whether a write to that table is released afterwards: an analog output of N2.
     pub fn releases(&self, table: Table) -> bool {
         table == Table::Holding && self.n2.release && self.protocols.contains(&Protocol::N2)
+    }
+
+    /// The write that stops every drive of the family on a line when it is sent to all of them: it clears the whole control
+    /// word. None where the family knows none.
+    pub fn broadcast_stop(&self) -> Option<RequestPdu> {
+        let (raw, ..) = self.run_bit().filter(|_| self.broadcast_stop)?;
+        let pdu = match raw.table {
+            Table::Coil => self.functions.write_coil(raw.address, false),
+            Table::Holding => self.functions.write_register(raw.address, 0),
+            Table::DiscreteInput | Table::Input => return None,
+        };
+        self.is_stop(raw.table, raw.address, 0).then_some(pdu)
     }
 
     /// Whether writing `value` to that register (or coil) clears the run command: a stop.

@@ -302,6 +302,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         input_is_holding,
         identify: identify::read(reader),
         simulator: reader.optional("simulator"),
+        broadcast_stop: reader.or("broadcast_stop", false),
         on_fault: read_on_fault(reader, &points),
         parameters: parameters::read(reader, &bases, &points, &ranges),
         functions: read_functions(reader, &ranges),
@@ -315,6 +316,13 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         tree: None,
         warnings: Vec::new(),
     };
+    if profile.broadcast_stop && (profile.protocols.contains(&Protocol::N2) || profile.broadcast_stop().is_none()) {
+        reader.problem(
+            "broadcast_stop",
+            "no broadcast can stop these drives: `run` is not a bit of a register or coil that 0 stops, or the protocol is n2",
+            "leave the key out",
+        );
+    }
     reader.finish();
     name.map(|_| profile)
 }
