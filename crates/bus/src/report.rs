@@ -433,7 +433,7 @@ impl Report {
         if drive.spec.supervision.is_some() {
             tracing::warn!(
                 target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
-                "the drive does not respond to a silent master ({point} = 0), its lease stops it only while the gateway \
+                "the drive does not respond to a silent master ({point}), its lease stops it only while the gateway \
                  works; set the parameter to a stop if the process allows it"
             );
             return;
@@ -441,7 +441,7 @@ impl Report {
         self.drive_event(index, EventKind::Unsupervised, None, |name| {
             format!(
                 "nothing stops drive {name} when whoever commands it falls silent: it has no lease, and its own response \
-                 to a silent master is off ({point} = 0); configure supervision, and set the parameter if the process \
+                 to a silent master is off ({point}); configure supervision, and set the parameter if the process \
                  allows it"
             )
         });

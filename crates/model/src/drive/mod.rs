@@ -25,6 +25,13 @@ pub use raw_writes::RawWrites;
 /// P2.7.22.
 pub const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";
 
+/// Name of the point with what a drive does after a communication error; 3 is that its motor runs on. For TECO 7300PA the first two
+/// digits of Sn-08.
+pub const COMMUNICATION_ERROR_REACTION: &str = "communication_error_reaction";
+
+/// Name of the point with the time without data, in seconds, after which a drive has a communication fault. For TECO 7300PA Cn-31.
+pub const COMMUNICATION_FAULT_TIME: &str = "communication_fault_time";
+
 /// Name of the point with the time without a request, in seconds, after which a drive responds to a silent master; 0 is
 /// never. For drives with a register for it.
 pub const COMMUNICATION_TIMEOUT: &str = "communication_timeout";

@@ -310,6 +310,12 @@ impl Look<'_> {
             let blocks = point.blocks.as_ref()?;
             let sample = (self.sample)(index);
             let value = sample.good().filter(|value| value.as_bool() == blocks.when)?;
+            // A drive that is ready waits for no interlock, whatever an uncertain bit seems to say (HVX status word bit 8, where
+            // table and legend of the manual contradict).
+            let ready = || self.bit(ModelPoint::Ready).is_some_and(|(ready, _)| ready);
+            if !point.verified && blocks.cause == INTERLOCKED && ready() {
+                return None;
+            }
             let unsure = if point.verified { "" } else { ", address not verified" };
             let evidence = format!("{}{unsure}", reads(point, value));
             Some(self.cause(&blocks.cause, evidence, sample.at, &blocks.remedy))
@@ -343,7 +349,12 @@ impl Look<'_> {
         }
         let evidence = "ready is off, and the drive does not tell why".to_string();
         let remedy = "check its enable and interlock inputs, the mains, and what its display shows";
-        Some(self.cause("not_ready", evidence, at, remedy))
+        let note = self.profile.model_point(ModelPoint::Ready).map_or("", |point| &point.note);
+        let remedy = match note.is_empty() {
+            true => remedy.to_string(),
+            false => format!("{remedy}; of this family: ready {note}"),
+        };
+        Some(self.cause("not_ready", evidence, at, &remedy))
     }
 
     /// It takes no order to run, whoever gives it.
