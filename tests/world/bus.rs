@@ -38,6 +38,8 @@ pub struct Asked {
     pub reply: Option<Reply>,
     /// The frame of that.
     pub frame: Vec<u8>,
+    /// Address of the drive that acted last.
+    pub acted: u8,
 }
 
 /// Something that happened on the line.
@@ -324,6 +326,7 @@ impl WorldBus {
             },
             reply: None,
             frame: Vec::new(),
+            acted: 0,
         };
         seen.push(Seen::Sent(asked.clone()));
         self.asked = Some(asked);
@@ -355,6 +358,7 @@ impl WorldBus {
                 continue;
             };
             asked.frame = act.reply.clone();
+            asked.acted = act.address;
             let Some(image) = self.handle.image.drives.get(asked.drive) else {
                 // None is configured at that address.
                 seen.push(Seen::Acted(asked.clone()));

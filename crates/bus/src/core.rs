@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::BusOptions;
+use super::drive_counters::DriveCounters;
 use super::line_state::{Exchanged, LineState};
 use super::master::{Handover, Master, Purpose, Remains, Turn, TurnEnd};
 use super::news::News;
@@ -84,6 +85,8 @@ pub struct BusCore {
     asked: Option<Turn>,
     connection: Connection,
     tap: Option<Tap>,
+    counters: DriveCounters,
+    writes: Arc<WriteStats>,
     /// Empty; kept for its memory.
     news: Vec<News>,
 }
@@ -107,7 +110,9 @@ impl BusCore {
         BusCore {
             line,
             master: Master::new(bus.clone(), options, silence, writes.clone(), before, now),
-            report: Report::new(bus.image.clone(), options, events, writes, now),
+            report: Report::new(bus.image.clone(), options, events, writes.clone(), now),
+            counters: DriveCounters::new(&bus, now),
+            writes,
             bus,
             chosen: None,
             quiet_until: before.quiet_until,
@@ -224,6 +229,8 @@ impl BusCore {
         let next = self.master.next(now, &mut news);
         self.report_all(news, now);
         self.report.tick(now);
+        self.counters
+            .look(&self.bus, &mut self.report.diagnosis, &self.writes, now);
         let turn = match next {
             Ok(turn) => turn,
             Err(until) => return Some(until),

@@ -19,6 +19,7 @@
 pub mod command_run;
 pub mod confirm;
 pub mod core;
+mod drive_counters;
 mod drive_state;
 pub mod late_replies;
 mod line_diagnosis;

@@ -16,7 +16,10 @@ use super::command_run::KnownWords;
 use super::news::{Adopted, News};
 use crate::command::{Answer, Outcome, Refusal};
 use crate::drive::profile::Form;
-use crate::drive::{COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Raw, Value};
+use crate::drive::{
+    COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Raw,
+    Value,
+};
 use crate::process_image::{LeaseAction, Reading, Unavailable};
 
 /// How long an action that was not acknowledged waits before it is written again.

@@ -495,7 +495,10 @@ fn warn_of_fault_time(reader: &Reader<'_>, found: &bus::Found, cycle: Option<Dur
         return;
     };
     let drives = found.drives.iter().filter_map(|drive| drive.spec.as_ref());
-    let Some(first) = drives.into_iter().find(|spec| spec.profile.point_index(fault_time).is_some()) else {
+    let Some(first) = drives
+        .into_iter()
+        .find(|spec| spec.profile.point_index(fault_time).is_some())
+    else {
         return;
     };
     reader.document().warning(

@@ -60,6 +60,8 @@ pub struct Profile {
     /// All points, in the order of the file.
     pub points: Vec<Point>,
     /// Points that a drive with a new fault is asked for at once.
+    /// The drive counts what it receives, damaged or not, and tells it by function 08 (subfunctions 0B to 0F).
+    pub counts_messages: bool,
     /// The drive may stop by itself when its master falls silent, and nothing that can be read tells whether it does.
     pub may_stop_by_itself: bool,
     /// A broadcast that clears the whole control word stops every drive of the family on the line.

@@ -349,7 +349,10 @@ impl Look<'_> {
         }
         let evidence = "ready is off, and the drive does not tell why".to_string();
         let remedy = "check its enable and interlock inputs, the mains, and what its display shows";
-        let note = self.profile.model_point(ModelPoint::Ready).map_or("", |point| &point.note);
+        let note = self
+            .profile
+            .model_point(ModelPoint::Ready)
+            .map_or("", |point| &point.note);
         let remedy = match note.is_empty() {
             true => remedy.to_string(),
             false => format!("{remedy}; of this family: ready {note}"),

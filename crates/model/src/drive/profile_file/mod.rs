@@ -302,6 +302,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         input_is_holding,
         identify: identify::read(reader),
         simulator: reader.optional("simulator"),
+        counts_messages: reader.or("counts_messages", false),
         may_stop_by_itself: reader.or("may_stop_by_itself", false),
         broadcast_stop: reader.or("broadcast_stop", false),
         on_fault: read_on_fault(reader, &points),
