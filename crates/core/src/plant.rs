@@ -521,6 +521,11 @@ impl DriveHandle {
         turn_away(&self.writes, name, what, Outcome::Refused(refusal), origin, now)
     }
 
+    /// Passes a request on to the line of the drive, as [`BusHandle::ask`].
+    pub fn ask_line(&self, question: Question, now: Instant) -> Exchange {
+        self.bus.ask(question, &self.writes, now)
+    }
+
     /// Publishes that a command was refused; a flood of them is counted.
     fn publish_refusal(&self, what: &str, refusal: &Refusal, origin: &Origin, now: Instant) {
         let what = if what.is_empty() { "an empty command" } else { what };

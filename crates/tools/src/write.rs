@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use super::drive_access::{Target, Way, target};
 use super::{EXIT_FAILED, EXIT_USAGE, printable, report};
 use crate::drive::model::Kind;
-use crate::drive::{Point, Value};
+use crate::drive::{Point, RESTART_COMMUNICATION, Value};
 use crate::north::local::protocol::{Outcome, Request, Setting, WriteOutcome, WriteRequest};
 use crate::process_image::value_or_null;
 
@@ -56,6 +56,21 @@ fn parse(target: &Target, text: &str) -> Result<(Setting, String), String> {
     let (name, text) = text.split_once('=').ok_or_else(|| {
         format!("expected POINT=VALUE, got `{text}`; command line; write for example speed_reference=50")
     })?;
+    let profile = &target.spec.profile;
+    if name.trim() == RESTART_COMMUNICATION && profile.counts_messages {
+        return match text.trim() {
+            "true" => Ok((
+                Setting {
+                    point: RESTART_COMMUNICATION.to_string(),
+                    value: true.into(),
+                },
+                format!("{RESTART_COMMUNICATION}=true"),
+            )),
+            other => Err(format!(
+                "`{other}` is not a value of `{RESTART_COMMUNICATION}`; write true"
+            )),
+        };
+    }
     let index = target.point(name.trim())?;
     let point = target.spec.profile.points.get(index);
     let point = point.ok_or_else(|| format!("there is no point `{name}`; command line; name another"))?;

@@ -377,6 +377,12 @@ impl Master {
         }
     }
 
+    /// Whether a background exchange has its turn that somebody asked for.
+    pub(super) fn background_of_others(&self) -> bool {
+        let begun = self.background.as_ref();
+        begun.is_some_and(|begun| !begun.request.is_of_gateway())
+    }
+
     /// Whether the background exchange is the broadcast of the shutdown.
     pub(super) fn stops_the_line(&self) -> bool {
         let begun = self.background.as_ref();

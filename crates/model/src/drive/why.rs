@@ -242,6 +242,12 @@ impl Look<'_> {
                 "its process data is too old to say anything".to_string(),
                 "see load and errors of the bus: the line may be overloaded or disturbed",
             ),
+            Contact::Silent if self.profile.counts_messages => (
+                "offline",
+                "it does not answer".to_string(),
+                "check its supply, the wiring and its address; if a master has set it to listen only (function 08, subfunction \
+                 04), write restart_communication=true with `drivegate write`",
+            ),
             Contact::Silent => (
                 "offline",
                 "it does not answer".to_string(),

@@ -15,7 +15,7 @@ use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Pace, Refus
 use crate::command_json::resolve;
 use crate::document::nearest;
 use crate::drive::why::Explanation;
-use crate::drive::{ModelPoint, Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
+use crate::drive::{ModelPoint, Point, PollClass, Profile, Quality, RESTART_COMMUNICATION, Raw, Sample, Source, Value};
 use crate::parameter_jobs::{Again, How, begin_reading, carry_out, prepare, release, take_up};
 use crate::parameters::{Id, ParameterFile, Wishes};
 use crate::plant::{DriveHandle, Plant, SharedPlant, Shown};
@@ -276,6 +276,17 @@ async fn write(request: &WriteRequest, plant: &Plant, origin: Origin, asked: Ins
         drive => drive?,
     };
     let profile = &drive.image.spec.profile;
+    if profile.counts_messages
+        && let [
+            Setting {
+                point,
+                value: Json::Bool(true),
+            },
+        ] = request.points.as_slice()
+        && point == RESTART_COMMUNICATION
+    {
+        return Ok(super::restart::communication(&drive, origin, asked).await);
+    }
     let (values, refused) = understood(profile, &request.points);
     let (client, stop) = (Authority::Write, stop_of(&values, profile));
     let mut placed = match (refused, stop) {
