@@ -15,7 +15,7 @@ use super::parameters::ParameterList;
 use crate::codec::{N2Options, Protocol, RequestPdu, Table};
 use crate::document::{Node, Problem};
 
-pub use raw::{Form, Raw, WordOrder};
+pub use raw::{Equals, Form, MOST_REGISTERS, Order, Raw};
 
 /// A validated profile.
 #[derive(Debug, Clone, PartialEq)]
@@ -241,6 +241,10 @@ pub struct Point {
     pub range: Option<RangeInclusive<f64>>,
     /// Texts of the values of an enumeration.
     pub texts: BTreeMap<i64, String>,
+    /// It takes other values than those of `texts`, too.
+    pub unlisted: bool,
+    /// A helper of other points that no north side shows and nobody commands.
+    pub hidden: bool,
     /// A state of the point that keeps the motor from running.
     pub blocks: Option<Blocks>,
     /// Whether an available manual confirms the address.
@@ -274,11 +278,12 @@ impl Point {
     pub fn kind(&self) -> Kind {
         use Derived::{All, Equal, LowestBit, Zero};
         match (&self.source, self.model) {
-            (Source::Raw(raw), _) if matches!(raw.form, Form::Bit { .. }) => Kind::Bool,
+            (Source::Raw(raw), _) if raw.is_bool() => Kind::Bool,
+            (Source::Raw(raw), _) if matches!(raw.form, Form::Text { .. }) => Kind::Text,
             (Source::Derived(Zero { .. } | Equal { .. } | All { .. }), _) => Kind::Bool,
             (_, Some(model)) => model.kind(),
             (Source::Derived(LowestBit { .. }), None) => Kind::Integer,
-            (Source::Raw(raw), None) if matches!(raw.form, Form::Bits { .. }) => Kind::Integer,
+            (Source::Raw(raw), None) if raw.is_code() => Kind::Integer,
             _ if !self.texts.is_empty() => Kind::Integer,
             _ => Kind::Number,
         }
@@ -289,9 +294,16 @@ impl Point {
         let code = match value {
             Value::Integer(code) => code,
             Value::Bool(state) => i64::from(state),
-            Value::Number(_) => return None,
+            Value::Number(_) | Value::Unsigned(_) | Value::Text(_) => return None,
         };
         self.texts.get(&code).map(String::as_str)
+    }
+
+    /// The value of an enumeration that a text means; `None` also where it means several.
+    pub fn code_of(&self, text: &str) -> Option<i64> {
+        let mut codes = self.texts.iter().filter(|(_, meaning)| *meaning == text);
+        let first = codes.next().map(|(code, _)| *code);
+        first.filter(|_| codes.next().is_none())
     }
 
     /// Its raw source, if it has one.
@@ -321,7 +333,7 @@ impl Profile {
                 let of = derived.rests_on();
                 of.into_iter().flat_map(|of| self.raw_points_of(of)).collect()
             }
-            Some(Source::Raw(_)) => vec![point],
+            Some(Source::Raw(raw)) => std::iter::once(point).chain(raw.scale_from).collect(),
             None => Vec::new(),
         }
     }

@@ -4,6 +4,7 @@
 mod base;
 mod derived;
 mod identify;
+mod meaning;
 mod n2;
 mod parameter_rules;
 mod parameters;
@@ -25,7 +26,7 @@ use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
 use crate::codec::{LineFormat, Protocol};
 use crate::document::{self, Document, Finding, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
-use points::{check_object, check_target, read_point};
+use points::{check_object, check_scale, check_target, read_point};
 use ranges::{Offsets, check_overlaps, read_functions, read_range};
 
 const BUILT_IN: [(&str, &str); 8] = [
@@ -241,6 +242,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     for (index, table) in tables.iter().enumerate() {
         check_derived(table, index, &points);
         check_target(table, index, &points);
+        check_scale(table, index, &points);
         if protocols.contains(&Protocol::N2) {
             check_object(table, index, &points);
         }
