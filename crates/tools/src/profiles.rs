@@ -245,6 +245,13 @@ fn remarks(profile: &Profile, point: &Point) -> String {
     if point.on_change {
         parts.push("written on change only".to_string());
     }
+    if point.hidden {
+        parts.push("hidden: for other points only".to_string());
+    }
+    if let Some(raw) = point.raw().filter(|raw| !raw.invalid.is_empty()) {
+        let values: Vec<String> = raw.invalid.iter().map(|value| format!("{value:#06x}")).collect();
+        parts.push(format!("{} means not available", values.join(", ")));
+    }
     if !point.texts.is_empty() {
         let texts: Vec<String> = point
             .texts
@@ -281,11 +288,11 @@ fn place(profile: &Profile, point: &Point) -> (String, String, String) {
             } else {
                 format!(" {:+}", raw.offset)
             };
-            let scale = format!("{}{offset}", raw.scale);
-            let form = raw.form.word_order().map_or_else(
-                || raw.form.name().to_string(),
-                |order| format!("{} {}", raw.form.name(), order.name()),
-            );
+            let scale = match raw.scale_from {
+                Some(power) => format!("10^{}", name_of(profile, power)),
+                None => format!("{}{offset}", raw.scale),
+            };
+            let form = raw.type_text();
             match raw.form {
                 Form::Bit { .. } if raw.table.is_bits() => (at, form, String::new()),
                 Form::Bit { bit, invert } => {

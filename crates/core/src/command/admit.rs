@@ -11,6 +11,9 @@ use crate::drive::profile::AddressRange;
 use crate::drive::{ModelPoint, Point, Source, Value};
 use crate::process_image::{Access, DriveSpec, Hold, ParamsAccess, Reading};
 
+/// Values of an enumeration that a refusal names.
+const MOST_TEXTS: usize = 12;
+
 /// An order that may go to the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Admitted {
@@ -248,7 +251,27 @@ fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
             format!("`{name}` = {number}{unit} is outside the limits {low} to {high}{unit}; nothing was written");
         return Err(Refusal::BadValue(text));
     }
-    Ok(Value::Number(number))
+    listed(point, value)?;
+    Ok(match value {
+        Value::Integer(_) | Value::Unsigned(_) if value.exact_f64().is_none() => value,
+        _ => Value::Number(number),
+    })
+}
+
+/// An enumeration takes the values that its profile lists, unless that says otherwise.
+fn listed(point: &Point, value: Value) -> Result<(), Refusal> {
+    let number = value.as_f64();
+    let is_known = || point.texts.keys().any(|code| *code as f64 == number);
+    if point.texts.is_empty() || point.unlisted || is_known() {
+        return Ok(());
+    }
+    let known = point.texts.iter().take(MOST_TEXTS);
+    let known: Vec<String> = known.map(|(code, text)| format!("{code} {text}")).collect();
+    Err(Refusal::BadValue(format!(
+        "`{}` = {number} is none of its values: {}; nothing was written",
+        point.name,
+        known.join(", ")
+    )))
 }
 
 /// The limits of the points that mean the same quantity: a command in Hz keeps the limits in percent, and the other

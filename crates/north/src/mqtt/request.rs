@@ -114,7 +114,8 @@ fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<
     check_size(incoming.oversized.unwrap_or(incoming.payload.len()))?;
     let mut asked = match point {
         Some(name) => {
-            let points = vec![resolve(profile, name, &bare(&incoming.payload)?)?];
+            let value = text_of(&incoming.payload, name, profile).map_or_else(|| bare(&incoming.payload), Ok)?;
+            let points = vec![resolve(profile, name, &value)?];
             Asked::new(points, DEFAULT_EXPIRY, None, profile)?
         }
         None => command_json::order(&incoming.payload, profile)?,
@@ -123,6 +124,13 @@ fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<
         asked.expiry = asked.expiry.min(Duration::from_secs(seconds.into()));
     }
     Ok(asked)
+}
+
+/// The text of an enumeration as the bare value of its point.
+fn text_of(payload: &[u8], name: &str, profile: &Profile) -> Option<Json> {
+    let point = profile.points.get(profile.point_index(name)?)?;
+    let text = std::str::from_utf8(payload).ok()?.trim();
+    point.code_of(text).map(|_| Json::String(text.to_string()))
 }
 
 /// The value of a `set/{point}` message: `true`, `false`, or a number.

@@ -107,6 +107,27 @@ impl Raw {
         self.equals.is_some() || matches!(self.form, Form::Bit { .. })
     }
 
+    /// Its type, order and what is taken of it, as profiles and output have it.
+    pub fn type_text(&self) -> String {
+        let mut text = match self.form {
+            Form::Text { registers } => format!("string:{registers}"),
+            form => form.name().to_string(),
+        };
+        match (self.form.items(), self.order) {
+            (2, Order::Abcd) if !matches!(self.form, Form::Text { .. }) => text += " high-first",
+            (2, Order::Cdab) => text += " low-first",
+            (_, Order::Abcd) => {}
+            (_, order) => text = format!("{text} {}", order.name()),
+        }
+        if let Some(mask) = self.mask {
+            text += &format!(" mask {mask:#06x}");
+        }
+        if let Some(Equals { count, invert }) = self.equals {
+            text += &format!(" {} {count}", if invert { "not" } else { "=" });
+        }
+        text
+    }
+
     /// Least and greatest whole count, after `mask`.
     pub(in crate::drive) fn counts(&self) -> (i128, i128) {
         let most = |mask: u64| (0, i128::from(mask.checked_shr(mask.trailing_zeros()).unwrap_or(0)));

@@ -112,6 +112,13 @@ pub(super) fn read_point(
         check_write(reader, &point, ranges);
     }
     check_texts(reader, &point, names);
+    if point.hidden && point.write {
+        reader.problem(
+            "hidden",
+            "nobody can command a hidden point",
+            "leave `write` or `hidden` out",
+        );
+    }
     if point.hidden && point.model.is_some() {
         reader.problem(
             "hidden",
