@@ -262,7 +262,7 @@ fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
 fn listed(point: &Point, value: Value) -> Result<(), Refusal> {
     let number = value.as_f64();
     let is_known = || point.texts.keys().any(|code| *code as f64 == number);
-    if point.texts.is_empty() || point.unlisted || is_known() {
+    if point.texts.is_empty() || !point.write || point.unlisted || is_known() {
         return Ok(());
     }
     let known = point.texts.iter().take(MOST_TEXTS);

@@ -353,6 +353,37 @@ mod tests {
         assert_eq!(first, read);
     }
 
+    /// Values that share registers are read together, in the class of the fastest, however they would be cut otherwise.
+    #[test]
+    fn values_that_overlap_are_one_read() {
+        let plan_of = |points: &[(&str, u16, &str)]| {
+            let mut text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\n\
+                            last = 99\nread = 4\n"
+                .to_string();
+            for (place, (kind, address, class)) in points.iter().enumerate() {
+                text += &format!(
+                    "[[point]]\nname = \"p{place}\"\nat = \"holding {address}\"\ntype = \"{kind}\"\nclass = \"{class}\"\n"
+                );
+            }
+            let plan = Plan::of(&Profile::parse("p.toml", &text, false).unwrap());
+            let reads = plan.reads.iter().map(|r| (r.class, r.start, r.count));
+            reads.collect::<Vec<_>>()
+        };
+        use PollClass::{Fast, Slow};
+        let split = [
+            ("u16", 0, "fast"),
+            ("u16", 1, "fast"),
+            ("u16", 2, "fast"),
+            ("u64", 3, "fast"),
+        ];
+        assert_eq!(plan_of(&split), [(Fast, 0, 3), (Fast, 3, 4)]);
+        let torn = [("u32", 1, "slow"), ("u16", 1, "fast"), ("u16", 9, "slow")];
+        assert_eq!(plan_of(&torn), [(Fast, 1, 2), (Slow, 9, 1)]);
+        let chain = [("u64", 0, "slow"), ("u64", 2, "slow")];
+        assert_eq!(plan_of(&chain), [(Slow, 0, 4), (Slow, 2, 4)], "each whole");
+        assert_eq!(plan_of(&[("string:4", 8, "slow")]), [(Slow, 8, 4)]);
+    }
+
     #[test]
     fn tables_are_never_mixed() {
         let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n\

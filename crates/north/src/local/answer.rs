@@ -3,7 +3,6 @@
 
 use std::time::{Duration, Instant};
 
-
 use super::protocol::{
     Expected, Failure, FailureCode, Outcome, ParamsOutcome, ParamsRequest, PointValue, ReadOutcome, ReadRequest,
     RecordOutcome, RecordRequest, Request, RestoreAct, RestoreOutcome, RestoreRequest, Setting, WhyRequest, Word,

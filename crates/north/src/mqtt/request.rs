@@ -331,6 +331,37 @@ mod tests {
         assert_eq!(set_point("nothing", "1").unwrap_err().code(), "not_writable");
     }
 
+    /// By its text over every way, by its number too; whole numbers keep every digit.
+    #[test]
+    fn enumerations_are_written_by_text() {
+        let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\nread = 5\n\
+            write = 5\n[[point]]\nname = \"count\"\nat = \"holding 1\"\ntype = \"u64\"\nwrite = true\n\
+            [[point]]\nname = \"mode\"\nat = \"holding 0\"\nwrite = true\n[point.texts]\n0 = \"off\"\n3 = \"night mode\"\n\
+            4 = \"twice\"\n5 = \"twice\"\n";
+        let profile = Profile::parse("p.toml", text, false).unwrap();
+        let value = |point: Option<&str>, payload: &str| {
+            let order = read(&message(payload), point, &profile).order;
+            order.map(|asked| asked.points[0].1)
+        };
+        for (payload, wanted) in [("night mode", 3), ("off", 0)] {
+            assert_eq!(value(Some("mode"), payload), Ok(Value::Integer(wanted)));
+            let object = format!("{{\"mode\": \"{payload}\"}}");
+            assert_eq!(value(None, &object), Ok(Value::Integer(wanted)));
+        }
+        assert_eq!(value(Some("mode"), "3"), Ok(Value::Number(3.0)));
+        for bad in ["night", "twice", "Off"] {
+            assert!(value(Some("mode"), bad).is_err(), "{bad}");
+        }
+        assert_eq!(
+            value(None, r#"{"count": 9007199254740993}"#),
+            Ok(Value::Integer(9_007_199_254_740_993))
+        );
+        assert_eq!(
+            value(None, r#"{"count": 18446744073709551615}"#),
+            Ok(Value::Unsigned(u64::MAX))
+        );
+    }
+
     #[test]
     fn retained_and_oversized_messages_are_refused() {
         let retained = Incoming {

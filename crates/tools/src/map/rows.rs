@@ -74,7 +74,12 @@ pub(super) fn drive_rows(profile: &Profile, plan: &Plan, access: Access, raw_wri
         .into_iter()
         .flatten()
         .map(|entry| entry_row(profile, plan, entry, access));
-    let mut raw: Vec<(&Point, &Raw)> = profile.points.iter().filter(|p| !p.hidden).filter_map(|p| Some((p, p.raw()?))).collect();
+    let mut raw: Vec<(&Point, &Raw)> = profile
+        .points
+        .iter()
+        .filter(|p| !p.hidden)
+        .filter_map(|p| Some((p, p.raw()?)))
+        .collect();
     raw.sort_by_key(|(_, raw)| (raw.table, raw.address));
     let raw = raw.into_iter().map(|(point, raw)| Row {
         access: if access == Access::Control && is_written_raw(profile, raw_writes, raw) {

@@ -258,16 +258,16 @@ impl Raw {
             });
         }
         let bits = match (self.form, value) {
+            (Form::Bits { first, count: bits }, _) => {
+                let (mask, count) = (low_mask(bits), count as u16);
+                return Ok(vec![(old & !(mask << first)) | ((count & mask) << first)]);
+            }
             (Form::F32, _) => u64::from((count as f32).to_bits()),
             (Form::F64, _) => count.to_bits(),
             (Form::Bcd16 | Form::Bcd32, _) => to_digits(count as u64),
             (_, Value::Integer(whole)) if self.is_unscaled() => self.form.bits_of(i128::from(whole)),
             (_, Value::Unsigned(whole)) if self.is_unscaled() => self.form.bits_of(i128::from(whole)),
             _ if count.abs() > EXACT as f64 => return Err(Unwritable::Rounded { value: value.as_f64() }),
-            (Form::Bits { first, count: bits }, _) => {
-                let (mask, count) = (low_mask(bits), count as u16);
-                return Ok(vec![(old & !(mask << first)) | ((count & mask) << first)]);
-            }
             _ => self.form.bits_of(count as i128),
         };
         if self.invalid.contains(&bits) {

@@ -24,7 +24,14 @@ const PLACE: [&str; 12] = [
 ];
 /// Those of them that a bit does not have.
 const REGISTER: [&str; 8] = [
-    "type", "words", "order", "scale", "offset", "mask", "equals", "scale_from",
+    "type",
+    "words",
+    "order",
+    "scale",
+    "offset",
+    "mask",
+    "equals",
+    "scale_from",
 ];
 
 /// Name and base of a file that is not read yet.

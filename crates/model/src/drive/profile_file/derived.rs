@@ -104,7 +104,11 @@ pub(super) fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point])
     };
     for source in derived.rests_on() {
         if let Some(point) = points.get(source).filter(|p| p.kind() == Kind::Text) {
-            reader.problem("derive", format!("`{}` is a text", point.name), "name points with values");
+            reader.problem(
+                "derive",
+                format!("`{}` is a text", point.name),
+                "name points with values",
+            );
         }
         if let Some(point) = points.get(source).filter(|p| p.raw().is_none()) {
             reader.problem(

@@ -69,7 +69,10 @@ fn read_equals(reader: &Reader<'_>, mut raw: Raw, invert: bool) -> Raw {
             "write a value of that range",
         );
     }
-    for key in ["scale", "offset", "scale_from"].into_iter().filter(|key| reader.has(key)) {
+    for key in ["scale", "offset", "scale_from"]
+        .into_iter()
+        .filter(|key| reader.has(key))
+    {
         reader.problem(key, "what is compared is the count", "leave the key out");
     }
     raw.equals = Some(Equals { count, invert });

@@ -122,7 +122,10 @@ pub(super) fn read_point(
     if point.hidden && point.model.is_some() {
         reader.problem(
             "hidden",
-            format!("`{}` is a point of the common model, which every side shows", point.name),
+            format!(
+                "`{}` is a point of the common model, which every side shows",
+                point.name
+            ),
             "give a helper a name of its own",
         );
     }
@@ -381,7 +384,9 @@ pub(super) fn check_scale(reader: &Reader<'_>, index: usize, points: &[Point]) {
     let Some(scale) = scale.and_then(|scale| points.get(scale)) else {
         return;
     };
-    let whole = |raw: &Raw| raw.is_unscaled() && !raw.is_bool() && !matches!(raw.form, Form::F32 | Form::F64 | Form::Text { .. });
+    let whole = |raw: &Raw| {
+        raw.is_unscaled() && !raw.is_bool() && !matches!(raw.form, Form::F32 | Form::F64 | Form::Text { .. })
+    };
     if !scale.raw().is_some_and(whole) {
         reader.problem(
             "scale_from",
@@ -389,6 +394,10 @@ pub(super) fn check_scale(reader: &Reader<'_>, index: usize, points: &[Point]) {
             "name a point with type = \"i16\" and no `scale`",
         );
     } else if scale.class == PollClass::Never {
-        reader.problem("scale_from", format!("`{}` is never read", scale.name), "give it another class");
+        reader.problem(
+            "scale_from",
+            format!("`{}` is never read", scale.name),
+            "give it another class",
+        );
     }
 }

@@ -178,7 +178,9 @@ impl Form {
 
     /// The bits of a whole count that fits.
     pub(super) fn bits_of(self, count: i128) -> u64 {
-        let all = u64::MAX.checked_shr(64u32.saturating_sub(self.width())).unwrap_or(u64::MAX);
+        let all = u64::MAX
+            .checked_shr(64u32.saturating_sub(self.width()))
+            .unwrap_or(u64::MAX);
         count as u64 & all
     }
 

@@ -135,7 +135,11 @@ fn sixty_four_bits_are_never_rounded() {
         scaled.decode(&words(1_234_567), Kind::Number),
         Some(Value::Number(1234.567))
     );
-    assert_eq!(scaled.decode(&words(big), Kind::Number), None, "no figure is better than a rounded one");
+    assert_eq!(
+        scaled.decode(&words(big), Kind::Number),
+        None,
+        "no figure is better than a rounded one"
+    );
     assert!(plain.encode(Value::Number(9_007_199_254_740_994.0), 0).is_err());
     assert_eq!(plain.encode(Value::Unsigned(u64::MAX), 0), Ok(words(u64::MAX)));
     let double = raw(Form::F64, 1.0);
@@ -186,7 +190,11 @@ fn masks_states_and_powers_of_ten() {
         mask: Some(0x0050),
         ..raw(Form::U16, 1.0)
     };
-    assert_eq!(masked.decode(&[0xFFFF], Kind::Integer), Some(Value::Integer(5)), "as they stand");
+    assert_eq!(
+        masked.decode(&[0xFFFF], Kind::Integer),
+        Some(Value::Integer(5)),
+        "as they stand"
+    );
     assert_eq!(masked.decode(&[0x0040], Kind::Integer), Some(Value::Integer(4)));
     assert!(masked.encode(Value::Integer(5), 0).is_err());
     let state = |count, invert| Raw {
