@@ -1,5 +1,6 @@
 //! What the documents say is true: commands, links, and every configuration they show.
 
+mod cabinet;
 mod commands;
 mod drives;
 
@@ -196,6 +197,11 @@ fn the_page_of_the_command_line_is_made_from_it() {
 #[test]
 fn the_page_of_drives_says_what_the_profiles_deliver() {
     generated("drives.md", "tables", &drives::tables());
+}
+
+#[test]
+fn the_page_of_commissioning_says_what_the_profiles_deliver() {
+    generated("commissioning.md", "cabinet", &cabinet::lists());
 }
 
 #[test]

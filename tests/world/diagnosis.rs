@@ -424,6 +424,12 @@ fn a_drive_that_never_answered_is_told_until_it_answers() {
             "{verdict:?}"
         );
         assert!(verdict.remedy.contains("drivegate scan"), "{verdict:?}");
+        // What to look at is that of this family.
+        let lamp = match line.family {
+            "teco-7300pa" => "teco-7300pa: LED 3 dark: line, terminals, or no master (inference)",
+            family => &format!("{family}: green LED (FS) steady: the board is active and has seen no message yet"),
+        };
+        assert!(verdict.steps.iter().any(|step| step.starts_with(lamp)), "{verdict:?}");
         // It is switched on, and off again: it has answered.
         rig.with_drive(2, |drive, now| drive.power_on(now));
         rig.run(2 * TOLD);

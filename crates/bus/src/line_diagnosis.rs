@@ -157,6 +157,7 @@ impl LineDiagnosis {
                 meaning: finding.cause.meaning().to_string(),
                 evidence: finding.evidence.clone(),
                 remedy: finding.cause.remedy().to_string(),
+                steps: steps_of(&self.image, finding),
                 since: humantime::format_rfc3339_millis(since).to_string(),
             }
         });
@@ -185,6 +186,16 @@ impl LineDiagnosis {
             drives,
         }));
     }
+}
+
+/// What the profiles of the drives that a finding is about have to do with it.
+fn steps_of(image: &BusImage, finding: &Finding) -> Vec<String> {
+    let about = (0..)
+        .zip(&image.drives)
+        .filter(|(place, _)| finding.drive.is_none_or(|drive| drive == *place));
+    finding
+        .cause
+        .steps_of(about.map(|(_, drive)| drive.spec.profile.as_ref()))
 }
 
 fn end(ended: &Ended) -> End {

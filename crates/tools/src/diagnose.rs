@@ -104,6 +104,12 @@ fn text(diagnosis: &Diagnosis) -> String {
             printable::line(&verdict.meaning),
             verdict.certainty.name()
         );
+        if !verdict.steps.is_empty() {
+            text += "      at the drives; `drivegate profiles show NAME` has all steps:\n";
+        }
+        for step in &verdict.steps {
+            let _ = writeln!(text, "        - {}", printable::line(step));
+        }
     }
     let bad = |one: &&Counted| one.silent + one.damaged + one.late + one.second + one.stray_before > 0;
     let bad: Vec<&Counted> = diagnosis.drives.iter().filter(bad).collect();
@@ -159,10 +165,11 @@ mod tests {
             meaning: "one is bad".to_string(),
             evidence: "7 of 9".to_string(),
             remedy: "look".to_string(),
+            steps: vec!["vacon-nx: green LED steady".to_string()],
             since: String::new(),
         });
         diagnosis.drives[0].silent = 7;
-        let expected = "line1:\n\n  one_drive pump-1: one is bad (likely)\n      seen: 7 of 9\n      do: look\n\n  in the last minute";
+        let expected = "line1:\n\n  one_drive pump-1: one is bad (likely)\n      seen: 7 of 9\n      do: look\n      at the drives; `drivegate profiles show NAME` has all steps:\n        - vacon-nx: green LED steady\n\n  in the last minute";
         assert!(text(&diagnosis).starts_with(expected), "{}", text(&diagnosis));
     }
 }

@@ -10,7 +10,7 @@ use crate::codec::n2::ASSUMPTIONS;
 use crate::config::{Settings, environment, unknown_profile};
 use crate::document::{Problem, format_duration};
 use crate::drive::profile::{AddressRange, Form, Profiles};
-use crate::drive::{Bound, Derived, Point, Profile, Source};
+use crate::drive::{Bound, Derived, Point, Profile, Source, Step};
 
 /// Mark of a point, fault text or address that no manual confirms.
 const NOT_VERIFIED: &str = "not verified";
@@ -139,6 +139,13 @@ fn show(profile: &Profile) -> String {
             ),
         ),
         (
+            "scan says",
+            match profile.identify.is_empty() {
+                true => String::new(),
+                false => profile.identified.clone(),
+            },
+        ),
+        (
             "simulator",
             profile.simulator.clone().unwrap_or_else(|| "none".to_string()),
         ),
@@ -159,6 +166,10 @@ fn show(profile: &Profile) -> String {
     if profile.input_is_holding {
         text += "  input registers read the same as holding registers\n";
     }
+    if !profile.commissioning.is_empty() {
+        text += "\nCommissioning\n";
+        text += &commissioning(profile);
+    }
     text += "\nPoints; addresses are those of the PDU, counted from 0\n\n";
     text += &points(profile);
     text += "\nAddress ranges\n\n";
@@ -170,6 +181,22 @@ fn show(profile: &Profile) -> String {
     if profile.protocols.contains(&Protocol::N2) {
         text += "\nAssumptions about N2, not verified on hardware; those with a key can be changed in [n2] of a profile\n\n";
         text += &assumptions(profile);
+    }
+    text
+}
+
+/// The lines of each step.
+fn commissioning(profile: &Profile) -> String {
+    let mut text = String::new();
+    for step in Step::ALL {
+        let lines = profile.commissioning.lines(step);
+        if !lines.is_empty() {
+            // Writing to a String cannot fail.
+            let _ = writeln!(text, "  {}", step.title());
+        }
+        for line in lines {
+            let _ = writeln!(text, "    - {}", printable::line(line));
+        }
     }
     text
 }
@@ -377,12 +404,15 @@ fn ranges(ranges: &[AddressRange]) -> String {
 }
 
 fn faults(profile: &Profile) -> String {
-    let mut table = report::table(["code", "text", "verified"]);
+    let mut table = report::table(["code", "text", "verified", "panel", "cause", "remedy"]);
     for (code, fault) in &profile.faults {
         table.add_row([
             code.to_string(),
             fault.text.clone(),
             verified(fault.verified).to_string(),
+            fault.panel.clone(),
+            fault.cause.clone(),
+            fault.remedy.clone(),
         ]);
     }
     report::lines(&table)

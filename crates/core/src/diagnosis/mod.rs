@@ -161,6 +161,9 @@ pub struct Verdict {
     pub evidence: String,
     /// What to do.
     pub remedy: String,
+    /// What to look at and to set at drives of these families, as their profiles say.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub steps: Vec<String>,
     /// Since when it holds, RFC 3339.
     pub since: String,
 }

@@ -1,5 +1,6 @@
 //! What a drive is: points, profiles and the requests that read them. Pure.
 
+pub mod commissioning;
 pub(crate) mod derive;
 #[cfg(test)]
 mod families_tests;
@@ -12,6 +13,7 @@ mod profile_file;
 pub mod raw_writes;
 pub mod why;
 
+pub use commissioning::{Commissioning, Step};
 pub use derive::{Bound, Derived};
 pub use model::tidy;
 pub use model::{ModelPoint, Quality, Sample, State, Value};

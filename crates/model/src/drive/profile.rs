@@ -9,6 +9,7 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
+use super::commissioning::Commissioning;
 use super::derive::Derived;
 use super::model::{Kind, ModelPoint, Value};
 use super::parameters::ParameterList;
@@ -64,12 +65,16 @@ pub struct Profile {
     pub parameters: ParameterList,
     /// Texts of fault codes.
     pub faults: BTreeMap<u16, FaultText>,
+    /// Lines for the engineer at the cabinet.
+    pub commissioning: Commissioning,
+    /// What it means that the reads of `identify` match; empty where they prove the family.
+    pub identified: String,
     /// Index of each model point in `points`.
     pub(super) model: Vec<Option<usize>>,
     /// The text of the file, without its base.
     pub text: Cow<'static, str>,
-    /// The file merged with its base, for profiles based on this one. None for built-in ones, which have no base: their
-    /// text says it all, in a fifth of the memory.
+    /// The file merged with its base, for profiles based on this one. None for built-in ones: their texts say it all, in a
+    /// fifth of the memory.
     pub(super) tree: Option<Node>,
     /// What its author may not have meant; of built-in ones nothing.
     pub warnings: Vec<Problem>,
@@ -80,6 +85,8 @@ pub struct Profile {
 pub struct FaultText {
     /// What the fault is.
     pub text: String,
+    /// What the panel shows; empty where no available manual says.
+    pub panel: String,
     /// What causes it; empty where no available manual says.
     pub cause: String,
     /// What to do; empty likewise.

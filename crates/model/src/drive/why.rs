@@ -276,7 +276,11 @@ impl Look<'_> {
                     cause => format!(" ({cause})"),
                 };
                 let unsure = if fault.verified { "" } else { ", text not verified" };
-                format!("fault {code}: {}{because}{unsure}", fault.text)
+                let panel = match fault.panel.as_str() {
+                    "" => String::new(),
+                    panel => format!(", at the panel {panel}"),
+                };
+                format!("fault {code}: {}{because}{panel}{unsure}", fault.text)
             }
             (Some(code), None) => format!("fault {code}, of which the profile has no text"),
             (None, _) => "a fault is active; its code is not known".to_string(),

@@ -2,6 +2,7 @@
 //! part of the program.
 
 mod base;
+mod commissioning;
 mod derived;
 mod identify;
 mod meaning;
@@ -24,12 +25,13 @@ use super::model::ModelPoint;
 use super::parameters::ParameterList;
 use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
 use crate::codec::{LineFormat, Protocol};
-use crate::document::{self, Document, Finding, Problem, Reader};
+use crate::document::{self, Document, Finding, Node, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
 use points::{check_object, check_scale, check_target, read_point};
 use ranges::{Offsets, check_overlaps, read_functions, read_range};
 
-const BUILT_IN: [(&str, &str); 8] = [
+/// A base stands before the profiles that are based on it, and has none itself.
+const BUILT_IN: [(&str, &str); 14] = [
     (
         "eaton-hvx-n2.toml",
         include_str!("../../../../../profiles/eaton-hvx-n2.toml"),
@@ -50,6 +52,30 @@ const BUILT_IN: [(&str, &str); 8] = [
         include_str!("../../../../../profiles/vacon-nx-n2.toml"),
     ),
     ("vacon-nx.toml", include_str!("../../../../../profiles/vacon-nx.toml")),
+    (
+        "eaton-svx-multipurpose.toml",
+        include_str!("../../../../../profiles/eaton-svx-multipurpose.toml"),
+    ),
+    (
+        "eaton-svx-pid.toml",
+        include_str!("../../../../../profiles/eaton-svx-pid.toml"),
+    ),
+    (
+        "eaton-svx-pump-fan.toml",
+        include_str!("../../../../../profiles/eaton-svx-pump-fan.toml"),
+    ),
+    (
+        "vacon-nx-multipurpose.toml",
+        include_str!("../../../../../profiles/vacon-nx-multipurpose.toml"),
+    ),
+    (
+        "vacon-nx-pid.toml",
+        include_str!("../../../../../profiles/vacon-nx-pid.toml"),
+    ),
+    (
+        "vacon-nx-pump-fan.toml",
+        include_str!("../../../../../profiles/vacon-nx-pump-fan.toml"),
+    ),
 ];
 
 /// Bases of bases that are followed; no sound set of files has so many.
@@ -61,7 +87,7 @@ impl Profiles {
         static READ: LazyLock<Profiles> = LazyLock::new(|| {
             let mut profiles = Profiles::default();
             for (file, source) in BUILT_IN {
-                if let Ok(profile) = Profile::parse(file, source, true) {
+                if let Ok(profile) = Profile::parse_over(file, source, true, &profiles) {
                     profiles.insert(Profile {
                         text: Cow::Borrowed(source),
                         ..profile
@@ -163,27 +189,14 @@ impl Profile {
     /// # Errors
     /// Every error of the file, with line and key.
     pub fn parse(file: &str, source: &str, built_in: bool) -> Result<Profile, Vec<Problem>> {
-        let known = if built_in {
-            Profiles::default()
-        } else {
-            Profiles::built_in()
-        };
-        Profile::parse_over(file, source, built_in, &known)
+        Profile::parse_over(file, source, built_in, &Profiles::built_in())
     }
 
     fn parse_over(file: &str, source: &str, built_in: bool, known: &Profiles) -> Result<Profile, Vec<Problem>> {
         let mut document = Document::parse(file, source);
         let (_, base) = base::peek(&document);
         if let Some(under) = base.as_deref().and_then(|base| known.get(base)) {
-            let parsed;
-            let tree = match &under.tree {
-                Some(tree) => tree,
-                None => {
-                    parsed = Document::parse(&under.name, &under.text);
-                    parsed.root()
-                }
-            };
-            base::lay_over(&mut document, tree, &under.name);
+            base::lay_over(&mut document, &tree_of(under), &under.name);
         }
         base::change_points(&mut document);
         let profile = read_profile(&document.reader(), built_in, known);
@@ -199,6 +212,20 @@ impl Profile {
             _ => Err(problems),
         }
     }
+}
+
+/// The file of a profile merged with its base. The base of a built-in one is a built-in one without a base.
+fn tree_of(profile: &Profile) -> Node {
+    if let Some(tree) = &profile.tree {
+        return tree.clone();
+    }
+    let mut document = Document::parse(&profile.name, &profile.text);
+    if let Some(base) = &profile.base
+        && let Some(under) = Profiles::built_in().get(base)
+    {
+        base::lay_over(&mut document, &tree_of(under), base);
+    }
+    document.root().clone()
 }
 
 fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option<Profile> {
@@ -251,6 +278,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     for (code, text) in read_faults(reader, "faults_unverified", false) {
         faults.entry(code).or_insert(text);
     }
+    read_fault_help(reader, "fault_panel", &mut faults, |fault| &mut fault.panel);
     read_fault_help(reader, "fault_causes", &mut faults, |fault| &mut fault.cause);
     read_fault_help(reader, "fault_remedies", &mut faults, |fault| &mut fault.remedy);
     let model = ModelPoint::ALL
@@ -281,6 +309,8 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         ranges,
         points,
         faults,
+        commissioning: commissioning::read(reader),
+        identified: reader.or("identified", String::new()),
         model,
         text: Cow::Borrowed(""),
         tree: None,
@@ -406,6 +436,7 @@ fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, 
             (Ok(number), Some(text)) => {
                 let fault = FaultText {
                     text,
+                    panel: String::new(),
                     cause: String::new(),
                     remedy: String::new(),
                     verified,
@@ -424,7 +455,7 @@ fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, 
     faults
 }
 
-/// `fault_causes` and `fault_remedies`: more about faults that have a text.
+/// `fault_panel`, `fault_causes` and `fault_remedies`: more about faults that have a text.
 fn read_fault_help(
     reader: &Reader<'_>,
     key: &str,

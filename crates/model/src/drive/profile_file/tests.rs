@@ -33,6 +33,25 @@ fn built_in_profiles_are_valid() {
         assert!(found.is_empty(), "{}", text.join("\n"));
     }
     assert_eq!(Profiles::built_in().iter().count(), BUILT_IN.len());
+    for profile in Profiles::built_in().iter() {
+        let base = profile
+            .base
+            .as_deref()
+            .map(|base| Profiles::built_in().get(base).cloned());
+        let is_sound = |base: Option<std::sync::Arc<Profile>>| base.is_some_and(|base| base.base.is_none());
+        assert!(base.is_none_or(is_sound), "{}", profile.name);
+    }
+}
+
+/// A profile over a built-in one that has a base has what both of them have.
+#[test]
+fn a_base_may_have_a_base() {
+    let source = "name = \"p\"\nbase = \"vacon-nx-pid\"\npoints.pid_setpoint.class = \"never\"\n";
+    let ours = Profile::parse("p", source, false).unwrap();
+    let pid = Profiles::built_in().get("vacon-nx-pid").cloned().unwrap();
+    assert_eq!(ours.points.len(), pid.points.len());
+    assert_eq!(ours.simulator, pid.simulator);
+    assert_eq!(ours.faults, pid.faults);
 }
 
 #[test]
@@ -447,6 +466,7 @@ fn the_page_names_every_key() {
         ![
             "faults.",
             "faults_unverified.",
+            "fault_panel.",
             "fault_causes.",
             "fault_remedies.",
             "address_offset.",
@@ -467,6 +487,7 @@ fn the_page_names_every_key() {
         ("\n### `[speed_reference]`\n", "speed_reference."),
         ("\n### `[[identify]]`\n", "identify[]."),
         ("\n### `[n2]`\n", "n2."),
+        ("\n### `[commissioning]`\n", "commissioning."),
         ("\n### `[parameters]`\n", "parameters."),
         ("\n### `[parameters.lock]`\n", "parameters.lock."),
         ("\n### `[[range]]`\n", "range[]."),
