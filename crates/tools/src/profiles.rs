@@ -9,6 +9,7 @@ use crate::codec::Protocol;
 use crate::codec::n2::ASSUMPTIONS;
 use crate::config::{Settings, environment, unknown_profile};
 use crate::document::{Problem, format_duration};
+use crate::drive::control::Mask;
 use crate::drive::profile::{AddressRange, Form, Profiles};
 use crate::drive::{Bound, Derived, Point, Profile, Source, Step};
 
@@ -85,7 +86,10 @@ fn list(profiles: &Profiles) -> String {
             profile.points.len().to_string(),
             protocols(profile),
             origin(profile).to_string(),
-            profile.title.clone(),
+            match profile.verified {
+                true => profile.title.clone(),
+                false => format!("{} ({NOT_VERIFIED})", profile.title),
+            },
         ]);
     }
     report::lines(&table)
@@ -110,6 +114,7 @@ fn show(profile: &Profile) -> String {
     let mut text = format!("{}: {}\n\n", profile.name, printable::line(&profile.title));
     for (what, value) in [
         ("origin", origin(profile).to_string()),
+        ("verified", unverified(profile).to_string()),
         ("based on", profile.base.clone().unwrap_or_default()),
         ("source", profile.source.clone()),
         ("protocols", protocols(profile)),
@@ -293,6 +298,14 @@ fn remarks(profile: &Profile, point: &Point) -> String {
     parts.join("; ")
 }
 
+/// That nobody has seen the profile right on hardware; empty otherwise.
+fn unverified(profile: &Profile) -> &'static str {
+    match profile.verified {
+        true => "",
+        false => "no: nobody has confirmed it on hardware yet; docs/verifying.md says how to",
+    }
+}
+
 fn verified(verified: bool) -> &'static str {
     if verified { "yes" } else { NOT_VERIFIED }
 }
@@ -364,6 +377,10 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
         }
         Derived::Zero { within, .. } => format!("true up to {within}"),
         Derived::Equal { within, .. } => format!("true while they differ by {within} at most"),
+        Derived::State { any } => {
+            let one = |state: &Mask| format!("{:#06x} of {:#06x}", state.is, state.mask);
+            any.iter().map(one).collect::<Vec<_>>().join(" or ")
+        }
         Derived::All { .. } => "true while all of them are".to_string(),
         Derived::LowestBit { .. } => "number of the lowest bit that is set, counted from 1".to_string(),
     }

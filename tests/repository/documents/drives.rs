@@ -145,6 +145,7 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
         }
         Derived::Zero { of, .. } => format!("{} = 0", name(of)),
         Derived::Equal { of, to, .. } => format!("{} = {}", name(of), name(to)),
+        Derived::State { any } => format!("{} states", any.len()),
         Derived::All { of } => of.iter().map(name).collect::<Vec<_>>().join(" and "),
         Derived::LowestBit { of } => format!("lowest bit of {}", name(of)),
     }

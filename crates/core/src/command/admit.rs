@@ -6,6 +6,7 @@ use super::standing::keeps_limits;
 use super::{Authority, Order, ParameterOrder, Refusal, Urgency};
 use crate::codec::n2::Object;
 use crate::codec::{Protocol, RequestPdu, Table};
+use crate::drive::control::Place;
 use crate::drive::model::Kind;
 use crate::drive::profile::AddressRange;
 use crate::drive::{ModelPoint, Point, Source, Value};
@@ -454,6 +455,7 @@ fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<Vec<FrequencyRange
         )));
     }
     raw_rule(drive, table, &items)?;
+    control_words(drive, table, &items)?;
     if profile.protocols.contains(&Protocol::N2) {
         one_object(table, *first, items.len())?;
     }
@@ -476,6 +478,29 @@ fn raw_rule(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(
             "{table} {address} of `{}` belongs to no writable point; add [{address}, {address}] to `raw_writes` of the \
              drive to write it raw",
             spec.name
+        ))),
+    }
+}
+
+/// A word of a control register that is neither a stop nor clearly a run command is not passed on: what it does is not known.
+fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
+    let Some(control) = &drive.spec.profile.control else {
+        return Ok(());
+    };
+    let refused = |(address, word): &&(u16, u16)| {
+        !control.admits(
+            Place {
+                table,
+                address: *address,
+            },
+            *word,
+        )
+    };
+    match items.iter().find(refused) {
+        None => Ok(()),
+        Some((address, word)) => Err(Refusal::BadValue(format!(
+            "{word:#06x} at {table} {address} of `{}` neither stops nor runs the drive by its profile; nothing was written",
+            drive.spec.name
         ))),
     }
 }

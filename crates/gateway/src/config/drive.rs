@@ -344,7 +344,7 @@ fn limited_point<'p>(profile: &'p Profile, key: &str) -> Result<&'p Point, Findi
         let points = profile
             .points
             .iter()
-            .filter(|p| p.write && !matches!(p.kind(), Kind::Bool | Kind::Text));
+            .filter(|p| p.is_commanded() && !matches!(p.kind(), Kind::Bool | Kind::Text));
         points.map(|p| p.name.as_str())
     };
     let known = || {

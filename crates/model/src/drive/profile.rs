@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::commissioning::Commissioning;
+use super::control::{Control, Place};
 use super::derive::Derived;
 use super::model::{Kind, ModelPoint, Value};
 use super::parameters::ParameterList;
@@ -61,6 +62,10 @@ pub struct Profile {
     pub points: Vec<Point>,
     /// Points that a drive with a new fault is asked for at once.
     pub on_fault: Vec<usize>,
+    /// How it is commanded, where its profile says so in `[control]`.
+    pub control: Option<Control>,
+    /// Whether somebody has seen the profile right on hardware, or it is made from manuals of that very family.
+    pub verified: bool,
     /// Its parameters.
     pub parameters: ParameterList,
     /// Texts of fault codes.
@@ -281,13 +286,41 @@ pub enum Source {
 }
 
 impl Point {
+    /// A point of the common model that is only derived, or not read by itself.
+    pub(super) fn of_model(model: ModelPoint, source: Source) -> Point {
+        Point {
+            name: model.name().to_string(),
+            model: Some(model),
+            unit: model.unit().to_string(),
+            source,
+            class: PollClass::Never,
+            fast_if_carried: false,
+            write: false,
+            write_to: None,
+            pulse: false,
+            on_change: false,
+            range: None,
+            texts: BTreeMap::new(),
+            unlisted: false,
+            hidden: false,
+            blocks: None,
+            verified: true,
+            note: String::new(),
+        }
+    }
+
+    /// Whether users can command it.
+    pub fn is_commanded(&self) -> bool {
+        self.write && !self.hidden
+    }
+
     /// Kind of its values.
     pub fn kind(&self) -> Kind {
-        use Derived::{All, Equal, LowestBit, Zero};
+        use Derived::{All, Equal, LowestBit, State, Zero};
         match (&self.source, self.model) {
             (Source::Raw(raw), _) if raw.is_bool() => Kind::Bool,
             (Source::Raw(raw), _) if matches!(raw.form, Form::Text { .. }) => Kind::Text,
-            (Source::Derived(Zero { .. } | Equal { .. } | All { .. }), _) => Kind::Bool,
+            (Source::Derived(Zero { .. } | Equal { .. } | All { .. } | State { .. }), _) => Kind::Bool,
             (_, Some(model)) => model.kind(),
             (Source::Derived(LowestBit { .. }), None) => Kind::Integer,
             (Source::Raw(raw), None) if raw.is_code() => Kind::Integer,
@@ -426,6 +459,9 @@ impl Profile {
 
     /// Whether writing `value` to that register (or coil) clears the run command: a stop.
     pub fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
+        if let Some(control) = &self.control {
+            return control.is_stop(Place { table, address }, value);
+        }
         self.run_bit().is_some_and(|(raw, bit, invert)| {
             raw.table == table && raw.address == address && ((value >> bit) & 1 == 1) == invert
         })

@@ -170,8 +170,14 @@ fn request_expiry(value: &Json) -> Result<Duration, Refusal> {
 /// The point of that name with its value. Limits are checked with the command.
 pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(usize, Value), Refusal> {
     let Some(index) = profile.point_index(name) else {
-        let writable = || profile.points.iter().filter(|p| p.write).map(|p| p.name.as_str());
-        let all = || profile.points.iter().map(|p| p.name.as_str());
+        let writable = || {
+            profile
+                .points
+                .iter()
+                .filter(|p| p.is_commanded())
+                .map(|p| p.name.as_str())
+        };
+        let all = || profile.points.iter().filter(|p| !p.hidden).map(|p| p.name.as_str());
         let likely = || nearest(name, writable()).or_else(|| nearest(name, all()));
         let hint = match (name.len() <= MAX_NAME).then(likely).flatten() {
             Some(near) => format!("did you mean `{near}`?"),
@@ -180,7 +186,7 @@ pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(us
         let name = excerpt(name.as_bytes());
         return Err(Refusal::NotWritable(format!("there is no point {name}; {hint}")));
     };
-    let point = profile.points.get(index).filter(|p| p.write);
+    let point = profile.points.get(index).filter(|p| p.is_commanded());
     let Some(point) = point else {
         return Err(Refusal::NotWritable(format!("`{name}` is read-only")));
     };

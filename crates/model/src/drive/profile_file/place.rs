@@ -1,5 +1,6 @@
 //! Address and format of a value: `at` and the keys of its form; those that change what is made of it are in `meaning`.
 
+use super::super::control::Place;
 use super::super::profile::{AddressRange, Form, MOST_REGISTERS, Order, Raw, Source};
 use super::meaning;
 use super::ranges::{Offsets, read_table};
@@ -26,6 +27,15 @@ pub(super) fn parse_address(text: &str) -> Option<u16> {
         Some(hex) => u16::from_str_radix(hex, 16).ok(),
         None => text.parse().ok(),
     }
+}
+
+/// `holding 2100`: table and PDU address.
+pub(super) fn parse_place(text: &str) -> Option<Place> {
+    let (table, address) = text.split_once(' ')?;
+    Some(Place {
+        table: Table::from_name(table)?,
+        address: parse_address(address)?,
+    })
 }
 
 /// `holding 2100.3`: table, PDU address, bit.

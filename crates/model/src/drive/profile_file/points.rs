@@ -112,13 +112,6 @@ pub(super) fn read_point(
         check_write(reader, &point, ranges);
     }
     check_texts(reader, &point, names);
-    if point.hidden && point.write {
-        reader.problem(
-            "hidden",
-            "nobody can command a hidden point",
-            "leave `write` or `hidden` out",
-        );
-    }
     if point.hidden && point.model.is_some() {
         reader.problem(
             "hidden",
@@ -239,7 +232,7 @@ fn check_kind(reader: &Reader<'_>, point: &Point) {
         Source::Raw(raw) => !raw.is_bool(),
         Source::Derived(derived) => !matches!(
             derived,
-            Derived::Zero { .. } | Derived::Equal { .. } | Derived::All { .. }
+            Derived::Zero { .. } | Derived::Equal { .. } | Derived::All { .. } | Derived::State { .. }
         ),
     };
     let key = if reader.has("derive") { "derive" } else { "at" };

@@ -646,10 +646,6 @@ fn each_mistake_of_a_value() {
         ),
         ("equals = 1\nwrite = true", "there is no way back; m:14, point[0].write"),
         (
-            "hidden = true\nwrite = true",
-            "nobody can command a hidden point; m:13, point[0].hidden",
-        ),
-        (
             "unlisted = true\nwrite = true",
             "only an enumeration that is written; m:13, point[0].unlisted",
         ),
