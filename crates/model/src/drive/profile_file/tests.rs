@@ -452,11 +452,8 @@ fn the_page_names_every_key() {
     let meter = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/energy-meter.toml")).unwrap();
     let choices = "[speed_reference]\nsigned = true\n[n2]\nstate_bit = 6\n";
     let mut known = std::collections::BTreeSet::new();
-    for source in BUILT_IN
-        .iter()
-        .map(|(_, source)| *source)
-        .chain([meter.as_str(), choices])
-    {
+    let all = BUILT_IN.iter();
+    for source in all.map(|(_, source)| *source).chain([meter.as_str(), choices]) {
         let document = Document::parse("p", source);
         let _ = read_profile(&document.reader(), true, &Profiles::default());
         known.extend(document.known_keys());
@@ -474,7 +471,16 @@ fn the_page_names_every_key() {
         .iter()
         .any(|p| key.starts_with(p))
     });
-    known.retain(|key| !key.contains("texts."));
+    known.retain(|key| !key.contains("texts.") && !key.contains(".always.") && !key.contains(".until."));
+    // The forms of all commands have their keys in one table.
+    const FORMS: [&str; 4] = ["run", "stop", "reverse", "fault_reset"];
+    let form = |key: String| {
+        let of = FORMS.iter().find_map(|of| key.strip_prefix(&format!("control.{of}.")));
+        of.map_or(key.clone(), |key| {
+            format!("form.{}", key.trim_start_matches("steps[]."))
+        })
+    };
+    let mut known: std::collections::BTreeSet<String> = known.into_iter().map(form).collect();
     known.extend(["remove".to_string(), "points".to_string()]);
     let section = |heading: &str| {
         let (_, rest) = page.split_once(heading).unwrap();
@@ -484,6 +490,10 @@ fn the_page_names_every_key() {
     };
     let mut named = section("\n## Keys of a profile\n");
     for (heading, path) in [
+        ("\n### `[control]`\n", "control."),
+        ("\n### Forms of a command\n", "form."),
+        ("\n### `[[state]]`\n", "state[]."),
+        ("\n### `[ranges]`\n", "ranges."),
         ("\n### `[speed_reference]`\n", "speed_reference."),
         ("\n### `[[identify]]`\n", "identify[]."),
         ("\n### `[n2]`\n", "n2."),
