@@ -98,13 +98,14 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
         let name = &point.name;
         format!("`{text}` is not a value of `{name}`; command line; write {wanted}")
     };
-    let meaning = point.texts.iter().find(|(_, meaning)| meaning.as_str() == text);
+    let meaning = point.code_of(text);
     match (point.kind(), text.to_ascii_lowercase().as_str()) {
         (Kind::Bool, "true" | "on" | "yes" | "1") => Ok(Value::Bool(true)),
         (Kind::Bool, "false" | "off" | "no" | "0") => Ok(Value::Bool(false)),
         (Kind::Bool, _) => Err(bad("true or false, on or off, yes or no, 1 or 0")),
-        _ if meaning.is_some() => Ok(Value::Integer(meaning.map_or(0, |(code, _)| *code))),
+        _ if meaning.is_some() => Ok(Value::Integer(meaning.unwrap_or_default())),
         (Kind::Integer, _) => text.parse().map(Value::Integer).map_err(|_| bad("a whole number")),
+        (Kind::Text, _) => Err(bad("another point: this one is a text, which is only read")),
         (Kind::Number, _) => {
             let number = text.parse::<f64>().ok().filter(|n| n.is_finite());
             number.map(Value::Number).ok_or_else(|| bad("a number"))

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant, SystemTime};
 use super::{DriveSpec, Hold};
 use crate::codec::{Exception, Table};
 use crate::drive::model::Kind;
+use crate::drive::profile::MOST_REGISTERS;
 use crate::drive::{Bound, ModelPoint, Plan, Point, PollClass, Quality, Raw, Sample, Source, State, Value};
 
 /// Oldest age of a parameter of the drive on which a command may rest, where the line can renew it faster.
@@ -388,18 +389,29 @@ impl Reading<'_> {
     /// A value of the drive's own registers: as good as the worst of them, as old as the oldest. What is no value
     /// (a float that is no number) is bad.
     fn raw_sample(&self, raw: &Raw, kind: Kind) -> Sample {
-        let (mut words, mut times, mut quality) = ([0; 2], [None; 2], Quality::Good);
-        for (offset, (word, time)) in (0..raw.form.items()).zip(words.iter_mut().zip(&mut times)) {
+        let (mut words, mut quality) = ([0; MOST_REGISTERS], Quality::Good);
+        let items = usize::from(raw.form.items());
+        // One that was never read comes before all times.
+        let mut at = Some(self.now);
+        for (offset, word) in (0..).zip(words.iter_mut().take(items)) {
             let address = raw.address.checked_add(offset);
             let Some((class, cell)) = address.and_then(|address| self.snapshot.cell(raw.table, address)) else {
                 return Sample::NONE;
             };
-            (*word, *time) = (cell.word, cell.at);
+            *word = cell.word;
+            at = if offset == 0 { cell.at } else { at.min(cell.at) };
             quality = quality.worse(self.quality(class, cell));
         }
-        // One that was never read comes before all times.
-        let at = times.into_iter().take(usize::from(raw.form.items())).min().flatten();
-        let value = at.and_then(|_| raw.decode(&words, kind));
+        let words = words.get(..items).unwrap_or_default();
+        let value = match raw.scale_from.map(|scale| self.sample(scale)) {
+            _ if at.is_none() => None,
+            None => raw.decode(words, kind),
+            Some(scale) => {
+                quality = quality.worse(scale.quality);
+                let power = scale.value.and_then(Value::exact_f64);
+                power.and_then(|power| raw.decode_scaled(words, kind, power as i64))
+            }
+        };
         Sample {
             value,
             quality: if value.is_some() { quality } else { Quality::Bad },

@@ -469,10 +469,10 @@ fn limits_and_lines() {
     }
 }
 
-/// What every family can be commanded, and that parameters and outputs of N2 are written on change only.
+/// What every family whose manual is at hand can be commanded, and that parameters and outputs of N2 are written on change only.
 #[test]
 fn commands_of_every_family() {
-    for profile in Profiles::built_in().iter() {
+    for profile in Profiles::built_in().iter().filter(|profile| profile.verified) {
         let name = &profile.name;
         for point in [
             ModelPoint::Run,
@@ -620,10 +620,10 @@ fn what_is_not_confirmed() {
     }
 }
 
-/// Every family has the steps of its manual, and one board has one list.
+/// Every family whose manual is at hand has the steps of it, and one board has one list.
 #[test]
 fn steps_at_the_cabinet() {
-    for family in Profiles::built_in().iter() {
+    for family in Profiles::built_in().iter().filter(|profile| profile.verified) {
         for step in Step::ALL {
             // No manual has a test of TECO.
             let is_blank = step == Step::Test && family.name.starts_with("teco");

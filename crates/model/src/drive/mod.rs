@@ -1,6 +1,7 @@
 //! What a drive is: points, profiles and the requests that read them. Pure.
 
 pub mod commissioning;
+pub mod control;
 pub(crate) mod derive;
 #[cfg(test)]
 mod families_tests;

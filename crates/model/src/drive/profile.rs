@@ -10,13 +10,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::commissioning::Commissioning;
+use super::control::{Control, Place};
 use super::derive::Derived;
 use super::model::{Kind, ModelPoint, Value};
 use super::parameters::ParameterList;
 use crate::codec::{N2Options, Protocol, RequestPdu, Table};
 use crate::document::{Node, Problem};
 
-pub use raw::{Form, Raw, WordOrder};
+pub use raw::{Equals, Form, MOST_REGISTERS, Order, Raw};
 
 /// A validated profile.
 #[derive(Debug, Clone, PartialEq)]
@@ -67,6 +68,10 @@ pub struct Profile {
     /// A broadcast that clears the whole control word stops every drive of the family on the line.
     pub broadcast_stop: bool,
     pub on_fault: Vec<usize>,
+    /// How it is commanded, where its profile says so in `[control]`.
+    pub control: Option<Control>,
+    /// Whether somebody has seen the profile right on hardware, or it is made from manuals of that very family.
+    pub verified: bool,
     /// Its parameters.
     pub parameters: ParameterList,
     /// Texts of fault codes.
@@ -260,6 +265,10 @@ pub struct Point {
     pub range: Option<RangeInclusive<f64>>,
     /// Texts of the values of an enumeration.
     pub texts: BTreeMap<i64, String>,
+    /// It takes other values than those of `texts`, too.
+    pub unlisted: bool,
+    /// A helper of other points that no north side shows and nobody commands.
+    pub hidden: bool,
     /// A state of the point that keeps the motor from running.
     pub blocks: Option<Blocks>,
     /// Whether an available manual confirms the address.
@@ -289,15 +298,45 @@ pub enum Source {
 }
 
 impl Point {
+    /// A point of the common model that is only derived, or not read by itself.
+    pub(super) fn of_model(model: ModelPoint, source: Source) -> Point {
+        Point {
+            name: model.name().to_string(),
+            model: Some(model),
+            unit: model.unit().to_string(),
+            source,
+            class: PollClass::Never,
+            fast_if_carried: false,
+            monitor: None,
+            write: false,
+            write_to: None,
+            pulse: false,
+            on_change: false,
+            range: None,
+            texts: BTreeMap::new(),
+            unlisted: false,
+            hidden: false,
+            blocks: None,
+            verified: true,
+            note: String::new(),
+        }
+    }
+
+    /// Whether users can command it.
+    pub fn is_commanded(&self) -> bool {
+        self.write && !self.hidden
+    }
+
     /// Kind of its values.
     pub fn kind(&self) -> Kind {
-        use Derived::{All, Equal, LowestBit, Zero};
+        use Derived::{All, Equal, LowestBit, State, Zero};
         match (&self.source, self.model) {
-            (Source::Raw(raw), _) if matches!(raw.form, Form::Bit { .. }) => Kind::Bool,
-            (Source::Derived(Zero { .. } | Equal { .. } | All { .. }), _) => Kind::Bool,
+            (Source::Raw(raw), _) if raw.is_bool() => Kind::Bool,
+            (Source::Raw(raw), _) if matches!(raw.form, Form::Text { .. }) => Kind::Text,
+            (Source::Derived(Zero { .. } | Equal { .. } | All { .. } | State { .. }), _) => Kind::Bool,
             (_, Some(model)) => model.kind(),
             (Source::Derived(LowestBit { .. }), None) => Kind::Integer,
-            (Source::Raw(raw), None) if matches!(raw.form, Form::Bits { .. }) => Kind::Integer,
+            (Source::Raw(raw), None) if raw.is_code() => Kind::Integer,
             _ if !self.texts.is_empty() => Kind::Integer,
             _ => Kind::Number,
         }
@@ -308,9 +347,16 @@ impl Point {
         let code = match value {
             Value::Integer(code) => code,
             Value::Bool(state) => i64::from(state),
-            Value::Number(_) => return None,
+            Value::Number(_) | Value::Unsigned(_) | Value::Text(_) => return None,
         };
         self.texts.get(&code).map(String::as_str)
+    }
+
+    /// The value of an enumeration that a text means; `None` also where it means several.
+    pub fn code_of(&self, text: &str) -> Option<i64> {
+        let mut codes = self.texts.iter().filter(|(_, meaning)| *meaning == text);
+        let first = codes.next().map(|(code, _)| *code);
+        first.filter(|_| codes.next().is_none())
     }
 
     /// Its raw source, if it has one.
@@ -340,7 +386,7 @@ impl Profile {
                 let of = derived.rests_on();
                 of.into_iter().flat_map(|of| self.raw_points_of(of)).collect()
             }
-            Some(Source::Raw(_)) => vec![point],
+            Some(Source::Raw(raw)) => std::iter::once(point).chain(raw.scale_from).collect(),
             None => Vec::new(),
         }
     }
@@ -438,6 +484,9 @@ impl Profile {
 
     /// Whether writing `value` to that register (or coil) clears the run command: a stop.
     pub fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
+        if let Some(control) = &self.control {
+            return control.is_stop(Place { table, address }, value);
+        }
         self.run_bit().is_some_and(|(raw, bit, invert)| {
             raw.table == table && raw.address == address && ((value >> bit) & 1 == 1) == invert
         })

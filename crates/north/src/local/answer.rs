@@ -3,8 +3,6 @@
 
 use std::time::{Duration, Instant};
 
-use serde_json::Value as Json;
-
 use super::protocol::{
     Expected, Failure, FailureCode, Outcome, ParamsOutcome, ParamsRequest, PointValue, ReadOutcome, ReadRequest,
     RecordOutcome, RecordRequest, Request, RestoreAct, RestoreOutcome, RestoreRequest, Setting, WhyRequest, Word,
@@ -166,8 +164,10 @@ fn wanted(profile: &Profile, names: &[String]) -> Result<Vec<Wanted>, Failure> {
     let of = |name: &String| {
         let has = |word: &Word| word.sources().iter().any(|point| profile.model_index(*point).is_some());
         let word = || Word::of(name).filter(has).map(Wanted::Word);
+        let shown = |index: &usize| profile.points.get(*index).is_some_and(|point| !point.hidden);
         profile
             .point_index(name)
+            .filter(shown)
             .map(Wanted::Point)
             .or_else(word)
             .ok_or_else(|| {
@@ -280,7 +280,7 @@ async fn write(request: &WriteRequest, plant: &Plant, origin: Origin, asked: Ins
         && let [
             Setting {
                 point,
-                value: Json::Bool(true),
+                value: serde_json::Value::Bool(true),
             },
         ] = request.points.as_slice()
         && point == RESTART_COMMUNICATION
@@ -387,27 +387,12 @@ async fn restore(request: &RestoreRequest, shared: &SharedPlant, origin: Origin)
 fn understood(profile: &Profile, settings: &[Setting]) -> (Vec<(usize, Value)>, Option<Refusal>) {
     let (mut values, mut refused) = (Vec::new(), None);
     for setting in settings {
-        match value_of(profile, setting) {
+        match resolve(profile, &setting.point, &setting.value) {
             Ok(value) => values.push(value),
             Err(refusal) => refused = refused.or(Some(refusal)),
         }
     }
     (values, refused)
-}
-
-/// The point and its value: as over MQTT, and the text of an enumeration too.
-fn value_of(profile: &Profile, setting: &Setting) -> Result<(usize, Value), Refusal> {
-    let point = profile
-        .point_index(&setting.point)
-        .and_then(|index| profile.points.get(index));
-    let code = match (&setting.value, point) {
-        (Json::String(text), Some(point)) => point.texts.iter().find(|(_, meaning)| *meaning == text),
-        _ => None,
-    };
-    match code {
-        Some((code, _)) => resolve(profile, &setting.point, &(*code).into()),
-        None => resolve(profile, &setting.point, &setting.value),
-    }
 }
 
 /// A command that was not understood, for the audit.

@@ -74,7 +74,12 @@ pub(super) fn drive_rows(profile: &Profile, plan: &Plan, access: Access, raw_wri
         .into_iter()
         .flatten()
         .map(|entry| entry_row(profile, plan, entry, access));
-    let mut raw: Vec<(&Point, &Raw)> = profile.points.iter().filter_map(|p| Some((p, p.raw()?))).collect();
+    let mut raw: Vec<(&Point, &Raw)> = profile
+        .points
+        .iter()
+        .filter(|p| !p.hidden)
+        .filter_map(|p| Some((p, p.raw()?)))
+        .collect();
     raw.sort_by_key(|(_, raw)| (raw.table, raw.address));
     let raw = raw.into_iter().map(|(point, raw)| Row {
         access: if access == Access::Control && is_written_raw(profile, raw_writes, raw) {
@@ -215,9 +220,16 @@ fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, raw_writes:
         RawForm::Bit { .. } if raw.table.is_bits() => "bit".to_string(),
         RawForm::Bit { bit, .. } => format!("bit {bit}"),
         RawForm::Bits { first, count } => format!("bits {first}-{}", first.saturating_add(count).saturating_sub(1)),
-        other => other.name().to_string(),
+        _ => raw.type_text().replace(" high-first", ""),
     };
     let mut notes = Vec::new();
+    if let Some(power) = raw.scale_from.and_then(|power| profile.points.get(power)) {
+        notes.push(format!("times 10^{}", power.name));
+    }
+    if !raw.invalid.is_empty() {
+        let values: Vec<String> = raw.invalid.iter().map(|value| format!("{value:#06x}")).collect();
+        notes.push(format!("{} means not available", values.join(", ")));
+    }
     if matches!(raw.form, RawForm::Bit { invert: true, .. }) {
         notes.push("0 means true".to_string());
     }

@@ -74,6 +74,7 @@ const texts = {
   "Logged in as": "Angemeldet als",
   "Logging in …": "Anmeldung läuft …",
   "Login": "Anmeldung",
+  "not verified on hardware": "nicht an einem Gerät geprüft",
   "Modbus TCP unit {unit}": "Modbus-TCP-Unit {unit}",
   "More of this family": "Weitere Werte dieser Baureihe",
   "More states": "Weitere Zustände",
