@@ -132,11 +132,7 @@ fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
             .collect(),
         Order::Write(pdu) => {
             let (table, items) = command::written(pdu).unwrap_or((Table::Holding, Vec::new()));
-            let run_bit = reading.spec.profile.run_bit();
-            let runs = |address: u16, word: u16| {
-                let (_, bit, invert) = run_bit.filter(|(raw, ..)| raw.table == table && raw.address == address)?;
-                Some(((word >> bit) & 1 == 1) != invert)
-            };
+            let runs = |address: u16, word: u16| reading.spec.profile.runs_by(table, address, word);
             let number = |word: u16| Value::Integer(i64::from(word));
             let change = |(address, word): (u16, u16)| Change {
                 point: format!("{table} {address}"),

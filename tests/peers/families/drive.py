@@ -1,7 +1,5 @@
 """What the simulated drives of the families share: Modbus RTU over TCP, a motor with a ramp, and a log on stdout.
 
-    families/run.py FAMILY PORT [unprepared]
-
 Address 1. Every write is printed as `wrote TABLE ADDRESS VALUE` (hexadecimal), every change of the motor as `motor forward`,
 `motor reverse` or `motor stopped`. SIGUSR1 trips the drive. An unprepared drive never becomes ready.
 """
@@ -13,6 +11,7 @@ import threading
 import time
 
 RAMP = 100.0  # percent per second
+TURNAROUND = 0.01  # s; longer than a request takes on the line
 
 
 def crc(data):
@@ -221,5 +220,7 @@ def talk(drive, client):
             return
         whole, data = frames(data + more)
         for frame in whole:
+            # An answer that is there before the request can be through would be an echo.
+            time.sleep(TURNAROUND)
             client.sendall(drive.exchange(frame))
 

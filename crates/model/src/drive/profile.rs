@@ -443,6 +443,18 @@ impl Profile {
         }
     }
 
+    /// Whether that word, written there, is a run command or a stop; `None` where it is neither.
+    pub fn runs_by(&self, table: Table, address: u16, word: u16) -> Option<bool> {
+        if let Some(control) = &self.control {
+            let place = Place { table, address };
+            let run = control.is_run(place, word).then_some(true);
+            return run.or(control.is_stop(place, word).then_some(false));
+        }
+        let here = |(raw, ..): &(&Raw, u8, bool)| raw.table == table && raw.address == address;
+        let (_, bit, invert) = self.run_bit().filter(here)?;
+        Some(((word >> bit) & 1 == 1) != invert)
+    }
+
     /// Whether a write of these items is skipped if the drive has them already, because it stores them in EEPROM with
     /// limited write cycles. On N2 that includes addresses without a point, but never a stop or a pulse.
     pub fn writes_on_change(&self, table: Table, items: &[(u16, u16)]) -> bool {

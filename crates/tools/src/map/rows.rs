@@ -3,7 +3,7 @@
 use crate::codec::Table;
 use crate::drive::profile::{Form as RawForm, Raw};
 use crate::drive::{ModelPoint, Plan, Point, Profile, RawWrites};
-use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry};
+use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry, FIRST};
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::Access;
 
@@ -79,6 +79,8 @@ pub(super) fn drive_rows(profile: &Profile, plan: &Plan, access: Access, raw_wri
         .iter()
         .filter(|p| !p.hidden)
         .filter_map(|p| Some((p, p.raw()?)))
+        // Registers from there on are the common model's.
+        .filter(|(_, raw)| raw.table.is_bits() || raw.address < FIRST)
         .collect();
     raw.sort_by_key(|(_, raw)| (raw.table, raw.address));
     let raw = raw.into_iter().map(|(point, raw)| Row {
