@@ -9,7 +9,7 @@ use drivegate::bus::master::{Handover, Purpose};
 use drivegate::bus::predict::predict;
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
-use drivegate::command::{CommandQueue, WriteStats};
+use drivegate::command::{CommandQueue, NO_DRIVE, WriteStats};
 use drivegate::drive::profile::Profiles;
 use drivegate::drive::{PollClass, Profile};
 use drivegate::event::Events;
@@ -80,6 +80,8 @@ pub struct WorldBus {
     until: Instant,
     commands: bool,
     asked: Option<Asked>,
+    /// The last request without an address of a drive.
+    broadcast: Option<Asked>,
     /// The exchange before: a late reply may have ended it while its request was still on the wire.
     ended: Option<Asked>,
 }
@@ -190,6 +192,7 @@ impl WorldBus {
             until: now,
             commands: true,
             asked: None,
+            broadcast: None,
             ended: None,
         }
     }
@@ -329,6 +332,9 @@ impl WorldBus {
             acted: 0,
         };
         seen.push(Seen::Sent(asked.clone()));
+        if asked.drive == NO_DRIVE {
+            self.broadcast = Some(asked.clone());
+        }
         self.asked = Some(asked);
         self.wire.on_bytes(&frame, self.sim(now));
         self.note_acts(seen);
@@ -359,6 +365,18 @@ impl WorldBus {
             };
             asked.frame = act.reply.clone();
             asked.acted = act.address;
+            let is_asked = self
+                .handle
+                .image
+                .drives
+                .get(asked.drive)
+                .is_none_or(|image| image.spec.address == act.address);
+            if let Some(broadcast) = self.broadcast.as_mut().filter(|_| !is_asked) {
+                // A drive may carry a broadcast out when another one is asked already.
+                broadcast.acted = act.address;
+                seen.push(Seen::Acted(broadcast.clone()));
+                continue;
+            }
             let Some(image) = self.handle.image.drives.get(asked.drive) else {
                 // None is configured at that address.
                 seen.push(Seen::Acted(asked.clone()));

@@ -7,7 +7,7 @@ use crate::drive::commissioning::{Shared, gather};
 use crate::drive::{Profile, Step};
 
 /// Most steps that are told with a verdict.
-const MOST_STEPS: usize = 48;
+const MOST_STEPS: usize = 96;
 
 impl Cause {
     /// What it means, in a few words.

@@ -540,7 +540,7 @@ fn points_for_faults_are_read_by_their_registers() {
     let plan = crate::drive::Plan::of(&profile);
     assert_eq!(plan.on_fault, []);
     let monitors: Vec<_> = plan.monitors.iter().map(|read| (read.start, read.count)).collect();
-    assert_eq!(monitors, [(0, 7), (44, 1), (98, 1)]);
+    assert_eq!(monitors, [(0, 2), (3, 4), (44, 1), (98, 1)]);
     // A derived point is read by what it is made of; what is removed is not read.
     let derived = Profile::parse("p", &source("\"frequency_reference\""), false).unwrap();
     let names: Vec<&str> = derived
