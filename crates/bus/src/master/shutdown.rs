@@ -173,7 +173,9 @@ impl Master {
 /// The broadcast that stops all drives of the bus, where all of them are to be stopped and one of them answers.
 fn broadcast(bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Option<Exchange> {
     let drives = &bus.image.drives;
-    let all = drives.iter().all(|image| image.spec.on_shutdown == OnShutdown::Stop);
+    let all = drives
+        .iter()
+        .all(|image| matches!(image.spec.on_shutdown, OnShutdown::Stop));
     let online = drives.iter().any(|image| image.snapshot().link.is_online());
     let pdu =
         stop_of_line(bus.image.spec.protocol, drives.iter().map(|image| &image.spec)).filter(|_| all && online)?;

@@ -434,8 +434,8 @@ mod tests {
         for (text, wanted) in [
             ("", "the list is empty; our meter 2.csv:1"),
             (
-                "name,adress\na,1\n",
-                "unknown column `adress`; our meter 2.csv:1, adress; did you mean `address`?",
+                "name,number_address\na,1\n",
+                "unknown column `number_address`; our meter 2.csv:1, number_address; known: name, address",
             ),
             (
                 "name,address\na,1\n\nb,x9\n",

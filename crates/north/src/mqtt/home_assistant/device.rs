@@ -8,12 +8,10 @@ use crate::plant::{DriveHandle, Plant};
 
 /// With whose names titles of profiles begin.
 const MANUFACTURERS: [&str; 18] = [
-    "Vacon",
-    "Eaton",
-    "TECO",
     "ABB",
     "Danfoss",
     "Delta",
+    "Eaton",
     "Fuji",
     "Hitachi",
     "INVT",
@@ -23,7 +21,9 @@ const MANUFACTURERS: [&str; 18] = [
     "Mitsubishi",
     "Schneider",
     "Siemens",
+    "TECO",
     "Toshiba",
+    "Vacon",
     "WEG",
     "Yaskawa",
 ];
