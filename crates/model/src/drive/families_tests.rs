@@ -514,7 +514,7 @@ fn process_data_is_few_requests() {
         ("eaton-svx", 1),
         ("eaton-hvx", 1),
         ("teco-7300pa", 1),
-        ("vacon-cx", 7),
+        ("vacon-cx", 4),
         ("vacon-nx-n2", 7),
         ("eaton-hvx-n2", 7),
         ("teco-7300pa-n2", 7),

@@ -49,6 +49,8 @@ pub struct Plan {
     pub on_fault: Vec<PlannedRead>,
     /// What process data is compared with, as far as no other read has it: see [`super::profile::Point::monitor`].
     pub monitors: Vec<PlannedRead>,
+    /// Those of `reads` that are longer than a manual states: bits that are read singly until a reply proves the whole.
+    pub trials: Vec<PlannedRead>,
     /// The reads of process data that decide the drive's state: fault, running, ready.
     pub behind_state: Vec<PlannedRead>,
 }
@@ -98,9 +100,15 @@ impl Plan {
             reads,
             on_fault,
             monitors,
+            trials: Vec::new(),
             behind_state: Vec::new(),
         };
         plan.behind_state = plan.behind_state(profile);
+        let is_trial = |read: &&PlannedRead| {
+            let range = profile.range(read.table, read.start);
+            read.class == PollClass::Fast && range.is_some_and(|range| read.count > range.read)
+        };
+        plan.trials = plan.reads.iter().filter(is_trial).copied().collect();
         plan
     }
 
@@ -219,7 +227,13 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<P
             let end = u32::from(last.start) + u32::from(last.count);
             let joined = piece_end.max(end) - u32::from(last.start);
             let adjacent = u32::from(address) <= end || range.holes;
-            let fits = joined <= u32::from(range.read);
+            // Only bits, which a drive that ignores the number of items reports as 0.
+            let tried = if class == PollClass::Fast && table.is_bits() {
+                range.try_read
+            } else {
+                0
+            };
+            let fits = joined <= u32::from(range.read.max(tried));
             if range.addresses.contains(&last.start) && adjacent && fits {
                 let at = u32::from(address) - u32::from(last.start);
                 last.wide |= inner.checked_shl(at).unwrap_or(0);

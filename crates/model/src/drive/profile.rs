@@ -115,6 +115,8 @@ pub struct AddressRange {
     pub addresses: RangeInclusive<u16>,
     /// Items per read request.
     pub read: u16,
+    /// Items per read request that no manual states: such a read is tried, and used once its reply proves it; 0 is none.
+    pub try_read: u16,
     /// Items per write request; 0 is read-only.
     pub write: u16,
     /// A read may cover addresses between two points that no point names.
