@@ -308,6 +308,13 @@ fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value)
     Ok(())
 }
 
+/// What a reference is in the unit of another point, once a command sets it.
+pub fn converted(drive: &Reading<'_>, (index, value): (usize, Value), to: usize) -> Option<Value> {
+    let point = drive.spec.profile.points.get(index)?;
+    let written = resolve(drive, index, point, value).ok()?;
+    becomes(drive, to, written).flatten()
+}
+
 /// What a point is once the register of another one is written: itself, or by the point that takes its commands, or by
 /// conversion. `None` where the two have nothing to do with each other, `Some(None)` where the band is not known.
 pub(super) fn becomes(drive: &Reading<'_>, point: usize, written: (usize, Value)) -> Option<Option<Value>> {
