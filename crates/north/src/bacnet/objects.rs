@@ -253,7 +253,7 @@ fn own(spec: &DriveSpec, all: &mut Objects) {
         .points
         .iter()
         .enumerate()
-        .filter(|(_, point)| point.model.is_none());
+        .filter(|(_, point)| point.model.is_none() && !point.hidden);
     for (number, (index, point)) in (OWN..).zip(own) {
         let writable = point.write && spec.access == Access::Control;
         let unread = point.raw().is_some() && point.class == PollClass::Never;
@@ -283,6 +283,8 @@ fn own(spec: &DriveSpec, all: &mut Objects) {
                 let id = (ObjectType::MULTI_STATE_INPUT, number);
                 all.add(id, texts, kind, Written::Read, Meaning::Enumeration(index));
             }
+            // Texts are objects of a kind that few clients read.
+            Values::Text => {}
             Values::Integer | Values::Number => {
                 let kind = of_type(ObjectType::ANALOG_INPUT, ObjectType::ANALOG_VALUE);
                 let limits = spec.limits_of(index).filter(|_| writable);
@@ -334,7 +336,7 @@ fn analog(spec: &DriveSpec, index: usize, model: Option<ModelPoint>, limits: Opt
     let unit = point.map_or("", |point| point.unit.as_str());
     let raw = raw_of(spec, index, 4);
     let resolution = match raw.map(|(form, scale)| (form, scale.abs())) {
-        Some((Form::F32(_), _)) | None => 0.01,
+        Some((Form::F32, _)) | None => 0.01,
         Some((_, scale)) => scale as f32,
     };
     let span = raw.and_then(|(form, scale)| {
