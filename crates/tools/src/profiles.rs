@@ -1,5 +1,6 @@
 //! `drivegate profiles`: the drive families and their points.
 
+mod commands;
 mod import;
 mod new;
 
@@ -249,6 +250,13 @@ fn show(profile: &Profile) -> String {
     if !profile.commissioning.is_empty() {
         text += "\nCommissioning\n";
         text += &commissioning(profile);
+    }
+    if let Some(control) = &profile.control {
+        text += "\nCommands\n";
+        for (what, words) in commands::lines(profile, control) {
+            // Writing to a String cannot fail.
+            let _ = writeln!(text, "  {what:<14}{words}");
+        }
     }
     text += "\nPoints; addresses are those of the PDU, counted from 0\n\n";
     text += &points(profile);
