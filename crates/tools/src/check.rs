@@ -257,6 +257,7 @@ fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
         let drives = counted(drives, "drive", "drives");
         let _ = writeln!(text, "Home Assistant: {drives} announced below {prefix}/device\n");
     }
+    text += &bacnet(settings);
     let warnings = match warnings {
         0 => "no warnings".to_string(),
         1 => "1 warning".to_string(),
@@ -318,6 +319,24 @@ fn functions(bus: &BusSettings) -> String {
         (!notes.is_empty()).then(|| format!("  writes      {}: {}\n", drive.name, notes.join("; ")))
     };
     controlled.filter_map(line).collect()
+}
+
+/// Octets of a notification of a change, with the headers of UDP, IP and Ethernet.
+const NOTIFICATION: usize = 120;
+
+/// What BACnet shows, and what it costs to tell all of it once; it adds nothing to the lines of the drives.
+fn bacnet(settings: &Settings) -> String {
+    let (Some(options), Some(devices)) = (&settings.bacnet, super::map::bacnet::devices(settings)) else {
+        return String::new();
+    };
+    let objects: usize = devices.iter().map(|shown| shown.device.objects().len()).sum();
+    format!(
+        "BACnet/IP on {}: {} with {}; a change of all of them takes {} kB of notifications for each subscriber, nothing on the lines\n\n",
+        options.listen,
+        counted(devices.len(), "device", "devices"),
+        counted(objects, "object", "objects"),
+        (objects * NOTIFICATION).div_ceil(1000),
+    )
 }
 
 /// Where tools reach the line, one line a slot.

@@ -5,6 +5,7 @@
 
 pub mod ede;
 mod kept;
+pub mod listing;
 pub mod objects;
 mod sockets;
 mod task;

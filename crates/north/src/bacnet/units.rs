@@ -42,6 +42,14 @@ pub(super) fn number(unit: &str) -> u32 {
     known.map_or(NONE, |(_, number)| *number)
 }
 
+/// The unit of a number; the first of several.
+pub(super) fn name(number: u32) -> &'static str {
+    UNITS
+        .iter()
+        .find(|(_, own)| *own == number)
+        .map_or("", |(name, _)| name)
+}
+
 /// The numbers that are used, with their units.
 pub(super) fn all() -> impl Iterator<Item = (u32, &'static str)> {
     UNITS.iter().map(|(name, number)| (*number, *name)).chain([(NONE, "")])
