@@ -18,6 +18,8 @@ const FIRST: u16 = 0x0B;
 const COUNTERS: usize = 5;
 /// Pause between two readings of a drive.
 const PAUSE: Duration = Duration::from_secs(30);
+/// Pause before a counter is asked for again whose reply was lost.
+const AGAIN: Duration = Duration::from_secs(1);
 /// Not sent after this.
 const EXPIRY: Duration = Duration::from_secs(20);
 
@@ -31,8 +33,8 @@ pub(super) struct DriveCounters {
 
 #[derive(Debug)]
 enum State {
-    /// Looked at again then.
-    Idle(Instant),
+    /// Looked at again then, with the counters read so far.
+    Idle(Instant, Vec<u16>),
     /// The counters read so far, and the answer that is waited for.
     Reading(Vec<u16>, Receiver<Answer>),
 }
@@ -43,7 +45,9 @@ impl DriveCounters {
         let drives = bus.image.drives.iter().enumerate();
         let counting = drives.filter(|(_, drive)| drive.spec.profile.counts_messages);
         DriveCounters {
-            drives: counting.map(|(index, _)| (index, State::Idle(now))).collect(),
+            drives: counting
+                .map(|(index, _)| (index, State::Idle(now, Vec::new())))
+                .collect(),
             due: now,
         }
     }
@@ -62,19 +66,20 @@ impl DriveCounters {
         self.due = now + Duration::from_millis(50);
         for (drive, state) in &mut self.drives {
             let next = match state {
-                State::Idle(at) if now < *at => continue,
-                State::Idle(_) => {
+                State::Idle(at, _) if now < *at => continue,
+                State::Idle(_, counted) => {
                     let online = bus
                         .image
                         .drives
                         .get(*drive)
                         .is_some_and(|d| d.snapshot().link.is_online());
-                    if !online {
-                        diagnosis.forget_counted(*drive);
-                    }
+                    let counted = std::mem::take(counted);
                     match online && diagnosis.has_errors(*drive) {
-                        true => State::Reading(Vec::new(), ask(bus, *drive, FIRST, writes, now)),
-                        false => State::Idle(now + Duration::from_secs(1)),
+                        true => {
+                            let next = FIRST + counted.len().min(COUNTERS) as u16;
+                            State::Reading(counted, ask(bus, *drive, next, writes, now))
+                        }
+                        false => State::Idle(now + AGAIN, counted),
                     }
                 }
                 State::Reading(counted, answer) => match answer.try_recv() {
@@ -94,7 +99,7 @@ impl DriveCounters {
                                     unanswered: *unanswered,
                                 };
                                 diagnosis.counted_by_drive(*drive, counted);
-                                State::Idle(now + PAUSE)
+                                State::Idle(now + PAUSE, Vec::new())
                             }
                             so_far => {
                                 let next = FIRST + so_far.len().min(COUNTERS) as u16;
@@ -102,8 +107,12 @@ impl DriveCounters {
                             }
                         }
                     }
-                    // Lost on the line, or refused: later again.
-                    Ok(_) | Err(TryRecvError::Closed) => State::Idle(now + PAUSE),
+                    // A drive that refuses it is not asked soon again; what was lost on the line is.
+                    Ok(Answer {
+                        outcome: Outcome::Exception(_),
+                        ..
+                    }) => State::Idle(now + PAUSE * 20, Vec::new()),
+                    Ok(_) | Err(TryRecvError::Closed) => State::Idle(now + AGAIN, std::mem::take(counted)),
                 },
             };
             *state = next;

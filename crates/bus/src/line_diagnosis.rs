@@ -69,15 +69,10 @@ impl LineDiagnosis {
     /// A drive told what it counted.
     pub(super) fn counted_by_drive(&mut self, drive: usize, counted: CountedByDrive) {
         if let Some(known) = self.by_drive.get_mut(drive) {
-            let first = known.map_or(counted, |(_, before)| before);
+            // A drive that was switched off counts from 0 again.
+            let goes_on = |before: &CountedByDrive| counted.since(before).messages < u16::MAX / 2;
+            let first = known.map(|(_, before)| before).filter(goes_on).unwrap_or(counted);
             *known = Some((first, counted));
-        }
-    }
-
-    /// The drive started again, or errors ended long ago: its counters are compared with none from before.
-    pub(super) fn forget_counted(&mut self, drive: usize) {
-        if let Some(known) = self.by_drive.get_mut(drive) {
-            *known = None;
         }
     }
 

@@ -52,6 +52,7 @@ tokens_file = "DIR/tokens"
 certificate = "DIR/gateway.crt"
 key = "DIR/gateway.key"
 [audit]
+[bacnet]
 [params]
 [log]
 [[bus.drive.trigger]]
