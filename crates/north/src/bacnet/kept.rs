@@ -124,7 +124,7 @@ mod tests {
             who: "10.0.0.5:47808".to_string(),
             client: "bacnet 10.0.0.5".to_string(),
         };
-        save(&file, &[slot.clone()]).unwrap();
+        save(&file, std::slice::from_ref(&slot)).unwrap();
         assert_eq!(load(&file), Ok(vec![slot]));
         std::fs::write(&file, "[{").unwrap();
         assert!(load(&file).is_err());

@@ -197,7 +197,7 @@ impl Bench {
     }
 
     /// An order of an MQTT client; the refusal, if it is refused.
-    fn from_elsewhere(&self, point: ModelPoint, value: Value) -> Option<Refusal> {
+    fn set_elsewhere(&self, point: ModelPoint, value: Value) -> Option<Refusal> {
         let drive = self.drive();
         let index = drive.image.spec.profile.model_index(point).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "cloud");

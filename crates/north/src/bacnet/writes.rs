@@ -19,6 +19,7 @@ const MINIMUM_TIMES: u8 = 6;
 
 /// What becomes of a job.
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "a few at a time, moved once")]
 pub(super) enum Begun {
     /// It is answered.
     Answered(Result<(), Error>),

@@ -134,28 +134,28 @@ fn both_references_are_one_thing_and_each_shows_its_unit() {
 }
 
 #[test]
-fn a_stop_from_elsewhere_withdraws_and_a_slot_that_protects_refuses() {
+fn a_stop_set_elsewhere_withdraws_and_a_slot_that_protects_refuses() {
     let bench = Bench::new();
     bench.order("127.0.0.5", RUN, 8, on(true), done());
-    assert_eq!(bench.from_elsewhere(ModelPoint::Run, Value::Bool(false)), None);
+    assert_eq!(bench.set_elsewhere(ModelPoint::Run, Value::Bool(false)), None);
     assert_eq!(bench.slots(RUN), []);
     bench.carry_out(done());
     bench.order("127.0.0.5", RUN, 3, on(false), done());
-    let refused = bench.from_elsewhere(ModelPoint::Run, Value::Bool(true)).unwrap();
+    let refused = bench.set_elsewhere(ModelPoint::Run, Value::Bool(true)).unwrap();
     assert_eq!(refused.code(), "held_by_other");
     assert!(
         refused.to_string().contains("127.0.0.5") && refused.to_string().contains("priority 3"),
         "{refused}"
     );
     assert_eq!(
-        bench.from_elsewhere(ModelPoint::Run, Value::Bool(false)),
+        bench.set_elsewhere(ModelPoint::Run, Value::Bool(false)),
         None,
         "a stop passes"
     );
     bench.carry_out(done());
     assert_eq!(bench.slots(RUN), [(3, Datum::Bool(false))]);
     bench.order("127.0.0.5", RUN, 3, NULL, done());
-    assert_eq!(bench.from_elsewhere(ModelPoint::Run, Value::Bool(true)), None);
+    assert_eq!(bench.set_elsewhere(ModelPoint::Run, Value::Bool(true)), None);
 }
 
 #[test]
