@@ -137,11 +137,7 @@ fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
             .collect(),
         Order::Write(pdu) => {
             let (table, items) = command::written(pdu).unwrap_or((Table::Holding, Vec::new()));
-            let run_bit = reading.spec.profile.run_bit();
-            let runs = |address: u16, word: u16| {
-                let (_, bit, invert) = run_bit.filter(|(raw, ..)| raw.table == table && raw.address == address)?;
-                Some(((word >> bit) & 1 == 1) != invert)
-            };
+            let runs = |address: u16, word: u16| reading.spec.profile.runs_by(table, address, word);
             let number = |word: u16| Value::Integer(i64::from(word));
             let change = |(address, word): (u16, u16)| Change {
                 point: format!("{table} {address}"),
@@ -558,6 +554,11 @@ impl DriveHandle {
         self.publish_refusal(what, &refusal, &origin, now);
         let name = &self.image.spec.name;
         turn_away(&self.writes, name, what, Outcome::Refused(refusal), origin, now)
+    }
+
+    /// Passes a request on to the line of the drive, as [`BusHandle::ask`].
+    pub fn ask_line(&self, question: Question, now: Instant) -> Exchange {
+        self.bus.ask(question, &self.writes, now)
     }
 
     /// Publishes that a command was refused; a flood of them is counted.

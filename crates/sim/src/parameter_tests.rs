@@ -119,7 +119,10 @@ impl Bench {
 /// The families with parameters, and where those of their simulated drives lie.
 fn families() -> Vec<(Arc<Profile>, BTreeSet<u16>)> {
     let all = Profiles::built_in();
-    let all = all.iter().filter(|profile| !profile.parameters.is_empty());
+    // Those of one application have the parameters of their base.
+    let all = all
+        .iter()
+        .filter(|profile| profile.base.is_none() && !profile.parameters.is_empty());
     let families: Vec<_> = all
         .map(|profile| {
             let file = Bench::new(profile).read(BTreeSet::new());

@@ -2,6 +2,7 @@
 
 mod as_service;
 
+use std::collections::BTreeSet;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -220,6 +221,13 @@ fn raw_writes(bus: &BusSettings, settings: &Settings) -> String {
     text
 }
 
+/// The profiles in use that nobody has confirmed on hardware.
+fn unverified(settings: &Settings) -> BTreeSet<&str> {
+    let drives = settings.buses.iter().flat_map(|bus| &bus.drives);
+    let profiles = drives.map(|drive| &drive.profile).filter(|profile| !profile.verified);
+    profiles.map(|profile| profile.name.as_str()).collect()
+}
+
 fn drive_name<'a>(bus: &'a BusSettings, request: &PredictedRequest) -> &'a str {
     bus.drives.get(request.drive).map_or("", |drive| &drive.name)
 }
@@ -235,6 +243,12 @@ fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
     for (bus, past) in settings.buses.iter().zip(&taken.buses) {
         text += &bus_text(bus, settings, &memory(past, taken.reach));
         text.push('\n');
+    }
+    for profile in unverified(settings) {
+        let _ = writeln!(
+            text,
+            "profile {profile}: not verified on hardware, see docs/verifying.md\n"
+        );
     }
     let total = taken.total(settings).div_ceil(1 << 20);
     let _ = writeln!(text, "memory at most {total} MiB for the gateway\n");

@@ -104,6 +104,12 @@ fn text(diagnosis: &Diagnosis) -> String {
             printable::line(&verdict.meaning),
             verdict.certainty.name()
         );
+        if !verdict.steps.is_empty() {
+            text += "      at the drives; `drivegate profiles show NAME` has all steps:\n";
+        }
+        for step in &verdict.steps {
+            let _ = writeln!(text, "        - {}", printable::line(step));
+        }
     }
     let bad = |one: &&Counted| one.silent + one.damaged + one.late + one.second + one.stray_before > 0;
     let bad: Vec<&Counted> = diagnosis.drives.iter().filter(bad).collect();
@@ -123,6 +129,14 @@ fn text(diagnosis: &Diagnosis) -> String {
             one.stray_before,
             one.slowest_ms
         );
+        if let Some(by_drive) = &one.by_drive {
+            let _ = writeln!(
+                text,
+                "    counted by the drive: {} sound and {} damaged messages on the line, {} to it, {} of them unanswered, {} \
+                 exceptions",
+                by_drive.messages, by_drive.damaged, by_drive.own, by_drive.unanswered, by_drive.exceptions
+            );
+        }
     }
     text
 }
@@ -139,6 +153,7 @@ mod tests {
             time: None,
             verdicts: Vec::new(),
             drives: vec![Counted {
+                by_drive: None,
                 drive: "pump-1".to_string(),
                 ..Counted::default()
             }],
@@ -159,10 +174,11 @@ mod tests {
             meaning: "one is bad".to_string(),
             evidence: "7 of 9".to_string(),
             remedy: "look".to_string(),
+            steps: vec!["vacon-nx: green LED steady".to_string()],
             since: String::new(),
         });
         diagnosis.drives[0].silent = 7;
-        let expected = "line1:\n\n  one_drive pump-1: one is bad (likely)\n      seen: 7 of 9\n      do: look\n\n  in the last minute";
+        let expected = "line1:\n\n  one_drive pump-1: one is bad (likely)\n      seen: 7 of 9\n      do: look\n      at the drives; `drivegate profiles show NAME` has all steps:\n        - vacon-nx: green LED steady\n\n  in the last minute";
         assert!(text(&diagnosis).starts_with(expected), "{}", text(&diagnosis));
     }
 }

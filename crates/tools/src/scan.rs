@@ -55,7 +55,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Extent::OneSetting
     };
     let outcome = search.run(&settings, extent);
-    finish(args, &search, outcome)
+    finish(args, &settings, &search, outcome)
 }
 
 /// The settings to try and all profiles, or an exit code; what is wrong was reported.
@@ -98,7 +98,7 @@ pub(super) fn configuration(port: &str, options: &Options, search: &Search<'_>) 
     snippet.text()
 }
 
-fn finish(args: &Args, search: &Search<'_>, outcome: Result<(), String>) -> ExitCode {
+fn finish(args: &Args, tried: &[Setting], search: &Search<'_>, outcome: Result<(), String>) -> ExitCode {
     let printed = if search.found.is_empty() {
         ExitCode::from(EXIT_FAILED)
     } else {
@@ -110,8 +110,12 @@ fn finish(args: &Args, search: &Search<'_>, outcome: Result<(), String>) -> Exit
     }
     if search.found.is_empty() {
         report::error(&verdict::nobody_answers(&search.heard, &args.port));
-    } else if let Some(told) = verdict::beside_answers(&search.heard) {
+        report::lines_to_stderr(&verdict::at_silent_drives(&search.heard, tried, &search.profiles));
+        return printed;
+    }
+    if let Some(told) = verdict::beside_answers(&search.heard) {
         report::note(&told);
     }
+    report::lines_to_stderr(&verdict::before_commands(&search.found, &search.profiles));
     printed
 }

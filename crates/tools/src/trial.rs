@@ -120,7 +120,9 @@ fn attempt(args: &Args, stop: &Stop) -> Result<ExitCode, ExitCode> {
         return Err(stopped());
     }
     if search.found.is_empty() {
-        return Err(failed(EXIT_FAILED, &verdict::nobody_answers(&search.heard, &port)));
+        let code = failed(EXIT_FAILED, &verdict::nobody_answers(&search.heard, &port));
+        report::lines_to_stderr(&verdict::at_silent_drives(&search.heard, &settings, &search.profiles));
+        return Err(code);
     }
     serving::serve(args, stop, &scan::configuration(&port, &args.options, &search))
 }

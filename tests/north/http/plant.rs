@@ -277,9 +277,11 @@ pub(crate) fn diagnose(bus: &BusHandle) {
         meaning: Cause::OneDrive.meaning().to_string(),
         evidence: "7 of 90 exchanges failed".to_string(),
         remedy: Cause::OneDrive.remedy().to_string(),
+        steps: vec!["vacon-nx: green LED (FS) steady: the board has seen no message yet".to_string()],
         since: "2026-03-02T06:11:09.480Z".to_string(),
     };
     let counted = |drive: &Arc<DriveImage>| Counted {
+        by_drive: None,
         drive: drive.spec.name.clone(),
         ..Counted::default()
     };

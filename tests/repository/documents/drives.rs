@@ -8,6 +8,15 @@ use drivegate::drive::{Bound, Derived, ModelPoint, Point, Source, Value};
 
 /// The families, Modbus first.
 const MODBUS: [&str; 5] = ["vacon-nx", "eaton-svx", "eaton-hvx", "vacon-cx", "teco-7300pa"];
+/// Profiles of one application, each based on one of them.
+const APPLICATIONS: [&str; 6] = [
+    "vacon-nx-multipurpose",
+    "vacon-nx-pid",
+    "vacon-nx-pump-fan",
+    "eaton-svx-multipurpose",
+    "eaton-svx-pid",
+    "eaton-svx-pump-fan",
+];
 const N2: [&str; 3] = ["vacon-nx-n2", "eaton-hvx-n2", "teco-7300pa-n2"];
 
 pub(crate) fn tables() -> String {
@@ -19,16 +28,33 @@ pub(crate) fn tables() -> String {
     for name in MODBUS.iter().chain(&N2) {
         if let Some(profile) = profiles.get(name) {
             text += &family(profile);
+            text += &faults(&profiles, profile);
         }
     }
+    text += &applications(&profiles);
+    let unverified = unverified(&profiles);
+    text += &unverified.0;
     text += &assumptions();
     text.push('\n');
     assert_eq!(
         profiles.iter().count(),
-        MODBUS.len() + N2.len(),
+        MODBUS.len() + N2.len() + APPLICATIONS.len() + unverified.1,
         "a family is missing here"
     );
     text
+}
+
+/// The families that nobody has confirmed on hardware, and how many they are.
+fn unverified(profiles: &Profiles) -> (String, usize) {
+    let mut text = String::from(
+        "\n## Families not verified on hardware\n\nMade from manuals and reports, not confirmed ([how to](verifying.md)); \
+         `drivegate profiles show NAME` has points, settings and sources.\n\n|profile|drives|\n|---|---|\n",
+    );
+    let all: Vec<&std::sync::Arc<Profile>> = profiles.iter().filter(|profile| !profile.verified).collect();
+    for profile in &all {
+        let _ = writeln!(text, "|`{}`|{}|", profile.name, profile.title);
+    }
+    (text, all.len())
 }
 
 fn model(profiles: &Profiles, names: &[&str]) -> String {
@@ -134,6 +160,7 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
         }
         Derived::Zero { of, .. } => format!("{} = 0", name(of)),
         Derived::Equal { of, to, .. } => format!("{} = {}", name(of), name(to)),
+        Derived::State { any } => format!("{} states", any.len()),
         Derived::All { of } => of.iter().map(name).collect::<Vec<_>>().join(" and "),
         Derived::LowestBit { of } => format!("lowest bit of {}", name(of)),
     }
@@ -146,16 +173,6 @@ fn family(profile: &Profile) -> String {
         "\n## `{}`: {}\n\nSource: {}.",
         profile.name, profile.title, profile.source
     );
-    let mut verified: Vec<String> = Vec::new();
-    let mut unverified: Vec<String> = Vec::new();
-    for (code, fault) in &profile.faults {
-        let text = format!("{code} {}", fault.text);
-        if fault.verified {
-            verified.push(text)
-        } else {
-            unverified.push(text)
-        }
-    }
     if doubtful > 0 {
         let _ = write!(text, " Not verified: {doubtful} of {} points.", profile.points.len());
     }
@@ -199,11 +216,64 @@ fn family(profile: &Profile) -> String {
     if !rules.is_empty() {
         let _ = write!(text, "\nWrites: {}.\n", rules.join("; "));
     }
+    text
+}
+
+/// The fault texts of a family, or which other family has the same.
+fn faults(profiles: &Profiles, profile: &Profile) -> String {
+    let earlier = MODBUS.iter().chain(&N2).take_while(|name| **name != profile.name);
+    let same = earlier
+        .filter_map(|name| profiles.get(name))
+        .find(|one| one.faults == profile.faults);
+    if let Some(same) = same {
+        return format!("\nFault texts: as `{}`.\n", same.name);
+    }
+    let mut text = String::new();
+    let mut verified: Vec<String> = Vec::new();
+    let mut unverified: Vec<String> = Vec::new();
+    for (code, fault) in &profile.faults {
+        let panel = match fault.panel.as_str() {
+            "" => String::new(),
+            panel => format!(" (panel: {panel})"),
+        };
+        let text = format!("{code} {}{panel}", fault.text);
+        if fault.verified {
+            verified.push(text)
+        } else {
+            unverified.push(text)
+        }
+    }
     if !verified.is_empty() {
         let _ = write!(text, "\nFault texts: {}.\n", verified.join(", "));
     }
     if !unverified.is_empty() {
         let _ = write!(text, "\nUnverified fault texts: {}.\n", unverified.join(", "));
+    }
+    text
+}
+
+/// The points by which profiles of an application differ from their base.
+fn applications(profiles: &Profiles) -> String {
+    let mut text = String::from(
+        "\n## Profiles of one application\n\nWhat process data in means depends on the application, and no read shows which one \
+         a drive has: choose the profile. It is its base without `process_data_in_1` to `process_data_in_8`, and with\n\n\
+         |point|unit|address|profiles|\n|---|---|---|---|\n",
+    );
+    let mut rows: Vec<(String, Vec<&str>)> = Vec::new();
+    for name in APPLICATIONS {
+        let profile = profiles.get(name).unwrap();
+        let base = profiles.get(profile.base.as_deref().unwrap()).unwrap();
+        let same = |point: &&Point| base.points.iter().any(|other| other.name == point.name);
+        for point in profile.points.iter().filter(|point| !same(point)) {
+            let row = format!("|`{}`|{}|{}|", point.name, point.unit, place(profile, point));
+            match rows.iter_mut().find(|(known, _)| *known == row) {
+                Some((_, names)) => names.push(name),
+                None => rows.push((row, vec![name])),
+            }
+        }
+    }
+    for (row, names) in rows {
+        let _ = writeln!(text, "{row}`{}`|", names.join("`, `"));
     }
     text
 }

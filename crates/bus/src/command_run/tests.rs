@@ -435,7 +435,15 @@ fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
         let ended = command.answered(&read, refused(), &mut bench.words);
         assert_eq!(ended, Some(Outcome::Exception(Exception::ADDRESS)), "{points:?}");
     }
-    let (mut both, _a) = bench.begin(&[("run", 1.0), ("reverse", 1.0)], Urgency::Command);
+    let order = [("run", 1.0), ("reverse", 1.0)];
+    // The rest of the word is the application's.
+    let (mut both, _a) = bench.begin(&order, Urgency::Command);
+    let read = sends(&bench, &mut both);
+    let ended = both.answered(&read, refused(), &mut bench.words);
+    assert_eq!(ended, Some(Outcome::Exception(Exception::ADDRESS)));
+    // A family whose word has no other bits.
+    bench.profile = Profiles::built_in().get("eaton-svx").unwrap().clone();
+    let (mut both, _a) = bench.begin(&order, Urgency::Command);
     let read = sends(&bench, &mut both);
     assert_eq!(both.answered(&read, refused(), &mut bench.words), None);
     assert_eq!(sends(&bench, &mut both), word(3));

@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use tokio::sync::oneshot;
 
-use super::{Command, Effect, Order, Outcome, Ticket, Touched, Urgency};
+use super::{Command, Effect, Order, Outcome, SourceKind, Ticket, Touched, Urgency};
 use crate::codec::RequestPdu;
 
 /// Background requests that may wait on one bus.
@@ -113,6 +113,11 @@ impl BackgroundRequest {
         }
     }
 
+    /// Whether the gateway reads something by itself, from time to time: it is left of no command and of no fault.
+    pub fn is_of_gateway(&self) -> bool {
+        self.ticket.origin().kind == SourceKind::Schedule
+    }
+
     /// Whether the tool for which it is passed on has gone, or asked for something else.
     pub fn is_unwanted(&self) -> bool {
         self.passed_on
@@ -202,6 +207,11 @@ impl Background {
     /// Takes requests again.
     pub fn open(&mut self) {
         self.closed = None;
+    }
+
+    /// Whether one waits that somebody asked for, and not the gateway by itself.
+    pub fn has_of_others(&self) -> bool {
+        self.waiting.iter().any(|request| !request.is_of_gateway())
     }
 
     /// Whether none waits.

@@ -307,6 +307,12 @@ impl Command {
         }
     }
 
+    /// Whether it may go while the gateway ends: a stop, and the broadcast that stops a whole line.
+    pub fn ends_the_gateway(&self) -> bool {
+        let is_broadcast = self.passed_on.is_some() && self.ticket.origin().kind == SourceKind::Shutdown;
+        self.urgency == Urgency::Stop || is_broadcast
+    }
+
     /// The same as the rest of an order, behind its stop.
     pub fn behind(mut self, stop: StopEnd) -> Command {
         self.behind = Some(stop);

@@ -119,7 +119,7 @@ impl Pending {
             command.answer(&outcome.clone(), now);
             return;
         }
-        if self.stops_only && command.urgency != Urgency::Stop {
+        if self.stops_only && !command.ends_the_gateway() {
             command.answer(&Outcome::ShuttingDown, now);
             return;
         }

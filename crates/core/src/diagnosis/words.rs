@@ -1,6 +1,13 @@
 //! How causes are told to people.
 
+use std::collections::BTreeSet;
+
 use super::Cause;
+use crate::drive::commissioning::{Shared, gather};
+use crate::drive::{Profile, Step};
+
+/// Most steps that are told with a verdict.
+const MOST_STEPS: usize = 96;
 
 impl Cause {
     /// What it means, in a few words.
@@ -91,5 +98,82 @@ impl Cause {
                  shows whether it is the cable"
             }
         }
+    }
+
+    /// The steps of the commissioning that it questions.
+    pub const fn steps(self) -> &'static [Step] {
+        match self {
+            Cause::AllSilent | Cause::NeverAnswered => &[Step::Lamps, Step::Settings],
+            Cause::OneDrive | Cause::WhileRunning => &[Step::Connect],
+            Cause::FromAddress | Cause::Bias | Cause::RequestEndLost | Cause::Noise => &[Step::Terminate],
+            Cause::AddressTwice
+            | Cause::Mains
+            | Cause::ReplyStartLost
+            | Cause::Echo
+            | Cause::LatencyTimer
+            | Cause::SilenceTooShort
+            | Cause::PortResets
+            | Cause::ConnectionCloses
+            | Cause::FasterThanBaud => &[],
+        }
+    }
+
+    /// Those steps in the words of these profiles: what to look at and to set at their drives.
+    pub fn steps_of<'p>(self, profiles: impl IntoIterator<Item = &'p Profile>) -> Vec<String> {
+        told(profiles, self.steps())
+    }
+}
+
+/// The lines of these steps, each behind the names of its profiles, without repetition.
+pub fn told<'p>(profiles: impl IntoIterator<Item = &'p Profile>, steps: &[Step]) -> Vec<String> {
+    let mut seen = BTreeSet::new();
+    let profiles: Vec<&Profile> = profiles.into_iter().filter(|one| seen.insert(&one.name)).collect();
+    let line = |Shared { profiles, line }: Shared<'_>| format!("{}: {line}", profiles.join(", "));
+    gather(&profiles, steps)
+        .into_iter()
+        .take(MOST_STEPS)
+        .map(line)
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::codec::Protocol;
+    use crate::drive::profile::Profiles;
+
+    /// Of every family whose manual is at hand, what a silent one has to be looked at for, and nothing is cut off.
+    #[test]
+    fn steps_are_those_of_the_families_on_the_line() {
+        let all = Profiles::built_in();
+        let families = || {
+            all.iter()
+                .map(AsRef::as_ref)
+                .filter(|one: &&Profile| one.base.is_none() && one.verified)
+        };
+        for (cause, protocol) in Cause::ALL
+            .into_iter()
+            .flat_map(|cause| Protocol::ALL.map(|protocol| (cause, protocol)))
+        {
+            let steps = cause.steps_of(families().filter(|one| one.protocols.contains(&protocol)));
+            assert!(steps.len() < MOST_STEPS, "{cause:?}: {}", steps.len());
+            assert_eq!(steps.is_empty(), cause.steps().is_empty(), "{cause:?}");
+        }
+        let silent = Cause::NeverAnswered.steps_of(families());
+        for (name, part) in [
+            ("vacon-nx", "has seen no message yet"),
+            ("eaton-hvx", "menu M4"),
+            ("vacon-cx", "8N1 by table 2-2"),
+            ("teco-7300pa", "SW2-1 and SW2-2"),
+        ] {
+            let is = |step: &String| {
+                step.split_once(": ")
+                    .is_some_and(|(names, line)| names.split(", ").any(|one| one == name) && line.contains(part))
+            };
+            assert!(silent.iter().any(is), "{name}: {silent:#?}");
+        }
+        let one = Cause::FromAddress.steps_of([all.get("vacon-cx").unwrap().as_ref(); 3]);
+        assert_eq!(one.len(), 1, "{one:?}");
+        assert!(one[0].starts_with("vacon-cx: last drive: jumper X12"), "{one:?}");
     }
 }

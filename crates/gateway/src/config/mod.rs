@@ -495,6 +495,7 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
             let Finding { what, remedy } = shortage.finding();
             reader.document().warning(place, what, remedy);
         }
+        warn_of_fault_time(reader, found, prediction.fast_cycle);
         if let (Some(cycle), Some((limit, place))) = (prediction.fast_cycle, stale_after)
             && cycle > limit
         {
@@ -507,6 +508,36 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
             );
         }
     }
+}
+
+/// Polls so rare that a drive may take them for a silent master. The manual's example is 1 s [T 6.2]; what is set can be read from
+/// the drive only.
+const FAULT_TIME: Duration = Duration::from_secs(1);
+
+/// Drives that may trip because they are polled too seldom.
+fn warn_of_fault_time(reader: &Reader<'_>, found: &bus::Found, cycle: Option<Duration>) {
+    let fault_time = crate::drive::COMMUNICATION_FAULT_TIME;
+    let Some(cycle) = cycle.filter(|cycle| *cycle > FAULT_TIME / 2) else {
+        return;
+    };
+    let drives = found.drives.iter().filter_map(|drive| drive.spec.as_ref());
+    let Some(first) = drives
+        .into_iter()
+        .find(|spec| spec.profile.point_index(fault_time).is_some())
+    else {
+        return;
+    };
+    reader.document().warning(
+        &found.cadence.0,
+        format!(
+            "each drive is polled every {:.2} s, and drive `{}` may have a communication fault where that is near its \
+             {fault_time}",
+            cycle.as_secs_f64(),
+            first.name
+        ),
+        "set that parameter (Cn-31 of a TECO 7300PA, 1 s in the manual's example) well above the cycle, or raise the baud or \
+         lower the number of drives",
+    );
 }
 
 /// Stops at shutdown that take longer than the service manager waits.
@@ -577,12 +608,16 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
         let known = [
             crate::drive::FIELDBUS_FAULT_RESPONSE,
             crate::drive::COMMUNICATION_TIMEOUT,
+            crate::drive::COMMUNICATION_ERROR_REACTION,
         ];
         let known: Vec<&str> = known
             .into_iter()
             .filter(|p| spec.profile.point_index(p).is_some())
             .collect();
         let own = match known.is_empty() {
+            true if spec.profile.may_stop_by_itself => {
+                "the drive may stop when its master falls silent, which cannot be read over this protocol".to_string()
+            }
             true => "the profile has no parameter for the drive's own response to a silent master".to_string(),
             false => format!(
                 "the drive's own response to a silent master ({}) may be off, and the gateway keeps polling",

@@ -3,7 +3,7 @@
 
 use super::derive::{Bound, Derived};
 use super::profile::{Form, Profiles};
-use super::{ModelPoint, PollClass, Profile, Source, Value};
+use super::{ModelPoint, PollClass, Profile, Source, Step, Value};
 use crate::codec::{Protocol, Table};
 
 fn profile(name: &str) -> std::sync::Arc<Profile> {
@@ -77,6 +77,14 @@ fn modbus_families() {
         ("trip_hours", "-", "-", "IR 9 x 0.01", "-"),
         ("fault_code", "HR 2110", "HR 2110", "IR 100", "derive lowest_bit"),
         ("fault_code_id99", "HR 98", "HR 98", "-", "-"),
+        // Documents of relatives [X7]: compared with process data.
+        ("output_frequency_id1", "HR 0 x 0.01", "HR 0 x 0.01", "-", "-"),
+        ("motor_speed_id2", "HR 1", "HR 1", "-", "-"),
+        ("motor_torque_id4", "HR 3 x 0.1", "HR 3 x 0.1", "-", "-"),
+        ("motor_power_id5", "HR 4 x 0.1", "HR 4 x 0.1", "-", "-"),
+        ("motor_voltage_id6", "HR 5 x 0.1", "HR 5 x 0.1", "-", "-"),
+        ("dc_link_voltage_id7", "HR 6", "HR 6", "-", "-"),
+        ("motor_current_id45", "HR 44 x 0.1", "HR 44 x 0.1", "-", "-"),
         ("fault_mask", "-", "-", "-", "HR 33"),
         (
             "speed_reference",
@@ -108,10 +116,16 @@ fn modbus_families() {
         ),
     ];
     for (point, nx, eaton, cx, teco) in rows {
+        // The default selection of process data out 8 of HVX is in another manual [E table 5-3].
+        let hvx = match point {
+            "fault_code" => "HR 98",
+            "fault_code_id99" => "-",
+            _ => eaton,
+        };
         for (name, wanted) in [
             ("vacon-nx", nx),
             ("eaton-svx", eaton),
-            ("eaton-hvx", eaton),
+            ("eaton-hvx", hvx),
             ("vacon-cx", cx),
             ("teco-7300pa", teco),
         ] {
@@ -135,6 +149,18 @@ fn modbus_families() {
     ] {
         assert_eq!(place(&hvx, point), wanted, "{point}");
         assert_eq!(place(&profile("eaton-svx"), point), "-", "{point} is none of SVX");
+    }
+    // As the N2 map has them: BO 4 to 16, BI 8 to 15.
+    let (nx, n2) = (profile("vacon-nx"), profile("vacon-nx-n2"));
+    for bit in 3..16 {
+        let name = format!("control_bit_{bit}");
+        assert_eq!(place(&nx, &name), format!("HR 2000.{bit}"));
+        assert_eq!(place(&n2, &name), format!("CO {bit}"));
+    }
+    for bit in 0..8 {
+        let name = format!("general_{bit}");
+        assert_eq!(place(&nx, &name), format!("HR 2101.{bit}"));
+        assert_eq!(place(&n2, &name), format!("DI {}", bit + 7));
     }
 }
 
@@ -351,8 +377,14 @@ fn teco_faults() {
                 panic!("{name} {bit}")
             };
             assert_eq!((code, profile.fault_text(code).as_str()), (bit + 1, text), "{name}");
+            let fault = &profile.faults[&u16::try_from(code).unwrap()];
+            assert!(
+                !fault.panel.is_empty() && fault.remedy.ends_with("(general advice)"),
+                "{name} {code}"
+            );
         }
         assert_eq!(lowest.value([Value::Integer(0)], None), Some(Value::Integer(0)));
+        assert_eq!(profile.faults[&8].panel, "EF3, EF5, EF6, EF7, EF8");
     }
 }
 
@@ -437,10 +469,10 @@ fn limits_and_lines() {
     }
 }
 
-/// What every family can be commanded, and that parameters and outputs of N2 are written on change only.
+/// What every family whose manual is at hand can be commanded, and that parameters and outputs of N2 are written on change only.
 #[test]
 fn commands_of_every_family() {
-    for profile in Profiles::built_in().iter() {
+    for profile in Profiles::built_in().iter().filter(|profile| profile.verified) {
         let name = &profile.name;
         for point in [
             ModelPoint::Run,
@@ -482,7 +514,7 @@ fn process_data_is_few_requests() {
         ("eaton-svx", 1),
         ("eaton-hvx", 1),
         ("teco-7300pa", 1),
-        ("vacon-cx", 7),
+        ("vacon-cx", 4),
         ("vacon-nx-n2", 7),
         ("eaton-hvx-n2", 7),
         ("teco-7300pa-n2", 7),
@@ -491,4 +523,126 @@ fn process_data_is_few_requests() {
         let fast = plan.reads.iter().filter(|r| r.class == PollClass::Fast).count();
         assert_eq!(fast, most, "{name}");
     }
+}
+
+/// What process data in means by application: [V] tables 28 and 29, [E] tables.
+#[test]
+fn process_data_in_by_application() {
+    let multipurpose = [
+        ("torque_reference", "HR 2003 x 0.1"),
+        ("free_analog_input", "HR 2004 x 0.01"),
+    ];
+    let pid = [
+        ("pid_setpoint", "HR 2003 x 0.01"),
+        ("pid_actual_value_1", "HR 2004 x 0.01"),
+        ("pid_actual_value_2", "HR 2005 x 0.01"),
+    ];
+    for (application, points) in [("multipurpose", &multipurpose[..]), ("pid", &pid), ("pump-fan", &pid)] {
+        for family in ["vacon-nx", "eaton-svx"] {
+            let (base, own) = (profile(family), profile(&format!("{family}-{application}")));
+            assert_eq!((own.base.as_deref(), &own.simulator), (Some(family), &base.simulator));
+            for (name, at) in points {
+                let point = &own.points[own.point_index(name).unwrap()];
+                assert_eq!(place(&own, name), *at, "{name} of {}", own.name);
+                assert!(point.write && point.raw().unwrap().form == Form::I16, "{name}");
+            }
+            let process_data = own
+                .points
+                .iter()
+                .filter(|point| point.name.starts_with("process_data_in"));
+            assert_eq!(process_data.count(), 0, "{}: the rest is not used", own.name);
+            // All else is the family's.
+            assert_eq!(own.points.len(), base.points.len() - 8 + points.len());
+            assert_eq!((&own.ranges, &own.faults), (&base.ranges, &base.faults));
+            assert_eq!(own.commissioning, base.commissioning);
+            assert!(own.identify.is_empty(), "no read tells the application");
+        }
+    }
+    let hvx = profile("eaton-hvx");
+    assert!(
+        hvx.points
+            .iter()
+            .all(|point| !point.name.starts_with("process_data_in"))
+    );
+}
+
+/// What no manual of the family states, or what they state in two ways.
+#[test]
+fn what_is_not_confirmed() {
+    for (name, points) in [
+        (
+            "vacon-nx",
+            &[
+                "minimum_frequency",
+                "maximum_frequency",
+                "acceleration_time",
+                "deceleration_time",
+            ][..],
+        ),
+        (
+            "eaton-svx",
+            &["maximum_frequency", "output_frequency", "fieldbus_fault_response"],
+        ),
+        ("eaton-hvx", &["maximum_frequency", "output_frequency", "interlocked"]),
+        (
+            "vacon-cx",
+            &["ready", "fault", "reversed", "remote", "reverse", "fault_reset"],
+        ),
+    ] {
+        let profile = profile(name);
+        for point in points {
+            assert!(
+                !profile.points[profile.point_index(point).unwrap()].verified,
+                "{point} of {name}"
+            );
+        }
+    }
+    for (name, point) in [
+        ("vacon-cx", "running"),
+        ("vacon-cx", "run"),
+        ("eaton-hvx", "bypass_active"),
+    ] {
+        let profile = profile(name);
+        assert!(
+            profile.points[profile.point_index(point).unwrap()].verified,
+            "{point} of {name}"
+        );
+    }
+    let width = profile("teco-7300pa-n2");
+    let width = &width.points[width.point_index("jump_frequency_width").unwrap()];
+    assert_eq!(width.range, Some(0.0..=25.5));
+    for (name, formats) in [
+        ("vacon-cx", &["8N2", "8N1", "8E1", "8O1"][..]),
+        ("teco-7300pa", &["7N2", "7E1", "7O1"]),
+    ] {
+        assert_eq!(profile(name).formats, formats);
+        assert!(!profile(name).bauds.contains(&38_400), "{name}");
+    }
+}
+
+/// Every family whose manual is at hand has the steps of it, and one board has one list.
+#[test]
+fn steps_at_the_cabinet() {
+    for family in Profiles::built_in().iter().filter(|profile| profile.verified) {
+        for step in Step::ALL {
+            // No manual has a test of TECO.
+            let is_blank = step == Step::Test && family.name.starts_with("teco");
+            assert_eq!(
+                family.commissioning.lines(step).is_empty(),
+                is_blank,
+                "{} {}",
+                family.name,
+                step.name()
+            );
+        }
+    }
+    let nx = profile("vacon-nx");
+    for name in ["vacon-nx-n2", "eaton-svx", "eaton-hvx", "eaton-hvx-n2"] {
+        let other = profile(name);
+        for step in [Step::Connect, Step::Terminate, Step::Lamps] {
+            assert_eq!(other.commissioning.lines(step), nx.commissioning.lines(step), "{name}");
+        }
+    }
+    let lamps = nx.commissioning.lines(Step::Lamps);
+    assert!(lamps[0].starts_with("green LED (FS) steady: the board is active and has seen no message yet"));
 }

@@ -257,7 +257,8 @@ fn own(spec: &DriveSpec, all: &mut Objects) {
     for (number, (index, point)) in (OWN..).zip(own) {
         let writable = point.write && spec.access == Access::Control;
         let unread = point.raw().is_some() && point.class == PollClass::Never;
-        if unread && !writable {
+        // It keeps its number all the same.
+        if point.hidden || (unread && !writable) {
             continue;
         }
         let access = if writable { Written::Write } else { Written::Read };
@@ -282,6 +283,10 @@ fn own(spec: &DriveSpec, all: &mut Objects) {
                 };
                 let id = (ObjectType::MULTI_STATE_INPUT, number);
                 all.add(id, texts, kind, Written::Read, Meaning::Enumeration(index));
+            }
+            Values::Text => {
+                let id = (ObjectType::CHARACTERSTRING_VALUE, number);
+                all.add(id, texts, Kind::Text, Written::Read, Meaning::Point(index));
             }
             Values::Integer | Values::Number => {
                 let kind = of_type(ObjectType::ANALOG_INPUT, ObjectType::ANALOG_VALUE);
@@ -334,7 +339,7 @@ fn analog(spec: &DriveSpec, index: usize, model: Option<ModelPoint>, limits: Opt
     let unit = point.map_or("", |point| point.unit.as_str());
     let raw = raw_of(spec, index, 4);
     let resolution = match raw.map(|(form, scale)| (form, scale.abs())) {
-        Some((Form::F32(_), _)) | None => 0.01,
+        Some((Form::F32, _)) | None => 0.01,
         Some((_, scale)) => scale as f32,
     };
     let span = raw.and_then(|(form, scale)| {

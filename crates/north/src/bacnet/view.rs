@@ -130,6 +130,7 @@ impl View {
         match meaning {
             Meaning::Point(index) => self.point(&reading, index, |value| match value {
                 Value::Bool(on) => Datum::Bool(on),
+                Value::Text(text) => Datum::Text(Arc::from(text.shown())),
                 value => Datum::Number(value.as_f64()),
             }),
             Meaning::Enumeration(index) => {

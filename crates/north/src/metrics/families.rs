@@ -11,7 +11,7 @@ use prometheus_client::encoding::{EncodeLabel, EncodeLabelSet, LabelSetEncoder};
 
 use super::model::MODEL;
 use super::process;
-use crate::drive::{ModelPoint, PollClass, State};
+use crate::drive::{ModelPoint, PollClass, State, Value};
 use crate::history::TriggerKind;
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
@@ -271,7 +271,7 @@ fn points(reading: &Reading<'_>, labels: &Labels, (model, other): (&[FamilyId], 
         let Some(value) = reading
             .sample(index)
             .good()
-            .map(|v| v.as_f64())
+            .and_then(Value::exact_f64)
             .filter(|v| v.is_finite())
         else {
             continue;

@@ -314,7 +314,7 @@ fn n2_in_the_words_of_its_objects() {
             bo,
             "N11\r",
             "override BO 1 = 1",
-            "N11: invalid command for the data type, or only in PRGM mode (TECO)",
+            "N11: invalid command for the data type, or only in PRGM mode (TECO, assumed)",
         ),
         (
             RequestPdu::N2(n2::Session::Release { table, address }),

@@ -70,14 +70,14 @@ impl Exception {
             0x0A => "gateway path unavailable",
             0x0B => "device behind the gateway does not answer",
             0x21 => "data value error (TECO)",
-            0x22 => "register write error: only in PRGM mode (TECO)",
+            0x22 => "register write error: only in PRGM mode (TECO, assumed)",
             0x80 => "the drive has restarted and waits for Identify",
             0x81 => "command not understood",
             0x82 => "checksum error",
             0x83 => "message too long",
             0x85 => "field size wrong for the command",
             0x90 => "invalid data, out of the expected range",
-            0x91 => "invalid command for the data type, or only in PRGM mode (TECO)",
+            0x91 => "invalid command for the data type, or only in PRGM mode (TECO, assumed)",
             0x92 => "the value is read-only",
             _ => "unknown exception",
         }
@@ -111,13 +111,13 @@ mod tests {
             ),
             (
                 Exception(0x22),
-                "exception 22H (register write error: only in PRGM mode (TECO))",
+                "exception 22H (register write error: only in PRGM mode (TECO, assumed))",
             ),
             (Exception(0x33), "exception 33H (unknown exception)"),
             (Exception::n2(0x05), "N2 error 05 (field size wrong for the command)"),
             (
                 Exception::n2(0x11),
-                "N2 error 11 (invalid command for the data type, or only in PRGM mode (TECO))",
+                "N2 error 11 (invalid command for the data type, or only in PRGM mode (TECO, assumed))",
             ),
             (
                 Exception::N2_RESTARTED,

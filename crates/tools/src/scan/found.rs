@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::settings::Setting;
+use crate::drive::profile::Profiles;
 
 /// A drive that answered.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -21,13 +22,25 @@ pub(crate) struct Found {
 
 impl Found {
     /// For people.
-    pub(crate) fn title(&self) -> String {
-        match self.profiles.as_slice() {
-            [] if self.unanswered > 0 => format!("family not known, because {}", self.silence()),
-            [] => "no known profile".to_string(),
-            [one] => one.clone(),
-            some => format!("{} (indistinguishable by reading)", some.join(" or ")),
+    pub(crate) fn title(&self, profiles: &Profiles) -> String {
+        let names = self.profiles.join(" or ");
+        let more = [
+            (self.profiles.len() > 1).then(|| "indistinguishable by reading".to_string()),
+            self.identified(profiles),
+        ];
+        let more: Vec<String> = more.into_iter().flatten().collect();
+        match (names.as_str(), more.as_slice()) {
+            ("", _) if self.unanswered > 0 => format!("family not known, because {}", self.silence()),
+            ("", _) => "no known profile".to_string(),
+            (names, []) => names.to_string(),
+            (names, more) => format!("{names} ({})", more.join("; ")),
         }
+    }
+
+    /// What it means that its answers match, if they do not prove the family.
+    pub(super) fn identified(&self, profiles: &Profiles) -> Option<String> {
+        let text = |name: &String| profiles.get(name).map(|profile| profile.identified.clone());
+        self.profiles.iter().filter_map(text).find(|text| !text.is_empty())
     }
 
     /// `2 reads got no answer`.
@@ -56,9 +69,22 @@ mod tests {
             unanswered,
             turnaround: None,
         };
-        assert_eq!(found(&[], 0).title(), "no known profile");
-        assert_eq!(found(&[], 2).title(), "family not known, because 2 reads got no answer");
-        assert_eq!(found(&["a", "b"], 0).title(), "a or b (indistinguishable by reading)");
-        assert_eq!(found(&["a"], 1).title(), "a");
+        let profiles = Profiles::built_in();
+        let title = |names: &[&str], unanswered| found(names, unanswered).title(&profiles);
+        assert_eq!(title(&[], 0), "no known profile");
+        assert_eq!(title(&[], 2), "family not known, because 2 reads got no answer");
+        assert_eq!(title(&["a", "b"], 0), "a or b (indistinguishable by reading)");
+        assert_eq!(title(&["vacon-cx"], 1), "vacon-cx");
+        // The board's answers do not prove the make of the drive.
+        let board = title(&["vacon-nx"], 0);
+        assert!(
+            board.ends_with("nx (an OPT-C2 board of 2012 or later: a Vacon NX, or an Eaton with a newer board)"),
+            "{board}"
+        );
+        let board = title(&["eaton-hvx", "eaton-svx"], 0);
+        assert!(
+            board.starts_with("eaton-hvx or eaton-svx (indistinguishable by reading; an older OPT-C2 board: "),
+            "{board}"
+        );
     }
 }

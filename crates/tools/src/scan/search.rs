@@ -162,7 +162,8 @@ impl<'a> Search<'a> {
             self.progress.step(prober.patience(&hello) * self.options.tries);
             if answered {
                 let found = self.look_closer(&mut prober, part.setting, *address)?;
-                self.progress.print_line(&format!("found {at}: {}", found.title()));
+                self.progress
+                    .print_line(&format!("found {at}: {}", found.title(&self.profiles)));
                 self.found.push(found);
             }
         }
@@ -290,7 +291,8 @@ impl<'a> Search<'a> {
     }
 }
 
-/// The usual format of a family found that does not list `format`, if every other family found lists it.
+/// The usual format of a family found that does not list `format`, or that has one stop bit more by custom, if every other
+/// family found lists it.
 fn better_format(profiles: &Profiles, format: LineFormat, found: &[Found]) -> Option<LineFormat> {
     let known = |found: &Found| -> Vec<Arc<Profile>> {
         let names = found.profiles.iter();
@@ -298,7 +300,12 @@ fn better_format(profiles: &Profiles, format: LineFormat, found: &[Found]) -> Op
     };
     let families: Vec<Arc<Profile>> = found.iter().flat_map(known).collect();
     let lists = |profile: &Profile, format: &String| profile.formats.is_empty() || profile.formats.contains(format);
-    let other = families.iter().find(|profile| !lists(profile, &format.characters()))?;
+    // A drive that counts with one stop bit is content with two, and not the other way round.
+    let (shorter, longer) = (format.characters(), format.characters().replace("N1", "N2"));
+    let is_other = |profile: &&Arc<Profile>| {
+        !lists(profile, &shorter) || shorter != longer && profile.formats.first() == Some(&longer)
+    };
+    let other = families.iter().find(is_other)?;
     let usual = other.formats.first()?;
     families.iter().all(|profile| lists(profile, usual)).then_some(())?;
     LineFormat::new(format.baud, usual).ok()
@@ -348,6 +355,8 @@ mod tests {
         assert_eq!(better("8N1", &[&["vacon-cx"]]), two_stop_bits);
         assert_eq!(better("8N1", &[&["vacon-nx"], &["vacon-cx"], &[]]), two_stop_bits);
         assert_eq!(better("8E1", &[&["vacon-cx"]]), None, "the manual lists it");
+        assert_eq!(better("8N2", &[&["vacon-cx"]]), None);
+        assert_eq!(better("8N2", &[&["vacon-nx"]]), None, "the manual lists it");
         assert_eq!(better("8N1", &[&[]]), None);
     }
 }

@@ -11,8 +11,10 @@ use crate::config;
 use crate::document::Finding;
 use crate::report;
 
-/// Bauds tried by default: the factory settings of the drives of the built-in profiles.
+/// Bauds of Modbus RTU tried by default: the factory settings of the drives of the built-in profiles, and those often chosen.
 const USUAL_BAUDS: [u32; 3] = [9600, 19_200, 38_400];
+/// Bauds of Modbus ASCII tried by default: all that the switches of the TECO 7300PA can set, the factory setting first.
+const ASCII_BAUDS: [u32; 4] = [19_200, 9600, 4800, 2400];
 /// Baud that is assumed behind a raw device server, which sets up its line itself: the highest of the usual ones, because a
 /// reply that comes later than the wire needs is believed, one that comes earlier is not.
 const ASSUMED_BAUD: u32 = 38_400;
@@ -169,7 +171,8 @@ fn bauds(protocol: Protocol, wanted: &[String], by_server: bool) -> Result<Vec<u
         return Ok(match protocol {
             Protocol::N2 => vec![9600],
             _ if by_server => vec![ASSUMED_BAUD],
-            _ => USUAL_BAUDS.to_vec(),
+            Protocol::ModbusAscii => ASCII_BAUDS.to_vec(),
+            Protocol::ModbusRtu => USUAL_BAUDS.to_vec(),
         });
     }
     let one = |text: &String| {
@@ -190,7 +193,7 @@ fn formats(protocol: Protocol, wanted: &[String], by_server: bool) -> Vec<String
         ]),
         _ if by_server => named(&[config::default_format(protocol)]),
         Protocol::ModbusRtu => named(&["8N1", "8E1", "8N2"]),
-        Protocol::ModbusAscii => named(&["7N2", "7E1"]),
+        Protocol::ModbusAscii => named(&["7N2", "7E1", "7O1"]),
         Protocol::N2 => named(&["8N1"]),
     }
 }
@@ -234,7 +237,12 @@ mod tests {
         let usual = settings_of("").unwrap();
         assert_eq!(usual.first().unwrap(), "modbus-rtu 9600 8N1");
         assert_eq!(usual.last().unwrap(), "n2 9600 8N1");
-        assert_eq!(usual.len(), 3 * 3 + 3 * 2 + 1);
+        assert_eq!(usual.len(), 3 * 3 + 4 * 3 + 1);
+        // What the switches of a TECO card can set, and nothing else.
+        let ascii: Vec<&String> = usual.iter().filter(|one| one.starts_with("modbus-ascii")).collect();
+        assert_eq!(ascii[0], "modbus-ascii 19200 7N2");
+        assert_eq!(ascii[11], "modbus-ascii 2400 7O1");
+        assert!(ascii.iter().all(|one| !one.contains("38400")), "{ascii:?}");
         assert_eq!(settings_of("--protocol n2").unwrap(), ["n2 9600 8N1"]);
         assert_eq!(
             settings_of("--protocol modbus-ascii --baud 19200 --format 7O1,8N1").unwrap(),

@@ -1,9 +1,13 @@
 //! What the line is likely to lack when no drive answered, by what was heard. Pure.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
-use super::{Heard, Setting};
+use super::{Found, Heard, Setting};
 use crate::diagnosis::Cause;
+use crate::drive::Step;
+use crate::drive::commissioning::{Shared, gather};
+use crate::drive::profile::{Profile, Profiles};
 
 /// Bytes that come of switching the port on, or are single disturbances.
 const FEW_BYTES: usize = 8;
@@ -107,6 +111,54 @@ pub(crate) fn beside_answers(heard: &Heard) -> Option<String> {
     ))
 }
 
+/// What shows more at the drives: of all families that speak one of the protocols tried.
+pub(crate) fn at_silent_drives(heard: &Heard, tried: &[Setting], profiles: &Profiles) -> String {
+    let speaks = |profile: &&Profile| tried.iter().any(|one| profile.protocols.contains(&one.protocol));
+    // Those with a base have its lines.
+    let families = profiles
+        .iter()
+        .map(AsRef::as_ref)
+        .filter(|profile: &&Profile| profile.base.is_none());
+    let families: Vec<&Profile> = families.filter(speaks).collect();
+    let (heading, steps) = match most_garbage(heard) {
+        Some(_) => ("settings at the drives", [Step::Settings]),
+        None => ("what lamps and panel of the drives show", [Step::Lamps]),
+    };
+    let lines = grouped(&gather(&families, &steps));
+    if lines.is_empty() {
+        return lines;
+    }
+    format!("{heading}; `drivegate profiles show NAME` has terminals, termination and settings:\n{lines}")
+}
+
+/// What the families that answered need before the first command.
+pub(crate) fn before_commands(found: &[Found], profiles: &Profiles) -> String {
+    let mut seen = BTreeSet::new();
+    let names = found
+        .iter()
+        .flat_map(|one| &one.profiles)
+        .filter(|name| seen.insert(*name));
+    let families: Vec<&Profile> = names.filter_map(|name| profiles.get(name)).map(AsRef::as_ref).collect();
+    let lines = grouped(&gather(&families, &[Step::ControlPlace]));
+    if lines.is_empty() {
+        return lines;
+    }
+    format!("before the first command; `drivegate profiles show NAME` has the rest of the commissioning:\n{lines}")
+}
+
+/// Lines below the names of the profiles that have them.
+fn grouped(lines: &[Shared<'_>]) -> String {
+    let mut text = String::new();
+    for same in lines.chunk_by(|one, next| one.profiles == next.profiles) {
+        let names = same.first().map(|shared| shared.profiles.join(", "));
+        text += &format!("  {}\n", names.unwrap_or_default());
+        for shared in same {
+            text += &format!("    - {}\n", shared.line);
+        }
+    }
+    text
+}
+
 /// The setting with most invalid replies, and how many.
 fn most_garbage(heard: &Heard) -> Option<(Setting, usize)> {
     let count = |setting: &Setting| heard.garbage.iter().filter(|(other, _)| other == setting).count();
@@ -198,5 +250,43 @@ mod tests {
             told.starts_with("64 bytes came within 1s before anything was sent"),
             "{told}"
         );
+    }
+
+    #[test]
+    fn the_steps_are_those_of_the_families_that_were_tried() {
+        let profiles = Profiles::built_in();
+        let silent = at_silent_drives(&Heard::default(), &[at(9600)], &profiles);
+        let wanted = "  eaton-hvx, eaton-svx, vacon-nx\n    - green LED (FS) steady: the board is active and has seen no message yet";
+        assert!(silent.contains(wanted), "{silent}");
+        assert!(silent.contains("  vacon-cx\n") && !silent.contains("teco"), "{silent}");
+        let wrong = Heard {
+            garbage: vec![(at(9600), 1)],
+            ..Heard::default()
+        };
+        let ascii = Setting {
+            protocol: Protocol::ModbusAscii,
+            format: LineFormat::new(9600, "7N2").unwrap(),
+        };
+        let settings = at_silent_drives(&wrong, &[ascii], &profiles);
+        assert!(
+            settings.contains("  teco-7300pa\n    - the switches are read at power-on"),
+            "{settings}"
+        );
+        assert!(!settings.contains("LED") && !settings.contains("vacon"), "{settings}");
+    }
+
+    #[test]
+    fn what_answered_is_told_what_it_needs() {
+        let found = |names: &[&str]| Found {
+            setting: at(9600),
+            address: 1,
+            profiles: names.iter().map(ToString::to_string).collect(),
+            unanswered: 0,
+            turnaround: None,
+        };
+        let profiles = Profiles::built_in();
+        let told = before_commands(&[found(&["vacon-cx"]), found(&["vacon-cx"])], &profiles);
+        assert_eq!(told.matches("Fieldbus control select = 1").count(), 1, "{told}");
+        assert_eq!(before_commands(&[found(&[])], &profiles), "");
     }
 }

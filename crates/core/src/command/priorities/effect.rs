@@ -80,12 +80,15 @@ fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
     let covered = |point: ModelPoint| {
         register(point).is_some_and(|raw| items.iter().any(|(address, _)| raw.covers(table, *address)))
     };
-    let stops = items
-        .iter()
-        .any(|(address, value)| profile.is_stop(table, *address, *value));
-    let run = match stops {
-        true => Some(false),
-        false => covered(ModelPoint::Run).then_some(true),
+    let runs = |wanted: bool| {
+        let mut items = items.iter();
+        items.any(|(address, word)| profile.runs_by(table, *address, *word) == Some(wanted))
+    };
+    // One that says both is a stop.
+    let run = match (runs(false), runs(true)) {
+        (true, _) => Some(false),
+        (false, true) => Some(true),
+        (false, false) => None,
     };
     let bit = |point: ModelPoint| {
         let raw = register(point)?;

@@ -1,0 +1,138 @@
+//! What an engineer does and sees at the cabinet, as lines of the profile: one source for pages, `profiles show`, `scan`
+//! and the verdicts of the diagnosis.
+
+use super::profile::Profile;
+
+/// A step of the commissioning.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Step {
+    /// Slot, connector, terminals, shield.
+    Connect,
+    /// Termination and bias.
+    Terminate,
+    /// Protocol, address, baud rate, parity, timeout: where, and their factory settings.
+    Settings,
+    /// What makes the drive obey the bus.
+    ControlPlace,
+    /// What lamps and panel show.
+    Lamps,
+    /// How to test it.
+    Test,
+}
+
+impl Step {
+    /// All steps, in their order.
+    pub const ALL: [Step; 6] = [
+        Step::Connect,
+        Step::Terminate,
+        Step::Settings,
+        Step::ControlPlace,
+        Step::Lamps,
+        Step::Test,
+    ];
+
+    /// The key in a profile.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Step::Connect => "connect",
+            Step::Terminate => "terminate",
+            Step::Settings => "settings",
+            Step::ControlPlace => "control_place",
+            Step::Lamps => "lamps",
+            Step::Test => "test",
+        }
+    }
+
+    /// The heading for people.
+    pub const fn title(self) -> &'static str {
+        match self {
+            Step::Connect => "connect",
+            Step::Terminate => "terminate and bias",
+            Step::Settings => "settings",
+            Step::ControlPlace => "control place",
+            Step::Lamps => "lamps and panel",
+            Step::Test => "test",
+        }
+    }
+}
+
+/// The lines of each step; none where no manual says anything.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Commissioning {
+    pub(super) connect: Vec<String>,
+    pub(super) terminate: Vec<String>,
+    pub(super) settings: Vec<String>,
+    pub(super) control_place: Vec<String>,
+    pub(super) lamps: Vec<String>,
+    pub(super) test: Vec<String>,
+}
+
+impl Commissioning {
+    /// The lines of a step.
+    pub fn lines(&self, step: Step) -> &[String] {
+        match step {
+            Step::Connect => &self.connect,
+            Step::Terminate => &self.terminate,
+            Step::Settings => &self.settings,
+            Step::ControlPlace => &self.control_place,
+            Step::Lamps => &self.lamps,
+            Step::Test => &self.test,
+        }
+    }
+
+    /// Whether there is no line at all.
+    pub fn is_empty(&self) -> bool {
+        Step::ALL.iter().all(|step| self.lines(*step).is_empty())
+    }
+}
+
+/// A line with the profiles that have it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Shared<'p> {
+    /// Names of the profiles, in the order given.
+    pub profiles: Vec<&'p str>,
+    /// The line.
+    pub line: &'p str,
+}
+
+/// The lines of these steps in several profiles: each line once, those of the first profile first.
+pub fn gather<'p>(profiles: &[&'p Profile], steps: &[Step]) -> Vec<Shared<'p>> {
+    let mut gathered: Vec<Shared<'p>> = Vec::new();
+    for step in steps {
+        // A line that one profile has in two steps is told in both.
+        let start = gathered.len();
+        for profile in profiles {
+            for line in profile.commissioning.lines(*step) {
+                let known = gathered.iter_mut().skip(start).find(|shared| shared.line == line);
+                match known {
+                    Some(shared) if shared.profiles.contains(&profile.name.as_str()) => {}
+                    Some(shared) => shared.profiles.push(&profile.name),
+                    None => gathered.push(Shared {
+                        profiles: vec![&profile.name],
+                        line,
+                    }),
+                }
+            }
+        }
+    }
+    gathered
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::drive::profile::Profiles;
+
+    #[test]
+    fn equal_lines_are_told_once() {
+        let all = Profiles::built_in();
+        let two = [all.get("vacon-nx").unwrap(), all.get("eaton-hvx").unwrap()];
+        let two = two.map(|profile| profile.as_ref());
+        let lamps = gather(&two, &[Step::Lamps]);
+        assert!(lamps.iter().all(|shared| shared.profiles == ["vacon-nx", "eaton-hvx"]));
+        assert_eq!(lamps.len(), two[0].commissioning.lines(Step::Lamps).len());
+        let settings = gather(&two, &[Step::Settings]);
+        let of = |name: &str| settings.iter().filter(|shared| shared.profiles == [name]).count();
+        assert!(of("vacon-nx") > 0 && of("eaton-hvx") > 0, "{settings:?}");
+    }
+}
