@@ -29,6 +29,9 @@ const INSTEAD: [(&str, &str); 19] = [
     ("exchanges", "transactions"),
 ];
 
+/// Of README and docs, without decisions.
+const MOST_WORDS: usize = 50_000;
+
 /// What is right although a part of it is not.
 const RIGHT: [&str; 6] = [
     "there is no",
@@ -99,6 +102,19 @@ fn the_pages_are_in_plain_words() {
         }
     }
     assert!(found.is_empty(), "{found:#?}");
+}
+
+/// README and the pages below docs, without the decisions, stay a book that one reads.
+#[test]
+fn the_pages_are_short_enough() {
+    let counted = pages().into_iter().filter(|page| {
+        let below_docs = page.parent().is_some_and(|folder| folder.ends_with("docs"));
+        below_docs || page.ends_with("README.md") && page.parent() == Some(root())
+    });
+    let words: usize = counted
+        .map(|page| fs::read_to_string(page).unwrap().split_whitespace().count())
+        .sum();
+    assert!((10_000..=MOST_WORDS).contains(&words), "{words} words, at most {MOST_WORDS}");
 }
 
 #[test]
