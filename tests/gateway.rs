@@ -16,6 +16,7 @@ mod gateway {
     mod commands;
     mod demo;
     mod drive_access;
+    mod families;
     mod history;
     mod listening;
     mod living;

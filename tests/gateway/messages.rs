@@ -18,7 +18,7 @@ fn points_that_may_be_meant_are_named() {
     for (arguments, wanted) in [
         (
             ["read", "pump-1", "speed"],
-            "did you mean `zero_speed`, `motor_speed`, `actual_speed`, `speed_reference`?",
+            "did you mean `zero_speed`, `motor_speed`, `actual_speed`, `motor_speed_id2`?",
         ),
         (["read", "pump-1", "motor_curent"], "did you mean `motor_current`?"),
         (["write", "pump-1", "speed_ref=5"], "did you mean `speed_reference`?"),

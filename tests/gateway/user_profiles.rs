@@ -4,7 +4,7 @@ use std::path::Path;
 
 use crate::support::process::{Running, api, free_port, get, mbpoll_write, read_registers, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
-use crate::support::tools::{python, root, run_well};
+use crate::support::tools::{python, root, run, run_well};
 
 /// A profile over the example, with a float that is no number.
 const OURS: &str = r#"
@@ -17,6 +17,66 @@ at = "input 18"
 type = "f32"
 unit = "A"
 class = "fast"
+[[range]]
+table = "input"
+first = 20
+last = 32
+read = 13
+[[point]]
+name = "serial_number"
+at = "input 20"
+type = "string:4"
+class = "once"
+[[point]]
+name = "impulses"
+at = "input 24"
+type = "u64"
+order = "CDAB"
+class = "fast"
+[[point]]
+name = "decimals"
+at = "input 28"
+type = "bcd16"
+class = "fast"
+[[point]]
+name = "motor_current"
+at = "input 29"
+type = "i16"
+invalid = [0x7FFF]
+class = "fast"
+[[point]]
+name = "apparent_power"
+at = "input 30"
+scale_from = "power_of_ten"
+unit = "kVA"
+class = "fast"
+[[point]]
+name = "power_of_ten"
+at = "input 31"
+type = "i16"
+hidden = true
+class = "fast"
+[[point]]
+name = "season"
+at = "input 32"
+mask = 0x00F0
+class = "fast"
+[point.texts]
+10 = "winter"
+[[point]]
+name = "is_quiet"
+at = "input 32"
+mask = 0x000F
+equals = 5
+class = "fast"
+[[point]]
+name = "display"
+at = "holding 257"
+write = true
+class = "slow"
+[point.texts]
+3 = "short"
+15 = "all of it"
 "#;
 
 #[test]
@@ -53,6 +113,13 @@ fn the_energy_meter_of_the_page_is_served() {
         ("no_load", serde_json::json!(false)),
         ("current_transformer_ratio", serde_json::json!(40.0)),
         ("relay", serde_json::json!(true)),
+        ("serial_number", serde_json::json!("SN-42")),
+        ("impulses", serde_json::json!(9_007_199_254_740_993_u64)),
+        ("decimals", serde_json::json!(1234.0)),
+        ("apparent_power", serde_json::json!(12.34)),
+        ("season", serde_json::json!(10)),
+        ("is_quiet", serde_json::json!(true)),
+        ("display", serde_json::json!(15)),
     ] {
         let read = || Some(site.point("meter", name)).filter(|v| !v.is_null());
         assert_eq!(until(name, read), value, "{name}");
@@ -79,6 +146,40 @@ fn the_energy_meter_of_the_page_is_served() {
         assert!(metrics.contains(&line), "{line} is missing in\n{metrics}");
     }
     assert!(!metrics.contains("neutral_current"), "{metrics}");
+    // Not available: bad on every side. A helper is on none. What a metric would round is not one.
+    assert_eq!(
+        (&points["motor_current"]["value"], &points["motor_current"]["quality"]),
+        (&().into(), &"bad".into())
+    );
+    assert_eq!(read_registers(modbus, 7, 0x8007, 1), [0x8000]);
+    for absent in [
+        "motor_current_amperes{bus=",
+        "power_of_ten",
+        "impulses",
+        "serial_number",
+    ] {
+        assert!(!metrics.contains(absent), "{absent} is in\n{metrics}");
+    }
+    assert!(metrics.contains("point=\"decimals\",unit=\"\"} 1234"), "{metrics}");
+    assert_eq!(points.get("power_of_ten"), None);
+    assert_eq!(points["season"]["text"], "winter");
+    // An enumeration is set by its text, and to nothing that it does not list.
+    let program = Path::new(env!("CARGO_BIN_EXE_drivegate"));
+    let config = site.config();
+    let write = |set: &str| run(program, &["write", "--config", &config, "meter", set]);
+    assert!(write("display=short").status.success());
+    site.until_point("meter", "display", 3);
+    assert!(write("display=all of it").status.success());
+    site.until_point("meter", "display", 15);
+    assert!(!write("display=7").status.success() && !write("display=long").status.success());
+    let refused = mbpoll_write(modbus, 7, 257, &[7]).unwrap_err();
+    assert!(refused.contains("Illegal data value"), "{refused}");
+    let shown = run(program, &["read", "--config", &config, "meter"]);
+    let shown = String::from_utf8_lossy(&shown.stdout).into_owned();
+    assert!(
+        shown.contains("9007199254740993") && shown.contains("SN-42") && !shown.contains("power_of_ten"),
+        "{shown}"
+    );
     // The common model and the meter's own registers, through Modbus TCP; 32 bits with the high word first.
     assert_eq!(read_registers(modbus, 7, 0x800D, 2), [0, 1235]);
     assert_eq!(read_registers(modbus, 7, 256, 2), [40, 15]);

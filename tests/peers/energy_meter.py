@@ -19,6 +19,12 @@ INPUTS = [
     0x0051,          # warning, wrong order of phases (bit 3 is 0), tariff 5
     2,               # 3 phases, 3 wires
     0x7FC0, 0x0000,  # no number
+    0x534E, 0x2D34, 0x3200, 0x5858,  # "SN-42", ended by a NUL
+    0x0001, 0x0000, 0x0000, 0x0020,  # 2 to the 53rd and 1, low word first
+    0x1234,          # 1234 in decimals
+    0x7FFF,          # not available
+    1234, 0xFFFE,    # 12.34: 1234 x 10 to the -2
+    0x00A5,          # bits 7 to 4: 10, bits 3 to 0: 5
 ]  # fmt: skip
 
 

@@ -183,10 +183,65 @@ fn the_page_of_profiles_quotes_the_energy_meter() {
     let shown = blocks(&read(&root().join("docs/profiles.md")), "toml");
     let shown = shown.iter().find(|block| block.contains("\"energy-meter\"")).unwrap();
     let parts: Vec<&str> = shown.trim_end().split("\n\n").collect();
-    assert!(parts.len() > 5, "{shown}");
+    assert!(parts.len() > 4, "{shown}");
     for part in &parts[1..] {
         assert!(meter.contains(part), "docs/energy-meter.toml lacks\n{part}");
     }
+}
+
+/// The three examples at the beginning of the page are profiles, read and commanded as it says.
+#[test]
+fn the_page_of_profiles_begins_with_three_profiles() {
+    use drivegate::drive::control::Run;
+    use drivegate::drive::{ModelPoint, Plan, PollClass, Profile};
+    let page = read(&root().join("docs/profiles.md"));
+    let (_, examples) = page.split_once("\n## Three examples\n").unwrap();
+    let (examples, _) = examples.split_once("\n## ").unwrap();
+    let profiles: Vec<Profile> = blocks(examples, "toml")
+        .iter()
+        .map(|text| Profile::parse("p.toml", text, false).unwrap_or_else(|why| panic!("{text}\n{why:?}")))
+        .collect();
+    let [meter, bits, cia402] = &profiles[..] else {
+        panic!("{} examples", profiles.len());
+    };
+    for profile in [meter, bits, cia402] {
+        assert_eq!(profile.warnings, [], "{}", profile.name);
+    }
+    let text = &blocks(examples, "toml")[0];
+    assert_eq!(
+        text.lines().filter(|line| !line.is_empty()).count(),
+        9,
+        "about ten lines"
+    );
+    let reads = |profile: &Profile, class| {
+        let reads = Plan::of(profile)
+            .reads
+            .into_iter()
+            .filter(move |read| read.class == class);
+        reads.map(|read| (read.start, read.count)).collect::<Vec<_>>()
+    };
+    assert_eq!(reads(meter, PollClass::Fast), [(0, 2), (4, 2)]);
+    assert_eq!(
+        (reads(meter, PollClass::Slow), reads(meter, PollClass::Once)),
+        (vec![(8, 4)], vec![(20, 8)])
+    );
+    let control = |profile: &Profile| profile.control.clone().unwrap();
+    let at = control(bits).at;
+    assert_eq!(bits.runs_by(at.table, at.address, 3), Some(true));
+    assert_eq!(bits.runs_by(at.table, at.address, 2), Some(false));
+    assert!(!control(bits).admits(at, 5), "an external fault");
+    assert_eq!(reads(bits, PollClass::Fast), [(0x2520, 5)]);
+    let Run::Steps(steps) = control(cia402).run else {
+        panic!("no steps");
+    };
+    let words: Vec<u16> = steps.iter().map(|step| step.write.value).collect();
+    assert_eq!(words, [6, 7, 15]);
+    assert_eq!(control(cia402).stop_word(0x080F), 0x0807);
+    assert!(
+        [ModelPoint::Running, ModelPoint::Fault]
+            .iter()
+            .all(|point| cia402.model_index(*point).is_some())
+    );
 }
 
 #[test]

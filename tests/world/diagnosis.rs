@@ -439,3 +439,36 @@ fn a_drive_that_never_answered_is_told_until_it_answers() {
         assert_eq!(told(&rig), Told::new(), "{}", line.family);
     }
 }
+
+/// A Vacon CX counts what it receives damaged (function 08): with that the verdict tells which direction is bad.
+#[test]
+fn a_drive_that_counts_tells_which_direction_is_bad() {
+    let evidence = |rates: &str| {
+        let mut rig = Rig::new(
+            &line("vacon-cx", Protocol::ModbusRtu, 9600, 3),
+            Parts {
+                faults: plan(rates, 7).only(&[2]),
+                ..Parts::of(0, &line("vacon-cx", Protocol::ModbusRtu, 9600, 3), 7)
+            },
+        );
+        let end = rig.now + 200 * SECOND;
+        while rig.now < end {
+            rig.run(SECOND);
+        }
+        let diagnosis = rig.bus.handle.image.diagnosis.load_full();
+        let of_it = diagnosis
+            .verdicts
+            .iter()
+            .find(|verdict| verdict.verdict == Cause::OneDrive);
+        let counted = diagnosis.drives[1].by_drive;
+        assert!(counted.is_some_and(|counted| counted.own > 100), "{counted:?}");
+        // Nobody asks a drive whose line is sound.
+        assert_eq!(diagnosis.drives[0].by_drive, None);
+        of_it.map(|verdict| verdict.evidence.clone()).unwrap_or_default()
+    };
+    let back = evidence("corrupt=0.2");
+    assert!(
+        back.contains("the way from the drive to the gateway is disturbed"),
+        "{back}"
+    );
+}

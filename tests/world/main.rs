@@ -36,6 +36,7 @@ mod recorder;
 mod restore;
 mod rig;
 mod scenario;
+mod selection;
 mod situations;
 mod slot;
 mod world;

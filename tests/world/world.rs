@@ -17,12 +17,12 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::{Protocol, Reply, RequestPdu};
-use drivegate::command::{Authority, CAPACITY, Order, Origin, Outcome, SourceKind, WriteStats, written};
+use drivegate::command::{Authority, CAPACITY, NO_DRIVE, Order, Origin, Outcome, SourceKind, WriteStats, written};
 use drivegate::drive::{ModelPoint, Quality, RawWrites, Value};
 use drivegate::event::{EventKind, Events};
 use drivegate::north::mqtt::Incoming;
 use drivegate::plant::{Plant, SharedPlant};
-use drivegate::process_image::LeaseAction;
+use drivegate::process_image::{LeaseAction, OnShutdown};
 use drivegate::sim::random::Random;
 use tokio::sync::broadcast;
 use tokio::sync::oneshot;

@@ -214,6 +214,9 @@ impl CommandRun {
             touched: Touched::Anything,
             passed_on: None,
             was_begun: self.begun,
+            // They are noted.
+            effects: Vec::new(),
+            slot: None,
         })
     }
 

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::BusOptions;
+use super::drive_counters::DriveCounters;
 use super::line_state::{Exchanged, LineState};
 use super::master::{Handover, Master, Purpose, Remains, Turn, TurnEnd};
 use super::news::News;
@@ -84,6 +85,8 @@ pub struct BusCore {
     asked: Option<Turn>,
     connection: Connection,
     tap: Option<Tap>,
+    counters: DriveCounters,
+    writes: Arc<WriteStats>,
     /// Empty; kept for its memory.
     news: Vec<News>,
 }
@@ -107,7 +110,9 @@ impl BusCore {
         BusCore {
             line,
             master: Master::new(bus.clone(), options, silence, writes.clone(), before, now),
-            report: Report::new(bus.image.clone(), options, events, writes, now),
+            report: Report::new(bus.image.clone(), options, events, writes.clone(), now),
+            counters: DriveCounters::new(&bus, now),
+            writes,
             bus,
             chosen: None,
             quiet_until: before.quiet_until,
@@ -224,6 +229,8 @@ impl BusCore {
         let next = self.master.next(now, &mut news);
         self.report_all(news, now);
         self.report.tick(now);
+        self.counters
+            .look(&self.bus, &mut self.report.diagnosis, &self.writes, now);
         let turn = match next {
             Ok(turn) => turn,
             Err(until) => return Some(until),
@@ -376,10 +383,14 @@ impl BusCore {
 
     fn report_all(&mut self, mut news: Vec<News>, now: Instant) {
         for one in news.drain(..) {
-            if let Some(drive) = self.report.apply(&one, now)
+            let wanted = self.report.apply(&one, now);
+            if let Some(drive) = wanted.fault
                 && self.bus.image.tape.takes(Taping::Everything)
             {
                 self.master.fault_came(drive, now);
+            }
+            for (drive, point, at) in wanted.monitors {
+                self.master.monitor(drive, point, at);
             }
         }
         self.news = news;

@@ -19,6 +19,7 @@
 pub mod command_run;
 pub mod confirm;
 pub mod core;
+mod drive_counters;
 mod drive_state;
 pub mod late_replies;
 mod line_diagnosis;
@@ -33,6 +34,8 @@ pub mod predict;
 pub mod prober;
 mod report;
 pub mod schedule;
+mod selection;
+pub mod stop_of_line;
 pub mod supervision;
 mod tap;
 pub mod transaction;

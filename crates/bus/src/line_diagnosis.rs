@@ -9,7 +9,9 @@ use super::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 use crate::codec::{Reply, RequestPdu};
 use crate::diagnosis::figures::Sign;
 use crate::diagnosis::hold::{Change, Hold};
-use crate::diagnosis::{Cause, Counted, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, rules};
+use crate::diagnosis::{
+    Cause, Counted, CountedByDrive, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, rules,
+};
 use crate::process_image::BusImage;
 
 /// The diagnosis of one line.
@@ -21,6 +23,8 @@ pub(super) struct LineDiagnosis {
     hold: Hold,
     /// Silence before the request that is on the line.
     gap: Duration,
+    /// What each drive counted itself: since the first reading of this run of errors, and the last reading.
+    by_drive: Vec<Option<(CountedByDrive, CountedByDrive)>>,
     /// When each verdict that is shown came.
     since: Vec<(Cause, Option<usize>, SystemTime)>,
 }
@@ -43,6 +47,7 @@ impl LineDiagnosis {
             names: image.drives.iter().map(|drive| drive.spec.name.clone()).collect(),
             figures: Figures::new(line, image.drives.iter().map(|drive| drive.spec.address), now),
             hold: Hold::default(),
+            by_drive: vec![None; image.drives.len()],
             gap: Duration::ZERO,
             since: Vec::new(),
             image,
@@ -52,6 +57,35 @@ impl LineDiagnosis {
     /// The figures, to be told of the port, of drives that run and of bytes that nobody asked for.
     pub(super) fn figures(&mut self) -> &mut Figures {
         &mut self.figures
+    }
+
+    /// Whether exchanges with that drive failed in the last minute.
+    pub(super) fn has_errors(&self, drive: usize) -> bool {
+        let failed = [Sign::Damaged, Sign::StartLost, Sign::CutEcho, Sign::Silent];
+        let drive = self.figures.drives.get(drive);
+        drive.is_some_and(|drive| failed.iter().any(|sign| drive.sum(*sign) > 0))
+    }
+
+    /// A drive told what it counted.
+    pub(super) fn counted_by_drive(&mut self, drive: usize, counted: CountedByDrive) {
+        if let Some(known) = self.by_drive.get_mut(drive) {
+            // A drive that was switched off counts from 0 again.
+            let goes_on = |before: &CountedByDrive| counted.since(before).messages < u16::MAX / 2;
+            let first = known.map(|(_, before)| before).filter(goes_on).unwrap_or(counted);
+            *known = Some((first, counted));
+        }
+    }
+
+    /// What the drives of a finding counted, as far as it tells which direction is bad.
+    fn directions(&self, finding: &Finding) -> String {
+        let about = (0..).zip(self.figures.drives.iter().zip(&self.names).zip(&self.by_drive));
+        let about = about.filter(|(place, _)| finding.drive.is_none_or(|drive| drive == *place));
+        let directions = about.filter_map(|(_, ((drive, name), counted))| {
+            let (before, last) = counted.as_ref()?;
+            let here = drive.sum(Sign::Damaged) + drive.sum(Sign::StartLost);
+            last.since(before).direction(name, here)
+        });
+        directions.take(3).map(|direction| format!("; {direction}")).collect()
     }
 
     /// A request goes onto a line that was silent for so long.
@@ -140,6 +174,8 @@ impl LineDiagnosis {
             finding.cause == *cause && finding.drive == *drive
         };
         self.since.retain(|one| shown.iter().any(|finding| is(finding, one)));
+        let directions: Vec<String> = shown.iter().map(|finding| self.directions(finding)).collect();
+        let mut directions = directions.into_iter();
         let verdicts = shown.iter().map(|finding| {
             let known = self
                 .since
@@ -155,29 +191,31 @@ impl LineDiagnosis {
                 drive: finding.drive.and_then(|drive| self.names.get(drive)).cloned(),
                 certainty: finding.certainty,
                 meaning: finding.cause.meaning().to_string(),
-                evidence: finding.evidence.clone(),
+                evidence: format!("{}{}", finding.evidence, directions.next().unwrap_or_default()),
                 remedy: finding.cause.remedy().to_string(),
                 steps: steps_of(&self.image, finding),
                 since: humantime::format_rfc3339_millis(since).to_string(),
             }
         });
         let verdicts = verdicts.collect();
-        let counted = self
-            .figures
-            .drives
-            .iter()
-            .zip(&self.names)
-            .map(|(drive, name)| Counted {
-                drive: name.clone(),
-                answered: drive.sum(Sign::Answered),
-                silent: drive.sum(Sign::Tried),
-                damaged: drive.sum(Sign::Damaged) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho),
-                stray_before: drive.sum(Sign::Led),
-                start_lost: drive.sum(Sign::StartLost),
-                late: drive.sum(Sign::Late),
-                second: drive.sum(Sign::Second),
-                slowest_ms: drive.slowest_ms(),
-            });
+        let counted =
+            self.figures
+                .drives
+                .iter()
+                .zip(&self.names)
+                .zip(&self.by_drive)
+                .map(|((drive, name), by_drive)| Counted {
+                    by_drive: by_drive.map(|(_, last)| last),
+                    drive: name.clone(),
+                    answered: drive.sum(Sign::Answered),
+                    silent: drive.sum(Sign::Tried),
+                    damaged: drive.sum(Sign::Damaged) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho),
+                    stray_before: drive.sum(Sign::Led),
+                    start_lost: drive.sum(Sign::StartLost),
+                    late: drive.sum(Sign::Late),
+                    second: drive.sum(Sign::Second),
+                    slowest_ms: drive.slowest_ms(),
+                });
         let drives = counted.collect();
         self.image.diagnosis.store(Arc::new(Diagnosis {
             at: Some(now),

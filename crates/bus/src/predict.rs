@@ -208,7 +208,7 @@ impl<'a> Line<'a> {
                         rounds.slow_requests += 1.0;
                         rounds.longest_slow = rounds.longest_slow.max(wire);
                     }
-                    PollClass::Once | PollClass::Fault | PollClass::Never => {}
+                    PollClass::Once | PollClass::Fault | PollClass::Monitor | PollClass::Never => {}
                 }
             }
             rounds

@@ -1,6 +1,7 @@
 //! Applies what the master has to say to the process image, and turns it into events and log lines.
 
 mod changes;
+mod selection;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -11,6 +12,7 @@ use super::confirm::Unconfirmed;
 use super::line_diagnosis::LineDiagnosis;
 use super::line_state::Exchanged;
 use super::news::{Adopted, News};
+use super::selection::{Findings, Selections};
 use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
 use super::transaction::{CONNECTION_CLOSED, Ended};
@@ -42,11 +44,22 @@ pub(super) struct Report {
     watched: Vec<[Watched; WATCHED.len()]>,
     /// What is known of each drive's own response to a silent master.
     responses: Vec<Response>,
+    /// Whether process data holds what the profiles say.
+    selections: Selections,
     /// What is wrong with the line.
     pub(super) diagnosis: LineDiagnosis,
     up: bool,
     /// It was reported that the bus is down, and it is still.
     down_reported: bool,
+}
+
+/// What a piece of news makes the master read.
+#[derive(Debug, Default)]
+pub(super) struct Wanted {
+    /// The drive in which a new fault came up.
+    pub(super) fault: Option<usize>,
+    /// Drive, monitoring point and time.
+    pub(super) monitors: Vec<(usize, usize, Instant)>,
 }
 
 /// What is known of a drive's own response to a silent master.
@@ -68,7 +81,9 @@ impl Report {
     ) -> Report {
         let faults = vec![None; image.drives.len()];
         let silence = image.spec.protocol.silence(options.silence, &image.spec.format);
+        let points = image.drives.iter().map(|drive| &*drive.spec.profile.points);
         Report {
+            selections: Selections::new(points, now),
             diagnosis: LineDiagnosis::new(image.clone(), silence, options.response_timeout, now),
             image,
             events,
@@ -83,8 +98,8 @@ impl Report {
         }
     }
 
-    /// Applies one piece of news. The drive in which it shows a new fault, if it does.
-    pub(super) fn apply(&mut self, news: &News, now: Instant) -> Option<usize> {
+    /// Applies one piece of news.
+    pub(super) fn apply(&mut self, news: &News, now: Instant) -> Wanted {
         match news {
             News::FastRound(cycle) => self.fast_round(*cycle),
             News::SlowRound(cycle) => self.slow_round(*cycle),
@@ -93,7 +108,7 @@ impl Report {
             News::Offline(drive) => self.offline(*drive),
             News::Restarted(drive) => self.restarted(*drive),
             News::Unlike(drive, device) => self.unlike(*drive, *device),
-            News::Unavailable(drive, read, exception) => self.unavailable(*drive, read, *exception),
+            News::Unavailable(drive, read, exception) => self.unavailable(*drive, read, *exception, now),
             News::NotConfirmed(drive, late) => self.not_confirmed(*drive, late, now),
             News::LeaseRanOut(drive) => self.lease_ran_out(*drive),
             News::ActionRefused { drive, what, refusal } => {
@@ -130,11 +145,17 @@ impl Report {
             }
             News::RunsUnsupervised(drive, adopted) => self.runs_unsupervised(*drive, *adopted),
         }
-        let News::Read { drive, .. } = news else { return None };
+        let News::Read { drive, read, at, .. } = news else {
+            return Wanted::default();
+        };
+        let monitors = self.compare_selection(*drive, read, *at);
         let new_fault = self.look_at_fault(*drive, now);
         self.look_at_state(*drive, now);
         self.look_at_own_response(*drive, now);
-        new_fault.then_some(*drive)
+        Wanted {
+            fault: new_fault.then_some(*drive),
+            monitors,
+        }
     }
 
     fn drive(&self, index: usize) -> Option<Arc<DriveImage>> {
@@ -345,7 +366,8 @@ impl Report {
         }
     }
 
-    fn offline(&self, index: usize) {
+    fn offline(&mut self, index: usize) {
+        self.selections.interrupted(index);
         if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
             self.offline_event(index, "it does not answer");
         }
@@ -378,11 +400,12 @@ impl Report {
         });
     }
 
-    fn unavailable(&self, index: usize, read: &PlannedRead, exception: Exception) {
-        let Some(drive) = self.image.drives.get(index) else {
-            return;
-        };
+    fn unavailable(&mut self, index: usize, read: &PlannedRead, exception: Exception, now: Instant) {
+        let Some(drive) = self.drive(index) else { return };
         drive.update(|s| s.refuse(read.table, read.start, read.count, exception));
+        if read.class == PollClass::Monitor {
+            return self.monitor_refused((index, &drive), read, exception, now);
+        }
         tracing::warn!(
             target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
             "the drive refuses {} {} with {exception}; its points are bad; asked again after 2 s, later every minute",
@@ -410,7 +433,7 @@ impl Report {
         if drive.spec.supervision.is_some() {
             tracing::warn!(
                 target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
-                "the drive does not respond to a silent master ({point} = 0), its lease stops it only while the gateway \
+                "the drive does not respond to a silent master ({point}), its lease stops it only while the gateway \
                  works; set the parameter to a stop if the process allows it"
             );
             return;
@@ -418,7 +441,7 @@ impl Report {
         self.drive_event(index, EventKind::Unsupervised, None, |name| {
             format!(
                 "nothing stops drive {name} when whoever commands it falls silent: it has no lease, and its own response \
-                 to a silent master is off ({point} = 0); configure supervision, and set the parameter if the process \
+                 to a silent master is off ({point}); configure supervision, and set the parameter if the process \
                  allows it"
             )
         });

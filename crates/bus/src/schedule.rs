@@ -17,7 +17,8 @@ use std::time::{Duration, Instant};
 
 pub use self::background::Admission;
 use self::background::BackgroundShare;
-use self::drives::{DriveSchedule, Item, Presence};
+pub(crate) use self::drives::TRIAL_PAUSE;
+use self::drives::{DriveSchedule, Item, Presence, singles};
 use self::share::CommandShare;
 use crate::codec::Exception;
 use crate::command::Urgency;
@@ -163,9 +164,20 @@ impl Schedule {
         now: Instant,
     ) -> Self {
         let drives = plans.iter().enumerate().map(|(index, plan)| {
-            let reads = plan.reads.iter().chain(&plan.on_fault);
-            let items = reads.map(|read| Item::new(*read, *read, cost(index, read), now));
-            DriveSchedule::new(items.collect(), plan.behind_state.clone(), now)
+            let items = plan.all().flat_map(|read| {
+                let parts = if plan.trials.contains(read) {
+                    singles(*read)
+                } else {
+                    vec![*read]
+                };
+                parts.into_iter().map(|part| {
+                    let mut item = Item::new(part, *read, cost(index, &part), now);
+                    item.whole_again = (part != *read).then(|| now + TRIAL_PAUSE.0);
+                    item
+                })
+            });
+            let items = items.collect();
+            DriveSchedule::new(items, plan.behind_state.clone(), plan.trials.clone(), now)
         });
         let drives: Vec<DriveSchedule> = drives.collect();
         let slow = drives.iter().flat_map(|drive| &drive.items);
@@ -287,6 +299,11 @@ impl Schedule {
             }
             self.note_slow(now);
         }
+        if matches!(polled, Polled::Failed | Polled::Garbled) && self.is_trial(poll.drive, &poll.read) {
+            // A drive that keeps silent to what no manual states, or answers something else, is not away for that.
+            self.not_proved(poll.drive, &poll.read, TRIAL_PAUSE.1, now);
+            return Change::None;
+        }
         self.probed |= poll.probe && matches!(polled, Polled::Failed | Polled::Garbled);
         match polled {
             Polled::Ok | Polled::Refused(_) => self.answered(poll, polled, now),
@@ -329,6 +346,25 @@ impl Schedule {
             drive.doubted = true;
             self.round.retain(|waiting| *waiting != (index, read));
             self.round.push_front((index, read));
+        }
+    }
+
+    /// Whether that read is longer than a manual states, and no reply has proved it.
+    pub fn is_trial(&self, drive: usize, read: &PlannedRead) -> bool {
+        self.drives.get(drive).is_some_and(|drive| drive.is_trial(read))
+    }
+
+    /// A reply to that read showed more than its first item.
+    pub fn proved(&mut self, drive: usize, read: &PlannedRead) {
+        if let Some(drive) = self.drives.get_mut(drive) {
+            drive.unproved.retain(|block| !block.covers(read.table, read.start));
+        }
+    }
+
+    /// No reply to that read proved it: its items are read singly, and it is tried again later.
+    pub fn not_proved(&mut self, drive: usize, read: &PlannedRead, pause: Duration, now: Instant) {
+        if let Some(drive) = self.drives.get_mut(drive) {
+            drive.take_apart(read, now, pause);
         }
     }
 
@@ -416,7 +452,11 @@ impl Schedule {
             let sound = |item: &Item| item.read == *read && !item.refused && !item.postponed;
             Some(*read) != just_read && drive.items.iter().any(sound)
         };
-        for read in drive.behind_state.iter().rev().filter(|read| may_go(read)) {
+        // A block that is not proved yet is read in parts.
+        let behind =
+            |item: &&Item| drive.behind_state.contains(&item.origin) || drive.behind_state.contains(&item.read);
+        let parts: Vec<PlannedRead> = drive.items.iter().filter(behind).map(|item| item.read).collect();
+        for read in parts.iter().rev().filter(|read| may_go(read)) {
             self.round.retain(|waiting| *waiting != (index, *read));
             self.round.push_front((index, *read));
             if !self.state_first.contains(&(index, *read)) {
@@ -435,9 +475,25 @@ impl Schedule {
                     (item.wanted, item.refused, item.failures) = (true, false, 0);
                     item.due = now;
                 }
+                PollClass::Monitor if covers(&item.read) && !item.refused => {
+                    item.wanted = true;
+                    item.due = item.due.min(now);
+                }
                 PollClass::Slow if covers(&item.read) && !item.refused => item.due = item.due.min(now),
                 _ => {}
             }
+        }
+    }
+
+    /// Monitoring registers are to be read again at `due`, as far as the drive has them.
+    pub fn monitor(&mut self, drive: usize, covers: impl Fn(&PlannedRead) -> bool, due: Instant) {
+        let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
+        let monitors = items
+            .into_iter()
+            .flatten()
+            .filter(|item| item.read.class == PollClass::Monitor && !item.refused && !item.wanted);
+        for item in monitors.filter(|item| covers(&item.read)) {
+            (item.wanted, item.due) = (true, due);
         }
     }
 
@@ -448,7 +504,9 @@ impl Schedule {
             .into_iter()
             .flatten()
             .filter(|item| !item.refused && item.failures == 0);
-        if let Some(item) = sound.find(|item| !matches!(item.read.class, PollClass::Fast | PollClass::Fault)) {
+        if let Some(item) =
+            sound.find(|item| !matches!(item.read.class, PollClass::Fast | PollClass::Fault | PollClass::Monitor))
+        {
             item.wanted = true;
             item.due = item.due.min(now);
         }

@@ -16,7 +16,10 @@ use super::command_run::KnownWords;
 use super::news::{Adopted, News};
 use crate::command::{Answer, Outcome, Refusal};
 use crate::drive::profile::Form;
-use crate::drive::{COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Raw, Value};
+use crate::drive::{
+    COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Raw,
+    Value,
+};
 use crate::process_image::{LeaseAction, Reading, Unavailable};
 
 /// How long an action that was not acknowledged waits before it is written again.
@@ -415,17 +418,24 @@ pub(super) enum OwnResponse {
     On,
 }
 
-/// The drive's own response: 0 in any of the points that the profile has is none.
+/// Points with a drive's own response to a silent master, and the value that means none.
+const RESPONSES: [(&str, f64); 3] = [
+    (FIELDBUS_FAULT_RESPONSE, 0.0),
+    (COMMUNICATION_TIMEOUT, 0.0),
+    (COMMUNICATION_ERROR_REACTION, 3.0),
+];
+
+/// The drive's own response: none where any of the points that the profile has says so.
 pub(super) fn own_response(reading: &Reading<'_>) -> OwnResponse {
     let mut seen = OwnResponse::Unknown;
-    for name in [FIELDBUS_FAULT_RESPONSE, COMMUNICATION_TIMEOUT] {
+    for (name, none) in RESPONSES {
         let Some(point) = reading.spec.profile.point_index(name) else {
             continue;
         };
         let Some(value) = reading.sample(point).good() else {
             return OwnResponse::Unknown;
         };
-        if value.as_f64() == 0.0 {
+        if value.as_f64() == none {
             return OwnResponse::Off(name);
         }
         seen = OwnResponse::On;

@@ -53,6 +53,8 @@ pub enum EventKind {
     Restarted,
     /// A drive says that it is another device than its profile expects.
     UnlikeProfile,
+    /// Process data of a drive does not hold what its profile says: a selector of the drive was changed.
+    SelectionDiffers,
     /// A lease ran out, and its action begins.
     Supervision,
     /// The action of a lease, or the stop of a shutdown, failed.
@@ -83,7 +85,7 @@ pub enum EventKind {
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 24] = [
+    pub const ALL: [EventKind; 25] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -95,6 +97,7 @@ impl EventKind {
         EventKind::ControlPlace,
         EventKind::Restarted,
         EventKind::UnlikeProfile,
+        EventKind::SelectionDiffers,
         EventKind::Supervision,
         EventKind::SupervisionFailed,
         EventKind::Unsupervised,
@@ -117,6 +120,7 @@ impl EventKind {
             | EventKind::Fault
             | EventKind::Warning
             | EventKind::UnlikeProfile
+            | EventKind::SelectionDiffers
             | EventKind::Supervision
             | EventKind::SupervisionFailed
             | EventKind::Unsupervised
@@ -154,6 +158,7 @@ impl EventKind {
             EventKind::ControlPlace => "control_place",
             EventKind::Restarted => "restarted",
             EventKind::UnlikeProfile => "unlike_profile",
+            EventKind::SelectionDiffers => "selection_differs",
             EventKind::Supervision => "supervision",
             EventKind::SupervisionFailed => "supervision_failed",
             EventKind::Unsupervised => "unsupervised",
@@ -472,8 +477,8 @@ mod tests {
         for (place, kind) in EventKind::ALL.into_iter().enumerate() {
             let last = match kind {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
-                | Restarted | UnlikeProfile | Supervision | SupervisionFailed | Unsupervised | RefusedCommand
-                | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
+                | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised
+                | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
                 ParametersChanged | RestoreUnfinished => false,
                 Diagnosis => true,
             };

@@ -13,8 +13,8 @@ use tokio::sync::oneshot;
 
 use crate::codec::{RequestPdu, Table, describe};
 use crate::command::{
-    self, Admitted, Answer, Authority, BackgroundRequest, Change, Command, CommandQueue, Order, Origin, Outcome, Pace,
-    Parts, Refusal, StopEnd, Ticket, Urgency, WriteStats,
+    self, Admitted, Answer, Authority, BackgroundRequest, Change, Command, CommandQueue, Effect, Order, Origin,
+    Outcome, Pace, Parts, Priorities, Refusal, SlotWrite, StopEnd, Ticket, Urgency, WriteStats,
 };
 use crate::drive::parameters::RawValue;
 use crate::drive::why::Explanation;
@@ -57,17 +57,22 @@ impl BusHandle {
                 let same = |image: &Arc<DriveImage>| bus.image.spec.machine(&image.spec) == machine;
                 Some((bus, bus.image.drives.iter().position(same)?))
             });
-            let (commander, stops) = match known {
+            let (commander, stops, priorities) = match known {
                 Some((bus, place)) => {
                     if let Some(image) = bus.image.drives.get(place) {
                         drive.take_over(image);
                     }
-                    let queue = bus.queue.lock();
-                    (queue.commander(place).cloned(), queue.stops(place))
+                    let mut queue = bus.queue.lock();
+                    let priorities = queue.priorities(place).clone();
+                    (queue.commander(place).cloned(), queue.stops(place), priorities)
                 }
-                None => (None, ADDED.fetch_add(STOPS_OF_ONE, Ordering::Relaxed)),
+                None => (
+                    None,
+                    ADDED.fetch_add(STOPS_OF_ONE, Ordering::Relaxed),
+                    Priorities::default(),
+                ),
             };
-            self.queue.lock().take_over(index, commander, stops);
+            self.queue.lock().take_over(index, commander, stops, priorities);
             // What is only monitored from now on is sent nothing.
             if let Some((bus, place)) = known.filter(|_| drive.spec.access == Access::Control) {
                 bus.queue.hand_over(place, &self.queue, index, now);
@@ -132,11 +137,7 @@ fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
             .collect(),
         Order::Write(pdu) => {
             let (table, items) = command::written(pdu).unwrap_or((Table::Holding, Vec::new()));
-            let run_bit = reading.spec.profile.run_bit();
-            let runs = |address: u16, word: u16| {
-                let (_, bit, invert) = run_bit.filter(|(raw, ..)| raw.table == table && raw.address == address)?;
-                Some(((word >> bit) & 1 == 1) != invert)
-            };
+            let runs = |address: u16, word: u16| reading.spec.profile.runs_by(table, address, word);
             let number = |word: u16| Value::Integer(i64::from(word));
             let change = |(address, word): (u16, u16)| Change {
                 point: format!("{table} {address}"),
@@ -325,8 +326,8 @@ impl DriveHandle {
                 let what = self.describe(&rest);
                 self.place_parts(stop, (&what, Ok(rest)), origin, authority, expiry, (asked, now))
             }
-            Parts::Two(..) => self.place_one(order, origin, authority, expiry, asked, now),
-            Parts::One(order) => self.place_one(order, origin, authority, expiry, asked, now),
+            Parts::Two(..) => self.place_one(order, None, origin, authority, expiry, (asked, now)),
+            Parts::One(order) => self.place_one(order, None, origin, authority, expiry, (asked, now)),
         }
     }
 
@@ -341,7 +342,7 @@ impl DriveHandle {
         now: Instant,
     ) -> Placed {
         if !self.may_go(&stop, &self.reading(now), authority) {
-            return self.place_one(stop, origin, authority, expiry, now, now);
+            return self.place_one(stop, None, origin, authority, expiry, (now, now));
         }
         self.place_parts(stop, (what, Err(refusal)), origin, authority, expiry, (now, now))
     }
@@ -356,24 +357,41 @@ impl DriveHandle {
         self.bus_up() || !self.bus.image.is_tried()
     }
 
+    /// The order that follows from a write to a slot; both are accepted, or neither is.
+    pub fn place_slot(
+        &self,
+        order: Order,
+        write: SlotWrite,
+        origin: Origin,
+        expiry: Duration,
+        (asked, now): (Instant, Instant),
+    ) -> Placed {
+        self.place_one(order, Some(write), origin, Authority::Write, expiry, (asked, now))
+    }
+
+    /// Calls `with` for the priority arrays of the drive.
+    pub fn priorities<T>(&self, with: impl FnOnce(&mut Priorities) -> T) -> T {
+        with(self.bus.queue.lock().priorities(self.index))
+    }
+
     fn place_one(
         &self,
         order: Order,
+        write_to: Option<SlotWrite>,
         origin: Origin,
         authority: Authority,
         expiry: Duration,
-        asked: Instant,
-        now: Instant,
+        (asked, now): (Instant, Instant),
     ) -> Placed {
         let reading = self.reading(now);
         let write = !matches!(order, Order::Read(_));
         let what = self.describe(&order);
         let (mut ticket, answer) = self.ticket(&what, changes(&reading, &order), origin, write, now);
         let placed = Placed::new(now, answer, ticket.confirmation());
-        match self.judge(order, &reading, authority) {
+        match self.judge(order, ticket.origin(), &reading, authority) {
             Err(outcome) => self.turn_away(ticket, &what, outcome, write, now),
             Ok(admitted) => {
-                let command = Command::new(self.index, admitted, now + expiry, ticket);
+                let command = Command::new(self.index, admitted, now + expiry, ticket).of_slot(write_to);
                 let command = command.asked_of(&self.image.spec.profile, asked);
                 self.bus.queue.submit(command, now);
             }
@@ -404,7 +422,7 @@ impl DriveHandle {
         sets.iter_mut().for_each(|change| change.run = None);
         let (mut rest_ticket, rest_answer) = self.ticket(what, sets, origin, true, now);
         let placed = placed.with_rest(rest_answer, rest_ticket.confirmation());
-        let stop = match self.judge(stop, &reading, authority) {
+        let stop = match self.judge(stop, ticket.origin(), &reading, authority) {
             Ok(admitted) => {
                 Command::new(self.index, admitted, now + expiry, ticket).asked_of(&self.image.spec.profile, now)
             }
@@ -415,7 +433,7 @@ impl DriveHandle {
             }
         };
         let judged = match rest {
-            Ok(order) => self.judge(order, &reading, authority),
+            Ok(order) => self.judge(order, rest_ticket.origin(), &reading, authority),
             Err(refusal) => Err(Outcome::Refused(refusal)),
         };
         match judged {
@@ -446,8 +464,21 @@ impl DriveHandle {
     }
 
     /// What becomes of an order at once: why it is not sent, or that it may be.
-    fn judge(&self, order: Order, reading: &Reading<'_>, authority: Authority) -> Result<Admitted, Outcome> {
+    fn judge(
+        &self,
+        order: Order,
+        origin: &Origin,
+        reading: &Reading<'_>,
+        authority: Authority,
+    ) -> Result<Admitted, Outcome> {
         let online = reading.snapshot.link.is_online();
+        let held_back = |admitted: &Admitted| {
+            let effect = Effect::of(&admitted.order, &self.image.spec.profile);
+            let queue = self.bus.queue.lock();
+            queue
+                .held_back(self.index, origin, effect)
+                .filter(|_| admitted.urgency == Urgency::Command)
+        };
         match command::admit(order, reading, authority) {
             Err(Refusal::NotKnown(_)) if !self.bus_up() => Err(Outcome::BusDown),
             Err(Refusal::NotKnown(_)) if !online => Err(Outcome::Offline),
@@ -456,7 +487,11 @@ impl DriveHandle {
             Ok(_) if !self.takes_stops() => Err(Outcome::BusDown),
             // A stop goes to a drive that does not answer too: it may be back.
             Ok(admitted) if !online && admitted.urgency != Urgency::Stop => Err(Outcome::Offline),
-            Ok(admitted) => Ok(admitted),
+            // Judged once more when it is accepted.
+            Ok(admitted) => match held_back(&admitted) {
+                Some(refusal) => Err(Outcome::Refused(refusal)),
+                None => Ok(admitted),
+            },
         }
     }
 
@@ -519,6 +554,11 @@ impl DriveHandle {
         self.publish_refusal(what, &refusal, &origin, now);
         let name = &self.image.spec.name;
         turn_away(&self.writes, name, what, Outcome::Refused(refusal), origin, now)
+    }
+
+    /// Passes a request on to the line of the drive, as [`BusHandle::ask`].
+    pub fn ask_line(&self, question: Question, now: Instant) -> Exchange {
+        self.bus.ask(question, &self.writes, now)
     }
 
     /// Publishes that a command was refused; a flood of them is counted.

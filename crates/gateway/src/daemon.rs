@@ -24,7 +24,7 @@ use crate::event::{Event, EventKind, Events};
 use crate::history::{History, Keeper, RecorderTask, Recordings};
 use crate::north::local::Control;
 use crate::north::parameter_jobs::{hold_unfinished, keep_reading};
-use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt, slot};
+use crate::north::{NorthStats, ServerError, bacnet, http, local, modbus_tcp, mqtt, slot};
 use crate::parameters::{Store, Vault};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
@@ -66,6 +66,7 @@ pub struct Daemon {
     mqtt: ServerSlot<mqtt::Mqtt>,
     http: ServerSlot<http::Http>,
     slots: ServerSlot<slot::Server>,
+    bacnet: ServerSlot<bacnet::Server>,
     local: ServerSlot<local::Local>,
     recordings: Arc<Recordings>,
     /// Readings of parameters.
@@ -87,6 +88,7 @@ pub struct Daemon {
 struct PreparedServers {
     modbus_tcp: Prepared<modbus_tcp::Server>,
     slots: Prepared<slot::Server>,
+    bacnet: Prepared<bacnet::Server>,
     http: Prepared<http::Http>,
 }
 
@@ -132,6 +134,7 @@ impl Daemon {
             mqtt: ServerSlot::default(),
             http: ServerSlot::default(),
             slots: ServerSlot::default(),
+            bacnet: ServerSlot::default(),
             local: ServerSlot::default(),
             recordings,
             vault,
@@ -180,6 +183,11 @@ impl Daemon {
     /// The addresses of the tool slots.
     pub fn slot_addresses(&self) -> Vec<std::net::SocketAddr> {
         self.slots.server().map(slot::Server::addresses).unwrap_or_default()
+    }
+
+    /// The address of the BACnet server.
+    pub fn bacnet_address(&self) -> Option<std::net::SocketAddr> {
+        self.bacnet.server().map(bacnet::Server::address)
     }
 
     /// Path of the local socket, if it is open.
@@ -418,13 +426,23 @@ impl Daemon {
                 return Err(error);
             }
         };
+        let bacnet = match self.bacnet.prepare(settings.bacnet.as_ref(), plant, stats).await {
+            Ok(bacnet) => bacnet,
+            Err(error) => {
+                self.slots.abort(slots).await;
+                self.modbus_tcp.abort(modbus_tcp).await;
+                return Err(error);
+            }
+        };
         match self.http.prepare(settings.http.as_ref(), plant, stats).await {
             Ok(http) => Ok(PreparedServers {
                 modbus_tcp,
                 slots,
+                bacnet,
                 http,
             }),
             Err(error) => {
+                self.bacnet.abort(bacnet).await;
                 self.slots.abort(slots).await;
                 self.modbus_tcp.abort(modbus_tcp).await;
                 Err(error)
@@ -435,12 +453,14 @@ impl Daemon {
     async fn abort_servers(&mut self, prepared: PreparedServers) {
         self.modbus_tcp.abort(prepared.modbus_tcp).await;
         self.slots.abort(prepared.slots).await;
+        self.bacnet.abort(prepared.bacnet).await;
         self.http.abort(prepared.http).await;
     }
 
     async fn commit_servers(&mut self, prepared: PreparedServers) {
         self.modbus_tcp.commit(prepared.modbus_tcp).await;
         self.slots.commit(prepared.slots).await;
+        self.bacnet.commit(prepared.bacnet).await;
         self.http.commit(prepared.http).await;
     }
 
@@ -502,6 +522,7 @@ impl Daemon {
     pub async fn stop(mut self) {
         self.local.stop().await;
         self.slots.stop().await;
+        self.bacnet.stop().await;
         self.modbus_tcp.stop().await;
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);

@@ -1,7 +1,8 @@
-//! The north sides: Modbus TCP, MQTT, HTTP, the local socket and the tool slots. They read the process image and queue commands; they never
+//! The north sides: Modbus TCP, MQTT, HTTP, BACnet/IP, the local socket and the tool slots. They read the process image and queue commands; they never
 //! name the bus.
 
 mod arrivals;
+pub mod bacnet;
 mod certificate;
 mod certificate_kind;
 mod command_json;
@@ -46,8 +47,8 @@ pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings}
 pub use listener::ListenerStates;
 pub use pem::unreadable;
 pub use stats::{
-    ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats, ServerKind,
-    SlotOutcome, SlotStats,
+    BacnetStats, ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats,
+    ServerKind, SlotOutcome, SlotStats,
 };
 pub use tls_words::{GATEWAY, Peer, explain};
 

@@ -20,6 +20,7 @@ use tokio_util::task::TaskTracker;
 use super::{NorthStats, ServerError, ServerKind};
 
 use self::accept::{AcceptLoop, ListeningSocket, stop_listening};
+pub(crate) use self::state::ListenerState;
 pub use self::state::ListenerStates;
 
 /// What a server does with the connections to one of its listeners.

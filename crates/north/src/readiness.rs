@@ -22,5 +22,6 @@ pub(crate) fn reasons(plant: &Plant, stats: &NorthStats) -> Vec<String> {
         }
     }
     reasons.extend(stats.listeners.reasons());
+    reasons.extend(stats.bacnet.reason());
     reasons
 }

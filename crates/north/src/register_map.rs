@@ -16,7 +16,7 @@ use crate::drive::{ModelPoint, State, Value};
 use crate::process_image::Reading;
 
 /// First address that does not belong to the drive.
-pub(crate) const FIRST: u16 = 0x8000;
+pub const FIRST: u16 = 0x8000;
 /// Unit id of the gateway itself.
 pub const GATEWAY_UNIT: u8 = 255;
 

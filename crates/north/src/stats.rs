@@ -22,6 +22,8 @@ pub struct NorthStats {
     pub mqtt: MqttStats,
     /// Of the tool slots.
     pub slots: SlotStats,
+    /// Of the BACnet server.
+    pub bacnet: BacnetStats,
     /// Refused connections of all servers.
     pub refused: RefusalStats,
     /// The listeners of all servers, and whether they listen.
@@ -78,11 +80,18 @@ pub enum ServerKind {
     Http,
     /// The tool slots.
     Slot,
+    /// BACnet/IP.
+    Bacnet,
 }
 
 impl ServerKind {
     /// All servers.
-    pub const ALL: [ServerKind; 3] = [ServerKind::ModbusTcp, ServerKind::Http, ServerKind::Slot];
+    pub const ALL: [ServerKind; 4] = [
+        ServerKind::ModbusTcp,
+        ServerKind::Http,
+        ServerKind::Slot,
+        ServerKind::Bacnet,
+    ];
 
     /// Name in the metrics.
     pub fn name(self) -> &'static str {
@@ -90,6 +99,7 @@ impl ServerKind {
             ServerKind::ModbusTcp => "modbus_tcp",
             ServerKind::Http => "http",
             ServerKind::Slot => "slot",
+            ServerKind::Bacnet => "bacnet",
         }
     }
 
@@ -99,6 +109,7 @@ impl ServerKind {
             ServerKind::ModbusTcp => "Modbus TCP",
             ServerKind::Http => "HTTP",
             ServerKind::Slot => "tool slot",
+            ServerKind::Bacnet => "BACnet/IP",
         }
     }
 }
@@ -210,6 +221,44 @@ impl ModbusTcpStats {
             }
         }
         all
+    }
+}
+
+/// Of the BACnet server, while it runs.
+#[derive(Debug, Default)]
+pub struct BacnetStats(Mutex<Option<BacnetFigures>>);
+
+/// Counters of the BACnet server and what became of its registration.
+#[derive(Debug, Clone)]
+pub struct BacnetFigures {
+    /// Since it was started.
+    pub counters: drivegate_bacnet::Counters,
+    /// The BBMD as configured, and whether it passes broadcasts on.
+    pub bbmd: Option<(String, drivegate_bacnet::Registration)>,
+}
+
+impl BacnetStats {
+    /// What the server says of itself; none when it ends.
+    pub(crate) fn set(&self, figures: Option<BacnetFigures>) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = figures;
+    }
+
+    /// The last of it.
+    pub fn get(&self) -> Option<BacnetFigures> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Why the gateway is not ready for its sake.
+    pub(crate) fn reason(&self) -> Option<String> {
+        use drivegate_bacnet::Registration;
+        let (bbmd, registration) = self.get()?.bbmd?;
+        match registration {
+            Registration::Refused(code) => Some(format!(
+                "BACnet/IP: the BBMD {bbmd} refuses the registration with code {code:#06x}; retrying"
+            )),
+            Registration::Unanswered => Some(format!("BACnet/IP: the BBMD {bbmd} does not answer; retrying")),
+            Registration::None | Registration::Registered => None,
+        }
     }
 }
 

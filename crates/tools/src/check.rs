@@ -2,6 +2,7 @@
 
 mod as_service;
 
+use std::collections::BTreeSet;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -220,6 +221,13 @@ fn raw_writes(bus: &BusSettings, settings: &Settings) -> String {
     text
 }
 
+/// The profiles in use that nobody has confirmed on hardware.
+fn unverified(settings: &Settings) -> BTreeSet<&str> {
+    let drives = settings.buses.iter().flat_map(|bus| &bus.drives);
+    let profiles = drives.map(|drive| &drive.profile).filter(|profile| !profile.verified);
+    profiles.map(|profile| profile.name.as_str()).collect()
+}
+
 fn drive_name<'a>(bus: &'a BusSettings, request: &PredictedRequest) -> &'a str {
     bus.drives.get(request.drive).map_or("", |drive| &drive.name)
 }
@@ -236,6 +244,12 @@ fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
         text += &bus_text(bus, settings, &memory(past, taken.reach));
         text.push('\n');
     }
+    for profile in unverified(settings) {
+        let _ = writeln!(
+            text,
+            "profile {profile}: not verified on hardware, see docs/verifying.md\n"
+        );
+    }
     let total = taken.total(settings).div_ceil(1 << 20);
     let _ = writeln!(text, "memory at most {total} MiB for the gateway\n");
     let drives: usize = settings.buses.iter().map(|bus| bus.drives.len()).sum();
@@ -243,6 +257,7 @@ fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
         let drives = counted(drives, "drive", "drives");
         let _ = writeln!(text, "Home Assistant: {drives} announced below {prefix}/device\n");
     }
+    text += &bacnet(settings);
     let warnings = match warnings {
         0 => "no warnings".to_string(),
         1 => "1 warning".to_string(),
@@ -304,6 +319,24 @@ fn functions(bus: &BusSettings) -> String {
         (!notes.is_empty()).then(|| format!("  writes      {}: {}\n", drive.name, notes.join("; ")))
     };
     controlled.filter_map(line).collect()
+}
+
+/// Octets of a notification of a change, with the headers of UDP, IP and Ethernet.
+const NOTIFICATION: usize = 120;
+
+/// What BACnet shows, and what it costs to tell all of it once; it adds nothing to the lines of the drives.
+fn bacnet(settings: &Settings) -> String {
+    let (Some(options), Some(devices)) = (&settings.bacnet, super::map::bacnet::devices(settings)) else {
+        return String::new();
+    };
+    let objects: usize = devices.iter().map(|shown| shown.device.objects().len()).sum();
+    format!(
+        "BACnet/IP on {}: {} with {}; a change of all of them takes {} kB of notifications for each subscriber, nothing on the lines\n\n",
+        options.listen,
+        counted(devices.len(), "device", "devices"),
+        counted(objects, "object", "objects"),
+        (objects * NOTIFICATION).div_ceil(1000),
+    )
 }
 
 /// Where tools reach the line, one line a slot.

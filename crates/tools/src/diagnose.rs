@@ -129,6 +129,14 @@ fn text(diagnosis: &Diagnosis) -> String {
             one.stray_before,
             one.slowest_ms
         );
+        if let Some(by_drive) = &one.by_drive {
+            let _ = writeln!(
+                text,
+                "    counted by the drive: {} sound and {} damaged messages on the line, {} to it, {} of them unanswered, {} \
+                 exceptions",
+                by_drive.messages, by_drive.damaged, by_drive.own, by_drive.unanswered, by_drive.exceptions
+            );
+        }
     }
     text
 }
@@ -145,6 +153,7 @@ mod tests {
             time: None,
             verdicts: Vec::new(),
             drives: vec![Counted {
+                by_drive: None,
                 drive: "pump-1".to_string(),
                 ..Counted::default()
             }],

@@ -1,5 +1,6 @@
-//! `drivegate map`: the Modbus TCP register map of a configuration, for the SCADA engineer.
+//! `drivegate map`: the Modbus TCP register map of a configuration, for the SCADA engineer, or its BACnet objects.
 
+pub(crate) mod bacnet;
 mod export;
 mod rows;
 mod text;
@@ -18,11 +19,12 @@ use crate::north::modbus_tcp::Role;
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{BusImage, DriveImage, DriveSpec};
 
-/// Prints the Modbus TCP register map of a configuration, for the SCADA engineer.
+/// Prints the Modbus TCP register map of a configuration, or its BACnet objects, for the SCADA engineer.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate map --config /etc/drivegate/drivegate.toml --csv > registers.csv
-  drivegate map --config /etc/drivegate/drivegate.toml --json --listener 127.0.0.1:1503")]
+  drivegate map --config /etc/drivegate/drivegate.toml --json --listener 127.0.0.1:1503
+  drivegate map --config /etc/drivegate/drivegate.toml --bacnet --ede plant.csv")]
 pub(super) struct Args {
     /// Configuration file
     #[arg(long, value_name = "FILE", default_value = DEFAULT_CONFIG)]
@@ -33,6 +35,12 @@ pub(super) struct Args {
     /// JSON: listeners, units and registers
     #[arg(long, conflicts_with = "csv")]
     json: bool,
+    /// BACnet objects instead: device, object, name, type, unit, access
+    #[arg(long, conflicts_with_all = ["json", "listener"])]
+    bacnet: bool,
+    /// Also write an EDE table to FILE, with the tables of state texts and units beside it
+    #[arg(long, value_name = "FILE", requires = "bacnet")]
+    ede: Option<PathBuf>,
     /// Only the units of the listener at this address
     #[arg(long, value_name = "ADDRESS")]
     listener: Option<SocketAddr>,
@@ -53,6 +61,9 @@ pub(super) fn run(args: &Args) -> ExitCode {
     let Some(settings) = loaded.settings else {
         return ExitCode::from(EXIT_CONFIG);
     };
+    if args.bacnet {
+        return bacnet::run(&settings, args.csv, args.ede.as_deref());
+    }
     let listeners = listeners(&settings);
     let shown = match args.listener {
         None => None,

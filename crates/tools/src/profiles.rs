@@ -1,14 +1,21 @@
 //! `drivegate profiles`: the drive families and their points.
 
+mod commands;
+mod import;
+mod new;
+
 use std::fmt::Write;
-use std::path::PathBuf;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use super::{EXIT_CONFIG, EXIT_USAGE, printable, report};
 use crate::codec::Protocol;
 use crate::codec::n2::ASSUMPTIONS;
 use crate::config::{Settings, environment, unknown_profile};
-use crate::document::{Problem, format_duration};
+use crate::document::{Finding, Problem, format_duration};
+use crate::drive::control::Mask;
 use crate::drive::profile::{AddressRange, Form, Profiles};
 use crate::drive::{Bound, Derived, Point, Profile, Source, Step};
 
@@ -44,6 +51,23 @@ enum What {
         #[arg(long)]
         toml: bool,
     },
+    /// Prints the beginning of a profile, from a frame or over another profile.
+    #[command(after_help = "Examples:\n  drivegate profiles new our-drive > our-drive.toml\n  \
+            drivegate profiles new our-pump --base danfoss-fc > /etc/drivegate/profiles/our-pump.toml")]
+    New {
+        /// Name of the new profile.
+        name: String,
+        /// The profile from which it differs.
+        #[arg(long, value_name = "FAMILY")]
+        base: Option<String>,
+    },
+    /// Prints the profile that a register list (CSV) makes; the columns are in docs/profiles.md.
+    #[command(after_help = "Examples:\n  drivegate profiles import our-meter.csv > our-meter.toml")]
+    Import {
+        /// The list, with a header line.
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+    },
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
@@ -63,17 +87,70 @@ pub(super) fn run(args: &Args) -> ExitCode {
         report::errors(&problems);
         return ExitCode::from(EXIT_CONFIG);
     }
-    let Some(What::Show { name, toml }) = &args.what else {
-        return report::print(&list(&profiles));
+    match &args.what {
+        None => report::print(&list(&profiles)),
+        Some(What::Show { name, toml }) => match profiles.get(name) {
+            Some(profile) if *toml => report::print(&profile.text),
+            Some(profile) => report::print(&show(profile)),
+            None => unknown(name, "NAME", &profiles),
+        },
+        Some(What::New { name, base }) => begin(name, base.as_deref(), &profiles),
+        Some(What::Import { file }) => match read_list(file).and_then(|text| import::profile(file, &text)) {
+            Ok(text) => report::print(&text),
+            Err(problems) => {
+                report::errors(&problems);
+                ExitCode::from(EXIT_CONFIG)
+            }
+        },
+    }
+}
+
+fn unknown(name: &str, key: &str, profiles: &Profiles) -> ExitCode {
+    let unknown = unknown_profile(name, profiles, false);
+    report::errors(&[Problem::of_file("command line", key, unknown)]);
+    ExitCode::from(EXIT_USAGE)
+}
+
+fn begin(name: &str, base: Option<&str>, profiles: &Profiles) -> ExitCode {
+    let text = match base.map(|base| (base, profiles.get(base))) {
+        None => new::frame(name),
+        Some((_, Some(base))) => new::over(name, base),
+        Some((base, None)) => return unknown(base, "--base", profiles),
     };
-    match profiles.get(name) {
-        Some(profile) if *toml => report::print(&profile.text),
-        Some(profile) => report::print(&show(profile)),
-        None => {
-            let unknown = unknown_profile(name, &profiles, false);
-            report::errors(&[Problem::of_file("command line", "NAME", unknown)]);
-            ExitCode::from(EXIT_USAGE)
+    let is_valid = name.starts_with(|c: char| c.is_ascii_lowercase())
+        && name
+            .chars()
+            .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-');
+    if is_valid {
+        return report::print(&text);
+    }
+    let invalid = Finding::new(
+        format!("`{}` is not a valid name", printable::line(name)),
+        "write a-z, 0-9 and -, starting with a letter",
+    );
+    report::errors(&[Problem::of_file("command line", "NAME", invalid)]);
+    ExitCode::from(EXIT_USAGE)
+}
+
+/// Longest list that is read.
+const MOST_BYTES: u64 = 16 << 20;
+
+fn read_list(file: &Path) -> Result<String, Vec<Problem>> {
+    let problem = |what: String, remedy: &str| {
+        let finding = Finding::new(what, remedy);
+        vec![Problem::of_file(file.display().to_string(), "", finding)]
+    };
+    let mut text = String::new();
+    let read = File::open(file).and_then(|open| open.take(MOST_BYTES + 1).read_to_string(&mut text));
+    match read {
+        Ok(_) if text.len() as u64 > MOST_BYTES => {
+            Err(problem("the list is longer than 16 MiB".to_string(), "split it"))
         }
+        Ok(_) => Ok(text),
+        Err(error) => Err(problem(
+            format!("cannot read the list: {error}"),
+            "check its path and its permissions; it must be UTF-8",
+        )),
     }
 }
 
@@ -85,7 +162,10 @@ fn list(profiles: &Profiles) -> String {
             profile.points.len().to_string(),
             protocols(profile),
             origin(profile).to_string(),
-            profile.title.clone(),
+            match profile.verified {
+                true => profile.title.clone(),
+                false => format!("{} ({NOT_VERIFIED})", profile.title),
+            },
         ]);
     }
     report::lines(&table)
@@ -110,6 +190,7 @@ fn show(profile: &Profile) -> String {
     let mut text = format!("{}: {}\n\n", profile.name, printable::line(&profile.title));
     for (what, value) in [
         ("origin", origin(profile).to_string()),
+        ("verified", unverified(profile).to_string()),
         ("based on", profile.base.clone().unwrap_or_default()),
         ("source", profile.source.clone()),
         ("protocols", protocols(profile)),
@@ -169,6 +250,13 @@ fn show(profile: &Profile) -> String {
     if !profile.commissioning.is_empty() {
         text += "\nCommissioning\n";
         text += &commissioning(profile);
+    }
+    if let Some(control) = &profile.control {
+        text += "\nCommands\n";
+        for (what, words) in commands::lines(profile, control) {
+            // Writing to a String cannot fail.
+            let _ = writeln!(text, "  {what:<14}{words}");
+        }
     }
     text += "\nPoints; addresses are those of the PDU, counted from 0\n\n";
     text += &points(profile);
@@ -272,6 +360,13 @@ fn remarks(profile: &Profile, point: &Point) -> String {
     if point.on_change {
         parts.push("written on change only".to_string());
     }
+    if point.hidden {
+        parts.push("hidden: for other points only".to_string());
+    }
+    if let Some(raw) = point.raw().filter(|raw| !raw.invalid.is_empty()) {
+        let values: Vec<String> = raw.invalid.iter().map(|value| format!("{value:#06x}")).collect();
+        parts.push(format!("{} means not available", values.join(", ")));
+    }
     if !point.texts.is_empty() {
         let texts: Vec<String> = point
             .texts
@@ -284,6 +379,14 @@ fn remarks(profile: &Profile, point: &Point) -> String {
         parts.push(point.note.clone());
     }
     parts.join("; ")
+}
+
+/// That nobody has seen the profile right on hardware; empty otherwise.
+fn unverified(profile: &Profile) -> &'static str {
+    match profile.verified {
+        true => "",
+        false => "no: nobody has confirmed it on hardware yet; docs/verifying.md says how to",
+    }
 }
 
 fn verified(verified: bool) -> &'static str {
@@ -308,11 +411,11 @@ fn place(profile: &Profile, point: &Point) -> (String, String, String) {
             } else {
                 format!(" {:+}", raw.offset)
             };
-            let scale = format!("{}{offset}", raw.scale);
-            let form = raw.form.word_order().map_or_else(
-                || raw.form.name().to_string(),
-                |order| format!("{} {}", raw.form.name(), order.name()),
-            );
+            let scale = match raw.scale_from {
+                Some(power) => format!("10^{}", name_of(profile, power)),
+                None => format!("{}{offset}", raw.scale),
+            };
+            let form = raw.type_text();
             match raw.form {
                 Form::Bit { .. } if raw.table.is_bits() => (at, form, String::new()),
                 Form::Bit { bit, invert } => {
@@ -357,6 +460,10 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
         }
         Derived::Zero { within, .. } => format!("true up to {within}"),
         Derived::Equal { within, .. } => format!("true while they differ by {within} at most"),
+        Derived::State { any } => {
+            let one = |state: &Mask| format!("{:#06x} of {:#06x}", state.is, state.mask);
+            any.iter().map(one).collect::<Vec<_>>().join(" or ")
+        }
         Derived::All { .. } => "true while all of them are".to_string(),
         Derived::LowestBit { .. } => "number of the lowest bit that is set, counted from 1".to_string(),
     }

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use super::drive_access::{Target, Way, target};
 use super::{EXIT_FAILED, EXIT_USAGE, printable, report};
 use crate::drive::model::Kind;
-use crate::drive::{Point, Value};
+use crate::drive::{Point, RESTART_COMMUNICATION, Value};
 use crate::north::local::protocol::{Outcome, Request, Setting, WriteOutcome, WriteRequest};
 use crate::process_image::value_or_null;
 
@@ -56,6 +56,21 @@ fn parse(target: &Target, text: &str) -> Result<(Setting, String), String> {
     let (name, text) = text.split_once('=').ok_or_else(|| {
         format!("expected POINT=VALUE, got `{text}`; command line; write for example speed_reference=50")
     })?;
+    let profile = &target.spec.profile;
+    if name.trim() == RESTART_COMMUNICATION && profile.counts_messages {
+        return match text.trim() {
+            "true" => Ok((
+                Setting {
+                    point: RESTART_COMMUNICATION.to_string(),
+                    value: true.into(),
+                },
+                format!("{RESTART_COMMUNICATION}=true"),
+            )),
+            other => Err(format!(
+                "`{other}` is not a value of `{RESTART_COMMUNICATION}`; write true"
+            )),
+        };
+    }
     let index = target.point(name.trim())?;
     let point = target.spec.profile.points.get(index);
     let point = point.ok_or_else(|| format!("there is no point `{name}`; command line; name another"))?;
@@ -83,13 +98,14 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
         let name = &point.name;
         format!("`{text}` is not a value of `{name}`; command line; write {wanted}")
     };
-    let meaning = point.texts.iter().find(|(_, meaning)| meaning.as_str() == text);
+    let meaning = point.code_of(text);
     match (point.kind(), text.to_ascii_lowercase().as_str()) {
         (Kind::Bool, "true" | "on" | "yes" | "1") => Ok(Value::Bool(true)),
         (Kind::Bool, "false" | "off" | "no" | "0") => Ok(Value::Bool(false)),
         (Kind::Bool, _) => Err(bad("true or false, on or off, yes or no, 1 or 0")),
-        _ if meaning.is_some() => Ok(Value::Integer(meaning.map_or(0, |(code, _)| *code))),
+        _ if meaning.is_some() => Ok(Value::Integer(meaning.unwrap_or_default())),
         (Kind::Integer, _) => text.parse().map(Value::Integer).map_err(|_| bad("a whole number")),
+        (Kind::Text, _) => Err(bad("another point: this one is a text, which is only read")),
         (Kind::Number, _) => {
             let number = text.parse::<f64>().ok().filter(|n| n.is_finite());
             number.map(Value::Number).ok_or_else(|| bad("a number"))

@@ -281,6 +281,7 @@ pub(crate) fn diagnose(bus: &BusHandle) {
         since: "2026-03-02T06:11:09.480Z".to_string(),
     };
     let counted = |drive: &Arc<DriveImage>| Counted {
+        by_drive: None,
         drive: drive.spec.name.clone(),
         ..Counted::default()
     };

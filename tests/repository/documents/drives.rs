@@ -32,14 +32,29 @@ pub(crate) fn tables() -> String {
         }
     }
     text += &applications(&profiles);
+    let unverified = unverified(&profiles);
+    text += &unverified.0;
     text += &assumptions();
     text.push('\n');
     assert_eq!(
         profiles.iter().count(),
-        MODBUS.len() + N2.len() + APPLICATIONS.len(),
+        MODBUS.len() + N2.len() + APPLICATIONS.len() + unverified.1,
         "a family is missing here"
     );
     text
+}
+
+/// The families that nobody has confirmed on hardware, and how many they are.
+fn unverified(profiles: &Profiles) -> (String, usize) {
+    let mut text = String::from(
+        "\n## Families not verified on hardware\n\nMade from manuals and reports, not confirmed ([how to](verifying.md)); \
+         `drivegate profiles show NAME` has points, settings and sources.\n\n|profile|drives|\n|---|---|\n",
+    );
+    let all: Vec<&std::sync::Arc<Profile>> = profiles.iter().filter(|profile| !profile.verified).collect();
+    for profile in &all {
+        let _ = writeln!(text, "|`{}`|{}|", profile.name, profile.title);
+    }
+    (text, all.len())
 }
 
 fn model(profiles: &Profiles, names: &[&str]) -> String {
@@ -145,6 +160,7 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
         }
         Derived::Zero { of, .. } => format!("{} = 0", name(of)),
         Derived::Equal { of, to, .. } => format!("{} = {}", name(of), name(to)),
+        Derived::State { any } => format!("{} states", any.len()),
         Derived::All { of } => of.iter().map(name).collect::<Vec<_>>().join(" and "),
         Derived::LowestBit { of } => format!("lowest bit of {}", name(of)),
     }

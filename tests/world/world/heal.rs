@@ -44,7 +44,7 @@ impl World {
         let slow = self
             .buses
             .iter()
-            .map(|bus| 2 * bus.slow_round)
+            .map(|bus| 2 * bus.first_slow_round)
             .max()
             .unwrap_or_default();
         let away = PROBED + longest + COMMANDED.max(slow);
@@ -106,7 +106,7 @@ impl World {
         }
         // A slow read of another look settles whether answers are those to the request before.
         let settled = (0..self.buses.len())
-            .map(|bus| self.rounds(bus) + 2 * self.buses[bus].slow_round)
+            .map(|bus| self.rounds(bus) + 2 * self.buses[bus].first_slow_round)
             .max();
         self.healing = Some(Healing {
             since: now,

@@ -39,7 +39,10 @@ impl World {
         );
         if !asked.is_poll || self.history.is_long() {
             let text = pdu.clone();
-            self.note(move || format!("line{bus} drive {} <- {text:?}", drive + 1));
+            self.note(move || format!("line{bus} drive {} <- {text:?}", drive.wrapping_add(1)));
+        }
+        if drive == NO_DRIVE {
+            return self.line_stopped(bus, pdu);
         }
         self.truths[bus][drive].asked = Some(now);
         if !pdu.is_write() {
@@ -96,6 +99,18 @@ impl World {
             }
         }
         self.check_unique(bus, drive, pdu);
+    }
+
+    /// The only broadcast that the gateway sends of itself: the stop of a line all of whose drives are to be stopped.
+    fn line_stopped(&mut self, bus: usize, pdu: &RequestPdu) {
+        let stops = run_command(&self.buses[bus].profile, pdu) == Some(false);
+        assert!(self.buses[bus].ending && stops, "a broadcast {pdu:?}");
+        let drives = &self.buses[bus].handle.image.drives;
+        let all = drives.iter().all(|drive| drive.spec.on_shutdown == OnShutdown::Stop);
+        assert!(all, "a drive that is to go on is stopped with the others");
+        for truth in &mut self.truths[bus] {
+            truth.stop_sent = Some(self.now);
+        }
     }
 
     /// A write contains the control word, or sets only what writable points and the configuration name.
@@ -247,7 +262,11 @@ impl World {
         let profile = self.buses[bus].profile.clone();
         let refused = matches!(asked.reply, Some(Reply::Exception(_)));
         let words = asked.reply.as_ref().and_then(Reply::words);
-        let truth = &mut self.truths[bus][asked.drive];
+        let drive = match asked.drive {
+            NO_DRIVE => usize::from(asked.acted) - 1,
+            drive => drive,
+        };
+        let truth = &mut self.truths[bus][drive];
         if refused {
             return;
         }

@@ -8,8 +8,8 @@ use super::{Master, Purpose, Turn, TurnEnd};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{
-    BackgroundRequest, Command, Interruption, NO_DRIVE, Order, Outcome, Pace, PassedOn, Pending, Refusal, Touched,
-    Urgency, written,
+    BackgroundRequest, Chosen, Command, Interruption, NO_DRIVE, Order, Outcome, Pace, PassedOn, Pending, Refusal,
+    SourceKind, Touched, Urgency, written,
 };
 use crate::drive::plan::WireTime;
 use crate::drive::{PlannedRead, PollClass};
@@ -20,12 +20,11 @@ use crate::n2_session::{N2Sessions, Progress};
 use crate::news::News;
 use crate::process_image::DriveImage;
 use crate::schedule::Admission;
+use crate::stop_of_line::BROADCAST_PAUSE;
 use crate::transaction::{CONNECTION_CLOSED, Ended};
 
 /// Time of an exchange whose request is not decoded, at most.
 const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);
-/// Time that drives have to carry out a broadcast before the next request (MODBUS over Serial Line 1.02, 2.4.1).
-const BROADCAST_PAUSE: Duration = Duration::from_millis(100);
 
 /// A background request that has its turn.
 #[derive(Debug)]
@@ -174,6 +173,25 @@ impl Master {
         if pending.is_empty() {
             return Err(None);
         }
+        let (chosen, blocked) = self.next_passed_on(&mut pending, now);
+        let Some((chosen, command)) = chosen.and_then(|chosen| Some((chosen, pending.get(chosen)?))) else {
+            return Err(blocked);
+        };
+        let Order::Write(pdu) = &command.order else {
+            return Err(blocked);
+        };
+        let cost = self.exchange_cost(command.drive, pdu);
+        let admission = self.schedule.admits_background(Pace::Brisk, cost, idle, now);
+        if let Admission::NotBefore(at) = admission {
+            return Err(blocked.into_iter().chain([at]).min());
+        }
+        let command = pending.take(chosen).ok_or(blocked)?;
+        drop(pending);
+        self.begin_passed_on(command, Some(admission), now).ok_or(None)
+    }
+
+    /// What is passed on next, and when to look again where something must wait.
+    fn next_passed_on(&mut self, pending: &mut Pending, now: Instant) -> (Option<Chosen>, Option<Instant>) {
         let mut blocked: Option<Instant> = None;
         let Master {
             drives,
@@ -195,20 +213,20 @@ impl Master {
                 false
             })
         });
-        let Some((chosen, command)) = chosen.and_then(|chosen| Some((chosen, pending.get(chosen)?))) else {
-            return Err(blocked);
-        };
-        let Order::Write(pdu) = &command.order else {
-            return Err(blocked);
-        };
-        let cost = self.exchange_cost(command.drive, pdu);
-        let admission = self.schedule.admits_background(Pace::Brisk, cost, idle, now);
-        if let Admission::NotBefore(at) = admission {
-            return Err(blocked.into_iter().chain([at]).min());
-        }
-        let command = pending.take(chosen).ok_or(blocked)?;
+        (chosen, blocked)
+    }
+
+    /// The broadcast of the shutdown, if it may go: the line is free for it.
+    ///
+    /// # Errors
+    /// When to look again; none where none waits.
+    pub(super) fn stop_the_line(&mut self, now: Instant) -> Result<Turn, Option<Instant>> {
+        let queue = self.bus.queue.clone();
+        let mut pending = queue.lock();
+        let (chosen, blocked) = self.next_passed_on(&mut pending, now);
+        let command = chosen.and_then(|chosen| pending.take(chosen)).ok_or(blocked)?;
         drop(pending);
-        self.begin_passed_on(command, Some(admission), now).ok_or(None)
+        self.begin_passed_on(command, None, now).ok_or(None)
     }
 
     /// Begins what is passed on and was taken from the queue.
@@ -357,6 +375,18 @@ impl Master {
             let outcome = if begun.sent { Outcome::Interrupted(why) } else { unsent };
             begun.request.answer(outcome, now);
         }
+    }
+
+    /// Whether a background exchange has its turn that somebody asked for.
+    pub(super) fn background_of_others(&self) -> bool {
+        let begun = self.background.as_ref();
+        begun.is_some_and(|begun| !begun.request.is_of_gateway())
+    }
+
+    /// Whether the background exchange is the broadcast of the shutdown.
+    pub(super) fn stops_the_line(&self) -> bool {
+        let begun = self.background.as_ref();
+        begun.is_some_and(|begun| begun.request.ticket.origin().kind == SourceKind::Shutdown)
     }
 
     /// A background exchange is over: it is answered, whatever came of it.

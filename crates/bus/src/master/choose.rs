@@ -111,11 +111,17 @@ impl Master {
         }
         let rank = self.turns.rank(|rank| commands.waits(rank));
         if self.shutdown.is_some() {
-            self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
+            if !self.stops_the_line() {
+                self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
+            }
             // Polls cease: the line belongs to the stops.
             return match rank {
                 Some(rank) => self.command(rank, &mut commands, now),
-                None => Some(Err(commands.wake_at.unwrap_or(now + super::LOOK_ROUND))),
+                // The broadcast that stops the whole line goes before the stops that wait for it.
+                None => Some(
+                    self.stop_the_line(now)
+                        .map_err(|_| commands.wake_at.unwrap_or(now + super::LOOK_ROUND)),
+                ),
             };
         }
         let highest = RANKS.into_iter().find(|rank| commands.waits(*rank));

@@ -38,8 +38,8 @@ impl Master {
         Remains {
             late_replies: late.sum::<usize>() + self.n2_late.owed(now),
             strangers: self.strangers.values().filter(|late| late.may_come(now)).count(),
-            begun: sum(DriveState::has_runs) + usize::from(self.background.is_some()),
-            waiting: self.bus.queue.lock().len() + usize::from(!self.bus.queue.background().is_empty()),
+            begun: sum(DriveState::has_runs) + usize::from(self.background_of_others()),
+            waiting: self.bus.queue.lock().len() + usize::from(self.bus.queue.background().has_of_others()),
             unconfirmed: sum(|drive| !drive.confirmations.is_empty()),
             held_stops: self
                 .drives

@@ -11,7 +11,7 @@ use crate::drive::{PlannedRead, Point, Raw};
 use crate::n2_late_replies::Asked;
 use crate::n2_session::Progress;
 use crate::news::News;
-use crate::schedule::{Change, Poll, Polled};
+use crate::schedule::{Change, Poll, Polled, TRIAL_PAUSE};
 use crate::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 
 impl Master {
@@ -45,6 +45,16 @@ impl Master {
         let wanted: Vec<_> = points.map(|raw| (raw.table, raw.address)).collect();
         let covers = |read: &PlannedRead| wanted.iter().any(|(table, address)| read.covers(*table, *address));
         self.schedule.fault_came(drive, covers, now);
+    }
+
+    /// Monitoring points are to be read then.
+    pub fn monitor(&mut self, drive: usize, point: usize, at: Instant) {
+        let Some(image) = self.bus.image.drives.get(drive) else {
+            return;
+        };
+        let raw = image.spec.profile.points.get(point).and_then(Point::raw);
+        let covers = |read: &PlannedRead| raw.is_some_and(|raw| read.covers(raw.table, raw.address));
+        self.schedule.monitor(drive, covers, at);
     }
 
     /// What may still come of the exchange: nothing where the drive's own reply came mangled, unless a late reply of an
@@ -190,6 +200,10 @@ impl Master {
             // A gateway in between reaches nobody: its word is no sign of the drive.
             Ended::Reply(reply) if says_no_answer(&reply) => Polled::Failed,
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(code),
+            Ended::Reply(reply) if self.proves_nothing(poll, &reply) => {
+                self.schedule.not_proved(poll.drive, &poll.read, TRIAL_PAUSE.1, now);
+                Polled::Ok
+            }
             Ended::Reply(reply) => {
                 self.read(poll.drive, poll.read, reply, end.began, now, news);
                 Polled::Ok
@@ -213,6 +227,21 @@ impl Master {
             Change::Unavailable(read, exception) => news.push(News::Unavailable(poll.drive, read, exception)),
             Change::None => {}
         }
+    }
+
+    /// Whether the reply is one to a read that no manual states, and may be that of a drive which ignores the number of items: all
+    /// behind the first is 0. One that shows more proves the read for good, until the drive goes away.
+    fn proves_nothing(&mut self, poll: &Poll, reply: &Reply) -> bool {
+        if !self.schedule.is_trial(poll.drive, &poll.read) {
+            return false;
+        }
+        let shows_more = reply
+            .words()
+            .is_some_and(|words| words.iter().skip(1).any(|word| *word != 0));
+        if shows_more {
+            self.schedule.proved(poll.drive, &poll.read);
+        }
+        !shows_more
     }
 
     /// The drive does not answer any more: whoever waits for it is answered, but for the stop, which is its probe.

@@ -1,6 +1,7 @@
 //! The end of the gateway: polls cease, and each drive that is configured so gets its stop.
 
 use std::sync::Arc;
+use std::task::{Context, Waker};
 use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot::Receiver;
@@ -10,9 +11,13 @@ use super::Master;
 use crate::command::{Answer, NotStopped, Origin, Outcome, SourceKind, Stopping, WriteStats};
 use crate::drive::{ModelPoint, Value};
 use crate::drive_state::FRESH;
-use crate::plant::BusHandle;
+use crate::plant::{BusHandle, Exchange, Question, Target};
 use crate::process_image::{Access, OnShutdown};
+use crate::stop_of_line::stop_of_line;
 
+/// How long the stops wait for a broadcast that goes before them: an exchange that is on the line, the broadcast, and the time
+/// that the drives have to carry it out.
+const BROADCAST: Duration = Duration::from_millis(500);
 /// Wait before a stop that was not acknowledged is ordered again.
 const AGAIN: Duration = Duration::from_millis(20);
 
@@ -21,6 +26,8 @@ const AGAIN: Duration = Duration::from_millis(20);
 pub(super) struct Shutdown {
     /// None once it is reported.
     stopping: Option<Stopping>,
+    /// The broadcast that goes before all stops, and until when they wait for it.
+    broadcast: Option<(Exchange, Instant)>,
     stops: Vec<Stop>,
 }
 
@@ -74,7 +81,7 @@ impl Stop {
 }
 
 impl Shutdown {
-    fn new(stopping: Stopping, bus: &BusHandle, now: Instant) -> Shutdown {
+    fn new(stopping: Stopping, bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Shutdown {
         let drives = bus.image.drives.iter().enumerate();
         let wanted = drives
             .filter(|(_, image)| image.spec.on_shutdown == OnShutdown::Stop && image.spec.access == Access::Control);
@@ -86,8 +93,22 @@ impl Shutdown {
         };
         Shutdown {
             stopping: Some(stopping),
+            broadcast: broadcast(bus, writes, now).map(|exchange| (exchange, now + BROADCAST)),
             stops: wanted.map(stop).collect(),
         }
+    }
+
+    /// Whether the stops still wait for the broadcast.
+    fn waits_for_broadcast(&mut self, now: Instant) -> bool {
+        let Some((exchange, until)) = &mut self.broadcast else {
+            return false;
+        };
+        let over = exchange.poll(&mut Context::from_waker(Waker::noop())).is_ready();
+        if over || now >= *until {
+            // Dropped, it is taken back where it was not sent.
+            self.broadcast = None;
+        }
+        self.broadcast.is_some()
     }
 
     /// Reports the drives that were not stopped, in words.
@@ -112,8 +133,10 @@ impl Shutdown {
 impl Master {
     /// Begins the shutdown when it is asked for; orders what is due, ends when all is done or its time is over.
     pub(super) fn look_at_shutdown(&mut self, now: Instant) {
-        if let Some(stopping) = self.bus.queue.lock().take_stopping() {
-            self.shutdown = Some(Shutdown::new(stopping, &self.bus, now));
+        // The queue is free again when the broadcast is put into it.
+        let stopping = self.bus.queue.lock().take_stopping();
+        if let Some(stopping) = stopping {
+            self.shutdown = Some(Shutdown::new(stopping, &self.bus, &self.writes, now));
         }
         let Master {
             shutdown,
@@ -126,6 +149,9 @@ impl Master {
         let Some(deadline) = shutdown.stopping.as_ref().map(Stopping::deadline) else {
             return;
         };
+        if shutdown.waits_for_broadcast(now) {
+            return;
+        }
         shutdown.stops.iter_mut().for_each(|stop| stop.look(now));
         if shutdown.stops.iter().all(Stop::is_over) || now >= deadline {
             shutdown.end(bus);
@@ -142,6 +168,26 @@ impl Master {
             }
         }
     }
+}
+
+/// The broadcast that stops all drives of the bus, where all of them are to be stopped and one of them answers.
+fn broadcast(bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Option<Exchange> {
+    let drives = &bus.image.drives;
+    let all = drives
+        .iter()
+        .all(|image| matches!(image.spec.on_shutdown, OnShutdown::Stop));
+    let online = drives.iter().any(|image| image.snapshot().link.is_online());
+    let pdu =
+        stop_of_line(bus.image.spec.protocol, drives.iter().map(|image| &image.spec)).filter(|_| all && online)?;
+    let question = Question {
+        target: Target::Address(0),
+        pdu,
+        may_write: true,
+        asked: now,
+        expires: now + BROADCAST,
+        origin: Origin::new(SourceKind::Shutdown, "on_shutdown"),
+    };
+    Some(bus.ask(question, writes, now))
 }
 
 fn order(bus: &BusHandle, drive: usize, deadline: Instant, writes: &Arc<WriteStats>, now: Instant) -> State {

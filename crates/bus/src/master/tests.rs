@@ -8,7 +8,7 @@ use tokio::sync::oneshot::Receiver;
 use super::*;
 use crate::codec::wire::Silence;
 use crate::codec::{Exception, LineFormat, Reply, Table};
-use crate::command::{Answer, Authority, Command, CommandQueue, Order, Ticket, admit};
+use crate::command::{Answer, Authority, Command, CommandQueue, NO_DRIVE, Order, Ticket, admit};
 use crate::drive::profile::Profiles;
 use crate::drive::{ModelPoint, PollClass, Value};
 use crate::line::LineOptions;
@@ -91,6 +91,8 @@ struct Rig {
     master: Master,
     stats: Arc<WriteStats>,
     drives: Vec<Registers>,
+    /// They do not hear a broadcast.
+    deaf: bool,
     news: Vec<News>,
     /// All that went onto the line.
     wire: Vec<(Instant, Turn)>,
@@ -107,6 +109,16 @@ impl Rig {
     }
 
     fn at(drives: u8, profile: &str, protocol: Protocol, cycle: Duration) -> Rig {
+        Rig::with(drives, profile, protocol, cycle, |spec| spec)
+    }
+
+    fn with(
+        drives: u8,
+        profile: &str,
+        protocol: Protocol,
+        cycle: Duration,
+        other: impl Fn(DriveSpec) -> DriveSpec,
+    ) -> Rig {
         let profile = Profiles::built_in().get(profile).unwrap().clone();
         let spec = |address| DriveSpec {
             access: Access::Control,
@@ -119,7 +131,8 @@ impl Rig {
             }),
             ..DriveSpec::new(&format!("d{address}"), "b", address, profile.clone())
         };
-        let images = (1..=drives).map(|address| Arc::new(DriveImage::new(spec(address), Duration::from_secs(1))));
+        let images =
+            (1..=drives).map(|address| Arc::new(DriveImage::new(other(spec(address)), Duration::from_secs(1))));
         let bus = BusSpec {
             name: "b".to_string(),
             port: "none".to_string(),
@@ -148,6 +161,7 @@ impl Rig {
             master,
             stats,
             drives: (0..drives).map(|_| Registers::default()).collect(),
+            deaf: false,
             news: Vec::new(),
             wire: Vec::new(),
             now,
@@ -167,7 +181,16 @@ impl Rig {
             Ok(turn) => {
                 self.master.sending(&turn, self.now);
                 let began = self.now;
-                let ended = self.drives[turn.drive].answer(turn.pdu());
+                let ended = match self.master.stranger(&turn) {
+                    Some(0) => {
+                        let heard = self.drives.iter_mut().filter(|drive| !drive.silent && !self.deaf);
+                        for drive in heard {
+                            drive.answer(turn.pdu());
+                        }
+                        Ended::Silent
+                    }
+                    _ => self.drives[turn.drive].answer(turn.pdu()),
+                };
                 let took = if ended == Ended::Silent { TIMEOUT } else { COST };
                 self.now += took;
                 let mangled = false;
@@ -471,6 +494,63 @@ fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
         rig.wire[from..].iter().find(stop).map(|(at, _)| *at - begin)
     });
     assert!(last.max().unwrap() < COST * 60);
+}
+
+/// Times, after the begin, of the frames of a shutdown: the broadcast and the first single stop.
+fn shutdown_of(rig: &mut Rig) -> (Option<Duration>, Duration) {
+    let (from, begin) = (rig.wire.len(), rig.now);
+    let deadline = begin + Duration::from_secs(5);
+    let mut missing = rig.bus.queue.begin_shutdown(deadline, begin);
+    let missing = loop {
+        rig.step();
+        if let Ok(missing) = missing.try_recv() {
+            break missing;
+        }
+        assert!(rig.now < deadline + TIMEOUT * 2, "{:?}", rig.wire.get(from..));
+    };
+    assert!(missing.is_empty(), "{missing:?}");
+    let first = |broadcast: bool| {
+        let mut sent = rig.wire[from..].iter();
+        let found = sent.find(|(_, turn)| turn.pdu().is_write() && (turn.drive == NO_DRIVE) == broadcast);
+        found.map(|(at, _)| *at - begin)
+    };
+    (first(true), first(false).expect("each drive has a stop of its own"))
+}
+
+#[test]
+fn one_broadcast_stops_the_line_before_each_drive_has_its_own_stop() {
+    let running = |deaf: bool| {
+        let mut rig = Rig::new(20);
+        rig.deaf = deaf;
+        for drive in &mut rig.drives {
+            drive.holding.insert(2000, 1);
+        }
+        rig
+    };
+    for deaf in [false, true] {
+        let mut rig = running(deaf);
+        let (broadcast, single) = shutdown_of(&mut rig);
+        assert!(broadcast.expect("one broadcast") <= COST, "{broadcast:?}");
+        assert!(single > broadcast.unwrap() && single <= Duration::from_millis(500));
+        // What the broadcast says is not believed.
+        assert!((0..20).all(|drive| !rig.runs(drive)));
+    }
+    // One that is to go on, or that may not be commanded, keeps the others from it.
+    let hold = |spec: DriveSpec| DriveSpec {
+        on_shutdown: if spec.address == 4 {
+            OnShutdown::Hold
+        } else {
+            OnShutdown::Stop
+        },
+        ..spec
+    };
+    let mut rig = Rig::with(20, "vacon-nx", Protocol::ModbusRtu, Duration::from_millis(10), hold);
+    for drive in &mut rig.drives {
+        drive.holding.insert(2000, 1);
+    }
+    let (broadcast, _) = shutdown_of(&mut rig);
+    assert_eq!(broadcast, None);
+    assert!(rig.runs(3) && (0..20).filter(|drive| *drive != 3).all(|drive| !rig.runs(drive)));
 }
 
 #[test]

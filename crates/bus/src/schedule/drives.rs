@@ -22,6 +22,9 @@ const EARLY_PROBES: [Duration; 3] = [
 /// it soon has, one that never has it must not take time from others.
 const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 
+/// Pause before a read that no manual states is tried: where it failed, and where its reply proved nothing.
+pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(20));
+
 /// Process data without a fault for that long shows that the line is sound.
 const SOUND_FOR: Duration = Duration::from_secs(10);
 /// Pause before a slow request is tried again that the drive was too busy for.
@@ -77,6 +80,9 @@ pub(super) struct DriveSchedule {
     pub(super) items: Vec<Item>,
     /// Those that decide its state.
     pub(super) behind_state: Vec<PlannedRead>,
+    /// Reads that are longer than a manual states, and those of them that no reply has proved since the drive came online.
+    trials: Vec<PlannedRead>,
+    pub(super) unproved: Vec<PlannedRead>,
 }
 
 /// The probes of a drive soon after it went away.
@@ -135,6 +141,19 @@ impl EarlyProbes {
     }
 }
 
+/// A read of each item of a block.
+pub(super) fn singles(block: PlannedRead) -> Vec<PlannedRead> {
+    let single = |offset: u16| {
+        Some(PlannedRead {
+            start: block.start.checked_add(offset)?,
+            count: 1,
+            wide: 0,
+            ..block
+        })
+    };
+    (0..block.count).filter_map(single).collect()
+}
+
 impl Item {
     pub(super) fn new(read: PlannedRead, origin: PlannedRead, cost: Duration, now: Instant) -> Item {
         Item {
@@ -148,7 +167,7 @@ impl Item {
             failures: 0,
             failed_at: None,
             wanted: read.class != PollClass::Fault,
-            unread: read.class != PollClass::Fault,
+            unread: !matches!(read.class, PollClass::Fault | PollClass::Monitor),
             asked: None,
             whole_again: None,
         }
@@ -157,7 +176,7 @@ impl Item {
     pub(super) fn is_slow(&self) -> bool {
         match self.read.class {
             PollClass::Slow => true,
-            PollClass::Once | PollClass::Fault => self.wanted,
+            PollClass::Once | PollClass::Fault | PollClass::Monitor => self.wanted,
             PollClass::Fast | PollClass::Never => false,
         }
     }
@@ -165,7 +184,12 @@ impl Item {
 
 impl DriveSchedule {
     /// A drive that was not asked yet.
-    pub(super) fn new(items: Vec<Item>, behind_state: Vec<PlannedRead>, now: Instant) -> DriveSchedule {
+    pub(super) fn new(
+        items: Vec<Item>,
+        behind_state: Vec<PlannedRead>,
+        trials: Vec<PlannedRead>,
+        now: Instant,
+    ) -> DriveSchedule {
         DriveSchedule {
             presence: Presence::Away(now, Duration::ZERO),
             early: EarlyProbes::default(),
@@ -178,7 +202,42 @@ impl DriveSchedule {
             troubled: None,
             items,
             behind_state,
+            unproved: trials.clone(),
+            trials,
         }
+    }
+
+    /// Whether that read is longer than a manual states, and no reply has proved it.
+    pub(super) fn is_trial(&self, read: &PlannedRead) -> bool {
+        read.count > 1 && self.unproved.iter().any(|block| block.covers(read.table, read.start))
+    }
+
+    /// The items of a read are read singly; it is tried again after the pause.
+    pub(super) fn take_apart(&mut self, read: &PlannedRead, now: Instant, pause: Duration) {
+        let Some(index) = self.items.iter().position(|item| item.read == *read && read.count > 1) else {
+            return;
+        };
+        let Some(whole) = self.items.get(index).cloned() else {
+            return;
+        };
+        let parts = singles(*read).into_iter().map(|part| Item {
+            read: part,
+            due: whole.due.min(now),
+            whole_again: Some(now + pause),
+            ..whole.clone()
+        });
+        self.items.splice(index..=index, parts.collect::<Vec<_>>());
+    }
+
+    /// The drive is away: whoever comes back may be another, and is asked by what every one answers.
+    fn doubt_trials(&mut self, now: Instant) {
+        for block in self.trials.clone() {
+            let within: Vec<PlannedRead> = self.items.iter().map(|item| item.read).collect();
+            for read in within.iter().filter(|read| block.covers(read.table, read.start)) {
+                self.take_apart(read, now, TRIAL_PAUSE.0);
+            }
+        }
+        self.unproved.clone_from(&self.trials);
     }
 
     /// It does not answer; the last request took the line for `took`. When it is probed next: the first probes come soon, then
@@ -189,6 +248,7 @@ impl DriveSchedule {
             Presence::Away(_, pause) => pause,
         };
         self.heard = false;
+        self.doubt_trials(now);
         let (first, longest) = PROBE_PAUSE;
         if let Some(at) = self.early.next(now, took) {
             self.presence = Presence::Away(at, (pause * 2).max(first));
@@ -255,7 +315,7 @@ impl DriveSchedule {
                 false => Change::Unavailable(read, exception),
             };
             item.refused = true;
-            item.wanted = item.read.class != PollClass::Fault;
+            item.wanted = !matches!(item.read.class, PollClass::Fault | PollClass::Monitor);
             item.due = now + (REFUSED_PAUSE.0 * (1 << item.refusals.min(5))).min(REFUSED_PAUSE.1);
             item.refusals = item.refusals.saturating_add(1);
             let origin = item.origin;

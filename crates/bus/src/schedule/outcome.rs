@@ -47,7 +47,7 @@ impl Schedule {
                 // The bad point is sound again: it is read with its neighbours.
                 item.whole_again = Some(now);
             }
-            item.wanted = !matches!(item.read.class, PollClass::Once | PollClass::Fault);
+            item.wanted = matches!(item.read.class, PollClass::Fast | PollClass::Slow);
             if item.read.class == PollClass::Slow {
                 let next = item.due + slow;
                 // Read before its time because a command asked for it, it is due a whole cycle later.

@@ -278,3 +278,5 @@ fn what_a_fault_asks_for_is_read_once_a_fault_and_takes_no_more_than_the_slow_sh
     let (_, _, asked) = pass(&mut schedule, Duration::from_secs(60));
     assert_eq!(asked.len(), 2, "the next fault asks again");
 }
+
+mod trials;

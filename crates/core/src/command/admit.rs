@@ -6,10 +6,14 @@ use super::standing::keeps_limits;
 use super::{Authority, Order, ParameterOrder, Refusal, Urgency};
 use crate::codec::n2::Object;
 use crate::codec::{Protocol, RequestPdu, Table};
+use crate::drive::control::Place;
 use crate::drive::model::Kind;
 use crate::drive::profile::AddressRange;
 use crate::drive::{ModelPoint, Point, Source, Value};
 use crate::process_image::{Access, DriveSpec, Hold, ParamsAccess, Reading};
+
+/// Values of an enumeration that a refusal names.
+const MOST_TEXTS: usize = 12;
 
 /// An order that may go to the bus.
 #[derive(Debug, Clone, PartialEq)]
@@ -248,7 +252,27 @@ fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
             format!("`{name}` = {number}{unit} is outside the limits {low} to {high}{unit}; nothing was written");
         return Err(Refusal::BadValue(text));
     }
-    Ok(Value::Number(number))
+    listed(point, value)?;
+    Ok(match value {
+        Value::Integer(_) | Value::Unsigned(_) if value.exact_f64().is_none() => value,
+        _ => Value::Number(number),
+    })
+}
+
+/// An enumeration takes the values that its profile lists, unless that says otherwise.
+fn listed(point: &Point, value: Value) -> Result<(), Refusal> {
+    let number = value.as_f64();
+    let is_known = || point.texts.keys().any(|code| *code as f64 == number);
+    if point.texts.is_empty() || !point.write || point.unlisted || is_known() {
+        return Ok(());
+    }
+    let known = point.texts.iter().take(MOST_TEXTS);
+    let known: Vec<String> = known.map(|(code, text)| format!("{code} {text}")).collect();
+    Err(Refusal::BadValue(format!(
+        "`{}` = {number} is none of its values: {}; nothing was written",
+        point.name,
+        known.join(", ")
+    )))
 }
 
 /// The limits of the points that mean the same quantity: a command in Hz keeps the limits in percent, and the other
@@ -282,6 +306,13 @@ fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value)
         }
     }
     Ok(())
+}
+
+/// What a reference is in the unit of another point, once a command sets it.
+pub fn converted(drive: &Reading<'_>, (index, value): (usize, Value), to: usize) -> Option<Value> {
+    let point = drive.spec.profile.points.get(index)?;
+    let written = resolve(drive, index, point, value).ok()?;
+    becomes(drive, to, written).flatten()
 }
 
 /// What a point is once the register of another one is written: itself, or by the point that takes its commands, or by
@@ -431,6 +462,7 @@ fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<Vec<FrequencyRange
         )));
     }
     raw_rule(drive, table, &items)?;
+    control_words(drive, table, &items)?;
     if profile.protocols.contains(&Protocol::N2) {
         one_object(table, *first, items.len())?;
     }
@@ -453,6 +485,29 @@ fn raw_rule(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(
             "{table} {address} of `{}` belongs to no writable point; add [{address}, {address}] to `raw_writes` of the \
              drive to write it raw",
             spec.name
+        ))),
+    }
+}
+
+/// A word of a control register that is neither a stop nor clearly a run command is not passed on: what it does is not known.
+fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
+    let Some(control) = &drive.spec.profile.control else {
+        return Ok(());
+    };
+    let refused = |(address, word): &&(u16, u16)| {
+        !control.admits(
+            Place {
+                table,
+                address: *address,
+            },
+            *word,
+        )
+    };
+    match items.iter().find(refused) {
+        None => Ok(()),
+        Some((address, word)) => Err(Refusal::BadValue(format!(
+            "{word:#06x} at {table} {address} of `{}` neither stops nor runs the drive by its profile; nothing was written",
+            drive.spec.name
         ))),
     }
 }

@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use tokio::sync::oneshot;
 
-use super::{Command, Order, Outcome, Ticket, Touched, Urgency};
+use super::{Command, Effect, Order, Outcome, SourceKind, Ticket, Touched, Urgency};
 use crate::codec::RequestPdu;
 
 /// Background requests that may wait on one bus.
@@ -72,6 +72,8 @@ pub struct PassedOn {
     pub reach: Vec<usize>,
     /// Those of them whose run command it takes away.
     pub stops: Vec<usize>,
+    /// What it means for the priority arrays of those that hear it.
+    pub effects: Vec<(usize, Effect)>,
     /// Where the frame of the reply goes, as the drive sent it.
     pub frame: oneshot::Sender<Vec<u8>>,
 }
@@ -85,7 +87,11 @@ impl PassedOn {
 
 impl BackgroundRequest {
     /// The command that waits among those of its drives, where it is an order to them.
-    pub fn into_command(self, touched: Touched) -> Command {
+    pub fn into_command(mut self, touched: Touched) -> Command {
+        let effects = self
+            .passed_on
+            .as_mut()
+            .map(|passed_on| std::mem::take(&mut passed_on.effects));
         Command {
             drive: self.drive,
             order: Order::Write(self.pdu),
@@ -102,7 +108,14 @@ impl BackgroundRequest {
             touched,
             passed_on: self.passed_on,
             was_begun: false,
+            effects: effects.unwrap_or_default(),
+            slot: None,
         }
+    }
+
+    /// Whether the gateway reads something by itself, from time to time: it is left of no command and of no fault.
+    pub fn is_of_gateway(&self) -> bool {
+        self.ticket.origin().kind == SourceKind::Schedule
     }
 
     /// Whether the tool for which it is passed on has gone, or asked for something else.
@@ -194,6 +207,11 @@ impl Background {
     /// Takes requests again.
     pub fn open(&mut self) {
         self.closed = None;
+    }
+
+    /// Whether one waits that somebody asked for, and not the gateway by itself.
+    pub fn has_of_others(&self) -> bool {
+        self.waiting.iter().any(|request| !request.is_of_gateway())
     }
 
     /// Whether none waits.

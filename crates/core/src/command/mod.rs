@@ -13,12 +13,13 @@ mod background;
 mod compound;
 mod frequency_range;
 mod parameter;
+mod priorities;
 mod queue;
 mod standing;
 mod ticket;
 mod touched;
 
-pub use admit::{Admitted, admit, may_restore, sets_twice, written};
+pub use admit::{Admitted, admit, converted, may_restore, sets_twice, written};
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
 pub use audit::{SENT, milliseconds, milliseconds_or_null};
 pub use background::{
@@ -27,6 +28,9 @@ pub use background::{
 pub use compound::{Parts, StopEnd, joined, stop_of};
 pub use frequency_range::{FrequencyRange, is_range_end};
 pub use parameter::ParameterOrder;
+pub use priorities::{
+    Commanded, Effect, Entry, Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, SlotWrite,
+};
 pub use queue::{CAPACITY, Chosen, CommandQueue, NotStopped, Pending, Stopping};
 pub use standing::{LastWritten, is_reference, limits_passed, still_keeps_limits};
 pub use ticket::{Receipt, Ticket, WriteStats};
@@ -70,11 +74,13 @@ pub enum SourceKind {
     Schedule,
     /// A tool at a slot of the bus.
     Slot,
+    /// BACnet client.
+    Bacnet,
 }
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 11] = [
+    pub const ALL: [SourceKind; 12] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
         SourceKind::Sparkplug,
@@ -86,6 +92,7 @@ impl SourceKind {
         SourceKind::OtherMaster,
         SourceKind::Schedule,
         SourceKind::Slot,
+        SourceKind::Bacnet,
     ];
 
     /// The label of metrics and audit lines.
@@ -102,6 +109,7 @@ impl SourceKind {
             SourceKind::OtherMaster => "other_master",
             SourceKind::Schedule => "schedule",
             SourceKind::Slot => "slot",
+            SourceKind::Bacnet => "bacnet",
         }
     }
 
@@ -228,6 +236,10 @@ pub struct Command {
     pub passed_on: Option<PassedOn>,
     /// A stop that another bus had begun before this one took its place.
     pub was_begun: bool,
+    /// What it means for the priority arrays of the drives that it reaches.
+    pub effects: Vec<(usize, Effect)>,
+    /// The write to a slot from which it follows.
+    pub slot: Option<SlotWrite>,
 }
 
 impl Command {
@@ -249,11 +261,14 @@ impl Command {
             touched: Touched::Anything,
             passed_on: None,
             was_begun: false,
+            effects: Vec::new(),
+            slot: None,
         }
     }
 
     /// The same to a drive of that profile, asked for at `asked`.
     pub fn asked_of(mut self, profile: &Profile, asked: Instant) -> Command {
+        self.effects = vec![(self.drive, Effect::of(&self.order, profile))];
         self.touched = Touched::of(&self.order, &self.ranges, profile);
         self.asked = Some(asked);
         self
@@ -272,12 +287,30 @@ impl Command {
         self.reach().contains(&drive)
     }
 
+    /// The same as what follows from a write to a slot.
+    pub fn of_slot(mut self, slot: Option<SlotWrite>) -> Command {
+        self.slot = slot;
+        self
+    }
+
+    /// What it means for the priority arrays of that drive.
+    pub fn effect(&self, drive: usize) -> Effect {
+        let of_drive = self.effects.iter().find(|(of, _)| *of == drive);
+        of_drive.map(|(_, effect)| *effect).unwrap_or_default()
+    }
+
     /// Whether it takes the run command of that drive away.
     pub fn stops(&self, drive: usize) -> bool {
         match &self.passed_on {
             Some(passed_on) => passed_on.stops.contains(&drive),
             None => self.urgency == Urgency::Stop && self.drive == drive,
         }
+    }
+
+    /// Whether it may go while the gateway ends: a stop, and the broadcast that stops a whole line.
+    pub fn ends_the_gateway(&self) -> bool {
+        let is_broadcast = self.passed_on.is_some() && self.ticket.origin().kind == SourceKind::Shutdown;
+        self.urgency == Urgency::Stop || is_broadcast
     }
 
     /// The same as the rest of an order, behind its stop.
@@ -511,6 +544,16 @@ pub enum Refusal {
     /// The value is outside the type, the profile or the limits, or the command contradicts itself.
     #[error("{0}")]
     BadValue(String),
+    /// Somebody else has a right to the drive that goes before that of the client.
+    #[error("{holder} ({rank}) {keeps}; it was not sent")]
+    HeldByOther {
+        /// Who.
+        holder: String,
+        /// By which right.
+        rank: String,
+        /// What is kept, and how that ends.
+        keeps: String,
+    },
     /// There is no drive of that name.
     #[error("{0}")]
     UnknownDrive(String),
@@ -531,6 +574,7 @@ impl Refusal {
             Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => "not_allowed",
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => "not_writable",
             Refusal::BadValue(_) => "bad_value",
+            Refusal::HeldByOther { .. } => "held_by_other",
             Refusal::UnknownDrive(_) => Refusal::UNKNOWN_DRIVE,
         }
     }
@@ -541,6 +585,7 @@ impl Refusal {
             Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => Exception::FUNCTION,
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => Exception::ADDRESS,
             Refusal::BadValue(_) => Exception::VALUE,
+            Refusal::HeldByOther { .. } => Exception::BUSY,
             Refusal::UnknownDrive(_) => Exception::GATEWAY_PATH,
         }
     }
@@ -569,7 +614,13 @@ mod tests {
             Refusal::UnknownDrive,
         ];
         let mut outcomes: Vec<Outcome> = refusals.iter().map(|r| Outcome::Refused(r(String::new()))).collect();
+        let held = Refusal::HeldByOther {
+            holder: String::new(),
+            rank: String::new(),
+            keeps: String::new(),
+        };
         outcomes.extend([
+            Outcome::Refused(held),
             Outcome::Acknowledged(Reply::Written),
             Outcome::TimedOut,
             Outcome::Garbled,

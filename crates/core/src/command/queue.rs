@@ -13,7 +13,7 @@ use rustix::event::{EventfdFlags, eventfd};
 use tokio::sync::oneshot;
 
 use super::background::{Background, BackgroundRequest};
-use super::{Command, Order, Outcome, SourceKind, Urgency};
+use super::{Command, Effect, Order, Origin, Outcome, Priorities, Refusal, SourceKind, Urgency};
 
 /// Commands and forwarded reads that may wait on one bus, besides two stops for each drive.
 pub const CAPACITY: usize = 64;
@@ -49,6 +49,8 @@ pub struct Pending {
     /// The login whose command was the last that a client gave, by drive; without an entry there was none, or its client
     /// has no login.
     commanders: BTreeMap<usize, Arc<str>>,
+    /// Who commands by priorities, by drive.
+    priorities: BTreeMap<usize, Priorities>,
     /// The stops that the gateway wants before it ends, until the bus takes note of it.
     stopping: Option<Stopping>,
 }
@@ -116,13 +118,17 @@ impl Pending {
             command.answer(&outcome.clone(), now);
             return;
         }
-        if self.stops_only && command.urgency != Urgency::Stop {
+        if self.stops_only && !command.ends_the_gateway() {
             command.answer(&Outcome::ShuttingDown, now);
             return;
         }
         if command.urgency == Urgency::Stop {
             self.note_stop(command.drive, now);
             self.push_stop(command, now);
+            return;
+        }
+        if let Some(refusal) = self.refuses(&command) {
+            command.answer(&Outcome::Refused(refusal), now);
             return;
         }
         if self.is_behind_its_stop(&command) {
@@ -133,7 +139,7 @@ impl Pending {
             && let Some(older) = self.waiting.remove(index)
         {
             older.answer(&Outcome::Replaced, now);
-            self.note_commander(&command);
+            self.note_accepted(&command, now);
             self.waiting.insert(index, command);
             return;
         }
@@ -147,13 +153,44 @@ impl Pending {
                 }
             }
         }
-        self.note_commander(&command);
+        self.note_accepted(&command, now);
         self.waiting.push_back(command);
     }
 
+    /// Who keeps a command from being accepted, where it starts the motor or sets a reference.
+    fn refuses(&self, command: &Command) -> Option<Refusal> {
+        let (origin, reach) = (command.ticket.origin(), command.reach());
+        let waits = |drive: &usize| self.held_back(*drive, origin, command.effect(*drive));
+        (command.urgency == Urgency::Command)
+            .then(|| reach.iter().find_map(waits))
+            .flatten()
+    }
+
+    /// Why an order of that client with that effect is not accepted, where a slot of another one keeps it.
+    pub fn held_back(&self, drive: usize, origin: &Origin, effect: Effect) -> Option<Refusal> {
+        let protects = self.priorities.get(&drive)?.refuses(origin, effect)?;
+        let (what, priority) = (protects.what.name(), protects.priority);
+        Some(Refusal::HeldByOther {
+            holder: format!("the BACnet client {}", protects.client),
+            rank: format!("priority {priority}"),
+            keeps: format!("keeps `{what}` until it gives that slot back"),
+        })
+    }
+
+    /// The priority arrays of a drive.
+    pub fn priorities(&mut self, drive: usize) -> &mut Priorities {
+        self.priorities.entry(drive).or_default()
+    }
+
     /// Keeps who gave a command that is taken in.
-    fn note_commander(&mut self, command: &Command) {
+    fn note_accepted(&mut self, command: &Command, now: Instant) {
         let origin = command.ticket.origin();
+        if command.urgency != Urgency::Read {
+            for drive in command.reach() {
+                let (effect, slot) = (command.effect(*drive), command.slot.as_ref());
+                self.priorities(*drive).accepted(origin, effect, slot, now);
+            }
+        }
         if command.urgency != Urgency::Read && origin.kind.is_client() {
             for drive in command.reach() {
                 self.set_commander(*drive, origin.login().cloned());
@@ -181,9 +218,11 @@ impl Pending {
         self.commanders.get(&drive)
     }
 
-    /// What a bus that starts anew knows of a drive from the bus before: who commanded it last, and how many stops it got.
-    pub fn take_over(&mut self, drive: usize, commander: Option<Arc<str>>, stops: u64) {
+    /// What a bus that starts anew knows of a drive from the bus before: who commanded it last, how many stops it got,
+    /// and what stands by priorities.
+    pub fn take_over(&mut self, drive: usize, commander: Option<Arc<str>>, stops: u64, priorities: Priorities) {
         self.set_commander(drive, commander);
+        self.priorities.insert(drive, priorities);
         self.stops.insert(drive, stops);
     }
 
@@ -198,7 +237,7 @@ impl Pending {
     /// same, and are answered with it; of two that do different things besides the newer one is sent.
     fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.drive;
-        self.note_commander(&stop);
+        self.note_accepted(&stop, now);
         self.remove(now, &Outcome::Purged, |c| {
             c.reaches(drive) && c.urgency == Urgency::Command && !c.stops(drive)
         });

@@ -202,6 +202,59 @@ pub struct Counted {
     pub second: u32,
     /// Slowest beginning of a reply, ms.
     pub slowest_ms: f64,
+    /// What the drive itself counted, where it counts and there were errors.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by_drive: Option<CountedByDrive>,
+}
+
+/// What a drive counted since its counters were cleared (function 08, subfunctions 0B to 0F); they wrap at 65536.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, serde::Deserialize)]
+pub struct CountedByDrive {
+    /// Sound messages on the line, to whatever address.
+    pub messages: u16,
+    /// Damaged messages.
+    pub damaged: u16,
+    /// Exceptions that it sent.
+    pub exceptions: u16,
+    /// Messages to it.
+    pub own: u16,
+    /// Of those: without an answer; broadcasts are among them [inference].
+    pub unanswered: u16,
+}
+
+impl CountedByDrive {
+    /// What was counted since `before`.
+    #[must_use]
+    pub fn since(&self, before: &CountedByDrive) -> CountedByDrive {
+        CountedByDrive {
+            messages: self.messages.wrapping_sub(before.messages),
+            damaged: self.damaged.wrapping_sub(before.damaged),
+            exceptions: self.exceptions.wrapping_sub(before.exceptions),
+            own: self.own.wrapping_sub(before.own),
+            unanswered: self.unanswered.wrapping_sub(before.unanswered),
+        }
+    }
+
+    /// Which direction of the line is bad, in words: what the drive received damaged between two readings, while so many of its
+    /// replies were damaged here. None where neither tells anything.
+    pub fn direction(&self, name: &str, damaged_here: u32) -> Option<String> {
+        let CountedByDrive { messages, damaged, .. } = self;
+        match (*damaged, damaged_here) {
+            (0, 0) => None,
+            (0, here) => Some(format!(
+                "{name} received all of {messages} messages sound while {here} of its replies arrived damaged: the way from the \
+                 drive to the gateway is disturbed"
+            )),
+            (damaged, 0) => Some(format!(
+                "{name} received {damaged} messages damaged and {messages} sound, and its replies arrived sound: the way from the \
+                 gateway to the drive is disturbed"
+            )),
+            (damaged, here) => Some(format!(
+                "{name} received {damaged} messages damaged and {messages} sound, and {here} of its replies arrived damaged: both \
+                 ways are disturbed"
+            )),
+        }
+    }
 }
 
 /// How often the rules are asked.

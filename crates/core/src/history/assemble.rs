@@ -131,11 +131,12 @@ fn read_of(profile: &Profile, taped: &TapedRead) -> Read {
         Some(Source::Derived(derived)) => derived.rests_on().into_iter().any(has),
         None => false,
     };
+    let shown = |point: &usize| profile.points.get(*point).is_some_and(|point| !point.hidden);
     Read {
         table: taped.table,
         start: taped.start,
         count: u16::try_from(taped.words.len()).unwrap_or(u16::MAX),
-        points: (0..profile.points.len()).filter(shows).collect(),
+        points: (0..profile.points.len()).filter(shown).filter(shows).collect(),
     }
 }
 

@@ -75,11 +75,11 @@ impl Budget {
         let rounds = |class| match class {
             PollClass::Fast => round(PollClass::Fast, bus.cycle),
             PollClass::Slow => round(PollClass::Slow, bus.slow_cycle),
-            PollClass::Once | PollClass::Fault => 1.0,
+            PollClass::Once | PollClass::Fault | PollClass::Monitor => 1.0,
             PollClass::Never => 0.0,
         };
         let of = |plan: &Plan, size: &dyn Fn(&PlannedRead) -> usize| -> usize {
-            let reads = plan.reads.iter().chain(&plan.on_fault);
+            let reads = plan.all();
             let bytes: f64 = reads.map(|read| rounds(read.class) * size(read) as f64).sum();
             (bytes * RESERVE) as usize
         };

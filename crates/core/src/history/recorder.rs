@@ -406,8 +406,13 @@ impl DriveRing {
     ) -> Option<Trigger> {
         let at = read.at;
         Arc::make_mut(&mut self.now).store(read.table, read.start, &read.words, at);
-        let reading = reading(&self.image.spec, &self.now, at);
         let known = self.image.reading(clock.now, stale_after);
+        for of in [&mut self.now, &mut self.base] {
+            if of.monitored != known.snapshot.monitored {
+                Arc::make_mut(of).monitored = known.snapshot.monitored.clone();
+            }
+        }
+        let reading = reading(&self.image.spec, &self.now, at);
         self.history.read(&read, &reading, &known);
         if !options.is_on() {
             return None;

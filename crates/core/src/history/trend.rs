@@ -369,7 +369,13 @@ fn registers_of(profile: &Profile, index: usize) -> Vec<Registers> {
     match &point.source {
         Source::Raw(raw) => {
             let last = raw.address.saturating_add(raw.form.items().saturating_sub(1));
-            vec![(raw.table, raw.address..=last)]
+            let monitor = point
+                .monitor
+                .into_iter()
+                .flat_map(|monitor| registers_of(profile, monitor));
+            std::iter::once((raw.table, raw.address..=last))
+                .chain(monitor)
+                .collect()
         }
         // A point rests on points before it only: the profile is refused otherwise.
         Source::Derived(derived) => {

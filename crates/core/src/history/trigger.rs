@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
+use crate::codec::Table;
 use crate::command::AuditRecord;
 use crate::drive::{ModelPoint, Profile, Value};
 use crate::event::EventKind;
@@ -126,10 +127,10 @@ pub(super) fn is_refused_stop(record: &AuditRecord, profile: &Profile) -> bool {
         (None, Value::Bool(false)) => change.point == ModelPoint::Run.name(),
         // A raw write: table and address.
         (Some((table, address)), Value::Integer(word)) => {
-            let run = profile.run_bit().map(|(raw, ..)| raw.table);
+            let table = Table::from_name(table);
             let address = address.parse::<u16>().ok();
             let word = u16::try_from(word).ok();
-            match (run.filter(|run| run.name() == table), address, word) {
+            match (table, address, word) {
                 (Some(table), Some(address), Some(word)) => profile.is_stop(table, address, word),
                 _ => false,
             }

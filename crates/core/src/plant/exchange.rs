@@ -10,7 +10,8 @@ use tokio::sync::oneshot;
 use super::{BusHandle, changes};
 use crate::codec::{Protocol, RequestPdu, describe};
 use crate::command::{
-    Answer, BackgroundRequest, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Ticket, Touched, WriteStats, written,
+    Answer, BackgroundRequest, Effect, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Ticket, Touched, WriteStats,
+    written,
 };
 use crate::process_image::DriveImage;
 
@@ -92,6 +93,8 @@ impl BusHandle {
         let runs: Vec<(String, bool)> = runs.collect();
         let stops = heard().filter(|(_, drive)| is_stop(drive, &question.pdu));
         let stops = stops.map(|(index, _)| index).collect();
+        let effects = heard().map(|(index, drive)| (index, Effect::of(&order, &drive.spec.profile)));
+        let effects = effects.filter(|_| may_write).collect();
         // What is not decoded may write anything. The registers are the same whoever hears it.
         let touched = heard().next().map_or(Touched::Anything, |(_, drive)| {
             Touched::of(&order, &[], &drive.spec.profile)
@@ -110,6 +113,7 @@ impl BusHandle {
                 may_write,
                 reach,
                 stops,
+                effects,
                 frame: sender,
             }),
         };

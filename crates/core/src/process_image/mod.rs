@@ -524,13 +524,15 @@ pub fn value_or_null(value: Option<Value>) -> serde_json::Value {
         Value::Bool(b) => b.into(),
         Value::Integer(i) => i.into(),
         Value::Number(n) => n.into(),
+        Value::Unsigned(u) => u.into(),
+        Value::Text(text) => text.shown().into(),
     })
 }
 
 /// The model points and profile points of a drive with their names, in their public order; not those that are never
-/// read, of which there is nothing to show.
+/// read, of which there is nothing to show, nor hidden ones.
 pub fn public_points(profile: &Profile) -> Vec<(usize, &str)> {
-    let is_read = |point: &Point| point.raw().is_none() || point.class != PollClass::Never;
+    let is_read = |point: &Point| !point.hidden && (point.raw().is_none() || point.class != PollClass::Never);
     let model = ModelPoint::ALL
         .iter()
         .filter_map(|m| profile.model_index(*m).map(|i| (i, m.name())));

@@ -6,7 +6,8 @@ use std::time::{Duration, Instant, SystemTime};
 use super::{DriveSpec, Hold};
 use crate::codec::{Exception, Table};
 use crate::drive::model::Kind;
-use crate::drive::{Bound, ModelPoint, Plan, PollClass, Quality, Raw, Sample, Source, State, Value};
+use crate::drive::profile::MOST_REGISTERS;
+use crate::drive::{Bound, ModelPoint, Plan, Point, PollClass, Quality, Raw, Sample, Source, State, Value};
 
 /// Oldest age of a parameter of the drive on which a command may rest, where the line can renew it faster.
 const PARAMETER_AGE: Duration = Duration::from_secs(5);
@@ -104,6 +105,9 @@ pub struct Snapshot {
     pub fast_at: Option<Instant>,
     /// Filled by what another master reads: how often it reads process data.
     pub heard: Option<Cadence>,
+    /// Points whose value is that of their monitoring register, because a selector of the drive gives them another content
+    /// than the profile states: see [`crate::drive::Point::monitor`].
+    pub monitored: Vec<usize>,
     /// Shared with the snapshots before, as far as nothing in them changed.
     spans: Vec<Arc<Span>>,
 }
@@ -122,7 +126,7 @@ pub enum Unavailable {
 impl Snapshot {
     /// Nothing is known of the plan's addresses yet.
     pub fn empty(plan: &Plan) -> Snapshot {
-        let spans = plan.reads.iter().map(|read| {
+        let spans = plan.reads.iter().chain(&plan.monitors).map(|read| {
             Arc::new(Span {
                 table: read.table,
                 start: read.start,
@@ -134,6 +138,7 @@ impl Snapshot {
             link: Link::Untried,
             fast_at: None,
             heard: None,
+            monitored: Vec::new(),
             spans: spans.collect(),
         }
     }
@@ -256,7 +261,7 @@ impl Reading<'_> {
     fn age_limit(&self, class: PollClass) -> Option<Duration> {
         match class {
             PollClass::Fast => Some(self.stale_after),
-            PollClass::Slow => Some(self.stale_after + 2 * self.slow_cycle),
+            PollClass::Slow | PollClass::Monitor => Some(self.stale_after + 2 * self.slow_cycle),
             PollClass::Once | PollClass::Fault | PollClass::Never => None,
         }
     }
@@ -264,7 +269,7 @@ impl Reading<'_> {
     /// For how long a value of that point is good once it was read, as long as the drive answers: that of its registers that
     /// age first.
     pub fn good_for(&self, point: usize) -> Duration {
-        let Some(point) = self.spec.profile.points.get(point) else {
+        let Some(point) = self.selected(point) else {
             return Duration::ZERO;
         };
         let limit = |raw: &Raw| {
@@ -316,6 +321,10 @@ impl Reading<'_> {
         for offset in 0..count {
             let address = start.checked_add(offset).ok_or(Unavailable::NotPolled)?;
             let (class, cell) = self.snapshot.cell(table, address).ok_or(Unavailable::NotPolled)?;
+            if class == PollClass::Monitor {
+                // Read now and then: what it is now only the drive knows.
+                return Err(Unavailable::NotPolled);
+            }
             let quality = match last {
                 Some((of, alike, quality)) if of == class && alike.is_like(cell) => quality,
                 _ => self.quality(class, cell),
@@ -333,11 +342,27 @@ impl Reading<'_> {
         worst.map_or(Ok(words), Err)
     }
 
+    /// The point that a value is taken from: the point itself, or its monitoring register.
+    fn selected(&self, point: usize) -> Option<&Point> {
+        let points = &self.spec.profile.points;
+        match self.snapshot.monitored.contains(&point) {
+            true => points.get(points.get(point)?.monitor?),
+            false => points.get(point),
+        }
+    }
+
     /// The sample of a point.
     pub fn sample(&self, point: usize) -> Sample {
-        let Some(point) = self.spec.profile.points.get(point) else {
-            return Sample::NONE;
-        };
+        self.selected(point).map_or(Sample::NONE, |point| self.sample_of(point))
+    }
+
+    /// The sample of a point's own register, whatever a selector of the drive puts there.
+    pub fn own_sample(&self, point: usize) -> Sample {
+        let point = self.spec.profile.points.get(point);
+        point.map_or(Sample::NONE, |point| self.sample_of(point))
+    }
+
+    fn sample_of(&self, point: &Point) -> Sample {
         match &point.source {
             Source::Raw(raw) => self.raw_sample(raw, point.kind()),
             Source::Derived(derived) => {
@@ -364,18 +389,29 @@ impl Reading<'_> {
     /// A value of the drive's own registers: as good as the worst of them, as old as the oldest. What is no value
     /// (a float that is no number) is bad.
     fn raw_sample(&self, raw: &Raw, kind: Kind) -> Sample {
-        let (mut words, mut times, mut quality) = ([0; 2], [None; 2], Quality::Good);
-        for (offset, (word, time)) in (0..raw.form.items()).zip(words.iter_mut().zip(&mut times)) {
+        let (mut words, mut quality) = ([0; MOST_REGISTERS], Quality::Good);
+        let items = usize::from(raw.form.items());
+        // One that was never read comes before all times.
+        let mut at = Some(self.now);
+        for (offset, word) in (0..).zip(words.iter_mut().take(items)) {
             let address = raw.address.checked_add(offset);
             let Some((class, cell)) = address.and_then(|address| self.snapshot.cell(raw.table, address)) else {
                 return Sample::NONE;
             };
-            (*word, *time) = (cell.word, cell.at);
+            *word = cell.word;
+            at = if offset == 0 { cell.at } else { at.min(cell.at) };
             quality = quality.worse(self.quality(class, cell));
         }
-        // One that was never read comes before all times.
-        let at = times.into_iter().take(usize::from(raw.form.items())).min().flatten();
-        let value = at.and_then(|_| raw.decode(&words, kind));
+        let words = words.get(..items).unwrap_or_default();
+        let value = match raw.scale_from.map(|scale| self.sample(scale)) {
+            _ if at.is_none() => None,
+            None => raw.decode(words, kind),
+            Some(scale) => {
+                quality = quality.worse(scale.quality);
+                let power = scale.value.and_then(Value::exact_f64);
+                power.and_then(|power| raw.decode_scaled(words, kind, power as i64))
+            }
+        };
         Sample {
             value,
             quality: if value.is_some() { quality } else { Quality::Bad },

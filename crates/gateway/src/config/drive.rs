@@ -253,7 +253,8 @@ fn trigger_point(name: &str, profile: &Profile) -> Result<usize, Finding> {
     let plan = Plan::of(profile);
     let is_number = |index: usize| {
         let point = profile.points.get(index);
-        point.is_some_and(|point| point.kind() != Kind::Bool) && plan.shows(profile, index)
+        point.is_some_and(|point| !point.hidden && !matches!(point.kind(), Kind::Bool | Kind::Text))
+            && plan.shows(profile, index)
     };
     let index = profile.point_index(name);
     index.filter(|index| is_number(*index)).ok_or_else(|| {
@@ -340,7 +341,10 @@ fn check_limits(
 /// The point that limits can be set for.
 fn limited_point<'p>(profile: &'p Profile, key: &str) -> Result<&'p Point, Finding> {
     let writable = || {
-        let points = profile.points.iter().filter(|p| p.write && p.kind() != Kind::Bool);
+        let points = profile
+            .points
+            .iter()
+            .filter(|p| p.is_commanded() && !matches!(p.kind(), Kind::Bool | Kind::Text));
         points.map(|p| p.name.as_str())
     };
     let known = || {

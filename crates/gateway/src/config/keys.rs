@@ -14,12 +14,13 @@ use super::key::{
 };
 use super::log::{self, LogFormat};
 use super::mqtt::TelemetryTopic;
-use super::{bus, modbus_tcp, mqtt, north, recordings, values};
+use super::{bacnet, bus, modbus_tcp, mqtt, north, recordings, values};
 use crate::bus::Mode;
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
 use crate::document::format_duration;
 use crate::line::{Level, MOST_RTS_DELAY, Rs485, Spin};
+use crate::north::bacnet::WhenOffline;
 use crate::north::modbus_tcp::{Role, Uncached};
 use crate::north::mqtt::History;
 use crate::north::slot::SlotAccess;
@@ -175,6 +176,8 @@ keys! {
         mqtt: Present = Own { schema: Mqtt::schema, range: "[mqtt]" }, or "not started";
         /// HTTP server for metrics, health and the status page; not started without this section.
         http: Present = Own { schema: Http::schema, range: "[http]" }, or "not started";
+        /// BACnet/IP server; not started without this section.
+        bacnet: Present = Own { schema: Bacnet::schema, range: "[bacnet]" }, or "not started";
         /// File of all commands; not written without this section.
         audit: Present = Own { schema: AuditTable::schema, range: "[audit]" }, or "not written";
         /// What the recorder keeps.
@@ -577,6 +580,37 @@ keys! {
         certificate: PathBuf = PATH, or "none";
         /// PEM file of the certificate's private key.
         key: PathBuf = PATH, or "none";
+    }
+
+    /// [BACnet/IP](bacnet.md) server; not started without this section. The gateway is device `device`, each drive device `device`
+    /// + `unit` on a virtual network of its own.
+    BACNET: Bacnet {
+        /// Listen address: that of one interface, whose broadcast address is used, or `0.0.0.0`, which needs `allow`.
+        listen: SocketAddr = SOCKET, default "127.0.0.1:47808";
+        /// Instance of the gateway; unique in the whole BACnet network, with those of all drives.
+        device: u32 = Number(0..=4_194_302, None), default 100;
+        /// Number of the virtual network of the drives, unique in the whole BACnet network.
+        network: u16 = Number(1..=65_534, Some((65_535, "network 65535 means all networks"))), default 1001;
+        /// A drive that is away: `"silent"`: answers nothing; `"fault"`: answers with the flag fault.
+        offline: WhenOffline = Words(&[("silent", WhenOffline::Silent), ("fault", WhenOffline::Fault)]), default "silent";
+        /// Whether clients in `write` may command drives with `access = "control"`.
+        commands: bool = Flag, default false;
+        /// Who may ask.
+        allow: Vec<IpNet> = NETWORKS, default ["127.0.0.0/8"];
+        /// Who may write; no one by default. BACnet has no passwords: keep it narrow.
+        write: Vec<IpNet> = NETWORKS, default [];
+        /// Whether `run` = inactive at priority 1 to 5 outlives a restart: it refuses starts as before; nothing is written.
+        keep_priorities: bool = Flag, default false;
+        /// BBMD in another subnet at which the gateway registers as a foreign device, to hear its broadcasts; `""`: none.
+        bbmd: Option<(String, u16)> = Parsed {
+            parse: bacnet::parse_bbmd, words: &[], pattern: "", range: "\"host:port\", or \"\"",
+        }, default "";
+        /// Vendor identifier, registered with ASHRAE; 0 is that of ASHRAE itself.
+        vendor: u16 = Number(0..=65_535, None), default 0;
+        /// File whose only line is the password of DeviceCommunicationControl; without one that is refused.
+        dcc_password_file: PathBuf = PATH, or "none";
+        /// Buses whose drives are devices; `[]`: all. Units must be unique among them.
+        buses: Vec<String> = List { parse: values::any_text, empty: None, range: "names of buses" }, default [];
     }
 
     /// File of all commands, in which every change shows; see [the audit file](commands.md#the-audit-file).

@@ -3,6 +3,7 @@
 //! One run reports every error with file, line and key. Nothing is opened but the file itself, the profiles and the
 //! secrets it names. Relative paths are relative to the directory of the file.
 
+mod bacnet;
 mod bus;
 mod deprecated;
 mod drive;
@@ -43,7 +44,9 @@ use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
 use crate::history::RecorderOptions;
 use crate::north::local::SocketPath;
-use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client, slot as slot_server};
+use crate::north::{
+    bacnet as bacnet_server, http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client, slot as slot_server,
+};
 use crate::process_image::{Access, BusSpec, DriveSpec};
 use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
 
@@ -85,6 +88,8 @@ pub struct Settings {
     pub mqtt: Option<mqtt_client::Options>,
     /// Absent: not started.
     pub http: Option<http::Options>,
+    /// Absent: not started.
+    pub bacnet: Option<bacnet_server::Options>,
     /// File of all commands; absent: not written.
     pub audit: Option<AuditFileOptions>,
     /// What is logged.
@@ -261,6 +266,8 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .table(reader)
         .map(|table| mqtt::read(&table, base, name.as_deref(), &state_dir));
     let http = ROOT.http.table(reader).map(|table| north::read_http(&table, base));
+    let bacnet = ROOT.bacnet.table(reader);
+    let bacnet = bacnet.map(|table| bacnet::read(&table, base, &state_dir, &names));
     let buffer = mqtt.as_ref().and_then(|mqtt| mqtt.as_ref()?.buffer.as_ref());
     let buffer = buffer.map(|buffer| buffer.dir.as_path());
     let audit = ROOT.audit.table(reader);
@@ -272,7 +279,13 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     let log = ROOT.log.table(reader).map(|table| log::read(&table));
     reader.finish();
 
-    judge(reader, &buses, modbus_tcp.as_ref(), mqtt.as_ref(), http.as_ref());
+    let clients = Clients {
+        modbus_tcp: modbus_tcp.as_ref(),
+        mqtt: mqtt.as_ref(),
+        http: http.as_ref(),
+        bacnet: bacnet.as_ref(),
+    };
+    judge(reader, &buses, &clients);
 
     let slots = buses.iter().flat_map(|bus| &bus.slots).map(|slot| slot.slot.clone());
     let slots: Vec<slot_server::Slot> = slots.collect::<Option<_>>()?;
@@ -295,23 +308,35 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
         http: flipped(http.map(|http| http.options))?,
+        bacnet: flipped(bacnet.map(|bacnet| bacnet.options))?,
         audit,
         log: log?,
     })
 }
 
+/// The sections by which clients reach the drives.
+struct Clients<'c> {
+    modbus_tcp: Option<&'c modbus_tcp::ModbusTcp>,
+    mqtt: Option<&'c Option<mqtt_client::Options>>,
+    http: Option<&'c north::Http>,
+    bacnet: Option<&'c bacnet::Bacnet>,
+}
+
 /// Reports what is wrong or doubtful about the sections together.
-fn judge(
-    reader: &Reader<'_>,
-    buses: &[bus::Found],
-    modbus_tcp: Option<&modbus_tcp::ModbusTcp>,
-    mqtt: Option<&Option<mqtt_client::Options>>,
-    http: Option<&north::Http>,
-) {
+fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients<'_>) {
+    let Clients {
+        modbus_tcp,
+        mqtt,
+        http,
+        bacnet,
+    } = *clients;
     unique::check(reader.document(), buses);
     // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
     if let Some(modbus_tcp) = modbus_tcp {
         unique::check_units(reader.document(), buses, &modbus_tcp.selections);
+    }
+    if let Some(bacnet) = bacnet {
+        bacnet::check_instances(reader, buses, bacnet);
     }
     let http_listener = http.and_then(|http| http.listener.as_ref());
     let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http_listener);
@@ -325,6 +350,7 @@ fn judge(
     let commanded = modbus_tcp.is_some_and(|m| m.commands)
         || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands))
         || http.is_some_and(|http| http.commands)
+        || bacnet.is_some_and(|bacnet| bacnet.commands)
         || slots().any(|slot| slot.writes);
     if !commanded {
         warn_of_idle_control(reader, buses);
@@ -469,6 +495,7 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
             let Finding { what, remedy } = shortage.finding();
             reader.document().warning(place, what, remedy);
         }
+        warn_of_fault_time(reader, found, prediction.fast_cycle);
         if let (Some(cycle), Some((limit, place))) = (prediction.fast_cycle, stale_after)
             && cycle > limit
         {
@@ -481,6 +508,36 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
             );
         }
     }
+}
+
+/// Polls so rare that a drive may take them for a silent master. The manual's example is 1 s [T 6.2]; what is set can be read from
+/// the drive only.
+const FAULT_TIME: Duration = Duration::from_secs(1);
+
+/// Drives that may trip because they are polled too seldom.
+fn warn_of_fault_time(reader: &Reader<'_>, found: &bus::Found, cycle: Option<Duration>) {
+    let fault_time = crate::drive::COMMUNICATION_FAULT_TIME;
+    let Some(cycle) = cycle.filter(|cycle| *cycle > FAULT_TIME / 2) else {
+        return;
+    };
+    let drives = found.drives.iter().filter_map(|drive| drive.spec.as_ref());
+    let Some(first) = drives
+        .into_iter()
+        .find(|spec| spec.profile.point_index(fault_time).is_some())
+    else {
+        return;
+    };
+    reader.document().warning(
+        &found.cadence.0,
+        format!(
+            "each drive is polled every {:.2} s, and drive `{}` may have a communication fault where that is near its \
+             {fault_time}",
+            cycle.as_secs_f64(),
+            first.name
+        ),
+        "set that parameter (Cn-31 of a TECO 7300PA, 1 s in the manual's example) well above the cycle, or raise the baud or \
+         lower the number of drives",
+    );
 }
 
 /// Stops at shutdown that take longer than the service manager waits.
@@ -534,7 +591,7 @@ fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
         reader.document().warning(
             place,
             format!("drive `{name}` accepts commands but no client may send any"),
-            "set `write` of [modbus_tcp], or `commands = true` of [mqtt] or [http]",
+            "set `write` of [modbus_tcp], or `commands = true` of [mqtt], [http] or [bacnet]",
         );
     }
 }
@@ -551,12 +608,16 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
         let known = [
             crate::drive::FIELDBUS_FAULT_RESPONSE,
             crate::drive::COMMUNICATION_TIMEOUT,
+            crate::drive::COMMUNICATION_ERROR_REACTION,
         ];
         let known: Vec<&str> = known
             .into_iter()
             .filter(|p| spec.profile.point_index(p).is_some())
             .collect();
         let own = match known.is_empty() {
+            true if spec.profile.may_stop_by_itself => {
+                "the drive may stop when its master falls silent, which cannot be read over this protocol".to_string()
+            }
             true => "the profile has no parameter for the drive's own response to a silent master".to_string(),
             false => format!(
                 "the drive's own response to a silent master ({}) may be off, and the gateway keeps polling",

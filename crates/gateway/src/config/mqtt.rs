@@ -222,7 +222,7 @@ fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Secret> {
 }
 
 /// The only line of a secret file.
-fn secret(path: &Path) -> Result<String, Finding> {
+pub(super) fn secret(path: &Path) -> Result<String, Finding> {
     let mut text = String::new();
     File::open(path)
         .and_then(|file| file.take(SECRET).read_to_string(&mut text))

@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::keys::{GATEWAY, HTTP, MODBUS_TCP, MQTT, ROOT, TLS};
+use super::keys::{BACNET, GATEWAY, HTTP, MODBUS_TCP, MQTT, ROOT, TLS};
 use super::{ENVIRONMENT, values};
 use crate::config::key::Key;
 use crate::document::{self, Document, Reader};
@@ -70,6 +70,9 @@ pub fn named_files(path: &Path, env: impl Iterator<Item = (String, String)>) -> 
         for key in [&HTTP.key, &HTTP.tokens_file, &HTTP.users_file] {
             found.add(&http, key, FileKind::Secret);
         }
+    }
+    if let Some(bacnet) = ROOT.bacnet.table(&reader) {
+        found.add(&bacnet, &BACNET.dcc_password_file, FileKind::Secret);
     }
     found.files
 }

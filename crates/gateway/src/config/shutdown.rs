@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::BusSettings;
+use crate::bus::stop_of_line::{BROADCAST_PAUSE, stop_of_line};
 use crate::codec::{RequestPdu, Table};
 use crate::document::Finding;
 use crate::drive::plan::WireTime;
@@ -55,6 +56,13 @@ impl BusSettings {
     /// word may have to be read first. If a drive does not answer, the write is repeated, the read is not.
     pub fn shutdown_time(&self) -> ShutdownTime {
         let mut time = ShutdownTime::default();
+        if let Some(stop) =
+            stop_of_line(self.spec.protocol, &self.drives).filter(|_| self.drives.iter().all(is_stopped))
+        {
+            let broadcast = self.exchange(&stop, BROADCAST_PAUSE);
+            time.answered += broadcast;
+            time.unanswered += broadcast;
+        }
         for drive in self.drives.iter().filter(|drive| is_stopped(drive)) {
             let Some((read, write)) = stop_of(drive) else { continue };
             let tries = self.options.retries.saturating_add(1);

@@ -18,6 +18,7 @@ pub(super) fn between(before: &Settings, after: &Settings) -> Vec<String> {
         section("the tool slots", &before.slots, &after.slots),
         section("MQTT", &before.mqtt, &after.mqtt),
         section("HTTP", &before.http, &after.http),
+        section("BACnet/IP", &before.bacnet, &after.bacnet),
         section("the audit file", &before.audit, &after.audit),
     ];
     changes.extend(sections.into_iter().flatten());

@@ -4,7 +4,7 @@
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 use crate::config::Settings;
-use crate::north::{http, modbus_tcp, slot};
+use crate::north::{bacnet, http, modbus_tcp, slot};
 
 /// Files that the process itself has open: logs, runtimes, queues, the configuration, MQTT with its buffer, local clients.
 const OWN_FILES: usize = 64;
@@ -56,7 +56,7 @@ fn raise(wanted: usize) -> usize {
 #[derive(Debug, Clone)]
 struct Wanted {
     buses: usize,
-    /// Of the tool slots.
+    /// Of the tool slots and BACnet.
     slots: usize,
     modbus_tcp: Option<modbus_tcp::Options>,
     http: Option<http::Options>,
@@ -66,7 +66,8 @@ impl Wanted {
     fn of(settings: &Settings) -> Wanted {
         Wanted {
             buses: settings.buses.len(),
-            slots: settings.slots.as_ref().map_or(0, slot::Options::files),
+            slots: settings.slots.as_ref().map_or(0, slot::Options::files)
+                + settings.bacnet.as_ref().map_or(0, bacnet::Options::files),
             modbus_tcp: settings.modbus_tcp.clone(),
             http: settings.http.clone(),
         }

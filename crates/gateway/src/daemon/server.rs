@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
-use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt, slot};
+use crate::north::{NorthStats, ServerError, bacnet, http, local, modbus_tcp, mqtt, slot};
 use crate::plant::SharedPlant;
 
 /// Time for what the clients of a server have begun that a reload takes away, longer than any order waits for its bus; and how often it
@@ -302,6 +302,48 @@ impl Reconfigure for slot::Server {
 
     fn is_drained(&self) -> bool {
         slot::Server::is_drained(self)
+    }
+}
+
+impl Server for bacnet::Server {
+    const NAME: &'static str = "BACnet/IP";
+    type Options = bacnet::Options;
+
+    async fn start(
+        options: Self::Options,
+        plant: SharedPlant,
+        stats: Arc<NorthStats>,
+        cancel: CancellationToken,
+    ) -> Result<Self, ServerError> {
+        bacnet::start(options, plant, stats, cancel).await
+    }
+
+    async fn stopped(self) {
+        bacnet::Server::stopped(&self).await;
+    }
+}
+
+impl Reconfigure for bacnet::Server {
+    type Change = bacnet::Change;
+
+    async fn prepare(&mut self, options: Self::Options) -> Result<Self::Change, ServerError> {
+        bacnet::Server::prepare(self, options).await
+    }
+
+    fn commit(&mut self, change: Self::Change) {
+        bacnet::Server::commit(self, change);
+    }
+
+    fn abort(&mut self, change: Self::Change) {
+        bacnet::Server::abort(self, change);
+    }
+
+    async fn retire(&mut self) {
+        bacnet::Server::retire(self).await;
+    }
+
+    fn is_drained(&self) -> bool {
+        bacnet::Server::is_drained(self)
     }
 }
 

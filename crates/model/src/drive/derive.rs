@@ -2,6 +2,7 @@
 
 use std::time::Instant;
 
+use super::control::Mask;
 use super::model::{Quality, Sample, Value, tidy};
 
 /// Share of the lower end of a band by which a value may miss it for the rounding of floats.
@@ -59,6 +60,11 @@ pub enum Derived {
         /// Points.
         of: Vec<usize>,
     },
+    /// True while a register is in one of these states.
+    State {
+        /// Alternatives.
+        any: Vec<Mask>,
+    },
     /// Number of the lowest set bit, counted from 1; 0 if none is set.
     LowestBit {
         /// Point with a mask.
@@ -76,6 +82,7 @@ impl Derived {
             Derived::Zero { .. } => "zero",
             Derived::Equal { .. } => "equal",
             Derived::All { .. } => "all",
+            Derived::State { .. } => "state",
             Derived::LowestBit { .. } => "lowest_bit",
         }
     }
@@ -92,15 +99,24 @@ impl Derived {
 
     /// The points that the value itself is derived from, without the ends of a band.
     pub fn sources(&self) -> impl Iterator<Item = usize> {
-        let (first, second, more): (Option<usize>, Option<usize>, &[usize]) = match self {
+        let (mut more, mut states): (&[usize], &[Mask]) = (&[], &[]);
+        let (first, second) = match self {
             Derived::Band { of, .. }
             | Derived::Percent { of, .. }
             | Derived::Zero { of, .. }
-            | Derived::LowestBit { of } => (Some(*of), None, &[]),
-            Derived::Equal { of, to, .. } => (Some(*of), Some(*to), &[]),
-            Derived::All { of } => (None, None, of),
+            | Derived::LowestBit { of } => (Some(*of), None),
+            Derived::Equal { of, to, .. } => (Some(*of), Some(*to)),
+            Derived::All { of } => {
+                more = of;
+                (None, None)
+            }
+            Derived::State { any } => {
+                states = any;
+                (None, None)
+            }
         };
-        first.into_iter().chain(second).chain(more.iter().copied())
+        let more = more.iter().copied().chain(states.iter().map(|state| state.point));
+        first.into_iter().chain(second).chain(more)
     }
 
     /// All points that it depends on, including the ends of a band.
@@ -139,6 +155,14 @@ impl Derived {
             Derived::All { .. } => Some(Value::Bool(
                 sources.fold(first.as_bool(), |all, value| all & value.as_bool()),
             )),
+            Derived::State { any } => {
+                let words = std::iter::once(first).chain(sources).map(|word| word.as_f64() as u64);
+                Some(Value::Bool(
+                    any.iter()
+                        .zip(words)
+                        .fold(false, |is, (state, word)| is | state.holds(word)),
+                ))
+            }
             Derived::LowestBit { .. } => {
                 let mask = first.as_f64() as u64;
                 let number = if mask == 0 {

@@ -77,6 +77,14 @@ fn modbus_families() {
         ("trip_hours", "-", "-", "IR 9 x 0.01", "-"),
         ("fault_code", "HR 2110", "HR 2110", "IR 100", "derive lowest_bit"),
         ("fault_code_id99", "HR 98", "HR 98", "-", "-"),
+        // Documents of relatives [X7]: compared with process data.
+        ("output_frequency_id1", "HR 0 x 0.01", "HR 0 x 0.01", "-", "-"),
+        ("motor_speed_id2", "HR 1", "HR 1", "-", "-"),
+        ("motor_torque_id4", "HR 3 x 0.1", "HR 3 x 0.1", "-", "-"),
+        ("motor_power_id5", "HR 4 x 0.1", "HR 4 x 0.1", "-", "-"),
+        ("motor_voltage_id6", "HR 5 x 0.1", "HR 5 x 0.1", "-", "-"),
+        ("dc_link_voltage_id7", "HR 6", "HR 6", "-", "-"),
+        ("motor_current_id45", "HR 44 x 0.1", "HR 44 x 0.1", "-", "-"),
         ("fault_mask", "-", "-", "-", "HR 33"),
         (
             "speed_reference",
@@ -108,10 +116,16 @@ fn modbus_families() {
         ),
     ];
     for (point, nx, eaton, cx, teco) in rows {
+        // The default selection of process data out 8 of HVX is in another manual [E table 5-3].
+        let hvx = match point {
+            "fault_code" => "HR 98",
+            "fault_code_id99" => "-",
+            _ => eaton,
+        };
         for (name, wanted) in [
             ("vacon-nx", nx),
             ("eaton-svx", eaton),
-            ("eaton-hvx", eaton),
+            ("eaton-hvx", hvx),
             ("vacon-cx", cx),
             ("teco-7300pa", teco),
         ] {
@@ -455,10 +469,10 @@ fn limits_and_lines() {
     }
 }
 
-/// What every family can be commanded, and that parameters and outputs of N2 are written on change only.
+/// What every family whose manual is at hand can be commanded, and that parameters and outputs of N2 are written on change only.
 #[test]
 fn commands_of_every_family() {
-    for profile in Profiles::built_in().iter() {
+    for profile in Profiles::built_in().iter().filter(|profile| profile.verified) {
         let name = &profile.name;
         for point in [
             ModelPoint::Run,
@@ -500,7 +514,7 @@ fn process_data_is_few_requests() {
         ("eaton-svx", 1),
         ("eaton-hvx", 1),
         ("teco-7300pa", 1),
-        ("vacon-cx", 7),
+        ("vacon-cx", 4),
         ("vacon-nx-n2", 7),
         ("eaton-hvx-n2", 7),
         ("teco-7300pa-n2", 7),
@@ -606,10 +620,10 @@ fn what_is_not_confirmed() {
     }
 }
 
-/// Every family has the steps of its manual, and one board has one list.
+/// Every family whose manual is at hand has the steps of it, and one board has one list.
 #[test]
 fn steps_at_the_cabinet() {
-    for family in Profiles::built_in().iter() {
+    for family in Profiles::built_in().iter().filter(|profile| profile.verified) {
         for step in Step::ALL {
             // No manual has a test of TECO.
             let is_blank = step == Step::Test && family.name.starts_with("teco");

@@ -1,6 +1,7 @@
 //! What a drive is: points, profiles and the requests that read them. Pure.
 
 pub mod commissioning;
+pub mod control;
 pub(crate) mod derive;
 #[cfg(test)]
 mod families_tests;
@@ -24,6 +25,16 @@ pub use raw_writes::RawWrites;
 /// Name of the point with the drive's own response to a silent master; 0 is no response. For Vacon NX parameter
 /// P2.7.22.
 pub const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";
+
+/// What restarts the communication of a drive that counts messages (function 08, subfunction 01); written like a point.
+pub const RESTART_COMMUNICATION: &str = "restart_communication";
+
+/// Name of the point with what a drive does after a communication error; 3 is that its motor runs on. For TECO 7300PA the first two
+/// digits of Sn-08.
+pub const COMMUNICATION_ERROR_REACTION: &str = "communication_error_reaction";
+
+/// Name of the point with the time without data, in seconds, after which a drive has a communication fault. For TECO 7300PA Cn-31.
+pub const COMMUNICATION_FAULT_TIME: &str = "communication_fault_time";
 
 /// Name of the point with the time without a request, in seconds, after which a drive responds to a silent master; 0 is
 /// never. For drives with a register for it.

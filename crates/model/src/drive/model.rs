@@ -5,6 +5,8 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::profile::Order;
+
 /// A value in engineering units.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(untagged)]
@@ -15,21 +17,87 @@ pub enum Value {
     Integer(i64),
     /// A number in the point's unit; always finite.
     Number(f64),
+    /// A whole number above those of `Integer`.
+    Unsigned(u64),
+    /// A text.
+    Text(Text),
+}
+
+/// A text of a drive: as much as a value may have, kept in place.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub struct Text {
+    bytes: [u8; Text::MOST],
+    length: u8,
+}
+
+impl Text {
+    const MOST: usize = 2 * super::profile::MOST_REGISTERS;
+
+    /// The text in these registers up to its first NUL; `None` if there are too many.
+    pub(crate) fn of_registers(words: &[u16], order: Order) -> Option<Text> {
+        let mut text = Text {
+            bytes: [0; Text::MOST],
+            length: 0,
+        };
+        if words.len() > super::profile::MOST_REGISTERS {
+            return None;
+        }
+        let all = order.bytes(words).take_while(|byte| *byte != 0);
+        for (place, byte) in text.bytes.iter_mut().zip(all) {
+            *place = byte;
+            text.length += 1;
+        }
+        Some(text)
+    }
+
+    /// The text; what is no character of it is shown as U+FFFD, so that nothing of a device reaches a terminal or a log.
+    pub fn shown(&self) -> String {
+        let bytes = self.bytes.get(..usize::from(self.length)).unwrap_or_default();
+        let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
+        String::from_utf8_lossy(bytes).chars().map(shown).collect()
+    }
+}
+
+impl fmt::Debug for Text {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:?}", self.shown())
+    }
+}
+
+impl Serialize for Text {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&self.shown())
+    }
 }
 
 impl Value {
-    /// The value as a number; true is 1.
+    /// The value as a number; true is 1, a text is none (NaN).
     pub fn as_f64(self) -> f64 {
         match self {
             Value::Bool(b) => f64::from(u8::from(b)),
             Value::Integer(i) => i as f64,
+            Value::Unsigned(u) => u as f64,
             Value::Number(n) => n,
+            Value::Text(_) => f64::NAN,
         }
     }
 
-    /// Whether the value is not zero.
+    /// The value as a number that is it to the last digit; `None` for a text and for a whole number that is rounded.
+    pub fn exact_f64(self) -> Option<f64> {
+        let number = self.as_f64();
+        let exact = match self {
+            Value::Integer(i) => number as i128 == i128::from(i),
+            Value::Unsigned(u) => number as i128 == i128::from(u),
+            Value::Bool(_) | Value::Number(_) => true,
+            Value::Text(_) => false,
+        };
+        exact.then_some(number)
+    }
+
+    /// Whether the value is not zero; a text says neither.
     pub fn as_bool(self) -> bool {
-        self.as_f64() != 0.0
+        let number = self.as_f64();
+        number != 0.0 && !number.is_nan()
     }
 }
 
@@ -38,7 +106,9 @@ impl fmt::Display for Value {
         match self {
             Value::Bool(b) => write!(f, "{b}"),
             Value::Integer(i) => write!(f, "{i}"),
+            Value::Unsigned(u) => write!(f, "{u}"),
             Value::Number(n) => write!(f, "{n}"),
+            Value::Text(text) => f.write_str(&text.shown()),
         }
     }
 }
@@ -161,8 +231,10 @@ pub enum Kind {
     Bool,
     /// A number with a unit.
     Number,
-    /// A code.
+    /// A code, or a whole number of 64 bits.
     Integer,
+    /// A text.
+    Text,
 }
 
 /// Rounds away the error of binary fractions in a scaled count: 2500 * 0.01 is 25, not 25.000000000000004.

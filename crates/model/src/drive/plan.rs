@@ -1,6 +1,6 @@
 //! The requests that read a drive: neighbouring points are read in one request.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use super::model::ModelPoint;
@@ -47,6 +47,10 @@ pub struct Plan {
     pub reads: Vec<PlannedRead>,
     /// What a drive with a new fault is asked for, as far as no fast read has it: once a fault, among its slow reads.
     pub on_fault: Vec<PlannedRead>,
+    /// What process data is compared with, as far as no other read has it: see [`super::profile::Point::monitor`].
+    pub monitors: Vec<PlannedRead>,
+    /// Those of `reads` that are longer than a manual states: bits that are read singly until a reply proves the whole.
+    pub trials: Vec<PlannedRead>,
     /// The reads of process data that decide the drive's state: fault, running, ready.
     pub behind_state: Vec<PlannedRead>,
 }
@@ -56,35 +60,55 @@ impl Plan {
     /// up to the limit of the range. A gap is read only where the range allows holes. An address that two classes need,
     /// or that the faster one reads as such a gap, is read in the faster one only.
     pub fn of(profile: &Profile) -> Plan {
+        let pieces = pieces_of(profile);
         let mut taken: BTreeSet<(Table, u16)> = BTreeSet::new();
+        let is_open = |taken: &BTreeSet<(Table, u16)>, &(table, address, items): &Piece| {
+            addresses(address, items).any(|at| !taken.contains(&(table, at)))
+        };
         let mut reads = Vec::new();
         for class in [PollClass::Fast, PollClass::Slow, PollClass::Once] {
-            let points = profile.points.iter().filter(|p| p.class == class);
-            let raw = points.filter_map(|p| p.raw());
-            let wanted: BTreeSet<Piece> = raw
-                .filter(|raw| raw.addresses().any(|a| !taken.contains(&(raw.table, a))))
-                .map(|raw| (raw.table, raw.address, raw.form.items()))
+            let of_class = pieces.iter().filter(|(_, of)| **of == class);
+            let wanted: BTreeSet<Piece> = of_class
+                .map(|(piece, _)| *piece)
+                .filter(|piece| is_open(&taken, piece))
                 .collect();
             let merged = merge(profile, class, &wanted);
             for read in &merged {
-                taken.extend((read.start..).take(usize::from(read.count)).map(|a| (read.table, a)));
+                taken.extend(addresses(read.start, read.count).map(|at| (read.table, at)));
             }
             reads.extend(merged);
+        }
+        let monitors = profile.points.iter().filter_map(|point| point.monitor);
+        let monitors = monitors.filter_map(|monitor| profile.points.get(monitor)?.raw());
+        let monitors: BTreeSet<Piece> = monitors
+            .filter(|raw| raw.addresses().any(|a| !taken.contains(&(raw.table, a))))
+            .map(|raw| (raw.table, raw.address, raw.form.items()))
+            .collect();
+        let monitors = merge(profile, PollClass::Monitor, &monitors);
+        for read in &monitors {
+            taken.extend((read.start..).take(usize::from(read.count)).map(|a| (read.table, a)));
         }
         let on_fault = profile.on_fault.iter().filter_map(|index| profile.points.get(*index));
         let on_fault: BTreeSet<Piece> = on_fault
             .filter(|point| point.class == PollClass::Never)
             .filter_map(|point| point.raw())
-            .filter(|raw| raw.addresses().any(|a| !taken.contains(&(raw.table, a))))
             .map(|raw| (raw.table, raw.address, raw.form.items()))
+            .filter(|piece| is_open(&taken, piece))
             .collect();
         let on_fault = merge(profile, PollClass::Fault, &on_fault);
         let mut plan = Plan {
             reads,
             on_fault,
+            monitors,
+            trials: Vec::new(),
             behind_state: Vec::new(),
         };
         plan.behind_state = plan.behind_state(profile);
+        let is_trial = |read: &&PlannedRead| {
+            let range = profile.range(read.table, read.start);
+            read.class == PollClass::Fast && range.is_some_and(|range| read.count > range.read)
+        };
+        plan.trials = plan.reads.iter().filter(is_trial).copied().collect();
         plan
     }
 
@@ -99,12 +123,17 @@ impl Plan {
         fast.filter(decides).copied().collect()
     }
 
+    /// All requests: those of the poll classes, those after a fault and those of comparisons.
+    pub fn all(&self) -> impl Iterator<Item = &PlannedRead> {
+        self.reads.iter().chain(&self.monitors).chain(&self.on_fault)
+    }
+
     /// Whether these requests read a point of that profile: everything it is in or derived from.
     pub fn shows(&self, profile: &Profile, point: usize) -> bool {
         match profile.points.get(point).map(|point| &point.source) {
             Some(Source::Raw(raw)) => {
                 let is_read = |address| self.reads.iter().any(|read| read.covers(raw.table, address));
-                raw.addresses().all(is_read)
+                raw.addresses().all(is_read) && raw.scale_from.is_none_or(|scale| self.shows(profile, scale))
             }
             Some(Source::Derived(derived)) => derived.rests_on().into_iter().all(|of| self.shows(profile, of)),
             None => false,
@@ -139,7 +168,8 @@ impl PlannedRead {
     }
 }
 
-fn is_wide(wide: u128, item: u16) -> bool {
+/// Whether the item is a further register of a value.
+pub fn is_wide(wide: u128, item: u16) -> bool {
     wide.checked_shr(u32::from(item)).is_some_and(|rest| rest & 1 == 1)
 }
 
@@ -149,6 +179,39 @@ fn low_bits(count: u16) -> u128 {
 
 /// Registers of one value, which are read together: table, first address, count.
 type Piece = (Table, u16, u16);
+
+fn addresses(start: u16, items: u16) -> impl Iterator<Item = u16> {
+    (0..items).filter_map(move |item| start.checked_add(item))
+}
+
+/// The values that the plan reads, each in the fastest class of those whose registers it shares: values that overlap are
+/// one piece, so that none of them is ever put together from two reads.
+fn pieces_of(profile: &Profile) -> BTreeMap<Piece, PollClass> {
+    let polled = profile.points.iter().filter(|point| point.class < PollClass::Fault);
+    let raws = polled.filter_map(|point| Some((point.raw()?, point.class)));
+    let mut all: Vec<(Piece, PollClass)> = raws
+        .map(|(raw, class)| ((raw.table, raw.address, raw.form.items()), class))
+        .collect();
+    all.sort();
+    let mut pieces: Vec<(Piece, PollClass)> = Vec::new();
+    for ((table, address, items), class) in all {
+        let end = |start: u16, items: u16| u32::from(start) + u32::from(items);
+        let most = profile.range(table, address).map_or(0, |range| range.read);
+        let joined = pieces.last_mut().filter(|((of, start, count), _)| {
+            let whole = end(address, items).max(end(*start, *count)) - u32::from(*start);
+            *of == table && u32::from(address) < end(*start, *count) && whole <= u32::from(most)
+        });
+        match joined {
+            Some(((_, start, count), fastest)) => {
+                let whole = end(address, items).max(end(*start, *count)) - u32::from(*start);
+                *count = u16::try_from(whole).unwrap_or(*count);
+                *fastest = class.min(*fastest);
+            }
+            None => pieces.push(((table, address, items), class)),
+        }
+    }
+    pieces.into_iter().collect()
+}
 
 fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<PlannedRead> {
     let mut reads: Vec<PlannedRead> = Vec::new();
@@ -164,7 +227,13 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<P
             let end = u32::from(last.start) + u32::from(last.count);
             let joined = piece_end.max(end) - u32::from(last.start);
             let adjacent = u32::from(address) <= end || range.holes;
-            let fits = joined <= u32::from(range.read);
+            // Only bits, which a drive that ignores the number of items reports as 0.
+            let tried = if class == PollClass::Fast && table.is_bits() {
+                range.try_read
+            } else {
+                0
+            };
+            let fits = joined <= u32::from(range.read.max(tried));
             if range.addresses.contains(&last.start) && adjacent && fits {
                 let at = u32::from(address) - u32::from(last.start);
                 last.wide |= inner.checked_shl(at).unwrap_or(0);
@@ -314,6 +383,37 @@ mod tests {
         assert_eq!(Plan::halves(low), None, "one value");
         first.append(&low);
         assert_eq!(first, read);
+    }
+
+    /// Values that share registers are read together, in the class of the fastest, however they would be cut otherwise.
+    #[test]
+    fn values_that_overlap_are_one_read() {
+        let plan_of = |points: &[(&str, u16, &str)]| {
+            let mut text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\n\
+                            last = 99\nread = 4\n"
+                .to_string();
+            for (place, (kind, address, class)) in points.iter().enumerate() {
+                text += &format!(
+                    "[[point]]\nname = \"p{place}\"\nat = \"holding {address}\"\ntype = \"{kind}\"\nclass = \"{class}\"\n"
+                );
+            }
+            let plan = Plan::of(&Profile::parse("p.toml", &text, false).unwrap());
+            let reads = plan.reads.iter().map(|r| (r.class, r.start, r.count));
+            reads.collect::<Vec<_>>()
+        };
+        use PollClass::{Fast, Slow};
+        let split = [
+            ("u16", 0, "fast"),
+            ("u16", 1, "fast"),
+            ("u16", 2, "fast"),
+            ("u64", 3, "fast"),
+        ];
+        assert_eq!(plan_of(&split), [(Fast, 0, 3), (Fast, 3, 4)]);
+        let torn = [("u32", 1, "slow"), ("u16", 1, "fast"), ("u16", 9, "slow")];
+        assert_eq!(plan_of(&torn), [(Fast, 1, 2), (Slow, 9, 1)]);
+        let chain = [("u64", 0, "slow"), ("u64", 2, "slow")];
+        assert_eq!(plan_of(&chain), [(Slow, 0, 4), (Slow, 2, 4)], "each whole");
+        assert_eq!(plan_of(&[("string:4", 8, "slow")]), [(Slow, 8, 4)]);
     }
 
     #[test]

@@ -10,13 +10,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::commissioning::Commissioning;
+use super::control::{Control, Place};
 use super::derive::Derived;
 use super::model::{Kind, ModelPoint, Value};
 use super::parameters::ParameterList;
 use crate::codec::{N2Options, Protocol, RequestPdu, Table};
 use crate::document::{Node, Problem};
 
-pub use raw::{Form, Raw, WordOrder};
+pub use raw::{Equals, Form, MOST_REGISTERS, Order, Raw};
 
 /// A validated profile.
 #[derive(Debug, Clone, PartialEq)]
@@ -60,7 +61,17 @@ pub struct Profile {
     /// All points, in the order of the file.
     pub points: Vec<Point>,
     /// Points that a drive with a new fault is asked for at once.
+    /// The drive counts what it receives, damaged or not, and tells it by function 08 (subfunctions 0B to 0F).
+    pub counts_messages: bool,
+    /// The drive may stop by itself when its master falls silent, and nothing that can be read tells whether it does.
+    pub may_stop_by_itself: bool,
+    /// A broadcast that clears the whole control word stops every drive of the family on the line.
+    pub broadcast_stop: bool,
     pub on_fault: Vec<usize>,
+    /// How it is commanded, where its profile says so in `[control]`.
+    pub control: Option<Control>,
+    /// Whether somebody has seen the profile right on hardware, or it is made from manuals of that very family.
+    pub verified: bool,
     /// Its parameters.
     pub parameters: ParameterList,
     /// Texts of fault codes.
@@ -104,6 +115,8 @@ pub struct AddressRange {
     pub addresses: RangeInclusive<u16>,
     /// Items per read request.
     pub read: u16,
+    /// Items per read request that no manual states: such a read is tried, and used once its reply proves it; 0 is none.
+    pub try_read: u16,
     /// Items per write request; 0 is read-only.
     pub write: u16,
     /// A read may cover addresses between two points that no point names.
@@ -204,6 +217,8 @@ pub enum PollClass {
     Once,
     /// Once after a fault came up: see [`Profile::on_fault`].
     Fault,
+    /// When the drive comes online and when a comparison needs it: see [`Point::monitor`].
+    Monitor,
     /// Never by itself.
     Never,
 }
@@ -216,6 +231,7 @@ impl PollClass {
             PollClass::Slow => "slow",
             PollClass::Once => "once",
             PollClass::Fault => "fault",
+            PollClass::Monitor => "monitor",
             PollClass::Never => "never",
         }
     }
@@ -236,6 +252,9 @@ pub struct Point {
     pub class: PollClass,
     /// A slow point that is read in the fast class on lines that carry it.
     pub fast_if_carried: bool,
+    /// The point that always has the same value, where a selector of the drive decides what this one has: the two are compared
+    /// when the drive comes online.
+    pub monitor: Option<usize>,
     /// Whether it can be commanded.
     pub write: bool,
     /// The point that receives the commands, in the same unit, if the drive reports the value elsewhere.
@@ -248,6 +267,10 @@ pub struct Point {
     pub range: Option<RangeInclusive<f64>>,
     /// Texts of the values of an enumeration.
     pub texts: BTreeMap<i64, String>,
+    /// It takes other values than those of `texts`, too.
+    pub unlisted: bool,
+    /// A helper of other points that no north side shows and nobody commands.
+    pub hidden: bool,
     /// A state of the point that keeps the motor from running.
     pub blocks: Option<Blocks>,
     /// Whether an available manual confirms the address.
@@ -277,15 +300,45 @@ pub enum Source {
 }
 
 impl Point {
+    /// A point of the common model that is only derived, or not read by itself.
+    pub(super) fn of_model(model: ModelPoint, source: Source) -> Point {
+        Point {
+            name: model.name().to_string(),
+            model: Some(model),
+            unit: model.unit().to_string(),
+            source,
+            class: PollClass::Never,
+            fast_if_carried: false,
+            monitor: None,
+            write: false,
+            write_to: None,
+            pulse: false,
+            on_change: false,
+            range: None,
+            texts: BTreeMap::new(),
+            unlisted: false,
+            hidden: false,
+            blocks: None,
+            verified: true,
+            note: String::new(),
+        }
+    }
+
+    /// Whether users can command it.
+    pub fn is_commanded(&self) -> bool {
+        self.write && !self.hidden
+    }
+
     /// Kind of its values.
     pub fn kind(&self) -> Kind {
-        use Derived::{All, Equal, LowestBit, Zero};
+        use Derived::{All, Equal, LowestBit, State, Zero};
         match (&self.source, self.model) {
-            (Source::Raw(raw), _) if matches!(raw.form, Form::Bit { .. }) => Kind::Bool,
-            (Source::Derived(Zero { .. } | Equal { .. } | All { .. }), _) => Kind::Bool,
+            (Source::Raw(raw), _) if raw.is_bool() => Kind::Bool,
+            (Source::Raw(raw), _) if matches!(raw.form, Form::Text { .. }) => Kind::Text,
+            (Source::Derived(Zero { .. } | Equal { .. } | All { .. } | State { .. }), _) => Kind::Bool,
             (_, Some(model)) => model.kind(),
             (Source::Derived(LowestBit { .. }), None) => Kind::Integer,
-            (Source::Raw(raw), None) if matches!(raw.form, Form::Bits { .. }) => Kind::Integer,
+            (Source::Raw(raw), None) if raw.is_code() => Kind::Integer,
             _ if !self.texts.is_empty() => Kind::Integer,
             _ => Kind::Number,
         }
@@ -296,9 +349,16 @@ impl Point {
         let code = match value {
             Value::Integer(code) => code,
             Value::Bool(state) => i64::from(state),
-            Value::Number(_) => return None,
+            Value::Number(_) | Value::Unsigned(_) | Value::Text(_) => return None,
         };
         self.texts.get(&code).map(String::as_str)
+    }
+
+    /// The value of an enumeration that a text means; `None` also where it means several.
+    pub fn code_of(&self, text: &str) -> Option<i64> {
+        let mut codes = self.texts.iter().filter(|(_, meaning)| *meaning == text);
+        let first = codes.next().map(|(code, _)| *code);
+        first.filter(|_| codes.next().is_none())
     }
 
     /// Its raw source, if it has one.
@@ -328,7 +388,7 @@ impl Profile {
                 let of = derived.rests_on();
                 of.into_iter().flat_map(|of| self.raw_points_of(of)).collect()
             }
-            Some(Source::Raw(_)) => vec![point],
+            Some(Source::Raw(raw)) => std::iter::once(point).chain(raw.scale_from).collect(),
             None => Vec::new(),
         }
     }
@@ -385,6 +445,18 @@ impl Profile {
         }
     }
 
+    /// Whether that word, written there, is a run command or a stop; `None` where it is neither.
+    pub fn runs_by(&self, table: Table, address: u16, word: u16) -> Option<bool> {
+        if let Some(control) = &self.control {
+            let place = Place { table, address };
+            let run = control.is_run(place, word).then_some(true);
+            return run.or(control.is_stop(place, word).then_some(false));
+        }
+        let here = |(raw, ..): &(&Raw, u8, bool)| raw.table == table && raw.address == address;
+        let (_, bit, invert) = self.run_bit().filter(here)?;
+        Some(((word >> bit) & 1 == 1) != invert)
+    }
+
     /// Whether a write of these items is skipped if the drive has them already, because it stores them in EEPROM with
     /// limited write cycles. On N2 that includes addresses without a point, but never a stop or a pulse.
     pub fn writes_on_change(&self, table: Table, items: &[(u16, u16)]) -> bool {
@@ -412,8 +484,23 @@ impl Profile {
         table == Table::Holding && self.n2.release && self.protocols.contains(&Protocol::N2)
     }
 
+    /// The write that stops every drive of the family on a line when it is sent to all of them: it clears the whole control
+    /// word. None where the family knows none.
+    pub fn broadcast_stop(&self) -> Option<RequestPdu> {
+        let (raw, ..) = self.run_bit().filter(|_| self.broadcast_stop)?;
+        let pdu = match raw.table {
+            Table::Coil => self.functions.write_coil(raw.address, false),
+            Table::Holding => self.functions.write_register(raw.address, 0),
+            Table::DiscreteInput | Table::Input => return None,
+        };
+        self.is_stop(raw.table, raw.address, 0).then_some(pdu)
+    }
+
     /// Whether writing `value` to that register (or coil) clears the run command: a stop.
     pub fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
+        if let Some(control) = &self.control {
+            return control.is_stop(Place { table, address }, value);
+        }
         self.run_bit().is_some_and(|(raw, bit, invert)| {
             raw.table == table && raw.address == address && ((value >> bit) & 1 == 1) == invert
         })

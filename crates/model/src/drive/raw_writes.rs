@@ -31,7 +31,9 @@ impl RawWrites {
     ) -> Option<u16> {
         let is_control_word = |address: u16| {
             let run = profile.run_bit();
+            let at = profile.control.as_ref().map(|control| control.at);
             run.is_some_and(|(raw, ..)| raw.table == table && raw.address == address)
+                || at.is_some_and(|at| at.table == table && at.address == address)
         };
         if addresses.clone().any(is_control_word) {
             return None;
@@ -171,8 +173,16 @@ mod tests {
     #[test]
     fn no_family_loses_its_control_word() {
         for profile in Profiles::built_in().iter() {
-            let (raw, ..) = profile.run_bit().unwrap();
-            let (table, address) = (raw.table, raw.address);
+            let run = profile.run_bit().map(|(raw, ..)| (raw.table, raw.address));
+            let control = profile
+                .control
+                .as_ref()
+                .map(|control| (control.at.table, control.at.address));
+            // A family that is only read has none.
+            let Some((table, address)) = control.or(run) else {
+                assert_eq!(profile.ranges.iter().map(|range| range.write).max(), Some(0));
+                continue;
+            };
             assert_eq!(
                 refused(&RawWrites::Points, profile, table, address..=address),
                 None,

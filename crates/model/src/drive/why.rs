@@ -242,6 +242,12 @@ impl Look<'_> {
                 "its process data is too old to say anything".to_string(),
                 "see load and errors of the bus: the line may be overloaded or disturbed",
             ),
+            Contact::Silent if self.profile.counts_messages => (
+                "offline",
+                "it does not answer".to_string(),
+                "check its supply, the wiring and its address; if a master has set it to listen only (function 08, subfunction \
+                 04), write restart_communication=true with `drivegate write`",
+            ),
             Contact::Silent => (
                 "offline",
                 "it does not answer".to_string(),
@@ -310,6 +316,12 @@ impl Look<'_> {
             let blocks = point.blocks.as_ref()?;
             let sample = (self.sample)(index);
             let value = sample.good().filter(|value| value.as_bool() == blocks.when)?;
+            // A drive that is ready waits for no interlock, whatever an uncertain bit seems to say (HVX status word bit 8, where
+            // table and legend of the manual contradict).
+            let ready = || self.bit(ModelPoint::Ready).is_some_and(|(ready, _)| ready);
+            if !point.verified && blocks.cause == INTERLOCKED && ready() {
+                return None;
+            }
             let unsure = if point.verified { "" } else { ", address not verified" };
             let evidence = format!("{}{unsure}", reads(point, value));
             Some(self.cause(&blocks.cause, evidence, sample.at, &blocks.remedy))
@@ -343,7 +355,15 @@ impl Look<'_> {
         }
         let evidence = "ready is off, and the drive does not tell why".to_string();
         let remedy = "check its enable and interlock inputs, the mains, and what its display shows";
-        Some(self.cause("not_ready", evidence, at, remedy))
+        let note = self
+            .profile
+            .model_point(ModelPoint::Ready)
+            .map_or("", |point| &point.note);
+        let remedy = match note.is_empty() {
+            true => remedy.to_string(),
+            false => format!("{remedy}; of this family: ready {note}"),
+        };
+        Some(self.cause("not_ready", evidence, at, &remedy))
     }
 
     /// It takes no order to run, whoever gives it.

@@ -170,8 +170,14 @@ fn request_expiry(value: &Json) -> Result<Duration, Refusal> {
 /// The point of that name with its value. Limits are checked with the command.
 pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(usize, Value), Refusal> {
     let Some(index) = profile.point_index(name) else {
-        let writable = || profile.points.iter().filter(|p| p.write).map(|p| p.name.as_str());
-        let all = || profile.points.iter().map(|p| p.name.as_str());
+        let writable = || {
+            profile
+                .points
+                .iter()
+                .filter(|p| p.is_commanded())
+                .map(|p| p.name.as_str())
+        };
+        let all = || profile.points.iter().filter(|p| !p.hidden).map(|p| p.name.as_str());
         let likely = || nearest(name, writable()).or_else(|| nearest(name, all()));
         let hint = match (name.len() <= MAX_NAME).then(likely).flatten() {
             Some(near) => format!("did you mean `{near}`?"),
@@ -180,7 +186,7 @@ pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(us
         let name = excerpt(name.as_bytes());
         return Err(Refusal::NotWritable(format!("there is no point {name}; {hint}")));
     };
-    let point = profile.points.get(index).filter(|p| p.write);
+    let point = profile.points.get(index).filter(|p| p.is_commanded());
     let Some(point) = point else {
         return Err(Refusal::NotWritable(format!("`{name}` is read-only")));
     };
@@ -189,14 +195,34 @@ pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(us
         (Kind::Bool, Json::Bool(b)) => Value::Bool(*b),
         (Kind::Bool, Json::Number(n)) if n.as_f64() == Some(0.0) => Value::Bool(false),
         (Kind::Bool, Json::Number(n)) if n.as_f64() == Some(1.0) => Value::Bool(true),
+        (Kind::Bool, Json::String(text)) if point.code_of(text).is_some() => {
+            Value::Bool(point.code_of(text).unwrap_or_default() != 0)
+        }
         (Kind::Bool, _) => return Err(wrong("true or false")),
+        (Kind::Number | Kind::Integer, Json::Number(n)) if is_long(n) => match (n.as_i64(), n.as_u64()) {
+            (Some(whole), _) => Value::Integer(whole),
+            (None, Some(whole)) => Value::Unsigned(whole),
+            (None, None) => return Err(wrong("a number")),
+        },
         (Kind::Number | Kind::Integer, Json::Number(n)) => {
             Value::Number(n.as_f64().filter(|n| n.is_finite()).ok_or_else(|| wrong("a number"))?)
         }
+        (Kind::Number | Kind::Integer, Json::String(text)) if !point.texts.is_empty() => match point.code_of(text) {
+            Some(code) => Value::Integer(code),
+            None => return Err(wrong("a text of its values, or a number")),
+        },
         (Kind::Number | Kind::Integer, Json::String(_)) => return Err(wrong("a number; remove the quotes")),
+        (Kind::Text, _) => return Err(wrong("written: the point is a text")),
         (Kind::Number | Kind::Integer, _) => return Err(wrong("a number")),
     };
     Ok((index, value))
+}
+
+/// A whole number that a number with a fraction does not hold to the last digit.
+fn is_long(number: &serde_json::Number) -> bool {
+    let whole = number.as_i64().map(Value::Integer);
+    let whole = whole.or_else(|| number.as_u64().map(Value::Unsigned));
+    whole.is_some_and(|whole| whole.exact_f64().is_none())
 }
 
 fn brief(value: &Json) -> String {

@@ -54,6 +54,9 @@ pub(super) struct Drive<'d> {
     address: u8,
     unit: u8,
     profile: &'d str,
+    /// Told where nobody has confirmed the profile on hardware.
+    #[serde(skip_serializing_if = "Clone::clone")]
+    profile_verified: bool,
     access: &'static str,
     /// `null` while it is not known.
     state: Option<State>,
@@ -98,6 +101,7 @@ impl<'d> Drive<'d> {
             address: spec.address,
             unit: spec.unit,
             profile: &spec.profile.name,
+            profile_verified: spec.profile.verified,
             access: match spec.access {
                 Access::Monitor | Access::Listen => "monitor",
                 Access::Control => "control",

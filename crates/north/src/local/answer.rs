@@ -3,8 +3,6 @@
 
 use std::time::{Duration, Instant};
 
-use serde_json::Value as Json;
-
 use super::protocol::{
     Expected, Failure, FailureCode, Outcome, ParamsOutcome, ParamsRequest, PointValue, ReadOutcome, ReadRequest,
     RecordOutcome, RecordRequest, Request, RestoreAct, RestoreOutcome, RestoreRequest, Setting, WhyRequest, Word,
@@ -15,7 +13,7 @@ use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Pace, Refus
 use crate::command_json::resolve;
 use crate::document::nearest;
 use crate::drive::why::Explanation;
-use crate::drive::{ModelPoint, Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
+use crate::drive::{ModelPoint, Point, PollClass, Profile, Quality, RESTART_COMMUNICATION, Raw, Sample, Source, Value};
 use crate::parameter_jobs::{Again, How, begin_reading, carry_out, prepare, release, take_up};
 use crate::parameters::{Id, ParameterFile, Wishes};
 use crate::plant::{DriveHandle, Plant, SharedPlant, Shown};
@@ -166,8 +164,10 @@ fn wanted(profile: &Profile, names: &[String]) -> Result<Vec<Wanted>, Failure> {
     let of = |name: &String| {
         let has = |word: &Word| word.sources().iter().any(|point| profile.model_index(*point).is_some());
         let word = || Word::of(name).filter(has).map(Wanted::Word);
+        let shown = |index: &usize| profile.points.get(*index).is_some_and(|point| !point.hidden);
         profile
             .point_index(name)
+            .filter(shown)
             .map(Wanted::Point)
             .or_else(word)
             .ok_or_else(|| {
@@ -276,6 +276,17 @@ async fn write(request: &WriteRequest, plant: &Plant, origin: Origin, asked: Ins
         drive => drive?,
     };
     let profile = &drive.image.spec.profile;
+    if profile.counts_messages
+        && let [
+            Setting {
+                point,
+                value: serde_json::Value::Bool(true),
+            },
+        ] = request.points.as_slice()
+        && point == RESTART_COMMUNICATION
+    {
+        return Ok(super::restart::communication(&drive, origin, asked).await);
+    }
     let (values, refused) = understood(profile, &request.points);
     let (client, stop) = (Authority::Write, stop_of(&values, profile));
     let mut placed = match (refused, stop) {
@@ -376,27 +387,12 @@ async fn restore(request: &RestoreRequest, shared: &SharedPlant, origin: Origin)
 fn understood(profile: &Profile, settings: &[Setting]) -> (Vec<(usize, Value)>, Option<Refusal>) {
     let (mut values, mut refused) = (Vec::new(), None);
     for setting in settings {
-        match value_of(profile, setting) {
+        match resolve(profile, &setting.point, &setting.value) {
             Ok(value) => values.push(value),
             Err(refusal) => refused = refused.or(Some(refusal)),
         }
     }
     (values, refused)
-}
-
-/// The point and its value: as over MQTT, and the text of an enumeration too.
-fn value_of(profile: &Profile, setting: &Setting) -> Result<(usize, Value), Refusal> {
-    let point = profile
-        .point_index(&setting.point)
-        .and_then(|index| profile.points.get(index));
-    let code = match (&setting.value, point) {
-        (Json::String(text), Some(point)) => point.texts.iter().find(|(_, meaning)| *meaning == text),
-        _ => None,
-    };
-    match code {
-        Some((code, _)) => resolve(profile, &setting.point, &(*code).into()),
-        None => resolve(profile, &setting.point, &setting.value),
-    }
 }
 
 /// A command that was not understood, for the audit.

@@ -9,6 +9,7 @@ mod answer;
 mod control;
 mod path;
 pub mod protocol;
+mod restart;
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr};

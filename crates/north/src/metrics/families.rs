@@ -11,7 +11,7 @@ use prometheus_client::encoding::{EncodeLabel, EncodeLabelSet, LabelSetEncoder};
 
 use super::model::MODEL;
 use super::process;
-use crate::drive::{ModelPoint, PollClass, State};
+use crate::drive::{ModelPoint, PollClass, State, Value};
 use crate::history::TriggerKind;
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
@@ -271,7 +271,7 @@ fn points(reading: &Reading<'_>, labels: &Labels, (model, other): (&[FamilyId], 
         let Some(value) = reading
             .sample(index)
             .good()
-            .map(|v| v.as_f64())
+            .and_then(Value::exact_f64)
             .filter(|v| v.is_finite())
         else {
             continue;
@@ -430,6 +430,52 @@ fn parameters(plant: &Plant, all: &mut Families) {
     }
 }
 
+fn bacnet(stats: &NorthStats, all: &mut Families) {
+    let Some(figures) = stats.bacnet.get() else { return };
+    let counters = figures.counters;
+    let requests = all.family(
+        Kind::Counter,
+        "drivegate_bacnet_requests_total",
+        "BACnet requests that were answered, by outcome.",
+    );
+    for (outcome, count) in [("ok", counters.done), ("refused", counters.refused)] {
+        all.add(requests, Labels::of([("outcome", outcome)]), SeriesValue::Count(count));
+    }
+    let datagrams = all.family(
+        Kind::Counter,
+        "drivegate_bacnet_datagrams_total",
+        "BACnet datagrams: received, discarded (not understood, or not allowed), dropped (the address had its share of answers).",
+    );
+    let fates = [
+        ("received", counters.received),
+        ("discarded", counters.discarded),
+        ("dropped", counters.dropped),
+    ];
+    for (fate, count) in fates {
+        all.add(datagrams, Labels::of([("fate", fate)]), SeriesValue::Count(count));
+    }
+    all.one(
+        Kind::Counter,
+        "drivegate_bacnet_notifications_total",
+        "Changes of value that were told to BACnet clients.",
+        SeriesValue::Count(counters.notifications),
+    );
+    all.one(
+        Kind::Gauge,
+        "drivegate_bacnet_subscriptions",
+        "Subscriptions of BACnet clients now.",
+        SeriesValue::Value(counters.subscriptions as f64),
+    );
+    if let Some((_, registration)) = figures.bbmd {
+        all.one(
+            Kind::Gauge,
+            "drivegate_bacnet_bbmd_registered",
+            "Whether the BBMD passes broadcasts on: 1, else 0.",
+            flag(registration == drivegate_bacnet::Registration::Registered),
+        );
+    }
+}
+
 fn north(stats: &NorthStats, all: &mut Families) {
     all.one(
         Kind::Gauge,
@@ -455,6 +501,7 @@ fn north(stats: &NorthStats, all: &mut Families) {
         let labels = Labels::default().with_both(("bus", bus.into()), ("outcome", outcome.name().into()));
         all.add(tools, labels, SeriesValue::Count(count));
     }
+    bacnet(stats, all);
     let listener_up = all.family(
         Kind::Gauge,
         "drivegate_listener_up",

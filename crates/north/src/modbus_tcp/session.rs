@@ -27,6 +27,7 @@ const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
 const OWN_FUNCTIONS: [u8; 5] = [3, 4, 6, 16, 43];
 
 /// How a request is handled.
+#[expect(clippy::large_enum_variant, reason = "one at a time, moved once")]
 enum Decision {
     /// Answered at once.
     Reply(RequestPdu, Reply),

@@ -61,7 +61,7 @@ impl Topics {
     pub(super) fn set_topics(&self, plant: &Plant) -> Vec<String> {
         let of_drive = |drive: DriveHandle| {
             let spec = &drive.image.spec;
-            let points = spec.profile.points.iter().filter(|point| point.write);
+            let points = spec.profile.points.iter().filter(|point| point.is_commanded());
             let points = points.map(|point| self.drive(&spec.name, &format!("set/{}", point.name)));
             let whole = self.drive(&spec.name, "set");
             std::iter::once(whole).chain(points).collect::<Vec<String>>()

@@ -114,7 +114,8 @@ fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<
     check_size(incoming.oversized.unwrap_or(incoming.payload.len()))?;
     let mut asked = match point {
         Some(name) => {
-            let points = vec![resolve(profile, name, &bare(&incoming.payload)?)?];
+            let value = text_of(&incoming.payload, name, profile).map_or_else(|| bare(&incoming.payload), Ok)?;
+            let points = vec![resolve(profile, name, &value)?];
             Asked::new(points, DEFAULT_EXPIRY, None, profile)?
         }
         None => command_json::order(&incoming.payload, profile)?,
@@ -123,6 +124,13 @@ fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<
         asked.expiry = asked.expiry.min(Duration::from_secs(seconds.into()));
     }
     Ok(asked)
+}
+
+/// The text of an enumeration as the bare value of its point.
+fn text_of(payload: &[u8], name: &str, profile: &Profile) -> Option<Json> {
+    let point = profile.points.get(profile.point_index(name)?)?;
+    let text = std::str::from_utf8(payload).ok()?.trim();
+    point.code_of(text).map(|_| Json::String(text.to_string()))
 }
 
 /// The value of a `set/{point}` message: `true`, `false`, or a number.
@@ -321,6 +329,37 @@ mod tests {
         }
         assert!(set_point("speed_reference", "true").is_err());
         assert_eq!(set_point("nothing", "1").unwrap_err().code(), "not_writable");
+    }
+
+    /// By its text over every way, by its number too; whole numbers keep every digit.
+    #[test]
+    fn enumerations_are_written_by_text() {
+        let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\nread = 5\n\
+            write = 5\n[[point]]\nname = \"count\"\nat = \"holding 1\"\ntype = \"u64\"\nwrite = true\n\
+            [[point]]\nname = \"mode\"\nat = \"holding 0\"\nwrite = true\n[point.texts]\n0 = \"off\"\n3 = \"night mode\"\n\
+            4 = \"twice\"\n5 = \"twice\"\n";
+        let profile = Profile::parse("p.toml", text, false).unwrap();
+        let value = |point: Option<&str>, payload: &str| {
+            let order = read(&message(payload), point, &profile).order;
+            order.map(|asked| asked.points[0].1)
+        };
+        for (payload, wanted) in [("night mode", 3), ("off", 0)] {
+            assert_eq!(value(Some("mode"), payload), Ok(Value::Integer(wanted)));
+            let object = format!("{{\"mode\": \"{payload}\"}}");
+            assert_eq!(value(None, &object), Ok(Value::Integer(wanted)));
+        }
+        assert_eq!(value(Some("mode"), "3"), Ok(Value::Number(3.0)));
+        for bad in ["night", "twice", "Off"] {
+            assert!(value(Some("mode"), bad).is_err(), "{bad}");
+        }
+        assert_eq!(
+            value(None, r#"{"count": 9007199254740993}"#),
+            Ok(Value::Integer(9_007_199_254_740_993))
+        );
+        assert_eq!(
+            value(None, r#"{"count": 18446744073709551615}"#),
+            Ok(Value::Unsigned(u64::MAX))
+        );
     }
 
     #[test]

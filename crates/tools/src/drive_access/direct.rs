@@ -163,7 +163,7 @@ fn is_polled(profile: &Profile, index: usize) -> bool {
     let read = |i: usize| profile.points.get(i).is_some_and(|p| p.class != PollClass::Never);
     match profile.points.get(index).map(|p| &p.source) {
         Some(Source::Derived(derived)) => derived.rests_on().into_iter().all(read),
-        Some(Source::Raw(_)) => read(index),
+        Some(Source::Raw(raw)) => read(index) && raw.scale_from.is_none_or(read),
         None => false,
     }
 }
@@ -172,7 +172,8 @@ fn is_polled(profile: &Profile, index: usize) -> bool {
 fn is_settled(reading: &Reading<'_>, index: usize) -> bool {
     let sources = match reading.spec.profile.points.get(index).map(|p| &p.source) {
         Some(Source::Derived(derived)) => derived.rests_on(),
-        _ => vec![index],
+        Some(Source::Raw(raw)) => std::iter::once(index).chain(raw.scale_from).collect(),
+        None => Vec::new(),
     };
     sources.into_iter().all(|source| {
         let raw = reading.spec.profile.points.get(source).and_then(Point::raw);

@@ -3,7 +3,7 @@
 use crate::codec::Table;
 use crate::drive::profile::{Form as RawForm, Raw};
 use crate::drive::{ModelPoint, Plan, Point, Profile, RawWrites};
-use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry};
+use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry, FIRST};
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::Access;
 
@@ -74,7 +74,14 @@ pub(super) fn drive_rows(profile: &Profile, plan: &Plan, access: Access, raw_wri
         .into_iter()
         .flatten()
         .map(|entry| entry_row(profile, plan, entry, access));
-    let mut raw: Vec<(&Point, &Raw)> = profile.points.iter().filter_map(|p| Some((p, p.raw()?))).collect();
+    let mut raw: Vec<(&Point, &Raw)> = profile
+        .points
+        .iter()
+        .filter(|p| !p.hidden)
+        .filter_map(|p| Some((p, p.raw()?)))
+        // Registers from there on are the common model's.
+        .filter(|(_, raw)| raw.table.is_bits() || raw.address < FIRST)
+        .collect();
     raw.sort_by_key(|(_, raw)| (raw.table, raw.address));
     let raw = raw.into_iter().map(|(point, raw)| Row {
         access: if access == Access::Control && is_written_raw(profile, raw_writes, raw) {
@@ -215,9 +222,16 @@ fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, raw_writes:
         RawForm::Bit { .. } if raw.table.is_bits() => "bit".to_string(),
         RawForm::Bit { bit, .. } => format!("bit {bit}"),
         RawForm::Bits { first, count } => format!("bits {first}-{}", first.saturating_add(count).saturating_sub(1)),
-        other => other.name().to_string(),
+        _ => raw.type_text().replace(" high-first", ""),
     };
     let mut notes = Vec::new();
+    if let Some(power) = raw.scale_from.and_then(|power| profile.points.get(power)) {
+        notes.push(format!("times 10^{}", power.name));
+    }
+    if !raw.invalid.is_empty() {
+        let values: Vec<String> = raw.invalid.iter().map(|value| format!("{value:#06x}")).collect();
+        notes.push(format!("{} means not available", values.join(", ")));
+    }
     if matches!(raw.form, RawForm::Bit { invert: true, .. }) {
         notes.push("0 means true".to_string());
     }

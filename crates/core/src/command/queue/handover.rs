@@ -31,6 +31,8 @@ impl Pending {
     fn inherit(&mut self, mut stop: Command, now: Instant) {
         self.numbered += 1;
         stop.number = self.numbered;
+        // What follows from it was noted there, too.
+        (stop.effects, stop.slot) = (Vec::new(), None);
         match &self.closed {
             Some(outcome) => stop.answer(&outcome.clone(), now),
             None => self.push_stop(stop, now),

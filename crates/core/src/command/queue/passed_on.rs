@@ -58,7 +58,7 @@ impl Pending {
     pub fn put_back(&mut self, command: Command, now: Instant) {
         let outcome = match &self.closed {
             Some(outcome) => Some(outcome.clone()),
-            None if self.stops_only => Some(Outcome::ShuttingDown),
+            None if self.stops_only && !command.ends_the_gateway() => Some(Outcome::ShuttingDown),
             None => {
                 let stopped = |drive: &usize| self.was_stopped(*drive) && !command.stops(*drive);
                 command.reach().iter().any(stopped).then_some(Outcome::Purged)

@@ -148,3 +148,56 @@ fn what_counts_is_the_pause_between_reads_of_the_same_registers() {
     assert!(!is_stale(now), "three rounds are over");
     assert!(!is_stale(now + Duration::from_secs(10)) && is_stale(now + Duration::from_secs(16)));
 }
+
+/// A scale of another register: no value without it, none with a power that is no scale, and never a better quality.
+#[test]
+fn a_scale_in_another_register() {
+    let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\nread = 5\n\
+        [[point]]\nname = \"power\"\nat = \"holding 0\"\ntype = \"i16\"\nscale_from = \"sf\"\nclass = \"fast\"\n\
+        [[point]]\nname = \"sf\"\nat = \"holding 5\"\ntype = \"i16\"\ninvalid = [0x8000]\nclass = \"slow\"\nhidden = true\n\
+        [[point]]\nname = \"count\"\nat = \"holding 1\"\ntype = \"u64\"\nclass = \"fast\"\n\
+        [[point]]\nname = \"motor_current\"\nat = \"holding 6\"\ninvalid = [0x7FFF]\nclass = \"fast\"\n";
+    let profile = Arc::new(crate::drive::Profile::parse("p.toml", text, false).unwrap());
+    let names: Vec<_> = crate::process_image::public_points(&profile)
+        .into_iter()
+        .map(|(_, n)| n.to_string())
+        .collect();
+    assert_eq!(names, ["motor_current", "power", "count"], "hidden ones are not shown");
+    let image = DriveImage::new(
+        DriveSpec::new("pump-1", "line1", 1, profile.clone()),
+        Duration::from_secs(1),
+    );
+    let (now, seconds) = (Instant::now(), Duration::from_secs);
+    let seen = |name: &str, after| {
+        let sample = image
+            .reading(now + seconds(after), seconds(100))
+            .sample(profile.point_index(name).unwrap());
+        (sample.value, sample.quality)
+    };
+    let store =
+        |start, words: &[u16], after| image.update(|s| s.store(Table::Holding, start, words, now + seconds(after)));
+    image.update(|s| s.link = Link::Online(SystemTime::now()));
+    store(0, &[1234, 0x0020, 0, 0, 1], 0);
+    assert_eq!(seen("power", 0), (None, Quality::Bad), "the scale was not read");
+    assert_eq!(
+        seen("count", 0),
+        (Some(Value::Integer((1 << 53) + 1)), Quality::Good),
+        "to the last digit"
+    );
+    store(5, &[0xFFFE], 0);
+    assert_eq!(seen("power", 0), (Some(Value::Number(12.34)), Quality::Good));
+    store(5, &[0x8000], 0);
+    assert_eq!(seen("power", 0), (None, Quality::Bad));
+    store(5, &[2], 0);
+    assert_eq!(seen("power", 0), (Some(Value::Number(123_400.0)), Quality::Good));
+    store(0, &[1234], 150);
+    assert_eq!(
+        seen("power", 150),
+        (Some(Value::Number(123_400.0)), Quality::Stale),
+        "as its scale"
+    );
+    store(6, &[0x7FFF], 0);
+    assert_eq!(seen("motor_current", 0), (None, Quality::Bad), "not available");
+    store(6, &[0x7FFE], 0);
+    assert_eq!(seen("motor_current", 0).1, Quality::Good);
+}

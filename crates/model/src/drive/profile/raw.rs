@@ -1,7 +1,19 @@
 //! Raw values: address, format and conversion to engineering units.
 
-use super::super::model::{Kind, Value, tidy, tidy_product};
+mod form;
+
+use super::super::model::{Kind, Text, Value, tidy, tidy_product};
 use crate::codec::Table;
+
+pub use form::{Form, Order};
+
+/// Whole numbers up to here are exact as a number with a fraction.
+const EXACT: u64 = 1 << 53;
+/// Most registers of one value.
+pub const MOST_REGISTERS: usize = 32;
+/// Powers of ten by which another register may scale a value; no unit of measure needs more.
+const LEAST_POWER: i32 = -20;
+const MOST_POWER: i32 = 20;
 
 /// Address and format of a raw value.
 #[derive(Debug, Clone, PartialEq)]
@@ -12,119 +24,29 @@ pub struct Raw {
     pub address: u16,
     /// Form.
     pub form: Form,
+    /// Order of the bytes over all registers of the value.
+    pub order: Order,
+    /// Bits taken as they stand, shifted down to bit 0.
+    pub mask: Option<u64>,
+    /// The count that means true; the point is true or false then.
+    pub equals: Option<Equals>,
+    /// What the registers hold, before `mask`, while there is no value.
+    pub invalid: Vec<u64>,
     /// Engineering value of one count.
     pub scale: f64,
     /// Engineering value of raw 0.
     pub offset: f64,
+    /// Index of the point whose value is the power of ten by which a count is multiplied.
+    pub scale_from: Option<usize>,
 }
 
-/// Form of a raw value.
+/// The count that makes a point true, or false.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Form {
-    /// One bit of a register (0 = least significant), or the bit itself in a bit table.
-    Bit {
-        /// Number of the bit.
-        bit: u8,
-        /// 0 means true.
-        invert: bool,
-    },
-    /// Neighbouring bits of a register as a number.
-    Bits {
-        /// Number of the least significant one.
-        first: u8,
-        /// How many, 2..=16.
-        count: u8,
-    },
-    /// Unsigned 16 bit.
-    U16,
-    /// Signed 16 bit, two's complement.
-    I16,
-    /// Unsigned 32 bit in two registers.
-    U32(WordOrder),
-    /// Signed 32 bit, two's complement, in two registers.
-    I32(WordOrder),
-    /// IEEE 754 single in two registers; NaN and infinities are not values.
-    F32(WordOrder),
-}
-
-/// Which register of two comes first.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WordOrder {
-    /// The more significant one, as Modbus devices mostly do.
-    HighFirst,
-    /// The less significant one.
-    LowFirst,
-}
-
-impl WordOrder {
-    /// The name in profiles and output.
-    pub fn name(self) -> &'static str {
-        match self {
-            WordOrder::HighFirst => "high-first",
-            WordOrder::LowFirst => "low-first",
-        }
-    }
-
-    fn join(self, words: &[u16]) -> Option<u32> {
-        let (&first, &second) = (words.first()?, words.get(1)?);
-        let (high, low) = match self {
-            WordOrder::HighFirst => (first, second),
-            WordOrder::LowFirst => (second, first),
-        };
-        Some(u32::from(high) << 16 | u32::from(low))
-    }
-
-    fn split(self, both: u32) -> Vec<u16> {
-        let (high, low) = ((both >> 16) as u16, both as u16);
-        match self {
-            WordOrder::HighFirst => vec![high, low],
-            WordOrder::LowFirst => vec![low, high],
-        }
-    }
-}
-
-impl Form {
-    /// Number of registers or bits of the value.
-    pub fn items(self) -> u16 {
-        match self {
-            Form::U32(_) | Form::I32(_) | Form::F32(_) => 2,
-            Form::Bit { .. } | Form::Bits { .. } | Form::U16 | Form::I16 => 1,
-        }
-    }
-
-    /// The name of the type in profiles and output.
-    pub fn name(self) -> &'static str {
-        match self {
-            Form::Bit { .. } => "bit",
-            Form::Bits { .. } => "bits",
-            Form::U16 => "u16",
-            Form::I16 => "i16",
-            Form::U32(_) => "u32",
-            Form::I32(_) => "i32",
-            Form::F32(_) => "f32",
-        }
-    }
-
-    /// Which register of two comes first, if there are two.
-    pub fn word_order(self) -> Option<WordOrder> {
-        match self {
-            Form::U32(order) | Form::I32(order) | Form::F32(order) => Some(order),
-            _ => None,
-        }
-    }
-
-    /// Least and greatest count.
-    fn span(self) -> (f64, f64) {
-        match self {
-            Form::Bit { .. } => (0.0, 1.0),
-            Form::Bits { count, .. } => (0.0, f64::from((1u32 << count.min(16)) - 1)),
-            Form::U16 => (0.0, f64::from(u16::MAX)),
-            Form::I16 => (f64::from(i16::MIN), f64::from(i16::MAX)),
-            Form::U32(_) => (0.0, f64::from(u32::MAX)),
-            Form::I32(_) => (f64::from(i32::MIN), f64::from(i32::MAX)),
-            Form::F32(_) => (f64::from(f32::MIN), f64::from(f32::MAX)),
-        }
-    }
+pub struct Equals {
+    /// The count.
+    pub count: i64,
+    /// It means false, any other true.
+    pub invert: bool,
 }
 
 /// Why a value cannot be written to a point.
@@ -140,30 +62,175 @@ pub enum Unwritable {
         /// Greatest value of the register in engineering units.
         most: f64,
     },
+    /// A whole number that a command does not carry to the last digit.
+    #[error("{value} is beyond 2^53, where a number of a command is no longer exact")]
+    Rounded {
+        /// Value asked for.
+        value: f64,
+    },
+    /// The drive would take it for no value.
+    #[error("{value} is a raw value that means \"not available\"")]
+    Invalid {
+        /// Value asked for.
+        value: f64,
+    },
+    /// There is no way back from the value to its registers.
+    #[error("the point is only read")]
+    ReadOnly,
+}
+
+/// What the registers hold.
+enum Count {
+    Whole(i128),
+    Real(f64),
 }
 
 impl Raw {
-    /// The value in `words`, the registers (or bits as 0 and 1) from `address` on; `None` if there are too few of them,
-    /// or a float is not a finite number.
-    pub fn decode(&self, words: &[u16], kind: Kind) -> Option<Value> {
-        let &word = words.first()?;
-        let count = match self.form {
-            Form::Bit { bit, invert } => return Some(Value::Bool(((word >> bit) & 1 == 1) != invert)),
-            Form::Bits { first, count } => f64::from((word >> first) & mask(count)),
-            Form::U16 => f64::from(word),
-            Form::I16 => f64::from(word as i16),
-            Form::U32(order) => f64::from(order.join(words)?),
-            Form::I32(order) => f64::from(order.join(words)? as i32),
-            Form::F32(order) => short(f32::from_bits(order.join(words)?))?,
-        };
-        if kind == Kind::Integer {
-            return Some(Value::Integer(count as i64));
+    /// A value in the most common form: a register, or one bit of a bit table.
+    pub fn plain(table: Table, address: u16, form: Form) -> Raw {
+        Raw {
+            table,
+            address,
+            form,
+            order: Order::Abcd,
+            mask: None,
+            equals: None,
+            invalid: Vec::new(),
+            scale: 1.0,
+            offset: 0.0,
+            scale_from: None,
         }
+    }
+
+    /// Whether its values are true and false.
+    pub fn is_bool(&self) -> bool {
+        self.equals.is_some() || matches!(self.form, Form::Bit { .. })
+    }
+
+    /// Its type, order and what is taken of it, as profiles and output have it.
+    pub fn type_text(&self) -> String {
+        let mut text = match self.form {
+            Form::Text { registers } => format!("string:{registers}"),
+            form => form.name().to_string(),
+        };
+        match (self.form.items(), self.order) {
+            (2, Order::Abcd) if !matches!(self.form, Form::Text { .. }) => text += " high-first",
+            (2, Order::Cdab) => text += " low-first",
+            (_, Order::Abcd) => {}
+            (_, order) => text = format!("{text} {}", order.name()),
+        }
+        if let Some(mask) = self.mask {
+            text += &format!(" mask {mask:#06x}");
+        }
+        if let Some(Equals { count, invert }) = self.equals {
+            text += &format!(" {} {count}", if invert { "not" } else { "=" });
+        }
+        text
+    }
+
+    /// Least and greatest whole count, after `mask`.
+    pub(in crate::drive) fn counts(&self) -> (i128, i128) {
+        let most = |mask: u64| (0, i128::from(mask.checked_shr(mask.trailing_zeros()).unwrap_or(0)));
+        match (self.mask, self.form) {
+            (Some(mask), _) => most(mask),
+            (None, Form::Bits { count, .. }) => (0, i128::from(low_mask(count))),
+            (None, Form::Bcd16) => (0, 9999),
+            (None, Form::Bcd32) => (0, 99_999_999),
+            (None, form) if form.is_signed() => (-(1 << (form.width() - 1)), (1 << (form.width() - 1)) - 1),
+            (None, form) => most(u64::MAX.checked_shr(64u32.saturating_sub(form.width())).unwrap_or(0)),
+        }
+    }
+
+    /// Whether there is a way back from a value to its registers.
+    pub(in crate::drive) fn is_only_read(&self) -> bool {
+        let derived = self.equals.is_some() || self.mask.is_some() || self.scale_from.is_some();
+        derived || matches!(self.form, Form::Text { .. })
+    }
+
+    /// Whether its values are codes or whole numbers of 64 bits, which are shown as they are.
+    pub(in crate::drive) fn is_code(&self) -> bool {
+        let long = matches!(self.form, Form::U64 | Form::I64);
+        matches!(self.form, Form::Bits { .. }) || self.is_unscaled() && (long || self.mask.is_some())
+    }
+
+    /// Whether a count is the value: nothing is multiplied or added.
+    pub fn is_unscaled(&self) -> bool {
+        self.scale == 1.0 && self.offset == 0.0 && self.scale_from.is_none()
+    }
+
+    /// The value in `words`, the registers (or bits as 0 and 1) from `address` on; `None` if there are too few of them or
+    /// they hold no value. A value with `scale_from` is decoded by [`Raw::decode_scaled`].
+    pub fn decode(&self, words: &[u16], kind: Kind) -> Option<Value> {
+        match self.scale_from {
+            Some(_) => None,
+            None => self.decode_scaled(words, kind, 0),
+        }
+    }
+
+    /// The same with its count multiplied by a power of ten.
+    pub fn decode_scaled(&self, words: &[u16], kind: Kind, power: i64) -> Option<Value> {
+        let words = words.get(..usize::from(self.form.items()))?;
+        if let Form::Text { .. } = self.form {
+            return Text::of_registers(words, self.order).map(Value::Text);
+        }
+        let bits = self.order.join(words)?;
+        if self.invalid.contains(&bits) {
+            return None;
+        }
+        let count = self.count(bits)?;
+        match (count, self.equals) {
+            (Count::Whole(whole), Some(Equals { count, invert })) => {
+                Some(Value::Bool((whole == i128::from(count)) != invert))
+            }
+            (Count::Whole(whole), None) if matches!(self.form, Form::Bit { .. }) => Some(Value::Bool(whole == 1)),
+            (Count::Whole(whole), None) if kind == Kind::Integer => whole_value(whole),
+            (Count::Whole(whole), None) => {
+                let exact = whole.unsigned_abs() <= u128::from(EXACT);
+                exact.then_some(()).and_then(|()| self.scaled(whole as f64, power))
+            }
+            (Count::Real(real), _) if kind == Kind::Integer => Some(Value::Integer(real as i64)),
+            (Count::Real(real), _) => self.scaled(real, power),
+        }
+    }
+
+    /// The count in the bits of the registers.
+    fn count(&self, bits: u64) -> Option<Count> {
+        let bits = match self.mask {
+            Some(0) => 0,
+            Some(mask) => (bits & mask) >> mask.trailing_zeros(),
+            None => bits,
+        };
+        let whole = |value: i128| Some(Count::Whole(value));
+        match self.form {
+            Form::Bit { bit, invert } => whole(i128::from(((bits >> bit) & 1 == 1) != invert)),
+            Form::Bits { first, count } => whole(i128::from((bits >> first) & u64::from(low_mask(count)))),
+            Form::U16 | Form::U32 | Form::U64 => whole(i128::from(bits)),
+            Form::I16 => whole(i128::from(bits as u16 as i16)),
+            Form::I32 => whole(i128::from(bits as u32 as i32)),
+            Form::I64 => whole(i128::from(bits as i64)),
+            Form::Bcd16 | Form::Bcd32 => whole(i128::from(of_digits(bits)?)),
+            Form::F32 => short(f32::from_bits(bits as u32)).map(Count::Real),
+            Form::F64 => Some(f64::from_bits(bits))
+                .filter(|real| real.is_finite())
+                .map(Count::Real),
+            Form::Text { .. } => None,
+        }
+    }
+
+    fn scaled(&self, count: f64, power: i64) -> Option<Value> {
+        // A division by a power of ten is rounded once, a product with a fraction of it twice.
+        let count = match i32::try_from(power) {
+            Ok(power @ 0..=MOST_POWER) => count * 10f64.powi(power),
+            Ok(power @ LEAST_POWER..0) => count / 10f64.powi(-power),
+            _ => return None,
+        };
         let scaled = count * self.scale;
-        Some(Value::Number(match self.offset == 0.0 {
-            true => tidy_product(scaled),
-            false => tidy(scaled + self.offset),
-        }))
+        let value = match (self.offset == 0.0, self.form) {
+            (true, Form::F64) if self.scale == 1.0 && power == 0 => scaled,
+            (true, _) => tidy_product(scaled),
+            (false, _) => tidy(scaled + self.offset),
+        };
+        value.is_finite().then_some(Value::Number(value))
     }
 
     /// The registers for `value`; bits are merged into `old`.
@@ -171,17 +238,17 @@ impl Raw {
     /// # Errors
     /// The value does not fit the register's type. Nothing is clamped.
     pub fn encode(&self, value: Value, old: u16) -> Result<Vec<u16>, Unwritable> {
+        if self.is_only_read() {
+            return Err(Unwritable::ReadOnly);
+        }
         if let Form::Bit { bit, invert } = self.form {
             let set = value.as_bool() != invert;
             return Ok(vec![if set { old | (1 << bit) } else { old & !(1 << bit) }]);
         }
         let (least, most) = self.form.span();
         let exact = (value.as_f64() - self.offset) / self.scale;
-        let count = if matches!(self.form, Form::F32(_)) {
-            exact
-        } else {
-            exact.round()
-        };
+        let real = matches!(self.form, Form::F32 | Form::F64);
+        let count = if real { exact } else { exact.round() };
         if !(least..=most).contains(&count) {
             let unit = |c: f64| tidy(c * self.scale + self.offset);
             return Err(Unwritable::Type {
@@ -190,15 +257,23 @@ impl Raw {
                 most: unit(most),
             });
         }
-        Ok(match self.form {
-            Form::Bits { first, count: bits } => {
-                vec![(old & !(mask(bits) << first)) | ((count as u16 & mask(bits)) << first)]
+        let bits = match (self.form, value) {
+            (Form::Bits { first, count: bits }, _) => {
+                let (mask, count) = (low_mask(bits), count as u16);
+                return Ok(vec![(old & !(mask << first)) | ((count & mask) << first)]);
             }
-            Form::U32(order) => order.split(count as u32),
-            Form::I32(order) => order.split(count as i32 as u32),
-            Form::F32(order) => order.split((count as f32).to_bits()),
-            Form::Bit { .. } | Form::U16 | Form::I16 => vec![count as i32 as u16],
-        })
+            (Form::F32, _) => u64::from((count as f32).to_bits()),
+            (Form::F64, _) => count.to_bits(),
+            (Form::Bcd16 | Form::Bcd32, _) => to_digits(count as u64),
+            (_, Value::Integer(whole)) if self.is_unscaled() => self.form.bits_of(i128::from(whole)),
+            (_, Value::Unsigned(whole)) if self.is_unscaled() => self.form.bits_of(i128::from(whole)),
+            _ if count.abs() > EXACT as f64 => return Err(Unwritable::Rounded { value: value.as_f64() }),
+            _ => self.form.bits_of(count as i128),
+        };
+        if self.invalid.contains(&bits) {
+            return Err(Unwritable::Invalid { value: value.as_f64() });
+        }
+        Ok(self.order.split(bits, self.form.items()))
     }
 
     /// The addresses of its registers or bits.
@@ -216,8 +291,27 @@ impl Raw {
     }
 }
 
-fn mask(bits: u8) -> u16 {
+fn low_mask(bits: u8) -> u16 {
     ((1u32 << bits.min(16)) - 1) as u16
+}
+
+/// The most compact whole value.
+fn whole_value(whole: i128) -> Option<Value> {
+    let signed = i64::try_from(whole).map(Value::Integer);
+    signed.or_else(|_| u64::try_from(whole).map(Value::Unsigned)).ok()
+}
+
+/// Binary-coded decimals, four bits a digit; `None` if one is above 9.
+fn of_digits(bits: u64) -> Option<u64> {
+    (0..8).rev().try_fold(0, |number, place| {
+        let digit = (bits >> (4 * place)) & 0xF;
+        (digit <= 9).then_some(number * 10 + digit)
+    })
+}
+
+fn to_digits(number: u64) -> u64 {
+    let digit = |place: u32| (number / 10u64.pow(place) % 10) << (4 * place);
+    (0..8).map(digit).sum()
 }
 
 /// A single as its shortest decimal: 0.1 and not 0.10000000149; `None` for NaN and infinities.
@@ -228,84 +322,4 @@ fn short(single: f32) -> Option<f64> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn raw(form: Form, scale: f64) -> Raw {
-        Raw {
-            table: Table::Holding,
-            address: 2002,
-            form,
-            scale,
-            offset: 0.0,
-        }
-    }
-
-    #[test]
-    fn raw_to_engineering_and_back() {
-        let reference = raw(Form::I16, 0.01);
-        assert_eq!(reference.decode(&[5000], Kind::Number), Some(Value::Number(50.0)));
-        assert_eq!(reference.decode(&[0xEC78], Kind::Number), Some(Value::Number(-50.0)));
-        assert_eq!(reference.encode(Value::Number(-50.0), 0), Ok(vec![0xEC78]));
-        assert_eq!(reference.encode(Value::Number(33.333), 0), Ok(vec![3333]));
-        assert!(reference.encode(Value::Number(400.0), 0).is_err());
-        assert!(reference.encode(Value::Number(f64::NAN), 0).is_err());
-        assert_eq!(
-            raw(Form::U16, 0.1).decode(&[12], Kind::Number),
-            Some(Value::Number(1.2))
-        );
-        assert_eq!(raw(Form::U16, 1.0).decode(&[], Kind::Number), None);
-    }
-
-    #[test]
-    fn bits_are_merged() {
-        let run = raw(Form::Bit { bit: 0, invert: false }, 1.0);
-        assert_eq!(run.encode(Value::Bool(true), 0x0102), Ok(vec![0x0103]));
-        assert_eq!(run.encode(Value::Bool(false), 0x0103), Ok(vec![0x0102]));
-        let inverted = raw(Form::Bit { bit: 8, invert: true }, 1.0);
-        assert_eq!(inverted.decode(&[0x0100], Kind::Bool), Some(Value::Bool(false)));
-        assert_eq!(inverted.encode(Value::Bool(true), 0xFFFF), Ok(vec![0xFEFF]));
-    }
-
-    #[test]
-    fn wide_forms() {
-        use WordOrder::{HighFirst, LowFirst};
-        let float = raw(Form::F32(HighFirst), 1.0);
-        assert_eq!(float.decode(&[0x4248, 0], Kind::Number), Some(Value::Number(50.0)));
-        assert_eq!(float.decode(&[0x3DCC, 0xCCCD], Kind::Number), Some(Value::Number(0.1)));
-        for small in [4.2e-7_f32, -1.5e-20, f32::MIN_POSITIVE, 16_777_215.0] {
-            let bits = small.to_bits();
-            let words = [(bits >> 16) as u16, bits as u16];
-            let wanted = small.to_string().parse().map(Value::Number).ok();
-            assert_eq!(float.decode(&words, Kind::Number), wanted, "{small}");
-        }
-        assert_eq!(
-            raw(Form::F32(LowFirst), 1.0).decode(&[0, 0x4248], Kind::Number),
-            Some(Value::Number(50.0))
-        );
-        for no_number in [0x7FC0, 0x7F80, 0xFF80] {
-            assert_eq!(float.decode(&[no_number, 0], Kind::Number), None);
-        }
-        assert_eq!(float.decode(&[0x4248], Kind::Number), None, "half of it is nothing");
-        assert_eq!(float.encode(Value::Number(50.0), 0), Ok(vec![0x4248, 0]));
-        assert!(float.encode(Value::Number(1e39), 0).is_err());
-        assert!(float.encode(Value::Number(f64::NAN), 0).is_err());
-        let signed = raw(Form::I32(HighFirst), 0.1);
-        assert_eq!(
-            signed.decode(&[0xFFFF, 0xFFF6], Kind::Number),
-            Some(Value::Number(-1.0))
-        );
-        assert_eq!(signed.encode(Value::Number(-1.0), 0), Ok(vec![0xFFFF, 0xFFF6]));
-        let unsigned = raw(Form::U32(LowFirst), 1.0);
-        assert_eq!(unsigned.decode(&[1, 2], Kind::Number), Some(Value::Number(131_073.0)));
-        assert_eq!(unsigned.encode(Value::Number(131_073.0), 0), Ok(vec![1, 2]));
-    }
-
-    #[test]
-    fn bit_fields() {
-        let field = raw(Form::Bits { first: 4, count: 3 }, 1.0);
-        assert_eq!(field.decode(&[0xFF5F], Kind::Integer), Some(Value::Integer(5)));
-        assert_eq!(field.encode(Value::Integer(2), 0xFFFF), Ok(vec![0xFFAF]));
-        assert!(field.encode(Value::Integer(8), 0).is_err());
-    }
-}
+mod tests;

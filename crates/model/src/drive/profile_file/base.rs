@@ -8,9 +8,31 @@ use crate::document::{Document, Entry, Finding, Node, Place, Raw, nearest};
 /// Keys of a derived point.
 const DERIVATION: [&str; 6] = ["derive", "of", "to", "within", "minimum", "maximum"];
 /// Keys of a point that is read from registers.
-const PLACE: [&str; 7] = ["at", "type", "words", "invert", "scale", "offset", "class"];
+const PLACE: [&str; 12] = [
+    "at",
+    "type",
+    "words",
+    "order",
+    "invert",
+    "scale",
+    "offset",
+    "class",
+    "mask",
+    "equals",
+    "invalid",
+    "scale_from",
+];
 /// Those of them that a bit does not have.
-const REGISTER: [&str; 4] = ["type", "words", "scale", "offset"];
+const REGISTER: [&str; 8] = [
+    "type",
+    "words",
+    "order",
+    "scale",
+    "offset",
+    "mask",
+    "equals",
+    "scale_from",
+];
 
 /// Name and base of a file that is not read yet.
 pub(super) fn peek(document: &Document) -> (Option<String>, Option<String>) {

@@ -1,6 +1,7 @@
 //! `derive`: points derived from other points.
 
 use super::super::derive::{Bound, Derived};
+use super::super::model::Kind;
 use super::super::profile::{Point, PollClass, Source};
 use crate::document::{self, Finding, Reader};
 
@@ -102,6 +103,13 @@ pub(super) fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point])
         return;
     };
     for source in derived.rests_on() {
+        if let Some(point) = points.get(source).filter(|p| p.kind() == Kind::Text) {
+            reader.problem(
+                "derive",
+                format!("`{}` is a text", point.name),
+                "name points with values",
+            );
+        }
         if let Some(point) = points.get(source).filter(|p| p.raw().is_none()) {
             reader.problem(
                 "derive",

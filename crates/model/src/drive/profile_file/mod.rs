@@ -3,8 +3,10 @@
 
 mod base;
 mod commissioning;
+mod control;
 mod derived;
 mod identify;
+mod meaning;
 mod n2;
 mod parameter_rules;
 mod parameters;
@@ -12,6 +14,7 @@ mod place;
 mod points;
 mod ranges;
 mod reference;
+mod states;
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -26,55 +29,50 @@ use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
 use crate::codec::{LineFormat, Protocol};
 use crate::document::{self, Document, Finding, Node, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
-use points::{check_object, check_target, read_point};
+use points::{check_monitor, check_object, check_scale, check_target, read_point};
 use ranges::{Offsets, check_overlaps, read_functions, read_range};
 
+macro_rules! files {
+    ($($name:literal,)*) => {
+        &[$(($name, include_str!(concat!("../../../../../profiles/", $name))),)*]
+    };
+}
+
 /// A base stands before the profiles that are based on it, and has none itself.
-const BUILT_IN: [(&str, &str); 14] = [
-    (
-        "eaton-hvx-n2.toml",
-        include_str!("../../../../../profiles/eaton-hvx-n2.toml"),
-    ),
-    ("eaton-hvx.toml", include_str!("../../../../../profiles/eaton-hvx.toml")),
-    ("eaton-svx.toml", include_str!("../../../../../profiles/eaton-svx.toml")),
-    (
-        "teco-7300pa-n2.toml",
-        include_str!("../../../../../profiles/teco-7300pa-n2.toml"),
-    ),
-    (
-        "teco-7300pa.toml",
-        include_str!("../../../../../profiles/teco-7300pa.toml"),
-    ),
-    ("vacon-cx.toml", include_str!("../../../../../profiles/vacon-cx.toml")),
-    (
-        "vacon-nx-n2.toml",
-        include_str!("../../../../../profiles/vacon-nx-n2.toml"),
-    ),
-    ("vacon-nx.toml", include_str!("../../../../../profiles/vacon-nx.toml")),
-    (
-        "eaton-svx-multipurpose.toml",
-        include_str!("../../../../../profiles/eaton-svx-multipurpose.toml"),
-    ),
-    (
-        "eaton-svx-pid.toml",
-        include_str!("../../../../../profiles/eaton-svx-pid.toml"),
-    ),
-    (
-        "eaton-svx-pump-fan.toml",
-        include_str!("../../../../../profiles/eaton-svx-pump-fan.toml"),
-    ),
-    (
-        "vacon-nx-multipurpose.toml",
-        include_str!("../../../../../profiles/vacon-nx-multipurpose.toml"),
-    ),
-    (
-        "vacon-nx-pid.toml",
-        include_str!("../../../../../profiles/vacon-nx-pid.toml"),
-    ),
-    (
-        "vacon-nx-pump-fan.toml",
-        include_str!("../../../../../profiles/vacon-nx-pump-fan.toml"),
-    ),
+const BUILT_IN: &[(&str, &str)] = files![
+    "eaton-hvx-n2.toml",
+    "eaton-hvx.toml",
+    "eaton-svx.toml",
+    "teco-7300pa-n2.toml",
+    "teco-7300pa.toml",
+    "vacon-cx.toml",
+    "vacon-nx-n2.toml",
+    "vacon-nx.toml",
+    "eaton-svx-multipurpose.toml",
+    "eaton-svx-pid.toml",
+    "eaton-svx-pump-fan.toml",
+    "vacon-nx-multipurpose.toml",
+    "vacon-nx-pid.toml",
+    "vacon-nx-pump-fan.toml",
+    "abb-acs550.toml",
+    "abb-acs580.toml",
+    "danfoss-fc.toml",
+    "delta-ms300.toml",
+    "fuji-frenic.toml",
+    "hitachi-wj200.toml",
+    "invertek-optidrive.toml",
+    "invt-goodrive.toml",
+    "lenze-i550.toml",
+    "ls-g100.toml",
+    "mitsubishi-d700.toml",
+    "schneider-altivar.toml",
+    "siemens-g120.toml",
+    "siemens-v20.toml",
+    "teco-f510.toml",
+    "toshiba-vf-s15.toml",
+    "vacon-10.toml",
+    "weg-cfw.toml",
+    "yaskawa-v1000.toml",
 ];
 
 /// Bases of bases that are followed; no sound set of files has so many.
@@ -85,7 +83,7 @@ impl Profiles {
     pub fn built_in() -> Profiles {
         static READ: LazyLock<Profiles> = LazyLock::new(|| {
             let mut profiles = Profiles::default();
-            for (file, source) in BUILT_IN {
+            for &(file, source) in BUILT_IN {
                 if let Ok(profile) = Profile::parse_over(file, source, true, &profiles) {
                     profiles.insert(Profile {
                         text: Cow::Borrowed(source),
@@ -268,9 +266,29 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     for (index, table) in tables.iter().enumerate() {
         check_derived(table, index, &points);
         check_target(table, index, &points);
+        check_monitor(table, index, &points);
+        check_scale(table, index, &points);
         if protocols.contains(&Protocol::N2) {
             check_object(table, index, &points);
         }
+    }
+    let update_period = reader.or("update_period", Duration::from_millis(10));
+    let around = control::Around {
+        points: &points,
+        names: &names,
+        ranges: &ranges,
+        offsets: &offsets,
+        update_period,
+    };
+    let control = control::read(reader, &around);
+    let made = states::read(reader, &around);
+    let plain = control.as_ref().map(control::plain_points).unwrap_or_default();
+    for point in made.into_iter().chain(plain) {
+        if names.contains(&point.name) {
+            let what = format!("`{}` follows from [control] or [[state]]", point.name);
+            reader.problem("point", what, "leave its [[point]] out");
+        }
+        points.push(point);
     }
     let mut faults = read_faults(reader, "faults", true);
     for (code, text) in read_faults(reader, "faults_unverified", false) {
@@ -296,12 +314,17 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         protocols,
         addresses,
         turnaround: reader.or("turnaround", Duration::from_millis(2)),
-        update_period: reader.or("update_period", Duration::from_millis(10)),
+        update_period,
         confirm_within: reader.or("confirm_within", Duration::from_secs(2)),
         input_is_holding,
         identify: identify::read(reader),
         simulator: reader.optional("simulator"),
+        counts_messages: reader.or("counts_messages", false),
+        may_stop_by_itself: reader.or("may_stop_by_itself", false),
+        broadcast_stop: reader.or("broadcast_stop", false),
         on_fault: read_on_fault(reader, &points),
+        control,
+        verified: reader.or("verified", true),
         parameters: parameters::read(reader, &bases, &points, &ranges),
         functions: read_functions(reader, &ranges),
         ranges,
@@ -314,6 +337,13 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         tree: None,
         warnings: Vec::new(),
     };
+    if profile.broadcast_stop && (profile.protocols.contains(&Protocol::N2) || profile.broadcast_stop().is_none()) {
+        reader.problem(
+            "broadcast_stop",
+            "no broadcast can stop these drives: `run` is not a bit of a register or coil that 0 stops, or the protocol is n2",
+            "leave the key out",
+        );
+    }
     reader.finish();
     name.map(|_| profile)
 }

@@ -1,9 +1,25 @@
-//! Address and format of a value: `at`, `type`, `words`, `invert`, `scale`, `offset`.
+//! Address and format of a value: `at` and the keys of its form; those that change what is made of it are in `meaning`.
 
-use super::super::profile::{AddressRange, Form, Raw, Source, WordOrder};
+use super::super::control::Place;
+use super::super::profile::{AddressRange, Form, MOST_REGISTERS, Order, Raw, Source};
+use super::meaning;
 use super::ranges::{Offsets, read_table};
 use crate::codec::Table;
 use crate::document::{Finding, Reader};
+
+/// Keys of a point that has `at`.
+const KEYS: [&str; 10] = [
+    "type",
+    "words",
+    "order",
+    "invert",
+    "scale",
+    "offset",
+    "mask",
+    "equals",
+    "invalid",
+    "scale_from",
+];
 
 /// A PDU address, decimal or hexadecimal as in some manuals (0x0023).
 pub(super) fn parse_address(text: &str) -> Option<u16> {
@@ -13,10 +29,24 @@ pub(super) fn parse_address(text: &str) -> Option<u16> {
     }
 }
 
+/// `holding 2100`: table and PDU address.
+pub(super) fn parse_place(text: &str) -> Option<Place> {
+    let (table, address) = text.split_once(' ')?;
+    Some(Place {
+        table: Table::from_name(table)?,
+        address: parse_address(address)?,
+    })
+}
+
 /// `holding 2100.3`: table, PDU address, bit.
-pub(super) fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange], offsets: &Offsets) -> Option<Source> {
+pub(super) fn read_raw(
+    reader: &Reader<'_>,
+    names: &[String],
+    ranges: &[AddressRange],
+    offsets: &Offsets,
+) -> Option<Source> {
     // They are keys of a point with an address, whatever is wrong with that.
-    for key in ["type", "words", "invert", "scale", "offset"] {
+    for key in KEYS {
         reader.raw(key);
     }
     let at: String = reader.required("at")?;
@@ -46,16 +76,20 @@ pub(super) fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange], offsets: &O
     let address = offsets.applied(reader, "at", table, address)?;
     let invert = reader.or("invert", false);
     let form = read_form(reader, table, bits, invert)?;
-    if reader.has("invert") && !matches!(form, Form::Bit { .. }) {
-        reader.problem("invert", "only a bit can be inverted", "leave the key out");
+    let raw = meaning::apply(
+        reader,
+        names,
+        Raw {
+            order: read_order(reader, form),
+            scale: reader.or("scale", 1.0),
+            offset: reader.or("offset", 0.0),
+            ..Raw::plain(table, address, form)
+        },
+        invert,
+    );
+    if reader.has("invert") && !raw.is_bool() {
+        reader.problem("invert", "only a bit or `equals` can be inverted", "leave the key out");
     }
-    let raw = Raw {
-        table,
-        address,
-        form,
-        scale: reader.or("scale", 1.0),
-        offset: reader.or("offset", 0.0),
-    };
     if raw.scale == 0.0 {
         reader.problem(
             "scale",
@@ -122,23 +156,11 @@ fn check_place(reader: &Reader<'_>, raw: &Raw, ranges: &[AddressRange]) {
 
 fn read_form(reader: &Reader<'_>, table: Table, bits: Option<(u8, u8)>, invert: bool) -> Option<Form> {
     let kind: Option<String> = reader.optional("type");
-    let words = match reader.optional::<String>("words").as_deref() {
-        None | Some("high-first") => WordOrder::HighFirst,
-        Some("low-first") => WordOrder::LowFirst,
-        Some(other) => {
-            reader.problem(
-                "words",
-                format!("unknown word order `{other}`"),
-                "write high-first or low-first",
-            );
-            WordOrder::HighFirst
-        }
-    };
     match (table.is_bits(), bits, kind.as_deref()) {
         (true, None, None) => Some(Form::Bit { bit: 0, invert }),
         (false, Some((bit, 1)), None) => Some(Form::Bit { bit, invert }),
         (false, Some((first, count)), None) => Some(Form::Bits { first, count }),
-        (false, None, Some(text)) => form_of(reader, text, words),
+        (false, None, Some(text)) => form_of(reader, text),
         (false, None, None) => Some(Form::U16),
         (true, _, _) => {
             reader.problem(
@@ -155,28 +177,69 @@ fn read_form(reader: &Reader<'_>, table: Table, bits: Option<(u8, u8)>, invert: 
     }
 }
 
-fn form_of(reader: &Reader<'_>, kind: &str, words: WordOrder) -> Option<Form> {
-    let form = match kind {
-        "u16" => Form::U16,
-        "i16" => Form::I16,
-        "u32" => Form::U32(words),
-        "i32" => Form::I32(words),
-        "f32" => Form::F32(words),
-        other => {
+fn form_of(reader: &Reader<'_>, kind: &str) -> Option<Form> {
+    if let Some(form) = Form::NAMED.into_iter().find(|form| form.name() == kind) {
+        return Some(form);
+    }
+    let length = kind.strip_prefix("string:");
+    if let Some(length) = length {
+        let registers = length.parse().ok().filter(|n| (1..=MOST_REGISTERS).contains(n));
+        if let Some(registers) = registers.and_then(|n| u8::try_from(n).ok()) {
+            return Some(Form::Text { registers });
+        }
+        reader.problem(
+            "type",
+            format!("a text of `{length}` registers is not possible"),
+            format!("write string:1 to string:{MOST_REGISTERS}"),
+        );
+        return None;
+    }
+    let known: Vec<&str> = Form::NAMED.iter().map(|form| form.name()).collect();
+    reader.problem(
+        "type",
+        format!("unknown type `{kind}`"),
+        format!("known: {}, string:N", known.join(", ")),
+    );
+    None
+}
+
+/// `order`, or `words` for two registers.
+fn read_order(reader: &Reader<'_>, form: Form) -> Order {
+    let order = reader.parsed("order", |text| {
+        let known = Order::ALL.into_iter().find(|order| order.name() == text);
+        known.ok_or_else(|| {
+            Finding::new(
+                format!("unknown order `{text}`"),
+                "write ABCD, CDAB, BADC or DCBA; A is the most significant byte",
+            )
+        })
+    });
+    let words = match reader.optional::<String>("words").as_deref() {
+        None => None,
+        Some("high-first") => Some(Order::Abcd),
+        Some("low-first") => Some(Order::Cdab),
+        Some(other) => {
             reader.problem(
-                "type",
-                format!("unknown type `{other}`"),
-                "known: u16, i16, u32, i32, f32",
+                "words",
+                format!("unknown word order `{other}`"),
+                "write high-first or low-first",
             );
-            return None;
+            None
         }
     };
-    if form.items() == 1 && reader.has("words") {
-        reader.problem(
-            "words",
-            format!("a {kind} is one register and has no word order"),
-            "leave the key out",
-        );
+    let bits = matches!(form, Form::Bit { .. } | Form::Bits { .. });
+    if bits && reader.has("order") {
+        reader.problem("order", "bits of one register have no order", "leave the key out");
     }
-    Some(form)
+    if form.items() == 1 && reader.has("words") {
+        let what = match bits {
+            true => "bits of one register have no word order".to_string(),
+            false => format!("a {} is one register and has no word order", form.name()),
+        };
+        reader.problem("words", what, "leave the key out");
+    }
+    if order.is_some() && words.is_some() {
+        reader.problem("words", "`order` says it already", "leave `words` out");
+    }
+    order.or(words).unwrap_or_default()
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::super::Value;
 use super::super::derive::Derived;
 use super::super::model::{Kind, ModelPoint};
-use super::super::profile::{AddressRange, Blocks, Form, Point, PollClass, Source, WordOrder};
+use super::super::profile::{AddressRange, Blocks, Form, Order, Point, PollClass, Raw, Source};
 use super::derived::{point_of, read_derived};
 use super::place::read_raw;
 use super::ranges::Offsets;
@@ -68,7 +68,7 @@ pub(super) fn read_point(
     let source = if reader.has("derive") {
         read_derived(reader, names)
     } else {
-        read_raw(reader, ranges, offsets)
+        read_raw(reader, names, ranges, offsets)
     };
     let found = source.is_some();
     let unit = match model {
@@ -92,6 +92,9 @@ pub(super) fn read_point(
         unit,
         class,
         fast_if_carried: reader.or("fast_if_carried", false) && class == PollClass::Slow,
+        monitor: reader
+            .optional::<String>("monitor")
+            .and_then(|name| point_of(reader, "monitor", &name, names)),
         write: reader.or("write", false),
         write_to: reader
             .optional::<String>("write_to")
@@ -100,6 +103,8 @@ pub(super) fn read_point(
         on_change: reader.or("on_change", false),
         range: read_pair::<f64>(reader, "range"),
         texts: read_texts(reader),
+        unlisted: reader.or("unlisted", false),
+        hidden: reader.or("hidden", false),
         blocks: read_blocks(reader),
         verified: reader.or("verified", true),
         note: reader.or("note", String::new()),
@@ -110,6 +115,16 @@ pub(super) fn read_point(
         check_write(reader, &point, ranges);
     }
     check_texts(reader, &point, names);
+    if point.hidden && point.model.is_some() {
+        reader.problem(
+            "hidden",
+            format!(
+                "`{}` is a point of the common model, which every side shows",
+                point.name
+            ),
+            "give a helper a name of its own",
+        );
+    }
     reader.finish();
     point
 }
@@ -157,6 +172,36 @@ pub(super) fn check_target(reader: &Reader<'_>, index: usize, points: &[Point]) 
             "write_to",
             format!("`{}` has another type", target.name),
             "name a point with values of the same type",
+        );
+    }
+}
+
+/// Checks `monitor`: both are registers of their own with values of the same type.
+pub(super) fn check_monitor(reader: &Reader<'_>, index: usize, points: &[Point]) {
+    let Some(point) = points.get(index) else { return };
+    let Some(monitor) = point.monitor.and_then(|monitor| points.get(monitor)) else {
+        return;
+    };
+    if point.class != PollClass::Fast || point.raw().is_none() {
+        reader.problem(
+            "monitor",
+            "only a register of process data is compared",
+            "set `class = \"fast\"`, or leave `monitor` out",
+        );
+    }
+    let registers = monitor.raw().map(|raw| raw.addresses().collect::<Vec<_>>());
+    let same = registers == point.raw().map(|raw| raw.addresses().collect());
+    if registers.is_none() || same || monitor.monitor.is_some() {
+        reader.problem(
+            "monitor",
+            format!("`{}` is not a register of its own", monitor.name),
+            "name a point that is read from another register",
+        );
+    } else if (monitor.kind() == Kind::Bool) != (point.kind() == Kind::Bool) || monitor.unit != point.unit {
+        reader.problem(
+            "monitor",
+            format!("`{}` has another type or unit", monitor.name),
+            "name a point with values of the same type and unit",
         );
     }
 }
@@ -217,10 +262,10 @@ fn read_texts(reader: &Reader<'_>) -> BTreeMap<i64, String> {
 /// Checks that a point of the common model has the kind of the model, and that enumerations and bits have no scale.
 fn check_kind(reader: &Reader<'_>, point: &Point) {
     let figure = match &point.source {
-        Source::Raw(raw) => !matches!(raw.form, Form::Bit { .. }),
+        Source::Raw(raw) => !raw.is_bool(),
         Source::Derived(derived) => !matches!(
             derived,
-            Derived::Zero { .. } | Derived::Equal { .. } | Derived::All { .. }
+            Derived::Zero { .. } | Derived::Equal { .. } | Derived::All { .. } | Derived::State { .. }
         ),
     };
     let key = if reader.has("derive") { "derive" } else { "at" };
@@ -230,6 +275,11 @@ fn check_kind(reader: &Reader<'_>, point: &Point) {
             format!("`{}` is true or false", point.name),
             "name a bit, such as \"holding 2100.3\"",
         ),
+        Some(_) if point.kind() == Kind::Text => reader.problem(
+            "type",
+            format!("`{}` is no text in the common model", point.name),
+            "name a register with a number, or choose another name",
+        ),
         Some(Kind::Number | Kind::Integer) if !figure => reader.problem(
             key,
             format!("`{}` is a number, not a bit", point.name),
@@ -237,9 +287,12 @@ fn check_kind(reader: &Reader<'_>, point: &Point) {
         ),
         _ => {}
     }
-    let scaled = reader.has("scale") || reader.has("offset");
-    if scaled && point.raw().is_some() && point.kind() != Kind::Number {
-        let key = if reader.has("scale") { "scale" } else { "offset" };
+    let scales = ["scale", "offset", "scale_from"];
+    if let Some(key) = scales.into_iter().find(|key| reader.has(key))
+        && !reader.has("equals")
+        && point.raw().is_some()
+        && point.kind() != Kind::Number
+    {
         reader.problem(
             key,
             format!("`{}` is a state or a code, which has no scale", point.name),
@@ -249,8 +302,18 @@ fn check_kind(reader: &Reader<'_>, point: &Point) {
 }
 
 fn check_texts(reader: &Reader<'_>, point: &Point, names: &[String]) {
+    if point.unlisted && (point.texts.is_empty() || !point.write) {
+        reader.problem(
+            "unlisted",
+            "only an enumeration that is written takes other values than those of `texts`",
+            "leave the key out",
+        );
+    }
     if point.texts.is_empty() {
         return;
+    }
+    if point.kind() == Kind::Text {
+        reader.problem("texts", "a text is no enumeration", "leave the table out");
     }
     let beside = format!("{}_text", point.name);
     if names.contains(&beside) {
@@ -276,7 +339,7 @@ pub(super) fn check_object(reader: &Reader<'_>, index: usize, points: &[Point]) 
     };
     let integer = raw.table == Table::Input && raw.address >= FIRST_ADI;
     match raw.form {
-        Form::F32(WordOrder::HighFirst) if !integer && raw.address % 2 == 0 => {}
+        Form::F32 if !integer && raw.address % 2 == 0 && raw.order == Order::Abcd => {}
         Form::U16 | Form::I16 if integer => {}
         _ if integer => reader.problem("at", "an ADI is one register", "write type = \"i16\" and no bit"),
         _ => reader.problem(
@@ -304,6 +367,16 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
     let Some(raw) = point.raw().filter(|_| point.write && !reader.has("write_to")) else {
         return;
     };
+    if raw.is_only_read() {
+        let keys = ["equals", "mask", "scale_from"];
+        let key = keys.into_iter().find(|key| reader.has(key)).unwrap_or("type");
+        reader.problem(
+            "write",
+            format!("there is no way back from such a value to its registers (`{key}`)"),
+            "leave `write` out; bits are written with `at = \"holding 300.4-6\"`",
+        );
+        return;
+    }
     let range = ranges
         .iter()
         .find(|r| r.table == raw.table && r.addresses.contains(&raw.address));
@@ -327,6 +400,30 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
             "write",
             format!("the value takes {items} registers, its range writes {most}"),
             "raise `write` there",
+        );
+    }
+}
+
+/// Checks `scale_from`: a whole number that the drive is asked for.
+pub(super) fn check_scale(reader: &Reader<'_>, index: usize, points: &[Point]) {
+    let scale = points.get(index).and_then(Point::raw).and_then(|raw| raw.scale_from);
+    let Some(scale) = scale.and_then(|scale| points.get(scale)) else {
+        return;
+    };
+    let whole = |raw: &Raw| {
+        raw.is_unscaled() && !raw.is_bool() && !matches!(raw.form, Form::F32 | Form::F64 | Form::Text { .. })
+    };
+    if !scale.raw().is_some_and(whole) {
+        reader.problem(
+            "scale_from",
+            format!("`{}` is no whole number without a scale of its own", scale.name),
+            "name a point with type = \"i16\" and no `scale`",
+        );
+    } else if scale.class == PollClass::Never {
+        reader.problem(
+            "scale_from",
+            format!("`{}` is never read", scale.name),
+            "give it another class",
         );
     }
 }

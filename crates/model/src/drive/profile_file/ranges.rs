@@ -26,6 +26,18 @@ pub(super) fn read_range(reader: &Reader<'_>, offsets: &Offsets) -> Option<Addre
     let read: u16 = reader.or("read", 1);
     let write: u16 = reader.or("write", 0);
     let holes = reader.or("holes", false);
+    let try_read: u16 = reader.or("try_read", 0);
+    let is_bits = table.is_some_and(crate::codec::Table::is_bits);
+    if try_read > 0 && (!is_bits || try_read <= read || try_read > 16) {
+        reader.problem(
+            "try_read",
+            format!(
+                "{try_read} is not a number of bits from {} to 16 that is to be tried",
+                read + 1
+            ),
+            "write it for a range of bits, above `read`, or leave it out",
+        );
+    }
     let note = reader.or("note", String::new());
     let write_when = reader.or("write_when", String::new());
     let first = first.and_then(|at| offsets.applied(reader, "first", table?, at));
@@ -63,6 +75,7 @@ pub(super) fn read_range(reader: &Reader<'_>, offsets: &Offsets) -> Option<Addre
         table,
         addresses: first..=last,
         read,
+        try_read,
         write,
         holes,
         write_when,

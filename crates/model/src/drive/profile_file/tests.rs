@@ -87,7 +87,7 @@ x = "y"
         "meter.toml:13, point[1].at; add the range",
         "meter.toml:14, point[1].scael; did you mean `scale`?",
         "meter.toml:16, point[2].name",
-        "meter.toml:18, point[2].type; known: u16, i16, u32, i32, f32",
+        "meter.toml:18, point[2].type; known: u16, i16, u32, i32, u64",
         "meter.toml:21, faults.x",
     ] {
         assert!(all.contains(wanted), "{wanted} is missing in\n{all}");
@@ -121,7 +121,7 @@ fn each_mistake_of_a_point() {
         ),
         (
             "at = \"holding 1\"\ninvert = true",
-            "only a bit can be inverted; m:13, point[0].invert",
+            "only a bit or `equals` can be inverted; m:13, point[0].invert",
         ),
         (
             "at = \"holding 1\"\nscale = 0",
@@ -452,11 +452,8 @@ fn the_page_names_every_key() {
     let meter = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/energy-meter.toml")).unwrap();
     let choices = "[speed_reference]\nsigned = true\n[n2]\nstate_bit = 6\n";
     let mut known = std::collections::BTreeSet::new();
-    for source in BUILT_IN
-        .iter()
-        .map(|(_, source)| *source)
-        .chain([meter.as_str(), choices])
-    {
+    let all = BUILT_IN.iter();
+    for source in all.map(|(_, source)| *source).chain([meter.as_str(), choices]) {
         let document = Document::parse("p", source);
         let _ = read_profile(&document.reader(), true, &Profiles::default());
         known.extend(document.known_keys());
@@ -474,7 +471,16 @@ fn the_page_names_every_key() {
         .iter()
         .any(|p| key.starts_with(p))
     });
-    known.retain(|key| !key.contains("texts."));
+    known.retain(|key| !key.contains("texts.") && !key.contains(".always.") && !key.contains(".until."));
+    // The forms of all commands have their keys in one table.
+    const FORMS: [&str; 4] = ["run", "stop", "reverse", "fault_reset"];
+    let form = |key: String| {
+        let of = FORMS.iter().find_map(|of| key.strip_prefix(&format!("control.{of}.")));
+        of.map_or(key.clone(), |key| {
+            format!("form.{}", key.trim_start_matches("steps[]."))
+        })
+    };
+    let mut known: std::collections::BTreeSet<String> = known.into_iter().map(form).collect();
     known.extend(["remove".to_string(), "points".to_string()]);
     let section = |heading: &str| {
         let (_, rest) = page.split_once(heading).unwrap();
@@ -484,6 +490,10 @@ fn the_page_names_every_key() {
     };
     let mut named = section("\n## Keys of a profile\n");
     for (heading, path) in [
+        ("\n### `[control]`\n", "control."),
+        ("\n### Forms of a command\n", "form."),
+        ("\n### `[[state]]`\n", "state[]."),
+        ("\n### `[ranges]`\n", "ranges."),
         ("\n### `[speed_reference]`\n", "speed_reference."),
         ("\n### `[[identify]]`\n", "identify[]."),
         ("\n### `[n2]`\n", "n2."),
@@ -526,15 +536,11 @@ fn points_for_faults_are_read_by_their_registers() {
         .map(|i| profile.points[*i].name.as_str())
         .collect();
     assert_eq!(names, ["fault_code_id99", "heatsink_temperature"]);
-    // What is polled anyway needs no read of its own.
+    // What is polled anyway, or is compared with process data, needs no read of its own.
     let plan = crate::drive::Plan::of(&profile);
-    assert_eq!(
-        plan.on_fault
-            .iter()
-            .map(|read| (read.start, read.count))
-            .collect::<Vec<_>>(),
-        [(98, 1)]
-    );
+    assert_eq!(plan.on_fault, []);
+    let monitors: Vec<_> = plan.monitors.iter().map(|read| (read.start, read.count)).collect();
+    assert_eq!(monitors, [(0, 2), (3, 4), (44, 1), (98, 1)]);
     // A derived point is read by what it is made of; what is removed is not read.
     let derived = Profile::parse("p", &source("\"frequency_reference\""), false).unwrap();
     let names: Vec<&str> = derived
@@ -596,5 +602,111 @@ fn a_range_ends_within_its_register() {
         range("[0, 5000]").contains("holds 0 to 655.35"),
         "{}",
         range("[0, 5000]")
+    );
+}
+
+/// One mistake each of the keys that make a value of registers.
+#[test]
+fn each_mistake_of_a_value() {
+    let cases = [
+        (
+            "type = \"string:0\"",
+            "a text of `0` registers is not possible; m:13, point[0].type; write string:1 to string:32",
+        ),
+        (
+            "type = \"u32\"\norder = \"abcd\"",
+            "unknown order `abcd`; m:14, point[0].order",
+        ),
+        (
+            "type = \"u32\"\norder = \"CDAB\"\nwords = \"low-first\"",
+            "`order` says it already; m:15, point[0].words",
+        ),
+        ("type = \"i16\"\nmask = 3", "not of i16; m:14, point[0].mask"),
+        ("mask = 0", "names no bits of 1 registers; m:13, point[0].mask"),
+        ("mask = 0x10000", "names no bits of 1 registers; m:13, point[0].mask"),
+        (
+            "mask = 0x0003\nequals = 4",
+            "4 is never reached: the value is 0 to 3; m:14, point[0].equals",
+        ),
+        ("type = \"f32\"\nequals = 4", "not compared with a whole number; m:14"),
+        (
+            "equals = 4\nscale = 2",
+            "what is compared is the count; m:14, point[0].scale",
+        ),
+        (
+            "invalid = [0x10000]",
+            "65536 is more than 1 registers hold; m:13, point[0].invalid",
+        ),
+        (
+            "type = \"string:2\"\ninvalid = [0]",
+            "only a register with a number; m:14",
+        ),
+        ("scale_from = \"b\"", "there is no point `b`; m:13, point[0].scale_from"),
+        (
+            "scale_from = \"a\"",
+            "`a` is no whole number without a scale of its own; m:13",
+        ),
+        (
+            "type = \"string:2\"\nwrite = true",
+            "there is no way back; m:14, point[0].write",
+        ),
+        ("equals = 1\nwrite = true", "there is no way back; m:14, point[0].write"),
+        (
+            "unlisted = true\nwrite = true",
+            "only an enumeration that is written; m:13, point[0].unlisted",
+        ),
+        (
+            "type = \"string:2\"\n[point.texts]\n1 = \"on\"",
+            "a text is no enumeration; m:14, point[0].texts",
+        ),
+    ];
+    for (lines, wanted) in cases {
+        let all = mistakes(
+            "m",
+            &format!("{HEAD}[[point]]\nname = \"a\"\nat = \"holding 1\"\n{lines}\n"),
+        );
+        let (what, place) = wanted.split_once("; ").unwrap();
+        assert!(
+            all.contains(what) && all.contains(place),
+            "{lines}\n{wanted} is missing in\n{all}"
+        );
+        assert_eq!(all.lines().count(), 1, "{lines}\n{all}");
+    }
+    let model = |name: &str, lines: &str| {
+        let place = format!("[[point]]\nname = \"{name}\"\nat = \"holding 1\"\n{lines}\n");
+        mistakes("m", &format!("{HEAD}{place}"))
+    };
+    assert!(model("motor_current", "hidden = true").contains("is a point of the common model"));
+    assert!(model("motor_current", "type = \"string:4\"").contains("is no text in the common model"));
+    assert!(model("running", "mask = 3").contains("is true or false"));
+    assert_eq!(model("running", "mask = 3\nequals = 3"), "");
+    assert!(model("motor_current", "mask = 3\nequals = 3").contains("is a number, not a bit"));
+}
+
+#[test]
+fn what_the_keys_of_a_value_make() {
+    let text = format!(
+        "{HEAD}[[point]]\nname = \"power\"\nat = \"holding 0\"\nscale_from = \"power_sf\"\n\
+         [[point]]\nname = \"power_sf\"\nat = \"holding 1\"\ntype = \"i16\"\nhidden = true\ninvalid = [0x8000]\n\
+         [[point]]\nname = \"mode\"\nat = \"holding 2\"\nmask = 0x0070\nwrite = true\n[point.texts]\n1 = \"a\"\n\
+         [[point]]\nname = \"count\"\nat = \"holding 4\"\ntype = \"u64\"\norder = \"CDAB\"\ninvalid = [-1]\n"
+    );
+    let profile = Profile::parse("p.toml", &text, false).unwrap();
+    let point = |name: &str| &profile.points[profile.point_index(name).unwrap()];
+    let raw = |name: &str| point(name).raw().unwrap();
+    assert_eq!(raw("power").scale_from, profile.point_index("power_sf"));
+    assert_eq!(raw("power_sf").invalid, [0x8000]);
+    assert!(point("power_sf").hidden);
+    assert_eq!(raw("mode").form, Form::Bits { first: 4, count: 3 });
+    assert_eq!(raw("mode").encode(Value::Integer(1), 0xFFFF), Ok(vec![0xFF9F]));
+    assert_eq!(
+        (point("count").kind(), point("power").kind()),
+        (Kind::Integer, Kind::Number)
+    );
+    assert_eq!(raw("count").type_text(), "u64 CDAB");
+    assert_eq!(raw("count").decode(&[0xFFFF; 4], Kind::Integer), None);
+    assert_eq!(
+        raw("count").decode(&[1, 0, 0, 0], Kind::Integer),
+        Some(Value::Integer(1))
     );
 }

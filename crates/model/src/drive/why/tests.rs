@@ -159,6 +159,16 @@ fn every_family_tells_what_the_common_model_has() {
     }
 }
 
+/// Table and legend of the manual contradict about bit 8 of the status word: it blocks no drive that is ready.
+#[test]
+fn an_uncertain_interlock_blocks_no_drive_that_is_ready() {
+    let ready = stands("eaton-hvx").with("interlocked", Value::Bool(true));
+    assert!(!ready.words().contains("interlocked"), "{}", ready.words());
+    let unready = stands("eaton-hvx").with("interlocked", Value::Bool(true)).off("ready");
+    assert!(unready.words().contains("interlocked"), "{}", unready.words());
+    assert!(unready.explain().causes[0].evidence.contains("not verified"));
+}
+
 #[test]
 fn what_only_some_families_tell() {
     for (family, point, state, word) in [
@@ -166,7 +176,6 @@ fn what_only_some_families_tell() {
         ("vacon-nx", "panel_control", true, "local_control"),
         ("vacon-nx", "io_control", true, "local_control"),
         ("vacon-nx", "undervoltage_stop_active", true, "undervoltage"),
-        ("eaton-hvx", "interlocked", true, "interlocked"),
         ("eaton-hvx", "bypass_active", true, "bypass"),
         ("eaton-hvx", "fire_mode_active", true, "fire_mode"),
         ("eaton-hvx", "hand_auto", false, "local_control"),

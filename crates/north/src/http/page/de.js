@@ -74,6 +74,7 @@ const texts = {
   "Logged in as": "Angemeldet als",
   "Logging in …": "Anmeldung läuft …",
   "Login": "Anmeldung",
+  "not verified on hardware": "nicht an einem Gerät geprüft",
   "Modbus TCP unit {unit}": "Modbus-TCP-Unit {unit}",
   "More of this family": "Weitere Werte dieser Baureihe",
   "More states": "Weitere Zustände",
@@ -280,7 +281,7 @@ const words = {
   // Events and triggers of recordings.
   fault_end: "Störung behoben", warning_end: "Warnung beendet", online: "online", started: "gestartet", stopped: "gestoppt", control_place: "Steuerplatz",
   supervision: "Überwachung", supervision_failed: "Überwachung fehlgeschlagen", unsupervised: "nicht überwacht", refused_command: "Befehl abgelehnt",
-  not_confirmed: "nicht bestätigt", restarted: "neu gestartet", unlike_profile: "anders als Profil", foreign_command: "fremder Befehl",
+  not_confirmed: "nicht bestätigt", restarted: "neu gestartet", unlike_profile: "anders als Profil", selection_differs: "Prozessdaten anders als Profil", foreign_command: "fremder Befehl",
   parameters_changed: "Parameter geändert", restore_unfinished: "Rückspielen unvollendet", recording: "Aufzeichnung", bus_up: "Leitung verbunden",
   bus_down: "Leitung unterbrochen", diagnosis: "Diagnose", reload_refused: "Neuladen abgelehnt", lost: "verloren", refused_stop: "Stopp abgelehnt",
   line_errors: "Leitungsfehler", point: "Grenzwert", command: "Befehl",

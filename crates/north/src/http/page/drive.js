@@ -133,7 +133,8 @@ function showTop(parts, drive) {
   const line = anchor(places.line(drive.bus), "", drive.bus);
   if (parts.known === JSON.stringify([drive.bus, drive.address, drive.unit, drive.profile, access])) return;
   parts.known = JSON.stringify([drive.bus, drive.address, drive.unit, drive.profile, access]);
-  parts.where.replaceChildren(line, ` · ${t("address {address}", drive)} · ${t("Modbus TCP unit {unit}", drive)} · ${drive.profile} · ${access}`);
+  const doubt = drive.profile_verified === false ? ` (${t("not verified on hardware")})` : "";
+  parts.where.replaceChildren(line, ` · ${t("address {address}", drive)} · ${t("Modbus TCP unit {unit}", drive)} · ${drive.profile}${doubt} · ${access}`);
 }
 
 // ---- What the gateway counted, and the line

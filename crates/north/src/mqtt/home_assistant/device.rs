@@ -7,7 +7,26 @@ use super::{Sources, id_of};
 use crate::plant::{DriveHandle, Plant};
 
 /// With whose names titles of profiles begin.
-const MANUFACTURERS: [&str; 3] = ["Eaton", "TECO", "Vacon"];
+const MANUFACTURERS: [&str; 18] = [
+    "ABB",
+    "Danfoss",
+    "Delta",
+    "Eaton",
+    "Fuji",
+    "Hitachi",
+    "INVT",
+    "Invertek",
+    "LS",
+    "Lenze",
+    "Mitsubishi",
+    "Schneider",
+    "Siemens",
+    "TECO",
+    "Toshiba",
+    "Vacon",
+    "WEG",
+    "Yaskawa",
+];
 
 /// A device of Home Assistant.
 #[derive(Debug)]

@@ -184,7 +184,7 @@ impl DriveEntities<'_> {
 
     /// The control of a point, if it is commanded.
     fn command(&self, point: &Point) -> Option<(String, Value)> {
-        if !self.is_commanded(point) {
+        if !self.is_commanded(point) || point.kind() == Kind::Text {
             return None;
         }
         let name = &point.name;
@@ -198,7 +198,7 @@ impl DriveEntities<'_> {
                 Platform::Switch,
                 json!({ "pl_on": "true", "pl_off": "false", "cmd_tpl": send("{{ value }}") }),
             ),
-            Kind::Number | Kind::Integer => {
+            Kind::Number | Kind::Integer | Kind::Text => {
                 let (least, most) = self.limits(point)?;
                 let more = json!({
                     "min": least, "max": most, "step": 0.01, "mode": "box", "unit_of_meas": point.unit,
@@ -261,7 +261,14 @@ impl DriveEntities<'_> {
                 self.show(&mut entity, name, &Shown::Plain);
                 quantity(&mut entity, point);
             }
-            Kind::Integer => self.show(&mut entity, name, &Shown::Plain),
+            Kind::Integer => {
+                self.show(&mut entity, name, &Shown::Plain);
+                // A count of 64 bits, not a code.
+                if !point.unit.is_empty() {
+                    quantity(&mut entity, point);
+                }
+            }
+            Kind::Text => self.show(&mut entity, name, &Shown::Plain),
         }
         (format!("{}_{name}", platform.name()), entity.into())
     }
@@ -329,7 +336,7 @@ impl DriveEntities<'_> {
                 let control = match point.kind() {
                     Kind::Bool if point.pulse => Platform::Button,
                     Kind::Bool => Platform::Switch,
-                    Kind::Number | Kind::Integer => Platform::Number,
+                    Kind::Number | Kind::Integer | Kind::Text => Platform::Number,
                 };
                 [control, sensor_platform(point)].map(|platform| (platform, point.name.as_str()))
             })
@@ -379,7 +386,7 @@ impl Shown<'_> {
             Shown::Texts(point) => {
                 let key = |code: &i64| match point.kind() {
                     Kind::Bool => (*code != 0).to_string(),
-                    Kind::Number | Kind::Integer => code.to_string(),
+                    Kind::Number | Kind::Integer | Kind::Text => code.to_string(),
                 };
                 let texts: Map<String, Value> = point.texts.iter().map(|(c, t)| (key(c), t.as_str().into())).collect();
                 format!("{}.get(v | string | lower, v)", Value::from(texts))
@@ -401,7 +408,7 @@ fn quantity(entity: &mut Map<String, Value>, point: &Point) {
         _ if counts && may_fall(point) => "total",
         _ if counts => "total_increasing",
         PollClass::Fast | PollClass::Slow => "measurement",
-        PollClass::Once | PollClass::Fault | PollClass::Never => return,
+        PollClass::Once | PollClass::Fault | PollClass::Monitor | PollClass::Never => return,
     };
     entity.insert("stat_cla".into(), class.into());
 }
@@ -409,9 +416,9 @@ fn quantity(entity: &mut Map<String, Value>, point: &Point) {
 /// Whether a count may go down, as a balance does: Home Assistant would take that for a meter that begins anew.
 fn may_fall(point: &Point) -> bool {
     match point.raw().map(|raw| raw.form) {
-        Some(Form::I16 | Form::I32(_)) => true,
+        Some(Form::I16 | Form::I32 | Form::I64) => true,
         // The energy of a drive on N2 is such a number, and never falls.
-        Some(Form::F32(_)) | None => {
+        Some(Form::F32 | Form::F64) | None => {
             point.model.is_none() && point.range.as_ref().is_none_or(|range| *range.start() < 0.0)
         }
         Some(_) => false,

@@ -107,7 +107,8 @@ fn there_is_one_entity_for_each_published_point() {
                 assert_eq!(keys.len(), all.len(), "{}: a key is there twice", profile.name);
                 let published = super::super::payload::published_points(profile);
                 let is_shown = published.iter().any(|(_, name)| *name == "fault_reset");
-                let reset = usize::from(access == Access::Control && !is_shown);
+                let has_reset = profile.model_index(crate::drive::ModelPoint::FaultReset).is_some();
+                let reset = usize::from(access == Access::Control && has_reset && !is_shown);
                 let code = usize::from(profile.model_index(crate::drive::ModelPoint::FaultCode).is_some());
                 let expected = published.len() + code + reset + 2;
                 assert_eq!(present(&all).count(), expected, "{} {access:?}", profile.name);

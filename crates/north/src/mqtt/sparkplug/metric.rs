@@ -8,6 +8,7 @@ use crate::drive::{Quality, Value};
 pub(super) enum Datum {
     Bool(bool),
     Integer(i64),
+    Unsigned(u64),
     Number(f64),
     Text(String),
 }
@@ -17,6 +18,8 @@ impl From<Value> for Datum {
         match value {
             Value::Bool(state) => Datum::Bool(state),
             Value::Integer(code) => Datum::Integer(code),
+            Value::Unsigned(count) => Datum::Unsigned(count),
+            Value::Text(text) => Datum::Text(text.shown()),
             // No negative zero.
             Value::Number(number) => Datum::Number(number + 0.0),
         }
@@ -127,6 +130,7 @@ impl Datum {
     fn on_the_wire(&self, datatype: DataType) -> MetricValue {
         match (self, datatype) {
             (Datum::Bool(state), _) => MetricValue::Boolean(*state),
+            (Datum::Unsigned(count), _) => MetricValue::Long(*count),
             (Datum::Integer(code), DataType::Double) => MetricValue::Double(*code as f64),
             (Datum::Integer(code), _) => MetricValue::Long(code.cast_unsigned()),
             (Datum::Number(number), _) => MetricValue::Double(*number),

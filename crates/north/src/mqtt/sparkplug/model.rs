@@ -6,6 +6,7 @@ use super::super::payload;
 use super::metric::{Datum, Definition, Pace, Sample};
 use super::wire::DataType;
 use crate::drive::model::Kind;
+use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, Point, Quality, State};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::Reading;
@@ -192,7 +193,9 @@ fn text(name: &str) -> Definition {
 fn datatype(point: &Point) -> DataType {
     match point.kind() {
         Kind::Bool => DataType::Boolean,
+        Kind::Integer if point.raw().is_some_and(|raw| raw.form == Form::U64) => DataType::UInt64,
         Kind::Integer => DataType::Int64,
+        Kind::Text => DataType::String,
         Kind::Number => DataType::Double,
     }
 }

@@ -114,6 +114,7 @@ impl Payload {
 pub(super) enum DataType {
     Int32,
     Int64,
+    UInt64,
     Double,
     Boolean,
     String,
@@ -125,6 +126,7 @@ impl DataType {
         match self {
             DataType::Int32 => 3,
             DataType::Int64 => 4,
+            DataType::UInt64 => 8,
             DataType::Double => 10,
             DataType::Boolean => 11,
             DataType::String => 12,

@@ -24,6 +24,7 @@ impl Bench {
                 address: 0,
                 may_write: true,
                 reach: vec![1, 2],
+                effects: Vec::new(),
                 stops: if value == STOP { vec![1, 2] } else { Vec::new() },
                 frame,
             }),

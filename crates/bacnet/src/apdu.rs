@@ -1,0 +1,225 @@
+//! The application layer's header (clause 20.1).
+
+use crate::encoding::Writer;
+use crate::types::{Abort, Error, Reject};
+
+/// Longest message that goes into a datagram of BACnet/IP.
+pub const MAX_APDU: usize = 1476;
+
+/// What a client takes as an answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Accepts {
+    /// Segments, and at most how many.
+    pub segments: Option<usize>,
+    /// Octets of one message.
+    pub size: usize,
+}
+
+/// A message of the application layer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Apdu<'a> {
+    /// A request that is answered.
+    Confirmed {
+        /// It comes in segments.
+        segmented: bool,
+        /// What its client takes.
+        accepts: Accepts,
+        /// Its number.
+        invoke: u8,
+        /// What is asked for.
+        service: u8,
+        /// Its content.
+        data: &'a [u8],
+    },
+    /// A message that is not answered.
+    Unconfirmed(u8, &'a [u8]),
+    /// A request of ours was carried out.
+    SimpleAck(u8),
+    /// A request of ours was answered.
+    ComplexAck(u8),
+    /// Segments arrived.
+    SegmentAck {
+        /// Not those that were expected.
+        negative: bool,
+        /// A server says so.
+        server: bool,
+        /// Of that exchange.
+        invoke: u8,
+        /// The last one that arrived.
+        sequence: u8,
+        /// So many may follow at once.
+        window: u8,
+    },
+    /// A request of ours failed.
+    Error(u8),
+    /// A request of ours was not understood.
+    Reject(u8),
+    /// An exchange ended.
+    Abort {
+        /// A server says so.
+        server: bool,
+        /// That one.
+        invoke: u8,
+    },
+}
+
+impl Accepts {
+    fn decode(segmented: bool, octet: u8) -> Accepts {
+        let segments = match octet >> 4 & 7 {
+            0 | 7 => usize::MAX,
+            power => 1 << power,
+        };
+        let size = match octet & 0x0F {
+            0 => 50,
+            1 => 128,
+            2 => 206,
+            3 => 480,
+            4 => 1024,
+            _ => MAX_APDU,
+        };
+        Accepts {
+            segments: segmented.then_some(segments),
+            size,
+        }
+    }
+}
+
+/// Reads a message; `None` where it is none.
+pub fn decode(bytes: &[u8]) -> Option<Apdu<'_>> {
+    let (first, rest) = bytes.split_first()?;
+    let flag = |bit: u8| first >> bit & 1 == 1;
+    Some(match (first >> 4, rest) {
+        (0, [accepts, invoke, rest @ ..]) => {
+            let segmented = flag(3);
+            let (service, data) = match (segmented, rest) {
+                (true, [_, _, service, data @ ..]) | (false, [service, data @ ..]) => (*service, data),
+                _ => return None,
+            };
+            Apdu::Confirmed {
+                segmented,
+                accepts: Accepts::decode(flag(1), *accepts),
+                invoke: *invoke,
+                service,
+                data,
+            }
+        }
+        (1, [service, data @ ..]) => Apdu::Unconfirmed(*service, data),
+        (2, [invoke, _]) => Apdu::SimpleAck(*invoke),
+        (3, [invoke, _, ..]) => Apdu::ComplexAck(*invoke),
+        (4, [invoke, sequence, window]) => Apdu::SegmentAck {
+            negative: flag(1),
+            server: flag(0),
+            invoke: *invoke,
+            sequence: *sequence,
+            window: *window,
+        },
+        (5, [invoke, _, ..]) => Apdu::Error(*invoke),
+        (6, [invoke, _]) => Apdu::Reject(*invoke),
+        (7, [invoke, _]) => Apdu::Abort {
+            server: flag(0),
+            invoke: *invoke,
+        },
+        _ => return None,
+    })
+}
+
+/// A request of ours, which takes no segments as an answer.
+pub fn confirmed(invoke: u8, service: u8, content: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![0x00, 0x05, invoke, service];
+    bytes.extend(content);
+    bytes
+}
+
+/// A message that is not answered.
+pub fn unconfirmed(service: u8, content: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![0x10, service];
+    bytes.extend(content);
+    bytes
+}
+
+/// The request was carried out.
+pub fn simple_ack(invoke: u8, service: u8) -> Vec<u8> {
+    vec![0x20, invoke, service]
+}
+
+/// The answer to a request.
+pub fn complex_ack(invoke: u8, service: u8, content: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![0x30, invoke, service];
+    bytes.extend(content);
+    bytes
+}
+
+/// A segment of an answer.
+pub fn segment(invoke: u8, service: u8, (sequence, window): (u8, u8), more: bool, content: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![0x38 | u8::from(more) << 2, invoke, sequence, window, service];
+    bytes.extend(content);
+    bytes
+}
+
+/// Octets of a segment before its content.
+pub const SEGMENT_HEADER: usize = 5;
+
+/// The request failed.
+pub fn error(invoke: u8, service: u8, error: Error) -> Vec<u8> {
+    let mut writer = Writer::default();
+    writer.raw(&[0x50, invoke, service]);
+    writer.enumerated(error.class as u32).enumerated(error.code.into());
+    writer.into_bytes()
+}
+
+/// The request is not understood.
+pub fn reject(invoke: u8, reason: Reject) -> Vec<u8> {
+    vec![0x60, invoke, reason as u8]
+}
+
+/// The exchange ends.
+pub fn abort(invoke: u8, reason: Abort) -> Vec<u8> {
+    vec![0x71, invoke, reason as u8]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Frames of annex F.
+    #[test]
+    fn frames_of_the_standard() {
+        let read = [0x00, 0x00, 0x01, 0x0C, 0x0C, 0, 0, 0, 5, 0x19, 0x55];
+        let accepts = Accepts {
+            segments: None,
+            size: 50,
+        };
+        let (segmented, invoke, service, data) = (false, 1, 12, &read[4..]);
+        let wanted = Apdu::Confirmed {
+            segmented,
+            accepts,
+            invoke,
+            service,
+            data,
+        };
+        assert_eq!(decode(&read), Some(wanted));
+        assert_eq!(decode(&[0x10, 8]), Some(Apdu::Unconfirmed(8, &[])));
+        assert_eq!(error(1, 12, Error::UNKNOWN_OBJECT), [0x50, 1, 12, 0x91, 1, 0x91, 31]);
+        assert_eq!(simple_ack(3, 15), [0x20, 3, 15]);
+        assert_eq!(segment(1, 14, (2, 4), true, &[9]), [0x3C, 1, 2, 4, 14, 9]);
+        let accepts = Accepts {
+            segments: Some(4),
+            size: MAX_APDU,
+        };
+        assert_eq!(Accepts::decode(true, 0x25), accepts);
+    }
+
+    #[test]
+    fn what_is_wrong_is_nothing() {
+        for bytes in [
+            &[][..],
+            &[0x00, 5, 1],
+            &[0x08, 5, 1, 0, 4],
+            &[0x20, 1],
+            &[0x40, 1, 1],
+            &[0x80, 0, 0],
+        ] {
+            assert_eq!(decode(bytes), None, "{bytes:?}");
+        }
+    }
+}

@@ -1,0 +1,114 @@
+//! The BACnet Virtual Link Layer of BACnet/IP (annex J).
+
+use std::net::{Ipv4Addr, SocketAddrV4};
+
+/// First octet of every datagram.
+const BACNET_IP: u8 = 0x81;
+
+/// A datagram.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Bvlc<'a> {
+    /// What became of a request to a BBMD.
+    Result(u16),
+    /// A message to this host.
+    Unicast(&'a [u8]),
+    /// A message to all hosts of this network.
+    Broadcast(&'a [u8]),
+    /// A broadcast that a BBMD passes on, with the host that sent it.
+    Forwarded(SocketAddrV4, &'a [u8]),
+    /// A request that only a BBMD serves, with the code that refuses it.
+    ForBbmd(u16),
+}
+
+/// Reads a datagram; `None` where it is none of BACnet/IP, or of no valid length.
+pub fn decode(bytes: &[u8]) -> Option<Bvlc<'_>> {
+    let [BACNET_IP, function, high, low, rest @ ..] = bytes else {
+        return None;
+    };
+    if usize::from(u16::from_be_bytes([*high, *low])) != bytes.len() {
+        return None;
+    }
+    Some(match function {
+        0x00 => match rest {
+            [high, low] => Bvlc::Result(u16::from_be_bytes([*high, *low])),
+            _ => return None,
+        },
+        0x01 => Bvlc::ForBbmd(0x0010),
+        0x02 => Bvlc::ForBbmd(0x0020),
+        0x04 => match rest {
+            [a, b, c, d, high, low, npdu @ ..] => {
+                let port = u16::from_be_bytes([*high, *low]);
+                Bvlc::Forwarded(SocketAddrV4::new(Ipv4Addr::new(*a, *b, *c, *d), port), npdu)
+            }
+            _ => return None,
+        },
+        0x05 => Bvlc::ForBbmd(0x0030),
+        0x06 => Bvlc::ForBbmd(0x0040),
+        0x08 => Bvlc::ForBbmd(0x0050),
+        0x09 => Bvlc::ForBbmd(0x0060),
+        0x0A => Bvlc::Unicast(rest),
+        0x0B => Bvlc::Broadcast(rest),
+        _ => return None,
+    })
+}
+
+fn datagram(function: u8, body: &[u8]) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(body.len() + 4);
+    let len = u16::try_from(body.len() + 4).unwrap_or(u16::MAX);
+    bytes.extend([BACNET_IP, function]);
+    bytes.extend(len.to_be_bytes());
+    bytes.extend(body);
+    bytes
+}
+
+/// A message to one host.
+pub fn unicast(npdu: &[u8]) -> Vec<u8> {
+    datagram(0x0A, npdu)
+}
+
+/// A message to all hosts of this network.
+pub fn broadcast(npdu: &[u8]) -> Vec<u8> {
+    datagram(0x0B, npdu)
+}
+
+/// A message that a BBMD is asked to broadcast.
+pub fn distribute(npdu: &[u8]) -> Vec<u8> {
+    datagram(0x09, npdu)
+}
+
+/// Registers as a foreign device for so many seconds.
+pub fn register(seconds: u16) -> Vec<u8> {
+    datagram(0x05, &seconds.to_be_bytes())
+}
+
+/// What became of a request.
+pub fn result(code: u16) -> Vec<u8> {
+    datagram(0x00, &code.to_be_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn datagrams_of_annex_j() {
+        assert_eq!(unicast(&[1, 4]), [0x81, 0x0A, 0, 6, 1, 4]);
+        assert_eq!(decode(&unicast(&[1, 4])), Some(Bvlc::Unicast(&[1, 4])));
+        assert_eq!(decode(&broadcast(&[1])), Some(Bvlc::Broadcast(&[1])));
+        assert_eq!(register(60), [0x81, 5, 0, 6, 0, 60]);
+        assert_eq!(decode(&register(60)), Some(Bvlc::ForBbmd(0x30)));
+        assert_eq!(decode(&result(0)), Some(Bvlc::Result(0)));
+        let forwarded = [0x81, 4, 0, 11, 10, 0, 0, 9, 0xBA, 0xC0, 1];
+        let origin = "10.0.0.9:47808".parse().unwrap();
+        assert_eq!(decode(&forwarded), Some(Bvlc::Forwarded(origin, &[1])));
+        for bad in [
+            &[][..],
+            &[0x81, 0x0A, 0, 5],
+            &[0x82, 0x0A, 0, 4],
+            &[0x81, 0x0C, 0, 4],
+            &[0x81, 4, 0, 9, 1, 2, 3, 4, 5],
+        ] {
+            assert_eq!(decode(bad), None, "{bad:?}");
+        }
+    }
+}

@@ -1,0 +1,254 @@
+//! What a device is made of. The description of an object stands still; its value comes from the application when it is asked for.
+
+mod properties;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use crate::types::{Address, DateTime, Mac, ObjectId, ObjectType};
+
+pub(crate) use properties::{Context, Environment, Port, cov_value, list, property};
+
+/// A device.
+#[derive(Debug, PartialEq)]
+pub struct Device {
+    /// Its instance, 0..=4194302, unique in the network.
+    pub instance: u32,
+    /// Its station on the virtual network; none: it is the device of the host itself.
+    pub station: Option<Mac>,
+    /// Its name, unique in the network.
+    pub name: String,
+    /// What it is.
+    pub description: String,
+    /// Its model.
+    pub model: String,
+    objects: Vec<Object>,
+    by_id: HashMap<ObjectId, usize>,
+    revision: u32,
+}
+
+/// An object of a device.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Object {
+    /// Its identifier, unique in the device.
+    pub id: ObjectId,
+    /// Its name, unique in the device.
+    pub name: Arc<str>,
+    /// What it is.
+    pub description: Arc<str>,
+    /// What its values are.
+    pub kind: Kind,
+    /// How it is written.
+    pub access: Access,
+}
+
+/// How an object is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// Not at all.
+    Read,
+    /// Its Present_Value, without priorities.
+    Write,
+    /// By sixteen priorities.
+    Command,
+}
+
+/// What the values of an object are.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Kind {
+    /// Numbers.
+    Analog {
+        /// The unit by the number of the standard.
+        units: u32,
+        /// The smallest difference between two values.
+        resolution: f32,
+        /// Smallest and greatest value, where they are known.
+        range: Option<(f32, f32)>,
+        /// The change that is worth a notification, unless a client sets another.
+        increment: f32,
+    },
+    /// Inactive or active.
+    Binary {
+        /// Their texts.
+        texts: [Arc<str>; 2],
+    },
+    /// One of several states, from 1.
+    MultiState {
+        /// Their texts.
+        texts: Arc<[String]>,
+    },
+    /// A text.
+    Text,
+}
+
+/// A value.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Datum {
+    /// Of an analog object.
+    Number(f64),
+    /// Of a binary object: active.
+    Bool(bool),
+    /// Of a multi-state object, from 1.
+    State(u32),
+    /// Of a text.
+    Text(Arc<str>),
+}
+
+/// Whether a value can be relied on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reliability {
+    /// It can.
+    NoFault = 0,
+    /// Its source gives no valid one.
+    UnreliableOther = 7,
+    /// Its source does not answer, or not in time.
+    CommunicationFailure = 12,
+}
+
+/// A value with what is known of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sample {
+    /// The last one; none was ever there.
+    pub value: Option<Datum>,
+    /// Whether it can be relied on.
+    pub reliability: Reliability,
+    /// When it was read.
+    pub at: Option<DateTime>,
+}
+
+/// Who wrote a value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ValueSource {
+    /// Nobody is known.
+    #[default]
+    None,
+    /// A client.
+    Address(Address),
+    /// A device, by its instance.
+    Device(u32),
+}
+
+/// A slot of a priority array.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Slot {
+    /// What stands in it.
+    pub value: Datum,
+    /// Who wrote it.
+    pub source: ValueSource,
+    /// When.
+    pub at: DateTime,
+}
+
+/// The priorities of an object.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Commands {
+    /// What stands in each slot, priority 1 first.
+    pub slots: [Option<Slot>; 16],
+    /// The priority that governs.
+    pub current: Option<u8>,
+    /// What holds without any.
+    pub default: Option<Datum>,
+    /// Who gave the value that holds.
+    pub source: ValueSource,
+    /// When.
+    pub at: Option<DateTime>,
+}
+
+impl Device {
+    /// A device of these objects; of several with one identifier the first counts.
+    pub fn new(
+        instance: u32,
+        station: Option<Mac>,
+        name: String,
+        (model, description): (String, String),
+        objects: Vec<Object>,
+    ) -> Device {
+        let mut by_id = HashMap::with_capacity(objects.len());
+        for (place, object) in objects.iter().enumerate() {
+            by_id.entry(object.id).or_insert(place);
+        }
+        let revision = revision(&name, &objects);
+        Device {
+            instance,
+            station,
+            name,
+            description,
+            model,
+            objects,
+            by_id,
+            revision,
+        }
+    }
+
+    /// Its identifier.
+    pub fn id(&self) -> ObjectId {
+        ObjectId::new(ObjectType::DEVICE, self.instance)
+    }
+
+    /// Its objects, itself and its port apart.
+    pub fn objects(&self) -> &[Object] {
+        &self.objects
+    }
+
+    /// The place of an object.
+    pub fn find(&self, id: ObjectId) -> Option<usize> {
+        self.by_id.get(&id).copied()
+    }
+
+    /// The identifiers of all objects, itself and its port included.
+    pub fn object_list(&self) -> impl Iterator<Item = ObjectId> + '_ {
+        let own = [self.id(), ObjectId::new(ObjectType::NETWORK_PORT, 1)];
+        own.into_iter().chain(self.objects.iter().map(|object| object.id))
+    }
+
+    /// The object of that name.
+    pub(crate) fn named(&self, name: &str) -> Option<ObjectId> {
+        if name == self.name {
+            return Some(self.id());
+        }
+        if name == PORT_NAME {
+            return Some(ObjectId::new(ObjectType::NETWORK_PORT, 1));
+        }
+        self.objects
+            .iter()
+            .find(|object| &*object.name == name)
+            .map(|object| object.id)
+    }
+
+    /// A number that is another one when the objects are others.
+    pub(crate) fn revision(&self) -> u32 {
+        self.revision
+    }
+}
+
+/// The name of the port.
+pub(crate) const PORT_NAME: &str = "network_port";
+
+/// FNV-1a over what identifies the objects.
+fn revision(name: &str, objects: &[Object]) -> u32 {
+    let mut hash = 0x811C_9DC5_u32;
+    let mut add = |bytes: &[u8]| {
+        for byte in bytes {
+            hash = (hash ^ u32::from(*byte)).wrapping_mul(0x0100_0193);
+        }
+    };
+    add(name.as_bytes());
+    for object in objects {
+        add(&object.id.bits().to_be_bytes());
+        add(object.name.as_bytes());
+    }
+    hash
+}
+
+impl Kind {
+    /// Whether that value is one of this kind.
+    pub(crate) fn takes(&self, datum: &Datum) -> bool {
+        matches!(
+            (self, datum),
+            (Kind::Analog { .. }, Datum::Number(_))
+                | (Kind::Binary { .. }, Datum::Bool(_))
+                | (Kind::MultiState { .. }, Datum::State(_))
+                | (Kind::Text, Datum::Text(_))
+        )
+    }
+}

@@ -1,0 +1,397 @@
+//! Subscriptions to changes of value (clauses 13.1, 13.14, 13.15): who is told what, and when again. What is told comes from the
+//! server; here is the bookkeeping, which is bounded.
+
+use std::collections::{BTreeMap, HashMap};
+use std::net::Ipv4Addr;
+use std::time::{Duration, Instant};
+
+use crate::services::PropertyRef;
+use crate::types::{Address, ObjectId};
+
+/// Subscriptions in all, of one host, and of one host to one device.
+const MOST: usize = 4096;
+const MOST_OF_HOST: usize = 2048;
+const MOST_OF_DEVICE: usize = 128;
+/// How long an acknowledgement is awaited, and how often.
+const WAIT: Duration = Duration::from_secs(3);
+const TRIES: u8 = 3;
+/// Notifications in a row that found nobody, after which a subscription without end is over.
+const LOST: u8 = 3;
+
+/// What is subscribed to, and by whom.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Key {
+    pub(super) subscriber: Address,
+    pub(super) process: u32,
+    pub(super) object: ObjectId,
+    /// One property instead of value and flags.
+    pub(super) property: Option<PropertyRef>,
+}
+
+/// What was told last.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct Told {
+    /// The number, where the value is one.
+    pub(super) number: Option<f64>,
+    /// Everything else, as it stands on the wire.
+    pub(super) rest: Vec<u8>,
+}
+
+impl Told {
+    /// Whether a client that was told this is to be told that.
+    fn differs(&self, now: &Told, increment: f64) -> bool {
+        let moved = match (self.number, now.number) {
+            (Some(before), Some(now)) => {
+                let change = (now - before).abs();
+                change > 0.0 && change >= increment
+            }
+            (before, now) => before.is_some() != now.is_some(),
+        };
+        moved || self.rest != now.rest
+    }
+}
+
+/// A subscription.
+#[derive(Debug)]
+pub(super) struct Subscription {
+    pub(super) key: Key,
+    pub(super) confirmed: bool,
+    /// The increment that the client set for itself.
+    pub(super) increment: Option<f32>,
+    until: Option<Instant>,
+    told: Option<Told>,
+    /// Waits for its turn since that number.
+    due: Option<u64>,
+    lost: u8,
+}
+
+impl Subscription {
+    /// Seconds until it ends; 0 without end.
+    pub(super) fn left(&self, now: Instant) -> u64 {
+        self.until
+            .map_or(0, |until| until.saturating_duration_since(now).as_secs().max(1))
+    }
+}
+
+/// A confirmed notification without an answer.
+#[derive(Debug)]
+struct Outstanding {
+    device: u32,
+    key: Key,
+    invoke: u8,
+    message: Vec<u8>,
+    tries: u8,
+    until: Instant,
+}
+
+/// All subscriptions.
+#[derive(Debug, Default)]
+pub(super) struct Cov {
+    of: BTreeMap<u32, Vec<Subscription>>,
+    hosts: HashMap<Ipv4Addr, usize>,
+    outstanding: HashMap<Address, Outstanding>,
+    numbered: u64,
+    invoke: u8,
+}
+
+/// What a subscription shows at the moment, and the increment of its object.
+pub(super) type Look<'a> = &'a mut dyn FnMut(u32, &Subscription) -> Option<(Told, f64)>;
+
+impl Cov {
+    /// Subscribes, or renews; false where there is no room.
+    pub(super) fn subscribe(
+        &mut self,
+        device: u32,
+        key: Key,
+        (confirmed, lifetime): (bool, u32),
+        increment: Option<f32>,
+        now: Instant,
+    ) -> bool {
+        let until = (lifetime > 0).then(|| now + Duration::from_secs(lifetime.into()));
+        let renewed = Subscription {
+            key,
+            confirmed,
+            increment,
+            until,
+            told: None,
+            due: None,
+            lost: 0,
+        };
+        let all = self.len();
+        let of_device = self.of.entry(device).or_default();
+        if let Some(known) = of_device.iter_mut().find(|s| s.key == key) {
+            *known = renewed;
+            return true;
+        }
+        let own = of_device
+            .iter()
+            .filter(|s| s.key.subscriber.ip() == key.subscriber.ip())
+            .count();
+        let of_host = self.hosts.entry(key.subscriber.ip()).or_default();
+        if all >= MOST || *of_host >= MOST_OF_HOST || own >= MOST_OF_DEVICE {
+            self.tidy();
+            return false;
+        }
+        *of_host += 1;
+        of_device.push(renewed);
+        true
+    }
+
+    /// Ends a subscription, whether or not there is one.
+    pub(super) fn cancel(&mut self, device: u32, key: &Key) {
+        self.retain(|of, subscription| of != device || subscription.key != *key);
+    }
+
+    /// Keeps those that `keep` says.
+    pub(super) fn retain(&mut self, mut keep: impl FnMut(u32, &Subscription) -> bool) {
+        for (device, all) in &mut self.of {
+            all.retain(|subscription| {
+                let keeps = keep(*device, subscription);
+                if !keeps && let Some(count) = self.hosts.get_mut(&subscription.key.subscriber.ip()) {
+                    *count = count.saturating_sub(1);
+                }
+                keeps
+            });
+        }
+        self.tidy();
+    }
+
+    fn tidy(&mut self) {
+        self.of.retain(|_, all| !all.is_empty());
+        self.hosts.retain(|_, count| *count > 0);
+    }
+
+    /// How many there are.
+    pub(super) fn len(&self) -> usize {
+        self.hosts.values().sum()
+    }
+
+    /// Devices with a subscription.
+    pub(super) fn devices(&self) -> Vec<u32> {
+        self.of.keys().copied().collect()
+    }
+
+    /// The subscriptions to a device.
+    pub(super) fn of(&self, device: u32) -> &[Subscription] {
+        self.of.get(&device).map_or(&[], Vec::as_slice)
+    }
+
+    /// Looks at the subscriptions of a device: those whose clients are to be told something become due.
+    pub(super) fn look(&mut self, device: u32, look: Look<'_>) {
+        let Some(all) = self.of.get_mut(&device) else { return };
+        for subscription in all.iter_mut().filter(|subscription| subscription.due.is_none()) {
+            let Some((now, increment)) = look(device, subscription) else {
+                continue;
+            };
+            let increment = subscription.increment.map_or(increment, f64::from);
+            if subscription
+                .told
+                .as_ref()
+                .is_none_or(|told| told.differs(&now, increment))
+            {
+                self.numbered += 1;
+                subscription.due = Some(self.numbered);
+            }
+        }
+    }
+
+    /// The subscription that is told something next: those that wait longest first, and one at a time of those that
+    /// acknowledge.
+    pub(super) fn next(&self) -> Option<(u32, Key, bool)> {
+        let free = |s: &&Subscription| !s.confirmed || !self.outstanding.contains_key(&s.key.subscriber);
+        let all = self
+            .of
+            .iter()
+            .flat_map(|(device, all)| all.iter().map(move |s| (*device, s)));
+        let due = all.filter(|(_, s)| s.due.is_some() && free(s));
+        let first = due.min_by_key(|(_, s)| s.due);
+        first.map(|(device, s)| (device, s.key, s.confirmed))
+    }
+
+    /// That subscription was told this.
+    pub(super) fn told(&mut self, device: u32, key: &Key, told: Option<Told>) {
+        let all = self.of.get_mut(&device);
+        if let Some(subscription) = all.and_then(|all| all.iter_mut().find(|s| s.key == *key)) {
+            subscription.due = None;
+            if told.is_some() {
+                subscription.told = told;
+            }
+        }
+    }
+
+    /// The number of the next confirmed notification.
+    pub(super) fn number(&mut self) -> u8 {
+        self.invoke = self.invoke.wrapping_add(1);
+        self.invoke
+    }
+
+    /// A confirmed notification left.
+    pub(super) fn sent(&mut self, device: u32, key: Key, invoke: u8, message: Vec<u8>, now: Instant) {
+        let outstanding = Outstanding {
+            device,
+            key,
+            invoke,
+            message,
+            tries: 1,
+            until: now + WAIT,
+        };
+        self.outstanding.insert(key.subscriber, outstanding);
+    }
+
+    /// A client answered a notification, in whatever way.
+    pub(super) fn answered(&mut self, from: Address, device: u32, invoke: u8) {
+        let is = |o: &Outstanding| (o.device, o.invoke) == (device, invoke);
+        if self.outstanding.get(&from).is_some_and(is)
+            && let Some(done) = self.outstanding.remove(&from)
+        {
+            self.note(done.device, done.key, false);
+        }
+    }
+
+    fn note(&mut self, device: u32, key: Key, lost: bool) {
+        let all = self.of.get_mut(&device);
+        let Some(subscription) = all.and_then(|all| all.iter_mut().find(|s| s.key == key)) else {
+            return;
+        };
+        subscription.lost = if lost { subscription.lost + 1 } else { 0 };
+        if lost {
+            // The client does not have it.
+            subscription.told = None;
+        }
+        if subscription.lost >= LOST && subscription.until.is_none() {
+            self.cancel(device, &key);
+        }
+    }
+
+    /// Ends what is over, and gives the notifications that are sent again.
+    pub(super) fn poll(&mut self, now: Instant) -> Vec<(Address, u32, Vec<u8>)> {
+        let over = |s: &Subscription| s.until.is_some_and(|until| until <= now);
+        if self.of.values().flatten().any(over) {
+            self.retain(|_, subscription| !over(subscription));
+        }
+        let mut again = Vec::new();
+        let mut lost = Vec::new();
+        for (subscriber, outstanding) in &mut self.outstanding {
+            if now < outstanding.until {
+                continue;
+            }
+            outstanding.tries += 1;
+            outstanding.until = now + WAIT;
+            if outstanding.tries <= TRIES {
+                again.push((*subscriber, outstanding.device, outstanding.message.clone()));
+            } else {
+                lost.push((*subscriber, outstanding.device, outstanding.key));
+            }
+        }
+        for (subscriber, device, key) in lost {
+            self.outstanding.remove(&subscriber);
+            self.note(device, key, true);
+        }
+        again
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::types::ObjectType;
+
+    fn key(host: u8, process: u32) -> Key {
+        Key {
+            subscriber: Address::local(format!("10.0.0.{host}:47808").parse().unwrap()),
+            process,
+            object: ObjectId::new(ObjectType::ANALOG_INPUT, 1),
+            property: None,
+        }
+    }
+
+    fn shows(number: f64, rest: u8) -> Told {
+        Told {
+            number: Some(number),
+            rest: vec![rest],
+        }
+    }
+
+    #[test]
+    fn subscriptions_are_bounded_for_each_client_too() {
+        let now = Instant::now();
+        let mut cov = Cov::default();
+        let taken = (0..200)
+            .filter(|n| cov.subscribe(1, key(1, *n), (false, 0), None, now))
+            .count();
+        assert_eq!(taken, MOST_OF_DEVICE);
+        assert!(cov.subscribe(1, key(1, 0), (true, 9), None, now), "renewed");
+        let mut more = |host: u8| {
+            let all = (0..5000).filter(|n| cov.subscribe(2 + n / 100, key(host, *n), (false, 0), None, now));
+            all.count()
+        };
+        assert_eq!(more(1), MOST_OF_HOST - MOST_OF_DEVICE);
+        assert_eq!((more(2), more(3)), (MOST_OF_HOST, 0));
+        assert_eq!(cov.len(), MOST);
+        cov.cancel(1, &key(1, 0));
+        assert_eq!((cov.len(), cov.of(1).len()), (MOST - 1, MOST_OF_DEVICE - 1));
+        cov.poll(now + Duration::from_secs(99));
+        assert_eq!(cov.len(), MOST - 1);
+    }
+
+    #[test]
+    fn told_at_once_then_by_the_increment_or_the_flags() {
+        let now = Instant::now();
+        let mut cov = Cov::default();
+        cov.subscribe(1, key(1, 7), (false, 10), None, now);
+        let mut due = |number: f64, rest: u8| {
+            cov.look(1, &mut |_, _| Some((shows(number, rest), 1.0)));
+            let due = cov.next().is_some();
+            if due {
+                cov.told(1, &key(1, 7), Some(shows(number, rest)));
+            }
+            due
+        };
+        let cases = [
+            (5.0, 0, true),
+            (5.0, 0, false),
+            (5.9, 0, false),
+            (6.0, 0, true),
+            (5.5, 1, true),
+            (5.5, 1, false),
+        ];
+        for (number, rest, is_due) in cases {
+            assert_eq!(due(number, rest), is_due, "{number} {rest}");
+        }
+        assert_eq!(cov.of(1)[0].left(now), 10);
+        cov.poll(now + Duration::from_secs(10));
+        assert_eq!(cov.len(), 0);
+    }
+
+    #[test]
+    fn one_at_a_time_and_three_in_vain_end_what_has_no_end() {
+        let now = Instant::now();
+        let mut cov = Cov::default();
+        cov.subscribe(1, key(1, 1), (true, 0), None, now);
+        cov.subscribe(1, key(1, 2), (true, 0), None, now);
+        cov.look(1, &mut |_, _| Some((shows(0.0, 0), 1.0)));
+        let (device, first, confirmed) = cov.next().unwrap();
+        assert!(confirmed);
+        cov.told(device, &first, Some(shows(0.0, 0)));
+        cov.sent(device, first, 9, vec![1], now);
+        assert!(cov.next().is_none(), "one outstanding for each subscriber");
+        cov.answered(first.subscriber, 1, 8);
+        cov.answered(key(2, 1).subscriber, 1, 9);
+        assert!(cov.next().is_none());
+        cov.answered(first.subscriber, 1, 9);
+        let (_, second, _) = cov.next().unwrap();
+        assert_ne!(second, first);
+        let mut at = now;
+        for _ in 0..LOST {
+            assert_eq!(cov.len(), 2);
+            cov.told(1, &second, Some(shows(0.0, 0)));
+            cov.sent(1, second, 10, vec![2], at);
+            for again in [1, 1, 0] {
+                at += WAIT;
+                assert_eq!(cov.poll(at).len(), again);
+            }
+            cov.look(1, &mut |_, _| Some((shows(0.0, 0), 1.0)));
+        }
+        assert_eq!((cov.len(), cov.of(1)[0].key), (1, first));
+    }
+}

@@ -1,0 +1,297 @@
+//! The server: a device of its own and a router to the devices behind it.
+
+mod bbmd;
+mod cov;
+mod discovery;
+mod network;
+mod notifying;
+mod reading;
+mod segments;
+mod traffic;
+mod writing;
+
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::sync::Arc;
+use std::time::Instant;
+
+use crate::object::{Commands, Device, Environment, Port, Sample};
+use crate::services::WriteItem;
+use crate::types::{Address, DateTime, Mac, ObjectId};
+
+pub use bbmd::Registration;
+pub use traffic::To;
+pub use writing::Job;
+
+use bbmd::Foreign;
+use cov::Cov;
+use segments::Segments;
+use traffic::Traffic;
+use writing::Exchanges;
+
+/// What a server is told once.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Options {
+    /// Its address.
+    pub address: SocketAddrV4,
+    /// Bits of the mask of its network.
+    pub prefix: u8,
+    /// The number of the virtual network, 1..=65534.
+    pub network: u16,
+    /// Identifier and name of the vendor.
+    pub vendor: (u16, Arc<str>),
+    /// The version of the program.
+    pub version: Arc<str>,
+    /// The BBMD at which it registers as a foreign device.
+    pub bbmd: Option<SocketAddrV4>,
+}
+
+/// What stands behind the server.
+pub trait Application {
+    /// Whether that host may say anything at all.
+    fn admits(&self, host: Ipv4Addr) -> bool;
+
+    /// Whether that host may write.
+    fn may_write(&self, host: Ipv4Addr) -> bool;
+
+    /// The clock of the day, UTC.
+    fn clock(&self) -> DateTime;
+
+    /// Whether that device answers.
+    fn answers(&self, device: u32) -> bool;
+
+    /// What the object at that place shows.
+    fn sample(&self, device: u32, place: usize) -> Sample;
+
+    /// Its priorities.
+    fn commands(&self, device: u32, place: usize) -> Option<Commands>;
+
+    /// Whether a write is a stop, which passes where nothing else does.
+    fn stops(&self, device: u32, write: &WriteItem) -> bool;
+
+    /// Orders to that device so far, from whomever: another number when somebody ordered something.
+    fn orders(&self, device: u32) -> u64;
+
+    /// Whether that is the password; false also where there is none.
+    fn password(&self, given: &str) -> bool;
+}
+
+/// Numbers of what happened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counters {
+    /// Datagrams that came from admitted hosts.
+    pub received: u64,
+    /// Datagrams that were not understood, or of hosts that are not admitted.
+    pub discarded: u64,
+    /// Requests that were answered with an error, a reject or an abort.
+    pub refused: u64,
+    /// Requests that were carried out.
+    pub done: u64,
+    /// Datagrams that were not sent: their address had its share.
+    pub dropped: u64,
+    /// Notifications that were sent.
+    pub notifications: u64,
+    /// Subscriptions at the moment.
+    pub subscriptions: u64,
+}
+
+/// The server. Datagrams go in by [`Server::receive`] and come out of [`Server::transmit`]; [`Server::poll`] is to be called at
+/// least ten times a second.
+#[derive(Debug)]
+pub struct Server {
+    options: Options,
+    environment: Environment,
+    devices: Vec<Arc<Device>>,
+    by_instance: BTreeMap<u32, usize>,
+    by_station: HashMap<Mac, usize>,
+    traffic: Traffic,
+    foreign: Foreign,
+    segments: Segments,
+    cov: Cov,
+    exchanges: Exchanges,
+    /// Increments that clients have set, by device and object.
+    increments: HashMap<(u32, ObjectId), f32>,
+    /// Devices that say nothing by themselves, and until when.
+    quiet: HashMap<u32, Instant>,
+    jobs: VecDeque<Job>,
+    counters: Counters,
+}
+
+impl Server {
+    /// A server of these devices, the first of which is its own and has no station.
+    pub fn new(options: Options, devices: Vec<Arc<Device>>, now: Instant) -> Server {
+        let (vendor, vendor_name) = options.vendor.clone();
+        let port = Port {
+            address: options.address,
+            prefix: options.prefix,
+            bbmd: options.bbmd.map(|bbmd| (bbmd, bbmd::LIFETIME)),
+        };
+        let environment = Environment {
+            vendor,
+            vendor_name,
+            version: options.version.clone(),
+            port,
+            network: options.network,
+        };
+        let mut server = Server {
+            environment,
+            devices: Vec::new(),
+            by_instance: BTreeMap::new(),
+            by_station: HashMap::new(),
+            traffic: Traffic::new(now),
+            foreign: Foreign::new(options.bbmd, now),
+            segments: Segments::default(),
+            cov: Cov::default(),
+            exchanges: Exchanges::default(),
+            increments: HashMap::new(),
+            quiet: HashMap::new(),
+            jobs: VecDeque::new(),
+            counters: Counters::default(),
+            options,
+        };
+        server.set_devices(devices);
+        server
+    }
+
+    /// Shows other devices from now on. Subscriptions to what is still there go on.
+    pub fn set_devices(&mut self, devices: Vec<Arc<Device>>) {
+        let places = || devices.iter().enumerate();
+        self.by_instance = places().map(|(place, device)| (device.instance, place)).collect();
+        self.by_station = places()
+            .filter_map(|(place, device)| Some((device.station?, place)))
+            .collect();
+        self.devices = devices;
+        let (devices, by_instance) = (&self.devices, &self.by_instance);
+        let has = |instance: u32, object: ObjectId| {
+            let device = by_instance.get(&instance).and_then(|place| devices.get(*place));
+            device.is_some_and(|device| device.object_list().any(|id| id == object))
+        };
+        self.cov
+            .retain(|instance, subscription| has(instance, subscription.key.object));
+        self.increments.retain(|(instance, object), _| has(*instance, *object));
+    }
+
+    /// The device of that instance.
+    fn device(&self, instance: u32) -> Option<Arc<Device>> {
+        self.by_instance
+            .get(&instance)
+            .and_then(|place| self.devices.get(*place))
+            .cloned()
+    }
+
+    /// Announces itself and its network.
+    pub fn start(&mut self, app: &dyn Application, now: Instant) {
+        self.announce_network(None, now);
+        if let Some(own) = self.devices.first().cloned() {
+            self.announce(own.instance, app, now);
+        }
+    }
+
+    /// Does what time has made due.
+    pub fn poll(&mut self, app: &dyn Application, now: Instant) {
+        if let Some((bbmd, request)) = self.foreign.poll(now) {
+            self.traffic.exempt(bbmd, request);
+        }
+        self.quiet.retain(|_, until| *until > now);
+        let mut out = Vec::new();
+        self.segments.poll(now, &mut out);
+        self.send_segments(out, now);
+        for (to, device, message) in self.cov.poll(now) {
+            self.send_exempt(to, device, &message, true);
+        }
+        for device in self.cov.devices() {
+            self.look(device, app, now);
+        }
+        self.notify(app, now);
+        self.exchanges.poll(now);
+        self.traffic.poll(now);
+    }
+
+    /// What that device shows may have changed.
+    pub fn changed(&mut self, device: u32, app: &dyn Application, now: Instant) {
+        self.look(device, app, now);
+        self.notify(app, now);
+    }
+
+    /// The next datagram to send.
+    pub fn transmit(&mut self) -> Option<(To, Vec<u8>)> {
+        self.traffic.next()
+    }
+
+    /// The next write to carry out; its answer goes to [`Server::written`].
+    pub fn take_job(&mut self) -> Option<Job> {
+        self.jobs.pop_front()
+    }
+
+    /// Whether a write is under way.
+    pub fn is_busy(&self) -> bool {
+        self.exchanges.is_busy()
+    }
+
+    /// Devices to which somebody subscribes.
+    pub fn subscribed(&self) -> Vec<u32> {
+        self.cov.devices()
+    }
+
+    /// Registers at that BBMD from now on.
+    pub fn set_bbmd(&mut self, bbmd: Option<SocketAddrV4>, now: Instant) {
+        self.options.bbmd = bbmd;
+        self.environment.port.bbmd = bbmd.map(|bbmd| (bbmd, bbmd::LIFETIME));
+        self.foreign = Foreign::new(bbmd, now);
+    }
+
+    /// What became of the registration at the BBMD.
+    pub fn registration(&self) -> Registration {
+        self.foreign.state
+    }
+
+    /// What happened so far.
+    pub fn counters(&self) -> Counters {
+        Counters {
+            dropped: self.traffic.dropped,
+            subscriptions: self.cov.len() as u64,
+            ..self.counters
+        }
+    }
+
+    /// The increment of an object.
+    fn increment(&self, device: u32, object: &crate::object::Object) -> f32 {
+        let own = match object.kind {
+            crate::object::Kind::Analog { increment, .. } => increment,
+            _ => 0.0,
+        };
+        self.increments.get(&(device, object.id)).copied().unwrap_or(own)
+    }
+}
+
+/// Where a message came from, and how.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Source {
+    address: Address,
+    way: Way,
+}
+
+/// How a message came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Way {
+    /// To this host alone.
+    Unicast,
+    /// To all hosts.
+    Broadcast,
+}
+
+/// Which devices a message is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Target {
+    /// The device of the host.
+    Own,
+    /// All devices.
+    All,
+    /// Those of the virtual network.
+    Network,
+    /// That one, by its place.
+    Device(usize),
+}

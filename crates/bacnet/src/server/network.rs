@@ -1,0 +1,234 @@
+//! Datagrams in and out, and what routers say to each other (clause 6).
+
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::time::Instant;
+
+use super::segments::Message;
+use super::{Application, Server, Source, Target, Way};
+use crate::apdu::{self, Apdu};
+use crate::bvlc::{self, Bvlc};
+use crate::npdu::{self, GLOBAL, Payload, message};
+use crate::types::{Address, Mac};
+
+/// Why a message to a network is refused.
+const UNKNOWN_NETWORK: u8 = 1;
+const UNKNOWN_MESSAGE: u8 = 3;
+const OTHER: u8 = 0;
+
+impl Server {
+    /// A datagram came.
+    pub fn receive(&mut self, from: SocketAddrV4, bytes: &[u8], app: &dyn Application, now: Instant) {
+        let Some(datagram) = bvlc::decode(bytes) else {
+            self.counters.discarded += 1;
+            return;
+        };
+        let of_bbmd = self.foreign.is_bbmd(from);
+        let passed_on = of_bbmd || self.is_neighbour(*from.ip());
+        let admitted = match datagram {
+            Bvlc::Result(_) => of_bbmd,
+            // The one that sent it is judged, not the one that passes it on.
+            Bvlc::Forwarded(origin, _) => passed_on && app.admits(*origin.ip()),
+            _ => app.admits(*from.ip()),
+        };
+        if !admitted || from == self.options.address {
+            self.counters.discarded += 1;
+            return;
+        }
+        self.counters.received += 1;
+        let source = |host: SocketAddrV4, way: Way| Source {
+            address: Address::local(host),
+            way,
+        };
+        match datagram {
+            Bvlc::Result(code) => self.foreign.answered(code, now),
+            Bvlc::ForBbmd(code) => {
+                self.traffic.came(*from.ip(), bytes.len(), now);
+                self.traffic.answer(from, bvlc::result(code), now);
+            }
+            Bvlc::Unicast(npdu) => {
+                self.traffic.came(*from.ip(), bytes.len(), now);
+                self.network(source(from, Way::Unicast), npdu, app, now);
+            }
+            Bvlc::Broadcast(npdu) => self.network(source(from, Way::Broadcast), npdu, app, now),
+            Bvlc::Forwarded(origin, npdu) if origin != self.options.address => {
+                self.network(source(origin, Way::Broadcast), npdu, app, now);
+            }
+            Bvlc::Forwarded(..) => {}
+        }
+    }
+
+    /// Whether a host is on the own network.
+    fn is_neighbour(&self, host: Ipv4Addr) -> bool {
+        let mask = u32::MAX
+            .checked_shl(32 - u32::from(self.options.prefix.min(32)))
+            .unwrap_or(0);
+        let own = u32::from(*self.options.address.ip());
+        self.options.prefix > 0 && u32::from(host) & mask == own & mask
+    }
+
+    fn network(&mut self, mut source: Source, bytes: &[u8], app: &dyn Application, now: Instant) {
+        let Some(npdu) = npdu::decode(bytes) else {
+            self.counters.discarded += 1;
+            return;
+        };
+        // Nobody on this network is behind the network that it is the router for.
+        if npdu.from.is_some_and(|(network, _)| network == self.options.network) {
+            self.counters.discarded += 1;
+            return;
+        }
+        source.address.remote = npdu.from;
+        let target = match npdu.to {
+            None => Target::Own,
+            Some((_, _, 0)) => return,
+            Some((GLOBAL, ..)) => Target::All,
+            Some((network, mac, _)) if network == self.options.network => match mac {
+                Mac::ALL => Target::Network,
+                mac => match self.by_station.get(&mac) {
+                    Some(place) => Target::Device(*place),
+                    None => return,
+                },
+            },
+            Some((network, ..)) => return self.reject(source, UNKNOWN_NETWORK, network, now),
+        };
+        match npdu.payload {
+            Payload::Application(apdu) => self.application(source, target, apdu, app, now),
+            Payload::Network(kind, content) => self.between_routers(source, target, kind, content, now),
+        }
+    }
+
+    fn between_routers(&mut self, source: Source, target: Target, kind: u8, content: &[u8], now: Instant) {
+        let network = self.options.network.to_be_bytes();
+        match (kind, content) {
+            _ if !matches!(target, Target::Own | Target::All) => {}
+            (message::WHO_IS_ROUTER, []) => self.announce_network(Some(source), now),
+            (message::WHO_IS_ROUTER, asked) if *asked == network => self.announce_network(Some(source), now),
+            // Another router answers, or what comes is not for us.
+            (message::WHO_IS_ROUTER | message::I_AM_ROUTER | message::REJECT, _) => {}
+            // A question for the table; nothing is written into it.
+            (message::INITIALIZE_TABLE, [0]) if source.way == Way::Unicast => {
+                let table = [1, network[0], network[1], 1, 0];
+                self.between(source, message::INITIALIZE_TABLE_ACK, &table, now);
+            }
+            // Busy and available routers, numbers of networks, security, vendors: of no concern here.
+            (0x01..=0x13 | 0x80.., _) => {}
+            _ => self.reject(source, UNKNOWN_MESSAGE, 0, now),
+        }
+    }
+
+    /// Says for which network it is the router.
+    pub(super) fn announce_network(&mut self, asked: Option<Source>, now: Instant) {
+        let network = self.options.network.to_be_bytes();
+        match asked {
+            Some(source) if source.way == Way::Unicast => self.between(source, message::I_AM_ROUTER, &network, now),
+            _ => {
+                let npdu = npdu::encode(None, None, false, Payload::Network(message::I_AM_ROUTER, &network));
+                self.broadcast(&npdu, now);
+            }
+        }
+    }
+
+    fn between(&mut self, source: Source, kind: u8, content: &[u8], now: Instant) {
+        let npdu = npdu::encode(source.address.remote, None, false, Payload::Network(kind, content));
+        self.traffic.answer(source.address.host, bvlc::unicast(&npdu), now);
+    }
+
+    /// Refuses a message; a broadcast is not answered with that.
+    fn reject(&mut self, source: Source, why: u8, network: u16, now: Instant) {
+        if source.way == Way::Unicast {
+            let [high, low] = network.to_be_bytes();
+            self.between(source, message::REJECT, &[why, high, low], now);
+        }
+        debug_assert!(why != OTHER);
+    }
+
+    fn application(&mut self, source: Source, target: Target, bytes: &[u8], app: &dyn Application, now: Instant) {
+        let Some(message) = apdu::decode(bytes) else {
+            self.counters.discarded += 1;
+            return;
+        };
+        if let Apdu::Unconfirmed(service, data) = message {
+            return self.unconfirmed(source, target, service, data, app, now);
+        }
+        // A request that is answered, and what belongs to one, is between two.
+        let place = match target {
+            Target::Own => 0,
+            Target::Device(place) => place,
+            Target::All | Target::Network => return,
+        };
+        let Some(device) = self.devices.get(place).cloned().filter(|_| source.way == Way::Unicast) else {
+            return;
+        };
+        let from = source.address;
+        match message {
+            Apdu::Confirmed { .. } => self.confirmed(from, &device, message, app, now),
+            Apdu::SimpleAck(invoke) | Apdu::ComplexAck(invoke) | Apdu::Error(invoke) | Apdu::Reject(invoke) => {
+                self.cov.answered(from, device.instance, invoke);
+                self.notify(app, now);
+            }
+            Apdu::SegmentAck {
+                server: false,
+                invoke,
+                sequence,
+                window,
+                ..
+            } => {
+                let mut out = Vec::new();
+                let which = (invoke, sequence, window);
+                self.segments
+                    .acknowledged((from, device.instance), which, now, &mut out);
+                self.send_segments(out, now);
+            }
+            Apdu::Abort { server: false, invoke } => self.segments.end(from, device.instance, invoke),
+            Apdu::Abort { server: true, invoke } => {
+                self.cov.answered(from, device.instance, invoke);
+                self.notify(app, now);
+            }
+            Apdu::SegmentAck { .. } | Apdu::Unconfirmed(..) => {}
+        }
+    }
+
+    /// The station of a device, as a sender.
+    fn station(&self, device: u32) -> Option<(u16, Mac)> {
+        let mac = self.device(device)?.station?;
+        Some((self.options.network, mac))
+    }
+
+    pub(super) fn message(&self, to: Address, device: u32, apdu: &[u8], expects: bool) -> Vec<u8> {
+        let payload = Payload::Application(apdu);
+        bvlc::unicast(&npdu::encode(to.remote, self.station(device), expects, payload))
+    }
+
+    /// Answers from a device.
+    pub(super) fn send(&mut self, to: Address, device: u32, apdu: &[u8], now: Instant) {
+        let message = self.message(to, device, apdu, false);
+        self.traffic.answer(to.host, message, now);
+    }
+
+    pub(super) fn send_segments(&mut self, segments: Vec<Message>, now: Instant) {
+        for (to, device, segment) in segments {
+            // The last one of a window is acknowledged.
+            let message = self.message(to, device, &segment, true);
+            self.traffic.answer(to.host, message, now);
+        }
+    }
+
+    /// Sends what was subscribed to.
+    pub(super) fn send_exempt(&mut self, to: Address, device: u32, apdu: &[u8], expects: bool) {
+        let message = self.message(to, device, apdu, expects);
+        self.traffic.exempt(to.host, message);
+    }
+
+    /// Says something to all, from a device: on this network, or on that which asked.
+    pub(super) fn tell_all(&mut self, device: u32, network: Option<u16>, apdu: &[u8], now: Instant) {
+        let to = network.map(|network| (network, Mac::ALL));
+        let npdu = npdu::encode(to, self.station(device), false, Payload::Application(apdu));
+        self.broadcast(&npdu, now);
+    }
+
+    fn broadcast(&mut self, npdu: &[u8], now: Instant) {
+        self.traffic.broadcast(bvlc::broadcast(npdu), now);
+        if let Some(bbmd) = self.foreign.passes_on() {
+            self.traffic.answer(bbmd, bvlc::distribute(npdu), now);
+        }
+    }
+}

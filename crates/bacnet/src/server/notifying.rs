@@ -1,0 +1,169 @@
+//! Notifications of changes: what they say (clauses 13.1, 13.6).
+
+use std::time::Instant;
+
+use super::cov::{Key, Subscription, Told};
+use super::reading::Failure;
+use super::{Application, Server};
+use crate::apdu;
+use crate::encoding::Writer;
+use crate::object::{Context, Device, cov_value, property};
+use crate::services::{PropertyRef, Subscribe, confirmed, unconfirmed};
+use crate::types::{Address, Error, ObjectId, ObjectType, PropertyId, WILDCARD};
+
+/// The properties that a subscription is told.
+fn told_of(of: &Context<'_>, one: Option<PropertyRef>) -> Vec<PropertyRef> {
+    let whole = |property: PropertyId| PropertyRef { property, index: None };
+    match one {
+        None => cov_value(of).iter().copied().map(whole).collect(),
+        Some(one) => {
+            let has_flags = matches!(of, Context::Object { .. } | Context::Port(_));
+            let flags = whole(PropertyId::STATUS_FLAGS);
+            [Some(one), Some(flags).filter(|flags| has_flags && *flags != one)]
+                .into_iter()
+                .flatten()
+                .collect()
+        }
+    }
+}
+
+impl Server {
+    pub(super) fn subscribe_to(
+        &mut self,
+        from: Address,
+        device: &Device,
+        asked: Subscribe,
+        app: &dyn Application,
+        now: Instant,
+    ) -> Result<(), Failure> {
+        let object = match asked.object {
+            id if id == ObjectId::new(ObjectType::DEVICE, WILDCARD) => device.id(),
+            id => id,
+        };
+        let key = Key {
+            subscriber: from,
+            process: asked.process,
+            object,
+            property: asked.property.map(|(property, _)| property),
+        };
+        let Some(terms) = asked.terms else {
+            self.cov.cancel(device.instance, &key);
+            return Ok(());
+        };
+        let known = self.with_object(device, object, app, now, |of| match key.property {
+            None => Ok(()),
+            Some(one)
+                if matches!(
+                    one.property,
+                    PropertyId::ALL | PropertyId::REQUIRED | PropertyId::OPTIONAL
+                ) =>
+            {
+                Err(Error::NOT_COV_PROPERTY)
+            }
+            Some(one) => property(&mut Writer::default(), of, one, &self.environment),
+        });
+        known.unwrap_or(Err(Error::UNKNOWN_OBJECT))?;
+        let increment = asked.property.and_then(|(_, increment)| increment);
+        match self.cov.subscribe(device.instance, key, terms, increment, now) {
+            true => Ok(()),
+            false => Err(Error::NO_SPACE_TO_ADD_LIST_ELEMENT.into()),
+        }
+    }
+
+    /// What a subscription shows now.
+    fn shows(&self, device: &Device, key: &Key, app: &dyn Application, now: Instant) -> Option<(Told, f64, Vec<u8>)> {
+        self.with_object(device, key.object, app, now, |of| {
+            let mut values = Writer::default();
+            let mut told = Told::default();
+            let (number, flags) = of.figure();
+            for one in told_of(of, key.property) {
+                let mut value = Writer::default();
+                // What is not there any more is told as nothing.
+                let _ = property(&mut value, of, one, &self.environment);
+                values.context_property(0, one.property);
+                if let Some(index) = one.index {
+                    values.context_unsigned(1, index.into());
+                }
+                values.open(2).raw(value.bytes()).close(2);
+                match one.property {
+                    PropertyId::PRESENT_VALUE if number.is_some() => told.number = number,
+                    _ => told.rest.extend_from_slice(value.bytes()),
+                }
+            }
+            told.rest.extend(flags.map(u8::from));
+            let increment = match of {
+                Context::Object { increment, .. } => f64::from(*increment),
+                _ => 0.0,
+            };
+            (told, increment, values.into_bytes())
+        })
+    }
+
+    /// Looks whether what a device shows is to be told.
+    pub(super) fn look(&mut self, instance: u32, app: &dyn Application, now: Instant) {
+        if self.cov.of(instance).is_empty() || self.quiet.contains_key(&instance) || !app.answers(instance) {
+            return;
+        }
+        let Some(device) = self.device(instance) else { return };
+        let mut cov = std::mem::take(&mut self.cov);
+        cov.look(instance, &mut |_, subscription: &Subscription| {
+            let (told, increment, _) = self.shows(&device, &subscription.key, app, now)?;
+            Some((told, increment))
+        });
+        self.cov = cov;
+    }
+
+    /// Sends the notifications that are due.
+    pub(super) fn notify(&mut self, app: &dyn Application, now: Instant) {
+        while let Some((instance, key, confirmed)) = self.cov.next() {
+            let device = self.device(instance).filter(|_| app.answers(instance));
+            let shows = device.and_then(|device| Some((self.shows(&device, &key, app, now)?, device)));
+            let Some(((told, _, values), device)) = shows else {
+                self.cov.told(instance, &key, None);
+                continue;
+            };
+            let subscription = self.cov.of(instance).iter().find(|s| s.key == key);
+            let left = subscription.map_or(0, |subscription| subscription.left(now));
+            let mut content = Writer::default();
+            content
+                .context_unsigned(0, key.process.into())
+                .context_object(1, device.id());
+            content.context_object(2, key.object).context_unsigned(3, left);
+            content.open(4).raw(&values).close(4);
+            self.cov.told(instance, &key, Some(told));
+            self.counters.notifications += 1;
+            if confirmed {
+                let invoke = self.cov.number();
+                let apdu = apdu::confirmed(invoke, confirmed::COV_NOTIFICATION, content.bytes());
+                self.cov.sent(instance, key, invoke, apdu.clone(), now);
+                self.send_exempt(key.subscriber, instance, &apdu, true);
+            } else {
+                let apdu = apdu::unconfirmed(unconfirmed::COV_NOTIFICATION, content.bytes());
+                self.send_exempt(key.subscriber, instance, &apdu, false);
+            }
+        }
+    }
+
+    /// Active_COV_Subscriptions.
+    pub(super) fn list_subscriptions(&self, instance: u32, out: &mut Writer, now: Instant) {
+        for subscription in self.cov.of(instance) {
+            let key = &subscription.key;
+            out.open(0).open(0).open(1);
+            match &key.subscriber.remote {
+                None => out.unsigned(0).octets(&Address::host_octets(key.subscriber.host)),
+                Some((network, mac)) => out.unsigned((*network).into()).octets(mac.octets()),
+            };
+            out.close(1).close(0).context_unsigned(1, key.process.into()).close(0);
+            let one = key.property.map_or(PropertyId::PRESENT_VALUE, |one| one.property);
+            out.open(1).context_object(0, key.object).context_property(1, one);
+            if let Some(index) = key.property.and_then(|one| one.index) {
+                out.context_unsigned(2, index.into());
+            }
+            out.close(1).context_bool(2, subscription.confirmed);
+            out.context_unsigned(3, subscription.left(now));
+            if let Some(increment) = subscription.increment {
+                out.context_real(4, increment);
+            }
+        }
+    }
+}

@@ -1,0 +1,292 @@
+//! What may leave: to an address that asked at most eight times as many octets as came from it, and so many broadcasts a second.
+
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::time::{Duration, Instant};
+
+/// Octets that may go to an address within a second for each that came from it.
+const FACTOR: u64 = 8;
+/// And so many more.
+const GRANT: u64 = 16 * 1024;
+/// Octets that may wait for an address, or for a broadcast.
+const WAITING: usize = 64 * 1024;
+/// Broadcasts within a second.
+const BROADCASTS: u64 = 100;
+/// Addresses that are known at once.
+const ADDRESSES: usize = 1024;
+/// A second, in the steps in which it is reckoned.
+const STEP: Duration = Duration::from_millis(100);
+const STEPS: usize = 11;
+
+/// Where a datagram goes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum To {
+    /// To that host.
+    Host(SocketAddrV4),
+    /// To all hosts of the network.
+    Broadcast,
+}
+
+/// Sums over the last second.
+#[derive(Debug, Clone, Default)]
+struct Window {
+    steps: [u32; STEPS],
+    /// The step that was counted last.
+    last: u64,
+}
+
+impl Window {
+    fn turn(&mut self, step: u64) {
+        let passed = step.saturating_sub(self.last).min(STEPS as u64);
+        for ahead in 1..=passed {
+            if let Some(count) = self.steps.get_mut(((self.last + ahead) % STEPS as u64) as usize) {
+                *count = 0;
+            }
+        }
+        if passed == STEPS as u64 {
+            self.steps = [0; STEPS];
+        }
+        self.last = self.last.max(step);
+    }
+
+    fn add(&mut self, step: u64, count: u32) {
+        self.turn(step);
+        let place = (self.last % STEPS as u64) as usize;
+        if let Some(sum) = self.steps.get_mut(place) {
+            *sum = sum.saturating_add(count);
+        }
+    }
+
+    fn sum(&mut self, step: u64) -> u64 {
+        self.turn(step);
+        self.steps.iter().map(|count| u64::from(*count)).sum()
+    }
+}
+
+#[derive(Debug, Default)]
+struct Known {
+    came: Window,
+    left: Window,
+    waiting: VecDeque<(SocketAddrV4, Vec<u8>)>,
+    octets: usize,
+}
+
+impl Known {
+    fn may(&mut self, len: usize, step: u64) -> bool {
+        let budget = self.came.sum(step) * FACTOR + GRANT;
+        self.left.sum(step) + len as u64 <= budget
+    }
+}
+
+/// What leaves, in order, within the limits.
+#[derive(Debug)]
+pub(super) struct Traffic {
+    begun: Instant,
+    known: HashMap<Ipv4Addr, Known>,
+    broadcasts: VecDeque<Vec<u8>>,
+    waiting: HashSet<Vec<u8>>,
+    octets: usize,
+    sent: Window,
+    ready: VecDeque<(To, Vec<u8>)>,
+    /// Datagrams that found no room.
+    pub(super) dropped: u64,
+}
+
+impl Traffic {
+    pub(super) fn new(now: Instant) -> Traffic {
+        Traffic {
+            begun: now,
+            known: HashMap::new(),
+            broadcasts: VecDeque::new(),
+            waiting: HashSet::new(),
+            octets: 0,
+            sent: Window::default(),
+            ready: VecDeque::new(),
+            dropped: 0,
+        }
+    }
+
+    fn step(&self, now: Instant) -> u64 {
+        let steps = now.saturating_duration_since(self.begun).as_millis() / STEP.as_millis();
+        u64::try_from(steps).unwrap_or(u64::MAX)
+    }
+
+    /// So many octets came from that address.
+    pub(super) fn came(&mut self, from: Ipv4Addr, octets: usize, now: Instant) {
+        let step = self.step(now);
+        if let Some(known) = self.known(from, step) {
+            known.came.add(step, u32::try_from(octets).unwrap_or(u32::MAX));
+        }
+    }
+
+    /// What is known of that address; the one that was quiet for longest is forgotten for it.
+    fn known(&mut self, address: Ipv4Addr, step: u64) -> Option<&mut Known> {
+        if !self.known.contains_key(&address) {
+            if self.known.len() >= ADDRESSES {
+                let quiet = |known: &Known| known.came.last.max(known.left.last);
+                let idle = self
+                    .known
+                    .iter()
+                    .filter(|(_, known)| known.waiting.is_empty() && quiet(known) + (STEPS as u64) < step);
+                let oldest = idle
+                    .min_by_key(|(_, known)| quiet(known))
+                    .map(|(address, _)| *address)?;
+                self.known.remove(&oldest);
+            }
+            self.known.insert(address, Known::default());
+        }
+        self.known.get_mut(&address)
+    }
+
+    /// Whether anything more to that address finds room.
+    pub(super) fn has_room(&self, to: To) -> bool {
+        match to {
+            To::Broadcast => self.octets < WAITING,
+            To::Host(host) => self.known.get(host.ip()).is_none_or(|known| known.octets < WAITING),
+        }
+    }
+
+    /// Sends an answer, now or later, or drops it.
+    pub(super) fn answer(&mut self, to: SocketAddrV4, bytes: Vec<u8>, now: Instant) {
+        let step = self.step(now);
+        let len = bytes.len();
+        let Some(known) = self.known(*to.ip(), step) else {
+            self.dropped += 1;
+            return;
+        };
+        if known.waiting.is_empty() && known.may(len, step) {
+            known.left.add(step, u32::try_from(len).unwrap_or(u32::MAX));
+            self.ready.push_back((To::Host(to), bytes));
+        } else if known.octets + len <= WAITING {
+            known.octets += len;
+            known.waiting.push_back((to, bytes));
+        } else {
+            self.dropped += 1;
+        }
+    }
+
+    /// Sends what is not reckoned: a notification, a request of our own.
+    pub(super) fn exempt(&mut self, to: SocketAddrV4, bytes: Vec<u8>) {
+        self.ready.push_back((To::Host(to), bytes));
+    }
+
+    /// Broadcasts, now or later; what waits already does not wait twice.
+    pub(super) fn broadcast(&mut self, bytes: Vec<u8>, now: Instant) {
+        let step = self.step(now);
+        if self.broadcasts.is_empty() && self.sent.sum(step) < BROADCASTS {
+            self.sent.add(step, 1);
+            self.ready.push_back((To::Broadcast, bytes));
+        } else if self.waiting.contains(&bytes) {
+        } else if self.octets + bytes.len() <= WAITING {
+            self.octets += bytes.len();
+            self.waiting.insert(bytes.clone());
+            self.broadcasts.push_back(bytes);
+        } else {
+            self.dropped += 1;
+        }
+    }
+
+    /// Lets go what may.
+    pub(super) fn poll(&mut self, now: Instant) {
+        let step = self.step(now);
+        while self.sent.sum(step) < BROADCASTS
+            && let Some(bytes) = self.broadcasts.pop_front()
+        {
+            self.sent.add(step, 1);
+            self.octets -= bytes.len();
+            self.waiting.remove(&bytes);
+            self.ready.push_back((To::Broadcast, bytes));
+        }
+        for known in self.known.values_mut() {
+            while let Some((_, bytes)) = known.waiting.front()
+                && let len = bytes.len()
+                && known.may(len, step)
+                && let Some((to, bytes)) = known.waiting.pop_front()
+            {
+                known.left.add(step, u32::try_from(len).unwrap_or(u32::MAX));
+                known.octets -= len;
+                self.ready.push_back((To::Host(to), bytes));
+            }
+        }
+    }
+
+    /// The next datagram that leaves.
+    pub(super) fn next(&mut self) -> Option<(To, Vec<u8>)> {
+        self.ready.pop_front()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn host(last: u8) -> SocketAddrV4 {
+        SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, last), 47808)
+    }
+
+    fn octets(traffic: &mut Traffic) -> usize {
+        std::iter::from_fn(|| traffic.next())
+            .map(|(_, bytes)| bytes.len())
+            .sum()
+    }
+
+    #[test]
+    fn an_address_gets_eight_times_what_it_sent_and_16_kb() {
+        let start = Instant::now();
+        let mut traffic = Traffic::new(start);
+        traffic.came(*host(1).ip(), 1000, start);
+        (0..1000).for_each(|_| traffic.answer(host(1), vec![0; 100], start));
+        let first = octets(&mut traffic);
+        assert_eq!(first, (16 * 1024 + 8000) / 100 * 100);
+        assert!(!traffic.has_room(To::Host(host(1))) || traffic.dropped > 0);
+        let mut left = vec![(0, first)];
+        for ms in (50..10_000).step_by(50) {
+            traffic.poll(start + Duration::from_millis(ms));
+            left.push((ms, octets(&mut traffic)));
+        }
+        for (ms, _) in &left {
+            let second = left
+                .iter()
+                .filter(|(at, _)| (*ms..ms + 1000).contains(at))
+                .map(|(_, n)| n)
+                .sum::<usize>();
+            assert!(second <= 16 * 1024 + 8000, "{second} from {ms} ms on");
+        }
+        let all: usize = left.iter().map(|(_, n)| n).sum();
+        assert_eq!(all + traffic.dropped as usize * 100, 100_000);
+        assert!(all > first + 60_000);
+    }
+
+    #[test]
+    fn broadcasts_are_a_hundred_a_second_and_each_waits_once() {
+        let start = Instant::now();
+        let mut traffic = Traffic::new(start);
+        for n in 0..150_u32 {
+            traffic.broadcast(n.to_be_bytes().to_vec(), start);
+        }
+        (100..150_u32).for_each(|n| traffic.broadcast(n.to_be_bytes().to_vec(), start));
+        assert_eq!(octets(&mut traffic), 400);
+        traffic.poll(start + Duration::from_millis(900));
+        assert_eq!(octets(&mut traffic), 0);
+        traffic.poll(start + Duration::from_millis(1200));
+        assert_eq!(octets(&mut traffic), 200, "those that waited, once");
+        assert_eq!(traffic.dropped, 0);
+    }
+
+    #[test]
+    fn addresses_are_bounded() {
+        let start = Instant::now();
+        let mut traffic = Traffic::new(start);
+        for n in 0..5000_u32 {
+            let address = SocketAddrV4::new(Ipv4Addr::from(n), 1);
+            traffic.came(*address.ip(), 10, start);
+            traffic.answer(address, vec![0; 10], start);
+        }
+        assert_eq!(traffic.known.len(), ADDRESSES);
+        assert_eq!(traffic.dropped, 5000 - ADDRESSES as u64);
+        let later = start + Duration::from_secs(3);
+        traffic.came(*host(9).ip(), 10, later);
+        assert!(traffic.known.contains_key(host(9).ip()));
+        assert_eq!(traffic.known.len(), ADDRESSES);
+    }
+}

@@ -1,0 +1,138 @@
+//! What drives counted of the line themselves (function 08), read while exchanges with them fail: it tells whether the way to the
+//! drive or the way back is bad. In the share of the line that nobody notices.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use tokio::sync::oneshot::Receiver;
+use tokio::sync::oneshot::error::TryRecvError;
+
+use crate::codec::{Reply, RequestPdu};
+use crate::command::{Answer, BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket, WriteStats};
+use crate::diagnosis::CountedByDrive;
+use crate::line_diagnosis::LineDiagnosis;
+use crate::plant::BusHandle;
+
+/// First subfunction: messages, damaged ones, exceptions, messages to the drive, those without an answer.
+const FIRST: u16 = 0x0B;
+const COUNTERS: usize = 5;
+/// Pause between two readings of a drive.
+const PAUSE: Duration = Duration::from_secs(30);
+/// Pause before a counter is asked for again whose reply was lost.
+const AGAIN: Duration = Duration::from_secs(1);
+/// Not sent after this.
+const EXPIRY: Duration = Duration::from_secs(20);
+
+/// The readings of all drives of a bus.
+#[derive(Debug)]
+pub(super) struct DriveCounters {
+    drives: Vec<(usize, State)>,
+    /// When a drive is looked at next.
+    due: Instant,
+}
+
+#[derive(Debug)]
+enum State {
+    /// Looked at again then, with the counters read so far.
+    Idle(Instant, Vec<u16>),
+    /// The counters read so far, and the answer that is waited for.
+    Reading(Vec<u16>, Receiver<Answer>),
+}
+
+impl DriveCounters {
+    /// Of the drives of a bus that count.
+    pub(super) fn new(bus: &BusHandle, now: Instant) -> DriveCounters {
+        let drives = bus.image.drives.iter().enumerate();
+        let counting = drives.filter(|(_, drive)| drive.spec.profile.counts_messages);
+        DriveCounters {
+            drives: counting
+                .map(|(index, _)| (index, State::Idle(now, Vec::new())))
+                .collect(),
+            due: now,
+        }
+    }
+
+    /// Asks for what is due, and takes what was told.
+    pub(super) fn look(
+        &mut self,
+        bus: &BusHandle,
+        diagnosis: &mut LineDiagnosis,
+        writes: &Arc<WriteStats>,
+        now: Instant,
+    ) {
+        if self.drives.is_empty() || now < self.due {
+            return;
+        }
+        self.due = now + Duration::from_millis(50);
+        for (drive, state) in &mut self.drives {
+            let next = match state {
+                State::Idle(at, _) if now < *at => continue,
+                State::Idle(_, counted) => {
+                    let online = bus
+                        .image
+                        .drives
+                        .get(*drive)
+                        .is_some_and(|d| d.snapshot().link.is_online());
+                    let counted = std::mem::take(counted);
+                    match online && diagnosis.has_errors(*drive) {
+                        true => {
+                            let next = FIRST + counted.len().min(COUNTERS) as u16;
+                            State::Reading(counted, ask(bus, *drive, next, writes, now))
+                        }
+                        false => State::Idle(now + AGAIN, counted),
+                    }
+                }
+                State::Reading(counted, answer) => match answer.try_recv() {
+                    Err(TryRecvError::Empty) => continue,
+                    Ok(Answer {
+                        outcome: Outcome::Acknowledged(Reply::Diagnostics(count)),
+                        ..
+                    }) => {
+                        counted.push(count);
+                        match counted.as_slice() {
+                            [messages, damaged, exceptions, own, unanswered] => {
+                                let counted = CountedByDrive {
+                                    messages: *messages,
+                                    damaged: *damaged,
+                                    exceptions: *exceptions,
+                                    own: *own,
+                                    unanswered: *unanswered,
+                                };
+                                diagnosis.counted_by_drive(*drive, counted);
+                                State::Idle(now + PAUSE, Vec::new())
+                            }
+                            so_far => {
+                                let next = FIRST + so_far.len().min(COUNTERS) as u16;
+                                State::Reading(std::mem::take(counted), ask(bus, *drive, next, writes, now))
+                            }
+                        }
+                    }
+                    // A drive that refuses it is not asked soon again; what was lost on the line is.
+                    Ok(Answer {
+                        outcome: Outcome::Exception(_),
+                        ..
+                    }) => State::Idle(now + PAUSE * 20, Vec::new()),
+                    Ok(_) | Err(TryRecvError::Closed) => State::Idle(now + AGAIN, std::mem::take(counted)),
+                },
+            };
+            *state = next;
+        }
+    }
+}
+
+fn ask(bus: &BusHandle, drive: usize, subfunction: u16, writes: &Arc<WriteStats>, now: Instant) -> Receiver<Answer> {
+    let name = bus.image.drives.get(drive).map_or("", |drive| drive.spec.name.as_str());
+    let origin = Origin::new(SourceKind::Schedule, "diagnosis");
+    let what = format!("counter {subfunction:02X}h of the drive");
+    let (ticket, answer) = Ticket::new(origin, name, what, false, now, writes.clone());
+    let request = BackgroundRequest {
+        drive,
+        pdu: RequestPdu::Diagnostics { subfunction, data: 0 },
+        pace: Pace::Slow,
+        expires: now + EXPIRY,
+        ticket,
+        passed_on: None,
+    };
+    bus.queue.submit_background(request, now);
+    answer
+}

@@ -1,0 +1,80 @@
+//! Process data that does not hold what its profile says: the comparisons of [`crate::selection`] applied to the image.
+
+use std::time::Instant;
+
+use super::{Findings, RECENT, Report};
+use crate::codec::Exception;
+use crate::drive::PlannedRead;
+use crate::event::EventKind;
+use crate::process_image::DriveImage;
+
+impl Report {
+    /// Compares what was just read. The monitoring points to be read: drive, point and time.
+    pub(super) fn compare_selection(
+        &mut self,
+        index: usize,
+        read: &PlannedRead,
+        at: Instant,
+    ) -> Vec<(usize, usize, Instant)> {
+        let Some(drive) = self.drive(index) else {
+            return Vec::new();
+        };
+        let findings = self.selections.read(index, read, &drive.reading(at, RECENT));
+        let wanted = findings.wanted.iter().map(|(point, at)| (index, *point, *at));
+        let wanted = wanted.collect();
+        self.selection_found(&drive, index, &findings);
+        wanted
+    }
+
+    /// The drive does not have a monitoring register: its process data is served as it is.
+    pub(super) fn monitor_refused(
+        &mut self,
+        (index, drive): (usize, &DriveImage),
+        read: &PlannedRead,
+        exception: Exception,
+        now: Instant,
+    ) {
+        tracing::debug!(
+            target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
+            "the drive refuses {} {} with {exception}; process data is not compared with it",
+            read.table, read.start
+        );
+        let findings = self.selections.refused(index, read, &drive.reading(now, RECENT), now);
+        self.selection_found(drive, index, &findings);
+    }
+
+    fn selection_found(&mut self, drive: &DriveImage, index: usize, findings: &Findings) {
+        if let Some(monitored) = &findings.monitored {
+            drive.update(|snapshot| snapshot.monitored.clone_from(monitored));
+        }
+        let points = &drive.spec.profile.points;
+        let name = |point: usize| points.get(point).map_or("", |point| &point.name);
+        for point in &findings.restored {
+            tracing::info!(
+                target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
+                "process data holds {} again; the value comes from there", name(*point)
+            );
+        }
+        let differ = |(point, own, monitored): &(usize, f64, f64)| {
+            format!(
+                "{} reads {own} there and {monitored} in its monitoring register",
+                name(*point)
+            )
+        };
+        let differ: Vec<String> = findings.differ.iter().map(differ).collect();
+        if differ.is_empty() {
+            return;
+        }
+        let text = format!(
+            "process data of drive {} does not hold what profile `{}` says: {}; the monitoring register is used; restore the \
+             selection of process data at the drive, or describe it in a profile of your own",
+            drive.spec.name,
+            drive.spec.profile.name,
+            differ.join(", ")
+        );
+        match self.selections.report_first(index) {
+            true => self.drive_event(index, EventKind::SelectionDiffers, None, |_| text),
+            false => tracing::warn!(target: "drivegate::bus::report", bus = %self.image.spec.name, "{text}"),
+        }
+    }
+}

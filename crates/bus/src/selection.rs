@@ -1,0 +1,283 @@
+//! Whether process data holds what the profile says. On several families a selector parameter decides what a register of
+//! process data shows; the profile names the register that always has the value ([`Point::monitor`]), and the two are compared
+//! when the drive comes online, until a comparison proves something. Pure.
+//!
+//! From the first comparison that differs on, the value comes from the monitoring register, which is slower and always right.
+//! Two comparisons that agree bring the process data back; three that differ show that the selection was changed.
+
+use std::time::{Duration, Instant};
+
+use crate::drive::{ModelPoint, PlannedRead, Point, Raw};
+use crate::process_image::Reading;
+
+/// Comparisons that differ, of one and the same selection, until it counts as changed.
+const DIFFERING: u8 = 3;
+/// Comparisons in a row that agree until process data is believed again.
+const AGREEING: u8 = 2;
+/// First and longest pause before a value is compared again that proved nothing, such as 0 of a motor that stands.
+const PAUSE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(600));
+/// Values that move differ by that part of them, or by that many counts, without a changed selection.
+const TOLERANCE: f64 = 0.1;
+const COUNTS: f64 = 50.0;
+
+/// The comparisons of all drives of a bus.
+#[derive(Debug, Default)]
+pub(super) struct Selections {
+    drives: Vec<DriveSelections>,
+}
+
+#[derive(Debug)]
+struct DriveSelections {
+    points: Vec<Compared>,
+    /// An event told that its selection differs.
+    reported: bool,
+}
+
+/// A point of process data and what its comparisons showed.
+#[derive(Debug)]
+struct Compared {
+    point: usize,
+    monitor: usize,
+    trust: Trust,
+    /// Process data before the monitoring register was read, and that register: to be compared with the next process data.
+    open: Option<(f64, f64)>,
+    last: f64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Trust {
+    /// No comparison has proved anything; the next one where there is something to compare, and the pause behind it.
+    Unproven(Instant, Duration),
+    Proven,
+    /// Its comparisons differ so often, and agreed so often since.
+    Doubted(u8, u8),
+    /// The selection was changed; comparisons that agree since.
+    Differs(u8),
+}
+
+/// What one comparison shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Verdict {
+    Agrees,
+    Differs,
+    /// Both are about 0, or the register may not exist.
+    Nothing,
+}
+
+/// What follows from a read.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct Findings {
+    /// Monitoring points to be read, and when.
+    pub(super) wanted: Vec<(usize, Instant)>,
+    /// The points whose value comes from their monitoring register from now on, if that changed.
+    pub(super) monitored: Option<Vec<usize>>,
+    /// Points of which it is now known that they hold something else, with both values: the first ones of the drive.
+    pub(super) differ: Vec<(usize, f64, f64)>,
+    /// Points that hold what the profile says again.
+    pub(super) restored: Vec<usize>,
+}
+
+impl Selections {
+    /// Of drives with these points.
+    pub(super) fn new<'p>(drives: impl Iterator<Item = &'p [Point]>, now: Instant) -> Selections {
+        let compared = |(point, monitor): (usize, usize)| Compared {
+            point,
+            monitor,
+            trust: Trust::Unproven(now, PAUSE.0),
+            open: None,
+            last: 0.0,
+        };
+        let of = |points: &[Point]| {
+            let pairs = points.iter().enumerate();
+            let pairs = pairs.filter_map(|(index, point)| Some((index, point.monitor?)));
+            DriveSelections {
+                points: pairs.map(compared).collect(),
+                reported: false,
+            }
+        };
+        Selections {
+            drives: drives.map(of).collect(),
+        }
+    }
+
+    /// The drive was away: what was read before is not compared with what is read now.
+    pub(super) fn interrupted(&mut self, drive: usize) {
+        for compared in self.points(drive) {
+            compared.open = None;
+        }
+    }
+
+    /// The drive refuses that read: a monitoring register that it does not have proves nothing.
+    pub(super) fn refused(
+        &mut self,
+        drive: usize,
+        read: &PlannedRead,
+        reading: &Reading<'_>,
+        now: Instant,
+    ) -> Findings {
+        let points = &reading.spec.profile.points;
+        for compared in self.points(drive) {
+            let raw = points.get(compared.monitor).and_then(Point::raw);
+            if raw.is_some_and(|raw| covers(read, raw)) {
+                compared.open = None;
+                if matches!(compared.trust, Trust::Doubted(..)) {
+                    compared.trust = Trust::Unproven(now + PAUSE.1, PAUSE.1);
+                }
+            }
+        }
+        self.findings(drive, reading, Vec::new(), Vec::new(), Vec::new())
+    }
+
+    /// The drive answered that read, and reads as `reading` right after it.
+    pub(super) fn read(&mut self, drive: usize, read: &PlannedRead, reading: &Reading<'_>) -> Findings {
+        let now = reading.now;
+        let profile = &reading.spec.profile;
+        let runs = || {
+            let running = profile.model_index(ModelPoint::Running);
+            running.is_some_and(|running| reading.sample(running).good().is_some_and(|value| value.as_bool()))
+        };
+        let value = |point: usize| reading.own_sample(point).good().map(|value| value.as_f64());
+        let (mut wanted, mut differ, mut restored) = (Vec::new(), Vec::new(), Vec::new());
+        for compared in self.points(drive) {
+            let Some((point, monitor)) = profile
+                .points
+                .get(compared.point)
+                .zip(profile.points.get(compared.monitor))
+            else {
+                continue;
+            };
+            if monitor.raw().is_some_and(|raw| covers(read, raw)) {
+                compared.open = value(compared.point).zip(value(compared.monitor));
+                continue;
+            }
+            if !point.raw().is_some_and(|raw| covers(read, raw)) {
+                continue;
+            }
+            let Some(own) = value(compared.point) else { continue };
+            let Some((before, monitored)) = compared.open.take() else {
+                wanted.extend(compared.wants(point, own, &runs, now).map(|at| (compared.monitor, at)));
+                compared.last = own;
+                continue;
+            };
+            compared.last = own;
+            let before_it = compared.trust;
+            compared.judge(compare((point, monitor), (before, own), monitored), now);
+            match (before_it, compared.trust) {
+                (Trust::Doubted(..), Trust::Differs(_)) => differ.push((compared.point, own, monitored)),
+                (Trust::Differs(_), Trust::Proven) => restored.push(compared.point),
+                _ => {}
+            }
+            if compared.is_monitored() {
+                wanted.push((compared.monitor, now + reading.slow_cycle));
+            }
+        }
+        self.findings(drive, reading, wanted, differ, restored)
+    }
+
+    fn findings(
+        &mut self,
+        drive: usize,
+        reading: &Reading<'_>,
+        wanted: Vec<(usize, Instant)>,
+        differ: Vec<(usize, f64, f64)>,
+        restored: Vec<usize>,
+    ) -> Findings {
+        let monitored = self.points(drive).filter(|compared| compared.is_monitored());
+        let monitored: Vec<usize> = monitored.map(|compared| compared.point).collect();
+        Findings {
+            monitored: (monitored != reading.snapshot.monitored).then_some(monitored),
+            wanted,
+            differ,
+            restored,
+        }
+    }
+
+    /// Whether this is the first report of a drive since the gateway started.
+    pub(super) fn report_first(&mut self, drive: usize) -> bool {
+        let drive = self.drives.get_mut(drive);
+        drive.is_some_and(|drive| !std::mem::replace(&mut drive.reported, true))
+    }
+
+    fn points(&mut self, drive: usize) -> impl Iterator<Item = &mut Compared> {
+        self.drives
+            .get_mut(drive)
+            .into_iter()
+            .flat_map(|drive| &mut drive.points)
+    }
+}
+
+impl Compared {
+    fn is_monitored(&self) -> bool {
+        matches!(self.trust, Trust::Doubted(..) | Trust::Differs(_))
+    }
+
+    /// When it is to be compared, where process data that was just read gives a reason.
+    fn wants(&mut self, point: &Point, own: f64, runs: &dyn Fn() -> bool, now: Instant) -> Option<Instant> {
+        let Trust::Unproven(next, pause) = self.trust else {
+            return None;
+        };
+        let came = is_code(point) && self.last == 0.0 && own != 0.0;
+        if !came && (now < next || (own == 0.0 && !runs())) {
+            return None;
+        }
+        self.trust = Trust::Unproven(now + pause, (pause * 2).min(PAUSE.1));
+        Some(now)
+    }
+
+    fn judge(&mut self, verdict: Verdict, now: Instant) {
+        self.trust = match (self.trust, verdict) {
+            (Trust::Unproven(next, pause), Verdict::Nothing) => Trust::Unproven(next.max(now + PAUSE.0), pause),
+            (Trust::Unproven(..) | Trust::Proven, Verdict::Agrees) => Trust::Proven,
+            (Trust::Proven, Verdict::Nothing) => Trust::Proven,
+            (Trust::Unproven(..) | Trust::Proven, Verdict::Differs) => Trust::Doubted(1, 0),
+            (Trust::Doubted(differing, _), Verdict::Differs) if differing + 1 >= DIFFERING => Trust::Differs(0),
+            (Trust::Doubted(differing, _), Verdict::Differs) => Trust::Doubted(differing + 1, 0),
+            (Trust::Doubted(_, agreeing), Verdict::Agrees) if agreeing + 1 >= AGREEING => Trust::Proven,
+            (Trust::Doubted(_, agreeing), Verdict::Nothing) if agreeing + 1 >= AGREEING => {
+                Trust::Unproven(now + PAUSE.0, PAUSE.0)
+            }
+            (Trust::Doubted(differing, agreeing), _) => Trust::Doubted(differing, agreeing + 1),
+            (Trust::Differs(agreeing), Verdict::Agrees) if agreeing + 1 >= AGREEING => Trust::Proven,
+            (Trust::Differs(agreeing), Verdict::Agrees) => Trust::Differs(agreeing + 1),
+            (Trust::Differs(_), Verdict::Differs) => Trust::Differs(0),
+            (Trust::Differs(agreeing), Verdict::Nothing) => Trust::Differs(agreeing),
+        };
+    }
+}
+
+/// A number that means something by itself, such as a fault code: it is the same or it is another.
+fn is_code(point: &Point) -> bool {
+    point.unit.is_empty()
+}
+
+/// Compares process data, as it was right before and right after its monitoring register was read.
+fn compare(of: (&Point, &Point), around: (f64, f64), monitored: f64) -> Verdict {
+    let (point, monitor) = of;
+    let (low, high) = (around.0.min(around.1), around.0.max(around.1));
+    let count = |point: &Point| point.raw().map_or(0.0, |raw| raw.scale.abs());
+    let most = low.abs().max(high.abs()).max(monitored.abs());
+    let slack = match is_code(point) {
+        true => 0.0,
+        false => (most * TOLERANCE).max(COUNTS * count(point).max(count(monitor))),
+    };
+    if (low - slack..=high + slack).contains(&monitored) {
+        let least = low.abs().min(high.abs()).min(monitored.abs());
+        return if least > slack {
+            Verdict::Agrees
+        } else {
+            Verdict::Nothing
+        };
+    }
+    // A register that only other documents name, and that reads 0, is perhaps not there.
+    match monitored == 0.0 && !monitor.verified {
+        true => Verdict::Nothing,
+        false => Verdict::Differs,
+    }
+}
+
+fn covers(read: &PlannedRead, raw: &Raw) -> bool {
+    raw.addresses().all(|address| read.covers(raw.table, address))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,93 @@
+//! Rules of the comparison; the whole of it with a drive is in the seeded world.
+
+use std::sync::Arc;
+
+use super::*;
+use crate::drive::PollClass;
+use crate::drive::profile::Profiles;
+
+fn nx() -> Arc<crate::drive::Profile> {
+    Profiles::built_in().get("vacon-nx").unwrap().clone()
+}
+
+fn pair<'p>(profile: &'p crate::drive::Profile, name: &str) -> (&'p Point, &'p Point) {
+    let point = profile.points.iter().find(|point| point.name == name).unwrap();
+    (point, &profile.points[point.monitor.unwrap()])
+}
+
+#[test]
+fn what_a_comparison_shows() {
+    let nx = nx();
+    let code = pair(&nx, "fault_code");
+    assert_eq!(
+        compare(code, (0.0, 0.0), 0.0),
+        Verdict::Nothing,
+        "no fault proves nothing"
+    );
+    assert_eq!(compare(code, (16.0, 16.0), 16.0), Verdict::Agrees);
+    assert_eq!(compare(code, (16.0, 16.0), 0.0), Verdict::Differs);
+    assert_eq!(
+        compare(code, (0.0, 16.0), 16.0),
+        Verdict::Nothing,
+        "the fault came in between"
+    );
+    assert_eq!(compare(code, (0.0, 0.0), 16.0), Verdict::Differs);
+    let torque = pair(&nx, "motor_torque");
+    assert_eq!(compare(torque, (40.0, 43.0), 41.5), Verdict::Agrees);
+    assert_eq!(compare(torque, (2.0, 0.0), 1.0), Verdict::Nothing, "both are about 0");
+    assert_eq!(
+        compare(torque, (40.0, 41.0), 0.0),
+        Verdict::Nothing,
+        "the register is perhaps not there"
+    );
+    assert_eq!(compare(torque, (350.0, 350.0), 41.0), Verdict::Differs);
+    // Speeding up: the monitoring register lies between what was before and what came after.
+    assert_eq!(compare(torque, (10.0, 90.0), 50.0), Verdict::Agrees);
+}
+
+#[test]
+fn trust_is_lost_after_three_and_comes_back_after_two() {
+    let now = Instant::now();
+    let mut compared = Compared {
+        point: 0,
+        monitor: 1,
+        trust: Trust::Unproven(now, PAUSE.0),
+        open: None,
+        last: 0.0,
+    };
+    let mut judge = |verdict| {
+        compared.judge(verdict, now);
+        (compared.trust, compared.is_monitored())
+    };
+    assert_eq!(judge(Verdict::Differs), (Trust::Doubted(1, 0), true), "at once");
+    judge(Verdict::Agrees);
+    assert_eq!(judge(Verdict::Agrees), (Trust::Proven, false));
+    for _ in 0..2 {
+        judge(Verdict::Differs);
+    }
+    assert_eq!(judge(Verdict::Differs), (Trust::Differs(0), true));
+    assert_eq!(judge(Verdict::Nothing), (Trust::Differs(0), true), "0 proves nothing");
+    judge(Verdict::Agrees);
+    judge(Verdict::Differs);
+    judge(Verdict::Agrees);
+    assert_eq!(
+        judge(Verdict::Agrees),
+        (Trust::Proven, false),
+        "the selection was restored"
+    );
+}
+
+#[test]
+fn every_monitoring_register_is_in_a_request_of_its_own_class() {
+    for name in ["vacon-nx", "eaton-svx", "eaton-hvx"] {
+        let profiles = Profiles::built_in();
+        let profile = profiles.get(name).unwrap();
+        let plan = crate::drive::Plan::of(profile);
+        for point in profile.points.iter().filter(|point| point.monitor.is_some()) {
+            let raw = profile.points[point.monitor.unwrap()].raw().unwrap();
+            let in_plan = plan.monitors.iter().filter(|read| covers(read, raw));
+            assert_eq!(in_plan.count(), 1, "{name} {}", point.name);
+        }
+        assert!(plan.monitors.iter().all(|read| read.class == PollClass::Monitor));
+    }
+}

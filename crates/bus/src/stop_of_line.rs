@@ -1,0 +1,65 @@
+//! One broadcast that stops all drives of a line.
+
+use std::time::Duration;
+
+use crate::codec::{Protocol, RequestPdu};
+use crate::process_image::{Access, DriveSpec};
+
+/// Time that drives have to carry out a broadcast before the next request (MODBUS over Serial Line 1.02, 2.4.1).
+pub const BROADCAST_PAUSE: Duration = Duration::from_millis(100);
+
+/// The write that stops every drive of a line at once when it is sent to all of them: only where all of them are to be stopped,
+/// and it means that to each of them. Nobody answers it, so a stop of its own has to follow for every drive.
+pub fn stop_of_line<'d>(protocol: Protocol, drives: impl IntoIterator<Item = &'d DriveSpec>) -> Option<RequestPdu> {
+    let mut stops = drives
+        .into_iter()
+        .map(|drive| (drive.access == Access::Control).then(|| drive.profile.broadcast_stop())?);
+    let first = stops.next()??;
+    // One drive is stopped as soon by its own stop.
+    let mut others = stops.peekable();
+    others.peek()?;
+    (protocol != Protocol::N2 && others.all(|stop| stop.as_ref() == Some(&first))).then_some(first)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::drive::profile::Profiles;
+
+    fn drives(profiles: &[&str], access: Access) -> Vec<DriveSpec> {
+        let known = Profiles::built_in();
+        let spec = |(address, profile): (usize, &&str)| DriveSpec {
+            access,
+            ..DriveSpec::new("d", "b", address as u8 + 1, known.get(profile).unwrap().clone())
+        };
+        profiles.iter().enumerate().map(spec).collect()
+    }
+
+    #[test]
+    fn only_where_it_means_the_same_to_every_drive() {
+        let rtu = |profiles: &[&str]| stop_of_line(Protocol::ModbusRtu, &drives(profiles, Access::Control));
+        let clear = |address| Some(RequestPdu::WriteRegister { address, value: 0 });
+        assert_eq!(rtu(&["vacon-nx", "vacon-nx"]), clear(2000));
+        assert_eq!(
+            rtu(&["vacon-nx", "eaton-svx", "eaton-hvx"]),
+            clear(2000),
+            "the same board"
+        );
+        let coil = RequestPdu::WriteCoil { address: 0, on: false };
+        assert_eq!(rtu(&["vacon-cx", "vacon-cx"]), Some(coil));
+        let ascii = stop_of_line(
+            Protocol::ModbusAscii,
+            &drives(&["teco-7300pa", "teco-7300pa"], Access::Control),
+        );
+        assert_eq!(ascii, clear(1));
+        assert_eq!(rtu(&["vacon-nx", "vacon-cx"]), None, "another register");
+        assert_eq!(rtu(&["vacon-nx"]), None, "its own stop is as fast");
+        let monitored = drives(&["vacon-nx", "vacon-nx"], Access::Monitor);
+        assert_eq!(stop_of_line(Protocol::ModbusRtu, &monitored), None);
+        let mut one_monitored = drives(&["vacon-nx", "vacon-nx"], Access::Control);
+        one_monitored[1].access = Access::Monitor;
+        assert_eq!(stop_of_line(Protocol::ModbusRtu, &one_monitored), None);
+        let n2 = drives(&["vacon-nx-n2", "vacon-nx-n2"], Access::Control);
+        assert_eq!(stop_of_line(Protocol::N2, &n2), None);
+    }
+}

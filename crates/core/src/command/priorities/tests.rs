@@ -1,0 +1,253 @@
+use super::*;
+use Commanded::{FrequencyReference, Reverse, Run, SpeedReference};
+
+const NULL: Option<f64> = None;
+
+fn client(name: &str) -> Origin {
+    Origin::new(SourceKind::Bacnet, name)
+}
+
+fn effect(run: Option<bool>, reference: bool) -> Effect {
+    Effect {
+        run,
+        reverse: None,
+        reference,
+    }
+}
+
+/// A write that is accepted and carried out at once: what follows from it, as point, value and owner.
+fn write(all: &mut Priorities, what: Commanded, who: &str, priority: u8, value: Option<f64>) -> String {
+    let write = asked(all, what, who, priority, value);
+    all.settle(write.1.id, Settled::Done, Instant::now());
+    write.0
+}
+
+/// The same, not settled.
+fn asked(all: &mut Priorities, what: Commanded, who: &str, priority: u8, value: Option<f64>) -> (String, SlotWrite) {
+    let value = value.map(|number| match what {
+        Run | Reverse => Value::Bool(number != 0.0),
+        SpeedReference | FrequencyReference => Value::Number(number),
+    });
+    let entry = value.map(|value| Entry::new(value, client(who), Instant::now()));
+    let write = SlotWrite::new(what, priority, entry);
+    let follows = match all.plan(&write) {
+        Follows::Nothing => "nothing".to_string(),
+        Follows::Stop => "stop".to_string(),
+        Follows::Order(what, entry) => format!("{}={} by {}", what.point().name(), entry.value, entry.origin.who),
+    };
+    all.ask(&write);
+    (follows, write)
+}
+
+fn standing(all: &Priorities, what: Commanded) -> Vec<(u8, f64)> {
+    let one = |priority| Some((priority, all.stands(what, priority)?.value.as_f64()));
+    (1..=16).filter_map(one).collect()
+}
+
+fn elsewhere(all: &mut Priorities, kind: SourceKind, effect: Effect) -> bool {
+    let origin = Origin::new(kind, "x");
+    let refused = all.refuses(&origin, effect).is_some();
+    if !refused {
+        all.accepted(&origin, effect, None, Instant::now());
+    }
+    !refused
+}
+
+#[test]
+fn the_lowest_occupied_slot_governs() {
+    let mut all = Priorities::default();
+    assert_eq!(write(&mut all, Run, "a", 8, Some(1.0)), "run=true by a");
+    assert_eq!(write(&mut all, Run, "b", 10, Some(0.0)), "nothing");
+    assert_eq!(write(&mut all, Run, "c", 5, Some(0.0)), "run=false by c");
+    assert_eq!(write(&mut all, Run, "a", 8, Some(1.0)), "nothing");
+    assert_eq!(write(&mut all, Run, "c", 4, NULL), "nothing", "was empty");
+    assert_eq!(write(&mut all, Run, "c", 5, NULL), "run=true by a");
+    assert_eq!(write(&mut all, Run, "a", 8, NULL), "run=false by b");
+    assert_eq!(write(&mut all, Run, "b", 10, NULL), "stop", "the last one");
+    assert!(all.arrays.is_none());
+    assert_eq!(write(&mut all, Reverse, "a", 8, Some(1.0)), "reverse=true by a");
+    assert_eq!(write(&mut all, Reverse, "a", 8, NULL), "nothing");
+}
+
+#[test]
+fn both_references_are_one_thing_to_the_drive() {
+    let mut all = Priorities::default();
+    assert_eq!(
+        write(&mut all, SpeedReference, "a", 8, Some(50.0)),
+        "speed_reference=50 by a"
+    );
+    assert_eq!(write(&mut all, FrequencyReference, "b", 9, Some(20.0)), "nothing");
+    assert_eq!(
+        write(&mut all, FrequencyReference, "b", 8, Some(21.0)),
+        "frequency_reference=21 by b"
+    );
+    assert_eq!(all.shown(SpeedReference), None);
+    assert_eq!(all.shown(FrequencyReference).map(|(priority, _)| priority), Some(8));
+    assert_eq!(
+        write(&mut all, SpeedReference, "a", 8, Some(51.0)),
+        "speed_reference=51 by a",
+        "the later one"
+    );
+    assert_eq!(write(&mut all, FrequencyReference, "b", 8, NULL), "nothing");
+    assert_eq!(
+        write(&mut all, SpeedReference, "a", 8, NULL),
+        "frequency_reference=20 by b"
+    );
+    assert_eq!(
+        write(&mut all, FrequencyReference, "b", 9, NULL),
+        "nothing",
+        "the drive keeps it"
+    );
+}
+
+#[test]
+fn a_stop_from_elsewhere_empties_every_active() {
+    let kinds = [
+        SourceKind::Mqtt,
+        SourceKind::ModbusTcp,
+        SourceKind::Slot,
+        SourceKind::Shutdown,
+    ];
+    for kind in kinds {
+        let mut all = Priorities::default();
+        write(&mut all, Run, "a", 3, Some(1.0));
+        write(&mut all, Run, "b", 8, Some(1.0));
+        write(&mut all, Run, "c", 9, Some(0.0));
+        write(&mut all, SpeedReference, "a", 8, Some(50.0));
+        let (_, pending) = asked(&mut all, Run, "a", 2, Some(1.0));
+        assert!(elsewhere(&mut all, kind, effect(Some(false), false)));
+        all.settle(pending.id, Settled::Done, Instant::now());
+        assert_eq!(standing(&all, Run), [(9, 0.0)], "{kind:?}");
+        assert_eq!(standing(&all, SpeedReference), [(8, 50.0)]);
+        assert_eq!(
+            write(&mut all, Run, "c", 9, NULL),
+            "stop",
+            "nothing starts later by itself"
+        );
+    }
+}
+
+#[test]
+fn an_inactive_that_protects_refuses_starts_from_elsewhere() {
+    for (priority, protects) in [(1, true), (5, true), (6, false), (16, false)] {
+        let mut all = Priorities::default();
+        write(&mut all, Run, "guard", priority, Some(0.0));
+        for kind in [SourceKind::Mqtt, SourceKind::Slot, SourceKind::LocalSocket] {
+            let held = all.refuses(&Origin::new(kind, "x"), effect(Some(true), false));
+            assert_eq!(
+                held.map(|held| (held.client, held.priority)),
+                protects.then(|| ("guard".to_string(), priority))
+            );
+        }
+        assert!(
+            all.refuses(&client("b"), effect(Some(true), false)).is_none(),
+            "slots decide among themselves"
+        );
+        assert!(
+            all.refuses(&Origin::new(SourceKind::Mqtt, "x"), effect(Some(false), true))
+                .is_none(),
+            "a stop"
+        );
+        assert_eq!(
+            elsewhere(&mut all, SourceKind::Mqtt, effect(Some(true), false)),
+            !protects
+        );
+        assert_eq!(standing(&all, Run).is_empty(), !protects);
+    }
+}
+
+#[test]
+fn a_reference_from_elsewhere_withdraws_those_that_do_not_protect() {
+    let mut all = Priorities::default();
+    write(&mut all, SpeedReference, "a", 8, Some(50.0));
+    write(&mut all, FrequencyReference, "a", 16, Some(20.0));
+    assert!(elsewhere(&mut all, SourceKind::Http, effect(None, true)));
+    assert!(all.arrays.is_none());
+    write(&mut all, FrequencyReference, "a", 4, Some(20.0));
+    assert!(!elsewhere(&mut all, SourceKind::Http, effect(None, true)));
+    assert!(
+        elsewhere(&mut all, SourceKind::Supervision, effect(None, true)),
+        "the gateway itself is not refused"
+    );
+    assert!(elsewhere(&mut all, SourceKind::Http, effect(None, true)));
+}
+
+#[test]
+fn a_lease_that_ends_empties_all_slots_of_its_client() {
+    let mut all = Priorities::default();
+    write(&mut all, Run, "a", 8, Some(1.0));
+    write(&mut all, SpeedReference, "a", 8, Some(50.0));
+    write(&mut all, Run, "b", 9, Some(0.0));
+    write(&mut all, Run, "b", 10, Some(1.0));
+    assert_eq!(
+        all.client().map(|client| client.to_string()),
+        Some("bacnet a".to_string())
+    );
+    assert!(elsewhere(&mut all, SourceKind::Supervision, effect(Some(false), false)));
+    assert_eq!(
+        (standing(&all, Run), standing(&all, SpeedReference)),
+        (vec![(9, 0.0)], vec![])
+    );
+}
+
+#[test]
+fn what_is_asked_for_counts_and_is_not_shown_before_it_is_done() {
+    let now = Instant::now();
+    let mut all = Priorities::default();
+    let (_, stop) = asked(&mut all, Run, "a", 8, Some(0.0));
+    assert_eq!(standing(&all, Run), []);
+    let (follows, start) = asked(&mut all, Run, "b", 10, Some(1.0));
+    assert_eq!(follows, "nothing", "the stop is on its way");
+    all.settle(start.id, Settled::Done, now);
+    all.settle(stop.id, Settled::Failed, now);
+    assert_eq!(standing(&all, Run), [(10, 1.0)], "as it was");
+    let (_, first) = asked(&mut all, Run, "a", 8, Some(1.0));
+    let (_, second) = asked(&mut all, Run, "a", 8, Some(0.0));
+    all.settle(second.id, Settled::Done, now);
+    all.settle(first.id, Settled::Done, now);
+    assert_eq!(standing(&all, Run), [(8, 0.0), (10, 1.0)], "the later write stands");
+}
+
+#[test]
+fn what_is_not_known_is_what_the_next_reading_shows() {
+    let now = Instant::now();
+    for (read, shown) in [(true, vec![(8, 1.0)]), (false, vec![])] {
+        let mut all = Priorities::default();
+        let (_, start) = asked(&mut all, Run, "a", 8, Some(1.0));
+        all.settle(start.id, Settled::Unknown, now);
+        assert_eq!((standing(&all, Run), all.is_uncertain()), (vec![], true));
+        all.resolve(|_, _| None);
+        assert!(all.is_uncertain());
+        all.resolve(|what, since| (what == Run && since == now).then_some(Value::Bool(read)));
+        assert_eq!((standing(&all, Run), all.is_uncertain()), (shown, false));
+    }
+}
+
+#[test]
+fn inactives_that_protect_outlive_a_restart() {
+    let mut all = Priorities::default();
+    for (priority, on) in [(1, 1.0), (3, 0.0), (5, 0.0), (8, 0.0)] {
+        write(&mut all, Run, "a", priority, Some(on));
+    }
+    let kept: Vec<(u8, Entry)> = all.kept().map(|(priority, entry)| (priority, entry.clone())).collect();
+    assert_eq!(kept.iter().map(|(priority, _)| *priority).collect::<Vec<_>>(), [3, 5]);
+    let mut later = Priorities::default();
+    kept.into_iter()
+        .for_each(|(priority, entry)| later.restore(Run, priority, entry));
+    assert!(!elsewhere(&mut later, SourceKind::Mqtt, effect(Some(true), false)));
+}
+
+#[test]
+fn outcomes_settle_slots() {
+    use crate::command::{Interruption, Refusal};
+    let cases = [
+        (Outcome::Acknowledged(crate::codec::Reply::Written), Settled::Done),
+        (Outcome::TimedOut, Settled::Unknown),
+        (Outcome::Interrupted(Interruption::Stop), Settled::Unknown),
+        (Outcome::Purged, Settled::Failed),
+        (Outcome::Refused(Refusal::NotAllowed(String::new())), Settled::Failed),
+    ];
+    for (outcome, settled) in cases {
+        assert_eq!(Settled::of(&outcome), settled);
+    }
+}

@@ -1,0 +1,221 @@
+//! `[bacnet]`.
+
+use std::collections::BTreeMap;
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
+use std::path::Path;
+
+use super::bus::Found;
+use super::keys::{BACNET, DRIVE};
+use super::{files, mqtt, values};
+use crate::document::{Finding, Place, Reader, nearest};
+use crate::north::bacnet::{Options, Secret};
+
+/// Highest instance of a device.
+const MAX_INSTANCE: u32 = 4_194_302;
+/// Port of a BBMD that is written without one.
+const PORT: u16 = 47808;
+
+/// `[bacnet]` as read.
+pub(super) struct Bacnet {
+    /// Absent when a part cannot be used, which is reported.
+    pub(super) options: Option<Options>,
+    device: (u32, Place),
+    buses: Option<Vec<String>>,
+    /// Whether any client could write.
+    pub(super) commands: bool,
+}
+
+/// Reads the section; `buses` are the names that it can select.
+pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, buses: &[&str]) -> Bacnet {
+    let listen = BACNET.listen.read(reader).and_then(|listen| ipv4(reader, listen));
+    let allow = BACNET.allow.get(reader);
+    let write = BACNET.write.get(reader);
+    let commands = BACNET.commands.get(reader);
+    let device = BACNET.device.get(reader);
+    let network = BACNET.network.read(reader);
+    let vendor = BACNET.vendor.read(reader);
+    let offline = BACNET.offline.get(reader);
+    let keep_priorities = BACNET.keep_priorities.get(reader);
+    let bbmd = BACNET.bbmd.get(reader);
+    let password = read_password(reader, base);
+    let buses = read_buses(reader, buses);
+    let is_open = listen.is_some_and(|listen| listen.ip().is_unspecified()) && !reader.has(BACNET.allow.name);
+    if is_open {
+        reader.problem(
+            BACNET.listen.name,
+            "0.0.0.0 hears every network of this machine, and nothing says who may ask",
+            "write `allow`, or the address of one interface",
+        );
+    }
+    let options = listen.zip(network).zip(vendor).filter(|_| !is_open);
+    let options = options.map(|((listen, network), vendor)| Options {
+        listen,
+        device,
+        network,
+        offline,
+        commands,
+        allow,
+        write,
+        keep_priorities,
+        bbmd,
+        vendor,
+        dcc_password: password.clone().flatten(),
+        buses: buses.clone(),
+        state_dir: state_dir.to_path_buf(),
+    });
+    if let Some(options) = &options {
+        warn(reader, options);
+    }
+    reader.finish();
+    Bacnet {
+        device: (device, BACNET.device.place(reader)),
+        commands: commands && options.as_ref().is_none_or(|options| !options.write.is_empty()),
+        options: options.filter(|_| password.is_some()),
+        buses,
+    }
+}
+
+fn ipv4(reader: &Reader<'_>, listen: SocketAddr) -> Option<SocketAddrV4> {
+    match listen {
+        SocketAddr::V4(listen) => Some(listen),
+        SocketAddr::V6(_) => {
+            let what = format!("{listen} is an address of IPv6, and BACnet/IP is served over IPv4 only");
+            reader.problem(
+                BACNET.listen.name,
+                what,
+                "write an address of IPv4, such as \"192.168.1.5:47808\"",
+            );
+            None
+        }
+    }
+}
+
+/// The host and port of a BBMD; none for an empty text.
+pub(super) fn parse_bbmd(text: &str) -> Result<Option<(String, u16)>, Finding> {
+    if text.is_empty() {
+        return Ok(None);
+    }
+    let bbmd = values::host_port(text, Some(PORT)).ok_or_else(|| {
+        Finding::new(
+            format!("`{text}` is not a host with a port"),
+            "write for example \"192.168.1.2:47808\", or \"\" for none",
+        )
+    });
+    bbmd.map(Some)
+}
+
+/// The password; none where there is no file. The outer is absent where the file cannot be read, which is reported.
+fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Option<Secret>> {
+    let key = &BACNET.dcc_password_file;
+    let Some(file) = key.written(reader).filter(|file| !file.as_os_str().is_empty()) else {
+        return Some(None);
+    };
+    let path = values::resolved(base, file);
+    files::warn_of_readers(reader, key.name, &path);
+    reader
+        .accept(key.name, mqtt::secret(&path))
+        .map(|text| Some(Secret::new(text)))
+}
+
+/// The buses that are served; none: all.
+fn read_buses(reader: &Reader<'_>, known: &[&str]) -> Option<Vec<String>> {
+    let mut names = BACNET.buses.get(reader);
+    names.retain(|name| {
+        let is_known = known.contains(&name.as_str());
+        if !is_known {
+            let remedy = match nearest(name, known.iter().copied()) {
+                Some(near) => format!("did you mean `{near}`?"),
+                None => "write names of buses, or [] for all".to_string(),
+            };
+            reader.problem(BACNET.buses.name, format!("there is no bus `{name}`"), remedy);
+        }
+        is_known
+    });
+    Some(names).filter(|names| !names.is_empty())
+}
+
+fn warn(reader: &Reader<'_>, options: &Options) {
+    let (listen, allow, write) = (BACNET.listen.name, BACNET.allow.name, BACNET.write.name);
+    for network in &options.write {
+        if !options.allow.iter().any(|allowed| allowed.contains(network)) {
+            let what = format!("{network} may write, but not all of it may ask");
+            reader.warning(write, what, "add it to `allow`");
+        }
+    }
+    if options.commands && options.write.is_empty() {
+        reader.warning(
+            BACNET.commands.name,
+            "commands are on, and nobody may write",
+            "add networks to `write`",
+        );
+    }
+    if !options.commands && !options.write.is_empty() {
+        reader.warning(
+            write,
+            "`commands` is off, so nobody may write",
+            "set commands = true, or leave `write` out",
+        );
+    }
+    if options.keep_priorities && !options.commands {
+        let what = "without `commands` there is nothing to keep";
+        reader.warning(
+            BACNET.keep_priorities.name,
+            what,
+            "set commands = true, or leave keep_priorities out",
+        );
+    }
+    if options.listen.ip().is_loopback() {
+        return;
+    }
+    let listening = options.listen;
+    if options.commands && !options.write.is_empty() {
+        reader.warning(
+            listen,
+            format!("{listening} can be reached from the network, and BACnet has no passwords: addresses in `write` command drives"),
+            "keep `write` as narrow as possible, and BACnet on a network of its own",
+        );
+    }
+    let only_here = options.allow.iter().all(|network| network.network().is_loopback());
+    if only_here && listening.ip() != &Ipv4Addr::LOCALHOST {
+        let what = format!("{listening} listens to the network, but `allow` admits nobody from there");
+        reader.warning(allow, what, "add the network to `allow`");
+    }
+}
+
+/// The instance of a drive is that of the gateway and its unit: none twice, none too high.
+pub(super) fn check_instances(reader: &Reader<'_>, buses: &[Found], bacnet: &Bacnet) {
+    let (device, place) = &bacnet.device;
+    let is_served = |bus: &&Found| match (&bacnet.buses, &bus.name) {
+        (Some(names), Some((name, _))) => names.contains(name),
+        _ => true,
+    };
+    let mut seen: BTreeMap<u8, &str> = BTreeMap::new();
+    for drive in buses.iter().filter(is_served).flat_map(|bus| &bus.drives) {
+        let (Some((unit, unit_place)), Some((name, _))) = (&drive.unit, &drive.name) else {
+            continue;
+        };
+        if let Some(other) = seen.insert(*unit, name) {
+            reader.document().problem(
+                unit_place,
+                format!(
+                    "in BACnet drive `{name}` has the same device instance {} as drive `{other}`",
+                    device + u32::from(*unit)
+                ),
+                format!(
+                    "give each a `{}` of its own, or serve fewer buses with `buses` of [bacnet]",
+                    DRIVE.unit.name
+                ),
+            );
+        }
+        if device + u32::from(*unit) > MAX_INSTANCE {
+            reader.document().problem(
+                place,
+                format!(
+                    "the device instance of drive `{name}`, {} + {unit}, is above {MAX_INSTANCE}",
+                    device
+                ),
+                "write a lower `device`",
+            );
+        }
+    }
+}

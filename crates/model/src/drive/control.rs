@@ -1,0 +1,290 @@
+//! How a family is commanded: the control word, which words run, stop and reset, and what comes before. Pure.
+
+use std::time::Duration;
+
+use super::profile::Raw;
+use crate::codec::Table;
+
+/// `[control]` of a profile.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Control {
+    /// The control word, or a coil.
+    pub at: Place,
+    /// What it reads as.
+    pub own_word: OwnWord,
+    /// Bits that every word carries.
+    pub always: Always,
+    /// What starts the motor.
+    pub run: Run,
+    /// What stops it, and by which a stop is known.
+    pub stop: Setting,
+    /// What turns it round, where that is not part of `run`.
+    pub reverse: Option<Setting>,
+    /// What resets a fault.
+    pub fault_reset: Option<Reset>,
+    /// A reset while a run command stands starts the motor.
+    pub restarts_on_reset: bool,
+}
+
+/// A register or coil that takes commands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Place {
+    /// Table.
+    pub table: Table,
+    /// PDU address.
+    pub address: u16,
+}
+
+impl Place {
+    /// The place of a raw point.
+    pub(super) fn of(raw: &Raw) -> Place {
+        Place {
+            table: raw.table,
+            address: raw.address,
+        }
+    }
+}
+
+/// Whose word the control word is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum OwnWord {
+    /// The register reads as the word written last.
+    #[default]
+    Read,
+    /// It reads as something else, or not at all: the gateway remembers its own.
+    Shadow,
+}
+
+/// Bits that every word carries.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Always {
+    /// Those that are 1.
+    pub set: u16,
+    /// Those that are 0.
+    pub clear: u16,
+}
+
+impl Always {
+    /// The word with these bits.
+    pub fn applied(self, word: u16) -> u16 {
+        (word | self.set) & !self.clear
+    }
+
+    /// Whether the word has all of them.
+    pub fn holds(self, word: u16) -> bool {
+        self.applied(word) == word
+    }
+}
+
+/// Some bits of a word and what they are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Setting {
+    /// Where; none is the control word.
+    pub place: Option<Place>,
+    /// The bits.
+    pub mask: u16,
+    /// Their values.
+    pub value: u16,
+    /// It acts when written; clearing it undoes nothing.
+    pub once: bool,
+}
+
+impl Setting {
+    /// The word with these bits.
+    pub fn applied(&self, word: u16) -> u16 {
+        word & !self.mask | self.value & self.mask
+    }
+
+    /// Whether the word has them.
+    pub fn holds(&self, word: u16) -> bool {
+        word & self.mask == self.value
+    }
+
+    /// The word with these bits the other way, where that is one bit.
+    pub fn undone(&self, word: u16) -> u16 {
+        word & !self.mask | !self.value & self.mask
+    }
+
+    /// Whether a word can have these bits and those of another.
+    pub fn agrees(&self, other: &Setting) -> bool {
+        let both = self.mask & other.mask;
+        self.place != other.place || self.value & both == other.value & both
+    }
+}
+
+/// What starts the motor.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Run {
+    /// One setting, forward or as `reverse` says.
+    One(Setting),
+    /// One for each direction; never both.
+    Pair {
+        /// Forward.
+        forward: Setting,
+        /// In reverse.
+        reverse: Setting,
+    },
+    /// One word after another; the last one runs.
+    Steps(Vec<Step>),
+}
+
+/// One word of a sequence.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Step {
+    /// The word; the bits of `reverse` stand in it as commanded.
+    pub write: Setting,
+    /// What ends it.
+    pub until: Until,
+    /// After which the command fails.
+    pub timeout: Duration,
+}
+
+/// What ends a step.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Until {
+    /// The word was acknowledged.
+    Written,
+    /// A time after that.
+    Time(Duration),
+    /// A state.
+    State(Mask),
+}
+
+/// A masked value of a register.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Mask {
+    /// Index of the point.
+    pub point: usize,
+    /// Bits of it that count.
+    pub mask: u64,
+    /// What they are.
+    pub is: u64,
+}
+
+impl Mask {
+    /// Whether the register is in that state.
+    pub fn holds(&self, word: u64) -> bool {
+        word & self.mask == self.is
+    }
+}
+
+/// What resets a fault: a pulse.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Reset {
+    /// What is set, and the other way afterwards.
+    pub setting: Setting,
+    /// For how long.
+    pub hold: Duration,
+}
+
+impl Control {
+    /// Every setting that starts the motor: the last of a sequence.
+    pub fn runs(&self) -> Vec<Setting> {
+        match &self.run {
+            Run::One(setting) => vec![*setting],
+            Run::Pair { forward, reverse } => vec![*forward, *reverse],
+            Run::Steps(steps) => steps.last().map(|step| step.write).into_iter().collect(),
+        }
+    }
+
+    /// Whether that word, written there, stops the motor.
+    pub fn is_stop(&self, place: Place, word: u16) -> bool {
+        self.stop.place.unwrap_or(self.at) == place && self.stop.holds(word)
+    }
+
+    /// Whether that word, written there, starts it or lets it run.
+    pub fn is_run(&self, place: Place, word: u16) -> bool {
+        let of = |setting: &Setting| setting.place.unwrap_or(self.at) == place && self.holds_run(setting, word);
+        !self.is_stop(place, word) && self.runs().iter().any(of)
+    }
+
+    /// Whether a client may write that word there as it stands: in the control word only what clearly stops or runs, at other
+    /// places only what they are for.
+    pub fn admits(&self, place: Place, word: u16) -> bool {
+        if place == self.at {
+            return self.is_stop(place, word) || self.is_run(place, word) && self.always.holds(word);
+        }
+        let mut others = self.runs();
+        others.extend(
+            [
+                Some(self.stop),
+                self.reverse,
+                self.fault_reset.map(|reset| reset.setting),
+            ]
+            .into_iter()
+            .flatten(),
+        );
+        let here: Vec<&Setting> = others.iter().filter(|setting| setting.place == Some(place)).collect();
+        here.is_empty()
+            || here
+                .iter()
+                .any(|setting| word == setting.applied(0) || word == setting.undone(0))
+    }
+
+    /// The bits of the direction count for nothing in a sequence, nor does what resets.
+    fn holds_run(&self, setting: &Setting, word: u16) -> bool {
+        let free = match (&self.run, &self.reverse) {
+            (Run::Steps(_), Some(reverse)) if reverse.place.is_none() => reverse.mask,
+            _ => 0,
+        };
+        (word ^ setting.value) & setting.mask & !free == 0
+    }
+
+    /// The word of a stop, made of the word that stands.
+    pub fn stop_word(&self, own: u16) -> u16 {
+        match self.stop.place {
+            None => self.stop.applied(self.always.applied(own)),
+            Some(_) => self.stop.applied(0),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::drive::Profile;
+
+    use super::*;
+
+    fn control(lines: &str) -> Control {
+        let text = format!(
+            "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\nread = 5\nwrite = 2\n\
+             [[point]]\nname = \"status_word\"\nat = \"holding 3\"\nclass = \"fast\"\nhidden = true\n\
+             [control]\nat = \"holding 0\"\n{lines}\n"
+        );
+        let profile = Profile::parse("p.toml", &text, false).unwrap();
+        profile.control.unwrap()
+    }
+
+    fn words(control: &Control, of: impl Fn(&Control, Place, u16) -> bool, all: &[u16]) -> Vec<u16> {
+        let place = control.at;
+        all.iter().copied().filter(|word| of(control, place, *word)).collect()
+    }
+
+    /// Words that run and stop, by hand from the manuals' figures (`control-words.md`), for each form.
+    #[test]
+    fn words_that_run_and_stop() {
+        let sequence = control(
+            "always = { set = [1, 2, 3, 4, 5, 6, 10] }\nstop = { bit = 0, is = 0 }\nreverse = { bit = 11 }\n\
+             run = { steps = [{ write = 0x047E, until = { point = \"status_word\", mask = 0x41, is = 1 } }, { write = 0x047F }] }\n\
+             fault_reset = { mask = 0x81, value = 0x80 }",
+        );
+        let all = [0x0000, 0x047E, 0x047F, 0x0C7F, 0x04FE, 0x0476, 0x0477, 0x0C7E];
+        assert_eq!(words(&sequence, Control::is_run, &all), [0x047F, 0x0C7F]);
+        assert_eq!(
+            words(&sequence, Control::is_stop, &all),
+            [0x0000, 0x047E, 0x04FE, 0x0476, 0x0C7E]
+        );
+        assert_eq!((sequence.stop_word(0x0C7F), sequence.stop_word(0)), (0x0C7E, 0x047E));
+
+        let pair = control("run = { forward_bit = 0, reverse_bit = 1 }\nstop = { mask = 3, value = 0 }");
+        let all = [0, 1, 2, 3, 8, 9];
+        assert_eq!(words(&pair, Control::is_run, &all), [1, 2, 9], "never both");
+        assert_eq!(words(&pair, Control::is_stop, &all), [0, 8]);
+        assert_eq!(pair.stop_word(2), 0, "reverse, too");
+
+        let codes = control("run = { forward = 0x12, reverse = 0x22, once = true }\nstop = { mask = 3, value = 1 }");
+        let all = [0, 1, 2, 0x12, 0x22, 0x11];
+        assert_eq!(words(&codes, Control::is_run, &all), [0x12, 0x22]);
+        assert_eq!(words(&codes, Control::is_stop, &all), [1, 0x11], "0 stops nothing");
+    }
+}

@@ -1,0 +1,205 @@
+//! Types of raw values and the order of their bytes.
+
+/// Form of a raw value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Form {
+    /// One bit of a register (0 = least significant), or the bit itself in a bit table.
+    Bit {
+        /// Number of the bit.
+        bit: u8,
+        /// 0 means true.
+        invert: bool,
+    },
+    /// Neighbouring bits of a register as a number.
+    Bits {
+        /// Number of the least significant one.
+        first: u8,
+        /// How many, 1..=16.
+        count: u8,
+    },
+    /// Unsigned 16 bit.
+    U16,
+    /// Signed 16 bit, two's complement.
+    I16,
+    /// Unsigned 32 bit in two registers.
+    U32,
+    /// Signed 32 bit, two's complement, in two registers.
+    I32,
+    /// Unsigned 64 bit in four registers.
+    U64,
+    /// Signed 64 bit, two's complement, in four registers.
+    I64,
+    /// IEEE 754 single in two registers; NaN and infinities are not values.
+    F32,
+    /// IEEE 754 double in four registers; likewise.
+    F64,
+    /// Four binary-coded decimals.
+    Bcd16,
+    /// Eight binary-coded decimals in two registers.
+    Bcd32,
+    /// Text, two characters a register, that ends at a NUL.
+    Text {
+        /// Registers.
+        registers: u8,
+    },
+}
+
+/// Order of the bytes of a value, as 32 bits of it appear on the wire; A is the most significant byte. With four registers
+/// CDAB is that of all words, the least significant first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Order {
+    /// High byte and high word first, as Modbus devices mostly have it.
+    #[default]
+    Abcd,
+    /// Low word first.
+    Cdab,
+    /// Low byte first in each register.
+    Badc,
+    /// Low word first, low byte first.
+    Dcba,
+}
+
+impl Order {
+    /// All of them.
+    pub const ALL: [Order; 4] = [Order::Abcd, Order::Cdab, Order::Badc, Order::Dcba];
+
+    /// The name in profiles and output.
+    pub fn name(self) -> &'static str {
+        match self {
+            Order::Abcd => "ABCD",
+            Order::Cdab => "CDAB",
+            Order::Badc => "BADC",
+            Order::Dcba => "DCBA",
+        }
+    }
+
+    fn low_word_first(self) -> bool {
+        matches!(self, Order::Cdab | Order::Dcba)
+    }
+
+    /// The word with its high byte high.
+    fn word(self, word: u16) -> u16 {
+        match self {
+            Order::Abcd | Order::Cdab => word,
+            Order::Badc | Order::Dcba => word.swap_bytes(),
+        }
+    }
+
+    /// The bits of up to four registers.
+    pub(super) fn join(self, words: &[u16]) -> Option<u64> {
+        let join = |bits: u64, word: &u16| bits << 16 | u64::from(self.word(*word));
+        match (words.len(), self.low_word_first()) {
+            (1..=4, false) => Some(words.iter().fold(0, join)),
+            (1..=4, true) => Some(words.iter().rev().fold(0, join)),
+            _ => None,
+        }
+    }
+
+    /// The registers of a value of that many.
+    pub(super) fn split(self, bits: u64, registers: u16) -> Vec<u16> {
+        let place = |register: u16| match self.low_word_first() {
+            true => register,
+            false => registers - 1 - register,
+        };
+        let word = |register| self.word((bits >> (16 * u32::from(place(register)))) as u16);
+        (0..registers.min(4)).map(word).collect()
+    }
+
+    /// The bytes of a text in their order.
+    pub(in crate::drive) fn bytes(self, words: &[u16]) -> impl Iterator<Item = u8> {
+        let last = words.len();
+        let at = move |place: usize| match self.low_word_first() {
+            true => last - 1 - place,
+            false => place,
+        };
+        let words = (0..last).filter_map(move |place| words.get(at(place)));
+        words.flat_map(move |word| self.word(*word).to_be_bytes())
+    }
+}
+
+impl Form {
+    /// Types that a profile names, without the texts.
+    pub const NAMED: [Form; 10] = [
+        Form::U16,
+        Form::I16,
+        Form::U32,
+        Form::I32,
+        Form::U64,
+        Form::I64,
+        Form::F32,
+        Form::F64,
+        Form::Bcd16,
+        Form::Bcd32,
+    ];
+
+    /// Number of registers or bits of the value.
+    pub fn items(self) -> u16 {
+        match self {
+            Form::U64 | Form::I64 | Form::F64 => 4,
+            Form::U32 | Form::I32 | Form::F32 | Form::Bcd32 => 2,
+            Form::Bit { .. } | Form::Bits { .. } | Form::U16 | Form::I16 | Form::Bcd16 => 1,
+            Form::Text { registers } => u16::from(registers),
+        }
+    }
+
+    /// The name of the type in profiles and output.
+    pub fn name(self) -> &'static str {
+        match self {
+            Form::Bit { .. } => "bit",
+            Form::Bits { .. } => "bits",
+            Form::U16 => "u16",
+            Form::I16 => "i16",
+            Form::U32 => "u32",
+            Form::I32 => "i32",
+            Form::U64 => "u64",
+            Form::I64 => "i64",
+            Form::F32 => "f32",
+            Form::F64 => "f64",
+            Form::Bcd16 => "bcd16",
+            Form::Bcd32 => "bcd32",
+            Form::Text { .. } => "string",
+        }
+    }
+
+    /// Whether its counts have a sign.
+    pub fn is_signed(self) -> bool {
+        matches!(self, Form::I16 | Form::I32 | Form::I64)
+    }
+
+    /// Whether it is a whole number of registers that `mask` may take bits of.
+    pub fn takes_mask(self) -> bool {
+        matches!(self, Form::U16 | Form::U32 | Form::U64)
+    }
+
+    /// Bits of its registers.
+    pub fn width(self) -> u32 {
+        16 * u32::from(self.items())
+    }
+
+    /// The bits of a whole count that fits.
+    pub(super) fn bits_of(self, count: i128) -> u64 {
+        let all = u64::MAX
+            .checked_shr(64u32.saturating_sub(self.width()))
+            .unwrap_or(u64::MAX);
+        count as u64 & all
+    }
+
+    /// Least and greatest count.
+    pub(super) fn span(self) -> (f64, f64) {
+        match self {
+            Form::Bit { .. } => (0.0, 1.0),
+            Form::Bits { count, .. } => (0.0, f64::from((1u32 << count.min(16)) - 1)),
+            Form::U16 => (0.0, f64::from(u16::MAX)),
+            Form::I16 => (f64::from(i16::MIN), f64::from(i16::MAX)),
+            Form::U32 => (0.0, f64::from(u32::MAX)),
+            Form::I32 => (f64::from(i32::MIN), f64::from(i32::MAX)),
+            Form::U64 => (0.0, u64::MAX as f64),
+            Form::I64 => (i64::MIN as f64, i64::MAX as f64),
+            Form::F32 => (f64::from(f32::MIN), f64::from(f32::MAX)),
+            Form::F64 => (f64::MIN, f64::MAX),
+            Form::Bcd16 => (0.0, 9999.0),
+            Form::Bcd32 => (0.0, 99_999_999.0),
+            Form::Text { .. } => (0.0, 0.0),
+        }
+    }
+}

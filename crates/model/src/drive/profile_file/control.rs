@@ -1,0 +1,446 @@
+//! `[control]`: how a family is commanded.
+
+use std::time::Duration;
+
+use super::super::control::{Always, Control, Mask, OwnWord, Place, Reset, Run, Setting, Step, Until};
+use super::super::model::ModelPoint;
+use super::super::profile::{AddressRange, Form, Point, PollClass, Raw, Source};
+use super::derived::point_of;
+use super::place::parse_place;
+use super::ranges::Offsets;
+use crate::codec::Table;
+use crate::document::{Finding, Reader};
+
+/// Time after which a step that does not end fails.
+const STEP_TIMEOUT: Duration = Duration::from_secs(2);
+const LONGEST: Duration = Duration::from_secs(60);
+const MOST_STEPS: usize = 8;
+
+/// What the table refers to.
+pub(super) struct Around<'p> {
+    pub(super) points: &'p [Point],
+    pub(super) names: &'p [String],
+    pub(super) ranges: &'p [AddressRange],
+    pub(super) offsets: &'p Offsets,
+    pub(super) update_period: Duration,
+}
+
+pub(super) fn read(reader: &Reader<'_>, around: &Around<'_>) -> Option<Control> {
+    let table = reader.table("control")?;
+    let at = read_at(&table, around);
+    let own_word = table.parsed("own_word", |text| match text {
+        "read" => Ok(OwnWord::Read),
+        "shadow" => Ok(OwnWord::Shadow),
+        other => Err(Finding::new(
+            format!("unknown word `{other}`"),
+            "write \"read\" or \"shadow\"",
+        )),
+    });
+    let always = read_always(&table);
+    let run = read_run(&table, around);
+    let of = |key: &str| {
+        let form = table.table(key)?;
+        let setting = read_setting(&form, around);
+        form.finish();
+        setting
+    };
+    let (stop, reverse) = (of("stop"), of("reverse"));
+    let fault_reset = read_reset(&table, around);
+    let restarts_on_reset = table.or("restarts_on_reset", false);
+    for key in ["run", "stop"].into_iter().filter(|key| !table.has(key)) {
+        table.problem(key, format!("`{key}` is missing"), "say which word does it");
+    }
+    table.finish();
+    let control = Control {
+        at: at?,
+        own_word: own_word.unwrap_or_default(),
+        always,
+        run: run?,
+        stop: stop?,
+        reverse,
+        fault_reset,
+        restarts_on_reset,
+    };
+    check(&table, &control);
+    Some(control)
+}
+
+fn read_at(table: &Reader<'_>, around: &Around<'_>) -> Option<Place> {
+    let text: String = table.required("at")?;
+    let place = parse_place(&text).filter(|place| matches!(place.table, Table::Holding | Table::Coil));
+    let Some(Place { table: kind, address }) = place else {
+        table.problem(
+            "at",
+            format!("`{text}` is no register or coil that can be written"),
+            "write \"holding 2000\" or \"coil 0\"",
+        );
+        return None;
+    };
+    let address = around.offsets.applied(table, "at", kind, address)?;
+    let writes = |range: &AddressRange| range.table == kind && range.addresses.contains(&address) && range.write > 0;
+    if !around.ranges.iter().any(writes) {
+        table.problem(
+            "at",
+            format!("{kind} {address} is in no [[range]] with `write`"),
+            "add the range, or set `write` there",
+        );
+    }
+    Some(Place { table: kind, address })
+}
+
+fn read_always(table: &Reader<'_>) -> Always {
+    let Some(given) = table.table("always") else {
+        return Always::default();
+    };
+    let bits = |key: &str| {
+        let list: Vec<u8> = given.or(key, Vec::new());
+        if let Some(bit) = list.iter().find(|bit| **bit > 15) {
+            given.problem(
+                key,
+                format!("there is no bit {bit} in a word"),
+                "write bits from 0 to 15",
+            );
+        }
+        list.iter()
+            .filter(|bit| **bit < 16)
+            .fold(0, |word, bit| word | 1u16 << bit)
+    };
+    let always = Always {
+        set: bits("set"),
+        clear: bits("clear"),
+    };
+    if always.set & always.clear != 0 {
+        given.problem("clear", "a bit is in `set` and in `clear`", "name each bit once");
+    }
+    given.finish();
+    always
+}
+
+/// `{ bit = 0, is = 1 }` or `{ mask = 0x0F, value = 0x02 }`, with `point` and `once`.
+fn read_setting(form: &Reader<'_>, around: &Around<'_>) -> Option<Setting> {
+    let place = read_place(form, around)?;
+    let once = form.or("once", false);
+    let bits = match (form.optional::<u8>("bit"), form.optional::<u16>("mask")) {
+        (Some(bit), None) if bit < 16 => {
+            let is = form.or("is", 1u8);
+            if is > 1 {
+                form.problem("is", format!("a bit is not {is}"), "write 0 or 1");
+            }
+            Some((1u16 << bit, u16::from(is & 1) << bit))
+        }
+        (Some(bit), None) => {
+            form.problem("bit", format!("there is no bit {bit} in a word"), "write 0 to 15");
+            None
+        }
+        (None, Some(mask)) => Some((mask, form.required("value")?)),
+        (Some(_), Some(_)) => {
+            form.problem("mask", "a form has `bit` or `mask`, not both", "leave one of them out");
+            None
+        }
+        (None, None) => {
+            // Errors of these keys were reported.
+            if !form.has("bit") && !form.has("mask") {
+                form.problem("bit", "the form names no bits", "write `bit`, or `mask` and `value`");
+            }
+            None
+        }
+    };
+    let (mask, value) = bits?;
+    if mask == 0 || value & !mask != 0 {
+        form.problem(
+            if mask == 0 { "mask" } else { "value" },
+            format!("{value:#06x} is not within the mask {mask:#06x}"),
+            "write a value of the bits of the mask",
+        );
+        return None;
+    }
+    Some(Setting {
+        place,
+        mask,
+        value,
+        once,
+    })
+}
+
+/// `point` of a form; `Some(None)` is the control word.
+fn read_place(form: &Reader<'_>, around: &Around<'_>) -> Option<Option<Place>> {
+    let Some(name) = form.optional::<String>("point") else {
+        return Some(None);
+    };
+    let index = point_of(form, "point", &name, around.names)?;
+    let point = around.points.get(index)?;
+    let raw = point.raw().filter(|raw| {
+        let one = matches!(raw.form, Form::U16 | Form::Bit { bit: 0, invert: false });
+        point.write && one && raw.is_unscaled()
+    });
+    match raw {
+        Some(raw) => Some(Some(Place::of(raw))),
+        None => {
+            form.problem(
+                "point",
+                format!("`{name}` is no register or coil that is written as it stands"),
+                "name a point with `write = true`, type u16 and no scale, or a coil",
+            );
+            None
+        }
+    }
+}
+
+fn whole(value: u16) -> Setting {
+    Setting {
+        place: None,
+        mask: u16::MAX,
+        value,
+        once: false,
+    }
+}
+
+fn read_run(table: &Reader<'_>, around: &Around<'_>) -> Option<Run> {
+    let form = table.table("run")?;
+    let run = if form.has("steps") {
+        read_steps(&form, around).map(Run::Steps)
+    } else if form.has("forward_bit") || form.has("reverse_bit") {
+        let bits = (form.required::<u8>("forward_bit"), form.required::<u8>("reverse_bit"));
+        pair_of_bits(&form, bits, read_place(&form, around)?)
+    } else if form.has("forward") || form.has("reverse") {
+        let (forward, reverse) = (form.required("forward"), form.required("reverse"));
+        let (place, once) = (read_place(&form, around)?, form.or("once", false));
+        let setting = |value| Setting {
+            place,
+            once,
+            ..whole(value)
+        };
+        forward.zip(reverse).map(|(forward, reverse)| Run::Pair {
+            forward: setting(forward),
+            reverse: setting(reverse),
+        })
+    } else {
+        read_setting(&form, around).map(Run::One)
+    };
+    form.finish();
+    run
+}
+
+fn pair_of_bits(form: &Reader<'_>, bits: (Option<u8>, Option<u8>), place: Option<Place>) -> Option<Run> {
+    let (forward, reverse) = (bits.0?, bits.1?);
+    if forward > 15 || reverse > 15 || forward == reverse {
+        form.problem(
+            "reverse_bit",
+            format!("{forward} and {reverse} are not two bits of a word"),
+            "write two bits from 0 to 15",
+        );
+        return None;
+    }
+    let once = form.or("once", false);
+    let mask = 1u16 << forward | 1u16 << reverse;
+    let setting = |bit: u8| Setting {
+        place,
+        mask,
+        value: 1 << bit,
+        once,
+    };
+    Some(Run::Pair {
+        forward: setting(forward),
+        reverse: setting(reverse),
+    })
+}
+
+fn read_steps(form: &Reader<'_>, around: &Around<'_>) -> Option<Vec<Step>> {
+    let tables = form.tables("steps");
+    if tables.is_empty() || tables.len() > MOST_STEPS {
+        form.problem(
+            "steps",
+            format!("{} steps", tables.len()),
+            format!("write 1 to {MOST_STEPS}"),
+        );
+        return None;
+    }
+    let steps: Vec<Option<Step>> = tables.iter().map(|table| read_step(table, around)).collect();
+    steps.into_iter().collect()
+}
+
+fn read_step(table: &Reader<'_>, around: &Around<'_>) -> Option<Step> {
+    let (write, mask) = (table.required::<u16>("write"), table.or("mask", u16::MAX));
+    let place = read_place(table, around);
+    let until = match table.table("until") {
+        Some(state) => {
+            let mask = read_mask(&state, around, "is");
+            state.finish();
+            mask.map(Until::State)
+        }
+        None => Some(match read_time(table, "time") {
+            Some(time) => Until::Time(time),
+            None => Until::Written,
+        }),
+    };
+    if table.has("until") && table.has("time") {
+        table.problem(
+            "time",
+            "a step ends by a state or after a time",
+            "leave one of them out",
+        );
+    }
+    let timeout = read_time(table, "timeout").unwrap_or(STEP_TIMEOUT);
+    table.finish();
+    let write = write?;
+    if write & !mask != 0 {
+        table.problem(
+            "write",
+            format!("{write:#06x} is not within the mask {mask:#06x}"),
+            "write a word of the bits of the mask",
+        );
+    }
+    Some(Step {
+        write: Setting {
+            place: place?,
+            mask,
+            ..whole(write)
+        },
+        until: until?,
+        timeout,
+    })
+}
+
+fn read_time(table: &Reader<'_>, key: &str) -> Option<Duration> {
+    let time: Duration = table.optional(key)?;
+    if time.is_zero() || time > LONGEST {
+        table.problem(key, "the time is out of range", "write up to 60s");
+    }
+    Some(time.min(LONGEST))
+}
+
+/// `{ point, mask, is }`: a masked value of a register that is read.
+pub(super) fn read_mask(table: &Reader<'_>, around: &Around<'_>, key: &str) -> Option<Mask> {
+    let name: Option<String> = table.required("point");
+    let (mask, is) = (table.required::<u32>("mask"), table.required::<u32>(key));
+    let point = name.and_then(|name| Some((point_of(table, "point", &name, around.names)?, name)));
+    let ((index, name), mask, is) = (point?, mask?, is?);
+    let read = around.points.get(index).is_some_and(|point| {
+        let plain = |raw: &Raw| matches!(raw.form, Form::U16 | Form::U32) && raw.is_unscaled();
+        point.raw().is_some_and(plain) && !point.raw().is_some_and(Raw::is_bool)
+    });
+    if !read {
+        table.problem(
+            "point",
+            format!("`{name}` is no whole register"),
+            "name a point of type u16 or u32 without scale, mask and equals",
+        );
+    } else if around
+        .points
+        .get(index)
+        .is_some_and(|point| point.class != PollClass::Fast)
+    {
+        table.problem(
+            "point",
+            format!("`{name}` is not read fast"),
+            "set class = \"fast\" there",
+        );
+    }
+    if mask == 0 || is & !mask != 0 {
+        table.problem(
+            key,
+            format!("{is:#06x} is not within the mask {mask:#06x}: it is never so"),
+            "write a value of the bits of the mask",
+        );
+    }
+    Some(Mask {
+        point: index,
+        mask: u64::from(mask),
+        is: u64::from(is),
+    })
+}
+
+fn read_reset(table: &Reader<'_>, around: &Around<'_>) -> Option<Reset> {
+    let form = table.table("fault_reset")?;
+    let setting = read_setting(&form, around);
+    let hold = read_time(&form, "hold").unwrap_or(2 * around.update_period);
+    form.finish();
+    Some(Reset {
+        setting: setting?,
+        hold,
+    })
+}
+
+/// The points of the common model that a control word of plain bits is: one that is read back and has no constant bits.
+pub(super) fn plain_points(control: &Control) -> Vec<Point> {
+    let bit = |setting: &Setting| {
+        let plain = setting.place.is_none() && !setting.once && setting.mask.count_ones() == 1;
+        plain.then(|| Form::Bit {
+            bit: u8::try_from(setting.mask.trailing_zeros()).unwrap_or_default(),
+            invert: setting.value == 0,
+        })
+    };
+    let Run::One(run) = &control.run else {
+        return Vec::new();
+    };
+    let opposite = control.stop.place.is_none() && control.stop.mask == run.mask && control.stop.value != run.value;
+    let settings = [
+        (ModelPoint::Run, Some(run)),
+        (ModelPoint::Reverse, control.reverse.as_ref()),
+        (
+            ModelPoint::FaultReset,
+            control.fault_reset.as_ref().map(|reset| &reset.setting),
+        ),
+    ];
+    let all_plain = settings
+        .iter()
+        .all(|(_, setting)| setting.is_none_or(|setting| bit(setting).is_some()));
+    if !all_plain || !opposite || control.own_word != OwnWord::Read || control.always != Always::default() {
+        return Vec::new();
+    }
+    let point = |model: ModelPoint, form: Form| Point {
+        class: PollClass::Slow,
+        write: true,
+        pulse: model == ModelPoint::FaultReset,
+        ..Point::of_model(
+            model,
+            Source::Raw(Raw::plain(control.at.table, control.at.address, form)),
+        )
+    };
+    let made = settings
+        .into_iter()
+        .filter_map(|(model, setting)| Some(point(model, bit(setting?)?)));
+    made.collect()
+}
+
+/// What contradicts something else is an error, never mended.
+fn check(table: &Reader<'_>, control: &Control) {
+    let always = control.always;
+    let contradicts = |setting: &Setting| {
+        let own = setting.place.is_none_or(|place| place == control.at);
+        own && (setting.value & always.clear != 0 || setting.mask & !setting.value & always.set != 0)
+    };
+    let refuse = |key: &str, setting: &Setting| {
+        if contradicts(setting) {
+            table.problem(
+                key,
+                format!("{:#06x} in {:#06x} contradicts `always`", setting.value, setting.mask),
+                "leave these bits out of one of them",
+            );
+        }
+    };
+    for setting in control.runs() {
+        refuse("run", &setting);
+        if setting.agrees(&control.stop) {
+            table.problem(
+                "stop",
+                "a word can be a run command and a stop at once",
+                "write bits of which the run command has the opposite",
+            );
+        }
+    }
+    if let Run::Steps(steps) = &control.run {
+        let before = steps.len().saturating_sub(1);
+        steps.iter().take(before).for_each(|step| refuse("run", &step.write));
+    }
+    refuse("stop", &control.stop);
+    if let Some(reverse) = &control.reverse {
+        refuse("reverse", reverse);
+        if matches!(control.run, Run::Pair { .. }) {
+            table.problem("reverse", "`run` says the direction already", "leave `reverse` out");
+        }
+    }
+    if let Some(reset) = &control.fault_reset {
+        refuse("fault_reset", &reset.setting);
+    }
+}

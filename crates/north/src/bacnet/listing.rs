@@ -1,0 +1,99 @@
+//! The devices of a configuration at rest, as lines for people and programs. Pure.
+
+use drivegate_bacnet::{Access, Kind, Object};
+
+use super::objects::{self, Shown};
+use super::{Options, units};
+use crate::process_image::{BusSpec, DriveSpec};
+
+/// One object.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Line {
+    /// Instance of its device.
+    pub device: u32,
+    /// Name of its device.
+    pub device_name: String,
+    /// As it is usually written, such as `AI 2`.
+    pub object: String,
+    /// Its name.
+    pub name: String,
+    /// What its values are.
+    pub kind: String,
+    /// The unit; empty without one.
+    pub unit: String,
+    /// How it is written.
+    pub access: &'static str,
+}
+
+/// The columns of a line.
+pub const COLUMNS: [&str; 7] = ["device", "device_name", "object", "name", "type", "unit", "access"];
+
+impl Line {
+    /// In the order of [`COLUMNS`].
+    pub fn cells(&self) -> [String; 7] {
+        [
+            self.device.to_string(),
+            self.device_name.clone(),
+            self.object.clone(),
+            self.name.clone(),
+            self.kind.clone(),
+            self.unit.clone(),
+            self.access.to_string(),
+        ]
+    }
+}
+
+/// The devices that a configuration shows, that of the gateway first.
+pub fn devices<'s>(
+    gateway: &str,
+    options: &Options,
+    buses: impl Iterator<Item = (&'s BusSpec, &'s [DriveSpec])> + Clone,
+) -> Vec<Shown> {
+    let own = (gateway, options.device);
+    let served = buses.clone().filter(|(bus, _)| options.serves(&bus.name));
+    let drives = served
+        .flat_map(|(_, drives)| drives)
+        .map(|spec| objects::of_drive(spec, own));
+    [objects::of_gateway(own, buses.map(|(bus, _)| bus))]
+        .into_iter()
+        .chain(drives)
+        .collect()
+}
+
+/// All objects of these devices.
+pub fn lines(devices: &[Shown]) -> Vec<Line> {
+    let of_device = |shown: &Shown| {
+        let device = shown.device.clone();
+        let objects: Vec<Line> = device
+            .objects()
+            .iter()
+            .map(|object| line(device.instance, &device.name, object))
+            .collect();
+        objects
+    };
+    devices.iter().flat_map(of_device).collect()
+}
+
+fn line(device: u32, device_name: &str, object: &Object) -> Line {
+    let (kind, unit) = match &object.kind {
+        Kind::Analog { units, .. } => ("number".to_string(), units::name(*units)),
+        Kind::Binary {
+            texts: [inactive, active],
+        } => (format!("{inactive}, {active}"), ""),
+        Kind::MultiState { texts } => (texts.join(", "), ""),
+        Kind::Text => ("text".to_string(), ""),
+    };
+    Line {
+        device,
+        device_name: device_name.to_string(),
+        object: object.id.to_string(),
+        name: object.name.to_string(),
+        kind,
+        unit: unit.to_string(),
+        access: match object.access {
+            Access::Read => "read",
+            Access::Write => "write",
+            Access::Command => "command",
+        },
+    }
+}

@@ -1,0 +1,226 @@
+//! The BACnet/IP server: each drive is a device of its own behind a virtual network (`docs/bacnet.md`).
+//!
+//! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` says what a drive shows, `view` reads it from the process image,
+//! `writes` makes orders of what clients write, `task` moves datagrams.
+
+pub mod ede;
+mod kept;
+pub mod listing;
+pub mod objects;
+mod sockets;
+mod task;
+mod units;
+mod view;
+mod writes;
+
+#[cfg(test)]
+mod tests;
+
+use std::net::{SocketAddr, SocketAddrV4};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use ipnet::IpNet;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use self::sockets::Sockets;
+use self::task::{Task, ToTask};
+use super::{NorthStats, ServerError, ServerKind};
+use crate::listener::ListenerState;
+use crate::plant::SharedPlant;
+
+/// What a drive that is away does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum WhenOffline {
+    /// It answers nothing.
+    #[default]
+    Silent,
+    /// It answers, with the flag fault.
+    Fault,
+}
+
+/// `[bacnet]`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Its address.
+    pub listen: SocketAddrV4,
+    /// Instance of the gateway; that of a drive is greater by its unit.
+    pub device: u32,
+    /// Number of the virtual network.
+    pub network: u16,
+    /// What a drive that is away does.
+    pub offline: WhenOffline,
+    /// Whether clients may write at all.
+    pub commands: bool,
+    /// Who may ask.
+    pub allow: Vec<IpNet>,
+    /// Who may write.
+    pub write: Vec<IpNet>,
+    /// Whether inactives that protect people outlive a restart.
+    pub keep_priorities: bool,
+    /// The BBMD at which it registers.
+    pub bbmd: Option<(String, u16)>,
+    /// Identifier of the vendor.
+    pub vendor: u16,
+    /// The password of DeviceCommunicationControl.
+    pub dcc_password: Option<Secret>,
+    /// The buses whose drives are shown; none: all.
+    pub buses: Option<Vec<String>>,
+    /// Directory of what is kept.
+    pub state_dir: PathBuf,
+}
+
+/// Text that is not shown.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Secret(String);
+
+impl Secret {
+    /// That text.
+    pub fn new(text: String) -> Secret {
+        Secret(text)
+    }
+}
+
+impl std::ops::Deref for Secret {
+    type Target = str;
+
+    fn deref(&self) -> &str {
+        &self.0
+    }
+}
+
+impl std::fmt::Debug for Secret {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("***")
+    }
+}
+
+impl Options {
+    /// Whether the drives of that bus are shown.
+    pub fn serves(&self, bus: &str) -> bool {
+        self.buses
+            .as_ref()
+            .is_none_or(|buses| buses.iter().any(|name| name == bus))
+    }
+
+    /// Files that the server has open.
+    pub fn files(&self) -> usize {
+        3
+    }
+
+    /// Whether a server with these options can go on with those: its sockets and what clients know of it stay.
+    fn continues(&self, other: &Options) -> bool {
+        (self.listen, self.device, self.network, self.vendor)
+            == (other.listen, other.device, other.network, other.vendor)
+    }
+}
+
+/// The running server.
+#[derive(Debug)]
+pub struct Server {
+    options: Options,
+    address: SocketAddr,
+    to_task: mpsc::UnboundedSender<ToTask>,
+    busy: Arc<AtomicBool>,
+    stats: Arc<NorthStats>,
+    _state: ListenerState,
+    tasks: TaskTracker,
+}
+
+/// What [`Server::commit`] needs to apply new options: all that can fail is done.
+#[derive(Debug)]
+pub struct Change {
+    options: Options,
+    sockets: Option<Sockets>,
+}
+
+impl Server {
+    /// The address on which it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Prepares other options: binds a new address. Nothing changes for any client.
+    ///
+    /// # Errors
+    /// The address cannot be bound; everything is as before.
+    pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+        let sockets = match options.listen == self.options.listen {
+            true => None,
+            false => Some(bind(options.listen).await?),
+        };
+        Ok(Change { options, sockets })
+    }
+
+    /// Forgets prepared options.
+    pub fn abort(&mut self, change: Change) {
+        drop(change);
+    }
+
+    /// Applies prepared options.
+    pub fn commit(&mut self, change: Change) {
+        let Change { options, sockets } = change;
+        if let Some(sockets) = &sockets {
+            self.address = SocketAddr::V4(sockets.address);
+            self._state = self.stats.listeners.add(ServerKind::Bacnet, self.address);
+        }
+        self.options = options.clone();
+        // A task that has ended ends with the process.
+        let _ = self.to_task.send(ToTask::Apply(Box::new(options), sockets));
+    }
+
+    /// Takes no more from any client; what was begun is answered.
+    pub async fn retire(&mut self) {
+        let _ = self.to_task.send(ToTask::Retire);
+    }
+
+    /// Whether everybody was answered, after it retired.
+    pub fn is_drained(&self) -> bool {
+        !self.busy.load(Ordering::Relaxed)
+    }
+
+    /// Waits until it has ended, after the cancellation.
+    pub async fn stopped(&self) {
+        self.tasks.wait().await;
+    }
+}
+
+async fn bind(listen: SocketAddrV4) -> Result<Sockets, ServerError> {
+    Sockets::bind(listen).await.map_err(|cause| ServerError::Listen {
+        protocol: ServerKind::Bacnet.title(),
+        address: SocketAddr::V4(listen),
+        section: "[bacnet]".to_string(),
+        cause,
+    })
+}
+
+/// Binds the address and serves until `cancel`.
+///
+/// # Errors
+/// The address cannot be bound.
+pub async fn start(
+    options: Options,
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    cancel: CancellationToken,
+) -> Result<Server, ServerError> {
+    let sockets = bind(options.listen).await?;
+    let address = SocketAddr::V4(sockets.address);
+    let (to_task, from_server) = mpsc::unbounded_channel();
+    let (busy, tasks) = (Arc::new(AtomicBool::new(false)), TaskTracker::new());
+    let task = Task::new(options.clone(), sockets, plant, stats.clone(), busy.clone());
+    tasks.spawn(task.run(from_server, cancel));
+    tasks.close();
+    Ok(Server {
+        options,
+        address,
+        to_task,
+        busy,
+        _state: stats.listeners.add(ServerKind::Bacnet, address),
+        stats,
+        tasks,
+    })
+}

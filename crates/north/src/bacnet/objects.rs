@@ -1,0 +1,374 @@
+//! The objects of a drive and of the gateway (`docs/bacnet.md`). Numbers are fixed: object n means the same point at every drive; a
+//! point that a family lacks leaves a gap. Pure.
+
+use std::ops::RangeInclusive;
+use std::sync::Arc;
+
+use drivegate_bacnet::{Access as Written, Device, Kind, Mac, Object, ObjectId, ObjectType};
+
+use super::units;
+use crate::command::Commanded;
+use crate::drive::model::Kind as Values;
+use crate::drive::profile::Form;
+use crate::drive::{ModelPoint, Point, PollClass, Source, State};
+use crate::process_image::{Access, BusSpec, DriveSpec};
+
+/// Analog inputs from 1 on.
+const ANALOG: [ModelPoint; 12] = [
+    ModelPoint::ActualSpeed,
+    ModelPoint::OutputFrequency,
+    ModelPoint::MotorSpeed,
+    ModelPoint::MotorCurrent,
+    ModelPoint::MotorTorque,
+    ModelPoint::MotorPower,
+    ModelPoint::MotorVoltage,
+    ModelPoint::DcLinkVoltage,
+    ModelPoint::HeatsinkTemperature,
+    ModelPoint::Energy,
+    ModelPoint::OperatingHours,
+    ModelPoint::FaultCode,
+];
+/// Binary inputs from 1 on.
+const BINARY: [ModelPoint; 8] = [
+    ModelPoint::Ready,
+    ModelPoint::Running,
+    ModelPoint::Reversed,
+    ModelPoint::Fault,
+    ModelPoint::Warning,
+    ModelPoint::AtReference,
+    ModelPoint::ZeroSpeed,
+    ModelPoint::Remote,
+];
+/// What only counts up, or has no size: every change is told.
+const COUNTERS: [ModelPoint; 3] = [ModelPoint::Energy, ModelPoint::OperatingHours, ModelPoint::FaultCode];
+/// The first number of the points that only the profile has.
+const OWN: u32 = 100;
+/// The last state of an enumeration: a code without a text.
+const OTHER: &str = "other";
+
+/// What an object shows, or commands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Meaning {
+    /// That point of the profile.
+    Point(usize),
+    /// That point, an enumeration.
+    Enumeration(usize),
+    /// The state of the drive.
+    State,
+    /// The text of the active fault.
+    FaultText,
+    /// A command with priorities, and its point.
+    Slot(Commanded, usize),
+    /// A pulse, and its point.
+    Reset(usize),
+    /// Whether that bus is up.
+    BusUp(usize),
+    /// Load of that bus.
+    BusLoad(usize),
+}
+
+/// A device with the meaning of its objects, place by place.
+#[derive(Debug, Clone)]
+pub struct Shown {
+    /// What BACnet sees of it.
+    pub device: Arc<Device>,
+    /// What each object means.
+    pub meanings: Vec<Meaning>,
+}
+
+/// Objects with their meanings.
+#[derive(Default)]
+struct Objects(Vec<(Object, Meaning)>);
+
+impl Objects {
+    fn add(&mut self, id: (ObjectType, u32), texts: (&str, &str), kind: Kind, access: Written, meaning: Meaning) {
+        let object = Object {
+            id: ObjectId::new(id.0, id.1),
+            name: texts.0.into(),
+            description: texts.1.into(),
+            kind,
+            access,
+        };
+        self.0.push((object, meaning));
+    }
+}
+
+/// The device of a drive, whose instance is that of the gateway and its unit.
+pub fn of_drive(spec: &DriveSpec, gateway: (&str, u32)) -> Shown {
+    let mut all = Objects::default();
+    model(spec, &mut all);
+    if spec.access == Access::Control {
+        commands(spec, &mut all);
+    }
+    own(spec, &mut all);
+    let (objects, meanings) = all.0.into_iter().unzip();
+    let (name, instance) = gateway;
+    let device = Device::new(
+        instance + u32::from(spec.unit),
+        Mac::new(&[spec.unit]),
+        format!("{name}.{}", spec.name),
+        (spec.profile.name.clone(), spec.profile.title.clone()),
+        objects,
+    );
+    Shown {
+        device: Arc::new(device),
+        meanings,
+    }
+}
+
+/// The device of the gateway.
+pub fn of_gateway<'b>((name, instance): (&str, u32), buses: impl Iterator<Item = &'b BusSpec>) -> Shown {
+    let mut all = Objects::default();
+    for (place, (number, bus)) in (1..).zip(buses).enumerate() {
+        let (up, load) = (format!("{}.up", bus.name), format!("{}.load", bus.name));
+        let texts = (up.as_str(), "the port of the bus is open");
+        all.add(
+            (ObjectType::BINARY_INPUT, number),
+            texts,
+            binary(None),
+            Written::Read,
+            Meaning::BusUp(place),
+        );
+        let kind = Kind::Analog {
+            units: units::number("%"),
+            resolution: 0.1,
+            range: Some((0.0, 100.0)),
+            increment: 1.0,
+        };
+        let texts = (load.as_str(), "share of the last second in which the line was in use");
+        all.add(
+            (ObjectType::ANALOG_INPUT, number),
+            texts,
+            kind,
+            Written::Read,
+            Meaning::BusLoad(place),
+        );
+    }
+    let (objects, meanings) = all.0.into_iter().unzip();
+    let about = ("drivegate".to_string(), "gateway to drives".to_string());
+    Shown {
+        device: Arc::new(Device::new(instance, None, name.to_string(), about, objects)),
+        meanings,
+    }
+}
+
+/// The points of the common model.
+fn model(spec: &DriveSpec, all: &mut Objects) {
+    let index = |point: ModelPoint| spec.profile.model_index(point);
+    for (number, point) in (1..).zip(ANALOG) {
+        if let Some(index) = index(point) {
+            let kind = analog(spec, index, Some(point), None);
+            let texts = (point.name(), describe(spec, index));
+            all.add(
+                (ObjectType::ANALOG_INPUT, number),
+                (texts.0, &texts.1),
+                kind,
+                Written::Read,
+                Meaning::Point(index),
+            );
+        }
+    }
+    for (number, point) in (1..).zip(BINARY) {
+        if let Some(index) = index(point) {
+            let texts = (point.name(), describe(spec, index));
+            let kind = binary(spec.profile.points.get(index));
+            all.add(
+                (ObjectType::BINARY_INPUT, number),
+                (texts.0, &texts.1),
+                kind,
+                Written::Read,
+                Meaning::Point(index),
+            );
+        }
+    }
+    let states: Vec<String> = State::ALL.iter().map(|state| state.name().to_string()).collect();
+    let kind = Kind::MultiState { texts: states.into() };
+    let texts = ("state", "the drive in one word");
+    all.add(
+        (ObjectType::MULTI_STATE_INPUT, 1),
+        texts,
+        kind,
+        Written::Read,
+        Meaning::State,
+    );
+    if index(ModelPoint::FaultCode).is_some() {
+        let texts = ("fault_text", "text of the active fault");
+        all.add(
+            (ObjectType::CHARACTERSTRING_VALUE, 1),
+            texts,
+            Kind::Text,
+            Written::Read,
+            Meaning::FaultText,
+        );
+    }
+}
+
+/// What a controlled drive takes.
+fn commands(spec: &DriveSpec, all: &mut Objects) {
+    let bits = [
+        (1, ModelPoint::Run, Some(Commanded::Run)),
+        (2, ModelPoint::Reverse, Some(Commanded::Reverse)),
+        (3, ModelPoint::FaultReset, None),
+    ];
+    for (number, point, slot) in bits {
+        let Some(index) = spec.profile.model_index(point) else {
+            continue;
+        };
+        let meaning = slot.map_or(Meaning::Reset(index), |slot| Meaning::Slot(slot, index));
+        let texts = (point.name(), describe(spec, index));
+        let kind = binary(None);
+        all.add(
+            (ObjectType::BINARY_VALUE, number),
+            (texts.0, &texts.1),
+            kind,
+            Written::Command,
+            meaning,
+        );
+    }
+    let references = [
+        (1, ModelPoint::SpeedReference, Commanded::SpeedReference),
+        (2, ModelPoint::FrequencyReference, Commanded::FrequencyReference),
+    ];
+    for (number, point, slot) in references {
+        let Some(index) = spec.profile.model_index(point) else {
+            continue;
+        };
+        let kind = analog(spec, index, Some(point), spec.limits_of(index));
+        let texts = (point.name(), describe(spec, index));
+        let meaning = Meaning::Slot(slot, index);
+        all.add(
+            (ObjectType::ANALOG_VALUE, number),
+            (texts.0, &texts.1),
+            kind,
+            Written::Command,
+            meaning,
+        );
+    }
+}
+
+/// The points that only the profile has, in its order, counted over all types.
+fn own(spec: &DriveSpec, all: &mut Objects) {
+    let profile = &spec.profile;
+    let own = profile
+        .points
+        .iter()
+        .enumerate()
+        .filter(|(_, point)| point.model.is_none() && !point.hidden);
+    for (number, (index, point)) in (OWN..).zip(own) {
+        let writable = point.write && spec.access == Access::Control;
+        let unread = point.raw().is_some() && point.class == PollClass::Never;
+        if unread && !writable {
+            continue;
+        }
+        let access = if writable { Written::Write } else { Written::Read };
+        let of_type = |input: ObjectType, value: ObjectType| if writable { value } else { input };
+        let texts = (point.name.as_str(), describe(spec, index));
+        let texts = (texts.0, texts.1.as_str());
+        match point.kind() {
+            Values::Bool => {
+                let kind = of_type(ObjectType::BINARY_INPUT, ObjectType::BINARY_VALUE);
+                all.add(
+                    (kind, number),
+                    texts,
+                    binary(Some(point)),
+                    access,
+                    Meaning::Point(index),
+                );
+            }
+            Values::Integer if !point.texts.is_empty() && !writable => {
+                let states = point.texts.values().cloned().chain([OTHER.to_string()]);
+                let kind = Kind::MultiState {
+                    texts: states.collect::<Vec<_>>().into(),
+                };
+                let id = (ObjectType::MULTI_STATE_INPUT, number);
+                all.add(id, texts, kind, Written::Read, Meaning::Enumeration(index));
+            }
+            // Texts are objects of a kind that few clients read.
+            Values::Text => {}
+            Values::Integer | Values::Number => {
+                let kind = of_type(ObjectType::ANALOG_INPUT, ObjectType::ANALOG_VALUE);
+                let limits = spec.limits_of(index).filter(|_| writable);
+                let analog = analog(spec, index, None, limits);
+                all.add((kind, number), texts, analog, access, Meaning::Point(index));
+            }
+        }
+    }
+}
+
+/// The state of an enumeration, from 1: the place of its code among those with texts.
+pub(super) fn state_of(point: &Point, code: i64) -> u32 {
+    let place = point
+        .texts
+        .keys()
+        .position(|known| *known == code)
+        .unwrap_or(point.texts.len());
+    u32::try_from(place + 1).unwrap_or(u32::MAX)
+}
+
+fn describe(spec: &DriveSpec, index: usize) -> String {
+    let Some(point) = spec.profile.points.get(index) else {
+        return String::new();
+    };
+    let words = point.name.replace('_', " ");
+    let unverified = if point.verified {
+        ""
+    } else {
+        "; not confirmed by a manual"
+    };
+    match point.note.is_empty() {
+        true => format!("{words}{unverified}"),
+        false => format!("{words}: {}{unverified}", point.note),
+    }
+}
+
+fn binary(point: Option<&Point>) -> Kind {
+    let text = |code: i64, otherwise: &str| -> Arc<str> {
+        let text = point.and_then(|point| point.texts.get(&code));
+        Arc::from(text.map_or(otherwise, String::as_str))
+    };
+    Kind::Binary {
+        texts: [text(0, "inactive"), text(1, "active")],
+    }
+}
+
+fn analog(spec: &DriveSpec, index: usize, model: Option<ModelPoint>, limits: Option<RangeInclusive<f64>>) -> Kind {
+    let point = spec.profile.points.get(index);
+    let unit = point.map_or("", |point| point.unit.as_str());
+    let raw = raw_of(spec, index, 4);
+    let resolution = match raw.map(|(form, scale)| (form, scale.abs())) {
+        Some((Form::F32, _)) | None => 0.01,
+        Some((_, scale)) => scale as f32,
+    };
+    let span = raw.and_then(|(form, scale)| {
+        let (low, high) = match form {
+            Form::U16 => (0.0, f64::from(u16::MAX)),
+            Form::I16 => (f64::from(i16::MIN), f64::from(i16::MAX)),
+            _ => return None,
+        };
+        Some((low * scale, high * scale))
+    });
+    let is_raw = point.is_some_and(|point| matches!(point.source, Source::Raw(_)));
+    let range = limits
+        .map(|limits| (*limits.start(), *limits.end()))
+        .or(span.filter(|_| is_raw));
+    let counts = model.is_some_and(|model| COUNTERS.contains(&model));
+    Kind::Analog {
+        units: units::number(unit),
+        resolution,
+        range: range.map(|(low, high)| (low as f32, high as f32)),
+        increment: if counts { 1.0 } else { 10.0 * resolution },
+    }
+}
+
+/// Form and scale of the register behind a point.
+fn raw_of(spec: &DriveSpec, index: usize, depth: usize) -> Option<(Form, f64)> {
+    let point = spec.profile.points.get(index)?;
+    match &point.source {
+        Source::Raw(raw) => Some((raw.form, raw.scale)),
+        Source::Derived(derived) if depth > 0 => {
+            let first = derived.sources().next()?;
+            raw_of(spec, first, depth - 1)
+        }
+        Source::Derived(_) => None,
+    }
+}

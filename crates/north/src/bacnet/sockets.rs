@@ -1,0 +1,133 @@
+//! The sockets: one for what comes to this host, one for broadcasts, which Linux gives to a socket that is bound to their address.
+
+use std::io;
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
+
+use rustix::net::{AddressFamily, SocketFlags, SocketType, bind, socket_with, sockopt};
+use tokio::net::UdpSocket;
+
+/// The sockets of a server.
+#[derive(Debug)]
+pub(super) struct Sockets {
+    pub(super) address: SocketAddrV4,
+    /// Bits of the mask of the network; 0 is not known.
+    pub(super) prefix: u8,
+    pub(super) broadcast_to: SocketAddrV4,
+    pub(super) unicast: UdpSocket,
+    pub(super) broadcast: Option<UdpSocket>,
+}
+
+impl Sockets {
+    /// Binds them.
+    ///
+    /// # Errors
+    /// The address cannot be used.
+    pub(super) async fn bind(listen: SocketAddrV4) -> io::Result<Sockets> {
+        let unicast = UdpSocket::bind(SocketAddr::V4(listen)).await?;
+        unicast.set_broadcast(true)?;
+        let port = unicast.local_addr()?.port();
+        let address = SocketAddrV4::new(*listen.ip(), port);
+        // Without the table of routes nothing but the widest broadcast is known.
+        let routes = std::fs::read_to_string("/proc/net/route").unwrap_or_default();
+        let prefix = prefix(*listen.ip(), &routes);
+        let to = broadcast_of(*listen.ip(), prefix);
+        let broadcast_to = SocketAddrV4::new(to, port);
+        // A socket that is bound to no address hears broadcasts itself.
+        let broadcast = match listen.ip().is_unspecified() {
+            true => None,
+            false => Some(shared(broadcast_to)?),
+        };
+        Ok(Sockets {
+            address,
+            prefix,
+            broadcast_to,
+            unicast,
+            broadcast,
+        })
+    }
+}
+
+/// A socket for broadcasts, which other programs of this host may hear, too.
+fn shared(address: SocketAddrV4) -> io::Result<UdpSocket> {
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    let socket = socket_with(AddressFamily::INET, SocketType::DGRAM, flags, None)?;
+    sockopt::set_socket_reuseaddr(&socket, true)?;
+    bind(&socket, &address)?;
+    UdpSocket::from_std(std::net::UdpSocket::from(socket))
+}
+
+/// Bits of the mask of the network of an address, by the table of routes; 0 is not known.
+fn prefix(address: Ipv4Addr, routes: &str) -> u8 {
+    if address.is_loopback() {
+        return 8;
+    }
+    let networks = routes.lines().skip(1).filter_map(|line| {
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        let number = |place: usize| Some(u32::from_str_radix(fields.get(place)?, 16).ok()?.swap_bytes());
+        // Those that a gateway leads to are not on the interface.
+        let (network, gateway, mask) = (number(1)?, number(2)?, number(7)?);
+        let own = gateway == 0 && mask != 0 && u32::from(address) & mask == network;
+        own.then_some(mask.leading_ones())
+    });
+    let longest = networks.filter(|bits| *bits < 31).max();
+    longest.and_then(|bits| u8::try_from(bits).ok()).unwrap_or(0)
+}
+
+fn broadcast_of(address: Ipv4Addr, prefix: u8) -> Ipv4Addr {
+    match prefix {
+        0 => Ipv4Addr::BROADCAST,
+        bits => Ipv4Addr::from(u32::from(address) | u32::MAX.checked_shr(bits.into()).unwrap_or(0)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ROUTES: &str = "Iface\tDestination\tGateway \tFlags\tRefCnt\tUse\tMetric\tMask\t\tMTU\tWindow\tIRTT\n\
+        eth0\t00000000\t010200C0\t0003\t0\t0\t0\t00000000\t0\t0\t0\n\
+        eth0\t000200C0\t00000000\t0001\t0\t0\t0\t00FFFFFF\t0\t0\t0\n\
+        eth1\t0000000A\t00000000\t0001\t0\t0\t0\t000000FF\t0\t0\t0\n\
+        eth1\t0000010A\t0100000A\t0003\t0\t0\t0\t0000FFFF\t0\t0\t0\n";
+
+    #[test]
+    fn broadcasts_go_to_the_network_of_the_interface() {
+        let cases = [
+            ("192.0.2.7", 24, "192.0.2.255"),
+            ("10.1.2.3", 8, "10.255.255.255"),
+            ("127.0.0.1", 8, "127.255.255.255"),
+            ("172.16.0.1", 0, "255.255.255.255"),
+            ("0.0.0.0", 0, "255.255.255.255"),
+        ];
+        for (address, bits, broadcast) in cases {
+            let address: Ipv4Addr = address.parse().unwrap();
+            let prefix = prefix(address, ROUTES);
+            assert_eq!(
+                (prefix, broadcast_of(address, prefix)),
+                (bits, broadcast.parse().unwrap()),
+                "{address}"
+            );
+        }
+        assert_eq!(prefix("192.0.2.7".parse().unwrap(), "broken\nx y z"), 0);
+    }
+
+    #[tokio::test]
+    async fn what_is_broadcast_is_heard() {
+        let sockets = Sockets::bind("127.0.0.3:0".parse().unwrap()).await.unwrap();
+        let other = UdpSocket::bind("127.0.0.4:0").await.unwrap();
+        other.set_broadcast(true).unwrap();
+        other.send_to(b"all", sockets.broadcast_to).await.unwrap();
+        let mut buffer = [0; 8];
+        let heard = sockets
+            .broadcast
+            .as_ref()
+            .unwrap()
+            .recv_from(&mut buffer)
+            .await
+            .unwrap();
+        assert_eq!(
+            (&buffer[..heard.0], heard.1),
+            (&b"all"[..], other.local_addr().unwrap())
+        );
+    }
+}

@@ -1,0 +1,223 @@
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use drivegate_bacnet::{Application as _, Datum, Error, Job, ObjectId, ObjectType, Reliability};
+use drivegate_testkit::next_command;
+
+use super::view::View;
+use super::writes::{Begun, Waiting};
+use super::*;
+use crate::codec::{LineFormat, Protocol, Reply, Table};
+use crate::command::{Authority, CommandQueue, Order, Origin, Outcome, Refusal, Settled, SourceKind, Urgency};
+use crate::drive::profile::Profiles;
+use crate::drive::{ModelPoint, Value};
+use crate::plant::{BusHandle, DriveHandle, Plant};
+use crate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link};
+
+mod objects;
+mod orders;
+
+const RUN: ObjectId = ObjectId::new(ObjectType::BINARY_VALUE, 1);
+const SPEED: ObjectId = ObjectId::new(ObjectType::ANALOG_VALUE, 1);
+const FREQUENCY: ObjectId = ObjectId::new(ObjectType::ANALOG_VALUE, 2);
+const DEVICE: u32 = 101;
+
+fn bus_spec() -> BusSpec {
+    BusSpec {
+        name: "line1".to_string(),
+        port: "/dev/null".to_string(),
+        protocol: Protocol::ModbusRtu,
+        format: LineFormat::new(38_400, "8N1").unwrap(),
+        cycle: Duration::from_millis(10),
+        slow_cycle: Duration::from_secs(1),
+    }
+}
+
+fn spec(profile: &str) -> DriveSpec {
+    let profile = Profiles::built_in().get(profile).unwrap().clone();
+    DriveSpec {
+        access: Access::Control,
+        limits: [("speed_reference".to_string(), 0.0..=80.0)].into(),
+        frequency_range: Some(0.0..=50.0),
+        ..DriveSpec::new("p1", "line1", 1, profile)
+    }
+}
+
+fn options() -> Options {
+    let everywhere = || vec!["127.0.0.0/8".parse().unwrap()];
+    Options {
+        listen: "127.0.0.1:0".parse().unwrap(),
+        device: 100,
+        network: 1001,
+        offline: WhenOffline::Silent,
+        commands: true,
+        allow: everywhere(),
+        write: everywhere(),
+        keep_priorities: false,
+        bbmd: None,
+        vendor: 0,
+        dcc_password: None,
+        buses: None,
+        state_dir: "/nonexistent".into(),
+    }
+}
+
+/// A controlled Vacon NX that answers, and clients.
+struct Bench {
+    view: View,
+    now: Instant,
+}
+
+impl Bench {
+    fn new() -> Bench {
+        let image = Arc::new(DriveImage::new(spec("vacon-nx"), Duration::from_secs(1)));
+        let bus = Arc::new(BusImage::new(bus_spec(), vec![image]));
+        bus.update_health(|health| (health.up, health.tried) = (true, true));
+        let handle = BusHandle {
+            image: bus,
+            queue: Arc::new(CommandQueue::new().unwrap()),
+        };
+        let plant = Plant {
+            gateway: "hall".to_string(),
+            stale_after: Duration::from_secs(1),
+            buses: vec![handle],
+            events: Default::default(),
+            writes: Default::default(),
+            recordings: Default::default(),
+            parameters: Default::default(),
+            history: Default::default(),
+        };
+        let bench = Bench {
+            view: View::new(Arc::new(plant), Arc::new(options())),
+            now: Instant::now(),
+        };
+        bench.read(0);
+        bench
+    }
+
+    fn drive(&self) -> DriveHandle {
+        self.view.plant.drive("p1").unwrap()
+    }
+
+    /// Everything that is planned was read just now, each register that value.
+    fn read(&self, word: u16) {
+        let drive = self.drive();
+        drive.image.update(|snapshot| {
+            snapshot.link = Link::Online(std::time::SystemTime::now());
+            snapshot.fast_at = Some(self.now);
+            for read in &drive.image.plan.reads {
+                snapshot.store(read.table, read.start, &vec![word; usize::from(read.count)], self.now);
+            }
+        });
+        self.view.look(self.now);
+    }
+
+    fn place(&self, object: ObjectId) -> usize {
+        let devices = self.view.devices();
+        devices
+            .iter()
+            .find(|device| device.instance == DEVICE)
+            .unwrap()
+            .find(object)
+            .unwrap()
+    }
+
+    fn begin(&self, client: &str, object: ObjectId, priority: u8, value: Option<Datum>) -> Begun {
+        let job = Job {
+            token: 1,
+            from: format!("{client}:47808").parse().unwrap(),
+            device: DEVICE,
+            place: self.place(object),
+            object,
+            value,
+            priority: Some(priority),
+            asked: self.now,
+        };
+        writes::begin(&self.view, &job, self.now)
+    }
+
+    /// What is refused, or done, at once.
+    fn at_once(&self, client: &str, object: ObjectId, priority: u8, value: Option<Datum>) -> Result<(), Error> {
+        match self.begin(client, object, priority, value) {
+            Begun::Answered(result) => result,
+            Begun::Waits(mut waiting) => {
+                let answer = waiting.placed.answer().expect("it waits for the drive");
+                self.settle(&waiting, &answer.outcome);
+                writes::error(&answer.outcome)
+            }
+        }
+    }
+
+    /// What becomes an order, with its outcome: point, value and client.
+    fn order(&self, client: &str, object: ObjectId, priority: u8, value: Option<Datum>, outcome: Outcome) -> String {
+        let Begun::Waits(mut waiting) = self.begin(client, object, priority, value) else {
+            panic!("no order");
+        };
+        let ordered = self.carry_out(outcome);
+        let answer = waiting.placed.answer().unwrap();
+        self.settle(&waiting, &answer.outcome);
+        ordered
+    }
+
+    fn settle(&self, waiting: &Waiting, outcome: &Outcome) {
+        if let Some(slot) = waiting.slot {
+            self.drive()
+                .priorities(|all| all.settle(slot, Settled::of(outcome), self.now));
+        }
+    }
+
+    /// The bus takes the next order, which ends so.
+    fn carry_out(&self, outcome: Outcome) -> String {
+        let drive = self.drive();
+        let command = next_command(&mut drive.bus.queue.lock(), Urgency::Read, self.now).expect("an order");
+        let Order::Points(values) = &command.order else {
+            panic!("{:?}", command.order)
+        };
+        let name = |index: usize| drive.image.spec.profile.points[index].name.clone();
+        let values: Vec<String> = values
+            .iter()
+            .map(|(index, value)| format!("{}={value}", name(*index)))
+            .collect();
+        let text = format!("{} by {}", values.join(" "), command.ticket.origin().client());
+        command.answer(&outcome, self.now);
+        text
+    }
+
+    /// What stands in a slot, for a reader.
+    fn slots(&self, object: ObjectId) -> Vec<(u8, Datum)> {
+        let commands = self.view.commands(DEVICE, self.place(object)).unwrap();
+        (1..)
+            .zip(commands.slots)
+            .filter_map(|(priority, slot)| Some((priority, slot?.value)))
+            .collect()
+    }
+
+    fn shown(&self, object: ObjectId) -> Datum {
+        self.view.sample(DEVICE, self.place(object)).value.unwrap()
+    }
+
+    /// An order of an MQTT client; the refusal, if it is refused.
+    fn set_elsewhere(&self, point: ModelPoint, value: Value) -> Option<Refusal> {
+        let drive = self.drive();
+        let index = drive.image.spec.profile.model_index(point).unwrap();
+        let origin = Origin::new(SourceKind::Mqtt, "cloud");
+        let order = Order::Points(vec![(index, value)]);
+        let mut placed = drive.place(order, origin, Authority::Write, Duration::from_secs(2), self.now);
+        match placed.answer().map(|answer| answer.outcome) {
+            Some(Outcome::Refused(refusal)) => Some(refusal),
+            _ => None,
+        }
+    }
+}
+
+fn done() -> Outcome {
+    Outcome::Acknowledged(Reply::Written)
+}
+
+fn on(active: bool) -> Option<Datum> {
+    Some(Datum::Bool(active))
+}
+
+fn number(value: f64) -> Option<Datum> {
+    Some(Datum::Number(value))
+}

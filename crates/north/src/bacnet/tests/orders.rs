@@ -1,0 +1,189 @@
+use super::*;
+
+const NULL: Option<Datum> = None;
+
+#[test]
+fn a_slot_that_governs_is_an_order_and_stands_when_the_drive_took_it() {
+    let bench = Bench::new();
+    assert_eq!(
+        bench.order("127.0.0.5", RUN, 8, on(true), done()),
+        "run=true by bacnet 127.0.0.5"
+    );
+    assert_eq!(bench.slots(RUN), [(8, Datum::Bool(true))]);
+    assert_eq!(bench.shown(RUN), Datum::Bool(true));
+    assert_eq!(
+        bench.at_once("127.0.0.6", RUN, 10, on(false)),
+        Ok(()),
+        "it does not govern"
+    );
+    assert_eq!(
+        bench.order("127.0.0.7", RUN, 5, on(false), done()),
+        "run=false by bacnet 127.0.0.7"
+    );
+    assert_eq!(
+        bench.order("127.0.0.7", RUN, 5, NULL, done()),
+        "run=true by bacnet 127.0.0.5",
+        "an order of its owner"
+    );
+    assert_eq!(
+        bench.order("127.0.0.5", RUN, 8, NULL, done()),
+        "run=false by bacnet 127.0.0.6"
+    );
+    assert_eq!(
+        bench.order("127.0.0.6", RUN, 10, NULL, done()),
+        "run=false by bacnet 127.0.0.6",
+        "the last one: a stop"
+    );
+    assert_eq!(bench.slots(RUN), []);
+    assert_eq!(bench.at_once("127.0.0.6", RUN, 10, NULL), Ok(()), "was empty");
+}
+
+#[test]
+fn what_failed_leaves_the_slot_and_what_is_unknown_leaves_what_is_read() {
+    let mut bench = Bench::new();
+    bench.order("127.0.0.5", RUN, 8, on(true), done());
+    bench.order(
+        "127.0.0.5",
+        RUN,
+        8,
+        on(false),
+        Outcome::Exception(crate::codec::Exception::DEVICE_FAILURE),
+    );
+    assert_eq!(bench.slots(RUN), [(8, Datum::Bool(true))]);
+    bench.order("127.0.0.5", RUN, 8, on(false), Outcome::TimedOut);
+    assert_eq!(bench.slots(RUN), []);
+    bench.now += Duration::from_millis(50);
+    bench.read(0);
+    let drive = bench.drive();
+    let reading = drive.reading(bench.now);
+    drive.priorities(|all| {
+        all.resolve(|what, since| {
+            let sample = reading.model(what.point());
+            sample.good().filter(|_| sample.at.is_some_and(|at| at > since))
+        });
+    });
+    assert_eq!(bench.slots(RUN), [(8, Datum::Bool(false))], "the drive shows the stop");
+}
+
+#[test]
+fn errors_say_what_happened() {
+    use crate::codec::Exception;
+    use crate::command::Interruption;
+    let cases = [
+        (
+            Outcome::Exception(Exception::DEVICE_FAILURE),
+            Error::OPERATIONAL_PROBLEM,
+        ),
+        (Outcome::NotTaken(String::new()), Error::OPERATIONAL_PROBLEM),
+        (Outcome::TimedOut, Error::TIMEOUT),
+        (Outcome::Interrupted(Interruption::Stop), Error::TIMEOUT),
+        (Outcome::Offline, Error::TIMEOUT),
+        (Outcome::Purged, Error::SERVICE_REQUEST_DENIED),
+        (
+            Outcome::Refused(Refusal::NotAllowed(String::new())),
+            Error::SERVICE_REQUEST_DENIED,
+        ),
+        (
+            Outcome::Refused(Refusal::BadValue(String::new())),
+            Error::VALUE_OUT_OF_RANGE,
+        ),
+        (
+            Outcome::Refused(Refusal::NotWritable(String::new())),
+            Error::WRITE_ACCESS_DENIED,
+        ),
+    ];
+    for (outcome, error) in cases {
+        assert_eq!(writes::error(&outcome), Err(error), "{outcome:?}");
+    }
+    let bench = Bench::new();
+    assert_eq!(
+        bench.at_once("127.0.0.5", SPEED, 8, number(80.5)),
+        Err(Error::VALUE_OUT_OF_RANGE),
+        "the limits"
+    );
+    assert_eq!(
+        bench.at_once("127.0.0.5", RUN, 6, on(false)),
+        Err(Error::WRITE_ACCESS_DENIED),
+        "minimum on and off times"
+    );
+    assert_eq!(bench.slots(SPEED), []);
+}
+
+#[test]
+fn both_references_are_one_thing_and_each_shows_its_unit() {
+    let bench = Bench::new();
+    assert_eq!(
+        bench.order("127.0.0.5", SPEED, 8, number(50.0), done()),
+        "speed_reference=50 by bacnet 127.0.0.5"
+    );
+    assert_eq!(
+        (bench.shown(SPEED), bench.shown(FREQUENCY)),
+        (Datum::Number(50.0), Datum::Number(25.0))
+    );
+    assert_eq!(bench.at_once("127.0.0.6", FREQUENCY, 9, number(10.0)), Ok(()));
+    let order = bench.order("127.0.0.6", FREQUENCY, 7, number(20.0), done());
+    assert_eq!(order, "speed_reference=40 by bacnet 127.0.0.6");
+    assert_eq!(
+        (bench.shown(SPEED), bench.shown(FREQUENCY)),
+        (Datum::Number(40.0), Datum::Number(20.0))
+    );
+    assert_eq!(
+        bench.order("127.0.0.6", FREQUENCY, 7, NULL, done()),
+        "speed_reference=50 by bacnet 127.0.0.5"
+    );
+}
+
+#[test]
+fn a_stop_set_elsewhere_withdraws_and_a_slot_that_protects_refuses() {
+    let bench = Bench::new();
+    bench.order("127.0.0.5", RUN, 8, on(true), done());
+    assert_eq!(bench.set_elsewhere(ModelPoint::Run, Value::Bool(false)), None);
+    assert_eq!(bench.slots(RUN), []);
+    bench.carry_out(done());
+    bench.order("127.0.0.5", RUN, 3, on(false), done());
+    let refused = bench.set_elsewhere(ModelPoint::Run, Value::Bool(true)).unwrap();
+    assert_eq!(refused.code(), "held_by_other");
+    assert!(
+        refused.to_string().contains("127.0.0.5") && refused.to_string().contains("priority 3"),
+        "{refused}"
+    );
+    assert_eq!(
+        bench.set_elsewhere(ModelPoint::Run, Value::Bool(false)),
+        None,
+        "a stop passes"
+    );
+    bench.carry_out(done());
+    assert_eq!(bench.slots(RUN), [(3, Datum::Bool(false))]);
+    bench.order("127.0.0.5", RUN, 3, NULL, done());
+    assert_eq!(bench.set_elsewhere(ModelPoint::Run, Value::Bool(true)), None);
+}
+
+#[test]
+fn who_comes_to_govern_is_judged_anew_and_gives_its_slot_back_when_refused() {
+    let bench = Bench::new();
+    bench.order("127.0.0.5", RUN, 8, on(true), done());
+    bench.order("127.0.0.7", RUN, 5, on(false), done());
+    let drive = bench.drive();
+    drive
+        .image
+        .hold
+        .set(Some("its parameters are being restored".to_string()));
+    let order = bench.order("127.0.0.7", RUN, 5, NULL, done());
+    assert_eq!(
+        order, "run=false by bacnet 127.0.0.7",
+        "nothing is left, so it is a stop"
+    );
+    assert_eq!(bench.slots(RUN), []);
+}
+
+#[test]
+fn a_pulse_leaves_nothing_behind() {
+    let bench = Bench::new();
+    let reset = ObjectId::new(ObjectType::BINARY_VALUE, 3);
+    assert_eq!(
+        bench.order("127.0.0.5", reset, 8, on(true), done()),
+        "fault_reset=true by bacnet 127.0.0.5"
+    );
+    assert_eq!((bench.slots(reset), bench.shown(reset)), (vec![], Datum::Bool(false)));
+    assert_eq!(bench.at_once("127.0.0.5", reset, 8, on(false)), Ok(()));
+}

@@ -1,0 +1,353 @@
+//! The plant as BACnet sees it at one time: what each object shows, which device answers.
+
+use std::cell::Cell;
+use std::collections::HashMap;
+use std::net::{IpAddr, Ipv4Addr};
+use std::sync::Arc;
+use std::time::{Instant, SystemTime};
+
+use drivegate_bacnet::services::WriteItem;
+use drivegate_bacnet::{
+    Address, Application, Commands, Data, DateTime, Datum, Device, ObjectId, ObjectType, PropertyId, Reliability,
+    Sample, Slot, ValueSource,
+};
+use subtle::ConstantTimeEq as _;
+
+use super::objects::{self, Meaning, Shown};
+use super::{Options, WhenOffline};
+use crate::codec::Table;
+use crate::command::{self, Commanded, Entry, Origin, Priorities, SourceKind};
+use crate::drive::{ModelPoint, Quality, Source, Value};
+use crate::plant::{BusHandle, DriveHandle, Plant};
+use crate::process_image::{Reading, Unavailable};
+
+/// The run command of every drive.
+const RUN: ObjectId = ObjectId::new(ObjectType::BINARY_VALUE, 1);
+
+/// A drive that is shown.
+#[derive(Debug)]
+pub(super) struct ShownDrive {
+    pub(super) handle: DriveHandle,
+    pub(super) shown: Shown,
+}
+
+/// The plant and how it is shown.
+#[derive(Debug)]
+pub(super) struct View {
+    pub(super) plant: Arc<Plant>,
+    pub(super) options: Arc<Options>,
+    gateway: Shown,
+    pub(super) drives: HashMap<u32, ShownDrive>,
+    buses: Vec<BusHandle>,
+    /// When it is looked at, by both clocks.
+    now: Cell<(Instant, SystemTime)>,
+}
+
+impl View {
+    pub(super) fn new(plant: Arc<Plant>, options: Arc<Options>) -> View {
+        let name = plant.gateway.clone();
+        let gateway = (name.as_str(), options.device);
+        let is_served = |bus: &BusHandle| options.serves(&bus.image.spec.name);
+        let buses: Vec<BusHandle> = plant.buses.clone();
+        let served = plant.drives().filter(|drive| is_served(&drive.bus));
+        let drives = served.map(|handle| {
+            let shown = objects::of_drive(&handle.image.spec, gateway);
+            (shown.device.instance, ShownDrive { handle, shown })
+        });
+        let drives = drives.collect();
+        let shown = objects::of_gateway(gateway, buses.iter().map(|bus| &bus.image.spec));
+        View {
+            gateway: shown,
+            drives,
+            buses,
+            plant,
+            options,
+            now: Cell::new((Instant::now(), SystemTime::now())),
+        }
+    }
+
+    /// The devices, that of the gateway first.
+    pub(super) fn devices(&self) -> Vec<Arc<Device>> {
+        let mut drives: Vec<_> = self.drives.values().map(|drive| drive.shown.device.clone()).collect();
+        drives.sort_by_key(|device| device.instance);
+        [self.gateway.device.clone()].into_iter().chain(drives).collect()
+    }
+
+    /// It is looked at now.
+    pub(super) fn look(&self, now: Instant) {
+        self.now.set((now, SystemTime::now()));
+    }
+
+    fn wall(&self, at: Instant) -> DateTime {
+        let (now, wall) = self.now.get();
+        let then = wall.checked_sub(now.saturating_duration_since(at)).unwrap_or(wall);
+        let since = then.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        DateTime::from_unix_ms(u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
+    }
+
+    fn meaning(&self, device: u32, place: usize) -> Option<Meaning> {
+        let shown = match self.drives.get(&device) {
+            Some(drive) => &drive.shown,
+            None => &self.gateway,
+        };
+        shown.meanings.get(place).copied()
+    }
+
+    /// What an object of a drive means.
+    pub(super) fn of_drive(&self, device: u32, place: usize) -> Option<(&DriveHandle, Meaning)> {
+        let drive = self.drives.get(&device)?;
+        Some((&drive.handle, drive.shown.meanings.get(place).copied()?))
+    }
+
+    fn of_bus(&self, meaning: Meaning) -> Sample {
+        let (Meaning::BusUp(place) | Meaning::BusLoad(place)) = meaning else {
+            return NOTHING;
+        };
+        let Some(bus) = self.buses.get(place) else {
+            return NOTHING;
+        };
+        let health = bus.image.health();
+        let (value, known) = match meaning {
+            Meaning::BusUp(_) => (Datum::Bool(health.up), true),
+            _ => {
+                let percent = (health.load.unwrap_or(0.0) * 1000.0).round() / 10.0;
+                (Datum::Number(percent), health.load.is_some())
+            }
+        };
+        Sample {
+            value: Some(value),
+            reliability: if known {
+                Reliability::NoFault
+            } else {
+                Reliability::CommunicationFailure
+            },
+            at: Some(self.clock()),
+        }
+    }
+
+    fn shows(&self, handle: &DriveHandle, meaning: Meaning) -> Sample {
+        let reading = handle.reading(self.now.get().0);
+        match meaning {
+            Meaning::Point(index) => self.point(&reading, index, |value| match value {
+                Value::Bool(on) => Datum::Bool(on),
+                value => Datum::Number(value.as_f64()),
+            }),
+            Meaning::Enumeration(index) => {
+                let point = reading.spec.profile.points.get(index);
+                let state = |value: Value| point.map_or(1, |point| objects::state_of(point, value.as_f64() as i64));
+                self.point(&reading, index, |value| Datum::State(state(value)))
+            }
+            Meaning::State => self.state(&reading),
+            Meaning::FaultText => self.fault_text(&reading),
+            Meaning::Slot(what, index) => {
+                let sample = self.drive_has(&reading, what, index);
+                let slot = handle.priorities(|all| governed(&reading, all, what, index));
+                Sample {
+                    value: slot.or(sample.value),
+                    ..sample
+                }
+            }
+            // A pulse is over when it can be read.
+            Meaning::Reset(index) => Sample {
+                value: Some(Datum::Bool(false)),
+                ..self.point(&reading, index, |value| Datum::Bool(value.as_bool()))
+            },
+            Meaning::BusUp(_) | Meaning::BusLoad(_) => NOTHING,
+        }
+    }
+
+    /// What the drive has of a command.
+    fn drive_has(&self, reading: &Reading<'_>, what: Commanded, index: usize) -> Sample {
+        self.point(reading, index, |value| match what {
+            Commanded::Run | Commanded::Reverse => Datum::Bool(value.as_bool()),
+            _ => Datum::Number(value.as_f64()),
+        })
+    }
+
+    fn point(&self, reading: &Reading<'_>, index: usize, datum: impl Fn(Value) -> Datum) -> Sample {
+        let sample = reading.sample(index);
+        let reliability = match sample.quality {
+            Quality::Good => Reliability::NoFault,
+            Quality::Stale => Reliability::CommunicationFailure,
+            Quality::Bad if refused(reading, index) || sample.at.is_some() => Reliability::UnreliableOther,
+            Quality::Bad => Reliability::CommunicationFailure,
+        };
+        Sample {
+            value: sample.value.map(datum),
+            reliability,
+            at: sample.at.map(|at| self.wall(at)),
+        }
+    }
+
+    fn state(&self, reading: &Reading<'_>) -> Sample {
+        use crate::drive::State;
+        let at = reading.snapshot.fast_at.map(|at| self.wall(at));
+        let (state, reliability) = match reading.state() {
+            Some(State::Offline) => (State::Offline, Reliability::CommunicationFailure),
+            Some(state) => (state, Reliability::NoFault),
+            // It answers, and does not say it.
+            None => (State::NotReady, Reliability::UnreliableOther),
+        };
+        Sample {
+            value: Some(Datum::State(u32::from(state.code()) + 1)),
+            reliability,
+            at,
+        }
+    }
+
+    fn fault_text(&self, reading: &Reading<'_>) -> Sample {
+        let Some(code) = reading.spec.profile.model_index(ModelPoint::FaultCode) else {
+            return NOTHING;
+        };
+        let profile = &reading.spec.profile;
+        self.point(reading, code, |value| {
+            Datum::Text(Arc::from(profile.fault_text(value.as_f64() as i64)))
+        })
+    }
+
+    fn source(&self, origin: &Origin) -> ValueSource {
+        match origin.kind {
+            SourceKind::Bacnet | SourceKind::ModbusTcp => match origin.who.parse::<Address>() {
+                Ok(address) => ValueSource::Address(address),
+                Err(()) => ValueSource::Device(self.options.device),
+            },
+            _ => ValueSource::Device(self.options.device),
+        }
+    }
+
+    fn slot(&self, entry: &Entry) -> Slot {
+        Slot {
+            value: datum_of(entry.value),
+            source: self.source(&entry.origin),
+            at: self.wall(entry.at),
+        }
+    }
+}
+
+/// An object that is not there.
+const NOTHING: Sample = Sample {
+    value: None,
+    reliability: Reliability::CommunicationFailure,
+    at: None,
+};
+
+fn datum_of(value: Value) -> Datum {
+    match value {
+        Value::Bool(on) => Datum::Bool(on),
+        value => Datum::Number(value.as_f64()),
+    }
+}
+
+/// Whether the drive refuses a register of a point.
+fn refused(reading: &Reading<'_>, index: usize) -> bool {
+    let Some(point) = reading.spec.profile.points.get(index) else {
+        return false;
+    };
+    match &point.source {
+        Source::Raw(raw) => {
+            let words = |table: Table| reading.words(table, raw.address, raw.form.items());
+            matches!(words(raw.table), Err(Unavailable::Refused(_)))
+        }
+        Source::Derived(derived) => derived
+            .sources()
+            .any(|source| source != index && refused(reading, source)),
+    }
+}
+
+/// The value of the slot that governs, in the unit of the point.
+fn governed(reading: &Reading<'_>, all: &Priorities, what: Commanded, index: usize) -> Option<Datum> {
+    let (of, _, entry) = all.governing(what)?;
+    if of == what {
+        return Some(datum_of(entry.value));
+    }
+    let from = reading.spec.profile.model_index(of.point())?;
+    command::converted(reading, (from, entry.value), index).map(datum_of)
+}
+
+impl Application for View {
+    fn admits(&self, host: Ipv4Addr) -> bool {
+        let host = IpAddr::V4(host);
+        self.options.allow.iter().any(|network| network.contains(&host))
+    }
+
+    fn may_write(&self, host: Ipv4Addr) -> bool {
+        let host = IpAddr::V4(host);
+        self.options.commands && self.options.write.iter().any(|network| network.contains(&host))
+    }
+
+    fn clock(&self) -> DateTime {
+        self.wall(self.now.get().0)
+    }
+
+    fn answers(&self, device: u32) -> bool {
+        let Some(drive) = self.drives.get(&device) else {
+            return device == self.options.device;
+        };
+        let snapshot = drive.handle.image.snapshot();
+        let was_read = snapshot.fast_at.is_some();
+        was_read && (snapshot.link.is_online() || self.options.offline == WhenOffline::Fault)
+    }
+
+    fn sample(&self, device: u32, place: usize) -> Sample {
+        match (self.of_drive(device, place), self.meaning(device, place)) {
+            (Some((handle, meaning)), _) => self.shows(handle, meaning),
+            (None, Some(meaning)) => self.of_bus(meaning),
+            (None, None) => NOTHING,
+        }
+    }
+
+    fn commands(&self, device: u32, place: usize) -> Option<Commands> {
+        let (handle, meaning) = self.of_drive(device, place)?;
+        let (what, index) = match meaning {
+            Meaning::Slot(what, index) => (what, index),
+            Meaning::Reset(_) => {
+                return Some(Commands {
+                    default: Some(Datum::Bool(false)),
+                    ..Commands::default()
+                });
+            }
+            _ => return None,
+        };
+        let reading = handle.reading(self.now.get().0);
+        let has = self.drive_has(&reading, what, index).value;
+        Some(handle.priorities(|all| {
+            let governs = all.governing(what);
+            let last = all.last();
+            let of_slot = governs.map(|(.., entry)| (&entry.origin, entry.at));
+            let by = of_slot.or(last.map(|(origin, at)| (origin, *at)));
+            // What a motor is to do when nobody says anything is to stand.
+            let is_bit = matches!(what, Commanded::Run | Commanded::Reverse);
+            let default = if governs.is_some() && is_bit {
+                Some(Datum::Bool(false))
+            } else {
+                has
+            };
+            Commands {
+                slots: std::array::from_fn(|place| {
+                    let priority = u8::try_from(place + 1).unwrap_or(u8::MAX);
+                    all.stands(what, priority).map(|entry| self.slot(entry))
+                }),
+                current: all.shown(what).map(|(priority, _)| priority),
+                default,
+                source: by.map_or(ValueSource::None, |(origin, _)| self.source(origin)),
+                at: by.map(|(_, at)| self.wall(at)),
+            }
+        }))
+    }
+
+    fn stops(&self, device: u32, write: &WriteItem) -> bool {
+        let is_run = write.object == RUN && write.property.property == PropertyId::PRESENT_VALUE;
+        let gives_up = matches!(write.value, Some(Data::Enumerated(0) | Data::Null));
+        is_run && gives_up && self.drives.contains_key(&device)
+    }
+
+    fn orders(&self, device: u32) -> u64 {
+        let drive = self.drives.get(&device);
+        drive.map_or(0, |drive| drive.handle.priorities(|all| all.orders()))
+    }
+
+    fn password(&self, given: &str) -> bool {
+        let wanted = self.options.dcc_password.as_deref();
+        wanted.is_some_and(|wanted| !wanted.is_empty() && wanted.as_bytes().ct_eq(given.as_bytes()).into())
+    }
+}

@@ -1,0 +1,218 @@
+//! What a client wrote becomes an order, or a slot that waits (`docs/bacnet.md`, Commands).
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use drivegate_bacnet::{Address, Datum, Error, Job};
+
+use super::objects::Meaning;
+use super::view::View;
+use crate::command::{
+    self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Refusal, SlotWrite, SourceKind,
+};
+use crate::drive::Value;
+use crate::plant::{DriveHandle, Placed};
+use crate::process_image::Machine;
+
+/// The priority that belongs to minimum on and off times.
+const MINIMUM_TIMES: u8 = 6;
+
+/// What becomes of a job.
+#[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "a few at a time, moved once")]
+pub(super) enum Begun {
+    /// It is answered.
+    Answered(Result<(), Error>),
+    /// It waits for the drive.
+    Waits(Waiting),
+}
+
+/// A write that waits for the drive.
+#[derive(Debug)]
+pub(super) struct Waiting {
+    pub(super) machine: Machine,
+    pub(super) placed: Placed,
+    /// The write to a slot from which the order follows.
+    pub(super) slot: Option<u64>,
+}
+
+/// The client, whatever port it uses.
+pub(super) fn origin(from: &Address) -> Origin {
+    let client = match &from.remote {
+        None => format!("bacnet {}", from.ip()),
+        Some(_) => format!("bacnet {} behind {}", from.remote_text(), from.ip()),
+    };
+    Origin::of(Arc::from(client), SourceKind::Bacnet, from.to_string())
+}
+
+/// Takes up a write.
+pub(super) fn begin(view: &View, job: &Job, now: Instant) -> Begun {
+    let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
+        return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
+    };
+    let origin = origin(&job.from);
+    match (meaning, &job.value) {
+        (Meaning::Point(index), Some(value)) => match value_of(value) {
+            Some(value) => {
+                let order = Order::Points(vec![(index, value)]);
+                waits(
+                    handle,
+                    handle.place_asked(order, origin, Authority::Write, DEFAULT_EXPIRY, job.asked, now),
+                    None,
+                )
+            }
+            None => Begun::Answered(Err(Error::INVALID_DATA_TYPE)),
+        },
+        (Meaning::Reset(_) | Meaning::Slot(..), _) if job.priority == Some(MINIMUM_TIMES) => {
+            let text = "priority 6 belongs to minimum on and off times";
+            handle.refuse(&described(job), Refusal::NotAllowed(text.to_string()), origin, now);
+            Begun::Answered(Err(Error::WRITE_ACCESS_DENIED))
+        }
+        (Meaning::Reset(index), Some(Datum::Bool(true))) => {
+            let order = Order::Points(vec![(index, Value::Bool(true))]);
+            waits(
+                handle,
+                handle.place_asked(order, origin, Authority::Write, DEFAULT_EXPIRY, job.asked, now),
+                None,
+            )
+        }
+        (Meaning::Reset(_), _) => Begun::Answered(Ok(())),
+        (Meaning::Slot(what, index), _) => slot(handle, (what, index), job, origin, now),
+        _ => Begun::Answered(Err(Error::WRITE_ACCESS_DENIED)),
+    }
+}
+
+fn waits(handle: &DriveHandle, placed: Placed, slot: Option<u64>) -> Begun {
+    Begun::Waits(Waiting {
+        machine: handle.machine(),
+        placed,
+        slot,
+    })
+}
+
+fn value_of(datum: &Datum) -> Option<Value> {
+    match datum {
+        Datum::Number(number) => Some(Value::Number(*number)),
+        Datum::Bool(on) => Some(Value::Bool(*on)),
+        Datum::State(_) | Datum::Text(_) => None,
+    }
+}
+
+fn described(job: &Job) -> String {
+    let priority = job.priority.unwrap_or(16);
+    match &job.value {
+        None => format!("{} = NULL at priority {priority}", job.object),
+        Some(Datum::Number(number)) => format!("{} = {number} at priority {priority}", job.object),
+        Some(Datum::Bool(on)) => format!("{} = {on} at priority {priority}", job.object),
+        Some(_) => format!("{} at priority {priority}", job.object),
+    }
+}
+
+/// A write to a slot, and the order that follows from it.
+fn slot(handle: &DriveHandle, (what, index): (Commanded, usize), job: &Job, origin: Origin, now: Instant) -> Begun {
+    let priority = job.priority.unwrap_or(16);
+    let value = job.value.as_ref().and_then(value_of);
+    if let Some(value) = value
+        && let Err(refusal) = possible(handle, index, value, now)
+    {
+        let error = of_refusal(&refusal);
+        handle.refuse(&described(job), refusal, origin, now);
+        return Begun::Answered(Err(error));
+    }
+    let entry = value.map(|value| Entry::new(value, origin.clone(), now));
+    let mut write = SlotWrite::new(what, priority, entry);
+    loop {
+        match handle.priorities(|all| all.plan(&write)) {
+            Follows::Nothing => return stands(handle, &write, &origin, now),
+            Follows::Stop => {
+                let Some(run) = handle.image.spec.profile.model_index(Commanded::Run.point()) else {
+                    return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
+                };
+                let order = Order::Points(vec![(run, Value::Bool(false))]);
+                let id = write.id;
+                let placed = handle.place_slot(order, write, origin, DEFAULT_EXPIRY, (job.asked, now));
+                return waits(handle, placed, Some(id));
+            }
+            Follows::Order(of, entry) => {
+                let Some(point) = handle.image.spec.profile.model_index(of.point()) else {
+                    return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
+                };
+                let order = Order::Points(vec![(point, entry.value)]);
+                let own = write.entry.is_some();
+                // What comes to govern was written long ago; its order is given now.
+                let asked = if own { job.asked } else { now };
+                let mut placed = handle.place_slot(order, write.clone(), entry.origin, DEFAULT_EXPIRY, (asked, now));
+                let refused = matches!(placed.answer().map(|answer| answer.outcome), Some(Outcome::Refused(_)));
+                let next = handle.priorities(|all| all.successor(&write));
+                match next.filter(|_| refused && !own) {
+                    // Its owner's order is refused, so it gives its slot back, too.
+                    Some(next) if !write.also.contains(&next) => write.also.push(next),
+                    _ => return waits(handle, placed, Some(write.id)),
+                }
+            }
+        }
+    }
+}
+
+/// Nothing follows: it stands at once. The lease of the drive is that of the client whose slot governs.
+fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant) -> Begun {
+    let governs = handle.priorities(|all| {
+        all.ask(write);
+        all.settle(write.id, command::Settled::Done, now);
+        all.client() == Some(origin.client())
+    });
+    if governs {
+        handle.image.renew_lease(now);
+    }
+    let (drive, priority) = (&handle.image.spec.name, write.priority);
+    let value = write
+        .entry
+        .as_ref()
+        .map_or("NULL".to_string(), |entry| entry.value.to_string());
+    tracing::info!(
+        target: "drivegate::bacnet", drive, priority, client = %origin.who,
+        "{} = {value} stands in its slot; nothing is sent", write.what.point().name()
+    );
+    Begun::Answered(Ok(()))
+}
+
+/// Whether the drive could be given that value at all; what is not known yet is judged when it becomes an order.
+fn possible(handle: &DriveHandle, index: usize, value: Value, now: Instant) -> Result<(), Refusal> {
+    let order = Order::Points(vec![(index, value)]);
+    match command::admit(order, &handle.reading(now), Authority::Write) {
+        Err(refusal @ (Refusal::BadValue(_) | Refusal::NotWritable(_))) => Err(refusal),
+        _ => Ok(()),
+    }
+}
+
+/// How an outcome is told.
+pub(super) fn error(outcome: &Outcome) -> Result<(), Error> {
+    Err(match outcome {
+        Outcome::Acknowledged(_) => return Ok(()),
+        Outcome::Exception(_) | Outcome::NotTaken(_) => Error::OPERATIONAL_PROBLEM,
+        Outcome::Refused(refusal) => of_refusal(refusal),
+        Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::QueueFull => Error::SERVICE_REQUEST_DENIED,
+        Outcome::StopOnly(part) | Outcome::StopFailed(part) => return error(part).and(Err(Error::TIMEOUT)),
+        Outcome::Unknown(_)
+        | Outcome::TimedOut
+        | Outcome::Garbled
+        | Outcome::Expired
+        | Outcome::Interrupted(_)
+        | Outcome::NotStopped
+        | Outcome::BusDown
+        | Outcome::Offline
+        | Outcome::ShuttingDown => Error::TIMEOUT,
+    })
+}
+
+fn of_refusal(refusal: &Refusal) -> Error {
+    match refusal {
+        Refusal::NotWritable(_) | Refusal::UnknownDrive(_) => Error::WRITE_ACCESS_DENIED,
+        Refusal::BadValue(_) => Error::VALUE_OUT_OF_RANGE,
+        Refusal::NotAllowed(_)
+        | Refusal::NotKnown(_)
+        | Refusal::MotorRuns(_)
+        | Refusal::OtherValue(_)
+        | Refusal::HeldByOther { .. } => Error::SERVICE_REQUEST_DENIED,
+    }
+}

@@ -1,0 +1,72 @@
+//! `[control]` of a profile for people.
+
+use super::name_of;
+use crate::document::format_duration;
+use crate::drive::Profile;
+use crate::drive::control::{Control, Mask, OwnWord, Place, Run, Setting, Step, Until};
+
+/// A line for each command, with its words in hex.
+pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, String)> {
+    let own = match control.own_word {
+        OwnWord::Read => "",
+        OwnWord::Shadow => ", which does not read as it was written",
+    };
+    let mut lines = vec![("control word", format!("{}{own}", place(control.at)))];
+    if control.always != Default::default() {
+        let always = control.always;
+        lines.push((
+            "in every word",
+            format!("{:#06x} set, {:#06x} clear", always.set, always.clear),
+        ));
+    }
+    match &control.run {
+        Run::One(run) => lines.push(("run", setting(run))),
+        Run::Pair { forward, reverse } => {
+            lines.push(("forward", setting(forward)));
+            lines.push(("reverse", setting(reverse)));
+        }
+        Run::Steps(steps) => {
+            let steps: Vec<String> = steps.iter().map(|one| step(profile, one)).collect();
+            lines.push(("run", steps.join("; then ")));
+        }
+    }
+    lines.push(("stop", setting(&control.stop)));
+    lines.extend(control.reverse.as_ref().map(|reverse| ("reverse", setting(reverse))));
+    if let Some(reset) = &control.fault_reset {
+        let hold = format_duration(reset.hold);
+        lines.push(("fault reset", format!("{}, for {hold}", setting(&reset.setting))));
+    }
+    if control.restarts_on_reset {
+        lines.push((
+            "caution",
+            "a reset while a run command stands starts the motor".to_string(),
+        ));
+    }
+    lines
+}
+
+fn place(place: Place) -> String {
+    format!("{} {}", place.table, place.address)
+}
+
+fn setting(setting: &Setting) -> String {
+    let bits = match setting.mask {
+        u16::MAX => format!("{:#06x}", setting.value),
+        mask => format!("{:#06x} in the bits {mask:#06x}", setting.value),
+    };
+    let at = setting.place.map(|at| format!(" at {}", place(at))).unwrap_or_default();
+    let once = if setting.once { ", acts when written" } else { "" };
+    format!("{bits}{at}{once}")
+}
+
+fn step(profile: &Profile, step: &Step) -> String {
+    let until = match &step.until {
+        Until::Written => return setting(&step.write),
+        Until::Time(time) => format!("for {}", format_duration(*time)),
+        Until::State(Mask { point, mask, is }) => {
+            format!("until {} has {is:#06x} in {mask:#06x}", name_of(profile, *point))
+        }
+    };
+    let timeout = format_duration(step.timeout);
+    format!("{} {until}, {timeout} at most", setting(&step.write))
+}

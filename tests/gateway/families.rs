@@ -1,0 +1,222 @@
+//! Families whose profiles come from reports: the real gateway with each profile against a drive in Python that was written
+//! from what is known of the family, not from the profile. The words here are by hand, too.
+
+mod cases;
+mod words;
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::time::Duration;
+
+use cases::{CASES, Case, Order};
+
+use crate::support::process::{PATIENCE, Running, api, free_port, until};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
+use crate::support::tools::{python, root};
+
+/// A gateway and the drive that it commands.
+struct Rig {
+    site: Site,
+    /// The tool slot, by which addresses are reached that are the common model's over Modbus TCP.
+    slot: u16,
+    drive: Running,
+    _gateway: Running,
+}
+
+impl Rig {
+    fn new(case: &Case, unprepared: bool) -> Rig {
+        let (port, slot) = (free_port(), free_port());
+        let bus = LINE1.replace("port = \"line1\"", &format!("port = \"tcp://127.0.0.1:{port}\""));
+        let drive = format!(
+            "cycle = \"50ms\"\nslow_cycle = \"200ms\"\n[[bus.drive]]\nname = \"drive\"\naddress = 1\nprofile = \"{}\"\n\
+             access = \"control\"\n[[bus.slot]]\nlisten = \"127.0.0.1:{slot}\"\naccess = \"write\"\n",
+            case.profile
+        );
+        let site = Site::of(&[&bus, &drive, MODBUS_TCP, HTTP]);
+        let program = root().join("tests/peers/families/run.py").display().to_string();
+        let port = port.to_string();
+        let mut arguments = vec![program.as_str(), case.peer, &port];
+        arguments.extend(unprepared.then_some("unprepared"));
+        let drive = Running::start(&python(), &arguments);
+        drive.until_printed("ready");
+        let gateway = site.run_ready();
+        Rig {
+            site,
+            slot,
+            drive,
+            _gateway: gateway,
+        }
+    }
+
+    /// Sends the orders as they stand; each is seen by the drive.
+    fn order(&self, orders: &[Order]) {
+        for order in orders {
+            let before = self.drive.output().len();
+            assert_eq!(self.exchange(order), Answer::Done, "{order:?}");
+            let wanted = order.as_seen();
+            until(&wanted, || {
+                self.drive.output().get(before..)?.contains(&wanted).then_some(())
+            });
+        }
+    }
+
+    /// Waits until the drive has printed `text` more often than `times`.
+    fn printed(&self, text: &str, times: usize) {
+        until(text, || {
+            (self.drive.output().matches(text).count() > times).then_some(())
+        });
+    }
+
+    fn is_refused(&self, order: &Order) -> bool {
+        self.exchange(order) == Answer::Exception(3)
+    }
+
+    fn exchange(&self, order: &Order) -> Answer {
+        let pdu = order.pdu();
+        let hidden = !matches!(order, Order::Model(..)) && pdu[1] >= 0x80;
+        let (port, frame, head) = match hidden {
+            true => (self.slot, rtu(&pdu), 1),
+            false => {
+                let head = [0, 1, 0, 0, 0, pdu.len() as u8 + 1, 1];
+                (self.site.modbus, [&head[..], &pdu].concat(), 7)
+            }
+        };
+        let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        stream.write_all(&frame).unwrap();
+        let mut reply = vec![0; head + 2];
+        stream.read_exact(&mut reply).unwrap();
+        match reply[head] & 0x80 {
+            0 => Answer::Done,
+            _ => Answer::Exception(reply[head + 1]),
+        }
+    }
+
+    fn state(&self) -> String {
+        api(self.site.http, "drive")["state"]
+            .as_str()
+            .unwrap_or_default()
+            .to_string()
+    }
+}
+
+/// The frame of a request to address 1.
+fn rtu(pdu: &[u8]) -> Vec<u8> {
+    let mut frame = [&[1], pdu].concat();
+    let shift = |crc: u16| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 };
+    let crc = frame.iter().fold(0xFFFF, |crc, byte| {
+        (0..8).fold(crc ^ u16::from(*byte), |crc, _| shift(crc))
+    });
+    frame.extend(crc.to_le_bytes());
+    frame
+}
+
+#[derive(Debug, PartialEq)]
+enum Answer {
+    Done,
+    Exception(u8),
+}
+
+/// Reference, start, reverse, stop, a fault and its reset, and words that are not passed on.
+fn obeys(case: &Case) {
+    let rig = Rig::new(case, false);
+    let name = case.profile;
+    assert_ne!(rig.state(), "running", "{name}");
+    rig.order(case.reference);
+    rig.order(case.start);
+    rig.printed("motor forward", 0);
+    rig.site.until_state("drive", "running");
+    let speed = || {
+        rig.site
+            .point("drive", "output_frequency")
+            .as_f64()
+            .filter(|hertz| hertz.abs() > 1.0)
+    };
+    if case.shows_frequency {
+        until("a frequency", speed);
+    }
+    rig.order(case.stop);
+    rig.printed("motor stopped", 0);
+    until("the end of running", || (rig.state() != "running").then_some(()));
+    let mut stopped = 1;
+    if !case.reverse.is_empty() {
+        rig.order(case.reverse);
+        rig.printed("motor reverse", 0);
+        rig.site.until_state("drive", "running");
+        if case.shows_reversed {
+            rig.site.until_point("drive", "reversed", true);
+        }
+    }
+    for order in case.refused {
+        assert!(rig.is_refused(order), "{name}: {order:?}");
+    }
+    rig.order(case.stop);
+    if !case.reverse.is_empty() {
+        rig.printed("motor stopped", stopped);
+        stopped += 1;
+    }
+    rig.order(case.reference);
+    rig.order(case.start);
+    rig.printed("motor forward", 1);
+    rig.drive.signal("USR1");
+    rig.printed("motor stopped", stopped);
+    rig.site.until_state("drive", "fault");
+    if !case.reset.is_empty() {
+        rig.order(case.reset);
+        rig.printed("\nreset", 0);
+        until("the end of the fault", || (rig.state() != "fault").then_some(()));
+        // No reset starts the motor.
+        std::thread::sleep(Duration::from_millis(300));
+        assert_eq!(rig.drive.output().matches("motor forward").count(), 2, "{name}");
+        assert_ne!(rig.state(), "running", "{name}");
+    }
+}
+
+/// A drive that is not prepared does not run, and is not said to.
+fn stays(case: &Case) {
+    let rig = Rig::new(case, true);
+    rig.order(case.reference);
+    rig.order(case.start);
+    std::thread::sleep(Duration::from_millis(500));
+    assert!(!rig.drive.output().contains("motor"), "{}", case.profile);
+    assert_ne!(rig.state(), "running", "{}", case.profile);
+    rig.order(case.stop);
+}
+
+/// The cases of every third family, so that three tests run side by side.
+fn every_third(first: usize, check: fn(&Case)) {
+    for case in CASES.iter().skip(first).step_by(3) {
+        println!("{}", case.profile);
+        check(case);
+    }
+}
+
+#[test]
+fn drives_obey_their_words_1() {
+    every_third(0, obeys);
+}
+
+#[test]
+fn drives_obey_their_words_2() {
+    every_third(1, obeys);
+}
+
+#[test]
+fn drives_obey_their_words_3() {
+    every_third(2, obeys);
+}
+
+#[test]
+fn unprepared_drives_stay_1() {
+    every_third(0, stays);
+}
+
+#[test]
+fn unprepared_drives_stay_2() {
+    every_third(1, stays);
+}
+
+#[test]
+fn unprepared_drives_stay_3() {
+    every_third(2, stays);
+}

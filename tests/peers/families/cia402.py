@@ -1,0 +1,71 @@
+"""Schneider Altivar, CiA 402: CMD 8501, LFR 8502 (0.1 Hz), ETA 3201, RFR 3202, RFRD 8604, last fault 7121.
+
+6 shutdown, 7 switch on, 15 enable operation, each only from the state before it; bit 4 of ETA is the mains. Bit 3 off stops by
+ramp, bit 2 off is the quick stop, bit 1 off takes the voltage away. Bit 11 turns the motor round, bit 7 resets on its edge.
+"""
+
+import drive
+
+CMD, LFR, ETA = 8501, 8502, 3201
+DISABLED, READY, ON, ENABLED, QUICK, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
+
+
+class Drive(drive.Drive):
+    FUNCTIONS = {3, 6, 16, 23}
+    MOST_READ = 63
+
+    def __init__(self, unprepared=False):
+        super().__init__(unprepared)
+        self.holding = {CMD: 0, LFR: 0, 8604: 0, 7121: 0, **dict.fromkeys(range(3201, 3212), 0)}
+        self.read_only = {8604, 7121, *range(3201, 3212)}
+        self.state = DISABLED
+        self.word = 0
+
+    def tripped(self):
+        self.state = FAULT
+
+    def wrote(self, table, address, value):
+        if address == LFR:
+            self.target = abs(drive.signed(value)) / 5
+        if address == CMD:
+            self.command(value)
+        if self.direction:
+            self.start(self.wanted())
+
+    def wanted(self):
+        sign = -1 if drive.signed(self.holding[LFR]) < 0 else 1
+        return -sign if self.word & 0x0800 else sign
+
+    def command(self, value):
+        before, self.word = self.word, value
+        if self.state == FAULT:
+            if value & 0x0080 and not before & 0x0080:
+                self.reset()
+                self.state = DISABLED
+            return
+        if self.unprepared:
+            return
+        code = value & 0x0F
+        if not value & 0x0002:
+            self.coast()
+            self.state = DISABLED
+        elif not value & 0x0004:
+            self.stop()
+            self.state = QUICK if self.state == ENABLED else DISABLED
+        elif code == 0x06 and self.state in (DISABLED, READY, ON, ENABLED):
+            self.stop()
+            self.state = READY
+        elif code == 0x07 and self.state in (READY, ON, ENABLED):
+            self.stop()
+            self.state = ON
+        elif code == 0x0F and self.state in (ON, ENABLED):
+            self.state = ENABLED
+            self.start(self.wanted())
+
+    def show(self):
+        status = self.state | 0x0210
+        status |= 0x0400 if self.speed == self.target * self.direction else 0
+        self.holding[ETA] = status
+        self.holding[3202] = drive.unsigned(self.speed * 5)
+        self.holding[8604] = drive.unsigned(self.speed * 15)
+        self.holding[7121] = 9 if self.faulted else 0

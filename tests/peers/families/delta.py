@@ -1,0 +1,44 @@
+"""Delta MS300: word 0x2000, reference 0x2001 (0.01 Hz), 0x2002 reset (bit 1; bit 0 external fault, bit 2 base block).
+
+Bits 1 and 0: 01 stop, 10 run; bits 5 and 4: 01 forward, 10 reverse. A code acts when it is written: 0 does nothing. Status 0x2100
+(low byte fault) and 0x2101.
+"""
+
+import drive
+
+
+class Drive(drive.Drive):
+    MOST_READ = MOST_WRITE = 20
+
+    def __init__(self, unprepared=False):
+        super().__init__(unprepared)
+        self.holding = dict.fromkeys([0x2000, 0x2001, 0x2002, *range(0x2100, 0x2110)], 0)
+        self.read_only = set(range(0x2100, 0x2110))
+        self.facing = 1
+
+    def wrote(self, table, address, value):
+        if address == 0x2001:
+            self.target = value / 50
+        elif address == 0x2002:
+            if value & 1:
+                self.trip()
+            if value & 2:
+                self.reset()
+            if value & 4:
+                self.coast()
+        elif address == 0x2000:
+            facing = value >> 4 & 3
+            if facing in (1, 2):
+                self.facing = 1 if facing == 1 else -1
+            if value & 3 == 2:
+                self.start(self.facing)
+            elif value & 3 == 1:
+                self.stop()
+
+    def show(self):
+        state = 3 if self.direction else 1 if self.speed else 0
+        self.holding[0x2100] = 4 if self.faulted else 0
+        self.holding[0x2101] = state | (3 << 3 if self.facing < 0 else 0) | 1 << 10
+        self.holding[0x2102] = self.holding[0x2001]
+        self.holding[0x2103] = drive.unsigned(abs(self.speed) * 50)
+        self.holding[0x2105] = 5400
