@@ -114,7 +114,10 @@ fn the_pages_are_short_enough() {
     let words: usize = counted
         .map(|page| fs::read_to_string(page).unwrap().split_whitespace().count())
         .sum();
-    assert!((10_000..=MOST_WORDS).contains(&words), "{words} words, at most {MOST_WORDS}");
+    assert!(
+        (10_000..=MOST_WORDS).contains(&words),
+        "{words} words, at most {MOST_WORDS}"
+    );
 }
 
 #[test]

@@ -36,12 +36,12 @@ KINDS = {
     ),
     "diagnosis": (
         "bus",
-        "line of bus {bus}: requests do not arrive whole (likely): 6 replies came after the time limit of 150 ms in the last minute; "
+        "line of bus {bus}: requests arrive truncated (likely): 6 replies came after the time limit of 150 ms in the last minute; "
         "check the cable and its terminals, and the supply of the drives",
     ),
     "reload_refused": (
         "gateway",
-        "the configuration was not applied, the former one goes on: unknown key `fil`; gateway.toml:119, audit.fil; did you mean `file`?",
+        "the configuration was not applied, the former one stays: unknown key `fil`; gateway.toml:119, audit.fil; did you mean `file`?",
     ),
 }
 

@@ -150,7 +150,7 @@ fn check_link(link: u32, offset: usize) -> Result<(), CaptureError> {
     }
     Err(error(
         offset,
-        format!("link type {link} is no serial line; RTAC Serial is {RTAC_SERIAL}, bare bytes are 147 to 162"),
+        format!("link type {link} is not a serial line; RTAC Serial is {RTAC_SERIAL}, bare bytes are 147 to 162"),
     ))
 }
 
@@ -216,7 +216,7 @@ fn read_pcapng(file: &[u8], packets: &mut Vec<Packet>) -> Result<(), CaptureErro
             INTERFACE => interfaces.push(interface(bytes, at, length)?),
             PACKET => {
                 let of = interfaces.get(bytes.u32(at + 8)? as usize).copied();
-                let of = of.ok_or_else(|| error(at + 8, "a packet of an interface that there is not"))?;
+                let of = of.ok_or_else(|| error(at + 8, "a packet of an unknown interface"))?;
                 if let Err(error) = check_link(of.link, at) {
                     not_serial.get_or_insert(error);
                     at += length;
