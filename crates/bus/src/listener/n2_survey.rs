@@ -240,7 +240,7 @@ impl N2Survey {
             "time is not synchronised",
             format!("{} commands with a time", self.times),
         );
-        line("other commands are not used", format!("{} heard", self.others));
+        line("other commands are not used", format!("{} seen", self.others));
         out
     }
 }

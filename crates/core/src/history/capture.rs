@@ -396,7 +396,7 @@ mod tests {
             read(&none)
                 .unwrap_err()
                 .what
-                .starts_with("link type 1 is no serial line")
+                .starts_with("link type 1 is not a serial line")
         );
     }
 
@@ -408,7 +408,7 @@ mod tests {
             told(b"time,drive"),
             "the file begins neither as pcap nor as pcapng, at byte 0"
         );
-        assert!(told(&pcap(1, &[])).starts_with("link type 1 is no serial line"));
+        assert!(told(&pcap(1, &[])).starts_with("link type 1 is not a serial line"));
         let mut long = pcap(250, &[(0, 0, &[0; 12])]);
         long[32..36].copy_from_slice(&[255, 255, 255, 0]);
         assert_eq!(

@@ -1,6 +1,5 @@
 //! Restores that did not come to their end: whose journal is on disk. The machine of such a journal takes no commands
-//! but stops. A
-//! journal whose machine is not configured any more is told of by an event, and by `drivegate check`.
+//! but stops. A journal whose machine is not configured any more is told of by an event, and by `drivegate check`.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -190,8 +189,8 @@ struct Configured {
 }
 
 /// Holds the drives whose journal tells of a restore that was interrupted, before anybody can command them, and tells
-/// of
-/// journals that belong to none of them. A machine is looked at once; it is held until that is done, however slow the disk.
+/// of journals that belong to none of them. A machine is looked at once; it is held until that is done, however slow
+/// the disk.
 pub async fn hold_unfinished<'a>(
     vault: &Arc<Vault>,
     events: &Events,

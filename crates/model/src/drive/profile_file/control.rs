@@ -425,7 +425,7 @@ fn check(table: &Reader<'_>, control: &Control) {
             table.problem(
                 "stop",
                 "a word can be a run command and a stop at once",
-                "write bits of which the run command has the opposite",
+                "write bits that the run command has the other way round",
             );
         }
     }

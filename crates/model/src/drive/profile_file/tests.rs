@@ -677,7 +677,7 @@ fn each_mistake_of_a_value() {
         mistakes("m", &format!("{HEAD}{place}"))
     };
     assert!(model("motor_current", "hidden = true").contains("is a point of the common model"));
-    assert!(model("motor_current", "type = \"string:4\"").contains("is no text in the common model"));
+    assert!(model("motor_current", "type = \"string:4\"").contains("is not a text in the common model"));
     assert!(model("running", "mask = 3").contains("is true or false"));
     assert_eq!(model("running", "mask = 3\nequals = 3"), "");
     assert!(model("motor_current", "mask = 3\nequals = 3").contains("is a number, not a bit"));
