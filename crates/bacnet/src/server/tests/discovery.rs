@@ -28,6 +28,7 @@ fn who_is_concerns_those_that_it_is_for() {
     let mut bench = Bench::new();
     let all = Some((npdu::GLOBAL, Mac::ALL));
     let network = Some((NETWORK, Mac::ALL));
+    #[expect(clippy::type_complexity, reason = "one row a case")]
     let cases: [(Option<(u16, Mac)>, Option<(u64, u64)>, &[u32]); 7] = [
         (None, None, &[100]),
         (all, None, &[100, 101, 102, 103]),
