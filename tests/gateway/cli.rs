@@ -329,7 +329,7 @@ fn the_tables_name_every_request() {
         " pump-1  fast   03 read holding     2100     11    11.44",
         " pump-2  slow   03 read holding      100      2",
         " pump-2  once   03 read holding      102      2",
-        "  fast cycle  50.0 ms (aimed at 50.0 ms)",
+        "  fast cycle  50.0 ms (target 50.0 ms)",
         "  line load   ",
         "drivegate.toml: ok, 1 bus, 2 drives, no warnings",
     ];

@@ -104,7 +104,7 @@ fn a_reload_is_asked_for_and_a_refused_one_is_seen() {
     site.configure(&[&before]);
     site.change("silence = \"chars\"", "silence = \"spec\"");
     let changed = command(&site, &["reload"]);
-    let expected = "changed: bus `line1`, started anew\n";
+    let expected = "changed: bus `line1`, restarted\n";
     assert_eq!((changed.code, changed.out.as_str()), (0, expected), "{}", changed.err);
     site.until_metric("drivegate_config_last_reload_successful 1");
     // Another file is another gateway's.

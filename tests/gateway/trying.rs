@@ -242,7 +242,7 @@ fn what_was_heard_tells_a_dead_line_from_a_wrong_setting() {
     let silent = ran(drivegate(&["try", "--port", &port, "--addresses", "1,2"]).args(fast));
     assert_eq!(silent.code, 1, "{}", silent.err);
     assert!(
-        silent.err.contains("after 2 requests not one byte was heard"),
+        silent.err.contains("after 2 requests no byte was received"),
         "{}",
         silent.err
     );

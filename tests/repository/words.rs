@@ -1,4 +1,4 @@
-//! The documents are in the words that engineers of the field use, and spelled right.
+//! Documents and messages are in the words that engineers of the field use, and spelled right.
 
 use std::fs;
 use std::path::PathBuf;
@@ -6,7 +6,7 @@ use std::process::Command;
 
 use crate::support::tools::root;
 
-/// What no page says, and what to say instead.
+/// What no page and no message says, and what to say instead.
 const INSTEAD: [(&str, &str); 19] = [
     ("told", "reported, shown"),
     ("tells", "reports, shows, says"),
@@ -29,14 +29,21 @@ const INSTEAD: [(&str, &str); 19] = [
     ("exchanges", "transactions"),
 ];
 
+/// Of README and docs, without decisions.
+const MOST_WORDS: usize = 50_000;
+
 /// What is right although a part of it is not.
-const RIGHT: [&str; 6] = [
+const RIGHT: [&str; 9] = [
     "there is no",
     "there are no",
     "is no longer",
     "are no longer",
     "is no better",
     "are no better",
+    "key exchange",
+    // Of a file format.
+    "data . exchange",
+    "begun . by",
 ];
 
 /// README, CONTRIBUTING and all pages below docs.
@@ -63,6 +70,113 @@ fn prose(text: &str) -> Vec<(usize, String)> {
         }
     }
     found
+}
+
+/// The string literals of code with the number of the line where each begins: without comments and modules of tests.
+fn literals(code: &str) -> Vec<(usize, String)> {
+    let code = code.split("mod tests {").next().unwrap_or_default();
+    let (mut rest, mut line, mut found) = (code, 1, Vec::new());
+    while let Some(c) = rest.chars().next() {
+        let length = if rest.starts_with("//") {
+            rest.find('\n').unwrap_or(rest.len())
+        } else if c == '"' {
+            let end = closing(&rest[1..]);
+            found.push((line, rest[1..=end].replace("\\n", " ")));
+            end + 2
+        } else if c == '\'' {
+            // A character, which may be a quotation mark; else a lifetime.
+            let is_char = |text: &str| rest[1..].starts_with(text) && rest[1 + text.len()..].starts_with('\'');
+            ["\"", "\\\"", "\\'", "\\\\"]
+                .iter()
+                .find(|text| is_char(text))
+                .map_or(1, |text| text.len() + 2)
+        } else {
+            c.len_utf8()
+        };
+        let length = length.min(rest.len());
+        line += rest[..length].matches('\n').count();
+        rest = &rest[length..];
+    }
+    found
+}
+
+/// Where a string literal ends, of which `text` is what follows its first mark.
+fn closing(text: &str) -> usize {
+    let mut escaped = false;
+    let end = text.char_indices().find(|(_, c)| {
+        let is_end = *c == '"' && !escaped;
+        escaped = *c == '\\' && !escaped;
+        is_end
+    });
+    end.map_or(text.len(), |(at, _)| at)
+}
+
+/// A message without what is put into it and what stands between backticks.
+fn said(literal: &str) -> String {
+    let (mut depth, mut plain) = (0_u32, String::new());
+    for c in literal.chars() {
+        match c {
+            '{' => depth += 1,
+            '}' => depth = depth.saturating_sub(1),
+            c if depth == 0 => plain.push(c),
+            _ => {}
+        }
+    }
+    plain
+        .replace("\\\n", " ")
+        .split('`')
+        .step_by(2)
+        .collect::<Vec<_>>()
+        .join("`")
+}
+
+/// All Rust code that is no test.
+fn code_files(folder: &std::path::Path, found: &mut Vec<PathBuf>) {
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_string_lossy().into_owned();
+        let is_test = name == "tests" || name == "tests.rs" || name.ends_with("_tests.rs") || name == "testkit";
+        if path.is_dir() && !is_test {
+            code_files(&path, found);
+        } else if name.ends_with(".rs") && !is_test {
+            found.push(path);
+        }
+    }
+}
+
+#[test]
+fn the_messages_are_in_plain_words() {
+    let mut files = Vec::new();
+    for folder in ["src", "crates"] {
+        code_files(&root().join(folder), &mut files);
+    }
+    let (mut seen, mut found) = (0, Vec::new());
+    for file in files {
+        for (number, literal) in literals(&fs::read_to_string(&file).unwrap()) {
+            // A single word is a name or a part of a format.
+            let text = said(&literal);
+            if text.split_whitespace().count() < 2 {
+                continue;
+            }
+            seen += 1;
+            if let Some((word, instead)) = unwanted(&text) {
+                found.push(format!(
+                    "{}:{number}: \"{word}\"; instead: {instead}; {text}",
+                    file.display()
+                ));
+            }
+        }
+    }
+    assert!(seen > 1_500, "{seen}");
+    assert!(found.is_empty(), "{found:#?}");
+}
+
+#[test]
+fn messages_are_found_in_code() {
+    let code = "fn f<'a>() { g('\"', \"it is told\", \"a \\\"b\\\" {told}\"); } // \"told\"\n\n\"x\\ny\"\n#[cfg(test)]\nmod tests { \"told\" }";
+    let expected = [(1, "it is told"), (1, "a \\\"b\\\" {told}"), (3, "x y")];
+    assert_eq!(literals(code), expected.map(|(line, text)| (line, text.to_string())));
+    assert_eq!(said("a {told} b `told` c"), "a  b ` c");
 }
 
 /// The words of a line in lower case, with a blank at each end; a sign is a word, so that nothing matches across it.
@@ -99,6 +213,22 @@ fn the_pages_are_in_plain_words() {
         }
     }
     assert!(found.is_empty(), "{found:#?}");
+}
+
+/// README and the pages below docs, without the decisions, stay a book that one reads.
+#[test]
+fn the_pages_are_short_enough() {
+    let counted = pages().into_iter().filter(|page| {
+        let below_docs = page.parent().is_some_and(|folder| folder.ends_with("docs"));
+        below_docs || page.ends_with("README.md") && page.parent() == Some(root())
+    });
+    let words: usize = counted
+        .map(|page| fs::read_to_string(page).unwrap().split_whitespace().count())
+        .sum();
+    assert!(
+        (10_000..=MOST_WORDS).contains(&words),
+        "{words} words, at most {MOST_WORDS}"
+    );
 }
 
 #[test]

@@ -151,7 +151,7 @@ fn behind_a_stop_that_failed_nothing_is_sent() {
     let outcome = rig.answered(&mut placed);
     assert!(matches!(outcome, Outcome::StopFailed(_)), "{outcome:?}");
     assert_eq!(outcome.code(), "timeout");
-    assert!(outcome.to_string().contains("the rest of the order was not sent"));
+    assert!(outcome.to_string().contains("the rest of the command was not sent"));
     rig.set_alive(1, true);
     rig.run(PATIENCE);
     assert_eq!(rig.word(1, REFERENCE), 5_000);

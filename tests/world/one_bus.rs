@@ -458,7 +458,7 @@ fn a_drive_that_nothing_stops_is_told_once() {
             let text = &event.text;
             let says = |part| text.contains(part);
             assert!(
-                says("nothing stops drive d0-1") && says("is off (fieldbus_fault_response)"),
+                says("drive d0-1 keeps running") && says("is off (fieldbus_fault_response)"),
                 "{text}"
             );
         }

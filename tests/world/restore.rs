@@ -162,7 +162,7 @@ impl Bench {
         }
     }
 
-    /// The drive takes no orders but stops from now on, or all again.
+    /// The drive takes no commands but stops from now on, or all again.
     fn hold(&self, held: bool) {
         let why = held.then(|| "a restore".to_string());
         self.rig.drive(DRIVE).image.hold.set(why);

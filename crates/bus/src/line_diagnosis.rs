@@ -162,7 +162,7 @@ impl LineDiagnosis {
         let tell = |change: &Change| match change {
             Change::Came(finding) => (finding.drive, told(finding)),
             Change::Firmer(finding) => (finding.drive, format!("now {}", told(finding))),
-            Change::Went(finding) => (finding.drive, format!("no longer: {}", finding.cause.meaning())),
+            Change::Went(finding) => (finding.drive, format!("cleared: {}", finding.cause.meaning())),
         };
         changes.iter().map(tell).collect()
     }

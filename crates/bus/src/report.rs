@@ -132,14 +132,14 @@ impl Report {
             News::ActionTaken { drive, failures } => {
                 let action = self.action_of(*drive);
                 self.drive_event(*drive, EventKind::Supervision, None, |name| {
-                    format!("drive {name} acknowledged {action} of its lease, after {failures} tries that failed")
+                    format!("drive {name} acknowledged {action} of its lease, after {failures} failed tries")
                 });
             }
             News::RunningUnknown(drive) => {
                 self.drive_event(*drive, EventKind::Supervision, None, |name| {
                     format!(
-                        "drive {name} does not say whether it runs; its supervision goes by the run command, and takes a \
-                         motor whose run command is not known to run"
+                        "drive {name} does not report whether it runs; its supervision follows the run command, and \
+                         treats an unknown run command as running"
                     )
                 });
             }
@@ -277,7 +277,8 @@ impl Report {
         let then = match adopted {
             Adopted::Yes => "its lease starts now (supervision.adopt)",
             Adopted::No => {
-                "its lease starts with the first order or heartbeat of a client; set supervision.adopt = true to start it \
+                "its lease starts with the first command or heartbeat of a client; set supervision.adopt = true to \
+                 start it \
                  whenever the drive is found running"
             }
         };
@@ -375,7 +376,7 @@ impl Report {
 
     fn offline_event(&self, index: usize, why: &str) {
         self.drive_event(index, EventKind::Offline, None, |name| {
-            format!("drive {name} is offline: {why}; it is asked again with pauses up to 10 s")
+            format!("drive {name} is offline: {why}; retrying at least every 10 s")
         });
     }
 
@@ -383,7 +384,7 @@ impl Report {
         let Some(drive) = self.drive(index) else { return };
         drive.update(Snapshot::outlive);
         self.drive_event(index, EventKind::Restarted, None, |name| {
-            format!("drive {name} has started anew; it is read again, and takes only commands that come from now on")
+            format!("drive {name} has restarted; it is read again, and takes only commands sent from now on")
         });
     }
 
@@ -440,9 +441,8 @@ impl Report {
         }
         self.drive_event(index, EventKind::Unsupervised, None, |name| {
             format!(
-                "nothing stops drive {name} when whoever commands it falls silent: it has no lease, and its own response \
-                 to a silent master is off ({point}); configure supervision, and set the parameter if the process \
-                 allows it"
+                "drive {name} keeps running if its controller goes silent: no supervision, and its own timeout \
+                 response is off ({point}); configure supervision, and set the parameter if the process allows it"
             )
         });
     }

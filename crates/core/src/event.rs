@@ -77,7 +77,7 @@ pub enum EventKind {
     ForeignCommand,
     /// Parameters changed that the gateway did not write.
     ParametersChanged,
-    /// A restore of parameters did not come to its end, or its journal belongs to no drive that is configured.
+    /// A restore of parameters was interrupted, or its journal belongs to no drive that is configured.
     RestoreUnfinished,
     /// A verdict about a line came, became firmer, or went.
     Diagnosis,

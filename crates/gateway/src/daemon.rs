@@ -381,7 +381,7 @@ impl Daemon {
         self.reader = every.map(|every| tokio::spawn(keep_reading(self.plant.clone(), every)));
     }
 
-    /// New drives whose parameters may be half restored take no orders but stops, before their bus starts.
+    /// New drives whose parameters may be half restored take no commands but stops, before their bus starts.
     async fn hold_unfinished(&self, settings: &Settings) {
         let drives = settings
             .buses
@@ -598,7 +598,7 @@ impl Daemon {
         let NotStopped { drive, why } = missing;
         let image = bus.image.drives.iter().find(|image| image.spec.name == *drive);
         image.into_iter().for_each(|image| image.count_supervision_failure());
-        let text = format!("the gateway ends, and drive {drive} {why}; nothing stops it any more");
+        let text = format!("the gateway shuts down, and drive {drive} {why}; nothing stops it from now on");
         self.events.publish(Event {
             bus: bus.image.spec.name.clone(),
             drive: Some(drive.clone()),

@@ -487,7 +487,10 @@ fn explain(error: &tokio_serial::Error) -> String {
         tokio_serial::ErrorKind::NoDevice | tokio_serial::ErrorKind::Io(io::ErrorKind::WouldBlock) => {
             "another program has it; end that program, or give this bus another port"
         }
-        _ => "it is no serial port or does not work as one; give the path of the adapter, such as /dev/serial/by-id/…",
+        _ => {
+            "it is not a serial port or does not work as one; give the path of the adapter, such as \
+            /dev/serial/by-id/…"
+        }
     };
     format!("{text}; {remedy}")
 }

@@ -68,7 +68,8 @@ pub(super) enum FileProblem {
     #[error("certificate and key cannot be used: {0}; specify a certificate and its key in PEM format")]
     Unusable(String),
     #[error(
-        "certificate `{name}` is of X.509 version 1, which TLS libraries refuse; have it issued anew as version 3, for which \
+        "certificate `{name}` is of X.509 version 1, which TLS libraries refuse; have it reissued as version 3, for \
+         which \
          openssl x509 -req needs -extfile with a subjectAltName"
     )]
     OldVersion { name: String },
@@ -77,17 +78,17 @@ pub(super) enum FileProblem {
     #[error("the private key is of a kind that the gateway does not support; use {SUPPORTED_KEYS}")]
     UnknownKey,
     #[error(
-        "certificate `{name}` in {file} names no host (subjectAltName), and most clients ignore its common name; have it issued \
-         anew with subjectAltName"
+        "certificate `{name}` in {file} names no host (subjectAltName), and most clients ignore its common name; have \
+         it reissued with subjectAltName"
     )]
     NoNames { name: String, file: String },
     #[error(
-        "certificate `{name}` in {file} has a key of {kind}, which the gateway does not support: who shows it, or one \
-         signed by it, is refused; use {SUPPORTED_KEYS}"
+        "certificate `{name}` in {file} has a key of {kind}, which the gateway does not support: a client with it, or \
+         with one signed by it, is refused; use {SUPPORTED_KEYS}"
     )]
     UnsupportedCaKey { name: String, file: String, kind: String },
     #[error(
-        "certificate `{name}` in {file} is no CA and is for {difference}, so the server with it is refused; \
+        "certificate `{name}` in {file} is not a CA and is for {difference}, so the server with it is refused; \
          write a name that is in the certificate into the url"
     )]
     OtherHost {

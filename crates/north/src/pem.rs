@@ -77,7 +77,7 @@ impl Found {
     fn what(self, expected: &str) -> &'static str {
         match self {
             Found::EncryptedKey if expected == PRIVATE_KEY => {
-                " that can be read: it is encrypted, and nobody is there to type its passphrase"
+                " that can be read: it is encrypted, and nobody can type its passphrase"
             }
             Found::EncryptedKey | Found::Key => ", but a private key",
             Found::SshKey => ", but a key in the format of OpenSSH",
@@ -195,7 +195,7 @@ pub fn unreadable(file: &Path, error: &io::Error) -> (String, String) {
     let who = named.unwrap_or_else(|| format!("user {user}"));
     (
         format!("cannot read {shown}: {who} is not permitted to"),
-        "let that user or a group of it read the file and enter its directories (chgrp, chmod g+r)".to_string(),
+        "let that user, or its group, read the file and enter its directories (chgrp, chmod g+r)".to_string(),
     )
 }
 

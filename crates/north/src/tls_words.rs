@@ -113,7 +113,7 @@ fn certificate(cause: &CertificateError, peer: Peer) -> (String, String) {
         Peer::Server { .. } => format!(", or name the certificate itself in {ca}"),
         Peer::Client => String::new(),
     };
-    let reissue = |as_what: &str| format!("have it issued anew {as_what}{pin}");
+    let reissue = |as_what: &str| format!("have it reissued {as_what}{pin}");
     match cause {
         E::ExpiredContext { not_after, .. } => (
             format!("its certificate expired on {}", date(not_after.as_secs())),
@@ -121,11 +121,11 @@ fn certificate(cause: &CertificateError, peer: Peer) -> (String, String) {
         ),
         E::Expired => (
             "the dates in its certificate contradict each other".to_string(),
-            "have it issued anew".to_string(),
+            "have it reissued".to_string(),
         ),
         E::NotValidYetContext { not_before, .. } => (
             format!("its certificate is not valid before {}", date(not_before.as_secs())),
-            "set the clock of this machine, or have it issued anew".to_string(),
+            "set the clock of this machine, or have it reissued".to_string(),
         ),
         E::NotValidForNameContext { expected, presented } => wrong_name(&expected.to_str(), presented, &pin),
         E::UnknownIssuer => (
@@ -147,7 +147,7 @@ fn certificate(cause: &CertificateError, peer: Peer) -> (String, String) {
             };
             (
                 format!("its certificate must not be used by {role}"),
-                format!("have it issued anew with extendedKeyUsage = {usage}"),
+                format!("have it reissued with extendedKeyUsage = {usage}"),
             )
         }
         E::UnsupportedSignatureAlgorithmContext {
@@ -172,7 +172,7 @@ fn certificate(cause: &CertificateError, peer: Peer) -> (String, String) {
         E::UnhandledCriticalExtension => critical_extension(),
         E::BadEncoding => (
             "its certificate is not valid X.509".to_string(),
-            "have it issued anew".to_string(),
+            "have it reissued".to_string(),
         ),
         E::Other(inner) => {
             let inner: &(dyn StdError + 'static) = &*inner.0;
@@ -211,7 +211,7 @@ fn wrong_name(expected: &str, presented: &[String], pin: &str) -> (String, Strin
         return (
             format!("its certificate does not name the host `{expected}` (it has no subjectAltName)"),
             format!(
-                "have it issued anew with subjectAltName = {subject_alternative}{pin} if its common name is that host"
+                "have it reissued with subjectAltName = {subject_alternative}{pin} if its common name is that host"
             ),
         );
     }
@@ -225,14 +225,14 @@ fn wrong_name(expected: &str, presented: &[String], pin: &str) -> (String, Strin
     let names: Vec<String> = presented.iter().map(word).collect();
     (
         format!("its certificate is for {}, not for `{expected}`", names.join(", ")),
-        format!("connect by a name in it, or have it issued anew with subjectAltName = {subject_alternative}"),
+        format!("connect by a name in it, or have it reissued with subjectAltName = {subject_alternative}"),
     )
 }
 
 fn critical_extension() -> (String, String) {
     (
         "its certificate has a critical extension that the gateway does not know".to_string(),
-        "have it issued anew without that extension, or with it not critical".to_string(),
+        "have it reissued without that extension, or with it not critical".to_string(),
     )
 }
 
@@ -244,7 +244,7 @@ fn by_webpki(cause: &webpki::Error, reissue: &dyn Fn(&str) -> String) -> (String
             "with basicConstraints = CA:FALSE",
         ),
         E::EndEntityUsedAsCa => (
-            "its certificate is signed by one that is no CA (basicConstraints is not CA:TRUE)",
+            "its certificate is signed by one that is not a CA (basicConstraints is not CA:TRUE)",
             "by a CA",
         ),
         E::UnsupportedCertVersion => (

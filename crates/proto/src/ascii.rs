@@ -171,7 +171,7 @@ fn value(character: u8) -> Result<u8, &'static str> {
         b'a'..=b'f' => Ok(character - b'a' + 10),
         b'\r' => Err("a carriage return without a line feed behind it"),
         0x80.. => Err("a character has bit 7 set: noise, or the data bits and parity are not the drive's"),
-        _ => Err("a character is no hexadecimal digit"),
+        _ => Err("a character is not a hexadecimal digit"),
     }
 }
 

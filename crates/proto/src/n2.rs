@@ -229,7 +229,7 @@ fn unended(frame: &[u8]) -> Decoded {
     match frame.split_first() {
         Some((b'A' | b'a' | b'N' | b'n', rest)) if rest.iter().all(u8::is_ascii_hexdigit) => Decoded::Incomplete,
         Some((b'>', _)) => Decoded::Incomplete,
-        _ => Decoded::Corrupt("the reply is no A or N and hexadecimal digits"),
+        _ => Decoded::Corrupt("the reply is not A or N and hexadecimal digits"),
     }
 }
 
@@ -260,7 +260,7 @@ fn reply_in(request: &Request, line: &[u8]) -> Result<Reply, &'static str> {
         (Form::State, _) => Err("the reply has not the length of a status byte"),
         (Form::Integer, _) => Err("the reply has not the length of an integer"),
         (Form::Float, _) => Err("the reply has not the length of a float"),
-        (Form::Changes | Form::Any, _) => Err("the reply is no report of changes"),
+        (Form::Changes | Form::Any, _) => Err("the reply is not a report of changes"),
     }
 }
 

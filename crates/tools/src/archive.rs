@@ -182,7 +182,7 @@ pub(super) fn read(
         let name = String::from_utf8_lossy(&entry.path_bytes()).into_owned();
         let kind = entry.header().entry_type();
         if kind != EntryType::Regular {
-            return Err(format!("the member {name:?} is no file but {kind:?}"));
+            return Err(format!("the member {name:?} is not a file but {kind:?}"));
         }
         let member = expected.next().filter(|member| member.name == name);
         let member = member.ok_or_else(|| format!("the member {name:?} is not the one the manifest names here"))?;
@@ -236,7 +236,7 @@ fn parse(json: &[u8]) -> Result<Manifest, String> {
     }
     for directory in &manifest.directories {
         if place(directory)?.0 != Root::Config {
-            return Err(format!("{directory} is no directory of profiles"));
+            return Err(format!("{directory} is not a directory of profiles"));
         }
     }
     if manifest.directories.len() > MOST_MEMBERS || manifest.members.len() > MOST_MEMBERS || bytes > MOST_BYTES {

@@ -82,7 +82,7 @@ impl Verify {
                 }
             }
             if file.cut {
-                faults.push(fault("the line has no end: a crash or somebody cut it", &place));
+                faults.push(fault("the line is incomplete: cut by a crash or by somebody", &place));
             }
             lines += number;
         }

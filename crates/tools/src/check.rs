@@ -290,7 +290,7 @@ fn bus_text(bus: &BusSettings, settings: &Settings, memory: &str) -> String {
         milliseconds(spec.protocol.silence(bus.options.silence, &spec.format)),
     );
     if bus.listens() {
-        return text + "  listens only: another master asks these drives, and the gateway sends nothing\n" + memory;
+        return text + "  listens only: another master polls these drives, and the gateway sends nothing\n" + memory;
     }
     let prediction = bus.predict();
     let mut table = report::table(["drive", "class", "function", "address", "count", "wire ms"]);
@@ -358,20 +358,20 @@ fn slots(bus: &BusSettings, settings: &Settings) -> String {
 fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
     let cycle = |name: &str, achieved: Option<Duration>, wanted: Duration| match achieved {
         Some(achieved) => format!(
-            "  {name} cycle  {:.1} ms (aimed at {:.1} ms)\n",
+            "  {name} cycle  {:.1} ms (target {:.1} ms)\n",
             milliseconds(achieved),
             milliseconds(wanted)
         ),
         None => format!("  {name} cycle  none, nothing to read\n"),
     };
     let wanted = match prediction.demand {
-        demand if demand > 1.0 => format!(" (the cadences ask for {:.0} %)", demand * 100.0),
+        demand if demand > 1.0 => format!(" (the configured cycles would need {:.0} %)", demand * 100.0),
         _ => String::new(),
     };
     let behind = match bus.spec.port.starts_with("tcp://") {
         true => {
-            "  baud        sets nothing at the device server, times are reckoned with it; `drivegate diagnose` says when replies\n              \
-             beat it, and which rate fits\n"
+            "  baud        only for timing: it sets nothing at the device server; `drivegate diagnose` reports replies that\n              \
+             come sooner, and which rate fits\n"
         }
         false => "",
     };

@@ -316,7 +316,7 @@ fn configuration(place: &Place, sides: &Sides) -> String {
     text += &format!("\n[http]\nlisten = \"{http}\"\n");
     text + &match place.written.as_ref().and_then(Written::users) {
         Some(users) => format!("commands = true\nusers_file = {:?}\n", users.display().to_string()),
-        None => "# Operating from the page: `drivegate user add --file users alice` here, then start the demo anew.\n"
+        None => "# Operating from the page: `drivegate user add --file users alice` here, then start the demo again.\n"
             .to_string(),
     }
 }

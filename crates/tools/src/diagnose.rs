@@ -73,8 +73,12 @@ async fn diagnose(args: &Args) -> Result<String, String> {
         return Ok(serde_json::to_string_pretty(&all).unwrap_or_default() + "\n");
     }
     let text = |value: serde_json::Value| {
-        let diagnosis: Diagnosis = serde_json::from_value(value)
-            .map_err(|error| format!("the reply is no diagnosis ({error}); the gateway; use the same version"))?;
+        let diagnosis: Diagnosis = serde_json::from_value(value).map_err(|error| {
+            format!(
+                "unexpected reply from the gateway ({error}); the gateway; use the same \
+                version"
+            )
+        })?;
         Ok(text(&diagnosis))
     };
     all.into_iter()

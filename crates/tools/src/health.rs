@@ -66,7 +66,10 @@ fn http_of(config: &Path) -> Result<Url, String> {
     let settings = Settings::load(config, environment()).settings;
     let settings = settings.ok_or_else(|| format!("the configuration is invalid; {shown}; see `drivegate check`"))?;
     let http = settings.http.ok_or_else(|| {
-        format!("neither the local socket nor [http] is configured, so nobody can be asked; {shown}; configure one")
+        format!(
+            "neither the local socket nor [http] is configured, so the gateway cannot be asked; {shown}; \
+            configure one"
+        )
     })?;
     if http.identity.is_some() {
         return Err(format!(

@@ -185,7 +185,7 @@ fn runtime() -> Result<tokio::runtime::Runtime, String> {
         .worker_threads(1)
         .enable_all()
         .build();
-    built.map_err(|why| format!("cannot start: {why}; the runtime; free memory, threads or file descriptors"))
+    built.map_err(|why| format!("cannot start: {why}; free memory, threads or file descriptors"))
 }
 
 /// Runs `command` on a runtime of its own.
@@ -194,7 +194,7 @@ pub fn block_on(command: impl Future<Output = ExitCode>) -> ExitCode {
         Ok(runtime) => runtime.block_on(command),
         Err(why) => {
             report::error(&format!(
-                "cannot start: {why}; the runtime; free memory, threads or file descriptors"
+                "cannot start: {why}; free memory, threads or file descriptors"
             ));
             ExitCode::from(EXIT_FAILED)
         }

@@ -40,7 +40,7 @@ const FORMATS: [&str; 3] = ["8N1", "8E1", "8O1"];
   drivegate listen --port /dev/ttyUSB0 --baud 9600 --protocol n2 --seconds 600 --n2-report
 
 The configuration goes to standard output, everything else to standard error.
-Exit codes: 0 when requests were heard, 1 when not, 2 wrong command line.")]
+Exit codes: 0 when requests were received, 1 when not, 2 wrong command line.")]
 pub(super) struct Args {
     /// Serial device, or rfc2217://host:port or tcp://host:port of a device server.
     #[arg(long, value_name = "PORT", value_parser = scan::parse_port)]
@@ -256,11 +256,13 @@ impl Ear<'_> {
 fn nothing(bytes: u64, port: &str) -> String {
     match bytes {
         0 => format!(
-            "not a byte was heard; {port}; check that the other master polls, that A and B reach this port, and that the adapter \
+            "no byte was received; {port}; check that the other master polls, that A and B reach this port, and that \
+             the adapter \
              receives"
         ),
         bytes => format!(
-            "{bytes} bytes were heard, and no request with any setting; {port}; check A and B, name --baud and --format, or the \
+            "{bytes} bytes were received, but no valid request with any setting; {port}; check A and B, name --baud \
+             and --format, or the \
              line has another protocol"
         ),
     }
@@ -273,7 +275,7 @@ fn seconds(time: Option<Duration>) -> String {
 /// Who is asked what how often.
 fn words(survey: &Survey, profiles: &Profiles, protocol: Protocol) -> String {
     let mut text = String::new();
-    let mut table = report::table(["address", "request", "heard", "answered", "refused", "cycle ms"]);
+    let mut table = report::table(["address", "request", "seen", "answered", "refused", "cycle ms"]);
     for (address, seen) in &survey.addresses {
         for asked in seen.requests.values() {
             table.add_row([
@@ -307,7 +309,7 @@ fn words(survey: &Survey, profiles: &Profiles, protocol: Protocol) -> String {
     }
     let _ = writeln!(
         text,
-        "{} requests in {:.1} s, cycle of the other master {} ms, {} bytes that are no frame",
+        "{} requests in {:.1} s, cycle of the other master {} ms, {} bytes outside frames",
         survey.requests,
         survey.time().as_secs_f64(),
         seconds(survey.cycle()),

@@ -60,7 +60,7 @@ Exit code 0: nothing differs; 1: something does, or it could not be found out.")
   drivegate params restore --resume pump-1
 
 Shows first what would be written, and asks. The drive needs access = \"control\" and params = \"write\". While parameters are written
-the drive takes no orders but stops; a restore that was cut off keeps it so until it is resumed, undone or released. A gateway
+the drive takes no commands but stops; a restore that was cut off keeps it so until it is resumed, undone or released. A gateway
 goes on with the restore when the command is interrupted.")]
     Restore(restore::RestoreArgs),
     /// Reads a drive and restores that to another of the same kind.
@@ -136,7 +136,7 @@ fn read_drive(config: &Path, args: &ReadArgs) -> Result<ExitCode, ExitCode> {
     };
     if file.missing() > 0 {
         report::warning(&format!(
-            "{} parameters were not read; the file tells why",
+            "{} parameters were not read; the file says why",
             file.missing()
         ));
     }
@@ -313,7 +313,7 @@ fn show(config: &Path, of: &str, names: Option<&Path>) -> Result<ExitCode, ExitC
             let store = store(config)?;
             let last = store
                 .latest(of)
-                .map_err(|why| failed(&format!("{why}; mend or remove that")))?;
+                .map_err(|why| failed(&format!("{why}; correct or remove it")))?;
             last.ok_or_else(|| {
                 failed(&format!(
                     "no reading of `{of}` is kept; {}; read it by `drivegate params read {of}`",

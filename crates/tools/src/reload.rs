@@ -25,7 +25,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
             Err(NotAsked::Because(why)) => why,
             Err(NotAsked::Off) => format!(
                 "`socket` of [gateway] is off, so the running gateway cannot be asked; {}; use `systemctl reload drivegate`, \
-                 which does not tell the outcome",
+                 which does not report the outcome",
                 args.config.path.display()
             ),
         };
@@ -38,7 +38,7 @@ fn reported(outcome: &ReloadOutcome) -> ExitCode {
     outcome.warnings.iter().for_each(|warning| report::warning(warning));
     outcome.errors.iter().for_each(|error| report::error(error));
     if !outcome.errors.is_empty() {
-        report::note("the gateway goes on with the former configuration");
+        report::note("the gateway keeps the former configuration");
         return ExitCode::from(EXIT_CONFIG);
     }
     report::print(&match outcome.changes.as_slice() {

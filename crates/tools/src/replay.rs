@@ -69,7 +69,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Ok(capture) => {
             if let Some(error) = capture.broken {
                 report::warning(&format!(
-                    "the capture is read up to a fault: {error}; {}; what comes behind it is left out",
+                    "the capture is read up to a damaged part: {error}; {}; what follows is left out",
                     args.capture.display()
                 ));
             }
@@ -134,8 +134,7 @@ fn play(bus: &BusSettings, packets: &[Packet], stale_after: Duration) -> Result<
     let image = |spec| Arc::new(DriveImage::new(spec, Duration::ZERO));
     let drives = bus.drives.iter().cloned().map(image).collect();
     let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
-    let queue =
-        CommandQueue::new().map_err(|error| format!("cannot start: {error}; the system; free file descriptors"))?;
+    let queue = CommandQueue::new().map_err(|error| format!("cannot start: {error}; free file descriptors"))?;
     let handle = BusHandle {
         image: image.clone(),
         queue: Arc::new(queue),
@@ -230,7 +229,7 @@ impl Player {
         let _ = write!(self.text, "\n{}", report::lines(&table));
         let _ = writeln!(
             self.text,
-            "\n{:.3} s: {} answered, {} refused, {} unanswered, {} damaged or doubtful, {} pieces that belong to no exchange",
+            "\n{:.3} s: {} answered, {} refused, {} unanswered, {} damaged or doubtful, {} pieces outside transactions",
             at.as_secs_f64(),
             counted(Outcome::Ok),
             counted(Outcome::Exception),

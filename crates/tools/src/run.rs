@@ -32,7 +32,7 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args) -> ExitCode {
     run_from(args.config.path()).unwrap_or_else(|why| {
         report::error(&format!(
-            "cannot start: {why}; the runtime; free memory, threads or file descriptors"
+            "cannot start: {why}; free memory, threads or file descriptors"
         ));
         ExitCode::from(EXIT_FAILED)
     })

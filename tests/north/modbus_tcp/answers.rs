@@ -1,5 +1,5 @@
 //! What is answered to what: every kind of request in every state of plant and client, and single requests byte by byte.
-//! `docs/modbus-tcp.md` shows both tables; `BLESS=1 cargo test --test north answers` writes them anew.
+//! `docs/modbus-tcp.md` shows the table of the former; `BLESS=1 cargo test --test north answers` writes it.
 
 use std::fmt::Write as _;
 use std::time::{Duration, SystemTime};
@@ -727,32 +727,17 @@ async fn answers_byte_by_byte() {
     let rig = Rig::new().await;
     let mut client = rig.client().await;
     let examples = examples();
-    let mut table = String::from("||unit|request|reply|\n|---|---|---|---|");
     for (what, unit, request, answer) in &examples {
         assert_eq!(client.ask(*unit, request).await, *answer, "{what}");
-        // The table of replies has the exceptions.
-        if answer.first().is_some_and(|function| function & 0x80 == 0) {
-            let _ = write!(table, "\n|{what}|{unit}|{}|{}|", hex(request), hex(answer));
-        }
     }
     let counted: u64 = rig.stats.modbus_tcp.requests().iter().map(|(_, _, n)| n).sum();
     assert_eq!(counted, examples.len() as u64);
     rig.end().await;
-    documented("examples", &table);
-}
-
-fn hex(bytes: &[u8]) -> String {
-    let shown: Vec<String> = bytes.iter().take(10).map(|byte| format!("{byte:02X}")).collect();
-    let more = if bytes.len() > 10 { " …" } else { "" };
-    format!("`{}`{more}", shown.join(" "))
 }
 
 /// Holds a part of the page against what the tests have found; `BLESS=1` writes it.
 fn documented(part: &str, found: &str) {
     let page = tools::root().join("docs/modbus-tcp.md");
-    // Two tests bless one page.
-    static PAGE: std::sync::Mutex<()> = std::sync::Mutex::new(());
-    let _guard = PAGE.lock().unwrap();
     let text = std::fs::read_to_string(&page).unwrap();
     let (begin, end) = (
         format!("<!-- {part}: generated -->\n"),
@@ -765,7 +750,7 @@ fn documented(part: &str, found: &str) {
     }
     assert!(
         std::env::var_os("BLESS").is_some(),
-        "docs/modbus-tcp.md does not show in `{part}` what is answered; read the difference, then write it anew by \
+        "docs/modbus-tcp.md does not show in `{part}` what is answered; read the difference, then write it by \
          BLESS=1 cargo test --test north answers"
     );
     std::fs::write(&page, format!("{before}{begin}\n{}\n{end}{after}", found.trim())).unwrap();

@@ -131,13 +131,14 @@ fn a_refused_certificate_is_told_with_cause_and_remedy() {
             "first",
             "ca",
             true,
-            "X.509 version 1, which has no names and no uses; have it issued anew as version 3",
+            "X.509 version 1, which has no names and no uses; have it reissued as version 3",
         ),
         (
             "nameless",
             "ca",
             true,
-            "does not name the host `127.0.0.1` (it has no subjectAltName); have it issued anew with subjectAltName = IP:127.0.0.1",
+            "does not name the host `127.0.0.1` (it has no subjectAltName); have it reissued with subjectAltName = \
+             IP:127.0.0.1",
         ),
         ("authority", "ca", true, "one of a CA (basicConstraints CA:TRUE)"),
         ("large", "large", true, "such as P-521"),
@@ -158,7 +159,7 @@ fn a_refused_certificate_is_told_with_cause_and_remedy() {
             "client",
             "client",
             false,
-            "must not be used by a server; have it issued anew with extendedKeyUsage = serverAuth",
+            "must not be used by a server; have it reissued with extendedKeyUsage = serverAuth",
         ),
         (
             "ordinary",

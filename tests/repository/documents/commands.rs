@@ -14,9 +14,6 @@ pub(crate) fn table() -> String {
     text
 }
 
-/// What the text above the table explains for all commands.
-const SHARED: [&str; 6] = ["help", "version", "config", "url", "ca", "token-file"];
-
 /// A row for the command, or one for each command below it.
 fn rows(text: &mut String, path: &str, command: &Command) {
     let path = format!("{path} {}", command.get_name());
@@ -35,12 +32,9 @@ fn rows(text: &mut String, path: &str, command: &Command) {
     }
 }
 
-/// A position or an option, in brackets where it may be left out.
+/// A position, in brackets where it may be left out, or an option that is required; `--help` has the others.
 fn argument(arg: &Arg) -> Option<String> {
-    let is_shared = arg
-        .get_long()
-        .is_some_and(|long| SHARED.contains(&long) && !arg.is_required_set());
-    if arg.is_hide_set() || is_shared {
+    if arg.is_hide_set() || (arg.get_long().is_some() && !arg.is_required_set()) {
         return None;
     }
     let names = arg.get_value_names().unwrap_or_default();
@@ -48,11 +42,7 @@ fn argument(arg: &Arg) -> Option<String> {
     let several =
         arg.get_num_args().is_some_and(|range| range.max_values() > 1) || matches!(arg.get_action(), ArgAction::Append);
     let value = format!("{}{}", names.join(" "), if several { "…" } else { "" });
-    let shown = match arg.get_long() {
-        None => value,
-        Some(long) if arg.get_action().takes_values() => format!("--{long} {value}"),
-        Some(long) => format!("--{long}"),
-    };
+    let shown = arg.get_long().map_or(value.clone(), |long| format!("--{long} {value}"));
     Some(if arg.is_required_set() {
         shown
     } else {

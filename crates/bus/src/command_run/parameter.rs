@@ -225,6 +225,6 @@ impl ParameterRun {
 fn shown(value: Option<RawValue>) -> String {
     match value {
         Some(value) => format!("it shows {}", value.number()),
-        None => "what it shows is no value".to_string(),
+        None => "what it shows is not a value".to_string(),
     }
 }

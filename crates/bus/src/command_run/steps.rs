@@ -117,7 +117,7 @@ pub(super) fn unsendable(profile: &Profile, values: &[(usize, Value)]) -> Option
             Some(Ok(_)) => Some(Refusal::BadValue(format!("`{name}` = {value} is nothing to write"))),
             Some(Err(why)) => Some(Refusal::BadValue(format!("`{name}`: {why}"))),
             None => Some(Refusal::NotWritable(format!(
-                "`{name}` is no register of the drive; the command does not name those that it rests on"
+                "`{name}` is not a register of the drive; the command does not name those that it rests on"
             ))),
         }
     })

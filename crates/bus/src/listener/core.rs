@@ -154,7 +154,7 @@ impl ListenCore {
             let is_silent = now.saturating_duration_since(known.heard) > silent;
             let due = known.commands.due(now);
             if is_silent {
-                let why = format!("nothing was heard of it for {} s", silent.as_secs());
+                let why = format!("no reply of it for {} s", silent.as_secs());
                 self.report.gone(index, &why);
             }
             if let Some(commanded) = due {

@@ -31,7 +31,7 @@ const N2_LATE: Duration = n2::RESPONSE_TIMEOUT.saturating_mul(3);
 /// Bytes of garbage that are kept of one exchange.
 const KEPT: usize = 512;
 
-const NO_REPLY_IN_FRONT: &str = "something that is no frame came between request and reply";
+const NO_REPLY_IN_FRONT: &str = "invalid bytes came between request and reply";
 const AMBIGUOUS: &str = "it could be a request as well";
 const BEHIND_MANGLED: &str = "it may be the late reply to a request that was mangled";
 

@@ -230,10 +230,7 @@ impl N2Survey {
             list(&self.integers),
         );
         line("a refusal has no checksum", list(&self.refusals));
-        line(
-            "any NaN or infinity means that there is no value",
-            list(&self.no_numbers),
-        );
+        line("any NaN or infinity means no value", list(&self.no_numbers));
         let [zero, others] = self.numbers;
         line(
             "object numbers are those of the printed maps, from 1",
@@ -243,7 +240,7 @@ impl N2Survey {
             "time is not synchronised",
             format!("{} commands with a time", self.times),
         );
-        line("other commands are not used", format!("{} heard", self.others));
+        line("other commands are not used", format!("{} seen", self.others));
         out
     }
 }

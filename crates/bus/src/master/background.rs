@@ -48,7 +48,7 @@ impl Begun {
     }
 }
 
-/// Why what is passed on may not go: a drive that it reaches takes no orders but stops.
+/// Why what is passed on may not go: a drive that it reaches takes no commands but stops.
 fn held(passed_on: &PassedOn, drives: &[Arc<DriveImage>]) -> Option<Outcome> {
     let reached = passed_on
         .reach

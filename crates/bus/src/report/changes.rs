@@ -128,7 +128,7 @@ impl Report {
                 Some(Some(who)) => text += &format!(": ordered by {who}"),
                 Some(None) if reading.is_set(ModelPoint::Fault) => text += ": it has a fault",
                 Some(None) => {
-                    text += ", by no order that this gateway knows of: at the drive, by another master or by itself"
+                    text += ", without a command from this gateway: at the drive, by another master or by itself"
                 }
                 None => {}
             }

@@ -279,7 +279,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
         let named = expected.unwrap_or_default();
         assert!(event.text.contains(named), "{}", event.text);
         assert_eq!(
-            event.text.contains("by no order"),
+            event.text.contains("without a command"),
             expected.is_none() && word != faults,
             "{}",
             event.text

@@ -230,7 +230,7 @@ fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
     let number = value.as_f64();
     if !number.is_finite() {
         return Err(Refusal::BadValue(format!(
-            "`{name}` = {number} is no number; nothing was written"
+            "`{name}` = {number} is not a number; nothing was written"
         )));
     }
     if point.kind() == Kind::Bool {

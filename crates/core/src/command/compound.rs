@@ -214,7 +214,7 @@ mod tests {
         let failed = joined(Some(Outcome::TimedOut), None).unwrap();
         assert_eq!((failed.code(), failed.is_ok()), ("timeout", false));
         assert!(
-            failed.to_string().contains("the rest of the order was not sent"),
+            failed.to_string().contains("the rest of the command was not sent"),
             "{failed}"
         );
     }

@@ -188,7 +188,7 @@ pub enum Order {
     Write(RequestPdu),
     /// A raw read outside the plan.
     Read(RequestPdu),
-    /// One parameter set by a restore, while the motor stands.
+    /// One parameter set by a restore, while the motor is stopped.
     Parameter(ParameterOrder),
 }
 
@@ -375,7 +375,7 @@ pub enum Outcome {
     Withdrawn,
     /// The drive acknowledged it and shows another value.
     NotTaken(String),
-    /// It was begun and did not come to its end: whether the drive took it, or a part of it, is not known.
+    /// It was begun and was interrupted: whether the drive took it, or a part of it, is not known.
     Interrupted(Interruption),
     /// The rest of an order whose stop failed; not sent.
     NotStopped,
@@ -507,9 +507,9 @@ impl fmt::Display for Outcome {
                     Interruption::Offline => "the drive went offline",
                     Interruption::ShuttingDown => "the gateway stops",
                 };
-                write!(f, "it was begun, then {why}; whether the drive took it is not known")
+                write!(f, "it was started, then {why}; whether the drive took it is unknown")
             }
-            Outcome::NotStopped => f.write_str("the stop of the same order failed; it was not sent"),
+            Outcome::NotStopped => f.write_str("the stop of the same command failed; it was not sent"),
             Outcome::StopOnly(rest) => {
                 let rest = rest
                     .to_string()
@@ -519,7 +519,7 @@ impl fmt::Display for Outcome {
                     "the drive acknowledged the stop; the rest was not carried out: {rest}"
                 )
             }
-            Outcome::StopFailed(stop) => write!(f, "{stop}; the rest of the order was not sent"),
+            Outcome::StopFailed(stop) => write!(f, "{stop}; the rest of the command was not sent"),
             Outcome::BusDown => f.write_str("the bus is down; it was not sent"),
             Outcome::Offline => f.write_str("the drive is offline; it was not sent"),
             Outcome::QueueFull => write!(f, "{CAPACITY} commands wait already; it was not sent, try again"),

@@ -151,9 +151,7 @@ impl Rules<'_> {
             (0, echoes) => {
                 format!("{echoes} came back as the adapter's own echo and nothing else, so the adapter sends")
             }
-            (_, _) => format!(
-                "{damaged} replies came that are no valid frames: baud, format or protocol are likely to differ"
-            ),
+            (_, _) => format!("{damaged} replies are not valid frames: baud, format or protocol are likely to differ"),
         };
         let certainty = if figures.answered_since_opened() || drives < 3 {
             Certainty::Fits
@@ -227,7 +225,8 @@ impl Rules<'_> {
         let [standing, runs] = running.failed.map(f32::round);
         let [of_standing, of_runs] = running.asked.map(f32::round);
         let evidence = format!(
-            "{runs} of {of_runs} exchanges failed lately while a drive ran, {standing} of {of_standing} while all stood"
+            "{runs} of {of_runs} transactions failed lately while a drive ran, {standing} of {of_standing} while all \
+             were stopped"
         );
         let certainty = if runs >= 30.0 && of_standing >= 300.0 {
             Certainty::Likely
@@ -343,7 +342,8 @@ impl Rules<'_> {
             String::new()
         };
         let evidence = format!(
-            "{} of {} exchanges with {} failed in the last minute ({} without a reply, {} damaged), {failed} of {asked} with the \
+            "{} of {} transactions with {} failed in the last minute ({} without a reply, {} damaged), {failed} of \
+             {asked} with the \
              others{tail}",
             bad.failed,
             bad.asked,
@@ -364,7 +364,8 @@ impl Rules<'_> {
         let Some(first) = bad.first() else { return };
         let address = self.figures.drives.get(first.place).map_or(0, |drive| drive.address);
         let evidence = format!(
-            "{of_bad} of {asked_bad} exchanges with {} failed in the last minute, {failed} of {asked} with the drives below \
+            "{of_bad} of {asked_bad} transactions with {} failed in the last minute, {failed} of {asked} with the \
+             drives below \
              address {address}",
             self.names_of(bad.iter().map(|one| one.place)),
         );
@@ -503,8 +504,8 @@ impl Rules<'_> {
             return;
         }
         let evidence = format!(
-            "{silent} of {asked} requests in the last minute got no reply, of all drives alike, and only {} replies were damaged",
-            failed - silent
+            "{silent} of {asked} requests in the last minute got no reply, of all drives alike, and only {}",
+            damaged_replies(failed - silent)
         );
         self.add(Cause::RequestEndLost, None, Certainty::Fits, evidence);
     }
@@ -667,5 +668,13 @@ impl Rules<'_> {
             Certainty::Fits
         };
         self.add(Cause::Noise, None, certainty, evidence);
+    }
+}
+
+/// A number of replies and their verb.
+fn damaged_replies(count: u32) -> String {
+    match count {
+        1 => "1 reply was damaged".to_string(),
+        more => format!("{more} replies were damaged"),
     }
 }

@@ -22,7 +22,7 @@ impl Cause {
             Cause::Mains => "errors come in step with the mains",
             Cause::Bias => "stray bytes come while nobody speaks",
             Cause::ReplyStartLost => "the beginning of replies is lost",
-            Cause::RequestEndLost => "requests do not arrive whole",
+            Cause::RequestEndLost => "requests arrive truncated",
             Cause::Echo => "the adapter hears its own requests",
             Cause::LatencyTimer => "the adapter hands replies over in steps of 16 ms",
             Cause::SilenceTooShort => "requests sent soon after a reply are ignored",
@@ -90,8 +90,8 @@ impl Cause {
                  after each request; that no second program connects to it in turn; each new connection takes time from the line"
             }
             Cause::FasterThanBaud => {
-                "set baud of the bus to the rate of the line behind the device server: by it the gateway reckons how long a \
-                 request and its reply are on the wire, and what a late reply is"
+                "set baud of the bus to the rate of the line behind the device server: it decides how long a request \
+                 and its reply are on the wire, and what a late reply is"
             }
             Cause::Noise => {
                 "check termination at both ends, the reference conductor, and shield and course of the cable; a lower baud rate \

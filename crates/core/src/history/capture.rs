@@ -150,7 +150,7 @@ fn check_link(link: u32, offset: usize) -> Result<(), CaptureError> {
     }
     Err(error(
         offset,
-        format!("link type {link} is no serial line; RTAC Serial is {RTAC_SERIAL}, bare bytes are 147 to 162"),
+        format!("link type {link} is not a serial line; RTAC Serial is {RTAC_SERIAL}, bare bytes are 147 to 162"),
     ))
 }
 
@@ -216,7 +216,7 @@ fn read_pcapng(file: &[u8], packets: &mut Vec<Packet>) -> Result<(), CaptureErro
             INTERFACE => interfaces.push(interface(bytes, at, length)?),
             PACKET => {
                 let of = interfaces.get(bytes.u32(at + 8)? as usize).copied();
-                let of = of.ok_or_else(|| error(at + 8, "a packet of an interface that there is not"))?;
+                let of = of.ok_or_else(|| error(at + 8, "a packet of an unknown interface"))?;
                 if let Err(error) = check_link(of.link, at) {
                     not_serial.get_or_insert(error);
                     at += length;
@@ -396,7 +396,7 @@ mod tests {
             read(&none)
                 .unwrap_err()
                 .what
-                .starts_with("link type 1 is no serial line")
+                .starts_with("link type 1 is not a serial line")
         );
     }
 
@@ -408,7 +408,7 @@ mod tests {
             told(b"time,drive"),
             "the file begins neither as pcap nor as pcapng, at byte 0"
         );
-        assert!(told(&pcap(1, &[])).starts_with("link type 1 is no serial line"));
+        assert!(told(&pcap(1, &[])).starts_with("link type 1 is not a serial line"));
         let mut long = pcap(250, &[(0, 0, &[0; 12])]);
         long[32..36].copy_from_slice(&[255, 255, 255, 0]);
         assert_eq!(

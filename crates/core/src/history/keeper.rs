@@ -277,8 +277,8 @@ impl Writer {
                 if !std::mem::replace(&mut self.failing, true) {
                     tracing::error!(
                         target: "drivegate::history",
-                        "cannot keep events and counters in {path}: {error}; a restart forgets those from now on, everything else goes \
-                         on; check state_dir of [gateway] and the disk"
+                        "cannot keep events and counters in {path}: {error}; a restart forgets those from now on; \
+                         everything else continues; check state_dir of [gateway] and the disk"
                     );
                 }
                 self.events.close();

@@ -75,7 +75,7 @@ fn packet(at: SystemTime, verdict: Verdict, bytes: &[u8], comment: &str) -> Vec<
 fn comment(recording: &Recording, frame: &Frame, protocol: Option<Protocol>, bytes: &[u8]) -> String {
     let drives = &recording.header.bus.drives;
     let drive = frame.drive.and_then(|place| drives.get(place));
-    let drive = drive.map_or("between two exchanges", String::as_str);
+    let drive = drive.map_or("between two transactions", String::as_str);
     let meaning = protocol.filter(|_| !bytes.is_empty()).map(|protocol| {
         let opened = protocol.open_frame(bytes).filter(|_| frame.verdict == Verdict::Sent);
         match opened.and_then(|(_, pdu)| RequestPdu::decode(&pdu).ok()) {

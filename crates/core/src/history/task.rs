@@ -365,8 +365,8 @@ impl Writer {
                 Err(error) => {
                     self.failing = true;
                     let text = format!(
-                        "the recording of {drive} is lost: cannot write {}: {error}; further ones are lost, too, until \
-                         there is room and permission; everything else goes on",
+                        "the recording of {drive} is lost: cannot write {}: {error}; further ones are lost, too, \
+                         until there is room and permission; everything else continues",
                         store::path_of(self.store.dir(), &header.id).display()
                     );
                     publish(&self.events, bus, Some(drive), text, None);

@@ -238,7 +238,7 @@ impl LineErrors {
             .map(|(_, drive)| *drive)
             .max_by_key(|drive| of(*drive))?;
         let text = format!(
-            "{} of the exchanges on the line failed within {} s, {} of them with this drive",
+            "{} of the transactions on the line failed within {} s, {} of them with this drive",
             self.recent.len(),
             BURST_IN.as_secs(),
             of(most)

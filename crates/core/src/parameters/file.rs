@@ -111,7 +111,7 @@ pub struct ParameterFile {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FileError {
     /// Something else.
-    #[error("it is no parameter file: its first line is not `{HEAD}`")]
+    #[error("it is not a parameter file: its first line is not `{HEAD}`")]
     Other,
     /// A line is not understood.
     #[error("line {0}: {1}")]

@@ -304,7 +304,7 @@ fn need(text: &str, profile: &Profile) -> Result<Need, String> {
         .ok_or_else(|| format!("profile `{}` has no point `{name}`", profile.name))?;
     let exception = match code {
         "-" => None,
-        code => Some(code.parse().map_err(|_| format!("`{code}` is no exception code"))?),
+        code => Some(code.parse().map_err(|_| format!("`{code}` is not an exception code"))?),
     };
     Ok(Need {
         point,
@@ -386,7 +386,7 @@ impl JournalFile {
         match there.filter(|there| !is_same(there)) {
             None => Ok(()),
             Some(there) => Err(io::Error::other(format!(
-                "there is the journal of a restore of {}, which did not come to its end; resume or undo it, or set it aside by \
+                "there is the journal of a restore of {}, which was interrupted; resume or undo it, or set it aside by \
                  `drivegate params restore --release {}`",
                 there.place(),
                 self.drive()

@@ -179,7 +179,7 @@ impl Reading {
                 Next::Go
             }
             Outcome::Refused(refusal) => Next::Failed(refusal.to_string()),
-            Outcome::ShuttingDown => Next::Failed("the gateway stops, or its bus starts anew".to_string()),
+            Outcome::ShuttingDown => Next::Failed("the gateway stops, or its bus restarts".to_string()),
             Outcome::Expired => {
                 self.todo.push_front(block);
                 Next::Go

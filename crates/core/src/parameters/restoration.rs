@@ -227,7 +227,7 @@ impl Restoration {
             Outcome::Expired | Outcome::QueueFull => self.pause(PAUSE, "the line is busy", now),
             Outcome::Offline => self.pause(PAUSE, "the drive does not answer", now),
             Outcome::BusDown => self.pause(PAUSE, "the bus is down", now),
-            Outcome::ShuttingDown => self.pause(PAUSE, "the gateway stops, or the bus starts anew", now),
+            Outcome::ShuttingDown => self.pause(PAUSE, "the gateway stops, or the bus restarts", now),
         }
     }
 

@@ -220,7 +220,7 @@ mod tests {
             store
                 .latest("pump-1")
                 .unwrap_err()
-                .contains("99999999.params: it is no parameter file")
+                .contains("99999999.params: it is not a parameter file")
         );
     }
 }

@@ -239,7 +239,7 @@ impl Vault {
     pub fn begin_restore(&self, drive: &Machine, name: &str, stage: RestoreStage) -> Result<u64, String> {
         let mut state = self.lock();
         if state.restores.get(drive).is_some_and(RestoreStatus::goes_on) {
-            return Err(format!("a restore of the parameters of `{name}` goes on already"));
+            return Err(format!("a restore of the parameters of `{name}` is already running"));
         }
         state.numbered += 1;
         let begun = RestoreStatus {

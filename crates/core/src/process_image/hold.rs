@@ -1,4 +1,4 @@
-//! Why a drive takes no orders but stops.
+//! Why a drive takes no commands but stops.
 
 use std::sync::Arc;
 
@@ -10,12 +10,12 @@ use arc_swap::ArcSwapOption;
 pub struct Hold(ArcSwapOption<String>);
 
 impl Hold {
-    /// From now on the drive takes no orders but stops, for the reason given; or all again.
+    /// From now on the drive takes no commands but stops, for the reason given; or all again.
     pub fn set(&self, why: Option<String>) {
         self.0.store(why.map(Arc::new));
     }
 
-    /// Why it takes no orders but stops, and what ends that; nothing where it takes all.
+    /// Why it takes no commands but stops, and what ends that; nothing where it takes all.
     pub fn why(&self) -> Option<Arc<String>> {
         self.0.load_full()
     }

@@ -191,7 +191,7 @@ pub struct DriveImage {
     pub spec: DriveSpec,
     /// The requests that read it.
     pub plan: Plan,
-    /// Why it takes no orders but stops, if that is so.
+    /// Why it takes no commands but stops, if that is so.
     pub hold: Arc<Hold>,
     /// Cadence of the slow class, which the staleness of slow points depends on.
     slow_cycle: Duration,

@@ -243,7 +243,7 @@ impl Snapshot {
 pub struct Reading<'d> {
     /// As configured.
     pub spec: &'d DriveSpec,
-    /// Why it takes no orders but stops, if that is so; none of a past in which nobody gives orders.
+    /// Why it takes no commands but stops, if that is so; none of a past in which nobody gives orders.
     pub hold: Option<&'d Hold>,
     /// What is known.
     pub snapshot: Arc<Snapshot>,

@@ -43,7 +43,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, buses: &[
     if is_open {
         reader.problem(
             BACNET.listen.name,
-            "0.0.0.0 hears every network of this machine, and nothing says who may ask",
+            "0.0.0.0 receives from every network of this machine, and nothing says who may read",
             "write `allow`, or the address of one interface",
         );
     }
@@ -138,21 +138,21 @@ fn warn(reader: &Reader<'_>, options: &Options) {
     let (listen, allow, write) = (BACNET.listen.name, BACNET.allow.name, BACNET.write.name);
     for network in &options.write {
         if !options.allow.iter().any(|allowed| allowed.contains(network)) {
-            let what = format!("{network} may write, but not all of it may ask");
+            let what = format!("{network} may write, but not all of it may read");
             reader.warning(write, what, "add it to `allow`");
         }
     }
     if options.commands && options.write.is_empty() {
         reader.warning(
             BACNET.commands.name,
-            "commands are on, and nobody may write",
+            "commands are on, and no client may write",
             "add networks to `write`",
         );
     }
     if !options.commands && !options.write.is_empty() {
         reader.warning(
             write,
-            "`commands` is off, so nobody may write",
+            "`commands` is off, so no client may write",
             "set commands = true, or leave `write` out",
         );
     }
@@ -177,7 +177,7 @@ fn warn(reader: &Reader<'_>, options: &Options) {
     }
     let only_here = options.allow.iter().all(|network| network.network().is_loopback());
     if only_here && listening.ip() != &Ipv4Addr::LOCALHOST {
-        let what = format!("{listening} listens to the network, but `allow` admits nobody from there");
+        let what = format!("{listening} listens to the network, but `allow` admits no client from there");
         reader.warning(allow, what, "add the network to `allow`");
     }
 }

@@ -203,7 +203,7 @@ pub fn check_port(text: &str, base: &Path) -> Result<String, Finding> {
             "write the path of the adapter on this machine, such as \"/dev/serial/by-id/usb-…\"; `ls /dev/serial/by-id` lists them",
         )),
         None if values::host_port(text, None).is_some() => Err(Finding::new(
-            format!("`{text}` is no path of a serial device"),
+            format!("`{text}` is not a path of a serial device"),
             format!(
                 "did you mean \"tcp://{text}\"? Or \"rfc2217://{text}\" for a server that sets up its port over the network"
             ),

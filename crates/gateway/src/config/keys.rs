@@ -192,15 +192,14 @@ keys! {
     GATEWAY: Gateway {
         /// Name of the gateway, used in MQTT topics and in the metric `drivegate_build_info`.
         name: String = Name("-"), required;
-        /// Path of the local socket, mode 0660, through which `drivegate read`, `write`, `reload` and `health` [reach the
-        /// running gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
-        /// the gateway runs without it.
+        /// Path of the local socket, mode 0660, through which `drivegate read`, `write`, `reload` and `health` [reach
+        /// the running gateway](commissioning.md#through-the-gateway); `""`: none.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
         /// Directory of what the gateway keeps: [recordings](history.md#recordings), [events, run hours and starts](history.md),
         /// [parameters](parameters.md), and the [audit file](commands.md#the-audit-file).
         state_dir: PathBuf = PATH, or "the state directory of the systemd unit, else `/var/lib/drivegate`";
-        /// Directories with custom [profiles](profiles.md), `*.toml`; a file with the name of a built-in profile
-        /// replaces it.
+        /// Directories with custom [profiles](profiles.md), `*.toml`; one with the name of a built-in profile replaces
+        /// it.
         profile_dirs: Vec<PathBuf> = List { parse: values::path, empty: None, range: "directories" }, or "none";
     }
 
@@ -208,34 +207,32 @@ keys! {
     BUS: Bus {
         /// Name of the bus, unique; metric label, MQTT topic.
         name: String = Name("-_"), required;
-        /// Serial port, preferably by its persistent name under `/dev/serial/by-id`; or a device server that passes
-        /// bytes through unchanged (`tcp://`: raw serial over TCP, not Modbus TCP), or one whose port drivegate sets up with `baud`
-        /// and `format` (`rfc2217://`: telnet with RFC 2217). A host name is resolved each time the port is
-        /// opened; if that fails, the last known addresses are used. Each port belongs to one bus.
+        /// Serial port, preferably by its name under `/dev/serial/by-id`; or a device server that passes bytes through
+        /// (`tcp://`: raw serial over TCP, not Modbus TCP), or one whose port drivegate sets up with `baud` and
+        /// `format` (`rfc2217://`). Each port belongs to one bus.
         port: String = Text("", "a path, \"tcp://host:port\" or \"rfc2217://host:port\""), required;
-        /// `"master"`: the gateway asks the drives. `"listen"`: another master owns the line; the gateway sends nothing and shows what
-        /// that master reads, see [Listening](troubleshooting.md#listening-to-a-line-that-another-master-owns). Its drives cannot have `access = "control"`, `supervision` or
-        /// `on_shutdown = "stop"`.
+        /// `"listen"`: another master owns the line; the gateway sends nothing and shows what that master reads, see
+        /// [Listening](troubleshooting.md#listening-to-a-line-that-another-master-owns). Its drives cannot have `access
+        /// = "control"`, `supervision` or `on_shutdown = "stop"`.
         mode: Mode = Words(&[("master", Mode::Master), ("listen", Mode::Listen)]), default "master";
         /// Protocol of the drives; every drive's profile must support it.
         protocol: Protocol = PROTOCOLS, default "modbus-rtu";
         /// Bits per second. N2 always uses 9600 8N1; a rate that the profile does not list causes a warning.
         baud: u32 = Number(300..=4_000_000, None), default 9600;
-        /// Data bits 7 or 8, parity `N`, `E` or `O`, stop bits 1 or 2, as set on the drives. Modbus RTU needs 8 data bits.
-        /// Modbus ASCII usually has 7, so that a character has 10 bits: `"7N2"` (a TECO card with all switches off),
-        /// `"7E1"`, `"7O1"`; devices with 8 exist. A format that the profile does not list causes a warning.
+        /// Data bits 7 or 8, parity `N`, `E` or `O`, stop bits 1 or 2, as set on the drives. Modbus RTU needs 8 data
+        /// bits; Modbus ASCII usually has 7 (`"7N2"`: a TECO card with all switches off). A format that the profile
+        /// does not list causes a warning.
         format: String = Text("^[78][NEOneo][12]$", "a format such as \"8N1\""),
             by_protocol |protocol| format!("\"{}\"", bus::default_format(protocol));
-        /// What switches the direction of the line: `"off"`: the adapter itself, as nearly all do; `"kernel"`: the port
-        /// driver, with RTS high while sending; `"kernel-inverted"`: the same with RTS low while sending.
+        /// What switches the direction of the line: the adapter itself, as nearly all do (`"off"`), or the port driver
+        /// with RTS high (`"kernel"`) or low (`"kernel-inverted"`) while sending.
         rs485: Rs485 = Words(&[
             ("off", Rs485::Off), ("kernel", Rs485::Kernel), ("kernel-inverted", Rs485::KernelInverted),
         ]), default "off";
-        /// With `rs485 = "kernel"`: time between switching to sending and the first bit, in whole milliseconds. What the driver
-        /// does not take is logged when the port is opened; so for the three keys below.
+        /// With `rs485 = "kernel"`: time between switching to sending and the first bit, in whole milliseconds. What
+        /// the driver does not take, of this and the next three keys, is logged when the port is opened.
         rts_before_send: Duration = RTS_DELAYS, default "0ms";
-        /// With `rs485 = "kernel"`: time between the last bit and switching back. The drive's reply may begin 3.5 characters after the
-        /// request; what comes before the line is switched back is lost.
+        /// With `rs485 = "kernel"`: time between the last bit and switching back; a reply that begins earlier is lost.
         rts_after_send: Duration = RTS_DELAYS, default "0ms";
         /// With `rs485 = "kernel"`: whether the port receives what it sends. Only for drivers that receive nothing otherwise.
         rx_during_tx: bool = Flag, default false;
@@ -246,25 +243,24 @@ keys! {
         rts: Level = LEVELS, default "driver";
         /// Level of DTR, likewise.
         dtr: Level = LEVELS, default "driver";
-        /// Whether the last 0.01 to 0.12 ms of a short wait are spent watching the clock, so that requests leave on time. `"auto"`: on
-        /// a machine with more than one processor. `"off"` saves processor time on small boxes; requests leave up to 0.1 ms later.
+        /// Whether the end of a short wait is spent watching the clock, so that requests leave on time. `"auto"`: with
+        /// more than one processor. `"off"` saves processor time on small boxes; requests leave up to 0.1 ms later.
         spin: Spin = Words(&[("auto", Spin::Auto), ("on", Spin::On), ("off", Spin::Off)]), default "auto";
         /// Target poll cycle of process data (poll class fast). If the line cannot carry it, cycles follow one another
-        /// without a pause; `check` warns about this.
+        /// without a pause.
         cycle: Duration = TIMES, default "10ms";
-        /// Target poll cycle of class slow: temperatures and other slowly changing values. A motor
-        /// speed that is slow in its profile is read every `cycle` where the line has time for it (`fast_if_carried`).
+        /// Target poll cycle of class slow. A motor speed that is slow in its profile is read every `cycle` where the
+        /// line has time for it (`fast_if_carried`).
         slow_cycle: Duration = TIMES, default "1s";
-        /// Time a drive may take to begin its reply; the time on the wire is added. Above `"1s"` causes a
-        /// warning: each try to reach an absent drive takes the line for that time.
+        /// Time a drive may take to begin its reply; the time on the wire is added. Each try to reach an absent drive
+        /// takes the line for that time.
         response_timeout: Duration = RESPONSE_TIMEOUT,
             by_protocol |protocol| format!("\"{}\"", format_duration(protocol.usual_timeout()));
         /// Retries after the first attempt before a drive counts as offline.
         retries: u32 = Number(0..=10, None), by_protocol |protocol| bus::default_retries(protocol).to_string();
         /// Silence before each request. `"spec"`: 3.5 characters, fixed at 1.75 ms above 19200 baud, as in the Modbus
-        /// specification. `"chars"`: 3.5 characters at any baud rate, which is faster at 38400 and above and still more
-        /// than most drives need. A duration: for drives that need more. Modbus ASCII frames need no silence between
-        /// them; it is kept all the same, for drives that release the line late. N2: `"5ms"`.
+        /// specification. `"chars"`: 3.5 characters at any baud rate, which is faster at 38400 and above and enough for
+        /// most drives. A duration: for drives that need more. N2: `"5ms"`.
         silence: Silence = Parsed {
             parse: bus::parse_silence, words: &["spec", "chars"], pattern: DURATION,
             range: "\"spec\", \"chars\" or a duration up to \"1s\"",
@@ -281,12 +277,11 @@ keys! {
         listen: SocketAddr = SOCKET, or "none";
         /// Address with a COM port by RFC 2217, for programs on Windows behind a COM port redirector.
         rfc2217: SocketAddr = SOCKET, or "none";
-        /// Path of a serial port (a link to a pseudo-terminal, mode 0660) that a program on this machine opens. Its baud rate and
-        /// format have no effect.
+        /// Path of a serial port (a link to a pseudo-terminal, mode 0660) that a program on this machine opens.
         pty: PathBuf = PATH, or "none";
-        /// `"read"`: every request that may write is refused. `"write"`: writes are passed on as those of a Modbus TCP client
-        /// that may write: to drives with `access = "control"`, within limits and `raw_writes`. `"raw"`: also what cannot be
-        /// checked: broadcasts, functions that drivegate does not decode, writes to addresses without a configured drive.
+        /// `"read"`: every request that may write is refused. `"write"`: writes are passed on as those of a Modbus TCP
+        /// client that may write. `"raw"`: also what cannot be checked: broadcasts, functions that drivegate does not
+        /// decode, writes to addresses without a configured drive.
         access: SlotAccess = Words(&[
             ("read", SlotAccess::Read), ("write", SlotAccess::Write), ("raw", SlotAccess::Raw),
         ]), default "read";
@@ -319,10 +314,8 @@ keys! {
         }, or "none";
         /// Lease of the drive. Not a safety function.
         supervision: Present = Own { schema: Supervision::schema, range: "[bus.drive.supervision]" }, or "none";
-        /// What is written at shutdown: nothing, or a stop. `check` reports how long the stops of a line take, and
-        /// warns if that is longer than the systemd unit allows (`TimeoutStopSec=90s`, 10 s of it reserved for
-        /// everything else). Nothing is ever written to a monitored drive: `check` warns about a stop there, and about
-        /// `supervision`.
+        /// What is written at [shutdown](commands.md#shutdown): nothing, or a stop. Nothing is ever written to a
+        /// monitored drive.
         on_shutdown: OnShutdown = Words(&[("hold", OnShutdown::Hold), ("stop", OnShutdown::Stop)]), default "hold";
         /// Time the drive takes to begin its reply, used only for the prediction of `check`; the measured value is a
         /// metric.
@@ -333,9 +326,9 @@ keys! {
             schema: || number_pair(Some(0.0), Some(MOST_HERTZ)),
             range: "[lowest, highest], Hz",
         }, or "none";
-        /// What raw writes may set besides the registers of writable points: nothing (`false`), everything that the profile
-        /// lets write (`true`), or ranges of PDU addresses, of registers and coils alike. A write that contains the control
-        /// word is [always admitted](modbus-tcp.md#what-raw-writes-may-set).
+        /// What [raw writes](modbus-tcp.md#what-raw-writes-may-set) may set besides the registers of writable points:
+        /// nothing, everything that the profile lets write (`true`), or ranges of PDU addresses, of registers and coils
+        /// alike.
         raw_writes: Present = Own {
             schema: || json!({ "anyOf": [{ "type": "boolean" }, { "type": "array", "items": {
                 "type": "array", "items": { "type": "integer", "minimum": 0, "maximum": u16::MAX },
@@ -373,8 +366,8 @@ keys! {
             schema: || json!({ "anyOf": [ { "enum": ["stop", "hold"] }, Reference::schema() ] }),
             range: "\"stop\", \"hold\" or { speed_reference = 20.0 }",
         }, default "stop";
-        /// Whether the lease of a drive that is running when the gateway starts begins immediately: only the clock
-        /// starts, nothing is written; see [leases](commands.md#leases).
+        /// Whether the [lease](commands.md#leases) of a drive that is running when the gateway starts begins
+        /// immediately; nothing is written.
         adopt: bool = Flag, default false;
     }
 
@@ -386,28 +379,27 @@ keys! {
 
     /// Modbus TCP server; not started without this section.
     MODBUS_TCP: ModbusTcp {
-        /// Listen addresses. Port 502 needs a privilege that the service does not have. Without this key, no listener
-        /// is opened here if there is a `listener` or `tls` section.
+        /// Listen addresses. Port 502 needs [a privilege](installation.md#port-502). Without this key, no listener is
+        /// opened here if there is a `listener` or `tls` section.
         listen: Vec<SocketAddr> = ADDRESSES, or "`[\"127.0.0.1:1502\"]`";
         /// Who may connect.
         allow: Vec<IpNet> = NETWORKS, default ["127.0.0.0/8", "::1/128"];
         /// Who may write; no one by default. Modbus TCP has no passwords: keep it narrow, or use TLS.
         write: Vec<IpNet> = NETWORKS, default [];
-        /// Concurrent connections, over all listeners; an eighth of them only for clients that may write. The daemon
-        /// raises its limit of open files; if the system does not permit enough, it serves fewer connections and warns.
+        /// Concurrent connections, over all listeners; an eighth of them only for clients that may write. If the system
+        /// does not permit enough open files, fewer are served, with a warning.
         max_connections: usize = CONNECTIONS, default 64;
         /// Concurrent connections from one address. Clients behind one NAT or proxy share an address.
         max_connections_per_address: usize = CONNECTIONS, default 16;
-        /// A connection without a request for this time is closed. A peer that disappeared is detected by TCP keepalive
-        /// after 90 s in any case.
+        /// A connection without a request for this time is closed.
         idle_timeout: Option<Duration> = Parsed {
             parse: modbus_tcp::parse_idle, words: &["off"], pattern: DURATION,
             range: "\"off\", or \"1s\" to \"168h\"",
         }, default "1h";
         /// Raw reads of registers that are not polled: forwarded to the drive, or refused with exception 02.
         uncached: Uncached = Words(&[("forward", Uncached::Forward), ("refuse", Uncached::Refuse)]), default "forward";
-        /// Older samples of process data are stale, on every interface; see [stale](#stale). If not set, it is three
-        /// cycles on a slower bus; if set, it applies to every bus.
+        /// Older samples of process data are [stale](#stale), on every interface. If not set, it is three cycles on a
+        /// slower bus; if set, it applies to every bus.
         stale_after: Duration = TIMES, default "1s";
         /// Listeners with separate permissions and buses.
         listener: Present = Own { schema: || each(Listener::schema()), range: "[[modbus_tcp.listener]]" }, or "none";
@@ -429,7 +421,7 @@ keys! {
 
     /// Modbus/TCP Security: TLS in which the clients present certificates.
     TLS: Tls {
-        /// Listen addresses. Ports below 1024 need a privilege that the service does not have.
+        /// Listen addresses. Ports below 1024 need [a privilege](installation.md#port-502).
         listen: Vec<SocketAddr> = ADDRESSES, default ["127.0.0.1:802"];
         /// Who may connect.
         allow: Vec<IpNet> = NETWORKS, or "that of `[modbus_tcp]`";
@@ -441,9 +433,8 @@ keys! {
         key: PathBuf = PATH, required;
         /// PEM file with one or more CAs whose client certificates are accepted.
         client_ca: PathBuf = PATH, required;
-        /// PEM or DER file with the certificate revocation lists of the CAs in `client_ca`: clients whose certificate was
-        /// revoked are refused, and disconnected at a reload. Each CA needs a list; one that is out of date stays in
-        /// force, with a warning.
+        /// PEM or DER file with the [certificate revocation lists](modbus-tcp.md#revocation) of the CAs in `client_ca`.
+        /// Each CA needs a list; one that is out of date stays in force, with a warning.
         client_crl: PathBuf = PATH, or "none";
         /// Permissions of the roles in client certificates; clients without a role or with any other role may only
         /// read.
@@ -497,13 +488,13 @@ keys! {
         ]), default "off";
         /// How often values are published.
         publish: Present = Own { schema: Publish::schema, range: "[mqtt.publish]" }, or "the defaults";
-        /// Whether commands are accepted on the set topics, for drives with `access = "control"`. Anyone who may
-        /// publish there can command the drives: restrict it in the broker.
+        /// Whether commands are accepted on the set topics, for drives with `access = "control"`, from anyone whom the
+        /// broker lets publish there.
         commands: bool = Flag, default false;
         /// Whether commands without an `id` are refused, except stops: only with an `id` a repetition is recognised.
         require_id: bool = Flag, default false;
         /// Filters of response topics below `base` that results may be sent to. Topics outside of `base` are always
-        /// allowed, those of the gateway itself never.
+        /// allowed.
         response_topics: Vec<String> = List {
             parse: mqtt::parse_filter, empty: None, range: "topic filters, such as [\"drivegate/answers/#\"]",
         }, default [];
@@ -575,14 +566,13 @@ keys! {
         /// unless there is a `tokens_file`.
         listen: SocketAddr = SOCKET, default "127.0.0.1:9488";
         /// Names and addresses, without a port, under which the server is reached besides `localhost`, the host name of
-        /// this machine and its own addresses: that of a reverse proxy, a container, a name in DNS. Requests for any
-        /// other [host](http.md#hosts) get 421.
+        /// this machine and its own addresses. Requests for any other [host](http.md#hosts) get 421.
         hosts: Vec<String> = HOSTS, default [];
         /// File of access [tokens](http.md#tokens), made by `drivegate token add`. With it, all paths except `/healthz`
         /// and `/readyz` require a token.
         tokens_file: PathBuf = PATH, or "none";
-        /// Whether [users](commands.md#over-http) may command drives with `access = "control"`, from the status page and by
-        /// programs. Needs `users_file`, and `certificate` or a `listen` on the loopback.
+        /// Whether [users](commands.md#over-http) may command drives with `access = "control"`. Needs `users_file`, and
+        /// `certificate` or a `listen` on the loopback.
         commands: bool = Flag, default false;
         /// File of the users who may command, made by `drivegate user add`.
         users_file: PathBuf = PATH, or "none";
@@ -651,8 +641,8 @@ keys! {
 
     /// When [parameters](parameters.md) are read by themselves, and what they are called.
     PARAMS: Params {
-        /// How often all parameters of every drive are read, one drive of a bus after the other; absent: only when asked. Readings are
-        /// kept in `params` of the `state_dir`; what changed without the gateway is an event.
+        /// How often all parameters of every drive are read, one drive of a bus after the other. Readings are kept in
+        /// `params` of the `state_dir`; what changed without the gateway is an event.
         every: Duration = Time(Duration::from_secs(60)..=Duration::from_secs(366 * 86_400)), or "never";
         /// Lists of names, units and scales of your own, [CSV](parameters.md#names-of-your-own); `vacon-cx.csv` is for the drives of
         /// profile `vacon-cx`.
@@ -662,7 +652,7 @@ keys! {
     /// What is logged.
     LOG: Log {
         /// Level, also per target: `"info,drivegate::bus=debug"` logs more about the buses. Every command is logged
-        /// under target `audit`, even at `"warn"` and `"error"`; only `"off"` and `audit=off` disable that.
+        /// under target `audit`, even at `"error"`; only `"off"` and `audit=off` disable that.
         level: String = Parsed {
             parse: log::parse_level, words: &[], pattern: log::PATTERN,
             range: "\"off\", \"error\", \"warn\", \"info\", \"debug\" or \"trace\"",

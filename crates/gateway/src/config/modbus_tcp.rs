@@ -336,7 +336,7 @@ fn warn_of_reach(reader: &Reader<'_>, listener: &modbus_tcp::Listener) {
     if only_here && reader.has(listen) {
         reader.warning(
             listen,
-            format!("{open} listens to the network, but `allow` admits nobody from there"),
+            format!("{open} listens to the network, but `allow` admits no client from there"),
             "add the network to `allow`",
         );
     }

@@ -247,8 +247,10 @@ fn warn_of_clear_text(reader: &Reader<'_>, host: &str, password: bool, commands:
         reader.warning(MQTT.url.name, what, remedy);
     }
     if commands {
-        let what =
-            format!("commands come from `{host}` without TLS: who can change them on the way commands the drives");
+        let what = format!(
+            "commands come from `{host}` without TLS: anyone who can change them on the way commands the \
+                drives"
+        );
         reader.warning(MQTT.commands.name, what, remedy);
     }
 }

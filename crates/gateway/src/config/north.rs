@@ -72,7 +72,7 @@ fn read_tokens(reader: &Reader<'_>, base: &Path) -> Option<Tokens> {
     match Tokens::parse(&text) {
         Ok(tokens) => {
             if tokens.list().is_empty() {
-                let what = format!("{} contains no token, so nobody is answered", path.display());
+                let what = format!("{} contains no token, so every request is refused", path.display());
                 reader.warning(key.name, what, "add one with `drivegate token add`");
             }
             Some(tokens)
@@ -153,7 +153,7 @@ fn warn_of_reach(reader: &Reader<'_>, listen: SocketAddr) {
     if !reader.has(HTTP.tokens_file.name) {
         reader.warning(
             HTTP.listen.name,
-            format!("{listen} can be reached from the network, and everybody who connects may read all data"),
+            format!("{listen} can be reached from the network, and every client may read all data"),
             "set tokens_file, or listen on 127.0.0.1 behind a reverse proxy that asks for a login",
         );
     } else if !reader.has(HTTP.certificate.name) {

@@ -57,7 +57,7 @@ fn range(pair: &Node, profile: Option<&Profile>) -> Result<RangeInclusive<u16>, 
     match profile.filter(|profile| !takes(profile)) {
         None => Ok(first..=last),
         Some(profile) => Err(Finding::new(
-            format!("profile `{}` lets nothing write from {first} to {last}", profile.name),
+            format!("profile `{}` allows no writes from {first} to {last}", profile.name),
             "leave the range out; `drivegate map` lists what can be written",
         )),
     }

@@ -76,7 +76,7 @@ fn read_one(reader: &Reader<'_>, base: &Path, around: &Surroundings<'_>) -> Foun
     if let Some(network) = beyond.filter(|_| writes && !listeners.is_empty()) {
         reader.warning(
             SLOT.allow.name,
-            format!("whoever connects from {network} may write to the drives; a slot has neither passwords nor TLS"),
+            format!("any client in {network} may write to the drives; a slot has neither passwords nor TLS"),
             "keep `allow` narrow, use a tunnel such as ssh, or write access = \"read\"",
         );
     }

@@ -36,7 +36,7 @@ fn buses(before: &Settings, after: &Settings) -> Vec<String> {
         let name = &bus.spec.name;
         match before.buses.iter().find(|old| old.spec.name == *name) {
             None => changes.push(format!("started: bus `{name}`")),
-            Some(old) if old != bus => changes.push(format!("changed: bus `{name}`, started anew")),
+            Some(old) if old != bus => changes.push(format!("changed: bus `{name}`, restarted")),
             Some(_) => {}
         }
     }
@@ -78,7 +78,7 @@ mod tests {
             between(&before, &after),
             [
                 "started: bus `d`",
-                "changed: bus `b`, started anew",
+                "changed: bus `b`, restarted",
                 "stopped: bus `c`",
                 "started: MQTT",
                 "stopped: HTTP",

@@ -48,7 +48,8 @@ impl Leases {
         self.0.into_iter().filter_map(move |(machine, left)| {
             let ends = left.lease.ends()?;
             let text = format!(
-                "the reload ended the lease of {} ({machine}), which is no drive to command any more: {ends}",
+                "the reload ended the lease of {} ({machine}), which has no drive to command in the new \
+                 configuration: {ends}",
                 left.drive
             );
             Some(Event {

@@ -143,7 +143,7 @@ pub struct Situation<'s> {
     pub read_at: Option<Instant>,
     /// Whether this gateway may command it.
     pub is_commandable: bool,
-    /// Why it takes no orders but stops, if that is so, and what ends that.
+    /// Why it takes no commands but stops, if that is so, and what ends that.
     pub held: Option<String>,
     /// The last order that concerns the run command; asked for only while the motor does not run.
     pub order: &'s dyn Fn() -> Option<RunOrder>,
@@ -288,7 +288,7 @@ impl Look<'_> {
                 };
                 format!("fault {code}: {}{because}{panel}{unsure}", fault.text)
             }
-            (Some(code), None) => format!("fault {code}, of which the profile has no text"),
+            (Some(code), None) => format!("fault {code}, without a text in the profile"),
             (None, _) => "a fault is active; its code is not known".to_string(),
         };
         let reset = match self
@@ -412,33 +412,33 @@ impl Look<'_> {
             (RunWish::Run, Fate::Refused, _) => (
                 "order_refused",
                 format!("run of {who} was refused: {text}"),
-                "correct the order or the rights of the client",
+                "correct the command or the rights of the client",
             ),
             (RunWish::Run, Fate::NotSent, _) => (
                 "order_expired",
                 format!("run of {who} was not sent: {text}"),
-                "order it again; see the load of the bus if it happens again",
+                "send it again; see the load of the bus if it happens again",
             ),
             (RunWish::Run, Fate::Unsure, _) => (
                 "order_unanswered",
                 format!("run of {who} was not acknowledged: {text}"),
-                "look whether the drive answers, then order it again",
+                "check whether the drive replies, then send it again",
             ),
             (RunWish::Run, Fate::Taken, _) if read_at > ended => (
                 "other_master",
                 format!("run of {who} was acknowledged, and run is off in the drive now"),
-                "look for another master that writes the control word; a drive that started anew has lost the order",
+                "look for another master that writes the control word; a drive that restarted has lost the command",
             ),
             (RunWish::Run, Fate::Taken, _) => return None,
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Supervision) => (
                 "supervision",
                 format!("its lease ran out, and {}", stopped(order.fate, text)),
-                "let the commanding client renew the lease by orders or heartbeats, then order run again",
+                "have the client renew the lease by commands or heartbeats, then send run again",
             ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Shutdown) => (
                 "stopped_by_gateway",
                 format!("the gateway ended, and {}", stopped(order.fate, text)),
-                "order run again",
+                "send run again",
             ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Client) => (
                 "stopped_by_order",
@@ -446,12 +446,12 @@ impl Look<'_> {
                     Fate::Unsure => format!("a stop of {who} was sent, and not acknowledged: {text}"),
                     _ => format!("{who} stopped it"),
                 },
-                "order run again if it may run",
+                "send run again if it may run",
             ),
             (RunWish::Reset, Fate::Taken | Fate::Unsure, _) => (
                 "fault_was_reset",
                 format!("{who} reset its fault, and a reset starts nothing"),
-                "order run again",
+                "send run again",
             ),
             (RunWish::Stop | RunWish::Reset, Fate::Refused | Fate::NotSent, _) => return None,
         };
@@ -459,10 +459,10 @@ impl Look<'_> {
     }
 
     fn no_order(&self, at: Option<Instant>) -> Cause {
-        let evidence = "run is off in the drive, and no order of this gateway is known".to_string();
+        let evidence = "run is off in the drive, and this gateway sent no command".to_string();
         let remedy = match self.situation.is_commandable {
-            true => "order run",
-            false => "this gateway only monitors it: whoever commands it must start it",
+            true => "send run",
+            false => "this gateway only monitors it: its controller must start it",
         };
         self.cause("no_run_order", evidence, at, remedy)
     }
@@ -474,7 +474,7 @@ impl Look<'_> {
         let (point, value, at) = references.into_iter().find_map(known)?;
         (value.as_f64() == 0.0).then(|| {
             let evidence = format!("run is on, and {} is 0 {}", point.name(), point.unit());
-            self.cause("reference_zero", evidence, at, "order a reference above zero")
+            self.cause("reference_zero", evidence, at, "send a reference above zero")
         })
     }
 
@@ -485,7 +485,7 @@ impl Look<'_> {
         let is_ready = self.bit(ModelPoint::Ready).is_some_and(|(ready, _)| ready);
         (found.is_empty() && is_ready && !reversed).then(|| {
             let evidence = "run and reverse are on, the drive is ready and does not turn in reverse".to_string();
-            let remedy = "order reverse = false, or allow the direction by the parameter of the drive";
+            let remedy = "send reverse = false, or allow the direction by the parameter of the drive";
             self.cause("direction_blocked", evidence, at, remedy)
         })
     }
@@ -498,7 +498,7 @@ impl Look<'_> {
 
     fn unknown(&self) -> Cause {
         let (_, at) = self.bit(ModelPoint::Running).unzip();
-        let evidence = "nothing that the drive tells keeps it from running".to_string();
+        let evidence = "nothing that the drive reports keeps it from running".to_string();
         let remedy = "look at its display; check what it does not tell";
         self.cause("not_known", evidence, at.flatten(), remedy)
     }

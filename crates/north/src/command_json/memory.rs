@@ -123,7 +123,7 @@ pub(crate) struct Fingerprint {
 pub(crate) enum Repetition<R> {
     /// A command whose result is the same now.
     Answered(R),
-    /// A command whose result is still to come, to the same address.
+    /// A command whose result is pending, to the same address.
     Pending,
     /// A command whose result does not answer this message, and why.
     Outdated(&'static str),
@@ -173,7 +173,7 @@ impl<R: Clone> Memory<R> {
         }
         if known.stops != stops {
             return Some(Repetition::Outdated(
-                "but the drive was stopped since, or added anew by a reload",
+                "but the drive was stopped since, or added again by a reload",
             ));
         }
         if let Some(last) = self.last_of.get(&known.identity)
@@ -183,7 +183,7 @@ impl<R: Clone> Memory<R> {
         }
         Some(match result {
             Some(Some(result)) => Repetition::Answered(result.clone()),
-            Some(None) if known.number > self.abandoned => Repetition::Outdated("whose result is still to come"),
+            Some(None) if known.number > self.abandoned => Repetition::Outdated("whose result is pending"),
             Some(None) | None => Repetition::Outdated("whose result is no longer known"),
         })
     }

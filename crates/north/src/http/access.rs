@@ -26,7 +26,7 @@ pub(super) enum AccessError {
     HostCount,
     #[error("the `Host` header is not a host name or an address")]
     BadHost,
-    #[error("this gateway does not go by the name in the `Host` header; add it to `hosts` of [http]")]
+    #[error("this host name is not in `hosts` of [http]; add it")]
     OtherHost,
     #[error("a token is required: send `Authorization: Bearer …` with one of tokens_file")]
     NoToken,

@@ -70,7 +70,7 @@ pub(super) struct Drive<'d> {
     blocked_by: Vec<String>,
     /// The same with evidence and remedy.
     why: Vec<Cause>,
-    /// Why it takes no orders but stops.
+    /// Why it takes no commands but stops.
     #[serde(skip_serializing_if = "Option::is_none")]
     held: Option<String>,
     turnaround_ms: Option<f64>,

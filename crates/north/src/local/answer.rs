@@ -35,7 +35,7 @@ pub async fn answer(request: &Request, shared: &SharedPlant, origin: Origin, ask
         Request::Params(request) => params(request, plant, origin).map(Outcome::Params),
         Request::ParamsRestore(request) => restore(request, shared, origin).await.map(Outcome::ParamsRestore),
         Request::Reload(_) | Request::Health(_) => {
-            let message = "this is no request to a drive";
+            let message = "this is not a request to a drive";
             Err(Failure::new(FailureCode::BadRequest, message))
         }
     };
@@ -154,7 +154,7 @@ fn word_of(word: Word, drive: &DriveHandle, reading: &Reading<'_>) -> Result<Str
 
 fn wanted(profile: &Profile, names: &[String]) -> Result<Vec<Wanted>, Failure> {
     if names.len() > MAX_POINTS {
-        let message = format!("{} points are asked for; {MAX_POINTS} are allowed", names.len());
+        let message = format!("{} points are requested; {MAX_POINTS} are allowed", names.len());
         return Err(Failure::new(FailureCode::BadRequest, message));
     }
     if names.is_empty() {

@@ -401,7 +401,7 @@ impl RestoreOutcome {
         let stage = match &status.stage {
             RestoreStage::Reading => Stage::Reading,
             RestoreStage::Prepared if plan.writes.is_empty() => {
-                text = Some("nothing differs that would be written".to_string());
+                text = Some("nothing to restore".to_string());
                 Stage::Done
             }
             RestoreStage::Prepared => Stage::Prepared,

@@ -181,7 +181,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
     let transactions = all.family(
         Kind::Counter,
         "drivegate_drive_transactions_total",
-        "Exchanges with the drive by their outcome.",
+        "Transactions with the drive by outcome.",
     );
     let turnaround = all.family(
         Kind::Gauge,
@@ -201,7 +201,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
     let unsupervised = all.family(
         Kind::Gauge,
         "drivegate_drive_unsupervised",
-        "Whether a drive with supervision runs of which no client is known to have commanded it: 1, else 0.",
+        "1 if a drive with supervision runs without a lease, else 0.",
     );
     for drive in plant.drives() {
         let image = &drive.image;
@@ -326,7 +326,7 @@ fn buses(handles: &[BusHandle], all: &mut Families) {
     let transactions = all.family(
         Kind::Histogram,
         "drivegate_bus_transaction_seconds",
-        "Duration of exchanges on the bus.",
+        "Duration of transactions on the bus.",
     );
     let queue = all.family(
         Kind::Gauge,
@@ -457,7 +457,7 @@ fn bacnet(stats: &NorthStats, all: &mut Families) {
     all.one(
         Kind::Counter,
         "drivegate_bacnet_notifications_total",
-        "Changes of value that were told to BACnet clients.",
+        "Changes of value sent to BACnet clients.",
         SeriesValue::Count(counters.notifications),
     );
     all.one(
@@ -568,7 +568,7 @@ fn reload(stats: &NorthStats, all: &mut Families) {
     all.one(
         Kind::Gauge,
         "drivegate_config_last_reload_successful",
-        "Whether the last reload of the configuration was applied: 1; 0 if it was refused and the former one goes on.",
+        "Whether the last reload of the configuration was applied: 1; 0 if it was refused.",
         flag(applied),
     );
     all.one(

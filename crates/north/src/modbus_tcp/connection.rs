@@ -45,7 +45,7 @@ enum End {
     HalfFrame,
     #[error("closed: no request for {0:?} (`idle_timeout`)")]
     Idle(Duration),
-    #[error("closed: the client accepted none of its answers within {WRITE_TIMEOUT:?}")]
+    #[error("closed: the client read none of its replies within {WRITE_TIMEOUT:?}")]
     NotReading,
     #[error("connection lost: {0}")]
     Lost(#[from] io::Error),

@@ -41,7 +41,7 @@ pub(crate) enum NotModbus {
     /// As from a client of a serial line that a device server would pass on.
     #[error(
         "the client speaks Modbus {0} over TCP; set it to Modbus TCP (MBAP), or let it use a tool slot of the bus ([[bus.slot]]), \
-         which takes frames of the line"
+         which accepts frames of the line"
     )]
     Serial(&'static str),
 }

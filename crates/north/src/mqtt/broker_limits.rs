@@ -50,12 +50,12 @@ impl BrokerLimits {
             ),
             (
                 self.retains,
-                "keeps no retained messages: who subscribes later sees no status, and each value only when it \
-                 is published again",
+                "keeps no retained messages: later subscribers see no status, and each value only when it is \
+                 published again",
             ),
             (
                 self.wildcards,
-                "takes no filters with wildcards: the gateway subscribes drive by drive, and commands for \
+                "accepts no filters with wildcards: the gateway subscribes drive by drive, and commands for \
                  unknown drives or points get no answer",
             ),
         ];

@@ -402,7 +402,7 @@ impl Thread {
         let written = self.journal.write();
         match written {
             Ok(true) if std::mem::take(&mut self.failing) => {
-                tracing::info!(target: "drivegate::north::mqtt", "{} takes the MQTT buffer again", self.dir.display());
+                tracing::info!(target: "drivegate::north::mqtt", "the MQTT buffer in {} works again", self.dir.display());
             }
             Err(error) if !std::mem::replace(&mut self.failing, true) => {
                 tracing::error!(

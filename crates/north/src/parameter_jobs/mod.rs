@@ -47,7 +47,7 @@ pub fn begin_reading(vault: &Arc<Vault>, drive: DriveHandle, origin: Origin, how
         ));
     }
     if spec.access == Access::Listen {
-        return Err(format!("bus `{}` only listens: nothing is asked on it", spec.bus));
+        return Err(format!("bus `{}` only listens: nothing is sent on it", spec.bus));
     }
     match vault.begin(&drive.machine()) {
         Err(number) => Ok(number),
@@ -232,7 +232,8 @@ async fn keep(store: Store, file: ParameterFile) {
     let dir = store.dir().display().to_string();
     let kept = tokio::task::spawn_blocking(move || store.keep(&file)).await;
     if let Ok(Err(error)) = kept {
-        tracing::warn!(target: "drivegate::north::parameter_jobs", "a reading of parameters cannot be kept in {dir}: {error}; free space or mend its permissions");
+        tracing::warn!(target: "drivegate::north::parameter_jobs", "a reading of parameters cannot be kept in {dir}: \
+            {error}; free space or correct its permissions");
     }
 }
 

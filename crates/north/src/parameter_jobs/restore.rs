@@ -1,7 +1,8 @@
 //! Restores of parameters: prepared, carried out, and where they were cut off taken up again or set aside.
 //!
 //! What the machine in `parameters::restoration` wants is done here: files by threads that may block, orders by the queue of the
-//! bus, one behind the other. While parameters are written the drive takes no orders but stops, and it takes none either while
+//! bus, one behind the other. While parameters are written the drive takes no commands but stops, and it takes none
+//! either while
 //! the journal of a restore that did not end is on disk.
 
 use std::sync::Arc;
@@ -127,7 +128,7 @@ pub fn carry_out(plant: &SharedPlant, drive: &DriveHandle, number: u64, origin: 
         .into_iter()
         .find(|passed| !prepared.risks.contains(passed))
     {
-        let why = format!("{new}; this was not so when the restore was prepared: prepare it anew");
+        let why = format!("{new}; this was not so when the restore was prepared: prepare it again");
         vault.update_restore(&machine, |restore| restore.stage = RestoreStage::Failed(why));
         return Ok(());
     }
@@ -227,10 +228,7 @@ pub async fn release(plant: &SharedPlant, drive: &DriveHandle, origin: &Origin) 
         }
         Ok(None) => {
             drive.image.hold.set(None);
-            RestoreStage::Ended(format!(
-                "`{}` takes all orders again; there is no journal any more",
-                spec.name
-            ))
+            RestoreStage::Ended(format!("`{}` takes commands again; the journal is gone", spec.name))
         }
         Ok(Some(aside)) => {
             drive.image.hold.set(None);
@@ -288,7 +286,7 @@ fn identified(drive: &DriveHandle, of: &Owner) -> Identified {
 
 /// Why the drive takes no orders while parameters are written.
 fn held_while_written(name: &str) -> String {
-    format!("the parameters of `{name}` are being restored: until that is over the drive takes no orders but stops")
+    format!("the parameters of `{name}` are being restored: until then the drive takes no commands but stops")
 }
 
 fn start(
@@ -367,7 +365,7 @@ impl Run {
         let file = self.file.clone();
         let path = file.path();
         let done = blocking(move || work(file)).await;
-        done.map_err(|why| format!("{}: {why}; free space or mend its permissions", path.display()))
+        done.map_err(|why| format!("{}: {why}; free space or correct its permissions", path.display()))
     }
 
     /// The machine as it is configured now, whatever it is called.
@@ -377,13 +375,14 @@ impl Run {
     fn bound(&mut self, plant: &Plant) -> Result<DriveHandle, String> {
         let of = self.restoration.journal().of.place();
         let drive = plant.drive_at(&self.machine).ok_or_else(|| {
-            format!("a new configuration has no drive there any more: the restore, and its journal, are of {of}")
+            format!("the new configuration has no drive there: the restore and its journal belong to {of}")
         })?;
         let name = &drive.image.spec.name;
         if *name != self.name {
             if plant.drive(&self.name).is_some() {
                 return Err(format!(
-                    "in a new configuration `{}` is another drive: the restore, and its journal, are of {of}, which is `{name}` now",
+                    "in the new configuration `{}` is another drive: the restore and its journal belong to {of}, \
+                     which is `{name}` now",
                     self.name
                 ));
             }
@@ -444,7 +443,7 @@ impl Run {
         let drive = self.plant.load().drive_at(&self.machine);
         let name = drive.as_ref().map_or(&self.name, |drive| &drive.image.spec.name);
         let saved = match self.restoration.journal().plan.handling.save {
-            Some(_) => ", and was told to keep them",
+            Some(_) => ", and was made to keep them",
             None => "",
         };
         let (stage, held) = match self.restoration.end() {
@@ -463,7 +462,7 @@ impl Run {
             unfinished => {
                 let why = match unfinished {
                     Some(End::Unfinished(why)) => why.as_str(),
-                    _ => "it did not come to its end",
+                    _ => "it was interrupted",
                 };
                 let text = held_unfinished(name, &format!("{why}; {done} of {all} are done"));
                 (RestoreStage::Failed(text.clone()), Some(text))

@@ -1,5 +1,5 @@
-//! Restores that did not come to their end: whose journal is on disk. The machine of such a journal takes no orders but stops. A
-//! journal whose machine is not configured any more is told of by an event, and by `drivegate check`.
+//! Restores that did not come to their end: whose journal is on disk. The machine of such a journal takes no commands
+//! but stops. A journal whose machine is not configured any more is told of by an event, and by `drivegate check`.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -125,11 +125,11 @@ fn orphaned((file, owner): &Found) -> (PathBuf, String, &'static str) {
         Ok(owner) => (
             file.path(),
             format!(
-                "a restore of parameters did not come to its end: this is its journal, it belongs to {}, and no such drive is configured; \
-                 that drive may be half restored",
+                "a restore of parameters was interrupted: its journal belongs to {}, which is not configured; that \
+                 drive may be half restored",
                 owner.place()
             ),
-            "configure the drive so again and resume or undo the restore, or move the journal away",
+            "configure that drive again and resume or undo the restore, or move the journal away",
         ),
         Err(why) => (
             file.path(),
@@ -139,10 +139,10 @@ fn orphaned((file, owner): &Found) -> (PathBuf, String, &'static str) {
     }
 }
 
-/// Why a drive is held when a restore of it did not come to its end.
+/// Why a drive is held when a restore of it was interrupted.
 pub(super) fn held_unfinished(name: &str, why: &str) -> String {
     format!(
-        "the parameters of `{name}` may be half restored ({why}): the drive takes no orders but stops until \
+        "the parameters of `{name}` may be half restored ({why}): the drive takes no commands but stops until \
          `drivegate params restore --resume {name}` has written the rest, --undo {name} the former values, or --release {name} \
          leaves them as they are"
     )
@@ -151,12 +151,14 @@ pub(super) fn held_unfinished(name: &str, why: &str) -> String {
 /// Why a drive is held by a journal that belongs to a machine which is not configured any more, and why it is not taken up.
 fn belongs_elsewhere(name: &str, profile: &str, claim: Claim, owner: &Owner) -> String {
     let but = match claim {
-        Claim::Own | Claim::Name => "where no drive is configured any more".to_string(),
+        Claim::Own | Claim::Name => "where no drive is configured now".to_string(),
         Claim::Place => format!("and the drive there is configured with profile `{profile}` now"),
     };
     format!(
-        "a restore of parameters did not come to its end, and its journal belongs to {}, {but}: whether `{name}` is the drive that may be \
-         half restored is not known; it takes no orders but stops until that drive is configured as it was, or `drivegate params restore \
+        "a restore of parameters was interrupted, and its journal belongs to {}, {but}: whether `{name}` is the drive \
+         that may be \
+         half restored is not known; it takes no commands but stops until that drive is configured as it was, or \
+         `drivegate params restore \
          --release {name}` sets the journal aside",
         owner.place()
     )
@@ -186,8 +188,9 @@ struct Configured {
     is_new: bool,
 }
 
-/// Holds the drives whose journal tells of a restore that did not come to its end, before anybody can command them, and tells of
-/// journals that belong to none of them. A machine is looked at once; it is held until that is done, however slow the disk.
+/// Holds the drives whose journal tells of a restore that was interrupted, before anybody can command them, and tells
+/// of journals that belong to none of them. A machine is looked at once; it is held until that is done, however slow
+/// the disk.
 pub async fn hold_unfinished<'a>(
     vault: &Arc<Vault>,
     events: &Events,
@@ -206,8 +209,8 @@ pub async fn hold_unfinished<'a>(
     let Some(store) = vault.store() else { return };
     for drive in drives.iter().filter(|drive| drive.is_new) {
         vault.hold(&drive.machine).set(Some(format!(
-            "whether a restore of the parameters of `{}` was cut off is not known before its journal is read: until then the drive takes \
-             no orders but stops",
+            "a restore of the parameters of `{}` may have been interrupted; until its journal is read, the drive \
+             takes no commands but stops",
             drive.spec.name
         )));
     }
@@ -215,7 +218,8 @@ pub async fn hold_unfinished<'a>(
     let looked = tokio::task::spawn_blocking(move || look(&vault, &events, store.dir(), &drives));
     if tokio::time::timeout(LOOK, looked).await.is_err() {
         tracing::warn!(
-            target: "drivegate::north::parameter_jobs", "the disk is slow: the drives take no orders but stops before the journals of restores are read"
+            target: "drivegate::north::parameter_jobs", "the disk is slow: the drives take no commands but stops \
+                before the journals of restores are read"
         );
     }
 }
@@ -280,7 +284,7 @@ fn why_held(spec: &DriveSpec, (file, owner): &Found, claim: Claim) -> String {
     };
     let why = match parsed {
         Ok(journal) => format!(
-            "begun {} by {}, cut off {}, {} of {} parameters done; the journal belongs to {}",
+            "started {} by {}, interrupted while {}, {} of {} parameters done; the journal belongs to {}",
             journal.begun,
             journal.by,
             journal.phase.name(),

@@ -32,7 +32,7 @@ enum End {
     Closed(#[from] CloseReason),
     #[error("closed: no request for {0:?} (`idle_timeout`)")]
     Idle(Duration),
-    #[error("closed: the tool took none of its answers within {WRITE_TIMEOUT:?}")]
+    #[error("closed: the tool read none of its replies within {WRITE_TIMEOUT:?}")]
     NotReading,
     #[error("connection lost: {0}")]
     Lost(#[from] io::Error),

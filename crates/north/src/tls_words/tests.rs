@@ -56,12 +56,12 @@ fn every_refusal_has_a_cause_and_a_remedy() {
         (
             of_webpki(webpki::Error::UnsupportedCriticalExtension),
             "critical extension",
-            "issued anew",
+            "reissued",
         ),
         (
             of_webpki(webpki::Error::MaximumPathDepthExceeded),
             "(MaximumPathDepthExceeded)",
-            "issued anew",
+            "reissued",
         ),
         (
             CertificateError::InvalidPurpose,

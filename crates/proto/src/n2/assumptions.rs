@@ -125,7 +125,7 @@ assumptions! {
         "devices differ", |_| "both".to_string();
     None, "a refusal has no checksum; one with a checksum is accepted too",
         "one open-source master expects none", |_| "both".to_string();
-    None, "any NaN or infinity means that there is no value",
+    None, "any NaN or infinity means no value",
         "the manuals name an Invalid Float without its bit pattern; the simulator sends 7FC00000", |_| "no value".to_string();
     None, "object numbers on the wire are those of the printed maps, from 1",
         "the manuals print no frames", |_| "from 1".to_string();

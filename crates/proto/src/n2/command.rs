@@ -254,7 +254,7 @@ impl Answer {
     pub fn decode(line: &[u8]) -> Result<Answer, &'static str> {
         let (lead, text) = line.split_first().ok_or("the reply is empty")?;
         if !text.iter().all(u8::is_ascii_hexdigit) {
-            return Err("the reply is no A or N and hexadecimal digits");
+            return Err("the reply is not A or N and hexadecimal digits");
         }
         match (lead, text) {
             (b'A' | b'a', []) => Ok(Answer::Ack),

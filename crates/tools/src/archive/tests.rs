@@ -127,7 +127,7 @@ fn what_a_backup_never_has_is_refused() {
         assert!(error.contains(why), "{error}: {why}");
     };
     for kind in [Symlink, Link, Directory, Fifo, GNULongName, XHeader] {
-        refused(&sound, &[(CONFIG.0, CONFIG.1, kind)], "is no file");
+        refused(&sound, &[(CONFIG.0, CONFIG.1, kind)], "is not a file");
     }
     refused(
         &sound,

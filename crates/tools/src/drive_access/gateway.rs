@@ -91,7 +91,7 @@ fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
         | Request::Reload(_)
         | Request::Health(_) => "try again",
         Request::ParamsRestore(_) => {
-            "a restore that was begun goes on in the gateway: look at `drivegate params restore --look DRIVE`"
+            "a started restore continues in the gateway: see `drivegate params restore --look DRIVE`"
         }
         Request::Write(_) => "whether the drive took the command is not known: read before you repeat it",
     };

@@ -39,7 +39,7 @@ pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, 
     if control.restarts_on_reset {
         lines.push((
             "caution",
-            "a reset while a run command stands starts the motor".to_string(),
+            "a reset while a run command is set starts the motor".to_string(),
         ));
     }
     lines

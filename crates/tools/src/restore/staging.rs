@@ -191,7 +191,7 @@ fn directory_of(root: &Path, path: &Path) -> io::Result<PathBuf> {
         match fs::symlink_metadata(&directory) {
             Ok(found) if found.is_dir() => {}
             Ok(_) => {
-                let what = format!("{} is no directory", directory.display());
+                let what = format!("{} is not a directory", directory.display());
                 return Err(io::Error::new(io::ErrorKind::NotADirectory, what));
             }
             Err(_) => {

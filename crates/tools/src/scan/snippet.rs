@@ -135,7 +135,7 @@ impl Snippet<'_> {
         };
         let note = match drive.profiles.as_slice() {
             [_, others @ ..] if !others.is_empty() => format!(
-                "# By reading alone {first} cannot be told from {}: check the nameplate.\n",
+                "# By reading alone {first} cannot be distinguished from {}: check the nameplate.\n",
                 others.join(" and ")
             ),
             _ => String::new(),
@@ -278,7 +278,8 @@ mod tests {
         drives[3].turnaround = Some(Duration::from_micros(15_300));
         let text = text_of("/dev/x", &drives);
         for wanted in [
-            "\n# By reading alone eaton-hvx cannot be told from eaton-svx: check the nameplate.\n# This is an older OPT-C2 board: an Eaton, or a Vacon NX with an older board.\n[[bus.drive]]\nname = \"drive-1\"\n",
+            "\n# By reading alone eaton-hvx cannot be distinguished from eaton-svx: check the nameplate.\n# This is \
+             an older OPT-C2 board: an Eaton, or a Vacon NX with an older board.\n[[bus.drive]]\nname = \"drive-1\"\n",
             "\n# This is an OPT-C2 board of 2012 or later: a Vacon NX, or an Eaton with a newer board.\n[[bus.drive]]\nname = \"drive-4\"\n",
             "\n# No profile matches the answers of this drive: docs/profiles.md says how to write one.\n# [[bus.drive]]\n",
             "\n# The family of this drive is not known, because 2 reads got no answer: scan again with --tries 3.\n# [[bus.drive]]\n",

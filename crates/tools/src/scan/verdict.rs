@@ -33,14 +33,16 @@ pub(crate) fn nobody_answers(heard: &Heard, port: &str) -> String {
     if heard.no_way > 0 {
         return format!(
             "no drive answered: the gateway at the port did, {} times for {requests} requests, and says by exception 0A or 0B \
-             that it reaches nobody at these addresses; {port}; check baud, format and wiring of the line behind that gateway, \
+             that it reaches no drive at these addresses; {port}; check baud, format and wiring of the line behind \
+             that gateway, \
              and the power of its drives",
             heard.no_way
         );
     }
     if let Some((setting, count)) = most_garbage(heard) {
         return format!(
-            "no drive answered, but {} bytes came that are no valid reply, most of them at {setting} ({count} times): \
+            "no drive answered, but {} bytes came that are not a valid reply, most of them at {setting} ({count} \
+             times): \
              something is connected and answers, so the wiring carries data; {port}; try the baud and format shown on the \
              drive's panel, or --baud all --format all; two drives with one address look the same",
             heard.bytes
@@ -55,14 +57,16 @@ pub(crate) fn nobody_answers(heard: &Heard, port: &str) -> String {
     }
     if heard.echoes > 0 {
         return format!(
-            "no drive answered: {} of {requests} requests came back as the adapter's own echo and nothing else was heard, so \
-             the adapter sends, and the drives are silent; {port}; check power, wiring (swap - and +) and that the bus is \
+            "no drive answered: {} of {requests} requests came back as the adapter's own echo and nothing else was \
+             received, so the adapter sends, and the drives are silent; {port}; check power, wiring (swap - and +) \
+             and that the bus is \
              enabled at the drive; then try --baud all --format all",
             heard.echoes
         );
     }
     format!(
-        "no drive answered: after {requests} requests not one byte was heard; {port}; a drive is silent at wrong settings as \
+        "no drive answered: after {requests} requests no byte was received; {port}; a drive is silent at wrong \
+         settings as \
          well as on a dead line, so first check power, wiring (swap - and +), termination and that the bus is enabled at the \
          drive, and whether the transmit light blinks; then try --baud all --format all"
     )
@@ -80,12 +84,12 @@ fn told_by_shape(heard: &Heard) -> Option<String> {
     let told = [
         (
             *start_lost,
-            format!("{start_lost} replies came that are sound once their first bytes are put back"),
+            format!("{start_lost} replies are valid once their first bytes are restored"),
             Cause::ReplyStartLost,
         ),
         (
             *cut_echoes,
-            format!("{cut_echoes} of {requests} requests came back as the adapter's own echo without their end"),
+            format!("{cut_echoes} of {requests} requests came back as the adapter's own echo without their last bytes"),
             Cause::RequestEndLost,
         ),
         (
@@ -218,17 +222,17 @@ mod tests {
         for (heard, wanted) in [
             (
                 late,
-                "4 replies came that are sound once their first bytes are put back: the beginning of replies is lost; ",
+                "4 replies are valid once their first bytes are restored: the beginning of replies is lost; ",
             ),
             (
                 early,
-                "30 of 30 requests came back as the adapter's own echo without their end",
+                "30 of 30 requests came back as the adapter's own echo without their last bytes",
             ),
-            (silent, "after 30 requests not one byte was heard; /dev/x; "),
+            (silent, "after 30 requests no byte was received; /dev/x; "),
             (echo, "30 of 30 requests came back as the adapter's own echo"),
             (
                 wrong,
-                "90 bytes came that are no valid reply, most of them at modbus-rtu 19200 8N1 (2 times)",
+                "90 bytes came that are not a valid reply, most of them at modbus-rtu 19200 8N1 (2 times)",
             ),
             (noise, "5 bytes came that belong to no request"),
         ] {

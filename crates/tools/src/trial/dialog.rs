@@ -56,7 +56,7 @@ pub(super) fn choose_port(stop: &Stop) -> Result<Option<String>, ExitCode> {
         return Err(failed(
             EXIT_USAGE,
             &format!(
-                "which adapter is not said, and there is no terminal to ask on; command line; write --port {}",
+                "no adapter is named, and there is no terminal to ask on; command line; write --port {}",
                 found.first().map_or("PORT", |adapter| adapter.port.as_str())
             ),
         ));

@@ -272,7 +272,7 @@ impl Verifier {
         let named = head.bytes.zip(head.sha256).filter(|_| head.entry == "fragment");
         if fragment != named {
             let why = match fragment {
-                Some(_) => "the line is no entry, and none names it as the rest of a crash",
+                Some(_) => "the line is not an entry, and none names it as the rest of a crash",
                 None => "the rest of a crash before this line was removed",
             };
             return Err(Fault {
@@ -291,7 +291,7 @@ impl Verifier {
     /// What is wrong with the end.
     pub fn finish(&self) -> Result<(), String> {
         if self.fragment.is_some() {
-            return Err("the last line is no entry: a crash or somebody cut it".to_string());
+            return Err("the last line is incomplete: cut by a crash or by somebody".to_string());
         }
         match self.wanted {
             Some(wanted) => Err(format!(

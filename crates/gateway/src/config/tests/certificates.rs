@@ -204,7 +204,7 @@ fn what_peers_will_refuse_is_a_warning() {
         (
             "own.crt",
             "10.0.0.5",
-            "is no CA and is for `hall.local`, `127.0.0.1`, not for `10.0.0.5`",
+            "is not a CA and is for `hall.local`, `127.0.0.1`, not for `10.0.0.5`",
         ),
         (
             "large.crt",

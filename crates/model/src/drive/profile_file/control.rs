@@ -71,7 +71,7 @@ fn read_at(table: &Reader<'_>, around: &Around<'_>) -> Option<Place> {
     let Some(Place { table: kind, address }) = place else {
         table.problem(
             "at",
-            format!("`{text}` is no register or coil that can be written"),
+            format!("`{text}` is not a register or coil that can be written"),
             "write \"holding 2000\" or \"coil 0\"",
         );
         return None;
@@ -178,7 +178,7 @@ fn read_place(form: &Reader<'_>, around: &Around<'_>) -> Option<Option<Place>> {
         None => {
             form.problem(
                 "point",
-                format!("`{name}` is no register or coil that is written as it stands"),
+                format!("`{name}` is not a register or coil that is written as it is"),
                 "name a point with `write = true`, type u16 and no scale, or a coil",
             );
             None
@@ -322,7 +322,7 @@ pub(super) fn read_mask(table: &Reader<'_>, around: &Around<'_>, key: &str) -> O
     if !read {
         table.problem(
             "point",
-            format!("`{name}` is no whole register"),
+            format!("`{name}` is not a whole register"),
             "name a point of type u16 or u32 without scale, mask and equals",
         );
     } else if around
@@ -425,7 +425,7 @@ fn check(table: &Reader<'_>, control: &Control) {
             table.problem(
                 "stop",
                 "a word can be a run command and a stop at once",
-                "write bits of which the run command has the opposite",
+                "write bits that the run command has the other way round",
             );
         }
     }

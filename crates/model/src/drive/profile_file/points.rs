@@ -277,7 +277,7 @@ fn check_kind(reader: &Reader<'_>, point: &Point) {
         ),
         Some(_) if point.kind() == Kind::Text => reader.problem(
             "type",
-            format!("`{}` is no text in the common model", point.name),
+            format!("`{}` is not a text in the common model", point.name),
             "name a register with a number, or choose another name",
         ),
         Some(Kind::Number | Kind::Integer) if !figure => reader.problem(
@@ -313,7 +313,7 @@ fn check_texts(reader: &Reader<'_>, point: &Point, names: &[String]) {
         return;
     }
     if point.kind() == Kind::Text {
-        reader.problem("texts", "a text is no enumeration", "leave the table out");
+        reader.problem("texts", "a text is not an enumeration", "leave the table out");
     }
     let beside = format!("{}_text", point.name);
     if names.contains(&beside) {
@@ -416,7 +416,7 @@ pub(super) fn check_scale(reader: &Reader<'_>, index: usize, points: &[Point]) {
     if !scale.raw().is_some_and(whole) {
         reader.problem(
             "scale_from",
-            format!("`{}` is no whole number without a scale of its own", scale.name),
+            format!("`{}` is not a whole number without a scale of its own", scale.name),
             "name a point with type = \"i16\" and no `scale`",
         );
     } else if scale.class == PollClass::Never {

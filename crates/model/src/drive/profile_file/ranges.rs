@@ -95,7 +95,7 @@ pub(super) fn read_functions(reader: &Reader<'_>, ranges: &[AddressRange]) -> Wr
             15 => (Table::Coil, &mut functions.coils_by_15),
             16 => (Table::Holding, &mut functions.registers_by_16),
             _ => {
-                let what = format!("{function} is no function that writes several items");
+                let what = format!("{function} is not a function that writes several items");
                 given.problem("single_write", what, "write 16 (registers), 15 (coils) or [15, 16]");
                 continue;
             }

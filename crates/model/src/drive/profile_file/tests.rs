@@ -644,7 +644,7 @@ fn each_mistake_of_a_value() {
         ("scale_from = \"b\"", "there is no point `b`; m:13, point[0].scale_from"),
         (
             "scale_from = \"a\"",
-            "`a` is no whole number without a scale of its own; m:13",
+            "`a` is not a whole number without a scale of its own; m:13",
         ),
         (
             "type = \"string:2\"\nwrite = true",
@@ -657,7 +657,7 @@ fn each_mistake_of_a_value() {
         ),
         (
             "type = \"string:2\"\n[point.texts]\n1 = \"on\"",
-            "a text is no enumeration; m:14, point[0].texts",
+            "a text is not an enumeration; m:14, point[0].texts",
         ),
     ];
     for (lines, wanted) in cases {
@@ -677,7 +677,7 @@ fn each_mistake_of_a_value() {
         mistakes("m", &format!("{HEAD}{place}"))
     };
     assert!(model("motor_current", "hidden = true").contains("is a point of the common model"));
-    assert!(model("motor_current", "type = \"string:4\"").contains("is no text in the common model"));
+    assert!(model("motor_current", "type = \"string:4\"").contains("is not a text in the common model"));
     assert!(model("running", "mask = 3").contains("is true or false"));
     assert_eq!(model("running", "mask = 3\nequals = 3"), "");
     assert!(model("motor_current", "mask = 3\nequals = 3").contains("is a number, not a bit"));

@@ -307,7 +307,7 @@ fn a_fault_has_cause_and_remedy_where_the_manual_has_them() {
     );
     assert_eq!(known.remedy, "check the installation; then write fault_reset");
     assert!(fault(1).evidence.ends_with("fault 1: overcurrent, text not verified"));
-    assert_eq!(fault(77).evidence, "fault 77, of which the profile has no text");
+    assert_eq!(fault(77).evidence, "fault 77, without a text in the profile");
 }
 
 #[test]

@@ -106,7 +106,7 @@ pub(super) enum Denied {
     #[error("too many logins at once; try again")]
     Busy,
     /// A page of somebody else.
-    #[error("the request comes from a page of another origin")]
+    #[error("the request comes from another origin")]
     OtherOrigin,
     /// The token of the session is missing or wrong.
     #[error("the header X-CSRF-Token does not have the token of this session")]

@@ -9,7 +9,7 @@ const texts = {
   "Another point": "Weiterer Wert",
   "Answer on this line without an entry in the configuration: addresses {addresses}.": "Auf dieser Leitung antworten ohne Eintrag in der Konfiguration: Adressen {addresses}.",
   "As CSV:": "Als CSV:",
-  "Asked {count} times without an answer, last at {time}; it is asked again.": "{count}-mal ohne Antwort abgefragt, zuletzt um {time}; es wird weiter abgefragt.",
+  "No reply to {count} requests, the last at {time}; retrying.": "{count}-mal ohne Antwort abgefragt, zuletzt um {time}; es wird weiter abgefragt.",
   "Asking the gateway …": "Das Gateway wird abgefragt …",
   "By": "Quelle",
   "By line": "Nach Leitung",

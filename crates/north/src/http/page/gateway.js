@@ -74,5 +74,5 @@ function show(isLost) {
 
 // Beside what is announced: it changes with every try.
 function showTries() {
-  text($("banner-tries"), tries ? t("Asked {count} times without an answer, last at {time}; it is asked again.", { count: tries, time: clock(new Date()) }) : "");
+  text($("banner-tries"), tries ? t("No reply to {count} requests, the last at {time}; retrying.", { count: tries, time: clock(new Date()) }) : "");
 }

@@ -122,7 +122,7 @@ impl Client {
 fn refusal(why: PubAckReason) -> String {
     match why {
         PubAckReason::NotAuthorized => "the broker does not allow it (ACL)".to_string(),
-        PubAckReason::QuotaExceeded => "the broker takes no more for now (quota exceeded)".to_string(),
+        PubAckReason::QuotaExceeded => "the broker accepts no more for now (quota exceeded)".to_string(),
         why => format!("the broker refuses it ({why:?})"),
     }
 }

@@ -135,7 +135,8 @@ impl Client {
         self.stats.mqtt.lost(MqttLoss::History, history);
         if events + history > 0 {
             tracing::warn!(
-                target: "drivegate::north::mqtt", "{} events or arrays of history that the broker did not take are lost with the end of the MQTT client; set \
+                target: "drivegate::north::mqtt", "{} events or arrays of history that the broker did not accept are \
+                    lost when the MQTT client ends; set \
                  mqtt.buffer to keep them",
                 events + history
             );

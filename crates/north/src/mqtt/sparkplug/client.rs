@@ -434,7 +434,7 @@ impl Client {
                 (true, _) => {}
                 (false, _) => {
                     let name = metric.name.as_deref().unwrap_or("a metric without a name");
-                    let why = format!("{name:?} is no command of the node");
+                    let why = format!("{name:?} is not a command of the node");
                     self.not_understood(&message.topic, &why);
                 }
             }
