@@ -133,8 +133,9 @@ pub(crate) fn at_silent_drives(heard: &Heard, tried: &[Setting], profiles: &Prof
     if lines.is_empty() {
         return lines;
     }
-    format!("{heading}; `drivegate profiles show NAME` has terminals, termination and settings, also of other \
-         families:\n{lines}")
+    format!(
+        "{heading}; `drivegate profiles show NAME` has terminals, termination and settings, of other families too:\n{lines}"
+    )
 }
 
 /// What the families that answered need before the first command.
