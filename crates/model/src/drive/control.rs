@@ -230,6 +230,42 @@ impl Control {
         (word ^ setting.value) & setting.mask & !free == 0
     }
 
+    /// The word without a reset that stands in it: its bits as they are between two resets.
+    pub fn without_reset(&self, own: u16) -> u16 {
+        match self.fault_reset.map(|reset| reset.setting) {
+            Some(reset) if reset.place.is_none() && reset.value == 0 => own | reset.mask,
+            Some(reset) if reset.place.is_none() && reset.holds(own) => own & !reset.value,
+            _ => own,
+        }
+    }
+
+    /// The word with that direction, where the direction is a setting of the control word.
+    pub fn with_direction(&self, word: u16, reverse: bool) -> u16 {
+        match self.reverse.filter(|setting| setting.place.is_none()) {
+            Some(setting) if reverse => setting.applied(word),
+            Some(setting) if setting.holds(word) || setting.mask.count_ones() == 1 => setting.undone(word),
+            _ => word,
+        }
+    }
+
+    /// The direction that the word says; none where it says none.
+    pub fn direction_of(&self, word: u16) -> Option<bool> {
+        if let Some(reverse) = self.reverse.filter(|setting| setting.place.is_none()) {
+            return Some(reverse.holds(word));
+        }
+        match &self.run {
+            Run::Pair { reverse, .. } if reverse.holds(word) => Some(true),
+            Run::Pair { forward, .. } if forward.holds(word) => Some(false),
+            _ => None,
+        }
+    }
+
+    /// Where `run` is written.
+    pub fn run_place(&self) -> Place {
+        let first = self.runs().first().and_then(|setting| setting.place);
+        first.unwrap_or(self.at)
+    }
+
     /// The word of a stop, made of the word that stands.
     pub fn stop_word(&self, own: u16) -> u16 {
         match self.stop.place {

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::super::control::{Always, Control, Mask, OwnWord, Place, Reset, Run, Setting, Step, Until};
+use super::super::derive::Derived;
 use super::super::model::ModelPoint;
 use super::super::profile::{AddressRange, Form, Point, PollClass, Raw, Source};
 use super::derived::point_of;
@@ -15,6 +16,8 @@ use crate::document::{Finding, Reader};
 const STEP_TIMEOUT: Duration = Duration::from_secs(2);
 const LONGEST: Duration = Duration::from_secs(60);
 const MOST_STEPS: usize = 8;
+/// The helper that holds the control word.
+const CONTROL_WORD: &str = "control_word";
 
 /// What the table refers to.
 pub(super) struct Around<'p> {
@@ -401,6 +404,75 @@ pub(super) fn plain_points(control: &Control) -> Vec<Point> {
         .into_iter()
         .filter_map(|(model, setting)| Some(point(model, bit(setting?)?)));
     made.collect()
+}
+
+/// The points of the common model that any other control word makes: what they read as rests on the control word, or on the
+/// place of its own; a word that reads as something else is not read. A helper for the control word goes before them.
+pub(super) fn made_points(control: &Control, points: &[Point], before: usize) -> Vec<Point> {
+    let mut helpers: Vec<Point> = Vec::new();
+    let mut index_of = |place: Place| {
+        let is_plain = |point: &Point| {
+            point.raw().is_some_and(|raw| {
+                let whole = matches!(raw.form, Form::U16 | Form::Bit { bit: 0, invert: false }) && raw.is_unscaled();
+                whole && (raw.table, raw.address) == (place.table, place.address)
+            })
+        };
+        let first = points.len() + before;
+        let known = points.iter().position(is_plain);
+        let known = known.or_else(|| helpers.iter().position(is_plain).map(|index| first + index));
+        known.unwrap_or_else(|| {
+            helpers.push(helper(control, place));
+            first + helpers.len() - 1
+        })
+    };
+    let mut state = |setting: &Setting| Mask {
+        point: index_of(setting.place.unwrap_or(control.at)),
+        mask: u64::from(setting.mask),
+        is: u64::from(setting.value),
+    };
+    let reset = control.fault_reset.map(|reset| reset.setting);
+    let reversed = match &control.run {
+        Run::Pair { reverse, .. } => Some(*reverse),
+        Run::One(_) | Run::Steps(_) => control.reverse,
+    };
+    let of_run = control.runs().iter().map(&mut state).collect();
+    let of_reverse = reversed.as_ref().map(&mut state).into_iter().collect();
+    let of_reset = reset.as_ref().map(&mut state).into_iter().collect();
+    let made: [(ModelPoint, Vec<Mask>); 3] = [
+        (ModelPoint::Run, of_run),
+        (ModelPoint::Reverse, of_reverse),
+        (ModelPoint::FaultReset, of_reset),
+    ];
+    let made = made.into_iter().filter(|(_, any)| !any.is_empty());
+    let made = made.map(|(model, any)| Point {
+        write: true,
+        pulse: model == ModelPoint::FaultReset,
+        ..Point::of_model(model, Source::Derived(Derived::State { any }))
+    });
+    helpers.iter().cloned().chain(made).collect()
+}
+
+/// The control word, for the points that rest on it.
+fn helper(control: &Control, place: Place) -> Point {
+    let form = match place.table {
+        Table::Coil | Table::DiscreteInput => Form::Bit {
+            bit: 0,
+            invert: false,
+        },
+        Table::Holding | Table::Input => Form::U16,
+    };
+    let source = Source::Raw(Raw::plain(place.table, place.address, form));
+    let class = match control.own_word {
+        OwnWord::Read => PollClass::Slow,
+        OwnWord::Shadow => PollClass::Never,
+    };
+    Point {
+        name: CONTROL_WORD.to_string(),
+        model: None,
+        class,
+        hidden: true,
+        ..Point::of_model(ModelPoint::Run, source)
+    }
 }
 
 /// What contradicts something else is an error, never mended.

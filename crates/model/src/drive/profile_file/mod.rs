@@ -282,9 +282,9 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     };
     let control = control::read(reader, &around);
     let made = states::read(reader, &around);
-    let plain = control.as_ref().map(control::plain_points).unwrap_or_default();
-    for point in made.into_iter().chain(plain) {
-        if names.contains(&point.name) {
+    let follow = control.as_ref().map(|control| control_points(control, &points, made.len()));
+    for point in made.into_iter().chain(follow.unwrap_or_default()) {
+        if names.contains(&point.name) && !point.hidden {
             let what = format!("`{}` follows from [control] or [[state]]", point.name);
             reader.problem("point", what, "leave its [[point]] out");
         }
@@ -346,6 +346,15 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     }
     reader.finish();
     name.map(|_| profile)
+}
+
+/// The points that follow from `[control]`, to be put behind `before` others.
+fn control_points(control: &super::control::Control, points: &[Point], before: usize) -> Vec<Point> {
+    let plain = control::plain_points(control);
+    match plain.is_empty() {
+        false => plain,
+        true => control::made_points(control, points, before),
+    }
 }
 
 /// The parameters of the base, of its base, and so on.
