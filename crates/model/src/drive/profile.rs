@@ -448,7 +448,9 @@ impl Profile {
     /// What `[control]` says, where it is more than plain bits: its points are no registers of their own.
     pub fn control_language(&self) -> Option<&Control> {
         let is_made = |run: &Point| run.write && run.raw().is_none();
-        self.control.as_ref().filter(|_| self.model_point(ModelPoint::Run).is_some_and(is_made))
+        self.control
+            .as_ref()
+            .filter(|_| self.model_point(ModelPoint::Run).is_some_and(is_made))
     }
 
     /// Where the run command is written, and read as the drive has it where it can be.

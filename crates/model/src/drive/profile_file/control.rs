@@ -455,10 +455,7 @@ pub(super) fn made_points(control: &Control, points: &[Point], before: usize) ->
 /// The control word, for the points that rest on it.
 fn helper(control: &Control, place: Place) -> Point {
     let form = match place.table {
-        Table::Coil | Table::DiscreteInput => Form::Bit {
-            bit: 0,
-            invert: false,
-        },
+        Table::Coil | Table::DiscreteInput => Form::Bit { bit: 0, invert: false },
         Table::Holding | Table::Input => Form::U16,
     };
     let source = Source::Raw(Raw::plain(place.table, place.address, form));
