@@ -140,7 +140,7 @@ pub struct Step {
 }
 
 /// What ends a step.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Until {
     /// The word was acknowledged.
     Written,
