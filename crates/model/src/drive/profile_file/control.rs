@@ -364,50 +364,9 @@ fn read_reset(table: &Reader<'_>, around: &Around<'_>) -> Option<Reset> {
     })
 }
 
-/// The points of the common model that a control word of plain bits is: one that is read back and has no constant bits.
-pub(super) fn plain_points(control: &Control) -> Vec<Point> {
-    let bit = |setting: &Setting| {
-        let plain = setting.place.is_none() && !setting.once && setting.mask.count_ones() == 1;
-        plain.then(|| Form::Bit {
-            bit: u8::try_from(setting.mask.trailing_zeros()).unwrap_or_default(),
-            invert: setting.value == 0,
-        })
-    };
-    let Run::One(run) = &control.run else {
-        return Vec::new();
-    };
-    let opposite = control.stop.place.is_none() && control.stop.mask == run.mask && control.stop.value != run.value;
-    let settings = [
-        (ModelPoint::Run, Some(run)),
-        (ModelPoint::Reverse, control.reverse.as_ref()),
-        (
-            ModelPoint::FaultReset,
-            control.fault_reset.as_ref().map(|reset| &reset.setting),
-        ),
-    ];
-    let all_plain = settings
-        .iter()
-        .all(|(_, setting)| setting.is_none_or(|setting| bit(setting).is_some()));
-    if !all_plain || !opposite || control.own_word != OwnWord::Read || control.always != Always::default() {
-        return Vec::new();
-    }
-    let point = |model: ModelPoint, form: Form| Point {
-        class: PollClass::Slow,
-        write: true,
-        pulse: model == ModelPoint::FaultReset,
-        ..Point::of_model(
-            model,
-            Source::Raw(Raw::plain(control.at.table, control.at.address, form)),
-        )
-    };
-    let made = settings
-        .into_iter()
-        .filter_map(|(model, setting)| Some(point(model, bit(setting?)?)));
-    made.collect()
-}
-
-/// The points of the common model that any other control word makes: what they read as rests on the control word, or on the
-/// place of its own; a word that reads as something else is not read. A helper for the control word goes before them.
+/// The points of the common model that `[control]` makes, to be put behind `before` others: what they read as rests on the
+/// control word, or on a place of its own; a word that reads as something else is not read. A helper for the control word goes
+/// before them.
 pub(super) fn made_points(control: &Control, points: &[Point], before: usize) -> Vec<Point> {
     let mut helpers: Vec<Point> = Vec::new();
     let mut index_of = |place: Place| {

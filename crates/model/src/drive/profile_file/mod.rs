@@ -350,15 +350,6 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     name.map(|_| profile)
 }
 
-/// The points that follow from `[control]`, to be put behind `before` others.
-fn control_points(control: &super::control::Control, points: &[Point], before: usize) -> Vec<Point> {
-    let plain = control::plain_points(control);
-    match plain.is_empty() {
-        false => plain,
-        true => control::made_points(control, points, before),
-    }
-}
-
 /// The parameters of the base, of its base, and so on.
 fn parameters_of_bases<'k>(base: Option<&str>, known: &'k Profiles) -> Vec<&'k ParameterList> {
     let first = base.and_then(|base| known.get(base));
