@@ -284,7 +284,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     let made = states::read(reader, &around);
     let follow = control
         .as_ref()
-        .map(|control| control_points(control, &points, made.len()));
+        .map(|control| control::made_points(control, &points, made.len()));
     for point in made.into_iter().chain(follow.unwrap_or_default()) {
         if names.contains(&point.name) && !point.hidden {
             let what = format!("`{}` follows from [control] or [[state]]", point.name);
