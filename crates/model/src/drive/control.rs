@@ -260,6 +260,60 @@ impl Control {
         }
     }
 
+    /// What contradicts something else: the key, what is wrong, and what to do.
+    pub fn contradictions(&self) -> Vec<(&'static str, String, &'static str)> {
+        let always = self.always;
+        let mut found = Vec::new();
+        let mut refuse = |key: &'static str, setting: &Setting| {
+            let own = setting.place.is_none_or(|place| place == self.at);
+            if own && (setting.value & always.clear != 0 || setting.mask & !setting.value & always.set != 0) {
+                let what = format!("{:#06x} in {:#06x} contradicts `always`", setting.value, setting.mask);
+                found.push((key, what, "leave these bits out of one of them"));
+            }
+        };
+        self.runs().iter().for_each(|run| refuse("run", run));
+        if let Run::Steps(steps) = &self.run {
+            let before = steps.len().saturating_sub(1);
+            steps.iter().take(before).for_each(|step| refuse("run", &step.write));
+        }
+        refuse("stop", &self.stop);
+        self.reverse.iter().for_each(|reverse| refuse("reverse", reverse));
+        let reset = self.fault_reset.map(|reset| reset.setting);
+        reset.iter().for_each(|reset| refuse("fault_reset", reset));
+        if self.runs().iter().any(|run| run.agrees(&self.stop)) {
+            found.push((
+                "stop",
+                "a word can be a run command and a stop at once".to_string(),
+                "write bits that the run command has the other way round",
+            ));
+        }
+        match &self.run {
+            Run::Pair { .. } if self.reverse.is_some() => found.push((
+                "reverse",
+                "`run` says the direction already".to_string(),
+                "leave `reverse` out",
+            )),
+            Run::Pair { forward, reverse } if forward.agrees(reverse) => found.push((
+                "run",
+                "a word can run forward and in reverse at once".to_string(),
+                "write bits that tell the two apart",
+            )),
+            _ => {}
+        }
+        if self.reverse.is_some_and(|reverse| {
+            self.runs().iter().any(|run| {
+                run.place == reverse.place && run.mask & reverse.mask != 0 && !matches!(self.run, Run::Steps(_))
+            })
+        }) {
+            found.push((
+                "reverse",
+                "the direction shares bits with the run command".to_string(),
+                "write the bits that say the direction only, or `run` as a pair",
+            ));
+        }
+        found
+    }
+
     /// Where `run` is written.
     pub fn run_place(&self) -> Place {
         let first = self.runs().first().and_then(|setting| setting.place);

@@ -433,42 +433,7 @@ fn helper(control: &Control, place: Place) -> Point {
 
 /// What contradicts something else is an error, never mended.
 fn check(table: &Reader<'_>, control: &Control) {
-    let always = control.always;
-    let contradicts = |setting: &Setting| {
-        let own = setting.place.is_none_or(|place| place == control.at);
-        own && (setting.value & always.clear != 0 || setting.mask & !setting.value & always.set != 0)
-    };
-    let refuse = |key: &str, setting: &Setting| {
-        if contradicts(setting) {
-            table.problem(
-                key,
-                format!("{:#06x} in {:#06x} contradicts `always`", setting.value, setting.mask),
-                "leave these bits out of one of them",
-            );
-        }
-    };
-    for setting in control.runs() {
-        refuse("run", &setting);
-        if setting.agrees(&control.stop) {
-            table.problem(
-                "stop",
-                "a word can be a run command and a stop at once",
-                "write bits that the run command has the other way round",
-            );
-        }
-    }
-    if let Run::Steps(steps) = &control.run {
-        let before = steps.len().saturating_sub(1);
-        steps.iter().take(before).for_each(|step| refuse("run", &step.write));
-    }
-    refuse("stop", &control.stop);
-    if let Some(reverse) = &control.reverse {
-        refuse("reverse", reverse);
-        if matches!(control.run, Run::Pair { .. }) {
-            table.problem("reverse", "`run` says the direction already", "leave `reverse` out");
-        }
-    }
-    if let Some(reset) = &control.fault_reset {
-        refuse("fault_reset", &reset.setting);
+    for (key, what, remedy) in control.contradictions() {
+        table.problem(key, what, remedy);
     }
 }
