@@ -57,6 +57,20 @@ impl std::fmt::Display for Counterexample {
     }
 }
 
+impl Counterexample {
+    /// On one line.
+    pub fn line(&self) -> String {
+        let frames = self.frames.join(", then ");
+        let Counterexample {
+            what, state, command, ..
+        } = self;
+        match frames.is_empty() {
+            true => format!("{what} (drive {state}; command {command})"),
+            false => format!("{what} (drive {state}; command {command}; {frames})"),
+        }
+    }
+}
+
 /// What becomes of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Fate {

@@ -55,7 +55,7 @@ fn wrong_profiles_are_refused_with_what_is_wrong() {
         (
             "a reset that carries the run command",
             "run = { bit = 0 }\nstop = { bit = 0, is = 0 }\nfault_reset = { mask = 0x81, value = 0x81 }".to_string(),
-            "a word that runs the drive is sent without a run command",
+            "the motor starts without a run command",
         ),
         (
             "a stop by a bit that a start sets nowhere (Delta)",
