@@ -445,6 +445,20 @@ impl Profile {
         }
     }
 
+    /// What `[control]` says, where it is more than plain bits: its points are no registers of their own.
+    pub fn control_language(&self) -> Option<&Control> {
+        let is_made = |run: &Point| run.write && run.raw().is_none();
+        self.control
+            .as_ref()
+            .filter(|_| self.model_point(ModelPoint::Run).is_some_and(is_made))
+    }
+
+    /// Where the run command is written, and read as the drive has it where it can be.
+    pub fn run_place(&self) -> Option<Place> {
+        let control = self.control.as_ref().map(Control::run_place);
+        control.or_else(|| self.model_point(ModelPoint::Run)?.raw().map(Place::of))
+    }
+
     /// Whether that word, written there, is a run command or a stop; `None` where it is neither.
     pub fn runs_by(&self, table: Table, address: u16, word: u16) -> Option<bool> {
         if let Some(control) = &self.control {
