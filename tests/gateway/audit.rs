@@ -164,7 +164,7 @@ fn a_client_that_may_not_write_destroys_nothing() {
         verify(&site, &[]).status.success(),
         "a cut end does not show without the hash"
     );
-    failing(&cut[..cut.len() - 9], &[], "the line has no end");
+    failing(&cut[..cut.len() - 9], &[], "the line is incomplete");
     // A start names what a crash left, and the chain goes on.
     let mut again = site.run_ready();
     write_registers(site.modbus, 1, SPEED_REFERENCE, &[3000]);

@@ -343,7 +343,7 @@ fn check_refuses_what_needs_a_byte() {
         "{told}"
     );
     assert!(
-        shown.contains("listens only: another master asks these drives"),
+        shown.contains("listens only: another master polls these drives"),
         "{shown}"
     );
 }

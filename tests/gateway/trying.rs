@@ -256,7 +256,7 @@ fn what_was_heard_tells_a_dead_line_from_a_wrong_setting() {
     assert!(
         wrong
             .err
-            .contains("that are no valid reply, most of them at modbus-rtu 38400 8N1"),
+            .contains("that are not a valid reply, most of them at modbus-rtu 38400 8N1"),
         "{}",
         wrong.err
     );

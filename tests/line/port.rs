@@ -136,9 +136,9 @@ async fn a_port_that_is_none() {
     std::fs::write(path("file"), "precious").unwrap();
     for (port, expected) in [
         (path("missing"), "plugged in"),
-        (path("file"), "no serial port"),
-        (directory.path().display().to_string(), "no serial port"),
-        ("/dev/null".to_string(), "no serial port"),
+        (path("file"), "not a serial port"),
+        (directory.path().display().to_string(), "not a serial port"),
+        ("/dev/null".to_string(), "not a serial port"),
     ] {
         let rig = with_port(&port);
         rig.until("it is tried", |r| !reason(r).is_empty()).await;

@@ -198,7 +198,7 @@ pub(super) fn check_instances(reader: &Reader<'_>, buses: &[Found], bacnet: &Bac
             reader.document().problem(
                 unit_place,
                 format!(
-                    "in BACnet drive `{name}` has the same device instance {} as drive `{other}`",
+                    "BACnet: drive `{name}` has the same device instance {} as drive `{other}`",
                     device + u32::from(*unit)
                 ),
                 format!(

@@ -115,14 +115,15 @@ pub(crate) fn beside_answers(heard: &Heard) -> Option<String> {
     ))
 }
 
-/// What shows more at the drives: of all families that speak one of the protocols tried.
+/// What shows more at the drives: of the families of the manuals that speak one of the protocols tried; those of the other
+/// families would fill pages.
 pub(crate) fn at_silent_drives(heard: &Heard, tried: &[Setting], profiles: &Profiles) -> String {
     let speaks = |profile: &&Profile| tried.iter().any(|one| profile.protocols.contains(&one.protocol));
     // Those with a base have its lines.
     let families = profiles
         .iter()
         .map(AsRef::as_ref)
-        .filter(|profile: &&Profile| profile.base.is_none());
+        .filter(|profile: &&Profile| profile.base.is_none() && profile.verified);
     let families: Vec<&Profile> = families.filter(speaks).collect();
     let (heading, steps) = match most_garbage(heard) {
         Some(_) => ("settings at the drives", [Step::Settings]),
@@ -132,7 +133,9 @@ pub(crate) fn at_silent_drives(heard: &Heard, tried: &[Setting], profiles: &Prof
     if lines.is_empty() {
         return lines;
     }
-    format!("{heading}; `drivegate profiles show NAME` has terminals, termination and settings:\n{lines}")
+    format!(
+        "{heading}; `drivegate profiles show NAME` has terminals, termination and settings, of other families too:\n{lines}"
+    )
 }
 
 /// What the families that answered need before the first command.

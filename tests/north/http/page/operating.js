@@ -108,8 +108,8 @@ async function aGatewayThatIsAwayIsTold(gateway, page) {
     return grey.every((value) => value === "none" || value === "1");
   }));
   assert.ok(filter && own, "neither the banner nor the stop is greyed out");
-  const count = await page.eval(() => Number(/Asked (\d+) times/.exec(document.getElementById("banner").innerText)[1]));
-  await page.until((count) => Number(/Asked (\d+) times/.exec(document.getElementById("banner").innerText)[1]) > count, count);
+  const count = await page.eval(() => Number(/No reply to (\d+) requests/.exec(document.getElementById("banner").innerText)[1]));
+  await page.until((count) => Number(/No reply to (\d+) requests/.exec(document.getElementById("banner").innerText)[1]) > count, count);
   // It was started anew meanwhile: its page learns that before somebody relies on a stop.
   gateway.session = null;
   gateway.silent = false;
