@@ -8,7 +8,11 @@ mod mutated;
 fn every_family_that_ships_is_proved() {
     for profile in Profiles::built_in().iter() {
         match prove(profile) {
-            Ok(proof) => assert_eq!(proof.commands > 100, profile.control.is_some(), "{}", profile.name),
+            Ok(proof) => {
+                let commanded = profile.model_index(ModelPoint::Run).is_some();
+                println!("{}: {} cases, {} requests", profile.name, proof.commands, proof.frames);
+                assert_eq!(proof.commands > 100, commanded, "{}", profile.name);
+            }
             Err(counterexample) => panic!("{}: {counterexample}", profile.name),
         }
     }
