@@ -44,6 +44,8 @@ struct Client {
     invoke: u8,
     waits: bool,
     last: Vec<u8>,
+    /// The drive was there when it was asked.
+    taken: bool,
     answers: Vec<Vec<u8>>,
 }
 
@@ -178,6 +180,7 @@ impl Bench {
 
     /// A client asks the drive; a write takes the next number, and one that is sent again its own.
     fn ask(&mut self, client: usize, service: u8, content: &[u8], again: bool) {
+        let there = self.rig.is_online(0);
         let asking = &mut self.clients[client];
         if !again {
             asking.invoke = asking.invoke.wrapping_add(1);
@@ -186,6 +189,7 @@ impl Bench {
         asking.waits = true;
         let apdu = [&[0x00, 0x05, asking.invoke, service][..], content].concat();
         asking.last = content.to_vec();
+        asking.taken = (again && asking.taken) || there;
         let to = Some((NETWORK, Mac::new(&[DRIVE]).unwrap()));
         let datagram = bvlc::unicast(&npdu::encode(to, None, true, Payload::Application(&apdu)));
         self.server.receive(host(client), &datagram, self.rig.now);
@@ -215,7 +219,9 @@ impl Bench {
 
     /// The values of a property of the drive.
     fn read(&mut self, object: ObjectId, property: u64) -> Vec<Data> {
-        let asked = content(object, |w| drop(w.context_unsigned(1, property).bytes().len()));
+        let asked = content(object, |w| {
+            w.context_unsigned(1, property);
+        });
         self.ask(2, 12, &asked, false);
         let answer = self.answer(2).expect("the drive is there");
         assert_eq!(answer[0], 0x30, "{answer:?}");
@@ -451,8 +457,11 @@ fn all_at_once(seed: u64) -> (usize, usize) {
         let pause = Duration::from_millis(bench.dice.within(0..=200));
         match bench.dice.within(0..=15) {
             0..=9 if bench.clients[client].waits => {
-                // The answer is late: the same once more. It is no new order.
+                // The answer is late: the same once more. It is no new order, unless the drive was away before.
                 let content = bench.clients[client].last.clone();
+                if !bench.clients[client].taken {
+                    bench.stopped = None;
+                }
                 bench.ask(client, 15, &content, true);
             }
             roll @ 0..=9 => {
@@ -479,18 +488,13 @@ fn all_at_once(seed: u64) -> (usize, usize) {
             }
             14 => {
                 bench.rig.set_alive(DRIVE, false);
-                bench.wait(Duration::from_millis(bench.rig.bus.index as u64 + 1_500));
+                let away = Duration::from_millis(bench.dice.within(200..=3_000));
+                bench.wait(away);
                 bench.rig.set_alive(DRIVE, true);
             }
             _ => bench.wait(Duration::from_secs(2)),
         }
         bench.wait(pause);
-        // Whoever waits too long gives up, and what he asked for may still be carried out.
-        for client in &mut bench.clients {
-            if client.waits && client.last.is_empty() {
-                client.waits = false;
-            }
-        }
     }
     bench
         .rig
