@@ -1,17 +1,17 @@
 //! BACnet/IP from outside: bacpypes3 and node-bacnet, which know nothing of each other, against the real gateway with simulated
 //! drives; tshark reads what they say.
 
-use std::io::Write as _;
-use std::net::UdpSocket;
+use std::io::{Read as _, Write as _};
+use std::net::{TcpStream, UdpSocket};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use drivegate::codec::Protocol;
 use drivegate::drive::profile::Profiles;
 use serde_json::{Value as Json, json};
 
-use crate::support::process::{Running, api, free_port, get, mbpoll_write, until};
+use crate::support::process::{Running, api, drivegate, free_port, get, mbpoll_write, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled, drive};
 use crate::support::tools::{python, root, run, tool};
 
@@ -231,18 +231,19 @@ fn every_family_shows_what_http_tells() {
     }
     let units = 1..=families.len();
     let ids: Vec<usize> = (100..=100 + families.len()).collect();
-    let mut orders = vec![
+    let asked = [
         json!(["who_is", null, null, "global"]),
         json!(["who_is", 103, 104, "global"]),
     ];
-    orders.extend(
-        units
-            .clone()
-            .map(|unit| json!(["read", unit, format!("device,{}", 100 + unit), "object-list"])),
-    );
-    let mut heard = plant.bacpypes(20, &orders);
-    let lists = heard.split_off(2);
-    assert_eq!(heard, [json!(ids), json!([103, 104])]);
+    // On a busy machine one or the other may be away for a moment.
+    until("all are there", || {
+        (plant.bacpypes(20, &asked) == [json!(ids), json!([103, 104])]).then_some(())
+    });
+    let orders: Vec<Json> = units
+        .clone()
+        .map(|unit| json!(["read", unit, format!("device,{}", 100 + unit), "object-list"]))
+        .collect();
+    let lists = plant.bacpypes(20, &orders);
     let lists: Vec<Vec<Json>> = lists.iter().map(|list| list.as_array().unwrap().clone()).collect();
     // What a motor that stands shows does not move; a value may be read between two looks all the same.
     let mut left: Vec<usize> = units.clone().collect();
@@ -261,12 +262,9 @@ fn every_family_shows_what_http_tells() {
         for ((unit, told), shown) in left.iter().zip(&told).zip(&shown) {
             match compared(shown, told) {
                 Ok(count) => {
-                    assert!(
-                        count >= 10,
-                        "{}: {count} of {}",
-                        families[unit - 1],
-                        lists[unit - 1].len()
-                    );
+                    // All but the device itself, its port, the state and the text of the fault.
+                    let of = lists[unit - 1].len();
+                    assert!(count + 4 >= of, "{}: {count} of {of}", families[unit - 1]);
                     objects += count;
                 }
                 Err(differs) => {
@@ -587,4 +585,59 @@ fn tshark_finds_nothing_wrong_with_any_frame() {
         metrics.contains("drivegate_bacnet_datagrams_total{fate=\"discarded\"} "),
         "{metrics}"
     );
+}
+
+/// What `check` predicts for the round of `line1`.
+fn predicted_round(site: &Site) -> Duration {
+    let output = drivegate(&["check", &site.config()]).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    let line = text.lines().find(|line| line.trim().starts_with("fast cycle")).unwrap();
+    let number = line.split_whitespace().nth(2).unwrap();
+    Duration::from_secs_f64(number.parse::<f64>().unwrap() / 1000.0)
+}
+
+#[test]
+fn a_change_is_told_within_a_round() {
+    let drives: String = (1..=8).map(|n| controlled(&format!("pump-{n}"), n, "")).collect();
+    let plant = plant(&[LINE1, &drives], "", |site| {
+        site.simulate(&["--addresses", "1-8", "--baud", "38400"])
+    });
+    let round = predicted_round(&plant.site);
+    let client = UdpSocket::bind("127.0.0.22:0").unwrap();
+    client.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+    // SubscribeCOV of `running` of unit 5, not confirmed, without end.
+    let apdu = [2, 5, 1, 5, 0x09, 7, 0x1C, 0, 0xC0, 0, 2, 0x29, 0, 0x39, 0];
+    let npdu = [&[1, 0x24, 3, 0xE9, 1, 5, 0xFF][..], &apdu].concat();
+    let datagram = [&[0x81, 0x0A, 0, npdu.len() as u8 + 4][..], &npdu].concat();
+    client.send_to(&datagram, plant.address()).unwrap();
+    let mut buffer = [0; 1500];
+    let mut heard = || {
+        let length = client.recv(&mut buffer).unwrap();
+        buffer[..length].to_vec()
+    };
+    (0..2).for_each(|_| drop(heard()));
+    let mut modbus = TcpStream::connect(("127.0.0.1", plant.site.modbus)).unwrap();
+    let mut took = Vec::new();
+    for number in 0..200_u16 {
+        // At another time of the round each time.
+        std::thread::sleep(Duration::from_millis(u64::from(number) * 37 % 113));
+        let on = u8::from(number % 2 == 0);
+        modbus.write_all(&[0, 1, 0, 0, 0, 6, 5, 6, 0x81, 0, 0, on]).unwrap();
+        modbus.read_exact(&mut [0; 12]).unwrap();
+        let acknowledged = Instant::now();
+        // The value stands between the tags 2: ENUMERATED.
+        while heard().windows(4).all(|bytes| bytes != [0x2E, 0x91, on, 0x2F]) {}
+        took.push(acknowledged.elapsed());
+    }
+    took.sort();
+    let at = |percent: usize| took[(took.len() * percent).div_ceil(100) - 1];
+    println!(
+        "COV behind the acknowledgement of the drive: median {:.1?}, p90 {:.1?}, p99 {:.1?}, most {:.1?}; predicted round {round:.1?}",
+        at(50),
+        at(90),
+        at(99),
+        at(100)
+    );
+    // One in ten may be late because this machine is busy.
+    assert!(at(90) <= round + Duration::from_millis(20), "{took:?}");
 }
