@@ -17,7 +17,7 @@ use super::parameters::ParameterList;
 use crate::codec::{N2Options, Protocol, RequestPdu, Table};
 use crate::document::{Node, Problem};
 
-pub use raw::{Equals, Form, MOST_REGISTERS, Order, Raw};
+pub use raw::{Equals, Form, MOST_REGISTERS, Order, Part, Raw};
 
 /// A validated profile.
 #[derive(Debug, Clone, PartialEq)]
