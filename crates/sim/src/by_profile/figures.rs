@@ -191,6 +191,7 @@ impl ProfileDrive {
         let shows = Shows {
             position: self.shown_position(now),
             running: self.body.shows_running(),
+            commanded: self.run.is_some(),
             faulted: self.body.latch.fault() != 0,
             word: self.word,
         };
@@ -295,7 +296,8 @@ fn usual(point: &Point, raw: &Raw) -> Option<Given> {
         "ms" => 500.0,
         "rpm" => 0.0,
         _ if name.contains("fault") || name.contains("alarm") || name.contains("error") => 0.0,
-        // A power of ten, most likely.
+        // Status words, and powers of ten.
+        _ if point.hidden => 0.0,
         _ if name.contains("scale") || name.contains("exponent") => 0.0,
         _ => 1.0,
     };

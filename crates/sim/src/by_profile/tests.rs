@@ -180,8 +180,8 @@ const CASES: &[Case] = &[
         reverse: &[Single(1, 2)],
         reset: &[Single(1, 0), Single(1, 8), Single(1, 0)],
         idle: &[Single(1, 3), Single(1, 8), Single(1, 0x10)],
-        runs: (0x2C, 0x4001, 0x0001),
-        fault: (0x2C, 0x4001, 0x4000),
+        runs: (0x4B, 0x0081, 0x0001),
+        fault: (0x4B, 0x0081, 0x0080),
     },
     Case {
         profile: "delta-ms300",
@@ -422,6 +422,17 @@ fn a_drive_at_its_panel_does_not_obey_the_bus() {
         bench.wait(1000);
         assert!(bench.drive.state().running, "{}", case.profile);
     }
+}
+
+/// A Delta drive shows for how long the motor comes down.
+#[test]
+fn a_motor_that_comes_down() {
+    let delta = CASES.iter().find(|case| case.profile == "delta-ms300").unwrap();
+    let mut bench = running(delta);
+    bench.send(delta.stop);
+    assert_eq!(bench.register(Table::Holding, 0x2101) & 3, 1);
+    bench.wait(5000);
+    assert_eq!(bench.register(Table::Holding, 0x2101) & 3, 0);
 }
 
 /// Every profile without a simulator of its own answers each of its points and nothing else, and as its limits say.

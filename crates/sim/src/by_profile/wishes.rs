@@ -56,9 +56,10 @@ fn search(fixed: &Fixed, wishes: &[&Wish], base: &impl Fn(Key) -> u16, tries: &m
     all.find_map(|way| search(&way, rest, base, tries))
 }
 
-/// Every way to fulfil a wish beside what is decided, those first that change least of `base`.
+/// Every way to fulfil a wish beside what is decided: its alternatives in their order; ways to avoid it by what they change of
+/// `base`.
 fn ways(fixed: &Fixed, wish: &Wish, base: &impl Fn(Key) -> u16) -> Vec<Fixed> {
-    let mut found: Vec<Fixed> = match wish.want {
+    match wish.want {
         true => wish.any.iter().filter_map(|bits| with(fixed, bits)).collect(),
         false => wish.any.iter().fold(vec![fixed.clone()], |ways, bits| {
             let mut next: Vec<Fixed> = ways.iter().flat_map(|way| without(way, bits)).collect();
@@ -66,9 +67,7 @@ fn ways(fixed: &Fixed, wish: &Wish, base: &impl Fn(Key) -> u16) -> Vec<Fixed> {
             next.truncate(MOST_WAYS);
             next
         }),
-    };
-    found.sort_by_key(|way| changes(way, base));
-    found
+    }
 }
 
 fn changes(fixed: &Fixed, base: &impl Fn(Key) -> u16) -> u32 {

@@ -69,6 +69,8 @@ pub(super) struct Family {
 pub(super) struct Shows {
     pub(super) position: usize,
     pub(super) running: bool,
+    /// A run command holds; else a running motor comes down.
+    pub(super) commanded: bool,
     pub(super) faulted: bool,
     pub(super) word: u16,
 }
@@ -99,6 +101,7 @@ pub(super) const FAMILIES: [Family; 16] = [
     Family {
         other: delta_reset,
         acts_once: true,
+        status: |shows| Some((0x2101, delta_status(shows))),
         ..family("delta", delta)
     },
     Family {
@@ -242,6 +245,16 @@ fn delta(known: &Known<'_>, word: u16) -> Told {
         _ => Does::Nothing,
     };
     told(does, false, word)
+}
+
+/// 00 stopped, 01 stopping, 11 running.
+fn delta_status(shows: &Shows) -> Part {
+    let value = match (shows.running, shows.commanded) {
+        (false, _) => 0,
+        (true, false) => 1,
+        (true, true) => 3,
+    };
+    Part { mask: 3, value }
 }
 
 /// 0x2002: bit 0 external fault, bit 1 reset, bit 2 base block.
