@@ -189,7 +189,11 @@ impl Profile {
         Profile::parse_over(file, source, built_in, &Profiles::built_in())
     }
 
-    fn parse_over(file: &str, source: &str, built_in: bool, known: &Profiles) -> Result<Profile, Vec<Problem>> {
+    /// The same over a base among the `known` profiles.
+    ///
+    /// # Errors
+    /// Every error of the file, with line and key.
+    pub fn parse_over(file: &str, source: &str, built_in: bool, known: &Profiles) -> Result<Profile, Vec<Problem>> {
         let mut document = Document::parse(file, source);
         let (_, base) = base::peek(&document);
         if let Some(under) = base.as_deref().and_then(|base| known.get(base)) {
