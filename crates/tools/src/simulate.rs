@@ -36,8 +36,8 @@ use std::time::Duration;
 Faults: {NAMES}.
 
 A simulated drive obeys the bus. Writing a fault, as its registers show it, to a holding register that no real drive \
-has trips it; PDU address by the key `simulator` of the profile: {}; others 9998, where 1 in the next register gives the drive \
-to its panel.", trip_registers()))]
+has trips it; PDU address by the key `simulator` of the profile: {}; others 9998. So does the signal USR1 with all \
+drives of the process; USR2 gives them to their panels, or back to the bus.", trip_registers()))]
 pub(super) struct Args {
     /// Simulate every bus of a gateway configuration, each under its own `port`
     #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "protocol", "baud", "format"])]

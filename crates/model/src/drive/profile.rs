@@ -426,6 +426,14 @@ impl Profile {
         }
     }
 
+    /// Its title as it is shown, with what is doubtful of it.
+    pub fn described(&self) -> Cow<'_, str> {
+        match self.verified {
+            true => Cow::Borrowed(&self.title),
+            false => Cow::Owned(format!("{} (not verified on hardware)", self.title).trim_start().to_string()),
+        }
+    }
+
     /// Text of a fault code; a code without text is shown as a plain number.
     pub fn fault_text(&self, code: i64) -> String {
         let known = u16::try_from(code).ok().and_then(|c| self.faults.get(&c));
