@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 
 use crate::support::process::PATIENCE;
+use crate::support::tools::{python, run_well};
 
 const BINARY: &str = env!("CARGO_BIN_EXE_drivegate");
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
@@ -89,6 +90,8 @@ fn exit_codes() {
         (vec!["profiles", "--profile-dir", "tests/bad/no-such"], 78),
         (vec!["map", "--config", &path], 0),
         (vec!["map", "--config", "tests/bad/twice.toml"], 78),
+        (vec!["inventory", &path], 0),
+        (vec!["inventory", "tests/bad/twice.toml"], 78),
         (vec!["schema"], 0),
         (vec!["--version"], 0),
         (vec!["--help"], 0),
@@ -455,6 +458,82 @@ fn the_schema_is_json() {
         schema["properties"]["bus"]["items"]["properties"]["baud"]["default"],
         9600
     );
+}
+
+/// What `check --json` says of the file, without the name of the file.
+fn checked(path: &Path) -> String {
+    let path = path.display().to_string();
+    run(&["check", "--json", "--config", &path]).out.replace(&path, "FILE")
+}
+
+/// The configuration in an inventory, as PyYAML reads it, and its host.
+fn from_inventory(inventory: &Path) -> (String, toml::Table) {
+    let script = "import json, sys, yaml\n(host, variables), = yaml.safe_load(open(sys.argv[1]))['drivegate']['hosts'].items()\n\
+        print(json.dumps([host, variables['drivegate_configuration']]))";
+    let printed = run_well(&python(), &["-c", script, &inventory.display().to_string()]);
+    serde_json::from_str(&printed).unwrap()
+}
+
+#[test]
+fn an_inventory_is_the_configuration_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let inventory = dir.path().join("inventory.yml");
+    let again = dir.path().join("drivegate.toml");
+    fs::write(dir.path().join("password"), "x").unwrap();
+    let odd = format!(
+        "{SOUND}[mqtt]\nusername = \"no \\\"\\\\ \u{e4}: #\"\npassword_file = \"password\"\nhome_assistant = false\n"
+    )
+    .replace(
+        "turnaround = \"0.5ms\"\n[[",
+        "access = \"control\"\nlimits = { speed_reference = [2.5, 1e2] }\n[[",
+    );
+    let shipped = [
+        "deploy/drivegate.toml",
+        "tests/doubtful/lease.toml",
+        "tests/doubtful/slots.toml",
+    ];
+    let read = |path| fs::read_to_string(Path::new(ROOT).join(path)).unwrap();
+    for source in shipped.map(read).into_iter().chain([odd]) {
+        fs::write(&again, &source).unwrap();
+        let (path, before) = (again.display().to_string(), checked(&again));
+        let made = run(&["inventory", &path]);
+        assert_eq!(made.code, Some(0), "{}", made.err);
+        fs::write(&inventory, &made.out).unwrap();
+        let (host, configuration) = from_inventory(&inventory);
+        let written: toml::Table = source.parse().unwrap();
+        assert_eq!(
+            (host.as_str(), &configuration),
+            (written["gateway"]["name"].as_str().unwrap(), &written)
+        );
+        fs::write(&again, toml::to_string(&configuration).unwrap()).unwrap();
+        // Warnings name lines, which are others now.
+        let ok = |report: &str| {
+            let mut report: Value = serde_json::from_str(report).unwrap();
+            for warning in report["warnings"].as_array_mut().unwrap() {
+                warning.as_object_mut().unwrap().remove("line");
+            }
+            report
+        };
+        assert_eq!(ok(&checked(&again)), ok(&before));
+    }
+}
+
+#[test]
+fn an_inventory_has_no_secrets() {
+    let (_dir, path) = sound();
+    fs::write(
+        &path,
+        format!("{SOUND}[mqtt]\nusername = \"u\"\npassword = \"hush-hush\"\n"),
+    )
+    .unwrap();
+    let ran = run(&["inventory", "--config", &path]);
+    assert_eq!((ran.code, ran.out.as_str()), (Some(78), ""));
+    assert!(
+        ran.err.contains("mqtt.password") && ran.err.contains("password_file"),
+        "{}",
+        ran.err
+    );
+    assert!(!ran.err.contains("hush-hush"), "{}", ran.err);
 }
 
 /// The commands that a help text lists.

@@ -15,6 +15,7 @@ mod demo;
 mod diagnose;
 mod drive_access;
 mod health;
+mod inventory;
 mod listen;
 mod loading;
 mod local_client;
@@ -136,6 +137,7 @@ commands! {
     Simulate => simulate,
     Profiles => profiles,
     Map => map,
+    Inventory => inventory,
     Audit => audit,
     Token => token,
     User => user,

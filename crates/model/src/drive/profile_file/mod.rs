@@ -286,9 +286,11 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     };
     let control = control::read(reader, &around);
     let made = states::read(reader, &around);
-    let plain = control.as_ref().map(control::plain_points).unwrap_or_default();
-    for point in made.into_iter().chain(plain) {
-        if names.contains(&point.name) {
+    let follow = control
+        .as_ref()
+        .map(|control| control::made_points(control, &points, made.len()));
+    for point in made.into_iter().chain(follow.unwrap_or_default()) {
+        if names.contains(&point.name) && !point.hidden {
             let what = format!("`{}` follows from [control] or [[state]]", point.name);
             reader.problem("point", what, "leave its [[point]] out");
         }
