@@ -42,7 +42,10 @@ fn examples() -> Vec<(String, String)> {
     let page = std::fs::read_to_string(root().join("docs/profiles.md")).unwrap();
     let (_, examples) = page.split_once("\n## Three examples\n").unwrap();
     let (examples, _) = examples.split_once("\n## ").unwrap();
-    let blocks = examples.split("```toml\n").skip(1).filter_map(|rest| rest.split_once("\n```"));
+    let blocks = examples
+        .split("```toml\n")
+        .skip(1)
+        .filter_map(|rest| rest.split_once("\n```"));
     let name = |text: &str| {
         let line = text.lines().find_map(|line| line.strip_prefix("name = "));
         line.unwrap().trim_matches('"').to_string()
@@ -57,7 +60,11 @@ fn the_examples_of_the_page_are_simulated() {
     assert_eq!(names, ["small-meter", "bit-drive", "cia402-drive"]);
     let (name, meter) = &examples[0];
     let site = site_of(name, meter);
-    let _line = simulated(&site, name, &["--set", "voltage_l1=231.5", "--set", "serial_number=SN-42"]);
+    let _line = simulated(
+        &site,
+        name,
+        &["--set", "voltage_l1=231.5", "--set", "serial_number=SN-42"],
+    );
     let _gateway = site.run_ready();
     is_shown(&site, "voltage_l1", &json!(231.5));
     is_shown(&site, "serial_number", &json!("SN-42"));
@@ -70,7 +77,9 @@ fn the_examples_of_the_page_are_simulated() {
         let site = site_of(name, text);
         let line = simulated(&site, name, &[]);
         let _gateway = site.run_ready();
-        until("the first reading", || (api(site.http, "drive")["state"] != "offline").then_some(()));
+        until("the first reading", || {
+            (api(site.http, "drive")["state"] != "offline").then_some(())
+        });
         write_registers(site.modbus, 1, reference, &[count]);
         for word in words {
             write_registers(site.modbus, 1, at, &[*word]);
@@ -80,9 +89,25 @@ fn the_examples_of_the_page_are_simulated() {
         is_shown(&site, "output_frequency", &json!(hertz));
         write_registers(site.modbus, 1, at, &[stop]);
         is_shown(&site, "output_frequency", &json!(0.0));
-        until("its stop", || (api(site.http, "drive")["state"] != "running").then_some(()));
+        until("its stop", || {
+            (api(site.http, "drive")["state"] != "running").then_some(())
+        });
         line.signal("USR1");
         site.until_state("drive", "fault");
+        // By the common model: reset, run, in reverse, stop.
+        let command = |word: u16| write_registers(site.modbus, 1, 0x8100, &[word]);
+        command(0);
+        command(4);
+        until("the reset", || {
+            (api(site.http, "drive")["state"] != "fault").then_some(())
+        });
+        command(1);
+        is_shown(&site, "output_frequency", &json!(hertz));
+        command(3);
+        is_shown(&site, "reverse", &json!(true));
+        site.until_state("drive", "running");
+        command(0);
+        is_shown(&site, "output_frequency", &json!(0.0));
     }
 }
 
@@ -145,7 +170,10 @@ fn read_input(site: &Site, start: u16, count: u16) -> Vec<u16> {
     assert_eq!(head[7], 4, "exception {}", head[8]);
     let mut words = vec![0; usize::from(head[8])];
     stream.read_exact(&mut words).unwrap();
-    words.chunks(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect()
+    words
+        .chunks(2)
+        .map(|pair| u16::from_be_bytes([pair[0], pair[1]]))
+        .collect()
 }
 
 /// All families without a simulator of their own, on one line: whatever the gateway reads of them is answered.

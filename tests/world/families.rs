@@ -128,7 +128,9 @@ fn every_family_is_operated_alike_over_each_protocol_it_speaks() {
     let built_in = Profiles::built_in();
     let here = |name: &str| FAMILIES.iter().any(|(family, ..)| *family == name);
     let has_simulator = |name: &str| ModelOptions::by_name(name).is_some();
-    let simulated = built_in.iter().filter(|profile| profile.simulator.as_deref().is_some_and(has_simulator));
+    let simulated = built_in
+        .iter()
+        .filter(|profile| profile.simulator.as_deref().is_some_and(has_simulator));
     assert!(
         simulated.map(|profile| profile.name.as_str()).all(here),
         "no family is left out"

@@ -151,7 +151,10 @@ fn given(text: &str, profile: &Profile) -> Result<(usize, Given), String> {
     let (name, value) = text
         .split_once('=')
         .ok_or_else(|| format!("`{text}` has no value; in --set; write POINT=VALUE, such as voltage_l1=231.5"))?;
-    let found = profile.points.iter().position(|point| point.name == name && point.raw().is_some());
+    let found = profile
+        .points
+        .iter()
+        .position(|point| point.name == name && point.raw().is_some());
     let found = found.and_then(|index| profile.points.get(index).map(|point| (index, point)));
     let (index, point) = found.ok_or_else(|| {
         let own = |point: &&Point| point.raw().is_some();
@@ -167,11 +170,16 @@ fn given(text: &str, profile: &Profile) -> Result<(usize, Given), String> {
         _ if point.kind() == Kind::Text => return Ok((index, Given::Text(value.to_string()))),
         "true" => Some(1.0),
         "false" => Some(0.0),
-        text => point.code_of(text).map(|code| code as f64).or_else(|| text.parse().ok()),
+        text => point
+            .code_of(text)
+            .map(|code| code as f64)
+            .or_else(|| text.parse().ok()),
     };
     match number.filter(|number: &f64| number.is_finite()) {
         Some(number) => Ok((index, Given::Number(number))),
-        None => Err(format!("`{value}` is not a value of `{name}`; in --set; write a number, true or false")),
+        None => Err(format!(
+            "`{value}` is not a value of `{name}`; in --set; write a number, true or false"
+        )),
     }
 }
 

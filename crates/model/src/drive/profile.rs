@@ -430,7 +430,11 @@ impl Profile {
     pub fn described(&self) -> Cow<'_, str> {
         match self.verified {
             true => Cow::Borrowed(&self.title),
-            false => Cow::Owned(format!("{} (not verified on hardware)", self.title).trim_start().to_string()),
+            false => Cow::Owned(
+                format!("{} (not verified on hardware)", self.title)
+                    .trim_start()
+                    .to_string(),
+            ),
         }
     }
 

@@ -25,13 +25,23 @@ impl ProfileDrive {
         let profile = self.profile();
         for parameter in &profile.parameters.named {
             let key = (Table::Holding, parameter.address);
-            let scale = if parameter.label.scale > 0.0 { parameter.label.scale } else { 1.0 };
+            let scale = if parameter.label.scale > 0.0 {
+                parameter.label.scale
+            } else {
+                1.0
+            };
             let least = parameter.range.as_ref().map_or(0.0, |range| *range.start() / scale);
-            self.registers.place(key, Part { mask: u16::MAX, value: unsigned(least) });
+            self.registers.place(
+                key,
+                Part {
+                    mask: u16::MAX,
+                    value: unsigned(least),
+                },
+            );
         }
         // Those with a scale in another register come after it.
-        let (scaled, plain): (Vec<usize>, Vec<usize>) =
-            (0..profile.points.len()).partition(|index| raw_of(&profile, *index).is_some_and(|raw| raw.scale_from.is_some()));
+        let (scaled, plain): (Vec<usize>, Vec<usize>) = (0..profile.points.len())
+            .partition(|index| raw_of(&profile, *index).is_some_and(|raw| raw.scale_from.is_some()));
         for index in plain.into_iter().chain(scaled) {
             let Some((point, raw)) = profile.points.get(index).and_then(|point| Some((point, point.raw()?))) else {
                 continue;
@@ -57,7 +67,10 @@ impl ProfileDrive {
             let places = super::said::places(control);
             places.iter().any(|place| raw.covers(place.table, place.address))
         };
-        let reference = matches!(point.model, Some(ModelPoint::SpeedReference | ModelPoint::FrequencyReference));
+        let reference = matches!(
+            point.model,
+            Some(ModelPoint::SpeedReference | ModelPoint::FrequencyReference)
+        );
         reference || self.control.as_ref().is_some_and(is_place)
     }
 
@@ -70,7 +83,10 @@ impl ProfileDrive {
     fn put_number(&mut self, profile: &Profile, raw: &Raw, number: f64) {
         let power = raw.scale_from.and_then(|index| {
             let from = raw_of(profile, index)?;
-            let words: Option<Vec<u16>> = from.addresses().map(|address| self.registers.get(from.table, address)).collect();
+            let words: Option<Vec<u16>> = from
+                .addresses()
+                .map(|address| self.registers.get(from.table, address))
+                .collect();
             from.decode(&words?, profile.points.get(index)?.kind())
         });
         let number = if is_signed(raw) { number } else { number.abs() };
@@ -86,7 +102,9 @@ impl ProfileDrive {
             (ModelPoint::FrequencyReference, percent * self.ratings.maximum / 100.0),
         ] {
             let point = profile.model_point(model).filter(|point| point.write);
-            let target = point.and_then(|point| point.write_to).and_then(|index| profile.points.get(index));
+            let target = point
+                .and_then(|point| point.write_to)
+                .and_then(|index| profile.points.get(index));
             if let Some(raw) = target.or(point).and_then(Point::raw) {
                 self.put_number(&profile, &raw.clone(), value);
             }
@@ -257,7 +275,9 @@ fn raw_of(profile: &Profile, index: usize) -> Option<&Raw> {
 
 fn bits(raw: &Raw, parts: &[Part]) -> Bits {
     let keys = raw.addresses().map(|address| -> Key { (raw.table, address) });
-    keys.zip(parts.iter().copied()).filter(|(_, part)| part.mask != 0).collect()
+    keys.zip(parts.iter().copied())
+        .filter(|(_, part)| part.mask != 0)
+        .collect()
 }
 
 fn masked(profile: &Profile, mask: &Mask) -> Option<Bits> {
@@ -301,6 +321,9 @@ fn usual(point: &Point, raw: &Raw) -> Option<Given> {
         _ if name.contains("scale") || name.contains("exponent") => 0.0,
         _ => 1.0,
     };
-    let within = point.range.as_ref().map_or(number, |range| number.clamp(*range.start(), *range.end()));
+    let within = point
+        .range
+        .as_ref()
+        .map_or(number, |range| number.clamp(*range.start(), *range.end()));
     Some(Given::Number(within))
 }

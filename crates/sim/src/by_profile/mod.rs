@@ -77,7 +77,9 @@ impl ProfileOptions {
         let is_free = |address: &u16| {
             let ranges = &self.profile.ranges;
             !ranges.iter().any(|range| {
-                range.table == Table::Holding && range.addresses.start() <= &(address + 1) && range.addresses.end() >= address
+                range.table == Table::Holding
+                    && range.addresses.start() <= &(address + 1)
+                    && range.addresses.end() >= address
             })
         };
         let [first, ..] = TRIP_ADDRESSES;
@@ -290,7 +292,10 @@ impl ProfileDrive {
         let target = point.write_to.and_then(|index| self.options.profile.points.get(index));
         let point = target.unwrap_or(point);
         let raw = point.raw()?;
-        let words: Option<Vec<u16>> = raw.addresses().map(|address| self.registers.get(raw.table, address)).collect();
+        let words: Option<Vec<u16>> = raw
+            .addresses()
+            .map(|address| self.registers.get(raw.table, address))
+            .collect();
         raw.decode(&words?, point.kind()).map(Value::as_f64)
     }
 
@@ -335,7 +340,11 @@ impl Model for ProfileDrive {
 
     fn target(&self) -> f64 {
         let reference = self.reference();
-        if self.run.unwrap_or(self.reverse) { -reference } else { reference }
+        if self.run.unwrap_or(self.reverse) {
+            -reference
+        } else {
+            reference
+        }
     }
 
     fn remote(&self) -> bool {
@@ -475,5 +484,8 @@ fn maximum(profile: &Profile) -> f64 {
         Bound::Fixed(hertz) => Some(hertz),
         Bound::Point(_) => None,
     });
-    fixed.filter(|hertz| (1.0..=600.0).contains(hertz)).next().unwrap_or(MAXIMUM)
+    fixed
+        .filter(|hertz| (1.0..=600.0).contains(hertz))
+        .next()
+        .unwrap_or(MAXIMUM)
 }

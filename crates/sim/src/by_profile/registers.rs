@@ -59,7 +59,10 @@ impl Registers {
         let places = control.map(said::places).unwrap_or_default();
         let is_place = |key: Key| places.iter().any(|place| (place.table, place.address) == key);
         for (key, held) in &mut self.0 {
-            let mut points = profile.points.iter().filter(|point| point.raw().is_some_and(|raw| raw.covers(key.0, key.1)));
+            let mut points = profile
+                .points
+                .iter()
+                .filter(|point| point.raw().is_some_and(|raw| raw.covers(key.0, key.1)));
             let setting = points.any(|point| point.write && point.model.is_none());
             if setting && !is_place(*key) {
                 *held = from.0.get(key).copied().unwrap_or(*held);
@@ -142,7 +145,9 @@ impl ProfileDrive {
     }
 
     fn read(&self, table: Table, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
-        let end = start.checked_add(count.checked_sub(1).ok_or(Exception::VALUE)?).ok_or(Exception::ADDRESS)?;
+        let end = start
+            .checked_add(count.checked_sub(1).ok_or(Exception::VALUE)?)
+            .ok_or(Exception::ADDRESS)?;
         let one = |address: u16| match self.is_extra(table, address) {
             true if address == self.options.trip_address() => Ok(self.body.latch.fault()),
             true => Ok(u16::from(!self.remote)),
@@ -214,11 +219,15 @@ fn refuses(point: &Point, items: &[(Key, u16)]) -> bool {
     let Some(value) = raw.decode(&words, point.kind()) else {
         return false;
     };
-    let outside = point.range.as_ref().is_some_and(|range| !range.contains(&value.as_f64()));
+    let outside = point
+        .range
+        .as_ref()
+        .is_some_and(|range| !range.contains(&value.as_f64()));
     let code = match value {
         Value::Integer(code) => Some(code),
         _ => None,
     };
-    let unlisted = !point.texts.is_empty() && !point.unlisted && code.is_some_and(|code| !point.texts.contains_key(&code));
+    let unlisted =
+        !point.texts.is_empty() && !point.unlisted && code.is_some_and(|code| !point.texts.contains_key(&code));
     outside || unlisted
 }

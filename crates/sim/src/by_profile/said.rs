@@ -52,7 +52,11 @@ fn next_step(control: &Control, position: usize, place: Place, word: u16) -> Opt
     };
     let whole = place != control.at || control.always.holds(word);
     let reached = steps.iter().take(position + 1);
-    reached.enumerate().filter(|(_, step)| whole && is(step)).map(|(step, _)| step).last()
+    reached
+        .enumerate()
+        .filter(|(_, step)| whole && is(step))
+        .map(|(step, _)| step)
+        .last()
 }
 
 /// Whether a write there can start the motor or turn it round.
@@ -70,7 +74,9 @@ pub(super) fn places(control: &Control) -> Vec<Place> {
     let settings = control.runs().into_iter().chain(steps.iter().map(|step| step.write));
     let settings = settings.chain([control.stop]).chain(control.reverse);
     let settings = settings.chain(control.fault_reset.map(|reset| reset.setting));
-    std::iter::once(control.at).chain(settings.filter_map(|setting| setting.place)).collect()
+    std::iter::once(control.at)
+        .chain(settings.filter_map(|setting| setting.place))
+        .collect()
 }
 
 /// Whether the run command acts when it is written and does not stand.

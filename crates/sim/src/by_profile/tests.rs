@@ -85,7 +85,9 @@ impl Bench {
             start: address,
             count: 1,
         };
-        self.ask(&request).into_words().unwrap_or_else(|| panic!("{table:?} {address}"))[0]
+        self.ask(&request)
+            .into_words()
+            .unwrap_or_else(|| panic!("{table:?} {address}"))[0]
     }
 }
 
@@ -113,7 +115,14 @@ const CASES: &[Case] = &[
         stop: &[Word(0, 0x047E)],
         reverse: &[Word(1, 0xD8F0), Word(0, 0x047F)],
         reset: &[Word(0, 0x047E), Word(0, 0x04FE), Word(0, 0x047E)],
-        idle: &[Word(0, 0x047F), Word(0, 0x0001), Word(0, 0x0477), Word(0, 0x04FF), Word(0, 0x007F), Word(0, 0x04FE)],
+        idle: &[
+            Word(0, 0x047F),
+            Word(0, 0x0001),
+            Word(0, 0x0477),
+            Word(0, 0x04FF),
+            Word(0, 0x007F),
+            Word(0, 0x04FE),
+        ],
         runs: (3, 0x000F, 0x0007),
         fault: (3, 0x000C, 0x0008),
     },
@@ -135,7 +144,13 @@ const CASES: &[Case] = &[
         stop: &[Word(49_999, 0x043C)],
         reverse: &[Word(49_999, 0x847C)],
         reset: &[Word(49_999, 0x043C), Word(49_999, 0x04BC), Word(49_999, 0x043C)],
-        idle: &[Word(49_999, 0x007C), Word(49_999, 0x0474), Word(49_999, 0x045C), Word(49_999, 0x046C), Word(49_999, 0x04BC)],
+        idle: &[
+            Word(49_999, 0x007C),
+            Word(49_999, 0x0474),
+            Word(49_999, 0x045C),
+            Word(49_999, 0x046C),
+            Word(49_999, 0x04BC),
+        ],
         runs: (50_199, 0x080B, 0x0803),
         fault: (50_199, 0x0808, 0x0008),
     },
@@ -168,7 +183,13 @@ const CASES: &[Case] = &[
         stop: &[Word(8501, 7)],
         reverse: &[Word(8501, 0x080F)],
         reset: &[Word(8501, 0), Word(8501, 0x80), Word(8501, 0)],
-        idle: &[Word(8501, 15), Word(8501, 7), Word(8501, 0x80), Word(8501, 6), Word(8501, 3)],
+        idle: &[
+            Word(8501, 15),
+            Word(8501, 7),
+            Word(8501, 0x80),
+            Word(8501, 6),
+            Word(8501, 3),
+        ],
         runs: (3201, 0x006F, 0x0027),
         fault: (3201, 0x004F, 0x0008),
     },
@@ -312,7 +333,12 @@ fn running(case: &Case) -> Bench {
     bench.send(case.reference);
     bench.send(case.start);
     bench.wait(5000);
-    assert!((bench.output() - 25.0).abs() < 0.01, "{}: {}", case.profile, bench.output());
+    assert!(
+        (bench.output() - 25.0).abs() < 0.01,
+        "{}: {}",
+        case.profile,
+        bench.output()
+    );
     bench
 }
 
@@ -400,7 +426,11 @@ fn a_reset_with_a_run_command() {
         bench.send(&[Word(bench.trip_address, 1)]);
         bench.send(&orders);
         bench.wait(1000);
-        assert_eq!((bench.drive.state().fault, bench.drive.state().running), (0, starts), "{name}");
+        assert_eq!(
+            (bench.drive.state().fault, bench.drive.state().running),
+            (0, starts),
+            "{name}"
+        );
     }
 }
 
@@ -412,7 +442,12 @@ fn a_drive_at_its_panel_does_not_obey_the_bus() {
         let panel = bench.trip_address + 1;
         bench.send(&[Word(panel, 1)]);
         bench.wait(5000);
-        assert_eq!((bench.output(), bench.drive.state().remote), (0.0, false), "{}", case.profile);
+        assert_eq!(
+            (bench.output(), bench.drive.state().remote),
+            (0.0, false),
+            "{}",
+            case.profile
+        );
         bench.send(case.start);
         bench.send(&[Word(panel, 0)]);
         bench.wait(1000);
@@ -453,12 +488,20 @@ fn every_profile_answers_its_points() {
                 start: raw.address,
                 count: raw.form.items(),
             };
-            let words = bench.ask(&read).into_words().unwrap_or_else(|| panic!("{} {}", profile.name, point.name));
+            let words = bench
+                .ask(&read)
+                .into_words()
+                .unwrap_or_else(|| panic!("{} {}", profile.name, point.name));
             if raw.scale_from.is_none() {
                 let value = raw.decode(&words, point.kind());
                 let value = value.unwrap_or_else(|| panic!("{} {}: no value", profile.name, point.name));
                 let within = point.range.as_ref().is_none_or(|range| range.contains(&value.as_f64()));
-                assert!(within || value.as_f64() == 0.0, "{} {}: {value}", profile.name, point.name);
+                assert!(
+                    within || value.as_f64() == 0.0,
+                    "{} {}: {value}",
+                    profile.name,
+                    point.name
+                );
             }
         }
         let range = &profile.ranges[0];
@@ -467,9 +510,19 @@ fn every_profile_answers_its_points() {
             start,
             count,
         };
-        let unknown = (0..=u16::MAX).find(|address| profile.range(range.table, *address).is_none()).unwrap();
-        assert_eq!(bench.ask(&read(unknown, 1)), Reply::Exception(Exception::ADDRESS), "{}", profile.name);
-        assert_eq!(bench.ask(&read(*range.addresses.start(), 0)), Reply::Exception(Exception::VALUE));
+        let unknown = (0..=u16::MAX)
+            .find(|address| profile.range(range.table, *address).is_none())
+            .unwrap();
+        assert_eq!(
+            bench.ask(&read(unknown, 1)),
+            Reply::Exception(Exception::ADDRESS),
+            "{}",
+            profile.name
+        );
+        assert_eq!(
+            bench.ask(&read(*range.addresses.start(), 0)),
+            Reply::Exception(Exception::VALUE)
+        );
         assert!(bench.drive.state().ready && !bench.drive.state().running);
     }
     assert!(seen >= 19, "{seen}");
@@ -496,7 +549,8 @@ fn a_profile_of_ones_own() {
          [[point]]\nname = \"output_frequency\"\nat = \"holding 4\"\ntype = \"i16\"\nscale = 0.1\nclass = \"fast\"\n\
          [[point]]\nname = \"frequency_reference\"\nat = \"holding 1\"\ntype = \"i16\"\nscale = 0.1\nwrite = true\nrange = [0, 50]\n"
     );
-    let text = text.replace(RANGE, "").replace("[ranges]\nsingle_write = 16\n", "") + "[ranges]\nsingle_write = 16\n" + RANGE;
+    let text =
+        text.replace(RANGE, "").replace("[ranges]\nsingle_write = 16\n", "") + "[ranges]\nsingle_write = 16\n" + RANGE;
     let mut bench = Bench::of(&profile(&text));
     let refused = bench.ask(&Word(0, 0x0406).pdu());
     assert_eq!(refused, Reply::Exception(Exception::FUNCTION), "function 16 only");

@@ -96,7 +96,10 @@ fn without(fixed: &Fixed, bits: &Bits) -> Vec<Fixed> {
     let mut ways = Vec::new();
     for (key, part) in bits {
         let known = fixed.get(key).map_or(0, |known| known.mask);
-        for bit in (0..16).map(|bit| 1u16 << bit).filter(|bit| part.mask & !known & bit != 0) {
+        for bit in (0..16)
+            .map(|bit| 1u16 << bit)
+            .filter(|bit| part.mask & !known & bit != 0)
+        {
             let other = Part {
                 mask: bit,
                 value: !part.value & bit,
@@ -134,15 +137,28 @@ mod tests {
         let ready: &[(u16, u16)] = &[(0x6F, 0x21), (0x6F, 0x23), (0x4F, 0x40)];
         let (running, fault): (&[(u16, u16)], &[(u16, u16)]) = (&[(0x6F, 0x27)], &[(0x4F, 0x08)]);
         let remote: &[(u16, u16)] = &[(0x200, 0x200)];
-        let idle = word(&[(false, fault), (false, running), (false, &[(0x6F, 0x21)]), (true, ready), (true, remote)]);
+        let idle = word(&[
+            (false, fault),
+            (false, running),
+            (false, &[(0x6F, 0x21)]),
+            (true, ready),
+            (true, remote),
+        ]);
         assert!(idle & 0x4F == 0x40 || idle & 0x6F == 0x23, "{idle:#x}");
         let runs = word(&[(false, fault), (true, running), (true, ready), (true, remote)]);
         assert_eq!(runs, 0x227, "not ready at once: the first ones count");
         assert_eq!(word(&[(true, fault), (false, running), (true, remote)]), 0x208);
         // The stopped one may not look ready, running or stopping.
-        assert_eq!(word(&[(false, &[(3, 3)]), (false, &[(3, 1)]), (true, &[(0x400, 0x400)])]), 0x400);
+        assert_eq!(
+            word(&[(false, &[(3, 3)]), (false, &[(3, 1)]), (true, &[(0x400, 0x400)])]),
+            0x400
+        );
         // A choice that later ones forbid is taken back.
         assert_eq!(word(&[(false, &[(3, 0)]), (false, &[(1, 1)])]), 2);
-        assert_eq!(word(&[(false, &[(3, 0)]), (false, &[(1, 1)]), (false, &[(2, 2)])]), 2, "the last one is left out");
+        assert_eq!(
+            word(&[(false, &[(3, 0)]), (false, &[(1, 1)]), (false, &[(2, 2)])]),
+            2,
+            "the last one is left out"
+        );
     }
 }

@@ -185,7 +185,10 @@ fn off_status(shows: &Shows) -> Part {
         is(shows.word, 0x0004),
         shows.position == 0,
     ];
-    let value = bits.iter().zip(0u16..).fold(0, |word, (on, bit)| word | u16::from(*on) << bit);
+    let value = bits
+        .iter()
+        .zip(0u16..)
+        .fold(0, |word, (on, bit)| word | u16::from(*on) << bit);
     Part { mask: 0x007F, value }
 }
 

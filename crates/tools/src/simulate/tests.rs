@@ -129,7 +129,10 @@ fn every_built_in_profile_can_be_simulated() {
         let line = args.applied_to(args.line().unwrap());
         assert_eq!(Some(&line.rules.protocol), profile.protocols.first(), "{name}");
         let baud = line.rules.format.baud;
-        assert!(profile.bauds.is_empty() || profile.bauds.contains(&baud), "{name}: {baud}");
+        assert!(
+            profile.bauds.is_empty() || profile.bauds.contains(&baud),
+            "{name}: {baud}"
+        );
         let address = line.drives[0].model.trip_address().to_string();
         let help = trip_registers().replace(',', " ");
         match &line.drives[0].model {
@@ -176,7 +179,10 @@ fn profiles_of_the_user_are_simulated() {
     write("meter.toml", meter);
     let error_of = |words: &str| parse(words).unwrap().line().unwrap_err();
     let file = path("meter.toml");
-    let args = parse(&format!("--profile {file} --set voltage=231.5 --set tariff=night --set serial=A1")).unwrap();
+    let args = parse(&format!(
+        "--profile {file} --set voltage=231.5 --set tariff=night --set serial=A1"
+    ))
+    .unwrap();
     let line = args.applied_to(args.line().unwrap());
     assert_eq!(line.rules.format.baud, 9600);
     let ModelOptions::Profile(of) = &line.drives[0].model else {
@@ -186,21 +192,36 @@ fn profiles_of_the_user_are_simulated() {
     let given: Vec<&Given> = of.values.values().collect();
     assert_eq!(
         given,
-        [&Given::Number(231.5), &Given::Number(2.0), &Given::Text("A1".to_string())]
+        [
+            &Given::Number(231.5),
+            &Given::Number(2.0),
+            &Given::Text("A1".to_string())
+        ]
     );
     let dir = directory.path().display();
-    assert!(parse(&format!("--profile meter --profile-dir {dir}")).unwrap().line().is_ok());
+    assert!(
+        parse(&format!("--profile meter --profile-dir {dir}"))
+            .unwrap()
+            .line()
+            .is_ok()
+    );
     for (words, wanted) in [
         (format!("--profile {file} --set voltag=1"), "did you mean `voltage`?"),
         (format!("--profile {file} --set voltage"), "write POINT=VALUE"),
-        (format!("--profile {file} --set voltage=high"), "`high` is not a value of `voltage`"),
+        (
+            format!("--profile {file} --set voltage=high"),
+            "`high` is not a value of `voltage`",
+        ),
         ("--set voltage=1".to_string(), "come from its simulated motor"),
         (format!("--profile {}", path("none.toml")), "none.toml"),
     ] {
         let error = error_of(&words);
         assert!(error.contains(wanted), "{words}: {error}");
     }
-    write("odd.toml", &meter.replace("name = \"meter\"", "name = \"odd\"\nsimulator = \"odd\""));
+    write(
+        "odd.toml",
+        &meter.replace("name = \"meter\"", "name = \"odd\"\nsimulator = \"odd\""),
+    );
     assert!(error_of(&format!("--profile {}", path("odd.toml"))).contains("unknown simulator `odd`"));
     write("bad.toml", "name = \"bad\"");
     assert!(error_of(&format!("--profile {}", path("bad.toml"))).contains("protocols"));

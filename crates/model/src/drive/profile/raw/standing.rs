@@ -33,13 +33,19 @@ impl Raw {
     /// The same of some bits of the whole value.
     pub fn masked(&self, mask: u64, is: u64) -> Vec<Part> {
         let items = self.form.items();
-        let words = self.order.split(mask, items).into_iter().zip(self.order.split(is, items));
+        let words = self
+            .order
+            .split(mask, items)
+            .into_iter()
+            .zip(self.order.split(is, items));
         words.map(|(mask, value)| Part { mask, value }).collect()
     }
 
     /// What its registers hold for a number, as near as the type comes to it, with the count divided by that power of ten.
     pub fn number_parts(&self, value: f64, power: i64) -> Vec<Part> {
-        let power = i32::try_from(power).unwrap_or(0).clamp(super::LEAST_POWER, super::MOST_POWER);
+        let power = i32::try_from(power)
+            .unwrap_or(0)
+            .clamp(super::LEAST_POWER, super::MOST_POWER);
         let exact = (value - self.offset) / self.scale / 10f64.powi(power);
         let exact = if exact.is_finite() { exact } else { 0.0 };
         let all = self.form.bits_of(-1);
@@ -79,10 +85,7 @@ impl Raw {
         if self.order.low_word_first() {
             words.reverse();
         }
-        let part = |value| Part {
-            mask: u16::MAX,
-            value,
-        };
+        let part = |value| Part { mask: u16::MAX, value };
         words.into_iter().map(part).collect()
     }
 }
@@ -109,7 +112,11 @@ mod tests {
                     ..Raw::plain(Table::Holding, 7, form)
                 };
                 let number = words(&raw.number_parts(123.4, 0));
-                assert_eq!(raw.decode(&number, Kind::Number), Some(Value::Number(123.4)), "{form:?} {order:?}");
+                assert_eq!(
+                    raw.decode(&number, Kind::Number),
+                    Some(Value::Number(123.4)),
+                    "{form:?} {order:?}"
+                );
                 let far = words(&raw.number_parts(-1e12, 0));
                 assert!(raw.decode(&far, Kind::Number).is_some(), "{form:?} {order:?}");
             }
@@ -155,7 +162,11 @@ mod tests {
                 ..Raw::plain(Table::Input, 0, Form::Text { registers: 3 })
             };
             let text = raw.decode(&words(&raw.text_parts("SIM-1")), Kind::Text);
-            assert_eq!(text.map(|text| text.to_string()), Some("SIM-1".to_string()), "{order:?}");
+            assert_eq!(
+                text.map(|text| text.to_string()),
+                Some("SIM-1".to_string()),
+                "{order:?}"
+            );
         }
     }
 }
