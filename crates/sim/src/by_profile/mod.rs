@@ -300,7 +300,7 @@ impl ProfileDrive {
     }
 
     /// Gives the drive to its panel, which lets it stand, or back to the bus, which has to command it anew.
-    fn to_bus(&mut self, on: bool) {
+    fn give_to_bus(&mut self, on: bool) {
         if self.remote != on {
             (self.remote, self.position) = (on, 0);
             self.run = None;
@@ -422,7 +422,7 @@ impl Model for ProfileDrive {
     }
 
     fn set_remote(&mut self, on: bool) {
-        self.to_bus(on);
+        self.give_to_bus(on);
     }
 }
 
@@ -480,12 +480,9 @@ fn maximum(profile: &Profile) -> f64 {
         Source::Derived(derived) => derived.band(),
         Source::Raw(_) => None,
     });
-    let fixed = ends.filter_map(|(_, _, maximum)| match maximum {
+    let mut fixed = ends.filter_map(|(_, _, maximum)| match maximum {
         Bound::Fixed(hertz) => Some(hertz),
         Bound::Point(_) => None,
     });
-    fixed
-        .filter(|hertz| (1.0..=600.0).contains(hertz))
-        .next()
-        .unwrap_or(MAXIMUM)
+    fixed.find(|hertz| (1.0..=600.0).contains(hertz)).unwrap_or(MAXIMUM)
 }

@@ -140,7 +140,7 @@ impl ProfileDrive {
     fn write_extra(&mut self, address: u16, value: u16) {
         match address == self.options.trip_address() {
             true => self.trip(value),
-            false => self.to_bus(value == 0),
+            false => self.give_to_bus(value == 0),
         }
     }
 

@@ -56,7 +56,7 @@ fn next_step(control: &Control, position: usize, place: Place, word: u16) -> Opt
         .enumerate()
         .filter(|(_, step)| whole && is(step))
         .map(|(step, _)| step)
-        .last()
+        .max()
 }
 
 /// Whether a write there can start the motor or turn it round.

@@ -1,5 +1,7 @@
 //! Families by hand: their words from the figures of the manuals, not from their profiles.
 
+use proptest::prelude::*;
+
 use super::*;
 use crate::drive::profile::Profiles;
 use crate::simulated_drive::{DriveOptions, ModelOptions, SimulatedDrive};
@@ -526,6 +528,73 @@ fn every_profile_answers_its_points() {
         assert!(bench.drive.state().ready && !bench.drive.state().running);
     }
     assert!(seen >= 19, "{seen}");
+}
+
+/// Requests near the addresses of a profile, and any others.
+fn request(profile: Arc<Profile>) -> impl Strategy<Value = RequestPdu> {
+    let near: Vec<u16> = profile
+        .ranges
+        .iter()
+        .flat_map(|range| [*range.addresses.start(), *range.addresses.end()])
+        .collect();
+    let address = prop_oneof![
+        4 => (prop::sample::select(near), 0..4u16).prop_map(|(address, more)| address.wrapping_add(more)),
+        1 => any::<u16>(),
+    ];
+    let value = || prop_oneof![0..20u16, 0x0400..0x0500u16, any::<u16>()];
+    let table = prop::sample::select(vec![Table::Coil, Table::DiscreteInput, Table::Input, Table::Holding]);
+    (address, table, value(), prop::collection::vec(value(), 0..6), 0..6u8).prop_map(
+        |(address, table, value, values, kind)| match kind {
+            0 => RequestPdu::Read {
+                table,
+                start: address,
+                count: value % 40,
+            },
+            1 => RequestPdu::WriteCoil {
+                address,
+                on: value & 1 == 1,
+            },
+            2 => RequestPdu::WriteRegister { address, value },
+            3 => RequestPdu::WriteRegisters { start: address, values },
+            4 => RequestPdu::WriteCoils {
+                start: address,
+                bits: values.iter().map(|value| value & 1 == 1).collect(),
+            },
+            _ => RequestPdu::MaskWrite {
+                address,
+                and_mask: value,
+                or_mask: 1,
+            },
+        },
+    )
+}
+
+fn any_bench() -> impl Strategy<Value = (Arc<Profile>, Vec<(RequestPdu, u64)>)> {
+    let profiles: Vec<Arc<Profile>> = Profiles::built_in().iter().cloned().collect();
+    let own = |profile: &Arc<Profile>| matches!(ModelOptions::of_profile(profile), Some(ModelOptions::Profile(_)));
+    let profiles: Vec<Arc<Profile>> = profiles.into_iter().filter(own).collect();
+    prop::sample::select(profiles).prop_flat_map(|profile| {
+        let requests = prop::collection::vec((request(Arc::clone(&profile)), 0..500u64), 1..40);
+        (Just(profile), requests)
+    })
+}
+
+proptest! {
+    /// Whatever a drive is asked, its reply fits, and it turns only where nothing is wrong.
+    #[test]
+    fn every_reply_fits_its_request((profile, requests) in any_bench()) {
+        let mut bench = Bench::of(&profile);
+        for (request, milliseconds) in requests {
+            let reply = bench.ask(&request);
+            let mut pdu = Vec::new();
+            reply.encode(&request, &mut pdu);
+            prop_assert_eq!(Reply::decode(&request, &pdu), Ok(reply), "{} {:?}", profile.name, request);
+            bench.wait(milliseconds);
+            let state = bench.drive.state();
+            prop_assert!(state.fault == 0 || !state.running && !state.ready, "{}: {state:?}", profile.name);
+            prop_assert!(state.running || state.output == 0.0, "{}: {state:?}", profile.name);
+        }
+    }
 }
 
 fn profile(text: &str) -> Arc<Profile> {
