@@ -135,7 +135,8 @@ mod tests {
     #[test]
     fn words_show_all_states_at_once() {
         let ready: &[(u16, u16)] = &[(0x6F, 0x21), (0x6F, 0x23), (0x4F, 0x40)];
-        let (running, fault): (&[(u16, u16)], &[(u16, u16)]) = (&[(0x6F, 0x27)], &[(0x4F, 0x08)]);
+        let running: &[(u16, u16)] = &[(0x6F, 0x27)];
+        let fault: &[(u16, u16)] = &[(0x4F, 0x08)];
         let remote: &[(u16, u16)] = &[(0x200, 0x200)];
         let idle = word(&[
             (false, fault),
