@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 use std::io;
+use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -44,14 +45,21 @@ impl Dial {
     pub(super) async fn connect(self, broker: Broker, first: usize, options: NetworkOptions) -> io::Result<TcpStream> {
         // rumqttc and TLS require IPv6 addresses without brackets.
         let found = tokio::net::lookup_host((broker.bare_host(), broker.port)).await?;
-        let mut addresses: Vec<_> = found.collect();
-        let mut failed = io::Error::other(format!("{} has no address", broker.host));
-        if addresses.is_empty() {
+        self.reach(found.collect(), first, options).await
+    }
+
+    async fn reach(
+        self,
+        mut addresses: Vec<SocketAddr>,
+        first: usize,
+        options: NetworkOptions,
+    ) -> io::Result<TcpStream> {
+        let mut failed = io::Error::other("the host has no address");
+        let Some(start) = first.checked_rem(addresses.len()) else {
             return Err(failed);
-        }
-        let count = addresses.len();
-        addresses.rotate_left(first % count);
-        let each = CONNECT_TIMEOUT / u32::try_from(count).unwrap_or(u32::MAX);
+        };
+        let each = CONNECT_TIMEOUT / u32::try_from(addresses.len()).unwrap_or(u32::MAX);
+        addresses.rotate_left(start);
         for address in addresses {
             self.turn().await;
             // A literal address: nothing is looked up.
@@ -98,22 +106,43 @@ mod tests {
         );
     }
 
-    #[tokio::test]
-    async fn an_attempt_begins_with_the_address_whose_turn_it_is() {
+    async fn listener() -> (tokio::net::TcpListener, SocketAddr) {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let port = listener.local_addr().unwrap().port();
-        for host in ["127.0.0.1", "localhost"] {
-            for first in 0..3 {
-                let host = host.to_string();
-                let dialled = Dial::default().connect(Broker { host, port }, first, NetworkOptions::new());
-                assert!(dialled.await.is_ok(), "{first}");
-            }
-        }
-        drop(listener);
-        let broker = Broker {
-            host: "[::1]".to_string(),
-            port,
+        let address = listener.local_addr().unwrap();
+        (listener, address)
+    }
+
+    #[tokio::test]
+    async fn every_address_has_its_turn() {
+        let ((one, a), (_two, b)) = (listener().await, listener().await);
+        let reached = async |first| {
+            let stream = Dial::default().reach(vec![a, b], first, NetworkOptions::new()).await;
+            stream.and_then(|stream| stream.peer_addr()).ok()
         };
-        assert!(Dial::default().connect(broker, 0, NetworkOptions::new()).await.is_err());
+        assert_eq!(
+            [reached(0).await, reached(1).await, reached(2).await],
+            [Some(a), Some(b), Some(a)]
+        );
+        drop(one);
+        assert_eq!(
+            [reached(0).await, reached(1).await],
+            [Some(b); 2],
+            "the other one refuses"
+        );
+        let none = Dial::default().reach(Vec::new(), 3, NetworkOptions::new()).await;
+        assert!(none.unwrap_err().to_string().contains("no address"));
+    }
+
+    #[tokio::test]
+    async fn names_and_addresses_are_dialled() {
+        let (_listener, address) = listener().await;
+        for (host, reaches) in [("127.0.0.1", true), ("localhost", true), ("[::1]", false)] {
+            let broker = Broker {
+                host: host.to_string(),
+                port: address.port(),
+            };
+            let dialled = Dial::default().connect(broker, 0, NetworkOptions::new()).await;
+            assert_eq!(dialled.is_ok(), reaches, "{host}");
+        }
     }
 }
