@@ -183,6 +183,90 @@ fn stays(case: &Case) {
     rig.order(case.stop);
 }
 
+/// The common model's command word.
+fn command(run: bool, reverse: bool, reset: bool) -> Order {
+    Order::Model(u16::from(run) | u16::from(reverse) << 1 | u16::from(reset) << 2, 0, 0)
+}
+
+/// The same by the common model: the words are the gateway's, and the drive must do as ordered.
+fn obeys_the_common_model(case: &Case) {
+    let rig = Rig::new(case, false);
+    let name = case.profile;
+    let done = |order: Order| {
+        assert_eq!(
+            rig.exchange(&order),
+            Answer::Done,
+            "{name}: {order:?}\n{}",
+            rig.drive.output()
+        )
+    };
+    // By the sign of the reference otherwise.
+    let turns_back = !["abb", "invertek"].contains(&case.peer);
+    rig.order(case.reference);
+    done(command(true, false, false));
+    rig.printed("motor forward", 0);
+    rig.site.until_state("drive", "running");
+    // Once more changes nothing.
+    done(command(true, false, false));
+    std::thread::sleep(Duration::from_millis(200));
+    assert!(!rig.drive.output().contains("motor stopped"), "{name}");
+    done(command(false, false, false));
+    rig.printed("motor stopped", 0);
+    until("the end of running", || (rig.state() != "running").then_some(()));
+    if turns_back {
+        done(command(false, true, false));
+        std::thread::sleep(Duration::from_millis(300));
+        assert!(
+            !rig.drive.output().contains("motor reverse"),
+            "{name}: the direction starts nothing"
+        );
+        done(command(true, true, false));
+        rig.printed("motor reverse", 0);
+        rig.site.until_state("drive", "running");
+        done(command(false, true, false));
+        rig.printed("motor stopped", 1);
+        until("the end of running", || (rig.state() != "running").then_some(()));
+    }
+    let forward = rig.drive.output().matches("motor forward").count();
+    done(command(true, false, false));
+    rig.printed("motor forward", forward);
+    let stopped = rig.drive.output().matches("motor stopped").count();
+    rig.drive.signal("USR1");
+    rig.printed("motor stopped", stopped);
+    rig.site.until_state("drive", "fault");
+    if !case.reset.is_empty() {
+        done(command(false, false, true));
+        rig.printed("\nreset", 0);
+        until("the end of the fault", || (rig.state() != "fault").then_some(()));
+        std::thread::sleep(Duration::from_millis(300));
+        assert_eq!(
+            rig.drive.output().matches("motor forward").count(),
+            forward + 1,
+            "{name}"
+        );
+        assert_ne!(rig.state(), "running", "{name}: no reset starts the motor");
+        done(command(true, false, false));
+        rig.printed("motor forward", forward + 1);
+    }
+    done(command(false, false, false));
+}
+
+/// A start that the drive does not follow fails where the family has a sequence, and leaves no run command behind.
+fn fails_to_start(case: &Case) {
+    let rig = Rig::new(case, true);
+    rig.order(case.reference);
+    let answer = rig.exchange(&command(true, false, false));
+    assert_eq!(answer != Answer::Done, case.has_sequence(), "{}", case.profile);
+    std::thread::sleep(Duration::from_millis(300));
+    assert!(!rig.drive.output().contains("motor"), "{}", case.profile);
+    assert_eq!(
+        rig.exchange(&command(false, false, false)),
+        Answer::Done,
+        "{}",
+        case.profile
+    );
+}
+
 /// The cases of every third family, so that three tests run side by side.
 fn every_third(first: usize, check: fn(&Case)) {
     for case in CASES.iter().skip(first).step_by(3) {
@@ -219,4 +303,26 @@ fn unprepared_drives_stay_2() {
 #[test]
 fn unprepared_drives_stay_3() {
     every_third(2, stays);
+}
+
+#[test]
+fn drives_obey_the_common_model_1() {
+    every_third(0, obeys_the_common_model);
+}
+
+#[test]
+fn drives_obey_the_common_model_2() {
+    every_third(1, obeys_the_common_model);
+}
+
+#[test]
+fn drives_obey_the_common_model_3() {
+    every_third(2, obeys_the_common_model);
+}
+
+#[test]
+fn a_start_that_is_not_followed_fails() {
+    for case in CASES.iter().filter(|case| case.has_sequence()) {
+        fails_to_start(case);
+    }
 }

@@ -1,5 +1,6 @@
 //! A command on its way through the line, step by step: control words from the known ones, pulses, safe order. Pure.
 
+mod control;
 mod functions;
 mod known_words;
 mod parameter;
@@ -9,9 +10,11 @@ mod steps;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+pub use self::control::read_place;
 pub use self::known_words::KnownWords;
 pub use self::steps::{Step, StepPurpose};
 
+use self::control::{Made, Word};
 use self::functions::other;
 use self::parameter::ParameterRun;
 use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_of, unsendable, write_on_change};
@@ -100,6 +103,8 @@ pub struct CommandRun {
     overtaken: u32,
     /// It is acknowledged only when the drive shows its effect.
     reads_back: bool,
+    /// The last word of a sequence was sent, which starts the motor: if the rest fails, a stop follows.
+    started: bool,
     /// A stop as it was ordered, for a bus that takes the place of this one.
     stop: Option<Order>,
 }
@@ -176,12 +181,13 @@ impl CommandRun {
             running: true,
             check: Check::NotYet,
             by_other_function: false,
-            control: profile.run_bit().map(|(raw, ..)| (raw.table, raw.address)),
+            control: profile.run_place().map(|place| (place.table, place.address)),
             blind: false,
             held_up: false,
             waits_for_late: false,
             overtaken: 0,
             reads_back,
+            started: false,
             stop,
         }
     }
@@ -298,11 +304,33 @@ impl CommandRun {
                 running,
                 masks: words.functions.masks(profile),
             };
-            match step_of(action, words, profile, known) {
+            let step = match action {
+                Action::Await(_) => match self.awaits(now) {
+                    Some(step) => Some(step),
+                    None => continue,
+                },
+                Action::Word(Word::Sequence(0, reverse)) if control::is_prepared(profile, words, running) => {
+                    self.only_last_word(*reverse, profile);
+                    continue;
+                }
+                Action::Word(word) => match control::word(*word, words, profile, known) {
+                    Made::Send(step) => Some(step),
+                    Made::Nothing => None,
+                    Made::Refused(refusal) => {
+                        self.give_up(Outcome::Refused(refusal));
+                        continue;
+                    }
+                },
+                action => step_of(action, words, profile, known),
+            };
+            match step {
                 Some(mut step) => {
                     step.pdu = words.functions.form(step.pdu, profile);
                     if let Some(other) = other(&step.pdu).filter(|_| self.by_other_function) {
                         step.pdu = other;
+                    }
+                    if let Some(Action::Word(Word::Sequence(number, _))) = self.actions.front() {
+                        self.started |= step.pdu.is_write() && control::is_last(profile, *number);
                     }
                     return Next::Send(step);
                 }
@@ -315,6 +343,48 @@ impl CommandRun {
                     }
                 }
             }
+        }
+    }
+
+    /// A sequence waits for a state: the read of it, as long as its time is not over.
+    fn awaits(&mut self, now: Instant) -> Option<Step> {
+        let Some(Action::Await(state)) = self.actions.front_mut() else {
+            return None;
+        };
+        let since = *state.since.get_or_insert(now);
+        if now.saturating_duration_since(since) < state.timeout {
+            return Some(state.look());
+        }
+        let why = state.not_reached();
+        self.give_up(Outcome::NotTaken(why));
+        None
+    }
+
+    /// The motor runs by this very command: of a sequence the last word alone is sent, which changes nothing or the direction.
+    fn only_last_word(&mut self, reverse: Option<bool>, profile: &Profile) {
+        let last = |action: &Action| matches!(action, Action::Word(Word::Sequence(number, _)) if control::is_last(profile, *number));
+        while self.actions.front().is_some_and(|action| !last(action)) {
+            self.pop();
+        }
+        if let Some(Action::Word(word @ Word::Sequence(..))) = self.actions.front_mut() {
+            let Word::Sequence(number, _) = *word else { return };
+            // Not the first word any more, even where the sequence has but one.
+            *word = match number {
+                0 => Word::Run(reverse),
+                number => Word::Sequence(number, reverse),
+            };
+        }
+    }
+
+    /// It goes no further, and ends with that outcome; a motor that it started is stopped.
+    fn give_up(&mut self, outcome: Outcome) {
+        self.actions.clear();
+        self.cut.get_or_insert(outcome);
+        self.only_ends = true;
+        self.tries.pause = None;
+        (self.tries.failures, self.check) = (0, Check::NotYet);
+        if std::mem::take(&mut self.started) {
+            self.actions.push_back(Action::Word(Word::Stop(None)));
         }
     }
 
@@ -461,6 +531,8 @@ impl CommandRun {
     /// A stop came in: what is not sent yet is not sent any more, but a reset bit that is set is taken away.
     /// The outcome, if the command is over by that.
     pub fn purge(&mut self) -> Option<Outcome> {
+        // The stop that came in is on its way.
+        self.started = false;
         self.cut_off(self.unless_begun(Outcome::Purged, Interruption::Stop));
         self.actions.is_empty().then(|| self.success())
     }
@@ -468,19 +540,23 @@ impl CommandRun {
     fn cut_off(&mut self, outcome: Outcome) {
         let before = self.actions.len();
         // A bit whose setting was sent and not answered may be set.
-        if self.tries.failures > 0 && matches!(self.actions.front(), Some(Action::PulseHigh { .. })) {
+        if self.tries.failures > 0 && self.actions.front().is_some_and(Action::is_reset) {
             self.actions.pop_front();
         }
-        let high = self.actions.iter().any(|a| matches!(a, Action::PulseHigh { .. }));
+        let high = self.actions.iter().any(Action::is_reset);
         self.actions
-            .retain(|a| !high && matches!(a, Action::PulseEnd { .. } | Action::Hold(_)));
+            .retain(|a| !high && (a.ends_reset() || matches!(a, Action::Hold(_))));
         // A hold without the end of a pulse behind it holds nothing.
-        if !self.actions.iter().any(|a| matches!(a, Action::PulseEnd { .. })) {
+        if !self.actions.iter().any(Action::ends_reset) {
             self.actions.clear();
+        }
+        let left = self.actions.len();
+        if std::mem::take(&mut self.started) && before > left {
+            self.actions.push_back(Action::Word(Word::Stop(None)));
         }
         self.only_ends = true;
         self.tries.pause = None;
-        if before != self.actions.len() {
+        if before != left {
             self.cut = Some(outcome);
             self.tries.failures = 0;
         }

@@ -32,6 +32,7 @@ pub mod n2_session;
 pub mod news;
 pub mod predict;
 pub mod prober;
+pub mod proof;
 mod report;
 pub mod schedule;
 mod selection;

@@ -15,10 +15,9 @@ use tokio::sync::oneshot::error::TryRecvError;
 use super::command_run::KnownWords;
 use super::news::{Adopted, News};
 use crate::command::{Answer, Outcome, Refusal};
-use crate::drive::profile::Form;
+use crate::drive::control::Place;
 use crate::drive::{
-    COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Raw,
-    Value,
+    COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Value,
 };
 use crate::process_image::{LeaseAction, Reading, Unavailable};
 
@@ -378,9 +377,9 @@ fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_va
     if let Some(run) = sample.good().filter(|_| sample.at.is_some_and(|at| at > since)) {
         return Some(run.as_bool());
     }
-    let run = reading.spec.profile.model_point(ModelPoint::Run).and_then(|p| p.raw());
-    let is_read = |raw: &Raw| {
-        let word = reading.words(raw.table, raw.address, 1);
+    let run = reading.spec.profile.run_place();
+    let is_read = |place: Place| {
+        let word = reading.words(place.table, place.address, 1);
         matches!(word, Ok(_) | Err(Unavailable::Stale))
     };
     if !in_vain && run.is_some_and(is_read) {
@@ -391,12 +390,14 @@ fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_va
 
 /// The run command in the drive's word as it is known.
 fn written_run(reading: &Reading<'_>, words: &KnownWords) -> Option<bool> {
-    let raw = reading.spec.profile.model_point(ModelPoint::Run)?.raw()?;
-    let word = words.get(raw.table, raw.address)?;
-    Some(match raw.form {
-        Form::Bit { bit, invert } => ((word >> bit) & 1 == 1) != invert,
-        _ => true,
-    })
+    let profile = &reading.spec.profile;
+    let place = profile.run_place()?;
+    let word = words.get(place.table, place.address)?;
+    Some(
+        profile
+            .runs_by(place.table, place.address, word)
+            .unwrap_or(profile.control.is_none()),
+    )
 }
 
 /// Whether an action failed that ended so: not where somebody else's order took its place, or the bus starts anew.

@@ -2,7 +2,7 @@
 
 mod as_service;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -12,6 +12,7 @@ use serde::Serialize;
 
 use super::{EXIT_CONFIG, NamedConfig, report};
 use crate::bus::predict::{PredictedRequest, Prediction};
+use crate::bus::proof;
 use crate::config::memory::{BusMemory, Memory};
 use crate::config::{BusSettings, Loaded, Settings, environment};
 use crate::document::{Finding, Problem};
@@ -221,6 +222,20 @@ fn raw_writes(bus: &BusSettings, settings: &Settings) -> String {
     text
 }
 
+/// The profiles by which drives are commanded in the language of `[control]`, and how many cases were proved of each. One that
+/// fails is an error of the configuration, and one of the program cannot fail.
+fn proved(settings: &Settings) -> BTreeMap<&str, usize> {
+    let drives = settings.buses.iter().flat_map(commanded);
+    let mut proved = BTreeMap::new();
+    for profile in drives.map(|drive| &drive.profile) {
+        if profile.control.is_some() && !proved.contains_key(profile.name.as_str()) {
+            let cases = proof::prove(profile).map_or(0, |proof| proof.commands);
+            proved.insert(profile.name.as_str(), cases);
+        }
+    }
+    proved
+}
+
 /// The profiles in use that nobody has confirmed on hardware.
 fn unverified(settings: &Settings) -> BTreeSet<&str> {
     let drives = settings.buses.iter().flat_map(|bus| &bus.drives);
@@ -243,6 +258,9 @@ fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
     for (bus, past) in settings.buses.iter().zip(&taken.buses) {
         text += &bus_text(bus, settings, &memory(past, taken.reach));
         text.push('\n');
+    }
+    for (profile, cases) in proved(settings) {
+        let _ = writeln!(text, "profile {profile}: commands proved, {cases} cases\n");
     }
     for profile in unverified(settings) {
         let _ = writeln!(

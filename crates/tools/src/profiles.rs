@@ -1,5 +1,6 @@
 //! `drivegate profiles`: the drive families and their points.
 
+mod check;
 mod commands;
 mod import;
 mod new;
@@ -61,6 +62,13 @@ enum What {
         #[arg(long, value_name = "FAMILY")]
         base: Option<String>,
     },
+    /// Checks the file of a profile and proves its commands; exits with 78 and a counterexample if one fails.
+    #[command(after_help = "Examples:\n  drivegate profiles check our-drive.toml")]
+    Check {
+        /// The file of the profile.
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+    },
     /// Prints the profile that a register list (CSV) makes; the columns are in docs/profiles.md.
     #[command(after_help = "Examples:\n  drivegate profiles import our-meter.csv > our-meter.toml")]
     Import {
@@ -95,6 +103,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
             None => unknown(name, "NAME", &profiles),
         },
         Some(What::New { name, base }) => begin(name, base.as_deref(), &profiles),
+        Some(What::Check { file }) => check::run(file, &profiles),
         Some(What::Import { file }) => match read_list(file).and_then(|text| import::profile(file, &text)) {
             Ok(text) => report::print(&text),
             Err(problems) => {

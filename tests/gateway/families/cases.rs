@@ -55,6 +55,13 @@ pub(super) struct Case {
     pub(super) shows_reversed: bool,
 }
 
+impl Case {
+    /// Whether the family is started by a sequence of words that the drive confirms.
+    pub(super) fn has_sequence(&self) -> bool {
+        ["abb", "cia402", "siemens"].contains(&self.peer)
+    }
+}
+
 use Order::{Coil, Model, Pair, Word};
 
 /// Half the maximum forward: 10000 of 20000, 0x2000 of 0x4000, 25 Hz of 50 Hz.

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::control::{LOOK_PAUSE, Word};
 use super::functions::other;
 use super::parameter::Then;
 use super::steps::{Action, Check};
@@ -55,16 +56,49 @@ impl CommandRun {
                 }
                 _ => Some(Outcome::Exception(Exception::DEVICE_FAILURE)),
             },
-            (StepPurpose::Execute, Reply::Exception(code)) => Some(Outcome::Exception(code)),
+            (StepPurpose::AskState, reply) => self.state_answered(&reply),
+            // It says nothing of an earlier try that was not answered.
+            (StepPurpose::Execute, Reply::Exception(code)) if self.tries.in_doubt => self.ended(Outcome::Unknown(code)),
+            (StepPurpose::Execute, Reply::Exception(code)) => self.ended(Outcome::Exception(code)),
             (purpose, reply) => {
                 words.written(&step.pdu);
                 if purpose == StepPurpose::Execute {
                     self.reply = reply;
                 }
+                if let Some(Action::Word(Word::Direction(to) | Word::Run(Some(to)))) = self.actions.front() {
+                    words.direction = Some(*to);
+                }
                 self.pop();
                 self.actions.is_empty().then(|| self.success())
             }
         }
+    }
+
+    /// The state for which a sequence waits, or another one.
+    fn state_answered(&mut self, reply: &Reply) -> Option<Outcome> {
+        if let Reply::Exception(code) = reply
+            && !code.is_busy()
+        {
+            return self.ended(Outcome::Exception(*code));
+        }
+        let Some(Action::Await(state)) = self.actions.front_mut() else {
+            return None;
+        };
+        if state.is_shown(reply) {
+            self.pop();
+            return self.actions.is_empty().then(|| self.success());
+        }
+        self.tries.pause = Some(LOOK_PAUSE);
+        None
+    }
+
+    /// It ends so; where its sequence started the motor, a stop goes before that.
+    fn ended(&mut self, outcome: Outcome) -> Option<Outcome> {
+        if self.urgency == Urgency::Stop || self.only_ends || !self.started {
+            return Some(self.cut.clone().filter(|_| self.only_ends).unwrap_or(outcome));
+        }
+        self.give_up(outcome);
+        None
     }
 
     /// Whether the drive is too busy for the step, which is tried again: of a command as long as its time is not over. Nobody
@@ -92,7 +126,7 @@ impl CommandRun {
     }
 
     fn ends_pulse(&self) -> bool {
-        matches!(self.actions.front(), Some(Action::PulseEnd { .. }))
+        self.actions.front().is_some_and(Action::ends_reset)
     }
 
     /// The drive does not know the function of a write. Whether there is another one to try, once; nothing can stop a drive
@@ -193,6 +227,10 @@ impl CommandRun {
         if step.pdu.is_write() && self.check == Check::Read {
             // By the next try it may have changed again.
             self.check = Check::NotYet;
+        }
+        if over && self.started && !self.only_ends {
+            self.give_up(self.tries.unanswered.clone());
+            return None;
         }
         over.then(|| self.without_answer())
     }

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
+use super::control::{AwaitedState, Ordered, Word};
 use super::known_words::KnownWords;
 use super::parameter::ParameterRun;
 use crate::codec::n2::Session;
@@ -35,6 +36,14 @@ pub(super) enum Action {
     PulseEnd { raw: Raw, bit: u8, invert: bool },
     /// Two update periods of the drive.
     Hold(Duration),
+    /// A word of the control register by `[control]` of the profile.
+    Word(Word),
+    /// Waits for the state that ends a step of a sequence.
+    Await(Box<AwaitedState>),
+    /// Sets a reset that has a place of its own.
+    ResetElsewhere(RequestPdu),
+    /// Takes it away again.
+    ResetOver(RequestPdu),
     /// A parameter, which has steps of its own.
     Parameter(Box<ParameterRun>),
 }
@@ -50,6 +59,8 @@ pub enum StepPurpose {
     Execute,
     /// Gives an overridden output back to the drive's own control.
     Release,
+    /// Asks for the state that ends a step of a sequence.
+    AskState,
     /// Asks whether the motor runs, right before a parameter is written.
     AskRunning,
     /// Asks whether the drive took a parameter.
@@ -65,8 +76,26 @@ pub struct Step {
     pub pdu: RequestPdu,
 }
 
+impl Action {
+    /// Whether it sets a reset.
+    pub(super) fn is_reset(&self) -> bool {
+        matches!(
+            self,
+            Action::PulseHigh { .. } | Action::Word(Word::ResetHigh) | Action::ResetElsewhere(_)
+        )
+    }
+
+    /// Whether it ends one.
+    pub(super) fn ends_reset(&self) -> bool {
+        matches!(
+            self,
+            Action::PulseEnd { .. } | Action::Word(Word::ResetEnd) | Action::ResetOver(_)
+        )
+    }
+}
+
 impl Step {
-    fn new(purpose: StepPurpose, pdu: RequestPdu) -> Step {
+    pub(super) fn new(purpose: StepPurpose, pdu: RequestPdu) -> Step {
         Step { purpose, pdu }
     }
 }
@@ -112,6 +141,9 @@ pub(super) fn unsendable(profile: &Profile, values: &[(usize, Value)]) -> Option
             return Some(Refusal::NotWritable(format!("there is no point {index}")));
         };
         let name = &point.name;
+        if Ordered::default().takes(profile, *index, *value) {
+            return None;
+        }
         match point.raw().map(|raw| raw.encode(*value, 0)) {
             Some(Ok(words)) if !words.is_empty() => None,
             Some(Ok(_)) => Some(Refusal::BadValue(format!("`{name}` = {value} is nothing to write"))),
@@ -125,6 +157,11 @@ pub(super) fn unsendable(profile: &Profile, values: &[(usize, Value)]) -> Option
 
 /// Whether a command says whether the motor is to run.
 pub(super) fn names_run(profile: &Profile, values: &[(usize, Value)]) -> bool {
+    if profile.control_language().is_some() {
+        return values
+            .iter()
+            .any(|(index, _)| profile.model_index(ModelPoint::Run) == Some(*index));
+    }
     let Some((run, bit, _)) = profile.run_bit() else {
         return false;
     };
@@ -142,7 +179,11 @@ pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool, 
     let mut numbers = VecDeque::new();
     let mut pulses = VecDeque::new();
     let mut words: BTreeMap<(Table, u16), WordChange> = BTreeMap::new();
+    let mut control = Ordered::default();
     for (index, value) in values {
+        if control.takes(profile, *index, *value) {
+            continue;
+        }
         let Some(point) = profile.points.get(*index) else {
             continue;
         };
@@ -209,12 +250,13 @@ pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool, 
     let run = run.and_then(|place| words.remove(&place));
     let others = words.into_values();
     let action = |(raw, changes): WordChange| Action::Bits { raw, changes };
+    let words = control.actions(profile, stop, stopped);
     if stop {
         let bits = run.into_iter().chain(others).map(action);
-        bits.chain(numbers).chain(pulses).collect()
+        words.into_iter().chain(bits).chain(numbers).chain(pulses).collect()
     } else {
         let bits = others.chain(run).map(action);
-        numbers.into_iter().chain(pulses).chain(bits).collect()
+        numbers.into_iter().chain(pulses).chain(bits).chain(words).collect()
     }
 }
 
@@ -234,8 +276,9 @@ fn write_of(address: u16, words: Vec<u16>) -> Option<RequestPdu> {
 pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, known: Known) -> Option<Step> {
     let execute = |pdu: &RequestPdu| Step::new(StepPurpose::Execute, pdu.clone());
     match action {
-        Action::Hold(_) => None,
-        Action::Send(pdu) => Some(execute(pdu)),
+        // They are made where they have their turn.
+        Action::Hold(_) | Action::Word(_) | Action::Await(_) => None,
+        Action::Send(pdu) | Action::ResetElsewhere(pdu) | Action::ResetOver(pdu) => Some(execute(pdu)),
         Action::Parameter(run) => Some(run.step()),
         Action::Release(pdu) => Some(Step::new(StepPurpose::Release, pdu.clone())),
         Action::Change { pdu, table, items } => match known.check {

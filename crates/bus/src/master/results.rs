@@ -6,7 +6,7 @@ use super::{Before, Master, Purpose, Turn, TurnEnd};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, is_reference, written};
-use crate::command_run::{Step, StepPurpose};
+use crate::command_run::{Step, StepPurpose, read_place};
 use crate::drive::{PlannedRead, Point, Raw};
 use crate::n2_late_replies::Asked;
 use crate::n2_session::Progress;
@@ -293,7 +293,9 @@ impl Master {
         drive.was_read = true;
         let written = image.spec.profile.points.iter().filter(|point| point.write);
         let commanded = written.filter_map(Point::raw).filter(|raw| raw.table == read.table);
-        for address in commanded.flat_map(Raw::addresses) {
+        let control = read_place(&image.spec.profile).filter(|place| place.table == read.table);
+        let control = control.map(|place| place.address);
+        for address in commanded.flat_map(Raw::addresses).chain(control) {
             let place = address.checked_sub(read.start).map(usize::from);
             if let Some(word) = place.and_then(|place| words.get(place)) {
                 drive.words.learn(read.table, address, *word);

@@ -10,8 +10,8 @@ use crate::command::{
     Urgency, WriteStats, admit, written,
 };
 use crate::command_run::{CommandRun, Next, Step};
-use crate::drive::Profile;
 use crate::drive::profile::Profiles;
+use crate::drive::{Derived, Profile, Source};
 use crate::drive_state::{DriveState, Wanted};
 use crate::master::supervise;
 use crate::n2_late_replies::N2LateReplies;
@@ -135,7 +135,19 @@ impl Bench {
     fn knows(&self, point: &str, value: Value) {
         let drive = self.image();
         let profile = &drive.spec.profile;
-        let raw = profile.points[profile.point_index(point).unwrap()].raw().unwrap();
+        let point = &profile.points[profile.point_index(point).unwrap()];
+        // A state of a register that has a point of its own.
+        let (raw, value) = match &point.source {
+            Source::Derived(Derived::State { any }) => {
+                let held = if value.as_bool() {
+                    any[0].is
+                } else {
+                    !any[0].is & any[0].mask
+                };
+                (profile.points[any[0].point].raw().unwrap(), Value::Number(held as f64))
+            }
+            _ => (point.raw().unwrap(), value),
+        };
         let words = raw.encode(value, 0).unwrap();
         drive.update(|s| s.store(raw.table, raw.address, &words, self.now));
     }
@@ -276,6 +288,9 @@ fn writes(profile: &Profile, command: Command, now: Instant) -> Vec<(String, Val
             write => {
                 let (table, items) = written(write).unwrap();
                 let words: Vec<u16> = items.iter().map(|(_, word)| *word).collect();
+                if let Some(run) = profile.runs_by(table, items[0].0, words[0]) {
+                    sets.push(("run".to_string(), Value::Bool(run)));
+                }
                 for point in profile.points.iter().filter(|p| p.write) {
                     if let Some(raw) = point.raw().filter(|r| (r.table, r.address) == (table, items[0].0)) {
                         sets.push((point.name.clone(), raw.decode(&words, point.kind()).unwrap()));
@@ -318,8 +333,12 @@ fn every_family_is_written_its_action() {
                     ("frequency_command", Value::Number(10.0)),
                 ]
             };
-            let is_wanted =
-                |set: &(String, Value)| wanted.iter().any(|(name, value)| set.0 == *name && set.1 == *value);
+            let is_wanted = |set: &(String, Value)| {
+                wanted.iter().any(|(name, value)| {
+                    // As near as the register holds it.
+                    set.0 == *name && (set.1.as_f64() - value.as_f64()).abs() < 0.02
+                })
+            };
             assert!(sets.iter().any(is_wanted), "{}: {sets:?}", profile.name);
         }
     }

@@ -9,7 +9,7 @@ use crate::codec::{Protocol, RequestPdu, Table};
 use crate::drive::control::Place;
 use crate::drive::model::Kind;
 use crate::drive::profile::AddressRange;
-use crate::drive::{ModelPoint, Point, Source, Value};
+use crate::drive::{Derived, ModelPoint, Point, Source, Value};
 use crate::process_image::{Access, DriveSpec, Hold, ParamsAccess, Reading};
 
 /// Values of an enumeration that a refusal names.
@@ -350,6 +350,8 @@ fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
                 .map_err(|why| Refusal::BadValue(format!("`{}`: {why}; nothing was written", point.name)))?;
             Ok((index, value))
         }
+        // It is made into control words when its turn comes.
+        Source::Derived(Derived::State { .. }) if point.write => Ok((index, value)),
         Source::Derived(derived) => {
             let name = &point.name;
             let Some((of, minimum, maximum)) = derived.band() else {

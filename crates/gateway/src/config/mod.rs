@@ -35,12 +35,15 @@ pub use named_files::{FileKind, NamedFile, named_files};
 pub use params::ParamsSettings;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use crate::bus::predict::{self, Prediction};
+use crate::bus::proof;
 use crate::bus::{BusOptions, Mode};
 use crate::command::AuditFileOptions;
 use crate::document::{self, Document, Finding, Place, Problem, Reader};
+use crate::drive::Profile;
 use crate::drive::profile::Profiles;
 use crate::history::RecorderOptions;
 use crate::north::local::SocketPath;
@@ -434,6 +437,7 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
             ),
         }
     }
+    errors.extend(unsafe_commands(&profiles));
     reader.finish();
     Gateway {
         name,
@@ -443,6 +447,24 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
         profiles,
         errors,
     }
+}
+
+/// The user's profiles by which a command does what it must not; those of the program are proved by its tests.
+fn unsafe_commands(profiles: &Profiles) -> Vec<Problem> {
+    let own = profiles.iter().filter(|profile| !profile.built_in);
+    let problem = |profile: &Arc<Profile>| {
+        let counterexample = proof::prove(profile).err()?;
+        let finding = Finding::new(
+            counterexample.line(),
+            "correct [control] of the profile; `drivegate profiles check FILE` prints state, command and frames",
+        );
+        Some(Problem::of_file(
+            format!("profile {}", profile.name),
+            "control",
+            finding,
+        ))
+    };
+    own.filter_map(problem).collect()
 }
 
 fn read_socket(reader: &Reader<'_>, base: &Path) -> SocketPath {

@@ -91,6 +91,14 @@ fn is_stopped(drive: &DriveSpec) -> bool {
 
 /// The requests of a stop: the read of the control word, if there is one, and the write.
 fn stop_of(drive: &DriveSpec) -> Option<(Option<RequestPdu>, RequestPdu)> {
+    if let Some(control) = drive.profile.control_language() {
+        let place = control.stop.place.unwrap_or(control.at);
+        let functions = drive.profile.functions;
+        return Some(match place.table {
+            Table::Coil | Table::DiscreteInput => (None, functions.write_coil(place.address, false)),
+            Table::Input | Table::Holding => (None, functions.write_register(place.address, control.stop_word(0))),
+        });
+    }
     let (raw, _, invert) = drive.profile.run_bit()?;
     let (table, address) = (raw.table, raw.address);
     Some(match table {

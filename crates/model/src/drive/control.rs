@@ -140,7 +140,7 @@ pub struct Step {
 }
 
 /// What ends a step.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Until {
     /// The word was acknowledged.
     Written,
@@ -228,6 +228,96 @@ impl Control {
             _ => 0,
         };
         (word ^ setting.value) & setting.mask & !free == 0
+    }
+
+    /// The word without a reset that stands in it: its bits as they are between two resets.
+    pub fn without_reset(&self, own: u16) -> u16 {
+        match self.fault_reset.map(|reset| reset.setting) {
+            Some(reset) if reset.place.is_none() && reset.value == 0 => own | reset.mask,
+            Some(reset) if reset.place.is_none() && reset.holds(own) => own & !reset.value,
+            _ => own,
+        }
+    }
+
+    /// The word with that direction, where the direction is a setting of the control word.
+    pub fn with_direction(&self, word: u16, reverse: bool) -> u16 {
+        match self.reverse.filter(|setting| setting.place.is_none()) {
+            Some(setting) if reverse => setting.applied(word),
+            Some(setting) if setting.holds(word) || setting.mask.count_ones() == 1 => setting.undone(word),
+            _ => word,
+        }
+    }
+
+    /// The direction that the word says; none where it says none.
+    pub fn direction_of(&self, word: u16) -> Option<bool> {
+        if let Some(reverse) = self.reverse.filter(|setting| setting.place.is_none()) {
+            return Some(reverse.holds(word));
+        }
+        match &self.run {
+            Run::Pair { reverse, .. } if reverse.holds(word) => Some(true),
+            Run::Pair { forward, .. } if forward.holds(word) => Some(false),
+            _ => None,
+        }
+    }
+
+    /// What contradicts something else: the key, what is wrong, and what to do.
+    pub fn contradictions(&self) -> Vec<(&'static str, String, &'static str)> {
+        let always = self.always;
+        let mut found = Vec::new();
+        let mut refuse = |key: &'static str, setting: &Setting| {
+            let own = setting.place.is_none_or(|place| place == self.at);
+            if own && (setting.value & always.clear != 0 || setting.mask & !setting.value & always.set != 0) {
+                let what = format!("{:#06x} in {:#06x} contradicts `always`", setting.value, setting.mask);
+                found.push((key, what, "leave these bits out of one of them"));
+            }
+        };
+        self.runs().iter().for_each(|run| refuse("run", run));
+        if let Run::Steps(steps) = &self.run {
+            let before = steps.len().saturating_sub(1);
+            steps.iter().take(before).for_each(|step| refuse("run", &step.write));
+        }
+        refuse("stop", &self.stop);
+        self.reverse.iter().for_each(|reverse| refuse("reverse", reverse));
+        let reset = self.fault_reset.map(|reset| reset.setting);
+        reset.iter().for_each(|reset| refuse("fault_reset", reset));
+        if self.runs().iter().any(|run| run.agrees(&self.stop)) {
+            found.push((
+                "stop",
+                "a word can be a run command and a stop at once".to_string(),
+                "write bits that the run command has the other way round",
+            ));
+        }
+        match &self.run {
+            Run::Pair { .. } if self.reverse.is_some() => found.push((
+                "reverse",
+                "`run` says the direction already".to_string(),
+                "leave `reverse` out",
+            )),
+            Run::Pair { forward, reverse } if forward.agrees(reverse) => found.push((
+                "run",
+                "a word can run forward and in reverse at once".to_string(),
+                "write bits that tell the two apart",
+            )),
+            _ => {}
+        }
+        if self.reverse.is_some_and(|reverse| {
+            self.runs().iter().any(|run| {
+                run.place == reverse.place && run.mask & reverse.mask != 0 && !matches!(self.run, Run::Steps(_))
+            })
+        }) {
+            found.push((
+                "reverse",
+                "the direction shares bits with the run command".to_string(),
+                "write the bits that say the direction only, or `run` as a pair",
+            ));
+        }
+        found
+    }
+
+    /// Where `run` is written.
+    pub fn run_place(&self) -> Place {
+        let first = self.runs().first().and_then(|setting| setting.place);
+        first.unwrap_or(self.at)
     }
 
     /// The word of a stop, made of the word that stands.

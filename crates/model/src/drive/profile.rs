@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::commissioning::Commissioning;
-use super::control::{Control, Place};
+use super::control::{Always, Control, OwnWord, Place, Reset, Run, Setting};
 use super::derive::Derived;
 use super::model::{Kind, ModelPoint, Value};
 use super::parameters::ParameterList;
@@ -443,6 +443,58 @@ impl Profile {
             Form::Bit { bit, invert } => Some((raw, bit, invert)),
             _ => None,
         }
+    }
+
+    /// What `[control]` says, where it is more than plain bits: its points are no registers of their own.
+    pub fn control_language(&self) -> Option<&Control> {
+        let is_made = |run: &Point| run.write && run.raw().is_none();
+        self.control
+            .as_ref()
+            .filter(|_| self.model_point(ModelPoint::Run).is_some_and(is_made))
+    }
+
+    /// The same for a profile whose commands are points of one bit each: what `[control]` would say of it.
+    pub fn control_of_bits(&self) -> Option<Control> {
+        let setting = |point: ModelPoint, on: bool| {
+            let raw = self.model_point(point).filter(|point| point.write)?.raw()?;
+            let (bit, invert) = match raw.form {
+                Form::Bit { bit, invert } if bit < 16 => (bit, invert),
+                _ => return None,
+            };
+            Some(Setting {
+                place: Some(Place::of(raw)),
+                mask: 1 << bit,
+                value: u16::from(on != invert) << bit,
+                once: false,
+            })
+        };
+        let run = setting(ModelPoint::Run, true)?;
+        let at = run.place?;
+        // What is in the control word has no place of its own.
+        let within = |setting: Setting| Setting {
+            place: setting.place.filter(|place| *place != at),
+            ..setting
+        };
+        let reset = setting(ModelPoint::FaultReset, true).map(within);
+        Some(Control {
+            at,
+            own_word: OwnWord::Read,
+            always: Always::default(),
+            run: Run::One(within(run)),
+            stop: within(setting(ModelPoint::Run, false)?),
+            reverse: setting(ModelPoint::Reverse, true).map(within),
+            fault_reset: reset.map(|setting| Reset {
+                setting,
+                hold: 2 * self.update_period,
+            }),
+            restarts_on_reset: false,
+        })
+    }
+
+    /// Where the run command is written, and read as the drive has it where it can be.
+    pub fn run_place(&self) -> Option<Place> {
+        let control = self.control.as_ref().map(Control::run_place);
+        control.or_else(|| self.model_point(ModelPoint::Run)?.raw().map(Place::of))
     }
 
     /// Whether that word, written there, is a run command or a stop; `None` where it is neither.

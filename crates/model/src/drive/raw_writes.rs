@@ -30,10 +30,12 @@ impl RawWrites {
         addresses: impl Iterator<Item = u16> + Clone,
     ) -> Option<u16> {
         let is_control_word = |address: u16| {
-            let run = profile.run_bit();
             let at = profile.control.as_ref().map(|control| control.at);
-            run.is_some_and(|(raw, ..)| raw.table == table && raw.address == address)
-                || at.is_some_and(|at| at.table == table && at.address == address)
+            let places = [profile.run_place(), at];
+            places
+                .into_iter()
+                .flatten()
+                .any(|at| (at.table, at.address) == (table, address))
         };
         if addresses.clone().any(is_control_word) {
             return None;

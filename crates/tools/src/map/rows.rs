@@ -208,7 +208,7 @@ fn has_writable_range(profile: &Profile, raw: &Raw) -> bool {
 
 /// Whether one raw write can set the point and the control word.
 fn shares_a_block_with_the_control_word(profile: &Profile, raw: &Raw) -> bool {
-    let run = profile.run_bit().map(|(run, ..)| run);
+    let run = profile.run_place();
     let range = profile.range(raw.table, raw.address);
     let pair = run.zip(range).filter(|(run, _)| run.table == raw.table);
     pair.is_some_and(|(run, range)| {

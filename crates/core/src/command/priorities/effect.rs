@@ -95,9 +95,16 @@ fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
         let (_, word) = items.iter().find(|(address, _)| raw.covers(table, *address))?;
         raw.decode(&[*word], crate::drive::model::Kind::Bool)
     };
+    let by_control = || {
+        let control = profile.control_language().filter(|control| control.at.table == table)?;
+        let (_, word) = items.iter().find(|(address, _)| *address == control.at.address)?;
+        control.direction_of(*word)
+    };
     Effect {
         run,
-        reverse: bit(ModelPoint::Reverse).map(|value| value.as_bool()),
+        reverse: bit(ModelPoint::Reverse)
+            .map(|value| value.as_bool())
+            .or_else(by_control),
         reference: covered(ModelPoint::SpeedReference) || covered(ModelPoint::FrequencyReference),
     }
 }

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::super::control::{Always, Control, Mask, OwnWord, Place, Reset, Run, Setting, Step, Until};
+use super::super::derive::Derived;
 use super::super::model::ModelPoint;
 use super::super::profile::{AddressRange, Form, Point, PollClass, Raw, Source};
 use super::derived::point_of;
@@ -15,6 +16,8 @@ use crate::document::{Finding, Reader};
 const STEP_TIMEOUT: Duration = Duration::from_secs(2);
 const LONGEST: Duration = Duration::from_secs(60);
 const MOST_STEPS: usize = 8;
+/// The helper that holds the control word.
+const CONTROL_WORD: &str = "control_word";
 
 /// What the table refers to.
 pub(super) struct Around<'p> {
@@ -361,86 +364,76 @@ fn read_reset(table: &Reader<'_>, around: &Around<'_>) -> Option<Reset> {
     })
 }
 
-/// The points of the common model that a control word of plain bits is: one that is read back and has no constant bits.
-pub(super) fn plain_points(control: &Control) -> Vec<Point> {
-    let bit = |setting: &Setting| {
-        let plain = setting.place.is_none() && !setting.once && setting.mask.count_ones() == 1;
-        plain.then(|| Form::Bit {
-            bit: u8::try_from(setting.mask.trailing_zeros()).unwrap_or_default(),
-            invert: setting.value == 0,
+/// The points of the common model that `[control]` makes, to be put behind `before` others: what they read as rests on the
+/// control word, or on a place of its own; a word that reads as something else is not read. A helper for the control word goes
+/// before them.
+pub(super) fn made_points(control: &Control, points: &[Point], before: usize) -> Vec<Point> {
+    let mut helpers: Vec<Point> = Vec::new();
+    let mut index_of = |place: Place| {
+        let is_plain = |point: &Point| {
+            point.raw().is_some_and(|raw| {
+                let whole = matches!(raw.form, Form::U16 | Form::Bit { bit: 0, invert: false }) && raw.is_unscaled();
+                whole && (raw.table, raw.address) == (place.table, place.address)
+            })
+        };
+        let first = points.len() + before;
+        let known = points.iter().position(is_plain);
+        let known = known.or_else(|| helpers.iter().position(is_plain).map(|index| first + index));
+        known.unwrap_or_else(|| {
+            helpers.push(helper(control, place));
+            first + helpers.len() - 1
         })
     };
-    let Run::One(run) = &control.run else {
-        return Vec::new();
+    let mut state = |setting: &Setting| Mask {
+        point: index_of(setting.place.unwrap_or(control.at)),
+        mask: u64::from(setting.mask),
+        is: u64::from(setting.value),
     };
-    let opposite = control.stop.place.is_none() && control.stop.mask == run.mask && control.stop.value != run.value;
-    let settings = [
-        (ModelPoint::Run, Some(run)),
-        (ModelPoint::Reverse, control.reverse.as_ref()),
-        (
-            ModelPoint::FaultReset,
-            control.fault_reset.as_ref().map(|reset| &reset.setting),
-        ),
+    let reset = control.fault_reset.map(|reset| reset.setting);
+    let reversed = match &control.run {
+        Run::Pair { reverse, .. } => Some(*reverse),
+        Run::One(_) | Run::Steps(_) => control.reverse,
+    };
+    let of_run = control.runs().iter().map(&mut state).collect();
+    let of_reverse = reversed.as_ref().map(&mut state).into_iter().collect();
+    let of_reset = reset.as_ref().map(&mut state).into_iter().collect();
+    let made: [(ModelPoint, Vec<Mask>); 3] = [
+        (ModelPoint::Run, of_run),
+        (ModelPoint::Reverse, of_reverse),
+        (ModelPoint::FaultReset, of_reset),
     ];
-    let all_plain = settings
-        .iter()
-        .all(|(_, setting)| setting.is_none_or(|setting| bit(setting).is_some()));
-    if !all_plain || !opposite || control.own_word != OwnWord::Read || control.always != Always::default() {
-        return Vec::new();
-    }
-    let point = |model: ModelPoint, form: Form| Point {
-        class: PollClass::Slow,
+    let made = made.into_iter().filter(|(_, any)| !any.is_empty());
+    let made = made.map(|(model, any)| Point {
         write: true,
         pulse: model == ModelPoint::FaultReset,
-        ..Point::of_model(
-            model,
-            Source::Raw(Raw::plain(control.at.table, control.at.address, form)),
-        )
+        ..Point::of_model(model, Source::Derived(Derived::State { any }))
+    });
+    helpers.iter().cloned().chain(made).collect()
+}
+
+/// The control word, for the points that rest on it.
+fn helper(control: &Control, place: Place) -> Point {
+    let form = match place.table {
+        Table::Coil | Table::DiscreteInput => Form::Bit { bit: 0, invert: false },
+        Table::Holding | Table::Input => Form::U16,
     };
-    let made = settings
-        .into_iter()
-        .filter_map(|(model, setting)| Some(point(model, bit(setting?)?)));
-    made.collect()
+    let source = Source::Raw(Raw::plain(place.table, place.address, form));
+    let class = match control.own_word {
+        OwnWord::Read => PollClass::Slow,
+        OwnWord::Shadow => PollClass::Never,
+    };
+    Point {
+        name: CONTROL_WORD.to_string(),
+        model: None,
+        class,
+        hidden: true,
+        ..Point::of_model(ModelPoint::Run, source)
+    }
 }
 
 /// What contradicts something else is an error, never mended.
 fn check(table: &Reader<'_>, control: &Control) {
-    let always = control.always;
-    let contradicts = |setting: &Setting| {
-        let own = setting.place.is_none_or(|place| place == control.at);
-        own && (setting.value & always.clear != 0 || setting.mask & !setting.value & always.set != 0)
-    };
-    let refuse = |key: &str, setting: &Setting| {
-        if contradicts(setting) {
-            table.problem(
-                key,
-                format!("{:#06x} in {:#06x} contradicts `always`", setting.value, setting.mask),
-                "leave these bits out of one of them",
-            );
-        }
-    };
-    for setting in control.runs() {
-        refuse("run", &setting);
-        if setting.agrees(&control.stop) {
-            table.problem(
-                "stop",
-                "a word can be a run command and a stop at once",
-                "write bits that the run command has the other way round",
-            );
-        }
-    }
-    if let Run::Steps(steps) = &control.run {
-        let before = steps.len().saturating_sub(1);
-        steps.iter().take(before).for_each(|step| refuse("run", &step.write));
-    }
-    refuse("stop", &control.stop);
-    if let Some(reverse) = &control.reverse {
-        refuse("reverse", reverse);
-        if matches!(control.run, Run::Pair { .. }) {
-            table.problem("reverse", "`run` says the direction already", "leave `reverse` out");
-        }
-    }
-    if let Some(reset) = &control.fault_reset {
-        refuse("fault_reset", &reset.setting);
+    for (key, what, remedy) in control.contradictions() {
+        table.problem(key, what, remedy);
     }
 }

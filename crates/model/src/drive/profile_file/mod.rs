@@ -189,7 +189,11 @@ impl Profile {
         Profile::parse_over(file, source, built_in, &Profiles::built_in())
     }
 
-    fn parse_over(file: &str, source: &str, built_in: bool, known: &Profiles) -> Result<Profile, Vec<Problem>> {
+    /// The same over a base among the `known` profiles.
+    ///
+    /// # Errors
+    /// Every error of the file, with line and key.
+    pub fn parse_over(file: &str, source: &str, built_in: bool, known: &Profiles) -> Result<Profile, Vec<Problem>> {
         let mut document = Document::parse(file, source);
         let (_, base) = base::peek(&document);
         if let Some(under) = base.as_deref().and_then(|base| known.get(base)) {
@@ -282,9 +286,11 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     };
     let control = control::read(reader, &around);
     let made = states::read(reader, &around);
-    let plain = control.as_ref().map(control::plain_points).unwrap_or_default();
-    for point in made.into_iter().chain(plain) {
-        if names.contains(&point.name) {
+    let follow = control
+        .as_ref()
+        .map(|control| control::made_points(control, &points, made.len()));
+    for point in made.into_iter().chain(follow.unwrap_or_default()) {
+        if names.contains(&point.name) && !point.hidden {
             let what = format!("`{}` follows from [control] or [[state]]", point.name);
             reader.problem("point", what, "leave its [[point]] out");
         }

@@ -1,0 +1,437 @@
+//! Commands of a family that is commanded as `[control]` of its profile says: the words of a start, a stop, a change of direction
+//! and a reset, and the steps of a sequence. Pure.
+//!
+//! A stop is one write and waits for nothing. A sequence is entered by a run command only; one that fails behind its last word
+//! ends with a stop.
+
+use std::time::{Duration, Instant};
+
+use super::known_words::KnownWords;
+use super::steps::{Action, Check, Known, Step, StepPurpose};
+use crate::codec::{Reply, RequestPdu, Table};
+use crate::command::Refusal;
+use crate::drive::control::{self, Control, Mask, OwnWord, Place, Run, Setting, Until};
+use crate::drive::model::Kind;
+use crate::drive::{ModelPoint, Profile, Raw, Value};
+
+/// Pause between two looks at a state for which a sequence waits.
+pub(super) const LOOK_PAUSE: Duration = Duration::from_millis(20);
+
+/// A word of the control register, made of what the drive has when its turn comes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Word {
+    /// Stops, with that direction where the order says one.
+    Stop(Option<bool>),
+    /// The direction alone.
+    Direction(bool),
+    /// Runs, in that direction where the order says one.
+    Run(Option<bool>),
+    /// That word of a sequence.
+    Sequence(usize, Option<bool>),
+    /// Before a reset: the reset is not set, nor the run command of a motor that stands.
+    ResetLow,
+    /// The reset.
+    ResetHigh,
+    /// Behind it.
+    ResetEnd,
+}
+
+impl Word {
+    /// Whether it is one of a command that says whether the motor is to run.
+    fn names_run(self) -> bool {
+        matches!(self, Word::Stop(_) | Word::Run(_) | Word::Sequence(..))
+    }
+}
+
+/// What a word needs.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Made {
+    /// This request.
+    Send(Step),
+    /// Nothing: the drive has it.
+    Nothing,
+    /// It cannot be said what it would do.
+    Refused(Refusal),
+}
+
+/// A state for which a sequence waits.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct AwaitedState {
+    /// The register.
+    raw: Raw,
+    /// Its name.
+    name: String,
+    mask: Mask,
+    /// After which the sequence is given up.
+    pub(super) timeout: Duration,
+    /// For people: the step, with its word.
+    step: String,
+    /// When the wait began.
+    pub(super) since: Option<Instant>,
+    /// What was read last.
+    seen: Option<u64>,
+}
+
+impl AwaitedState {
+    fn of(profile: &Profile, steps: &[control::Step], number: usize) -> Option<AwaitedState> {
+        let step = steps.get(number)?;
+        let Until::State(mask) = step.until else {
+            return None;
+        };
+        let point = profile.points.get(mask.point)?;
+        Some(AwaitedState {
+            raw: point.raw()?.clone(),
+            name: point.name.clone(),
+            mask,
+            timeout: step.timeout,
+            step: format!("step {} of {} ({:#06x})", number + 1, steps.len(), step.write.value),
+            since: None,
+            seen: None,
+        })
+    }
+
+    /// The read of it.
+    pub(super) fn look(&self) -> Step {
+        let pdu = RequestPdu::Read {
+            table: self.raw.table,
+            start: self.raw.address,
+            count: self.raw.form.items(),
+        };
+        Step::new(StepPurpose::AskState, pdu)
+    }
+
+    /// Whether the reply shows it.
+    pub(super) fn is_shown(&mut self, reply: &Reply) -> bool {
+        let words = reply.words();
+        let value = words.and_then(|words| self.raw.decode(&words, Kind::Integer));
+        // A whole register without scale: never negative.
+        self.seen = value.map(|value| value.as_f64() as u64).or(self.seen);
+        value.is_some() && self.seen.is_some_and(|seen| self.mask.holds(seen))
+    }
+
+    /// For people: what was not seen in time.
+    pub(super) fn not_reached(&self) -> String {
+        let AwaitedState {
+            name,
+            mask,
+            timeout,
+            step,
+            ..
+        } = self;
+        let seen = self
+            .seen
+            .map_or("was not read".to_string(), |seen| format!("is {seen:#06x}"));
+        format!(
+            "{step}: `{name}` {seen}, not {:#06x} in {:#06x}, within {timeout:?}; the start was given up",
+            mask.is, mask.mask
+        )
+    }
+}
+
+/// What an order says of points that follow from `[control]`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Ordered {
+    run: Option<bool>,
+    reverse: Option<bool>,
+    reset: bool,
+}
+
+impl Ordered {
+    /// Takes the value, if the point follows from `[control]`.
+    pub(super) fn takes(&mut self, profile: &Profile, index: usize, value: Value) -> bool {
+        let is = |point: ModelPoint| profile.model_index(point) == Some(index);
+        let on = value.as_bool();
+        if profile.control_language().is_none() {
+            return false;
+        }
+        if is(ModelPoint::Run) {
+            self.run = Some(on);
+        } else if is(ModelPoint::Reverse) {
+            self.reverse = Some(on);
+        } else if is(ModelPoint::FaultReset) {
+            self.reset |= on;
+        } else {
+            return false;
+        }
+        true
+    }
+
+    /// The actions, in the order that is safe. `stopped`: a stop went before them.
+    pub(super) fn actions(self, profile: &Profile, stop: bool, stopped: bool) -> Vec<Action> {
+        let Some(control) = profile.control_language() else {
+            return Vec::new();
+        };
+        let mut actions = Vec::new();
+        if stop && self.run == Some(false) {
+            actions.extend(stops(control, profile, self.reverse));
+        }
+        if self.reset {
+            actions.extend(resets(control, profile, stopped || stop));
+        }
+        if stop {
+            return actions;
+        }
+        let elsewhere = control
+            .reverse
+            .and_then(|setting| Some((setting, setting.place?)))
+            .filter(|_| !matches!(control.run, Run::Pair { .. }));
+        if let (Some(reverse), Some((setting, place))) = (self.reverse, elsewhere) {
+            let word = if reverse { setting.applied(0) } else { setting.undone(0) };
+            actions.push(Action::Send(write(place, word, profile)));
+        }
+        match (self.run, self.reverse) {
+            (Some(true), reverse) => actions.extend(runs(control, profile, reverse)),
+            // A stop is an order of its own; here it is one that names no other command.
+            (Some(false), reverse) => actions.extend(stops(control, profile, reverse)),
+            (None, Some(reverse)) if elsewhere.is_none() => actions.push(Action::Word(Word::Direction(reverse))),
+            (None, _) => {}
+        }
+        actions
+    }
+}
+
+fn stops(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Action> {
+    let mut actions = Vec::new();
+    match control.stop.place {
+        None => actions.push(Action::Word(Word::Stop(reverse))),
+        Some(place) => actions.push(Action::Send(write(place, control.stop.applied(0), profile))),
+    }
+    // What lets it run elsewhere goes, too.
+    let stands = |setting: &Setting| !setting.once && setting.place != control.stop.place;
+    let mut done: Vec<Place> = Vec::new();
+    for setting in control.runs().iter().filter(|setting| stands(setting)) {
+        let place = setting.place.unwrap_or(control.at);
+        if !done.contains(&place) {
+            done.push(place);
+            actions.push(Action::Send(write(place, 0, profile)));
+        }
+    }
+    actions
+}
+
+fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
+    let Some(reset) = control.fault_reset else {
+        return Vec::new();
+    };
+    let hold = Action::Hold(reset.hold);
+    let setting = reset.setting;
+    let mut actions = Vec::new();
+    match setting.place {
+        None => {
+            actions.extend([
+                Action::Word(Word::ResetLow),
+                hold.clone(),
+                Action::Word(Word::ResetHigh),
+            ]);
+            if !setting.once {
+                actions.extend([hold, Action::Word(Word::ResetEnd)]);
+            }
+        }
+        Some(place) => {
+            if !stopped {
+                actions.extend([Action::Word(Word::ResetLow), hold.clone()]);
+            }
+            let (high, low) = (setting.applied(0), low_of(&setting));
+            if !setting.once {
+                actions.extend([Action::Send(write(place, low, profile)), hold.clone()]);
+            }
+            actions.push(Action::ResetElsewhere(write(place, high, profile)));
+            if !setting.once {
+                actions.extend([hold, Action::ResetOver(write(place, low, profile))]);
+            }
+        }
+    }
+    actions
+}
+
+/// The word of a place of its own between two resets.
+fn low_of(setting: &Setting) -> u16 {
+    match setting.value {
+        0 => setting.mask,
+        _ => 0,
+    }
+}
+
+fn runs(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Action> {
+    match &control.run {
+        Run::Steps(steps) => {
+            let mut actions = Vec::new();
+            for (number, step) in steps.iter().enumerate() {
+                match step.write.place {
+                    None => actions.push(Action::Word(Word::Sequence(number, reverse))),
+                    Some(place) => actions.push(Action::Send(write(place, step.write.applied(0), profile))),
+                }
+                match step.until {
+                    Until::Written => {}
+                    Until::Time(time) => actions.push(Action::Hold(time)),
+                    Until::State(_) => {
+                        let state = AwaitedState::of(profile, steps, number);
+                        actions.extend(state.map(|state| Action::Await(Box::new(state))));
+                    }
+                }
+            }
+            actions
+        }
+        Run::One(setting) => match setting.place {
+            None => vec![Action::Word(Word::Run(reverse))],
+            Some(place) => vec![Action::Send(write(place, setting.applied(0), profile))],
+        },
+        Run::Pair { forward, reverse: back } => match forward.place {
+            None => vec![Action::Word(Word::Run(reverse))],
+            Some(place) => {
+                let setting = if reverse == Some(true) { back } else { forward };
+                vec![Action::Send(write(place, setting.applied(0), profile))]
+            }
+        },
+    }
+}
+
+/// The write of a word to that place.
+fn write(place: Place, word: u16, profile: &Profile) -> RequestPdu {
+    match place.table {
+        Table::Coil | Table::DiscreteInput => profile.functions.write_coil(place.address, word != 0),
+        Table::Holding | Table::Input => profile.functions.write_register(place.address, word),
+    }
+}
+
+/// Whether the first word of a sequence can be left out, and all but the last: the motor runs by this very command.
+pub(super) fn is_prepared(profile: &Profile, words: &KnownWords, running: bool) -> bool {
+    let Some(control) = profile.control_language().filter(|_| running) else {
+        return false;
+    };
+    let own = words.get(control.at.table, control.at.address);
+    own.is_some_and(|own| control.is_run(control.at, own))
+}
+
+/// The request of a word with the control word as it is known; the read of that where it has to be asked for.
+pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Known) -> Made {
+    let Some(control) = profile.control_language() else {
+        return Made::Nothing;
+    };
+    let at = control.at;
+    let own = words.get(at.table, at.address);
+    if asks_first(word, control, own, known) {
+        return Made::Send(read_of(at));
+    }
+    // A word that nobody can ask for may have been taken away elsewhere: a motor that stands keeps standing.
+    let is_told = known.check == Check::Read;
+    let base = match own {
+        Some(own) => control.without_reset(own),
+        None if known.running && !word.names_run() => {
+            return Made::Refused(Refusal::NotKnown(
+                "what the drive was commanded last is not known; say with the same command whether the motor is to run"
+                    .to_string(),
+            ));
+        }
+        None => 0,
+    };
+    let kept = control.always.applied(base);
+    let stays = if is_told || known.running {
+        kept
+    } else {
+        control.stop_word(base)
+    };
+    let sent = |word: u16| Made::Send(Step::new(StepPurpose::Execute, write(at, word, profile)));
+    match word {
+        Word::Stop(reverse) => {
+            let stop = control.stop_word(base);
+            let turned = reverse.map_or(stop, |reverse| control.with_direction(stop, reverse));
+            sent(if control.is_stop(at, turned) { turned } else { stop })
+        }
+        Word::Direction(reverse) => match &control.run {
+            // Kept for the next start where no bit of the drive says it; the word that stands is sent once more.
+            Run::Pair { forward, reverse: back } => {
+                let run = if reverse { back } else { forward };
+                let runs = control.is_run(at, stays);
+                sent(if runs { run.applied(stays) } else { stays })
+            }
+            Run::One(_) | Run::Steps(_) => sent(control.with_direction(stays, reverse)),
+        },
+        Word::Run(reverse) => sent(run_word(control, kept, reverse, words)),
+        Word::Sequence(number, reverse) => {
+            let Run::Steps(steps) = &control.run else {
+                return Made::Nothing;
+            };
+            let Some(step) = steps.get(number) else {
+                return Made::Nothing;
+            };
+            let reverse = reverse.or_else(|| own.and_then(|own| control.direction_of(own)));
+            let word = step.write.applied(kept);
+            sent(reverse.map_or(word, |reverse| control.with_direction(word, reverse)))
+        }
+        Word::ResetLow => reset_low(control, own, base, known, sent),
+        Word::ResetHigh => {
+            let reset = control.fault_reset.map(|reset| reset.setting);
+            reset.map_or(Made::Nothing, |reset| sent(reset.applied(kept)))
+        }
+        Word::ResetEnd if known.running => sent(kept),
+        Word::ResetEnd => sent(control.stop_word(base)),
+    }
+}
+
+/// Whether the drive is asked for its word first: where a bit stays as it has it. A stop and a start do without.
+fn asks_first(word: Word, control: &Control, own: Option<u16>, known: Known) -> bool {
+    let is_coil = matches!(control.at.table, Table::Coil | Table::DiscreteInput);
+    if control.own_word == OwnWord::Shadow || is_coil || known.blind {
+        return false;
+    }
+    match word {
+        Word::Stop(_) | Word::ResetEnd => false,
+        Word::ResetHigh | Word::Run(_) | Word::Sequence(..) => own.is_none() && known.check == Check::NotYet,
+        Word::Direction(_) | Word::ResetLow => known.check == Check::NotYet,
+    }
+}
+
+fn run_word(control: &Control, kept: u16, reverse: Option<bool>, words: &KnownWords) -> u16 {
+    match &control.run {
+        Run::Pair { forward, reverse: back } => {
+            let stands = control.direction_of(kept);
+            let turned = reverse.or(stands).or(words.direction).unwrap_or(false);
+            if turned {
+                back.applied(kept)
+            } else {
+                forward.applied(kept)
+            }
+        }
+        Run::One(setting) => {
+            let word = setting.applied(kept);
+            reverse.map_or(word, |reverse| control.with_direction(word, reverse))
+        }
+        Run::Steps(_) => kept,
+    }
+}
+
+fn reset_low(control: &Control, own: Option<u16>, base: u16, known: Known, sent: impl Fn(u16) -> Made) -> Made {
+    let stops = |reset: &Setting| reset.place.is_none() && control.runs().iter().any(|run| !reset.agrees(run));
+    if known.running && control.fault_reset.is_some_and(|reset| stops(&reset.setting)) {
+        return Made::Refused(Refusal::NotAllowed(
+            "the motor runs, and the reset of this family would stop it; nothing was written".to_string(),
+        ));
+    }
+    let low = match known.running {
+        true => control.always.applied(base),
+        false => control.stop_word(base),
+    };
+    match own == Some(low) {
+        true => Made::Nothing,
+        false => sent(low),
+    }
+}
+
+fn read_of(place: Place) -> Step {
+    let (start, count) = (place.address, 1);
+    let table = place.table;
+    Step::new(StepPurpose::ReadWord, RequestPdu::Read { table, start, count })
+}
+
+/// Whether that word of a sequence is its last, which starts the motor.
+pub(super) fn is_last(profile: &Profile, number: usize) -> bool {
+    let run = profile.control_language().map(|control| &control.run);
+    matches!(run, Some(Run::Steps(steps)) if number + 1 == steps.len())
+}
+
+/// The place of `[control]` whose word is learned as the drive reports it; none where it reports something else.
+pub fn read_place(profile: &Profile) -> Option<Place> {
+    let control = profile.control_language()?;
+    (control.own_word == OwnWord::Read).then_some(control.at)
+}

@@ -1,0 +1,557 @@
+//! Proves the commands of a profile with `[control]`: every state of a drive, every command, each frame lost, refused or repeated,
+//! a stop and the end of its time at every step. It runs the commands of the bus themselves ([`super::command_run`]), not a copy,
+//! against the worst drive that has such a profile. Pure.
+
+mod drive;
+
+use std::fmt::Write as _;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use self::drive::{Drive, Start};
+use super::command_run::{CommandRun, KnownWords, Next, Step};
+use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::command::{Admitted, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats, written};
+use crate::drive::control::{Control, Place, Run, Setting};
+use crate::drive::{ModelPoint, Profile, Value};
+
+/// Requests after which a command should have ended, reads of a state for which it waits among them.
+const MOST_FRAMES: usize = 1000;
+/// What a request takes, and the pause before a state is read once more.
+const EXCHANGE: Duration = Duration::from_millis(10);
+const LOOK_AGAIN: Duration = Duration::from_secs(1);
+/// Longer than the steps of any sequence may wait.
+const LONGEST: Duration = Duration::from_secs(600);
+
+/// What was explored without a counterexample.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Proof {
+    /// Commands that were run to their end.
+    pub commands: usize,
+    /// Requests that they sent.
+    pub frames: usize,
+}
+
+/// A way in which a command does what it must not.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Counterexample {
+    /// What is wrong.
+    pub what: String,
+    /// The drive before.
+    pub state: String,
+    /// The command.
+    pub command: String,
+    /// The requests, with their words in hex, and what became of them.
+    pub frames: Vec<String>,
+}
+
+impl std::fmt::Display for Counterexample {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        writeln!(f, "{}", self.what)?;
+        writeln!(f, "  drive    {}", self.state)?;
+        write!(f, "  command  {}", self.command)?;
+        for frame in &self.frames {
+            write!(f, "\n  frame    {frame}")?;
+        }
+        Ok(())
+    }
+}
+
+impl Counterexample {
+    /// On one line.
+    pub fn line(&self) -> String {
+        let frames = self.frames.join(", then ");
+        let Counterexample {
+            what, state, command, ..
+        } = self;
+        match frames.is_empty() {
+            true => format!("{what} (drive {state}; command {command})"),
+            false => format!("{what} (drive {state}; command {command}; {frames})"),
+        }
+    }
+}
+
+/// What becomes of a request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Fate {
+    RequestLost,
+    ReplyLost,
+    Refused(Exception),
+    /// It arrives twice.
+    Repeated,
+}
+
+const FATES: [Fate; 9] = [
+    Fate::RequestLost,
+    Fate::ReplyLost,
+    Fate::Repeated,
+    Fate::Refused(Exception::FUNCTION),
+    Fate::Refused(Exception::ADDRESS),
+    Fate::Refused(Exception::VALUE),
+    Fate::Refused(Exception::DEVICE_FAILURE),
+    Fate::Refused(Exception::ACKNOWLEDGE),
+    Fate::Refused(Exception::BUSY),
+];
+
+/// What happens in between, behind so many requests.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Event {
+    None,
+    Fate(usize, Fate),
+    Stop(usize),
+    Expiry(usize),
+}
+
+/// A command, as the points that it sets.
+type Sets = &'static [(ModelPoint, bool)];
+
+const COMMANDS: [Sets; 10] = [
+    &[(ModelPoint::Run, false)],
+    &[(ModelPoint::Run, false), (ModelPoint::Reverse, false)],
+    &[(ModelPoint::Run, true)],
+    &[(ModelPoint::Run, true), (ModelPoint::Reverse, true)],
+    &[(ModelPoint::Run, true), (ModelPoint::Reverse, false)],
+    &[(ModelPoint::Reverse, true)],
+    &[(ModelPoint::Reverse, false)],
+    &[(ModelPoint::FaultReset, true)],
+    &[(ModelPoint::FaultReset, true), (ModelPoint::Reverse, true)],
+    &[(ModelPoint::FaultReset, true), (ModelPoint::Run, true)],
+];
+
+/// Proves the profile, whether `[control]` or points of one bit each say how it is commanded; of one without commands there is
+/// nothing to be proved.
+///
+/// # Errors
+/// A counterexample.
+pub fn prove(profile: &Profile) -> Result<Proof, Box<Counterexample>> {
+    if let Some(control) = profile.control_language() {
+        overlaps(profile, control)?;
+        return explore(profile, control);
+    }
+    let control = profile.control_of_bits();
+    control.map_or(Ok(Proof::default()), |control| explore(profile, &control))
+}
+
+fn explore(profile: &Profile, control: &Control) -> Result<Proof, Box<Counterexample>> {
+    let mut proof = Proof::default();
+    for start in Start::ALL {
+        for known in [true, false] {
+            for sets in COMMANDS {
+                let Some(case) = Case::new(profile, control, start, known, sets) else {
+                    continue;
+                };
+                let frames = case.run(Event::None)?;
+                proof.add(frames.len());
+                for number in different(&frames) {
+                    for fate in FATES {
+                        proof.add(case.run(Event::Fate(number, fate))?.len());
+                    }
+                    proof.add(case.run(Event::Stop(number + 1))?.len());
+                    proof.add(case.run(Event::Expiry(number + 1))?.len());
+                }
+            }
+        }
+    }
+    Ok(proof)
+}
+
+impl Proof {
+    fn add(&mut self, frames: usize) {
+        self.commands += 1;
+        self.frames += frames;
+    }
+}
+
+/// No other writable point may share a register with the commands.
+fn overlaps(profile: &Profile, control: &Control) -> Result<(), Box<Counterexample>> {
+    let is_own = |point: ModelPoint| profile.model_index(point);
+    let own = [ModelPoint::Run, ModelPoint::Reverse, ModelPoint::FaultReset].map(is_own);
+    let points = profile.points.iter().enumerate();
+    for (index, point) in points.filter(|(_, point)| point.is_commanded()) {
+        let covers = point
+            .raw()
+            .is_some_and(|raw| !own.contains(&Some(index)) && raw.covers(control.at.table, control.at.address));
+        if covers {
+            return Err(Box::new(Counterexample {
+                what: format!("point `{}` writes into the control word, past [control]", point.name),
+                state: "any".to_string(),
+                command: format!("{} = …", point.name),
+                frames: Vec::new(),
+            }));
+        }
+    }
+    Ok(())
+}
+
+/// One command to a drive in one state.
+#[derive(Debug)]
+struct Case<'p> {
+    profile: &'p Profile,
+    control: &'p Control,
+    start: Start,
+    /// The gateway knows the control word.
+    known: bool,
+    sets: Sets,
+    values: Vec<(usize, Value)>,
+}
+
+/// What a run of a case has come to.
+struct Progress<'p> {
+    drive: Drive<'p>,
+    words: KnownWords,
+    now: Instant,
+    frames: Vec<String>,
+    /// When the reset was set.
+    reset_at: Option<Instant>,
+    /// It ran when the command was given, or at a stop in between.
+    ran: bool,
+}
+
+impl<'p> Case<'p> {
+    /// None where the profile has not all of the points, or a drive no such state.
+    fn new(profile: &'p Profile, control: &'p Control, start: Start, known: bool, sets: Sets) -> Option<Case<'p>> {
+        Drive::new(profile, control, start)?;
+        let values = sets
+            .iter()
+            .map(|(point, on)| Some((profile.model_index(*point)?, Value::Bool(*on))));
+        let values: Option<Vec<(usize, Value)>> = values.collect();
+        Some(Case {
+            profile,
+            control,
+            start,
+            known,
+            sets,
+            values: values?,
+        })
+    }
+
+    fn says(&self, point: ModelPoint) -> Option<bool> {
+        self.sets.iter().find(|(of, _)| *of == point).map(|(_, on)| *on)
+    }
+
+    fn is_stop(&self) -> bool {
+        self.says(ModelPoint::Run) == Some(false)
+    }
+
+    fn begin(&self, values: Vec<(usize, Value)>, urgency: Urgency, now: Instant, expires: Instant) -> CommandRun {
+        let origin = Origin::new(SourceKind::LocalSocket, "proof");
+        let (ticket, _) = Ticket::new(origin, "", String::new(), false, now, Arc::new(WriteStats::default()));
+        let admitted = Admitted {
+            order: Order::Points(values),
+            urgency,
+            reference_only: false,
+            ranges: Vec::new(),
+        };
+        CommandRun::new(Command::new(0, admitted, expires, ticket), self.profile)
+    }
+
+    /// Runs the command to its end with that event; its requests.
+    fn run(&self, event: Event) -> Result<Vec<String>, Box<Counterexample>> {
+        let now = Instant::now();
+        let Some(drive) = Drive::new(self.profile, self.control, self.start) else {
+            return Ok(Vec::new());
+        };
+        let mut progress = Progress {
+            ran: drive.running.is_some(),
+            drive,
+            words: KnownWords::default(),
+            now,
+            frames: Vec::new(),
+            reset_at: None,
+        };
+        if self.known {
+            let at = self.control.at;
+            progress.words.learn(at.table, at.address, progress.drive.word(at));
+        }
+        let urgency = if self.is_stop() {
+            Urgency::Stop
+        } else {
+            Urgency::Command
+        };
+        let expires = now + LONGEST;
+        let mut run = self.begin(self.values.clone(), urgency, now, expires);
+        let mut stopped = false;
+        let mut late = Duration::ZERO;
+        let outcome = loop {
+            let sent = progress.frames.len();
+            if event == Event::Stop(sent) && !std::mem::replace(&mut stopped, true) {
+                let over = run.purge();
+                self.stop_between(&mut progress)?;
+                if let Some(outcome) = over {
+                    break outcome;
+                }
+            }
+            if event == Event::Expiry(sent) {
+                late = LONGEST;
+            }
+            let fate = match event {
+                Event::Fate(number, fate) if number == sent => Some(fate),
+                _ => None,
+            };
+            match self.step(&mut run, &mut progress, fate, late, stopped)? {
+                Some(outcome) => break outcome,
+                None if progress.frames.len() > MOST_FRAMES || progress.now > expires => {
+                    return Err(self.wrong("the command does not end", &progress));
+                }
+                None => {}
+            }
+        };
+        self.judge(event, &outcome, &progress, stopped)?;
+        Ok(progress.frames)
+    }
+
+    /// A stop in the middle of the command.
+    fn stop_between(&self, progress: &mut Progress<'p>) -> Result<(), Box<Counterexample>> {
+        let Some(run) = self.profile.model_index(ModelPoint::Run) else {
+            return Ok(());
+        };
+        let expires = progress.now + LONGEST;
+        let mut stop = self.begin(vec![(run, Value::Bool(false))], Urgency::Stop, progress.now, expires);
+        progress.frames.push("(a stop comes in)".to_string());
+        for _ in 0..MOST_FRAMES {
+            if self.step(&mut stop, progress, None, Duration::ZERO, true)?.is_some() {
+                break;
+            }
+        }
+        if progress.drive.running.is_some() {
+            return Err(self.wrong("a stop in the middle of the command does not stop the motor", progress));
+        }
+        progress.ran = false;
+        Ok(())
+    }
+
+    /// One step of a command; the outcome, if it is over.
+    fn step(
+        &self,
+        run: &mut CommandRun,
+        progress: &mut Progress<'p>,
+        fate: Option<Fate>,
+        late: Duration,
+        stopped: bool,
+    ) -> Result<Option<Outcome>, Box<Counterexample>> {
+        let running = progress.drive.running.is_some() && !progress.drive.fault;
+        let step = match run.next(&progress.words, self.profile, running, progress.now + late) {
+            Next::Done => return Ok(Some(run.success())),
+            Next::Wait(until) => {
+                progress.now = until.checked_sub(late).unwrap_or(until).max(progress.now);
+                return Ok(None);
+            }
+            Next::Send(step) => step,
+        };
+        run.sent(&step);
+        self.note(&step, fate, progress)?;
+        // A run command that stands anyway is not given by the word that keeps it.
+        let stood = self
+            .control
+            .is_run(self.control.at, progress.drive.word(self.control.at));
+        let reply = match fate {
+            Some(Fate::RequestLost | Fate::Refused(_)) => None,
+            Some(Fate::Repeated) => {
+                progress.drive.receives(&step.pdu);
+                Some(progress.drive.receives(&step.pdu))
+            }
+            Some(Fate::ReplyLost) | None => Some(progress.drive.receives(&step.pdu)),
+        };
+        // The drive changes nothing between two looks at its state, so there need not be many.
+        let again = progress
+            .frames
+            .iter()
+            .rev()
+            .take(2)
+            .all(|frame| frame.starts_with("read "))
+            && progress.frames.len() > 1;
+        progress.now += if again { LOOK_AGAIN } else { EXCHANGE };
+        self.look(&step, progress, stopped, stood)?;
+        Ok(match (fate, reply) {
+            (Some(Fate::Refused(code)), _) if step.pdu.is_write() && code.leaves_open() => {
+                run.failed(&step, Outcome::Unknown(code), 1)
+            }
+            (Some(Fate::Refused(code)), _) => run.answered(&step, Reply::Exception(code), &mut progress.words),
+            (Some(Fate::RequestLost | Fate::ReplyLost), _) | (_, None) => run.failed(&step, Outcome::TimedOut, 1),
+            (_, Some(reply)) => run.answered(&step, reply, &mut progress.words),
+        })
+    }
+
+    /// The frame, for people; and whether a pulse had its time.
+    fn note(&self, step: &Step, fate: Option<Fate>, progress: &mut Progress<'p>) -> Result<(), Box<Counterexample>> {
+        let mut text = in_words(&step.pdu);
+        let fate = match fate {
+            None => String::new(),
+            Some(Fate::RequestLost) => " (lost)".to_string(),
+            Some(Fate::ReplyLost) => " (its reply is lost)".to_string(),
+            Some(Fate::Repeated) => " (arrives twice)".to_string(),
+            Some(Fate::Refused(code)) => format!(" (refused: {code})"),
+        };
+        // Writing to a String cannot fail.
+        let _ = write!(text, "{fate}");
+        progress.frames.push(text);
+        let Some(reset) = self.control.fault_reset else {
+            return Ok(());
+        };
+        let Some((table, items)) = written(&step.pdu) else {
+            return Ok(());
+        };
+        let place = reset.setting.place.unwrap_or(self.control.at);
+        let word = items
+            .iter()
+            .find(|(address, _)| (table, *address) == (place.table, place.address));
+        let Some((_, word)) = word else { return Ok(()) };
+        if reset.setting.holds(*word) {
+            progress.reset_at = Some(progress.now);
+        } else if let Some(at) = progress.reset_at.take()
+            && progress.now.saturating_duration_since(at) < reset.hold
+            && !reset.setting.once
+            && !self.control.is_stop(place, *word)
+        {
+            return Err(self.wrong("the pulse of a reset is too short", progress));
+        }
+        Ok(())
+    }
+
+    /// What must hold after every request.
+    fn look(
+        &self,
+        step: &Step,
+        progress: &Progress<'p>,
+        stopped: bool,
+        stood: bool,
+    ) -> Result<(), Box<Counterexample>> {
+        let starts = self.says(ModelPoint::Run) == Some(true) && !stopped;
+        if progress.drive.running.is_some() && !progress.ran && !starts {
+            return Err(self.wrong("the motor starts without a run command", progress));
+        }
+        let Some((table, items)) = written(&step.pdu) else {
+            return Ok(());
+        };
+        for (address, word) in items {
+            let place = Place { table, address };
+            if place == self.control.at && !is_coil(place) && !self.keeps_always(word) {
+                return Err(self.wrong("a word lacks a bit of `always`", progress));
+            }
+            if self.says_both(place, word) {
+                return Err(self.wrong("forward and reverse are set together", progress));
+            }
+            if place == self.control.at && self.control.is_run(place, word) && !stood && !starts && !progress.ran {
+                return Err(self.wrong("a word that runs the drive is sent without a run command", progress));
+            }
+        }
+        Ok(())
+    }
+
+    fn keeps_always(&self, word: u16) -> bool {
+        // A whole word that the profile writes as it stands.
+        let wholes = self.control.runs().into_iter().chain([self.control.stop]);
+        let mut wholes = wholes.chain(self.control.fault_reset.map(|reset| reset.setting));
+        self.control.always.holds(word) || wholes.any(|setting| setting.mask == u16::MAX && setting.value == word)
+    }
+
+    fn says_both(&self, place: Place, word: u16) -> bool {
+        let Run::Pair { forward, reverse } = &self.control.run else {
+            return false;
+        };
+        let here = |setting: &Setting| setting.place.unwrap_or(self.control.at) == place;
+        let (one, other) = (forward.value & !reverse.value, reverse.value & !forward.value);
+        let bits = forward.mask.count_ones() < 16 && one != 0 && other != 0;
+        bits && here(forward) && word & one == one && word & other == other
+    }
+
+    /// What must hold when the command is over.
+    fn judge(
+        &self,
+        event: Event,
+        outcome: &Outcome,
+        progress: &Progress<'p>,
+        stopped: bool,
+    ) -> Result<(), Box<Counterexample>> {
+        let runs = progress.drive.running.is_some();
+        if (self.is_stop() && outcome.is_ok() || stopped) && runs {
+            return Err(self.wrong("the motor runs behind a stop", progress));
+        }
+        if self.is_stop() && event == Event::None {
+            // Bits of a word stay as the drive has them, which takes a read before where that is not known.
+            let reads = usize::from(self.profile.control_language().is_none() && !self.known);
+            let writes = |frame: &&String| frame.contains(" = ");
+            let first = progress.frames.iter().take(1 + reads).find(writes);
+            if !outcome.is_ok() || runs || first.is_none() {
+                return Err(self.wrong("a stop does not stop the motor in one exchange", progress));
+            }
+        }
+        // A drive that refuses its end says so.
+        if progress.drive.reset_stands() && !matches!(outcome, Outcome::Exception(_)) {
+            return Err(self.wrong("a reset is left standing", progress));
+        }
+        let sequence = matches!(self.control.run, Run::Steps(_));
+        let refused = matches!(outcome, Outcome::Exception(_) | Outcome::Refused(_));
+        if !outcome.is_ok() && runs && !progress.ran && (sequence || refused) {
+            return Err(self.wrong("the command failed and the motor runs", progress));
+        }
+        if event != Event::None {
+            return Ok(());
+        }
+        self.judge_effect(outcome, progress)
+    }
+
+    /// A command that nothing disturbs does what it says.
+    fn judge_effect(&self, outcome: &Outcome, progress: &Progress<'p>) -> Result<(), Box<Counterexample>> {
+        let stands = matches!(self.start, Start::PoweredUp | Start::Stopped | Start::Prepared);
+        let starts = self.says(ModelPoint::Run) == Some(true);
+        let direction = self.says(ModelPoint::Reverse);
+        if starts && stands {
+            if !outcome.is_ok() || progress.drive.running.is_none() {
+                return Err(self.wrong("a run command does not start the motor", progress));
+            }
+            if direction.is_some_and(|reverse| progress.drive.running != Some(reverse)) {
+                return Err(self.wrong("the motor runs in the wrong direction", progress));
+            }
+        }
+        let resets = self.says(ModelPoint::FaultReset) == Some(true);
+        let faulted = matches!(self.start, Start::FaultedRunning | Start::FaultedStopped);
+        if resets && faulted && progress.drive.fault {
+            return Err(self.wrong("a reset does not reset the fault", progress));
+        }
+        Ok(())
+    }
+
+    fn wrong(&self, what: &str, progress: &Progress<'p>) -> Box<Counterexample> {
+        let known = match self.known {
+            true => "",
+            false => "; the gateway does not know its control word",
+        };
+        let sets = self.sets.iter().map(|(point, on)| format!("{} = {on}", point.name()));
+        Box::new(Counterexample {
+            what: what.to_string(),
+            state: format!("{}{known}", self.start.in_words()),
+            command: sets.collect::<Vec<_>>().join(", "),
+            frames: progress.frames.clone(),
+        })
+    }
+}
+
+/// The requests that something is to happen to: of a state that is read again and again the first and the last read.
+fn different(frames: &[String]) -> Vec<usize> {
+    let other = |one: usize, by: Option<usize>| by.and_then(|by| frames.get(by)) != frames.get(one);
+    let all = 0..frames.len();
+    all.filter(|number| other(*number, number.checked_sub(1)) || other(*number, Some(number + 1)))
+        .collect()
+}
+
+fn is_coil(place: Place) -> bool {
+    matches!(place.table, Table::Coil | Table::DiscreteInput)
+}
+
+/// `holding 8501 = 0x000f`, or `read holding 3201`.
+fn in_words(pdu: &RequestPdu) -> String {
+    if let RequestPdu::Read { table, start, .. } = pdu {
+        return format!("read {table} {start}");
+    }
+    let Some((table, items)) = written(pdu) else {
+        return "another request".to_string();
+    };
+    let items = items
+        .iter()
+        .map(|(address, word)| format!("{table} {address} = {word:#06x}"));
+    items.collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests;

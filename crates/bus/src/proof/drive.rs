@@ -1,0 +1,275 @@
+//! The drive of a proof: the least that every drive with such a profile does, at its worst. It starts whenever a run command
+//! stands and nothing keeps it, and goes on turning until a stop comes. Pure.
+
+use std::collections::BTreeMap;
+
+use crate::codec::{Reply, RequestPdu};
+use crate::command::written;
+use crate::drive::Profile;
+use crate::drive::control::{Control, Place, Run, Setting, Step, Until};
+
+/// In which state a proof begins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Start {
+    /// Just switched on: every register holds 0.
+    PoweredUp,
+    /// Stopped by the gateway.
+    Stopped,
+    /// One word before the end of its sequence.
+    Prepared,
+    Running {
+        reverse: bool,
+    },
+    /// A fault came while it ran: the run command stands.
+    FaultedRunning,
+    FaultedStopped,
+    /// Commanded at its panel; the gateway's word is a stop.
+    Local,
+    /// The same, and the gateway's word is a run command.
+    LocalRunning,
+}
+
+impl Start {
+    pub(super) const ALL: [Start; 9] = [
+        Start::PoweredUp,
+        Start::Stopped,
+        Start::Prepared,
+        Start::Running { reverse: false },
+        Start::Running { reverse: true },
+        Start::FaultedRunning,
+        Start::FaultedStopped,
+        Start::Local,
+        Start::LocalRunning,
+    ];
+
+    pub(super) fn in_words(self) -> &'static str {
+        match self {
+            Start::PoweredUp => "just powered up",
+            Start::Stopped => "stopped by the gateway",
+            Start::Prepared => "prepared to run",
+            Start::Running { reverse: false } => "running forward",
+            Start::Running { reverse: true } => "running in reverse",
+            Start::FaultedRunning => "faulted, the run command stands",
+            Start::FaultedStopped => "faulted and stopped",
+            Start::Local => "commanded at its panel, stopped",
+            Start::LocalRunning => "commanded at its panel, the run command stands",
+        }
+    }
+}
+
+/// The drive.
+#[derive(Debug, Clone)]
+pub(super) struct Drive<'p> {
+    profile: &'p Profile,
+    control: &'p Control,
+    words: BTreeMap<(u8, u16), u16>,
+    /// Steps of the sequence that it has taken.
+    prepared: usize,
+    /// The direction in which it runs: true is reverse.
+    pub(super) running: Option<bool>,
+    pub(super) fault: bool,
+    local: bool,
+}
+
+fn key(place: Place) -> (u8, u16) {
+    (place.table as u8, place.address)
+}
+
+impl<'p> Drive<'p> {
+    /// None where the profile cannot be in that state.
+    pub(super) fn new(profile: &'p Profile, control: &'p Control, start: Start) -> Option<Drive<'p>> {
+        let mut drive = Drive {
+            profile,
+            control,
+            words: BTreeMap::new(),
+            prepared: 0,
+            running: None,
+            fault: false,
+            local: false,
+        };
+        let reverse = match start {
+            Start::Running { reverse: true } => true,
+            _ => false,
+        };
+        if reverse && control.reverse.is_none() && !matches!(control.run, Run::Pair { .. }) {
+            return None;
+        }
+        let steps = drive.steps().len();
+        match start {
+            Start::PoweredUp => {}
+            Start::Stopped | Start::FaultedStopped | Start::Local => drive.put_stop(),
+            Start::Prepared => {
+                let last = steps.checked_sub(2)?;
+                let word = drive.steps().get(last)?.write;
+                drive.put(word.place.unwrap_or(control.at), word.value);
+                drive.prepared = last + 1;
+            }
+            Start::Running { .. } | Start::FaultedRunning | Start::LocalRunning => {
+                drive.prepared = steps;
+                drive.put_run(reverse);
+                drive.running = Some(reverse);
+            }
+        }
+        drive.fault = matches!(start, Start::FaultedRunning | Start::FaultedStopped);
+        drive.local = matches!(start, Start::Local | Start::LocalRunning);
+        if drive.fault || drive.local {
+            (drive.running, drive.prepared) = (None, 0);
+        }
+        Some(drive)
+    }
+
+    fn steps(&self) -> &'p [Step] {
+        match &self.control.run {
+            Run::Steps(steps) => steps,
+            _ => &[],
+        }
+    }
+
+    fn put(&mut self, place: Place, word: u16) {
+        self.words.insert(key(place), word);
+    }
+
+    fn put_stop(&mut self) {
+        let place = self.control.stop.place.unwrap_or(self.control.at);
+        self.put(place, self.control.stop_word(0));
+    }
+
+    fn put_run(&mut self, reverse: bool) {
+        let runs = self.control.runs();
+        let run = if reverse { runs.last() } else { runs.first() };
+        let Some(run) = run else { return };
+        let own = self.control.always.applied(0);
+        let word = self.control.with_direction(run.applied(own), reverse);
+        self.put(run.place.unwrap_or(self.control.at), word);
+        if let Some((setting, place)) = self.control.reverse.and_then(|setting| Some((setting, setting.place?))) {
+            self.put(place, if reverse { setting.applied(0) } else { setting.undone(0) });
+        }
+    }
+
+    /// The word that stands there.
+    pub(super) fn word(&self, place: Place) -> u16 {
+        self.words.get(&key(place)).copied().unwrap_or(0)
+    }
+
+    fn word_of(&self, setting: &Setting) -> u16 {
+        self.word(setting.place.unwrap_or(self.control.at))
+    }
+
+    /// Whether its reset stands.
+    pub(super) fn reset_stands(&self) -> bool {
+        let reset = self.control.fault_reset;
+        reset.is_some_and(|reset| !reset.setting.once && reset.setting.holds(self.word_of(&reset.setting)))
+    }
+
+    /// What it answers, and does.
+    pub(super) fn receives(&mut self, pdu: &RequestPdu) -> Reply {
+        if let RequestPdu::Read { table, start, count } = pdu {
+            let word = |address| self.read(Place { table: *table, address });
+            let words: Vec<u64> = vec![word(*start)];
+            let value = words.first().copied().unwrap_or(0);
+            return match (table.is_bits(), count) {
+                (true, _) => Reply::Bits(vec![value != 0; usize::from(*count)]),
+                (false, 2) => Reply::Registers(vec![(value >> 16) as u16, value as u16]),
+                (false, _) => Reply::Registers(vec![value as u16; usize::from(*count)]),
+            };
+        }
+        if let Some((table, items)) = written(pdu) {
+            for (address, word) in items {
+                self.takes(Place { table, address }, word);
+            }
+        }
+        Reply::Written
+    }
+
+    fn takes(&mut self, place: Place, word: u16) {
+        let before = self.word(place);
+        self.put(place, word);
+        let here = |setting: &Setting| setting.place.unwrap_or(self.control.at) == place;
+        if self.control.is_stop(place, word) {
+            self.running = None;
+            self.prepared = self.prepared.min(self.steps().len().saturating_sub(1));
+        }
+        let reset = self.control.fault_reset.map(|reset| reset.setting).filter(here);
+        if reset.is_some_and(|reset| reset.holds(word) && (reset.once || !reset.holds(before))) {
+            self.fault = false;
+        }
+        let once = self
+            .control
+            .runs()
+            .iter()
+            .any(|run| run.once && here(run) && self.control.is_run(place, word));
+        self.step(place, word);
+        if !self.fault && !self.local && (once || self.is_commanded()) {
+            self.running = Some(self.direction());
+        }
+    }
+
+    /// Takes a word of the sequence, if it is the next one or an earlier one.
+    fn step(&mut self, place: Place, word: u16) {
+        let free = self
+            .control
+            .reverse
+            .filter(|setting| setting.place.is_none())
+            .map_or(0, |setting| setting.mask);
+        let holds = |step: &Step| {
+            let here = step.write.place.unwrap_or(self.control.at) == place;
+            here && (word ^ step.write.value) & step.write.mask & !free == 0
+        };
+        let taken = self.steps().iter().take(self.prepared + 1).rposition(holds);
+        if let Some(number) = taken.filter(|_| !self.fault && !self.local) {
+            self.prepared = number + 1;
+        }
+    }
+
+    /// Whether a run command stands that is more than a moment.
+    fn is_commanded(&self) -> bool {
+        let prepared = self.prepared >= self.steps().len();
+        let stands = |run: &Setting| {
+            let place = run.place.unwrap_or(self.control.at);
+            !run.once && self.control.is_run(place, self.word(place))
+        };
+        let stopped = {
+            let stop = &self.control.stop;
+            stop.place.is_some() && stop.holds(self.word_of(stop))
+        };
+        prepared && !stopped && self.control.runs().iter().any(stands)
+    }
+
+    fn direction(&self) -> bool {
+        if let Some(setting) = self
+            .control
+            .reverse
+            .filter(|_| !matches!(self.control.run, Run::Pair { .. }))
+        {
+            return setting.holds(self.word_of(&setting));
+        }
+        match &self.control.run {
+            Run::Pair { reverse, .. } => reverse.holds(self.word_of(reverse)),
+            Run::One(_) | Run::Steps(_) => false,
+        }
+    }
+
+    /// A register: the control word, or a status word as its steps and its motor make it.
+    fn read(&self, place: Place) -> u64 {
+        if let Some(word) = self.words.get(&key(place)) {
+            return u64::from(*word);
+        }
+        let is_here = |point: usize| {
+            let raw = self.profile.points.get(point).and_then(|point| point.raw());
+            raw.is_some_and(|raw| (raw.table, raw.address) == (place.table, place.address))
+        };
+        let states = self.steps().iter().map(|step| step.until);
+        let states: Vec<_> = states
+            .map(|until| match until {
+                Until::State(mask) if is_here(mask.point) => Some(mask),
+                _ => None,
+            })
+            .collect();
+        let reached = states.iter().take(self.prepared).flatten().next_back();
+        match (reached, states.iter().flatten().next()) {
+            (Some(mask), _) => mask.is,
+            (None, Some(first)) => !first.is & first.mask,
+            (None, None) => 0,
+        }
+    }
+}
