@@ -454,8 +454,7 @@ keys! {
             parse: mqtt::parse_url, words: &[], pattern: "^mqtts?://",
             range: "\"mqtt://host[:port]\" or \"mqtts://host[:port]\"",
         }, default "mqtt://127.0.0.1:1883";
-        /// [Further brokers](mqtt.md#several-brokers), with the same credentials, TLS and client id: tried in order after `url`,
-        /// then from the beginning. All are `mqtts://` if `url` is.
+        /// [Further brokers](mqtt.md#several-brokers), tried in order after `url`; with its credentials, all `mqtts://` or none.
         urls: Vec<mqtt::Broker> = List {
             parse: mqtt::parse_url, empty: None, range: "addresses such as [\"mqtt://broker-2:1883\"]",
         }, default [];
@@ -487,8 +486,7 @@ keys! {
         qos: Present = Own { schema: MqttQos::schema, range: "[mqtt.qos]" }, or "the defaults";
         /// The broker drops telemetry that is older (message expiry); `"0s"` is never.
         expiry: Duration = Time(Duration::ZERO..=Duration::from_secs(365 * 86_400)), default "5min";
-        /// A broker drops the status `online`, and telemetry at the latest, after this time unless the gateway renews it (it does after
-        /// half of it); `"0s"` is never.
+        /// The broker drops `online`, and telemetry at the latest, after this time; renewed after half of it; `"0s"` is never.
         message_expiry: Duration = Time(Duration::ZERO..=Duration::from_secs(365 * 86_400)), default "10min";
         /// Values of an outage that are published afterwards, on `history` topics: those that changed, or all samples.
         history: History = Words(&[
