@@ -87,7 +87,7 @@ impl<'p> Drive<'p> {
             fault: false,
             local: false,
         };
-        let reverse = matches!(start, Start::Running { reverse: true });
+        let reverse = start == Start::Running { reverse: true };
         if reverse && control.reverse.is_none() && !matches!(control.run, Run::Pair { .. }) {
             return None;
         }
