@@ -433,6 +433,7 @@ impl MqttStats {
             self.keep_unread(None),
             self.keep_orders(None),
             self.keep_node_orders(None),
+            [LinkOf::Topics, LinkOf::Node].map(|of| self.keep_broker(of, None)),
         ));
     }
 
