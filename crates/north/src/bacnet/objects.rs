@@ -107,7 +107,7 @@ pub fn of_drive(spec: &DriveSpec, gateway: (&str, u32)) -> Shown {
         instance + u32::from(spec.unit),
         Mac::new(&[spec.unit]),
         format!("{name}.{}", spec.name),
-        (spec.profile.name.clone(), spec.profile.title.clone()),
+        (spec.profile.name.clone(), spec.profile.described().into_owned()),
         objects,
     );
     Shown {
