@@ -119,6 +119,7 @@ impl Daemon {
             events: events.clone(),
             writes: writes.clone(),
             recordings: recordings.clone(),
+            stop_all: Arc::default(),
             parameters: vault.clone(),
             history: history.clone(),
         };
@@ -142,7 +143,8 @@ impl Daemon {
             history,
             recorder: None,
             keeper: None,
-            reporter: report_refusals(shared),
+            reporter: report_refusals(shared.clone()),
+            stopper: stop_all(shared),
             pulse: Pulse::default(),
             control,
         };
@@ -318,6 +320,7 @@ impl Daemon {
             events: self.events.clone(),
             writes: self.writes.clone(),
             recordings: self.recordings.clone(),
+            stop_all: self.plant.load().stop_all.clone(),
             parameters: self.vault.clone(),
             history: self.history.clone(),
         }));
@@ -620,6 +623,19 @@ async fn at_once<T: Send + 'static>(
     // A bus thread that panicked has ended the process.
     let stopped = futures_util::future::join_all(stopping).await;
     stopped.into_iter().filter_map(Result::ok).collect()
+}
+
+/// Watches the orders that stop all drives.
+fn stop_all(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
+    let orders = plant.load().stop_all.clone();
+    tokio::spawn(async move {
+        loop {
+            orders.begun().await;
+            while orders.look(&plant.load(), Instant::now()) {
+                tokio::time::sleep(LOOK).await;
+            }
+        }
+    })
 }
 
 /// Reports refusals of the plant whose count is due.
