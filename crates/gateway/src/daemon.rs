@@ -28,6 +28,7 @@ use crate::north::{NorthStats, ServerError, bacnet, http, local, modbus_tcp, mqt
 use crate::parameters::{Store, Vault};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
+use crate::stop_all::LOOK;
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
 const STOP_SLACK: Duration = Duration::from_millis(300);
@@ -79,6 +80,7 @@ pub struct Daemon {
     keeper: Option<Keeper>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
+    stopper: tokio::task::JoinHandle<()>,
     pulse: Pulse,
     /// Who is asked to reload, and the file that the gateway runs with.
     control: Option<Control>,
@@ -539,6 +541,7 @@ impl Daemon {
         })
         .await;
         self.reporter.abort();
+        self.stopper.abort();
         if let Some(reader) = &self.reader {
             reader.abort();
         }

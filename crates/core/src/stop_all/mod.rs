@@ -242,10 +242,12 @@ fn broadcast(plant: &Plant, bus: &BusHandle, origin: &Origin, now: Instant) -> O
     Some(bus.ask_first(question, &plant.writes, now))
 }
 
-/// How many controlled drives are not known to stand.
-pub fn not_standing(plant: &Plant, now: Instant) -> usize {
-    let controlled = plant.drives().filter(|drive| drive.image.spec.access == Access::Control);
-    let stands = |drive: &DriveHandle| drive.reading(now).standstill(None) == Standstill::Stands;
+/// How many of these drives are controlled and not known to stand.
+pub fn not_standing<'d>(drives: impl IntoIterator<Item = &'d DriveHandle>, now: Instant) -> usize {
+    let controlled = drives
+        .into_iter()
+        .filter(|drive| drive.image.spec.access == Access::Control);
+    let stands = |drive: &&DriveHandle| drive.reading(now).standstill(None) == Standstill::Stands;
     controlled.filter(|drive| !stands(drive)).count()
 }
 

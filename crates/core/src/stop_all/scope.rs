@@ -10,6 +10,8 @@ pub enum Scope {
     Gateway,
     /// Those of the bus of that name.
     Bus(String),
+    /// Those of these buses.
+    Buses(Vec<String>),
     /// Those with that `group`.
     Group(String),
 }
@@ -71,6 +73,7 @@ impl Scope {
         match self {
             Scope::Gateway => true,
             Scope::Bus(name) => spec.bus == *name,
+            Scope::Buses(names) => names.contains(&spec.bus),
             Scope::Group(name) => spec.group.as_ref() == Some(name),
         }
     }

@@ -19,7 +19,7 @@ use self::discovery::{announcer, discovery_topics};
 use self::repair::Repair;
 use super::back_off::BackOff;
 use super::broker_limits::{BrokerLimits, WillForm};
-use super::commands::{Commands, FinishedCommand, Rules};
+use super::commands::{Commands, Finished, Rules};
 use super::connection::{self, CLOSED, Connection, ConnectionEvent, SUBSCRIBE_TIMEOUT, Subscription};
 use super::home_assistant::{Announcer, Sources};
 use super::outage_log::OutageLog;
@@ -380,8 +380,8 @@ impl Client {
         matches!(&self.link, BrokerLink::Open(session) if matches!(session.phase, Phase::Ready { .. }))
     }
 
-    fn on_ended(&mut self, ended: FinishedCommand) {
-        let result = self.commands.result(ended, SystemTime::now());
+    fn on_ended(&mut self, ended: Finished) {
+        let result = self.commands.answer(ended, SystemTime::now());
         self.outbox.push_result(result);
     }
 

@@ -162,7 +162,7 @@ impl Waiting {
 
 impl Operator {
     /// As the audit shows it. All that a user does counts as one client.
-    fn origin(&self) -> Origin {
+    pub(super) fn origin(&self) -> Origin {
         let client = format!("{} {}", SourceKind::Http.name(), self.user);
         let who = format!("{} {}", self.user, self.address);
         Origin::of(client.into(), SourceKind::Http, who).with_login(self.login.clone())

@@ -8,6 +8,7 @@ mod commands;
 mod cookies;
 mod login;
 mod sessions;
+mod stop_all;
 mod throttle;
 mod verifier;
 
@@ -38,6 +39,7 @@ use crate::log_throttle::LogThrottle;
 pub(crate) use self::commands::PostedCommands;
 pub(super) use self::commands::{command, commands_of, heartbeat};
 pub(super) use self::login::{log_in, log_out, session};
+pub(super) use self::stop_all::stop;
 
 /// A password that a program sends with each request is not hashed anew for that long.
 const VERIFIED: Duration = Duration::from_secs(300);
@@ -406,7 +408,10 @@ pub(super) fn is_operating(path: &str) -> bool {
         rest.split_once('/')
             .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat"))
     };
-    matches!(path, "/api/v1/login" | "/api/v1/logout" | "/api/v1/session")
+    matches!(
+        path,
+        "/api/v1/login" | "/api/v1/logout" | "/api/v1/session" | "/api/v1/stop"
+    )
         || path.starts_with("/assets/operate.")
         || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive)
 }
@@ -418,7 +423,7 @@ pub(super) fn may_change(method: &Method, path: &str) -> bool {
 
 /// Whether it is a command: that is served in whatever way the client got in.
 pub(super) fn is_command(method: &Method, path: &str) -> bool {
-    may_change(method, path) && path.ends_with("/commands")
+    may_change(method, path) && (path.ends_with("/commands") || path == "/api/v1/stop")
 }
 
 #[cfg(test)]

@@ -72,7 +72,7 @@ impl Bench {
 
     fn finished(&mut self) -> Option<Json> {
         let ended = self.commands.try_finished()?;
-        Some(json(&self.commands.result(ended, SystemTime::UNIX_EPOCH)))
+        Some(json(&self.commands.answer(ended, SystemTime::UNIX_EPOCH)))
     }
 
     /// The drive acknowledges the next command; its effect has not been read yet.
