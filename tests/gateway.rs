@@ -31,6 +31,7 @@ mod gateway {
     mod restart;
     mod restoring;
     mod slow_log;
+    mod stop_all;
     mod trace;
     mod trying;
     mod user_profiles;
