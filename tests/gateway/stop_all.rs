@@ -23,7 +23,7 @@ fn plant() -> Plant {
     let site = Site::of(&[LINE1, &drives, MODBUS_TCP, MQTT, &http]);
     let file = site.path("users");
     let program = std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"));
-    let added = feed(program, &["user", "add", "--file", &file, "alice"], &format!("{PASSWORD}\n{PASSWORD}\n"));
+    let added = feed(program, &["user", "add", "--file", &file, "alice"], &format!("{PASSWORD}\n"));
     assert!(added.status.success(), "{added:?}");
     let simulator = site.simulate(&["--addresses", "1-3", "--baud", "38400"]);
     let broker = site.broker();
