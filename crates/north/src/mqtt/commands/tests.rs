@@ -666,3 +666,5 @@ fn a_start_that_came_before_a_stop_and_is_taken_behind_it_is_not_executed() {
     assert_eq!((&result["ok"], &result["result"]), (&false.into(), &"purged".into()));
     assert_eq!(bench.queued(), 1, "the stop");
 }
+
+mod stop_all;
