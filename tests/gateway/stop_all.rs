@@ -23,7 +23,11 @@ fn plant() -> Plant {
     let site = Site::of(&[LINE1, &drives, MODBUS_TCP, MQTT, &http]);
     let file = site.path("users");
     let program = std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"));
-    let added = feed(program, &["user", "add", "--file", &file, "alice"], &format!("{PASSWORD}\n"));
+    let added = feed(
+        program,
+        &["user", "add", "--file", &file, "alice"],
+        &format!("{PASSWORD}\n"),
+    );
     assert!(added.status.success(), "{added:?}");
     let simulator = site.simulate(&["--addresses", "1-3", "--baud", "38400"]);
     let broker = site.broker();
@@ -118,7 +122,11 @@ fn from_every_side() {
     // One group alone.
     plant.start();
     let (status, answer) = plant.curl("{\"group\": \"fans\"}");
-    assert_eq!((status, &answer["drives"][0]["drive"]), (200, &json!("fan-1")), "{answer}");
+    assert_eq!(
+        (status, &answer["drives"][0]["drive"]),
+        (200, &json!("fan-1")),
+        "{answer}"
+    );
     assert_eq!(plant.not_standing(), 1);
     assert_eq!(plant.site.point("pump-1", "running"), true);
 
@@ -134,6 +142,9 @@ fn from_every_side() {
 
     // Not without a login.
     let url = format!("http://127.0.0.1:{}/api/v1/stop", plant.site.http);
-    let nobody = run(&tool("curl"), &["-s", "-o", "/dev/null", "-d", "{}", "-w", "%{http_code}", &url]);
+    let nobody = run(
+        &tool("curl"),
+        &["-s", "-o", "/dev/null", "-d", "{}", "-w", "%{http_code}", &url],
+    );
     assert_eq!(nobody.stdout, b"401");
 }

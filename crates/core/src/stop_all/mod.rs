@@ -170,16 +170,25 @@ impl State {
     fn place(&mut self, plant: &Plant, drives: &[DriveHandle], origin: &Origin, now: Instant) {
         let machines: Vec<Machine> = drives.iter().map(DriveHandle::machine).collect();
         let waits = |stop: &OneStop| stop.waits_for_acknowledgement();
-        let joins: Vec<Machine> = self.stops.iter().filter(|stop| waits(stop)).map(|stop| stop.machine.clone()).collect();
+        let joins: Vec<Machine> = self
+            .stops
+            .iter()
+            .filter(|stop| waits(stop))
+            .map(|stop| stop.machine.clone())
+            .collect();
         self.stops
             .retain(|stop| waits(stop) || !machines.contains(&stop.machine));
         for bus in &plant.buses {
             let is_of_bus = |machine: &&Machine| machine.port == bus.image.spec.port;
             let concerned = machines.iter().filter(is_of_bus).count();
-            let new = machines.iter().filter(is_of_bus).any(|machine| !joins.contains(machine));
+            let new = machines
+                .iter()
+                .filter(is_of_bus)
+                .any(|machine| !joins.contains(machine));
             if new && concerned == bus.image.drives.len() {
                 let exchange = broadcast(plant, bus, origin, now);
-                self.broadcasts.extend(exchange.map(|exchange| (exchange, now + BROADCAST)));
+                self.broadcasts
+                    .extend(exchange.map(|exchange| (exchange, now + BROADCAST)));
             }
         }
         for (drive, machine) in drives.iter().zip(machines) {

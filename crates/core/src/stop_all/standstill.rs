@@ -43,9 +43,9 @@ impl Reading<'_> {
             (_, Some(true), _) => Standstill::Stands,
             (_, _, Some(hertz)) if hertz > STANDS => Standstill::Turns(format!("`output_frequency` {hertz:.1} Hz")),
             (Some(false), _, Some(_)) => Standstill::Stands,
-            _ if !self.tells_standstill() => {
-                Standstill::Unknown("standstill cannot be seen: the drive tells no `zero_speed` and no frequency".to_string())
-            }
+            _ if !self.tells_standstill() => Standstill::Unknown(
+                "standstill cannot be seen: the drive tells no `zero_speed` and no frequency".to_string(),
+            ),
             _ => Standstill::Unknown("it was not read since".to_string()),
         }
     }

@@ -82,7 +82,10 @@ fn an_order_reaches_the_controlled_drives_of_its_scope() {
     let monitored = plant.buses[0].image.drives[1].clone();
     let spec = plant.buses[0].image.spec.clone();
     plant.buses[0].image = Arc::new(BusImage::new(spec, vec![monitored]));
-    let error = plant.stop_all.order(&plant, &Scope::Gateway, &origin, WAIT, now).unwrap_err();
+    let error = plant
+        .stop_all
+        .order(&plant, &Scope::Gateway, &origin, WAIT, now)
+        .unwrap_err();
     assert_eq!(error, NothingToStop::NotControlled);
 }
 
@@ -91,7 +94,12 @@ fn orders_without_end_are_all_answered() {
     let plant = plant();
     let (origin, now) = (Origin::new(SourceKind::Http, "alice"), Instant::now());
     let mut orders: Vec<StopOrder> = (0..MOST_ORDERS + 10)
-        .map(|_| plant.stop_all.order(&plant, &Scope::Gateway, &origin, WAIT, now).unwrap())
+        .map(|_| {
+            plant
+                .stop_all
+                .order(&plant, &Scope::Gateway, &origin, WAIT, now)
+                .unwrap()
+        })
         .collect();
     assert_eq!(waiting(&plant), [1, 1], "they join");
     let answered = orders.iter_mut().filter_map(|order| order.report.try_recv().ok());

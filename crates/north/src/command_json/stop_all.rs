@@ -36,7 +36,9 @@ pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), String> {
         (None, None) => Scope::Gateway,
         (Some(bus), None) => Scope::Bus(bus),
         (None, Some(group)) => Scope::Group(group),
-        (Some(_), Some(_)) => return Err("both `bus` and `group` are given, so no stop was sent; write one of them".to_string()),
+        (Some(_), Some(_)) => {
+            return Err("both `bus` and `group` are given, so no stop was sent; write one of them".to_string());
+        }
     };
     // A wait that is none is no reason not to stop.
     let wait = body.wait_s.filter(|wait| *wait >= 0.0).unwrap_or(WAIT.as_secs_f64());
@@ -59,7 +61,13 @@ mod tests {
             stop_all(b"{\"group\": \"g\", \"wait_s\": 1e9}"),
             Ok((group, LONGEST_WAIT))
         );
-        for bad in ["1", "{\"bus\": 1}", "{\"drive\": \"d\"}", "{\"bus\": \"b\", \"group\": \"g\"}", "{"] {
+        for bad in [
+            "1",
+            "{\"bus\": 1}",
+            "{\"drive\": \"d\"}",
+            "{\"bus\": \"b\", \"group\": \"g\"}",
+            "{",
+        ] {
             assert!(stop_all(bad.as_bytes()).is_err(), "{bad}");
         }
     }

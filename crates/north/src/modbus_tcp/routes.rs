@@ -96,7 +96,7 @@ impl Routes {
 
     /// All of these drives, to stop them.
     pub(super) fn scope(&self) -> Scope {
-        match &**self.buses {
+        match &*self.buses {
             Some(buses) => Scope::Buses(buses.clone()),
             None => Scope::Gateway,
         }

@@ -306,10 +306,14 @@ impl ClientSession {
         }
         let request = RequestPdu::decode(frame.pdu)?;
         let value = match &request {
-            RequestPdu::WriteRegister { address: STOP_ALL, value } => *value,
-            RequestPdu::WriteRegisters { start: STOP_ALL, values } if values.len() == 1 => {
-                values.first().copied().unwrap_or_default()
-            }
+            RequestPdu::WriteRegister {
+                address: STOP_ALL,
+                value,
+            } => *value,
+            RequestPdu::WriteRegisters {
+                start: STOP_ALL,
+                values,
+            } if values.len() == 1 => values.first().copied().unwrap_or_default(),
             _ => return Err(Exception::FUNCTION),
         };
         if value != 1 {

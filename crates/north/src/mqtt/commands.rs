@@ -235,7 +235,9 @@ impl Commands {
             Err(why) => return refuse(why),
         };
         let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
-        let who = who.as_deref().map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
+        let who = who
+            .as_deref()
+            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
         let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, who);
         match plant.stop_all.order(plant, &scope, &origin, wait, now) {
             Ok(order) => {

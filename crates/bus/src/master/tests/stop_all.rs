@@ -69,7 +69,10 @@ fn a_broadcast_goes_before_all_and_each_drive_is_proven_to_stand() {
         assert_eq!(outcomes(&report), [Stopped::Standing; 20]);
         assert_eq!(order.acknowledged.try_recv(), Ok(true));
         assert_eq!(not_standing(&plant.drives().collect::<Vec<_>>(), rig.now), 0);
-        let writes: Vec<_> = rig.wire[from..].iter().filter(|(_, turn)| turn.pdu().is_write()).collect();
+        let writes: Vec<_> = rig.wire[from..]
+            .iter()
+            .filter(|(_, turn)| turn.pdu().is_write())
+            .collect();
         assert_eq!(writes[0].1.drive, NO_DRIVE, "the broadcast goes first");
         assert!(writes[0].0 - begin <= COST);
         for drive in 0..20 {
@@ -120,7 +123,12 @@ fn a_silent_drive_is_named_and_stopped_once_it_is_back() {
         outcomes(&report),
         [Stopped::Standing, Stopped::Unproven, Stopped::Standing]
     );
-    assert!(report.drives[1].reason.as_deref().is_some_and(|why| why.contains("did not acknowledge")));
+    assert!(
+        report.drives[1]
+            .reason
+            .as_deref()
+            .is_some_and(|why| why.contains("did not acknowledge"))
+    );
     assert!(rig.runs(1));
     // Back within the time of the next order: tried again, it stops.
     let mut second = order(&rig, &plant, &stop_all, &Scope::Gateway);
@@ -162,6 +170,11 @@ fn a_motor_that_runs_down_is_told_as_stopping() {
     let mut order = order(&rig, &plant, &stop_all, &Scope::Gateway);
     let report = answered(&mut rig, &plant, &stop_all, &mut order);
     assert_eq!(outcomes(&report), [Stopped::Standing, Stopped::Stopping]);
-    assert!(report.drives[1].reason.as_deref().is_some_and(|why| why.contains("12.0 Hz")));
+    assert!(
+        report.drives[1]
+            .reason
+            .as_deref()
+            .is_some_and(|why| why.contains("12.0 Hz"))
+    );
     assert_eq!(order.acknowledged.try_recv(), Ok(true), "its stop was acknowledged");
 }

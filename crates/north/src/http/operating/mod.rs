@@ -411,8 +411,7 @@ pub(super) fn is_operating(path: &str) -> bool {
     matches!(
         path,
         "/api/v1/login" | "/api/v1/logout" | "/api/v1/session" | "/api/v1/stop"
-    )
-        || path.starts_with("/assets/operate.")
+    ) || path.starts_with("/assets/operate.")
         || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive)
 }
 

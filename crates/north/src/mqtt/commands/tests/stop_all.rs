@@ -53,8 +53,15 @@ fn a_drive_that_is_not_proven_to_stand_is_named() {
     bench.now += Duration::from_millis(100);
     bench.plant.stop_all.look(&bench.plant, bench.now);
     let answer = bench.finished().expect("an answer");
-    assert_eq!((&answer["ok"], &answer["drives"][0]["outcome"]), (&false.into(), &"unproven".into()));
-    assert!(answer["drives"][0]["reason"].as_str().is_some_and(|why| why.contains("not read since")));
+    assert_eq!(
+        (&answer["ok"], &answer["drives"][0]["outcome"]),
+        (&false.into(), &"unproven".into())
+    );
+    assert!(
+        answer["drives"][0]["reason"]
+            .as_str()
+            .is_some_and(|why| why.contains("not read since"))
+    );
 }
 
 #[test]
@@ -72,7 +79,10 @@ fn what_is_retained_or_not_understood_stops_nothing_and_says_so() {
     ] {
         let refused = json(&bench.take(message).expect("an answer at once"));
         assert_eq!(refused["ok"], false);
-        assert!(refused["error"].as_str().is_some_and(|why| why.contains(says)), "{refused}");
+        assert!(
+            refused["error"].as_str().is_some_and(|why| why.contains(says)),
+            "{refused}"
+        );
     }
     let cleared = Incoming {
         retain: true,
