@@ -78,8 +78,10 @@ impl Gateway {
     fn start(runtime: &Runtime, port: u16, drives: u16, min_interval: Duration) -> Result<Gateway, Box<dyn Error>> {
         let plant = Arc::new(ArcSwap::from_pointee(plant(drives)?));
         let options = Options {
-            host: "127.0.0.1".to_string(),
-            port,
+            brokers: vec![mqtt::Broker {
+                host: "127.0.0.1".to_string(),
+                port,
+            }],
             tls: false,
             client_id: "bench-gateway".to_string(),
             username: None,
@@ -95,6 +97,7 @@ impl Gateway {
             telemetry_qos: Qos::AtMostOnce,
             event_qos: Qos::AtLeastOnce,
             expiry: Some(Duration::from_secs(300)),
+            message_expiry: Some(Duration::from_secs(600)),
             min_interval,
             max_interval: Duration::from_secs(60),
             commands: false,

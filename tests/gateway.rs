@@ -10,6 +10,7 @@
 mod support;
 
 mod gateway {
+    mod any_profile;
     mod audit;
     mod bacnet;
     mod bad_commands;

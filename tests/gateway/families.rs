@@ -14,6 +14,14 @@ use crate::support::process::{PATIENCE, Running, api, free_port, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
 use crate::support::tools::{python, root};
 
+/// Each profile with the module of its drive.
+pub(super) fn peers() -> impl Iterator<Item = (&'static str, &'static str)> {
+    let mut all: Vec<_> = CASES.iter().map(|case| (case.profile, case.peer)).collect();
+    all.sort_unstable();
+    all.dedup();
+    all.into_iter()
+}
+
 /// A gateway and the drive that it commands.
 struct Rig {
     site: Site,

@@ -440,3 +440,53 @@ fn a_configured_frequency_range_counts_as_over_mqtt() {
         (value == 50.0).then_some(())
     });
 }
+
+/// The HTTP API at the socket, by curl: status and reply.
+fn http(line: &Line, arguments: &[&str], path: &str) -> (u16, Value) {
+    let socket = line.socket().display().to_string();
+    let url = format!("http://gateway{path}");
+    let mut command = Command::new(tool("curl"));
+    command.args(["-sS", "-w", "\n%{http_code}", "--unix-socket", &socket]);
+    let output = command.args(arguments).arg(url).output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    let (body, status) = text.rsplit_once('\n').unwrap();
+    (
+        status.parse().unwrap(),
+        serde_json::from_str(body).unwrap_or(json!(body)),
+    )
+}
+
+#[test]
+fn it_serves_the_http_api_to_whoever_may_open_it() {
+    let line = Line::start();
+    let _gateway = line.gateway();
+    until("ready", || {
+        (http(&line, &[], "/api/v1/health").1 == json!({"ready": true, "reasons": []})).then_some(())
+    });
+    let (status, drive) = http(&line, &[], "/api/v1/drives/pump-1");
+    assert_eq!((status, &drive["online"]), (200, &json!(true)));
+    // No login, no token, any host; the audit has the user's id.
+    let command = "/api/v1/drives/pump-1/commands";
+    let (status, started) = http(&line, &["-d", r#"{"run":true,"speed_reference":40}"#], command);
+    assert_eq!((status, &started["result"]), (200, &json!("confirmed")), "{started}");
+    let (status, stopped) = http(&line, &["-d", r#"{"run":false}"#], command);
+    assert_eq!((status, &stopped["result"]), (200, &json!("confirmed")), "{stopped}");
+    let (_, audit) = http(&line, &[], "/api/v1/audit?drive=pump-1");
+    let last = audit.as_array().unwrap().last().unwrap();
+    assert_eq!(last["source"], "local_socket");
+    assert!(last["client"].as_str().unwrap().starts_with("uid "), "{last}");
+    assert_eq!(http(&line, &["-d", r#"{"speed_reference":140}"#], command).0, 422);
+    assert_eq!(
+        http(&line, &["-d", "{}"], "/api/v1/login").0,
+        405,
+        "nobody logs in here"
+    );
+    // It reads its configuration again, or says why not.
+    let (status, outcome) = http(&line, &["-d", "{}"], "/api/v1/reload");
+    assert_eq!((status, &outcome["changes"]), (200, &json!([])), "{outcome}");
+    line.reconfigure(|text| text.replace("address = 1", "address = 999"));
+    let (status, outcome) = http(&line, &["-d", "{}"], "/api/v1/reload");
+    assert_eq!(status, 422, "{outcome}");
+    assert!(outcome["errors"][0].as_str().unwrap().contains("999"), "{outcome}");
+    assert_eq!(http(&line, &[], "/api/v1/nothing").0, 404);
+}

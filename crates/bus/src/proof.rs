@@ -473,7 +473,7 @@ impl<'p> Case<'p> {
             let writes = |frame: &&String| frame.contains(" = ");
             let first = progress.frames.iter().take(1 + reads).find(writes);
             if !outcome.is_ok() || runs || first.is_none() {
-                return Err(self.wrong("a stop does not stop the motor in one exchange", progress));
+                return Err(self.wrong("a stop does not stop the motor in one request", progress));
             }
         }
         // A drive that refuses its end says so.

@@ -10,7 +10,7 @@ use tokio::sync::broadcast::Receiver;
 use super::command_json::SharedMemory;
 use super::http::PostedCommands;
 use super::listener::ListenerStates;
-use super::mqtt::{NodeOrdersLeft, OrdersLeft};
+use super::mqtt::{Broker, NodeOrdersLeft, OrdersLeft};
 use crate::event::Event;
 
 /// What outlives the servers that a reload replaces: counters of all north sides, and which commands were taken.
@@ -357,6 +357,17 @@ pub struct MqttStats {
     orders: Mutex<Option<OrdersLeft>>,
     /// Those of the last edge node.
     node_orders: Mutex<Option<NodeOrdersLeft>>,
+    /// The brokers in use, by [`LinkOf`], for the clients that a reload puts in the place of these.
+    brokers: Mutex<[Option<Broker>; 2]>,
+}
+
+/// Which client is linked to a broker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum LinkOf {
+    /// That of the plain topics.
+    Topics,
+    /// The edge node of Sparkplug.
+    Node,
 }
 
 /// What the MQTT client lost.
@@ -409,12 +420,20 @@ impl MqttStats {
         std::mem::replace(&mut kept, orders)
     }
 
+    /// Keeps the broker that a client used when it ended; returns the one kept before.
+    pub(crate) fn keep_broker(&self, of: LinkOf, broker: Option<Broker>) -> Option<Broker> {
+        let mut kept = self.brokers.lock().unwrap_or_else(PoisonError::into_inner);
+        kept.get_mut(of as usize)
+            .and_then(|kept| std::mem::replace(kept, broker))
+    }
+
     /// There is no client that goes on with what the last one left.
     pub fn forget_what_is_left(&self) {
         drop((
             self.keep_unread(None),
             self.keep_orders(None),
             self.keep_node_orders(None),
+            [LinkOf::Topics, LinkOf::Node].map(|of| self.keep_broker(of, None)),
         ));
     }
 

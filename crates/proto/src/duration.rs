@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-/// A duration: a number, not negative, and one of `us`, `ms`, `s`, `min`, `h`; `None` if the text is not one.
+/// A duration: a number, not negative, and one of `us`, `ms`, `s`, `min` or `m`, `h`; `None` if the text is not one.
 pub fn parse(text: &str) -> Option<Duration> {
     let trimmed = text.trim();
     let digits = trimmed.find(|c: char| !c.is_ascii_digit() && c != '.')?;
@@ -12,7 +12,7 @@ pub fn parse(text: &str) -> Option<Duration> {
         "us" | "µs" => 1e-6,
         "ms" => 1e-3,
         "s" => 1.0,
-        "min" => 60.0,
+        "min" | "m" => 60.0,
         "h" => 3600.0,
         _ => return None,
     };
@@ -38,6 +38,7 @@ mod tests {
     fn texts_are_read_and_written() {
         assert_eq!(parse("0.5ms"), Some(Duration::from_micros(500)));
         assert_eq!(parse("2min"), Some(Duration::from_secs(120)));
+        assert_eq!(parse("10m"), parse("10min"));
         assert_eq!(parse("10 s"), Some(Duration::from_secs(10)));
         for bad in ["", "10", "ms", "-1s", "1d", "1.2.3s", "1e3s"] {
             assert_eq!(parse(bad), None, "{bad}");

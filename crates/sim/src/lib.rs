@@ -4,7 +4,7 @@
 //!
 //! - `motor`, `parameter_set`, `model`: what all drives have, and what a drive is to the line.
 //! - [`nx`] (Vacon NX, Eaton SVX and HVX), `cx` (Vacon CX), `teco` (TECO 7300PA): what the drives with their boards
-//!   do, asked by Modbus PDUs (pure); and `autopilot`, which runs one in a demo.
+//!   do, [`by_profile`] what a drive of any other profile does, asked by Modbus PDUs (pure); and `autopilot`, which runs one in a demo.
 //! - [`simulated_drive`]: a drive of any model with its autopilot and its power switch; [`slave`]: all drives of a line, frames
 //!   in and replies out.
 //! - `n2`: the N2 board that a drive may have in the place of its Modbus board.
@@ -21,6 +21,7 @@ use std::time::Duration;
 
 pub(crate) mod autopilot;
 pub mod broker;
+pub mod by_profile;
 pub mod cx;
 pub mod endpoint;
 pub mod faults;
@@ -46,7 +47,6 @@ use drivegate_core::command;
 use drivegate_core::parameters;
 use drivegate_line as line;
 use drivegate_model::document;
-#[cfg(test)]
 use drivegate_model::drive;
 use drivegate_proto as codec;
 

@@ -2,13 +2,16 @@
 
 use super::SimTime;
 use super::autopilot::Autopilot;
+use super::by_profile::{ProfileDrive, ProfileOptions};
 use super::cx::{CxDrive, CxOptions};
 use super::model::{Command, DriveState, Model};
 use super::nx::{NxDrive, NxOptions};
 use super::random::Random;
 use super::teco::{TecoDrive, TecoOptions};
 use crate::codec::{Exception, Reply, RequestPdu};
+use crate::drive::Profile;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 pub use super::parameter_set::Writes;
@@ -36,6 +39,8 @@ pub enum ModelOptions {
     Cx(CxOptions),
     /// TECO 7300PA with its PA-C card.
     Teco(TecoOptions),
+    /// A drive of any profile.
+    Profile(ProfileOptions),
 }
 
 impl ModelOptions {
@@ -54,12 +59,21 @@ impl ModelOptions {
         })
     }
 
+    /// The drive that a profile describes: the model that it names, else what its points and its `[control]` say. `None` for what is
+    /// not simulated.
+    pub fn of_profile(profile: &Arc<Profile>) -> Option<ModelOptions> {
+        let named = profile.simulator.as_deref().and_then(ModelOptions::by_name);
+        let by_profile = || ProfileOptions::knows(profile).then(|| ModelOptions::Profile(ProfileOptions::new(profile)));
+        named.or_else(by_profile)
+    }
+
     /// Gives the drive the simulator's own register that trips a fault, or takes it away.
     pub fn set_trip_register(&mut self, on: bool) {
         match self {
             ModelOptions::Nx(nx) => nx.trip_register = on,
             ModelOptions::Cx(cx) => cx.trip_register = on,
             ModelOptions::Teco(teco) => teco.trip_register = on,
+            ModelOptions::Profile(of) => of.trip_register = on,
         }
     }
 
@@ -69,6 +83,7 @@ impl ModelOptions {
             ModelOptions::Nx(_) => NxOptions::TRIP_ADDRESS,
             ModelOptions::Cx(_) => CxOptions::TRIP_ADDRESS,
             ModelOptions::Teco(_) => TecoOptions::TRIP_ADDRESS,
+            ModelOptions::Profile(of) => of.trip_address(),
         }
     }
 
@@ -77,6 +92,7 @@ impl ModelOptions {
         match self {
             ModelOptions::Nx(_) | ModelOptions::Cx(_) => None,
             ModelOptions::Teco(teco) => teco.turnaround,
+            ModelOptions::Profile(of) => of.turnaround,
         }
     }
 
@@ -85,6 +101,7 @@ impl ModelOptions {
         match self {
             ModelOptions::Nx(_) | ModelOptions::Cx(_) => {}
             ModelOptions::Teco(teco) => teco.turnaround = None,
+            ModelOptions::Profile(of) => of.turnaround = None,
         }
     }
 }
@@ -110,6 +127,7 @@ enum AnyModel {
     Nx(NxDrive),
     Cx(CxDrive),
     Teco(TecoDrive),
+    Profile(Box<ProfileDrive>),
 }
 
 impl AnyModel {
@@ -118,6 +136,7 @@ impl AnyModel {
             AnyModel::Nx(drive) => drive,
             AnyModel::Cx(drive) => drive,
             AnyModel::Teco(drive) => drive,
+            AnyModel::Profile(drive) => drive.as_ref(),
         }
     }
 
@@ -126,6 +145,7 @@ impl AnyModel {
             AnyModel::Nx(drive) => drive,
             AnyModel::Cx(drive) => drive,
             AnyModel::Teco(drive) => drive,
+            AnyModel::Profile(drive) => drive.as_mut(),
         }
     }
 }
@@ -150,6 +170,7 @@ impl SimulatedDrive {
                 ModelOptions::Nx(nx) => AnyModel::Nx(NxDrive::new(nx, now)),
                 ModelOptions::Cx(cx) => AnyModel::Cx(CxDrive::new(cx, now)),
                 ModelOptions::Teco(teco) => AnyModel::Teco(TecoDrive::new(teco, now)),
+                ModelOptions::Profile(of) => AnyModel::Profile(Box::new(ProfileDrive::new(of, now))),
             },
             autopilot: options.autopilot.map(|seed| Autopilot::new(seed, now)),
             alive: true,

@@ -91,7 +91,7 @@ struct Request<'a> {
 
 pub(super) fn run(args: &Args) -> ExitCode {
     let path = args.config.path();
-    let mut loaded = Settings::load(path, environment());
+    let mut loaded = Settings::load_proved(path, environment());
     if args.as_service {
         loaded.errors.extend(as_service::problems(path));
         loaded.settings = loaded.settings.filter(|_| loaded.errors.is_empty());

@@ -54,7 +54,7 @@ impl Loading {
         let path = path.to_path_buf();
         let read = move || {
             // Nobody listens after the time limit.
-            let _ = sender.send(Settings::load(&path, config::environment()));
+            let _ = sender.send(Settings::load_proved(&path, config::environment()));
             drop(reader);
         };
         std::thread::Builder::new().name("load".to_string()).spawn(read)?;

@@ -171,10 +171,7 @@ fn list(profiles: &Profiles) -> String {
             profile.points.len().to_string(),
             protocols(profile),
             origin(profile).to_string(),
-            match profile.verified {
-                true => profile.title.clone(),
-                false => format!("{} ({NOT_VERIFIED})", profile.title),
-            },
+            profile.described().into_owned(),
         ]);
     }
     report::lines(&table)
@@ -196,7 +193,7 @@ fn show(profile: &Profile) -> String {
     } else {
         bauds.join(", ")
     };
-    let mut text = format!("{}: {}\n\n", profile.name, printable::line(&profile.title));
+    let mut text = format!("{}: {}\n\n", profile.name, printable::line(&profile.described()));
     for (what, value) in [
         ("origin", origin(profile).to_string()),
         ("verified", unverified(profile).to_string()),

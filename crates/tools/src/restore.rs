@@ -145,7 +145,10 @@ fn check(staging: &Staging, name: &std::ffi::OsStr, manifest: &Manifest, base: &
             staging.borrow(below, &base.join(below))?;
         }
     }
-    Ok(Settings::load(staging.of(Root::Config).join(name), environment()))
+    Ok(Settings::load_proved(
+        staging.of(Root::Config).join(name),
+        environment(),
+    ))
 }
 
 fn summary(manifest: &Manifest, placed: &[PathBuf]) -> String {

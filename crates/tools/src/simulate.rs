@@ -6,9 +6,12 @@ use super::addresses::{Addresses, parse_addresses};
 use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{self, BusSettings, Settings, default_format};
-use crate::document::nearest;
+use crate::document::{self, Problem, nearest};
+use crate::drive::Point;
+use crate::drive::model::Kind;
 use crate::drive::profile::{Profile, Profiles};
 use crate::process_image::DriveSpec;
+use crate::sim::by_profile::Given;
 use crate::sim::cx::AddressOffset;
 use crate::sim::endpoint::EndpointOptions;
 use crate::sim::faults::{FaultPlan, NAMES, Rates};
@@ -18,6 +21,7 @@ use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::time::Duration;
 
 /// Simulates drives on a pseudo-terminal, a real port or a TCP port, with wire timing and faults
@@ -26,19 +30,27 @@ use std::time::Duration;
   drivegate simulate --addresses 1-10 --link /tmp/line1 --baud 38400
   drivegate simulate --addresses 1,2 --link /tmp/line1 --fault drop=0.01,late:150ms=0.01 --seed 7
   drivegate simulate --profile teco-7300pa --addresses 1-3 --link /tmp/line2
+  drivegate simulate --profile our-meter.toml --set voltage_l1=231.5 --link /tmp/line3
   drivegate simulate --config drivegate.toml
 
 Faults: {NAMES}.
 
 A simulated drive obeys the bus. Writing a fault, as its registers show it, to a holding register that no real drive \
-has trips it; PDU address by the key `simulator` of the profile: {}.", trip_registers()))]
+has trips it; PDU address by the key `simulator` of the profile: {}; others 9998. So does the signal USR1 with all \
+drives of the process; USR2 gives them to their panels, or back to the bus.", trip_registers()))]
 pub(super) struct Args {
     /// Simulate every bus of a gateway configuration, each under its own `port`
     #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "protocol", "baud", "format"])]
     pub config: Option<PathBuf>,
-    /// Profile of the drives
+    /// Profile of the drives: its name, or a file *.toml
     #[arg(long, value_name = "PROFILE", default_value = "vacon-nx")]
     pub profile: String,
+    /// Include the profiles (*.toml) of this directory; may be repeated
+    #[arg(long, value_name = "DIR", conflicts_with = "config")]
+    pub profile_dir: Vec<PathBuf>,
+    /// What a point of a profile without a simulator of its own shows, such as voltage_l1=231.5; may be repeated
+    #[arg(long, value_name = "POINT=VALUE", conflicts_with = "config")]
+    pub set: Vec<String>,
     /// Their addresses, such as 1-10 or 1,2,7
     #[arg(long, value_name = "LIST", default_value = "1", value_parser = parse_addresses)]
     pub addresses: Addresses,
@@ -116,9 +128,59 @@ fn parse_protocol(text: &str) -> Result<Protocol, String> {
     Protocol::from_name(text).ok_or_else(|| format!("unknown protocol `{text}`; write {}", known.join(", ")))
 }
 
-/// The simulated drive that a profile names.
-fn model_of(profile: &Profile) -> Option<ModelOptions> {
-    profile.simulator.as_deref().and_then(ModelOptions::by_name)
+/// The simulated drive of a profile.
+///
+/// # Errors
+/// What of it cannot be simulated.
+fn model_of(profile: &Arc<Profile>) -> Result<ModelOptions, String> {
+    ModelOptions::of_profile(profile).ok_or_else(|| match &profile.simulator {
+        Some(name) if ModelOptions::by_name(name).is_none() && !profile.protocols.contains(&Protocol::N2) => format!(
+            "the profile `{}` has the unknown simulator `{name}`; omit the key `simulator`",
+            profile.name
+        ),
+        _ => format!(
+            "drives of the profile `{}` cannot be simulated, because they speak Metasys N2 and no family is simulated like them; \
+             choose another",
+            profile.name
+        ),
+    })
+}
+
+/// `POINT=VALUE`, the value as the point has it.
+fn given(text: &str, profile: &Profile) -> Result<(usize, Given), String> {
+    let (name, value) = text
+        .split_once('=')
+        .ok_or_else(|| format!("`{text}` has no value; in --set; write POINT=VALUE, such as voltage_l1=231.5"))?;
+    let found = profile
+        .points
+        .iter()
+        .position(|point| point.name == name && point.raw().is_some());
+    let found = found.and_then(|index| profile.points.get(index).map(|point| (index, point)));
+    let (index, point) = found.ok_or_else(|| {
+        let own = |point: &&Point| point.raw().is_some();
+        let names = profile.points.iter().filter(own).map(|point| point.name.as_str());
+        let near = nearest(name, names).map(|near| format!("; did you mean `{near}`?"));
+        format!(
+            "the profile `{}` has no point `{name}` with a register of its own; in --set{}",
+            profile.name,
+            near.unwrap_or_default()
+        )
+    })?;
+    let number = match value {
+        _ if point.kind() == Kind::Text => return Ok((index, Given::Text(value.to_string()))),
+        "true" => Some(1.0),
+        "false" => Some(0.0),
+        text => point
+            .code_of(text)
+            .map(|code| code as f64)
+            .or_else(|| text.parse().ok()),
+    };
+    match number.filter(|number: &f64| number.is_finite()) {
+        Some(number) => Ok((index, Given::Number(number))),
+        None => Err(format!(
+            "`{value}` is not a value of `{name}`; in --set; write a number, true or false"
+        )),
+    }
 }
 
 /// How fast the simulated lines are.
@@ -170,10 +232,7 @@ fn configured(file: &Path) -> Result<Vec<SimulatedBusOptions>, ExitCode> {
 
 fn line_of(bus: &BusSettings) -> Result<SimulatedBusOptions, String> {
     let drive = |spec: &DriveSpec| {
-        let model = model_of(&spec.profile).ok_or_else(|| {
-            let (name, profile) = (&spec.name, &spec.profile.name);
-            format!("drives of the profile `{profile}` cannot be simulated; drive `{name}`; give it another profile")
-        })?;
+        let model = model_of(&spec.profile).map_err(|why| format!("{why}; drive `{}`", spec.name))?;
         Ok(DriveOptions::new(spec.address, model))
     };
     let drives = bus.drives.iter().map(drive).collect::<Result<_, String>>()?;
@@ -224,23 +283,23 @@ fn failed(code: u8, message: &str) -> ExitCode {
 impl Args {
     /// The line of the command line.
     fn line(&self) -> Result<SimulatedBusOptions, String> {
-        let profiles = Profiles::built_in();
-        let profile = profiles.get(&self.profile).ok_or_else(|| {
-            let near = nearest(&self.profile, profiles.names()).map(|name| format!("; did you mean `{name}`?"));
-            let known: Vec<&str> = profiles.names().collect();
-            let known = format!("; known profiles: {}", known.join(", "));
-            format!(
-                "unknown profile `{}`; in --profile{}",
-                self.profile,
-                near.unwrap_or(known)
-            )
-        })?;
-        let model = model_of(profile).ok_or_else(|| {
-            format!(
-                "drives of the profile `{}` cannot be simulated; in --profile; choose another",
-                self.profile
-            )
-        })?;
+        let mut profiles = Profiles::built_in();
+        let problems: Vec<Problem> = self.profile_dir.iter().flat_map(|dir| profiles.load(dir)).collect();
+        let profile = self.profile_of(&profiles, problems)?;
+        let mut model = model_of(&profile).map_err(|why| format!("{why}; in --profile"))?;
+        match &mut model {
+            ModelOptions::Profile(of) => {
+                let given = self.set.iter().map(|text| given(text, &profile));
+                of.values = given.collect::<Result<_, String>>()?;
+            }
+            _ if !self.set.is_empty() => {
+                return Err(format!(
+                    "the values of `{}` come from its simulated motor; in --set; omit it",
+                    self.profile
+                ));
+            }
+            _ => {}
+        }
         if self.cx_address_offset.is_some() && !matches!(model, ModelOptions::Cx(_)) {
             return Err(format!(
                 "drives of the profile `{}` have no address offset; in --cx-address-offset; omit it, or choose \
@@ -248,7 +307,7 @@ impl Args {
                 self.profile
             ));
         }
-        let protocol = self.protocol_of(profile, &profiles)?;
+        let protocol = self.protocol_of(&profile, &profiles)?;
         if let Some(address) = self
             .addresses
             .0
@@ -277,6 +336,33 @@ impl Args {
             },
         };
         Ok(line)
+    }
+
+    /// The profile of that name, or that file.
+    fn profile_of(&self, known: &Profiles, problems: Vec<Problem>) -> Result<Arc<Profile>, String> {
+        let all = |problems: Vec<Problem>| {
+            let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
+            lines.join("\n")
+        };
+        if !problems.is_empty() {
+            return Err(all(problems));
+        }
+        if let Some(profile) = known.get(&self.profile) {
+            return Ok(Arc::clone(profile));
+        }
+        if self.profile.ends_with(".toml") {
+            let text = document::read_file(Path::new(&self.profile)).map_err(|problem| problem.to_string())?;
+            let profile = Profile::parse_over(&self.profile, &text, false, known).map_err(all)?;
+            return Ok(Arc::new(profile));
+        }
+        let near = nearest(&self.profile, known.names()).map(|name| format!("; did you mean `{name}`?"));
+        let names: Vec<&str> = known.names().collect();
+        let names = format!("; write a file *.toml, or one of {}", names.join(", "));
+        Err(format!(
+            "unknown profile `{}`; in --profile{}",
+            self.profile,
+            near.unwrap_or(names)
+        ))
     }
 
     /// Protocol of the drives: as requested, or the first of the profile.

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use super::drive_access::target;
 use super::{EXIT_FAILED, printable, report};
+use crate::drive::Profile;
 use crate::drive::why::Explanation;
 use crate::north::local::protocol::{Outcome, Request, WhyRequest};
 
@@ -44,7 +45,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Ok(explanation) if args.json => {
             report::print(&(serde_json::to_string_pretty(&explanation).unwrap_or_default() + "\n"))
         }
-        Ok(explanation) => report::print(&text(&args.drive, &explanation)),
+        Ok(explanation) => report::print(&text(&args.drive, &explanation, &target.spec.profile)),
         Err(message) => {
             report::error(&message);
             ExitCode::from(EXIT_FAILED)
@@ -52,7 +53,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     }
 }
 
-fn text(drive: &str, explanation: &Explanation) -> String {
+fn text(drive: &str, explanation: &Explanation, profile: &Profile) -> String {
     let mut text = match explanation.runs {
         Some(true) => format!("{drive} runs\n"),
         Some(false) => format!("{drive} does not run\n"),
@@ -73,6 +74,13 @@ fn text(drive: &str, explanation: &Explanation) -> String {
             explanation.not_told.join(", ")
         );
     }
+    if !profile.verified {
+        let _ = write!(
+            text,
+            "\n  the profile {} is not verified on hardware: what it takes the drive's state for may be wrong\n",
+            profile.name
+        );
+    }
     text
 }
 
@@ -88,6 +96,7 @@ fn seconds(age: Duration) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::drive::profile::Profiles;
     use crate::drive::why::Cause;
 
     #[test]
@@ -105,11 +114,15 @@ mod tests {
         };
         let expected = "fan-1 does not run\n\n  interlocked: interlocked is on (0.1 s ago)\n      close it\n\n  \
                         not known, because the drive does not tell: enable input\n";
-        assert_eq!(text("fan-1", &explanation), expected);
+        let profiles = Profiles::built_in();
+        let [known, doubtful] = ["vacon-nx", "yaskawa-v1000"].map(|name| profiles.get(name).unwrap());
+        assert_eq!(text("fan-1", &explanation, known), expected);
+        let doubt = text("fan-1", &explanation, doubtful);
+        assert!(doubt.starts_with(expected) && doubt.contains("yaskawa-v1000 is not verified on hardware"));
         let runs = Explanation {
             runs: Some(true),
             ..Explanation::default()
         };
-        assert_eq!(text("fan-1", &runs), "fan-1 runs\n");
+        assert_eq!(text("fan-1", &runs, known), "fan-1 runs\n");
     }
 }

@@ -552,11 +552,18 @@ pub(crate) fn plant(drives: &[&str]) -> Plant {
     plant
 }
 
+/// A broker of this machine.
+pub(crate) fn at(port: u16) -> mqtt::Broker {
+    mqtt::Broker {
+        host: "127.0.0.1".to_string(),
+        port,
+    }
+}
+
 /// Options for a broker on that port; commands are served.
 pub(crate) fn options(port: u16) -> Options {
     Options {
-        host: "127.0.0.1".to_string(),
-        port,
+        brokers: vec![at(port)],
         tls: false,
         client_id: "drivegate-hall".to_string(),
         username: None,
@@ -572,6 +579,7 @@ pub(crate) fn options(port: u16) -> Options {
         telemetry_qos: Qos::AtMostOnce,
         event_qos: Qos::AtLeastOnce,
         expiry: None,
+        message_expiry: None,
         min_interval: Duration::from_millis(40),
         max_interval: Duration::from_secs(60),
         commands: true,

@@ -4,6 +4,7 @@ mod bench;
 mod certificates;
 mod commands;
 mod delivery;
+mod failover;
 mod home_assistant;
 mod hostile;
 mod sparkplug;

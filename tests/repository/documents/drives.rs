@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use drivegate::codec::{N2Options, Protocol, Table, n2};
 use drivegate::drive::profile::{Form, Profile, Profiles};
-use drivegate::drive::{Bound, Derived, ModelPoint, Point, Source, Value};
+use drivegate::drive::{Bound, Derived, ModelPoint, Point, PollClass, Source, Value};
 
 /// The families, Modbus first.
 const MODBUS: [&str; 5] = ["vacon-nx", "eaton-svx", "eaton-hvx", "vacon-cx", "teco-7300pa"];
@@ -166,6 +166,9 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
     }
 }
 
+/// Points that are read on request only, up to which all of them are listed.
+const MOST_ON_REQUEST: usize = 30;
+
 /// The points of a family beyond the common model.
 fn family(profile: &Profile) -> String {
     let doubtful = profile.points.iter().filter(|p| !p.verified).count();
@@ -177,7 +180,11 @@ fn family(profile: &Profile) -> String {
         let _ = write!(text, " Not verified: {doubtful} of {} points.", profile.points.len());
     }
     text += "\n\n|point|unit|address|class|commands|note|\n|---|---|---|---|---|---|\n";
-    for point in profile.points.iter().filter(|p| p.model.is_none()) {
+    let on_request = |p: &&Point| p.raw().is_some() && p.class == PollClass::Never;
+    let many = profile.points.iter().filter(on_request).count();
+    let left_out = many > MOST_ON_REQUEST;
+    let points = profile.points.iter().filter(|p| p.model.is_none());
+    for point in points.filter(|p| !(left_out && on_request(p))) {
         let class = if point.raw().is_some() { point.class.name() } else { "" };
         let range = point.range.as_ref().map(|r| format!("{} to {}", r.start(), r.end()));
         let write = match (point.write, &range) {
@@ -205,6 +212,13 @@ fn family(profile: &Profile) -> String {
             point.unit,
             place(profile, point),
             note.join("; ")
+        );
+    }
+    if left_out {
+        let _ = write!(
+            text,
+            "\nAnd {many} parameters, read on request only: `drivegate profiles show {}`.\n",
+            profile.name
         );
     }
     let rules: Vec<String> = profile

@@ -147,8 +147,13 @@ impl Cov {
         for (device, all) in &mut self.of {
             all.retain(|subscription| {
                 let keeps = keep(*device, subscription);
-                if !keeps && let Some(count) = self.hosts.get_mut(&subscription.key.subscriber.ip()) {
+                let subscriber = subscription.key.subscriber;
+                if !keeps && let Some(count) = self.hosts.get_mut(&subscriber.ip()) {
                     *count = count.saturating_sub(1);
+                }
+                let of_it = |o: &Outstanding| (o.device, o.key) == (*device, subscription.key);
+                if !keeps && self.outstanding.get(&subscriber).is_some_and(of_it) {
+                    self.outstanding.remove(&subscriber);
                 }
                 keeps
             });
@@ -310,6 +315,23 @@ mod tests {
             number: Some(number),
             rest: vec![rest],
         }
+    }
+
+    #[test]
+    fn what_is_not_acknowledged_ends_with_its_subscription() {
+        let now = Instant::now();
+        let mut cov = Cov::default();
+        for n in 0..10_000_u32 {
+            let key = Key {
+                subscriber: Address::local(format!("10.0.0.1:{}", 1000 + n % 60_000).parse().unwrap()),
+                ..key(1, n)
+            };
+            assert!(cov.subscribe(1, key, (true, 0), None, now));
+            cov.sent(1, key, n as u8, vec![0; 50], now);
+            cov.cancel(1, &key);
+        }
+        assert_eq!(cov.outstanding.len(), 0);
+        assert!(cov.poll(now + WAIT).is_empty());
     }
 
     #[test]

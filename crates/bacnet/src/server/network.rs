@@ -18,6 +18,10 @@ const OTHER: u8 = 0;
 impl Server {
     /// A datagram came.
     pub fn receive(&mut self, from: SocketAddrV4, bytes: &[u8], app: &dyn Application, now: Instant) {
+        // An own broadcast comes back.
+        if from == self.options.address {
+            return;
+        }
         let Some(datagram) = bvlc::decode(bytes) else {
             self.counters.discarded += 1;
             return;
@@ -30,7 +34,7 @@ impl Server {
             Bvlc::Forwarded(origin, _) => passed_on && app.admits(*origin.ip()),
             _ => app.admits(*from.ip()),
         };
-        if !admitted || from == self.options.address {
+        if !admitted {
             self.counters.discarded += 1;
             return;
         }

@@ -11,6 +11,18 @@ use crate::object::{Context, Device, cov_value, property};
 use crate::services::{PropertyRef, Subscribe, confirmed, unconfirmed};
 use crate::types::{Address, Error, ObjectId, ObjectType, PropertyId, WILDCARD};
 
+/// What no subscription can be to: several properties at once, clocks, and what a notification itself changes.
+const NEVER_TOLD: [PropertyId; 6] = [
+    PropertyId::ALL,
+    PropertyId::REQUIRED,
+    PropertyId::OPTIONAL,
+    PropertyId::LOCAL_DATE,
+    PropertyId::LOCAL_TIME,
+    PropertyId::ACTIVE_COV_SUBSCRIPTIONS,
+];
+/// Longest value of a notification, which comes in one message.
+const LONGEST: usize = 1024;
+
 /// The properties that a subscription is told.
 fn told_of(of: &Context<'_>, one: Option<PropertyRef>) -> Vec<PropertyRef> {
     let whole = |property: PropertyId| PropertyRef { property, index: None };
@@ -52,15 +64,15 @@ impl Server {
         };
         let known = self.with_object(device, object, app, now, |of| match key.property {
             None => Ok(()),
-            Some(one)
-                if matches!(
-                    one.property,
-                    PropertyId::ALL | PropertyId::REQUIRED | PropertyId::OPTIONAL
-                ) =>
-            {
-                Err(Error::NOT_COV_PROPERTY)
+            Some(one) if NEVER_TOLD.contains(&one.property) => Err(Error::NOT_COV_PROPERTY),
+            Some(one) => {
+                let mut value = Writer::default();
+                property(&mut value, of, one, &self.environment)?;
+                match value.bytes().len() <= LONGEST {
+                    true => Ok(()),
+                    false => Err(Error::NOT_COV_PROPERTY),
+                }
             }
-            Some(one) => property(&mut Writer::default(), of, one, &self.environment),
         });
         known.unwrap_or(Err(Error::UNKNOWN_OBJECT))?;
         let increment = asked.property.and_then(|(_, increment)| increment);
@@ -78,8 +90,10 @@ impl Server {
             let (number, flags) = of.figure();
             for one in told_of(of, key.property) {
                 let mut value = Writer::default();
-                // What is not there any more is told as nothing.
-                let _ = property(&mut value, of, one, &self.environment);
+                // What is not there any more, or too long by now, is told as nothing.
+                if property(&mut value, of, one, &self.environment).is_err() || value.bytes().len() > LONGEST {
+                    value = Writer::default();
+                }
                 values.context_property(0, one.property);
                 if let Some(index) = one.index {
                     values.context_unsigned(1, index.into());

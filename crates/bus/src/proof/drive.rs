@@ -87,10 +87,7 @@ impl<'p> Drive<'p> {
             fault: false,
             local: false,
         };
-        let reverse = match start {
-            Start::Running { reverse: true } => true,
-            _ => false,
-        };
+        let reverse = start == Start::Running { reverse: true };
         if reverse && control.reverse.is_none() && !matches!(control.run, Run::Pair { .. }) {
             return None;
         }

@@ -107,6 +107,8 @@ pub struct SlotWrite {
     pub entry: Option<Entry>,
     /// Slots that are given back with it: their owners' orders were refused when they came to govern.
     pub also: Vec<(Commanded, u8)>,
+    /// The entry that comes to govern by it, as it was planned.
+    heir: Option<u64>,
 }
 
 impl SlotWrite {
@@ -118,7 +120,14 @@ impl SlotWrite {
             priority,
             entry,
             also: Vec::new(),
+            heir: None,
         }
+    }
+
+    /// The same, planned when that came to govern by it.
+    pub fn in_favour_of(mut self, entry: &Entry) -> SlotWrite {
+        self.heir = Some(entry.number);
+        self
     }
 }
 
@@ -321,6 +330,27 @@ impl Priorities {
             (None, Some((what, _, next))) => Follows::Order(what, next.clone()),
             (None, None) if write.what == Commanded::Run => Follows::Stop,
             (None, None) => Follows::Nothing,
+        }
+    }
+
+    /// Whether the order that was planned still follows from a write: other sides may have withdrawn its slot since.
+    pub fn still_follows(&self, write: &SlotWrite) -> bool {
+        match self.plan(write) {
+            Follows::Order(_, entry) => write.heir.is_none_or(|heir| heir == entry.number),
+            Follows::Nothing | Follows::Stop => false,
+        }
+    }
+
+    /// Whether a write to a slot of `run` is a stop: an inactive that governs, or a slot given back to no active.
+    pub fn stops(&self, priority: u8, value: Option<bool>) -> bool {
+        let below = |(_, governs, _): (Commanded, u8, &Entry)| governs < priority;
+        match value {
+            Some(true) => false,
+            Some(false) => !self.counting(Commanded::Run).is_some_and(below),
+            None => match self.plan(&SlotWrite::new(Commanded::Run, priority, None)) {
+                Follows::Order(_, entry) => !entry.value.as_bool(),
+                Follows::Nothing | Follows::Stop => true,
+            },
         }
     }
 

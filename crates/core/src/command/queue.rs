@@ -132,6 +132,12 @@ impl Pending {
             command.answer(&Outcome::Refused(refusal), now);
             return;
         }
+        if let Some(write) = &command.slot
+            && !self.priorities.entry(command.drive).or_default().still_follows(write)
+        {
+            command.answer(&Outcome::Replaced, now);
+            return;
+        }
         if self.is_behind_its_stop(&command) {
             command.answer(&Outcome::Purged, now);
             return;

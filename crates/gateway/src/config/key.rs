@@ -11,7 +11,7 @@ use crate::codec::Protocol;
 use crate::document::{Document, Finding, FromNode, Place, Reader, ValueError, format_duration};
 
 /// A number and a unit, as [`crate::document::parse_duration`] reads it.
-pub(super) const DURATION: &str = r"^\s*(\d+\.?\d*|\.\d+)\s*(us|µs|ms|s|min|h)\s*$";
+pub(super) const DURATION: &str = r"^\s*(\d+\.?\d*|\.\d+)\s*(us|µs|ms|s|min|m|h)\s*$";
 /// As [`crate::document::parse_size`] reads it.
 pub(super) const SIZE: &str = r"^\s*\d+\s*(B|KiB|MiB|GiB)\s*$";
 

@@ -456,6 +456,10 @@ keys! {
             parse: mqtt::parse_url, words: &[], pattern: "^mqtts?://",
             range: "\"mqtt://host[:port]\" or \"mqtts://host[:port]\"",
         }, default "mqtt://127.0.0.1:1883";
+        /// [Further brokers](mqtt.md#several-brokers), tried in order after `url`; with its credentials, all `mqtts://` or none.
+        urls: Vec<mqtt::Broker> = List {
+            parse: mqtt::parse_url, empty: None, range: "addresses such as [\"mqtt://broker-2:1883\"]",
+        }, default [];
         /// Client id, unique on the broker.
         client_id: String = Parsed { parse: mqtt::parse_client_id, words: &[], pattern: "", range: "a string in quotes" },
             or "`drivegate-` and the gateway's name";
@@ -484,6 +488,8 @@ keys! {
         qos: Present = Own { schema: MqttQos::schema, range: "[mqtt.qos]" }, or "the defaults";
         /// The broker drops telemetry that is older (message expiry); `"0s"` is never.
         expiry: Duration = Time(Duration::ZERO..=Duration::from_secs(365 * 86_400)), default "5min";
+        /// The broker drops `online`, and telemetry at the latest, after this time; renewed after half of it; `"0s"` is never.
+        message_expiry: Duration = Time(Duration::ZERO..=Duration::from_secs(365 * 86_400)), default "10min";
         /// Values of an outage that are published afterwards, on `history` topics: those that changed, or all samples.
         history: History = Words(&[
             ("off", History::Off), ("changes", History::Changes), ("all", History::All),

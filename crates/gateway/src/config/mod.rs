@@ -34,8 +34,8 @@ pub use log::parse_level;
 pub use named_files::{FileKind, NamedFile, named_files};
 pub use params::ParamsSettings;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::Duration;
 
 use crate::bus::predict::{self, Prediction};
@@ -165,6 +165,14 @@ impl Settings {
                 warnings: Vec::new(),
             },
         }
+    }
+
+    /// Like [`Settings::load`], for who is going to command the drives: the commands of the user's profiles are proved, too.
+    pub fn load_proved(path: impl AsRef<Path>, env: impl Iterator<Item = (String, String)>) -> Loaded {
+        let mut loaded = Settings::load(path, env);
+        loaded.errors.extend(loaded.settings.iter().flat_map(unsafe_commands));
+        loaded.settings = loaded.settings.filter(|_| loaded.errors.is_empty());
+        loaded
     }
 
     /// Like [`Settings::load`], with `source` as the text of the file.
@@ -437,7 +445,6 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
             ),
         }
     }
-    errors.extend(unsafe_commands(&profiles));
     reader.finish();
     Gateway {
         name,
@@ -449,10 +456,14 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
     }
 }
 
-/// The user's profiles by which a command does what it must not; those of the program are proved by its tests.
-fn unsafe_commands(profiles: &Profiles) -> Vec<Problem> {
-    let own = profiles.iter().filter(|profile| !profile.built_in);
-    let problem = |profile: &Arc<Profile>| {
+/// The user's profiles in use by which a command does what it must not; those of the program are proved by its tests.
+fn unsafe_commands(settings: &Settings) -> Vec<Problem> {
+    let drives = settings.buses.iter().flat_map(|bus| &bus.drives);
+    let commanded = drives.filter(|drive| drive.access == Access::Control && !drive.profile.built_in);
+    let own: BTreeMap<&str, &Profile> = commanded
+        .map(|drive| (drive.profile.name.as_str(), &*drive.profile))
+        .collect();
+    let problem = |profile: &Profile| {
         let counterexample = proof::prove(profile).err()?;
         let finding = Finding::new(
             counterexample.line(),
@@ -464,7 +475,7 @@ fn unsafe_commands(profiles: &Profiles) -> Vec<Problem> {
             finding,
         ))
     };
-    own.filter_map(problem).collect()
+    own.into_values().filter_map(problem).collect()
 }
 
 fn read_socket(reader: &Reader<'_>, base: &Path) -> SocketPath {

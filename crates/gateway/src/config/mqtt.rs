@@ -10,7 +10,7 @@ use super::key::Key;
 use super::keys::{BUFFER, MQTT, MQTT_HOME_ASSISTANT, MQTT_QOS, PUBLISH, SPARKPLUG};
 use super::{files, values};
 use crate::document::{Finding, FromNode, Reader, format_duration, parse_size};
-use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry, sparkplug};
+use crate::north::mqtt::{self, Buffer, Options, Qos, Secret, Telemetry, sparkplug};
 use crate::north::{ServerIdentity, TlsFile};
 
 /// Most bytes of a secret: a longer file is not a password.
@@ -29,7 +29,7 @@ pub(super) enum TelemetryTopic {
     Points,
 }
 
-/// Where the broker is.
+/// Where a broker is.
 pub(super) struct Broker {
     host: String,
     port: u16,
@@ -46,10 +46,39 @@ impl Broker {
     }
 }
 
+/// Most brokers: all of them are tried within 10 s, three a second.
+const MOST_BROKERS: usize = 16;
+
+/// `url` and `urls`, in this order.
+fn read_brokers(reader: &Reader<'_>) -> Option<Vec<Broker>> {
+    let (first, more) = (MQTT.url.read(reader), MQTT.urls.get(reader));
+    let brokers: Vec<Broker> = std::iter::once(first?).chain(more).collect();
+    let mut before: Vec<(&str, u16)> = Vec::new();
+    for broker in &brokers {
+        let (address, tls) = ((broker.host.as_str(), broker.port), broker.tls);
+        let shown = format!("{}:{}", broker.host, broker.port);
+        if brokers.first().is_some_and(|first| first.tls != tls) {
+            let what = format!("{shown} uses another scheme than mqtt.url");
+            reader.problem(MQTT.urls.name, what, "write mqtts:// for all brokers or for none");
+        }
+        if before.contains(&address) {
+            let what = format!("the broker {shown} is there twice");
+            reader.problem(MQTT.urls.name, what, "remove it from urls");
+        }
+        before.push(address);
+    }
+    if brokers.len() > MOST_BROKERS {
+        let what = format!("there are {} brokers, with that of mqtt.url", brokers.len());
+        reader.problem(MQTT.urls.name, what, format!("name {MOST_BROKERS} at most"));
+    }
+    Some(brokers)
+}
+
 /// `gateway` and `state_dir` are those of the gateway.
 pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, state_dir: &Path) -> Option<Options> {
-    let broker = MQTT.url.read(reader);
-    let tls = broker.as_ref().is_some_and(|b| b.tls);
+    let brokers = read_brokers(reader);
+    let all = || brokers.iter().flatten();
+    let tls = all().any(|broker| broker.tls);
     let client_id = MQTT.client_id.read(reader);
     let username = MQTT.username.read(reader);
     let password = read_password(reader, base);
@@ -63,15 +92,17 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
     }
     let ca = read_pem(reader, &MQTT.ca, base);
     let identity = read_identity(reader, base);
-    if !tls && broker.is_some() && (has(MQTT.ca.name) || has(MQTT.certificate.name)) {
+    if !tls && brokers.is_some() && (has(MQTT.ca.name) || has(MQTT.certificate.name)) {
         reader.warning(
             MQTT.url.name,
             "certificates are not used on an mqtt:// connection",
             "write mqtts:// for TLS",
         );
     }
-    if let Some(broker) = broker.as_ref().filter(|broker| broker.tls) {
-        check_certificates(reader, &broker.host, ca.as_deref(), identity.as_ref());
+    for (place, broker) in all().enumerate().filter(|(_, broker)| broker.tls) {
+        // The gateway's own certificate is the same for all.
+        let identity = identity.as_ref().filter(|_| place == 0);
+        check_certificates(reader, &broker.host, ca.as_deref(), identity);
     }
     let topics = MQTT.base.read(reader);
     let (min_interval, max_interval) = read_publish(reader)?;
@@ -83,20 +114,20 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
     };
     let (telemetry_qos, event_qos) = read_qos(reader);
     let expiry = read_expiry(reader, max_interval);
+    let message_expiry = Some(MQTT.message_expiry.get(reader)).filter(|expiry| !expiry.is_zero());
     let commands = MQTT.commands.get(reader);
     let require_id = MQTT.require_id.get(reader);
     let response_topics = read_response_topics(reader, topics.as_deref(), gateway);
-    if let Some(broker) = broker.as_ref().filter(|broker| !broker.tls && !broker.is_here()) {
+    for broker in all().filter(|broker| !broker.tls && !broker.is_here()) {
         warn_of_clear_text(reader, &broker.host, password.is_some(), commands);
     }
     let buffer = read_buffer(reader, base);
     let home_assistant = read_home_assistant(reader);
     let sparkplug = read_sparkplug(reader, gateway, state_dir);
     reader.finish();
-    let Broker { host, port, tls } = broker?;
+    let at = |Broker { host, port, .. }| mqtt::Broker { host, port };
     Some(Options {
-        host,
-        port,
+        brokers: brokers?.into_iter().map(at).collect(),
         tls,
         client_id: client_id.unwrap_or_else(|| format!("drivegate-{}", gateway.unwrap_or_default())),
         username,
@@ -108,6 +139,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
         telemetry_qos,
         event_qos,
         expiry,
+        message_expiry,
         min_interval,
         max_interval,
         commands,
@@ -459,6 +491,35 @@ pub(super) fn parse_buffer_size(text: &str) -> Result<u64, Finding> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Settings;
+
+    #[test]
+    fn brokers_are_tried_in_order_and_mistakes_named() {
+        let load = |mqtt: &str| {
+            let source = format!("[gateway]\nname = \"a\"\n[mqtt]\n{mqtt}\n");
+            Settings::parse("a.toml", &source, std::iter::empty())
+        };
+        let options = load("url = \"mqtt://b1\"\nurls = [\"mqtt://b2:1884\", \"mqtt://[::1]\"]").settings;
+        let options = options.unwrap().mqtt.unwrap();
+        let brokers: Vec<String> = options.brokers.iter().map(ToString::to_string).collect();
+        assert_eq!(brokers, ["b1:1883", "b2:1884", "[::1]:1883"]);
+        assert_eq!(options.message_expiry, Some(Duration::from_secs(600)));
+        let many: Vec<String> = (0..16).map(|n| format!("\"mqtt://b{n}\"")).collect();
+        let many = format!("urls = [{}]", many.join(", "));
+        for (mqtt, part) in [
+            ("urls = [\"mqtts://b\"]", "another scheme"),
+            ("urls = [\"mqtt://127.0.0.1\"]", "twice"),
+            ("urls = [\"http://b\"]", "not an MQTT address"),
+            ("urls = [\"mqtt://me:secret@b\"]", "contains a user"),
+            (many.as_str(), "17 brokers"),
+        ] {
+            let errors = load(mqtt).errors;
+            assert!(
+                matches!(errors.as_slice(), [error] if error.to_string().contains(part)),
+                "{mqtt}: {errors:?}"
+            );
+        }
+    }
 
     #[test]
     fn broker_addresses() {

@@ -218,7 +218,7 @@ sparkplug = { group = "plant", primary_host = "scada" }
     );
     assert_eq!(modbus.listeners[0].write[0].to_string(), "127.0.0.1/32");
     let mqtt = all.mqtt.as_ref().unwrap();
-    assert_eq!((mqtt.host.as_str(), mqtt.port, mqtt.tls), ("broker", 8883, true));
+    assert_eq!((mqtt.brokers[0].to_string().as_str(), mqtt.tls), ("broker:8883", true));
     assert_eq!(mqtt.client_id, "drivegate-pump-house");
     assert_eq!(mqtt.buffer.as_ref().unwrap().dir, Path::new("/etc/drivegate/spool"));
     let node = mqtt.sparkplug.as_ref().unwrap();

@@ -17,7 +17,7 @@ use super::parameters::ParameterList;
 use crate::codec::{N2Options, Protocol, RequestPdu, Table};
 use crate::document::{Node, Problem};
 
-pub use raw::{Equals, Form, MOST_REGISTERS, Order, Raw};
+pub use raw::{Equals, Form, MOST_REGISTERS, Order, Part, Raw};
 
 /// A validated profile.
 #[derive(Debug, Clone, PartialEq)]
@@ -423,6 +423,18 @@ impl Profile {
             Table::Holding
         } else {
             table
+        }
+    }
+
+    /// Its title as it is shown, with what is doubtful of it.
+    pub fn described(&self) -> Cow<'_, str> {
+        match self.verified {
+            true => Cow::Borrowed(&self.title),
+            false => Cow::Owned(
+                format!("{} (not verified on hardware)", self.title)
+                    .trim_start()
+                    .to_string(),
+            ),
         }
     }
 

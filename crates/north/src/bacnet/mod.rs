@@ -1,12 +1,14 @@
 //! The BACnet/IP server: each drive is a device of its own behind a virtual network (`docs/bacnet.md`).
 //!
 //! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` says what a drive shows, `view` reads it from the process image,
-//! `writes` makes orders of what clients write, `task` moves datagrams.
+//! `writes` makes orders of what clients write, `desk` brings them together, `task` moves datagrams, `offline` does so without sockets.
 
+mod desk;
 pub mod ede;
 mod kept;
 pub mod listing;
 pub mod objects;
+mod offline;
 mod sockets;
 mod task;
 mod units;
@@ -25,6 +27,8 @@ use ipnet::IpNet;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
+
+pub use self::offline::Offline;
 
 use self::sockets::Sockets;
 use self::task::{Task, ToTask};

@@ -107,7 +107,7 @@ pub fn of_drive(spec: &DriveSpec, gateway: (&str, u32)) -> Shown {
         instance + u32::from(spec.unit),
         Mac::new(&[spec.unit]),
         format!("{name}.{}", spec.name),
-        (spec.profile.name.clone(), spec.profile.title.clone()),
+        (spec.profile.name.clone(), spec.profile.described().into_owned()),
         objects,
     );
     Shown {
@@ -340,7 +340,7 @@ fn analog(spec: &DriveSpec, index: usize, model: Option<ModelPoint>, limits: Opt
     let raw = raw_of(spec, index, 4);
     let resolution = match raw.map(|(form, scale)| (form, scale.abs())) {
         Some((Form::F32, _)) | None => 0.01,
-        Some((_, scale)) => scale as f32,
+        Some((_, scale)) => scale,
     };
     let span = raw.and_then(|(form, scale)| {
         let (low, high) = match form {
@@ -357,9 +357,9 @@ fn analog(spec: &DriveSpec, index: usize, model: Option<ModelPoint>, limits: Opt
     let counts = model.is_some_and(|model| COUNTERS.contains(&model));
     Kind::Analog {
         units: units::number(unit),
-        resolution,
+        resolution: resolution as f32,
         range: range.map(|(low, high)| (low as f32, high as f32)),
-        increment: if counts { 1.0 } else { 10.0 * resolution },
+        increment: if counts { 1.0 } else { (10.0 * resolution) as f32 },
     }
 }
 

@@ -45,6 +45,11 @@ impl Sockets {
             broadcast,
         })
     }
+
+    /// The address, and the bits of the mask.
+    pub(super) fn place(&self) -> (SocketAddrV4, u8) {
+        (self.address, self.prefix)
+    }
 }
 
 /// A socket for broadcasts, which other programs of this host may hear, too.

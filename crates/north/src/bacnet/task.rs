@@ -1,6 +1,6 @@
-//! Moves datagrams between the sockets and the server, and writes between it and the drives.
+//! Moves datagrams between the sockets and the desk, and waits for drives; keeps what outlives a restart, finds the BBMD.
 
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap};
 use std::future::Future;
 use std::net::{SocketAddr, SocketAddrV4};
 use std::pin::Pin;
@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate_bacnet::{Application as _, Options as ServerOptions, Server, To};
+use drivegate_bacnet::To;
 use futures_util::stream::FuturesUnordered;
 use futures_util::{FutureExt as _, StreamExt as _};
 use tokio::net::UdpSocket;
@@ -17,16 +17,16 @@ use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
+use super::desk::{Desk, Ended};
 use super::kept::{self, KeptSlot};
 use super::sockets::Sockets;
-use super::view::View;
-use super::writes::{self, Begun, Waiting};
+use super::writes::Waiting;
 use super::{NorthStats, Options};
-use crate::command::{Commanded, Outcome, Settled};
+use crate::command::Commanded;
 use crate::drive::ModelPoint;
 use crate::event::{Event, EventKind};
-use crate::plant::{Plant, SharedPlant};
-use crate::process_image::{LeaseAction, Machine, Snapshot};
+use crate::plant::SharedPlant;
+use crate::process_image::Snapshot;
 use crate::stats::BacnetFigures;
 
 /// How often time is looked at.
@@ -39,8 +39,6 @@ const BATCH: usize = 64;
 const RESOLVE: Duration = Duration::from_secs(30);
 /// How long what was begun is waited for at the end.
 const LAST_ANSWERS: Duration = Duration::from_millis(1500);
-/// The name of the vendor without an identifier of one's own.
-const VENDOR: &str = "drivegate";
 
 /// What the server tells its task.
 #[derive(Debug)]
@@ -51,36 +49,20 @@ pub(super) enum ToTask {
     Retire,
 }
 
-/// How a write ended.
-struct Ended {
-    token: u64,
-    machine: Machine,
-    slot: Option<u64>,
-    outcome: Outcome,
-}
-
 type Ending = Pin<Box<dyn Future<Output = Ended> + Send>>;
 
 /// The task.
 pub(super) struct Task {
     options: Arc<Options>,
     sockets: Sockets,
-    plant: SharedPlant,
     stats: Arc<NorthStats>,
     busy: Arc<AtomicBool>,
-    view: View,
-    server: Server,
+    desk: Desk,
     writes: FuturesUnordered<Ending>,
     /// Woken by every update of a drive.
     news: Arc<Notify>,
     /// What was seen of each drive to which somebody subscribes.
     seen: HashMap<u32, Arc<Snapshot>>,
-    /// Drives that answered when they were looked at last.
-    present: HashSet<u32>,
-    /// Leases that ran out so far, by device.
-    leases: HashMap<u32, u64>,
-    /// Devices of which a slot waits for the next reading.
-    uncertain: BTreeSet<u32>,
     kept: Vec<KeptSlot>,
     /// Devices with a slot of before the restart against which the motor may run.
     watched: BTreeSet<u32>,
@@ -88,18 +70,6 @@ pub(super) struct Task {
     /// Looks up the BBMD.
     lookup: Option<JoinHandle<Option<SocketAddrV4>>>,
     retired: bool,
-}
-
-fn server_of(options: &Options, sockets: &Sockets, view: &View, now: Instant) -> Server {
-    let options = ServerOptions {
-        address: sockets.address,
-        prefix: sockets.prefix,
-        network: options.network,
-        vendor: (options.vendor, VENDOR.into()),
-        version: crate::version::VERSION.into(),
-        bbmd: None,
-    };
-    Server::new(options, view.devices(), now)
 }
 
 impl Task {
@@ -111,22 +81,16 @@ impl Task {
         busy: Arc<AtomicBool>,
     ) -> Task {
         let options = Arc::new(options);
-        let view = View::new(plant.load_full(), options.clone());
-        let server = server_of(&options, &sockets, &view, Instant::now());
+        let desk = Desk::new(options.clone(), plant, sockets.place(), Instant::now());
         Task {
             options,
             sockets,
-            plant,
             stats,
             busy,
-            view,
-            server,
+            desk,
             writes: FuturesUnordered::new(),
             news: Arc::default(),
             seen: HashMap::new(),
-            present: HashSet::new(),
-            leases: HashMap::new(),
-            uncertain: BTreeSet::new(),
             kept: Vec::new(),
             watched: BTreeSet::new(),
             resolved: None,
@@ -138,9 +102,7 @@ impl Task {
     pub(super) async fn run(mut self, mut orders: mpsc::UnboundedReceiver<ToTask>, cancel: CancellationToken) {
         self.load();
         self.hear_drives();
-        let now = Instant::now();
-        self.view.look(now);
-        self.server.start(&self.view, now);
+        self.desk.start(Instant::now());
         let mut ticks = interval(TICK);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut buffer = vec![0; 2048];
@@ -162,7 +124,7 @@ impl Task {
                     }
                 }
                 () = heard(self.sockets.broadcast.as_ref()), if !self.retired => self.take(&mut buffer, true),
-                Some(ended) = self.writes.next(), if waits => self.ended(ended),
+                Some(ended) = self.writes.next(), if waits => self.desk.ended(&ended, Instant::now()),
                 () = self.news.notified(), if subscribed && !due => due = true,
                 () = tokio::time::sleep_until(next_look.into()), if due => {
                     self.look();
@@ -180,7 +142,7 @@ impl Task {
     async fn answer_what_was_begun(&mut self) {
         let until = tokio::time::Instant::now() + LAST_ANSWERS;
         while let Ok(Some(ended)) = tokio::time::timeout_at(until, self.writes.next()).await {
-            self.ended(ended);
+            self.desk.ended(&ended, Instant::now());
             self.flush();
         }
     }
@@ -188,7 +150,6 @@ impl Task {
     /// Takes up what came.
     fn take(&mut self, buffer: &mut [u8], broadcast: bool) {
         let now = Instant::now();
-        self.view.look(now);
         for _ in 0..BATCH {
             let socket = match (broadcast, &self.sockets.broadcast) {
                 (true, Some(socket)) => socket,
@@ -198,14 +159,14 @@ impl Task {
                 return;
             };
             if let Some(datagram) = buffer.get(..length) {
-                self.server.receive(from, datagram, &self.view, now);
+                self.desk.receive(from, datagram, now);
             }
         }
     }
 
     /// Sends what is to be sent. What the system does not take at once is lost, as datagrams may be.
     fn flush(&mut self) {
-        while let Some((to, datagram)) = self.server.transmit() {
+        while let Some((to, datagram)) = self.desk.server.transmit() {
             let to = match to {
                 To::Host(host) => host,
                 To::Broadcast => self.sockets.broadcast_to,
@@ -218,52 +179,26 @@ impl Task {
 
     /// Hands writes to the drives.
     fn take_up_jobs(&mut self) {
-        let now = Instant::now();
-        self.view.look(now);
-        while let Some(job) = self.server.take_job() {
-            match writes::begin(&self.view, &job, now) {
-                Begun::Answered(result) => self.server.written(job.token, result, &self.view, now),
-                Begun::Waits(waiting) => self.writes.push(Box::pin(ending(job.token, *waiting))),
-            }
+        while let Some((token, waiting)) = self.desk.next_order(Instant::now()) {
+            self.writes.push(Box::pin(ending(token, waiting)));
         }
         self.busy.store(!self.writes.is_empty(), Ordering::Relaxed);
     }
 
-    fn ended(&mut self, ended: Ended) {
-        let now = Instant::now();
-        let plant = self.plant.load();
-        if let (Some(slot), Some(drive)) = (ended.slot, plant.drive_at(&ended.machine)) {
-            let settled = Settled::of(&ended.outcome);
-            drive.priorities(|all| all.settle(slot, settled, now));
-            if settled == Settled::Unknown {
-                let device = self.options.device + u32::from(drive.image.spec.unit);
-                self.uncertain.insert(device);
-            }
-        }
-        self.view.look(now);
-        let result = writes::error(&ended.outcome);
-        self.server.written(ended.token, result, &self.view, now);
-    }
-
     fn tick(&mut self) {
         let now = Instant::now();
-        let plant = self.plant.load_full();
-        if !Arc::ptr_eq(&plant, &self.view.plant) {
-            self.see(plant);
+        if self.desk.is_outdated() {
+            self.see();
         }
-        self.view.look(now);
-        self.note_leases();
-        self.resolve_slots(now);
         self.watch_kept();
-        self.announce(now);
-        self.server.poll(&self.view, now);
+        self.desk.poll(now);
         self.stats.bacnet.set(Some(BacnetFigures {
-            counters: self.server.counters(),
+            counters: self.desk.server.counters(),
             bbmd: self
                 .options
                 .bbmd
                 .as_ref()
-                .map(|(host, port)| (format!("{host}:{port}"), self.server.registration())),
+                .map(|(host, port)| (format!("{host}:{port}"), self.desk.server.registration())),
         }));
         self.find_bbmd(now);
         self.take_bbmd(now);
@@ -271,15 +206,14 @@ impl Task {
     }
 
     /// Shows another plant, or the same with other options.
-    fn see(&mut self, plant: Arc<Plant>) {
-        self.view = View::new(plant, self.options.clone());
-        self.server.set_devices(self.view.devices());
+    fn see(&mut self) {
+        self.desk.see(self.options.clone());
         self.seen.clear();
         self.hear_drives();
     }
 
     fn hear_drives(&self) {
-        for drive in self.view.drives.values() {
+        for drive in self.desk.view.drives.values() {
             drive.handle.image.notify(&self.news);
         }
     }
@@ -287,66 +221,17 @@ impl Task {
     /// Tells what changed at drives to which somebody subscribes.
     fn look(&mut self) {
         let now = Instant::now();
-        self.view.look(now);
-        for device in self.server.subscribed() {
-            let Some(drive) = self.view.drives.get(&device) else {
+        for device in self.desk.server.subscribed() {
+            let Some(drive) = self.desk.view.drives.get(&device) else {
                 continue;
             };
             let snapshot = drive.handle.image.snapshot();
             let same = self.seen.get(&device).is_some_and(|seen| Arc::ptr_eq(seen, &snapshot));
             if !same {
                 self.seen.insert(device, snapshot);
-                self.server.changed(device, &self.view, now);
+                self.desk.changed(device, now);
             }
         }
-    }
-
-    /// A drive that comes back says so.
-    fn announce(&mut self, now: Instant) {
-        let answers: HashSet<u32> = self
-            .view
-            .drives
-            .keys()
-            .copied()
-            .filter(|device| self.view.answers(*device))
-            .collect();
-        for device in answers.difference(&self.present) {
-            self.server.announce(*device, &self.view, now);
-        }
-        self.present = answers;
-    }
-
-    /// A lease that ended without a stop gives the slots of its client back, too.
-    fn note_leases(&mut self) {
-        for (device, drive) in &self.view.drives {
-            let image = &drive.handle.image;
-            let stops = image
-                .spec
-                .supervision
-                .as_ref()
-                .is_none_or(|lease| lease.action == LeaseAction::Stop);
-            let count = image.supervisions();
-            let before = self.leases.insert(*device, count);
-            if !stops && before.is_some_and(|before| before < count) {
-                drive.handle.priorities(|all| all.silenced());
-            }
-        }
-    }
-
-    /// Settles what is not known by what the drives show.
-    fn resolve_slots(&mut self, now: Instant) {
-        let drives = &self.view.drives;
-        self.uncertain.retain(|device| {
-            let Some(drive) = drives.get(device) else { return false };
-            let reading = drive.handle.reading(now);
-            drive.handle.priorities(|all| {
-                all.resolve(|what, since| {
-                    let sample = reading.model(what.point());
-                    sample.good().filter(|_| sample.at.is_some_and(|at| at > since))
-                });
-                all.is_uncertain()
-            })
-        });
     }
 
     fn keep_file(&self) -> Option<std::path::PathBuf> {
@@ -359,13 +244,13 @@ impl Task {
         let Some(path) = self.keep_file() else { return };
         match kept::load(&path) {
             Ok(slots) => {
-                kept::restore(&self.view.plant, &slots, Instant::now());
-                self.kept = kept::of_plant(&self.view.plant);
+                kept::restore(&self.desk.view.plant, &slots, Instant::now());
+                self.kept = kept::of_plant(&self.desk.view.plant);
                 let protected = |device: &u32| {
-                    let drive = self.view.drives.get(device);
+                    let drive = self.desk.view.drives.get(device);
                     drive.is_some_and(|drive| drive.handle.priorities(|all| all.kept().next().is_some()))
                 };
-                self.watched = self.view.drives.keys().copied().filter(protected).collect();
+                self.watched = self.desk.view.drives.keys().copied().filter(protected).collect();
             }
             Err(why) => tracing::error!(
                 target: "drivegate::bacnet",
@@ -377,7 +262,7 @@ impl Task {
     /// Writes what outlives a restart, where it is another.
     fn keep(&mut self) {
         let Some(path) = self.keep_file() else { return };
-        let slots = kept::of_plant(&self.view.plant);
+        let slots = kept::of_plant(&self.desk.view.plant);
         if slots != self.kept {
             self.kept.clone_from(&slots);
             tokio::task::spawn_blocking(move || {
@@ -392,14 +277,14 @@ impl Task {
 
     async fn save(&mut self) {
         let Some(path) = self.keep_file() else { return };
-        let slots = kept::of_plant(&self.plant.load());
+        let slots = kept::of_plant(&self.desk.newest_plant());
         // A thread that panicked has logged that.
         let _ = tokio::task::spawn_blocking(move || kept::save(&path, &slots)).await;
     }
 
     /// An event tells if a motor runs against a slot of before the restart.
     fn watch_kept(&mut self) {
-        let view = &self.view;
+        let view = &self.desk.view;
         self.watched.retain(|device| {
             let Some(drive) = view.drives.get(device) else { return false };
             let now = Instant::now();
@@ -437,15 +322,13 @@ impl Task {
                 if let Some(sockets) = sockets {
                     self.sockets = sockets;
                 }
-                self.see(self.plant.load_full());
+                self.see();
                 let now = Instant::now();
-                self.view.look(now);
                 if !continues {
-                    self.server = server_of(&self.options, &self.sockets, &self.view, now);
-                    self.server.start(&self.view, now);
+                    self.desk.start_anew(self.sockets.place(), now);
                 }
                 if !continues || !same_bbmd {
-                    self.server.set_bbmd(None, now);
+                    self.desk.server.set_bbmd(None, now);
                     (self.resolved, self.lookup) = (None, None);
                 }
             }
@@ -461,7 +344,7 @@ impl Task {
         let due = self
             .resolved
             .is_none_or(|at| now.saturating_duration_since(at) >= RESOLVE);
-        if self.server.registration() != Registration::None || !due {
+        if self.desk.server.registration() != Registration::None || !due {
             return;
         }
         self.resolved = Some(now);
@@ -483,7 +366,7 @@ impl Task {
             return;
         };
         match lookup.now_or_never() {
-            Some(Ok(Some(address))) => self.server.set_bbmd(Some(address), now),
+            Some(Ok(Some(address))) => self.desk.server.set_bbmd(Some(address), now),
             _ => tracing::warn!(
                 target: "drivegate::bacnet", "cannot find the BBMD {host}:{port}; trying again every 30 s; check `bbmd` of [bacnet]"
             ),
@@ -491,19 +374,9 @@ impl Task {
     }
 }
 
-async fn ending(token: u64, waiting: Waiting) -> Ended {
-    let Waiting {
-        machine,
-        mut placed,
-        slot,
-    } = waiting;
-    let outcome = placed.answered().await.outcome;
-    Ended {
-        token,
-        machine,
-        slot,
-        outcome,
-    }
+async fn ending(token: u64, mut waiting: Waiting) -> Ended {
+    let outcome = waiting.placed.answered().await.outcome;
+    Ended::of(token, waiting, outcome)
 }
 
 /// Waits for a broadcast.

@@ -1,14 +1,17 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate_bacnet::{Application as _, Datum, Error, Job, ObjectId, ObjectType, Reliability};
+use drivegate_bacnet::{Application as _, Data, Datum, Error, Job, ObjectId, ObjectType, PropertyId, Reliability};
 use drivegate_testkit::next_command;
 
 use super::view::View;
 use super::writes::{Begun, Waiting};
 use super::*;
 use crate::codec::{LineFormat, Protocol, Reply, Table};
-use crate::command::{Authority, CommandQueue, Order, Origin, Outcome, Refusal, Settled, SourceKind, Urgency};
+use crate::command::{
+    Authority, CommandQueue, Commanded, Follows, Order, Origin, Outcome, Refusal, Settled, SlotWrite, SourceKind,
+    Urgency,
+};
 use crate::drive::profile::Profiles;
 use crate::drive::{ModelPoint, Value};
 use crate::plant::{BusHandle, DriveHandle, Plant};

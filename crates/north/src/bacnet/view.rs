@@ -350,8 +350,16 @@ impl Application for View {
 
     fn stops(&self, device: u32, write: &WriteItem) -> bool {
         let is_run = write.object == RUN && write.property.property == PropertyId::PRESENT_VALUE;
-        let gives_up = matches!(write.value, Some(Data::Enumerated(0) | Data::Null));
-        is_run && gives_up && self.drives.contains_key(&device)
+        let value = match write.value {
+            Some(Data::Enumerated(0)) => Some(false),
+            Some(Data::Null) => None,
+            _ => return false,
+        };
+        let priority = write.priority.unwrap_or(16);
+        match (self.drives.get(&device).filter(|_| is_run), u8::try_from(priority)) {
+            (Some(drive), Ok(priority)) => drive.handle.priorities(|all| all.stops(priority, value)),
+            _ => false,
+        }
     }
 
     fn orders(&self, device: u32) -> u64 {

@@ -122,7 +122,11 @@ fn slot(handle: &DriveHandle, (what, index): (Commanded, usize), job: &Job, orig
     let mut write = SlotWrite::new(what, priority, entry);
     loop {
         match handle.priorities(|all| all.plan(&write)) {
-            Follows::Nothing => return stands(handle, &write, &origin, now),
+            // Another side may have withdrawn what governed since.
+            Follows::Nothing => match stands(handle, &write, &origin, now) {
+                Some(begun) => return begun,
+                None => continue,
+            },
             Follows::Stop => {
                 let Some(run) = handle.image.spec.profile.model_index(Commanded::Run.point()) else {
                     return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
@@ -140,7 +144,8 @@ fn slot(handle: &DriveHandle, (what, index): (Commanded, usize), job: &Job, orig
                 let own = write.entry.is_some();
                 // What comes to govern was written long ago; its order is given now.
                 let asked = if own { job.asked } else { now };
-                let mut placed = handle.place_slot(order, write.clone(), entry.origin, DEFAULT_EXPIRY, (asked, now));
+                let as_planned = write.clone().in_favour_of(&entry);
+                let mut placed = handle.place_slot(order, as_planned, entry.origin, DEFAULT_EXPIRY, (asked, now));
                 let refused = matches!(placed.answer().map(|answer| answer.outcome), Some(Outcome::Refused(_)));
                 let next = handle.priorities(|all| all.successor(&write));
                 match next.filter(|_| refused && !own) {
@@ -154,12 +159,15 @@ fn slot(handle: &DriveHandle, (what, index): (Commanded, usize), job: &Job, orig
 }
 
 /// Nothing follows: it stands at once. The lease of the drive is that of the client whose slot governs.
-fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant) -> Begun {
+fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant) -> Option<Begun> {
     let governs = handle.priorities(|all| {
+        if all.plan(write) != Follows::Nothing {
+            return None;
+        }
         all.ask(write);
         all.settle(write.id, command::Settled::Done, now);
-        all.client() == Some(origin.client())
-    });
+        Some(all.client() == Some(origin.client()))
+    })?;
     if governs {
         handle.image.renew_lease(now);
     }
@@ -172,7 +180,7 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
         target: "drivegate::bacnet", drive, priority, client = %origin.who,
         "{} = {value} stands in its slot; nothing is sent", write.what.point().name()
     );
-    Begun::Answered(Ok(()))
+    Some(Begun::Answered(Ok(())))
 }
 
 /// Whether the drive could be given that value at all; what is not known yet is judged when it becomes an order.

@@ -17,6 +17,7 @@ mod params;
 mod query;
 mod recordings;
 mod routes;
+mod socket_door;
 mod streams;
 mod terms;
 mod tokens;
@@ -46,7 +47,9 @@ use self::hosts::Host;
 use self::in_use::InUse;
 use self::operating::Operating;
 pub(super) use self::operating::PostedCommands;
+pub(super) use self::routes::LocalUser;
 use self::routes::Reached;
+pub(super) use self::socket_door::SocketDoor;
 use self::terms::{Terms, Tls};
 use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Limits, Newcomer};
 use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
@@ -394,6 +397,7 @@ impl HttpConnections {
             refusals: self.no_access.clone(),
             access: terms.access.clone(),
             tls: terms.tls.is_some(),
+            local: None,
             place: Some(place.clone()),
         };
         let client = routes::Client {

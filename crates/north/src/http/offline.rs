@@ -56,6 +56,7 @@ impl Offline {
             }),
             refusals: Arc::default(),
             tls: false,
+            local: None,
             place: None,
         };
         let client = Client {

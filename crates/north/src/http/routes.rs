@@ -23,6 +23,8 @@ use super::{
     Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, line, page, query, recordings, streams, trend,
 };
 use crate::connection_limit::{ConnectionLimit, Limits, Place};
+use crate::local::control::{self, Control};
+use crate::local::protocol::{HealthOutcome, OfGateway};
 use crate::log_throttle::LogThrottle;
 use crate::parameters::ParameterFile;
 use crate::plant::{Plant, SharedPlant};
@@ -63,6 +65,15 @@ pub(super) struct Client {
     pub(super) coverage: Coverage,
 }
 
+/// Who came through the local socket: whoever may open it may do everything.
+#[derive(Debug, Clone)]
+pub(crate) struct LocalUser {
+    /// Of the client's process.
+    pub(crate) uid: u32,
+    /// The gateway itself, where that has a configuration file.
+    pub(crate) control: Option<Control>,
+}
+
 /// How a request came, as an extension of it.
 #[derive(Debug, Clone)]
 pub(super) struct Reached {
@@ -74,9 +85,14 @@ pub(super) struct Reached {
     pub(super) refusals: Arc<LogThrottle>,
     /// The connection has TLS.
     pub(super) tls: bool,
+    /// It came through the local socket; `None`: over TCP.
+    pub(super) local: Option<LocalUser>,
     /// The place of the connection; `None` without a socket.
     pub(super) place: Option<Arc<Place>>,
 }
+
+/// Only at the socket.
+const RELOAD: &str = "/api/v1/reload";
 
 /// All routes.
 pub(super) fn router(
@@ -100,6 +116,8 @@ pub(super) fn router(
         .route("/metrics", get(exposition))
         .route("/healthz", get(|| async { "ok\n" }))
         .route("/readyz", get(ready))
+        .route("/api/v1/health", get(health))
+        .route(RELOAD, post(reload))
         .route("/api/v1/drives", get(drives))
         .route("/api/v1/drives/{name}", get(drive))
         .route("/api/v1/drives/{name}/params", get(params))
@@ -137,10 +155,15 @@ async fn guard(
 ) -> Response {
     let coverage = request.extensions().get::<Client>().map(|client| client.coverage);
     let (method, path) = (request.method(), request.uri().path());
-    let is_on = app.operating.is_on();
+    let is_local = reached.local.is_some();
+    // Nobody logs in at the socket.
+    let is_on = app.operating.is_on() || (is_local && !operating::is_session(path));
     // A command of somebody who may give it is served on the last connection too.
     let is_urgent = ["/healthz", "/readyz"].contains(&path) || (is_on && operating::is_command(method, path));
-    let access = reached.access.check(request.uri(), request.headers(), reached.address);
+    let access = match is_local {
+        true => Ok(()),
+        false => reached.access.check(request.uri(), request.headers(), reached.address),
+    };
     let refusal = match access {
         Ok(()) => None,
         Err(error) => refused(&app, &reached, error, request.uri().clone(), request.headers().clone()).await,
@@ -150,7 +173,7 @@ async fn guard(
     } else if coverage == Some(Coverage::Health) && !is_urgent {
         let text = "too many connections are open; close some and try again\n";
         (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "5")], text).into_response()
-    } else if is_on && operating::may_change(method, path) {
+    } else if (is_on && operating::may_change(method, path)) || (is_local && path == RELOAD) {
         next.run(request).await
     } else if !matches!(*method, Method::GET | Method::HEAD) {
         let text = match is_on {
@@ -190,12 +213,7 @@ async fn refused(
             return None;
         }
         let cookies = app.cookies(reached);
-        if app
-            .operating
-            .operator(&headers, &cookies, reached.peer.ip())
-            .await
-            .is_ok()
-        {
+        if app.operating.operator(&headers, &cookies, reached).await.is_ok() {
             return None;
         }
         if path == "/" {
@@ -257,6 +275,38 @@ async fn ready(State(app): State<Arc<AppState>>) -> Response {
         let _ = writeln!(text, "{reason}");
     }
     (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
+}
+
+/// Whether the gateway is ready, and why not: 200 in both cases.
+async fn health(State(app): State<Arc<AppState>>) -> Response {
+    let reasons = readiness::reasons(&app.plant.load(), &app.stats);
+    let ready = reasons.is_empty();
+    Json(HealthOutcome { ready, reasons }).into_response()
+}
+
+/// The gateway reads its configuration again: 200 with what changed, 422 with the errors, and it goes on as before.
+async fn reload(Extension(reached): Extension<Reached>, uri: Uri, request: Request) -> Response {
+    let Some(local) = reached.local else {
+        return unknown(uri).await;
+    };
+    if !matches!(*request.method(), Method::POST) {
+        return StatusCode::METHOD_NOT_ALLOWED.into_response();
+    }
+    let who = format!("uid {}", local.uid);
+    match control::reload(local.control.as_ref(), &OfGateway::default(), who).await {
+        Ok(outcome) if outcome.errors.is_empty() => {
+            let (changes, warnings) = (outcome.changes, outcome.warnings);
+            Json(serde_json::json!({ "changes": changes, "warnings": warnings })).into_response()
+        }
+        Ok(outcome) => {
+            let errors = serde_json::json!({ "errors": outcome.errors });
+            (StatusCode::UNPROCESSABLE_ENTITY, Json(errors)).into_response()
+        }
+        Err(failure) => {
+            let (error, known) = (failure.message, Vec::new());
+            (StatusCode::SERVICE_UNAVAILABLE, Json(api::ErrorReply { error, known })).into_response()
+        }
+    }
 }
 
 /// All drives; with `points=` only these points of each.

@@ -71,7 +71,7 @@ fn is_meant(control: Option<&Control>, asked: &OfGateway) -> Result<(), Failure>
 ///
 /// # Errors
 /// It is another gateway, or it stops.
-pub(super) async fn reload(
+pub(crate) async fn reload(
     control: Option<&Control>,
     asked: &OfGateway,
     who: String,

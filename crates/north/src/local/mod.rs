@@ -6,7 +6,7 @@
 //! for no response is closed in favour of the newcomer.
 
 mod answer;
-mod control;
+pub(crate) mod control;
 mod path;
 pub mod protocol;
 mod restart;
@@ -29,6 +29,7 @@ use self::protocol::{Failure, FailureCode, MAX_REQUEST, Outcome, Request, Respon
 use crate::NorthStats;
 use crate::command::{Authority, Origin, SourceKind};
 use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Limits, Newcomer};
+use crate::http::{LocalUser, SocketDoor};
 use crate::plant::{Plant, SharedPlant};
 
 pub use answer::answer;
@@ -58,6 +59,8 @@ pub struct Options {
 /// What a client may ask.
 #[derive(Debug)]
 struct Asked {
+    /// The HTTP API, for clients that speak it.
+    door: SocketDoor,
     plant: SharedPlant,
     stats: Arc<NorthStats>,
     control: Option<Control>,
@@ -120,7 +123,13 @@ pub async fn start(
         .map_err(|error| io::Error::new(error.kind(), format!("cannot listen on {first}: {error}")))?;
     let path = bound.path.clone();
     let control = options.control.clone();
-    let asked = Arc::new(Asked { plant, stats, control });
+    let door = SocketDoor::new(&plant, &stats, cancel.clone());
+    let asked = Arc::new(Asked {
+        door,
+        plant,
+        stats,
+        control,
+    });
     tracing::info!(target: "drivegate::local", path = %path.display(), "local socket: listening");
     let task = tokio::spawn(accept(bound, asked, cancel));
     Ok(Local { path, task })
@@ -163,17 +172,23 @@ fn response(plant: &Plant, result: Outcome) -> Vec<u8> {
 }
 
 /// Serves one client until it leaves, falls silent, takes no response or yields to another one.
-async fn serve(mut stream: UnixStream, asked: Arc<Asked>, permit: ConnectionPermit) {
+async fn serve(stream: UnixStream, asked: Arc<Asked>, permit: ConnectionPermit) {
     // Without a user id there is nobody to hold the command against.
     let Ok(peer) = stream.peer_cred() else { return };
     let place = permit.place();
     let origin = Origin::new(SourceKind::LocalSocket, format!("uid {}", peer.uid()));
-    let (read_half, mut write_half) = stream.split();
-    let mut reader = BufReader::new(read_half);
     // What is found at once may have come since.
     let mut since = Instant::now();
+    let mut stream = BufReader::new(stream);
+    if speaks_http(&mut stream, place.closing()).await {
+        let user = LocalUser {
+            uid: peer.uid(),
+            control: asked.control.clone(),
+        };
+        return asked.door.serve(stream, user, place).await;
+    }
     loop {
-        let request = timeout(REQUEST_TIMEOUT, next_line(&mut reader, since));
+        let request = timeout(REQUEST_TIMEOUT, next_line(&mut stream, since));
         let Some(Ok(Ok((line, came)))) = place.closing().run_until_cancelled(request).await else {
             break;
         };
@@ -191,15 +206,22 @@ async fn serve(mut stream: UnixStream, asked: Arc<Asked>, permit: ConnectionPerm
             },
         };
         let response = response(&asked.plant.load(), result);
-        let written = timeout(RESPONSE_TIMEOUT, write_half.write_all(&response)).await;
+        let written = timeout(RESPONSE_TIMEOUT, stream.write_all(&response)).await;
         if !matches!(written, Ok(Ok(()))) || !goes_on {
             break;
         }
         place.use_at(Instant::now(), false);
     }
     if place.close_reason() == Some(CloseReason::Displaced) {
-        turn_away(&stream, &asked.plant.load());
+        turn_away(stream.get_ref(), &asked.plant.load());
     }
+}
+
+/// Whether the client's first byte is that of an HTTP request; a request of the other protocol begins with `{`.
+async fn speaks_http(stream: &mut BufReader<UnixStream>, closing: &CancellationToken) -> bool {
+    let first = timeout(REQUEST_TIMEOUT, stream.fill_buf());
+    let first = closing.run_until_cancelled(first).await;
+    matches!(first, Some(Ok(Ok(bytes))) if bytes.first().is_some_and(u8::is_ascii_uppercase))
 }
 
 enum Line {

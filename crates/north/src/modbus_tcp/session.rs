@@ -245,7 +245,7 @@ impl ClientSession {
             RequestPdu::DeviceIdentification { code, object } => {
                 let identity = Identity {
                     product: &profile.name,
-                    title: &profile.title,
+                    title: &profile.described(),
                     name: &drive.image.spec.name,
                 };
                 identity

@@ -1,4 +1,4 @@
-//! The wait between two connection attempts.
+//! Which broker comes next, and the wait before the attempt.
 
 use std::hash::{BuildHasher, RandomState};
 use std::time::Duration;
@@ -8,32 +8,70 @@ const BACK_OFF: (Duration, Duration) = (Duration::from_millis(100), Duration::fr
 /// After a connection that lasted this long, the next attempt follows after the shortest wait.
 const STABLE: Duration = Duration::from_secs(5);
 
-/// Doubles the wait from attempt to attempt.
+/// The brokers in turn: the next one after the shortest wait; when all were tried, after a wait that doubles from round to round.
 #[derive(Debug)]
-pub(super) struct BackOff(Duration);
-
-impl Default for BackOff {
-    fn default() -> BackOff {
-        BackOff(BACK_OFF.0)
-    }
+pub(super) struct Rotation {
+    count: usize,
+    current: usize,
+    /// Brokers tried since the last wait that doubled.
+    tried: usize,
+    /// How often the turn came back to the first one.
+    round: usize,
+    wait: Duration,
 }
 
-impl BackOff {
-    /// The wait after a connection that was `held` for this long. It differs by chance: gateways that lost their broker at
-    /// the same time come back one after the other.
-    pub(super) fn after(&mut self, held: Duration) -> Duration {
-        if held >= STABLE {
-            self.0 = BACK_OFF.0;
+impl Rotation {
+    /// Of `count` brokers; begins with this one.
+    pub(super) fn new(count: usize, current: usize) -> Rotation {
+        Rotation {
+            count: count.max(1),
+            current,
+            tried: 0,
+            round: 0,
+            wait: BACK_OFF.0,
         }
-        let wait = jittered(self.0, RandomState::new().hash_one(0));
-        self.0 = (self.0 * 2).min(BACK_OFF.1);
+    }
+
+    pub(super) fn current(&self) -> usize {
+        self.current
+    }
+
+    /// How often the turn came back to the first broker.
+    pub(super) fn round(&self) -> usize {
+        self.round
+    }
+
+    pub(super) fn is_single(&self) -> bool {
+        self.count == 1
+    }
+
+    /// The turn of the next broker, and the wait before it, after a connection that was `held` for this long. The wait differs by
+    /// chance: gateways that lost their broker at the same time come back one after the other.
+    pub(super) fn next(&mut self, held: Duration) -> Duration {
+        if held >= STABLE {
+            (self.tried, self.wait) = (0, BACK_OFF.0);
+        }
+        self.current = (self.current + 1) % self.count;
+        self.round += usize::from(self.current == 0);
+        self.tried += 1;
+        if self.tried < self.count {
+            return spread(BACK_OFF.0);
+        }
+        self.tried = 0;
+        let wait = spread(self.wait);
+        self.wait = (self.wait * 2).min(BACK_OFF.1);
         wait
     }
 }
 
-/// 10 to 100 % of `wait`, by a random number.
-fn jittered(wait: Duration, random: u64) -> Duration {
-    wait.mul_f64(0.1 + 0.9 * (random as f64 / u64::MAX as f64))
+/// 10 to 100 % of `wait`, by chance.
+fn spread(wait: Duration) -> Duration {
+    wait.mul_f64(0.1 + 0.9 * chance())
+}
+
+/// A random number from 0 to 1.
+pub(super) fn chance() -> f64 {
+    RandomState::new().hash_one(0) as f64 / u64::MAX as f64
 }
 
 #[cfg(test)]
@@ -42,18 +80,46 @@ mod tests {
 
     #[test]
     fn waits_are_spread() {
-        let wait = Duration::from_secs(4);
-        assert_eq!(jittered(wait, 0), Duration::from_millis(400));
-        assert_eq!(jittered(wait, u64::MAX), wait);
+        let (least, most) = (Duration::from_millis(400), Duration::from_secs(4));
+        let waits: Vec<Duration> = (0..100).map(|_| spread(most)).collect();
+        assert!(waits.iter().all(|wait| (least..=most).contains(wait)));
+        assert!(waits.iter().max() > waits.iter().min().map(|wait| *wait * 2).as_ref());
     }
 
     #[test]
     fn waits_grow_until_a_connection_lasts() {
-        let mut back_off = BackOff::default();
+        let mut rotation = Rotation::new(1, 0);
         for _ in 0..10 {
-            back_off.after(Duration::ZERO);
+            rotation.next(Duration::ZERO);
         }
-        assert!(back_off.after(Duration::ZERO) >= Duration::from_millis(500));
-        assert!(back_off.after(STABLE) <= BACK_OFF.0);
+        assert!(rotation.next(Duration::ZERO) >= Duration::from_millis(500));
+        assert!(rotation.next(STABLE) <= BACK_OFF.0);
+        assert_eq!((rotation.current(), rotation.round()), (0, 12));
+    }
+
+    #[test]
+    fn all_brokers_are_tried_before_the_wait_grows() {
+        let mut rotation = Rotation::new(3, 1);
+        let mut turns = Vec::new();
+        for _ in 0..7 {
+            for place in 0..3 {
+                let wait = rotation.next(Duration::ZERO);
+                assert!(place == 2 || wait <= BACK_OFF.0, "{wait:?}");
+                turns.push(rotation.current());
+            }
+        }
+        assert_eq!(turns.get(..6), Some(&[2, 0, 1, 2, 0, 1][..]));
+        assert_eq!(rotation.wait, BACK_OFF.1);
+        // A broker that kept the connection: the others come at once again.
+        let waits = [STABLE, Duration::ZERO].map(|held| rotation.next(held));
+        assert!(waits.iter().all(|wait| *wait <= BACK_OFF.0), "{waits:?}");
+    }
+
+    #[test]
+    fn brokers_that_close_at_once_are_not_besieged() {
+        let mut rotation = Rotation::new(2, 0);
+        let short = Duration::from_secs(1);
+        let waits: Duration = (0..40).map(|_| rotation.next(short)).sum();
+        assert!(waits >= Duration::from_secs(8), "{waits:?}");
     }
 }

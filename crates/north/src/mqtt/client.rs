@@ -15,14 +15,13 @@ use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio_util::sync::CancellationToken;
 
 use self::buffering::buffers;
-use self::discovery::{announcer, discovery_topics};
+use self::discovery::{announcer, discovery_topics, report_refused};
 use self::repair::Repair;
-use super::back_off::BackOff;
-use super::broker_limits::{BrokerLimits, WillForm};
+use super::broker_limits::BrokerLimits;
 use super::commands::{Commands, Finished, Rules};
-use super::connection::{self, CLOSED, Connection, ConnectionEvent, SUBSCRIBE_TIMEOUT, Subscription};
+use super::connection::{self, ConnectionEvent, Subscription};
 use super::home_assistant::{Announcer, Sources};
-use super::outage_log::OutageLog;
+use super::link::{BrokerLink, Due, Step};
 use super::outbox::{Delivery, Key, Kind, Message, Outbox, Settled};
 use super::payload::{self, Topics};
 use super::publisher::{Publisher, Update};
@@ -30,12 +29,12 @@ use super::reply::ResponseTopics;
 use super::request::Incoming;
 use super::retry::Retry;
 use super::store::{Loaded, LostCount, Store};
-use super::takeover::Takeovers;
-use super::{Buffer, History, Options, tls};
+use super::{Buffer, History, Options};
 use crate::event::{BURST, Event, EventKind};
 use crate::files::names::{MQTT_EVENTS, MQTT_HISTORY};
 use crate::log_throttle::LogThrottle;
 use crate::plant::{Plant, SharedPlant};
+use crate::stats::LinkOf;
 use crate::{MqttLoss, NorthStats};
 
 /// Maximum time between two checks of the connection, the plant and the buffer.
@@ -53,6 +52,14 @@ const HISTORY_PACE: Duration = Duration::from_millis(50);
 /// Minimum time between two log lines about messages that the broker refused.
 const REFUSED_LOGGED: Duration = Duration::from_secs(60);
 
+/// What expires after a time is renewed after this part of it.
+const RENEWED: u32 = 2;
+
+/// An expiry in whole seconds: 0 would mean at once.
+fn seconds(expiry: Duration) -> u32 {
+    u32::try_from(expiry.as_secs()).unwrap_or(u32::MAX).max(1)
+}
+
 /// Runs the MQTT client until `cancel`.
 pub(super) async fn run(
     options: Options,
@@ -68,7 +75,7 @@ pub(super) async fn run(
         tokio::select! {
             () = cancel.cancelled() => break,
             event = client.events.recv() => client.on_event(event),
-            event = next(&mut client.link), if client.receives() => client.on_connection_event(event),
+            event = client.link.next(), if client.receives() => client.on_connection_event(event),
             ended = client.commands.finished() => client.on_ended(ended),
             loaded = client.store.next() => client.on_loaded(Kind::Event, loaded),
             loaded = client.history.next() => client.on_loaded(Kind::History, loaded),
@@ -78,45 +85,6 @@ pub(super) async fn run(
         client.publish_waiting();
     }
     client.shut_down().await;
-}
-
-/// The next event of the connection; pending while there is none. Cancel safe.
-async fn next(link: &mut BrokerLink) -> ConnectionEvent {
-    match link {
-        BrokerLink::Disconnected { .. } => std::future::pending().await,
-        BrokerLink::Open(session) => session.connection.next().await,
-    }
-}
-
-#[derive(Debug)]
-enum BrokerLink {
-    /// No connection; the next attempt follows then.
-    Disconnected { retry_at: Instant },
-    /// A connection that the broker may not have accepted yet.
-    Open(BrokerSession),
-}
-
-#[derive(Debug)]
-struct BrokerSession {
-    connection: Connection,
-    phase: Phase,
-}
-
-#[derive(Debug, Clone, Copy)]
-enum Phase {
-    Connecting,
-    Subscribing { limits: BrokerLimits, since: Instant },
-    Ready { limits: BrokerLimits, since: Instant },
-}
-
-impl Phase {
-    /// What the broker can do, once it is known.
-    fn limits(self) -> Option<BrokerLimits> {
-        match self {
-            Phase::Connecting => None,
-            Phase::Subscribing { limits, .. } | Phase::Ready { limits, .. } => Some(limits),
-        }
-    }
 }
 
 struct Client {
@@ -145,10 +113,8 @@ struct Client {
     history_at: Instant,
     commands: Commands,
     link: BrokerLink,
-    will: WillForm,
-    back_off: BackOff,
-    outages: OutageLog,
-    takeovers: Takeovers,
+    /// When `online` is published again, before it expires.
+    renew_at: Option<Instant>,
     /// When messages that the broker refused are published again, and log lines about them.
     retry: Retry,
     refused: LogThrottle,
@@ -164,7 +130,11 @@ impl Client {
         let observed = plant.load_full();
         let topics = Topics::new(&options.base, &observed.gateway);
         let fresh = Arc::new(Notify::new());
-        let intervals = (options.min_interval, options.max_interval);
+        // What expires is renewed before.
+        let most = options.message_expiry.map_or(options.max_interval, |expiry| {
+            options.max_interval.min(expiry / RENEWED)
+        });
+        let intervals = (options.min_interval, most);
         let mut publisher = Publisher::new(topics.clone(), intervals, options.telemetry, fresh.clone());
         let mut announcer = announcer(&options, &topics);
         publisher.adopt(&observed, discovery_topics(announcer.as_mut(), &observed));
@@ -175,12 +145,18 @@ impl Client {
         let delivery = Delivery {
             telemetry: options.telemetry_qos,
             events: options.event_qos,
-            expiry: options.expiry.and_then(|expiry| u32::try_from(expiry.as_secs()).ok()),
+            expiry: options
+                .expiry
+                .into_iter()
+                .chain(options.message_expiry)
+                .min()
+                .map(seconds),
         };
         let (events_buffer, history_buffer) = buffers(&options);
         let has_buffer = events_buffer.is_some();
         let count = |kind| LostCount(stats.clone(), kind);
         let now = Instant::now();
+        let kept = stats.mqtt.keep_broker(LinkOf::Topics, None);
         let (topics_of_commands, memory) = (topics.clone(), stats.taken.clone());
         let (commands, results) = match stats.mqtt.keep_orders(None) {
             Some(mut left) => {
@@ -195,11 +171,8 @@ impl Client {
             history_at: now,
             commands,
             outbox: Outbox::new(delivery),
-            link: BrokerLink::Disconnected { retry_at: now },
-            will: WillForm::default(),
-            back_off: BackOff::default(),
-            outages: OutageLog::default(),
-            takeovers: Takeovers::default(),
+            link: BrokerLink::new(options.clone(), options.client_id.clone(), "", kept.as_ref()),
+            renew_at: None,
             retry: Retry::default(),
             refused: LogThrottle::every(REFUSED_LOGGED),
             missed: 0,
@@ -230,31 +203,30 @@ impl Client {
     }
 
     fn on_connection_event(&mut self, event: ConnectionEvent) {
-        let BrokerLink::Open(session) = &mut self.link else {
-            return;
-        };
-        match event {
-            ConnectionEvent::Connected(limits) => self.connected(limits),
-            ConnectionEvent::Subscribed(refused) => {
-                let phase = session.phase;
-                self.subscribed(phase, &refused);
+        match self.link.take(event) {
+            // A client that reads `online` may send commands, so the subscription comes first.
+            Step::Accepted(limits) | Step::Subscribe(limits) => self.subscribe(limits),
+            Step::Subscribed(refused, ready) => {
+                report_refused(&self.subscriptions, &refused);
+                if let Some(limits) = ready {
+                    self.ready(limits);
+                }
             }
-            ConnectionEvent::Sent(packet) => {
+            Step::Sent(packet) => {
                 if let Err(why) = self.outbox.numbered(packet) {
                     self.give_up(why);
                 }
             }
-            ConnectionEvent::Acked(packet) => {
+            Step::Acked(packet) => {
                 self.stats.mqtt.published.fetch_add(1, Ordering::Relaxed);
                 let settled = self.outbox.acked(packet);
                 self.settled(settled);
             }
-            ConnectionEvent::Refused(packet, why) => self.refused(packet, why),
-            ConnectionEvent::Message(message) => self.on_message(*message),
-            ConnectionEvent::Room | ConnectionEvent::Alive => {}
-            ConnectionEvent::Refuses(lack) => self.lessen_will(lack),
-            ConnectionEvent::Stuck(why) => self.give_up(why),
-            ConnectionEvent::Lost(why) => drop(self.lost(&why)),
+            Step::Refused(packet, why) => self.refused(packet, why),
+            Step::Message(message) => self.on_message(*message),
+            Step::GiveUp(why) => self.give_up(why),
+            Step::Lost(why) => self.lost(&why),
+            Step::Nothing => {}
         }
     }
 
@@ -271,18 +243,9 @@ impl Client {
     }
 
     /// Publishes the status, then everything else.
-    fn ready(&mut self, limits: BrokerLimits, since: Instant) {
-        let BrokerLink::Open(session) = &mut self.link else {
-            return;
-        };
-        session.phase = Phase::Ready { limits, since };
+    fn ready(&mut self, limits: BrokerLimits) {
         self.stats.mqtt.connected.store(true, Ordering::Relaxed);
-        let (host, port) = (&self.options.host, self.options.port);
-        tracing::info!(target: "drivegate::north::mqtt", "connected to the broker at {host}:{port}");
-        for lost in limits.losses() {
-            tracing::warn!(target: "drivegate::north::mqtt", "the broker at {host}:{port} {lost}");
-        }
-        self.outages.end();
+        self.link.log_ready(limits, "");
         self.repair.forget();
         self.publish_online();
         self.keep_recorded();
@@ -291,57 +254,34 @@ impl Client {
             announcer.restart(limits.max_packet);
         }
         self.leftovers_known = true;
-        self.look_at = since;
+        self.look_at = Instant::now();
     }
 
     fn publish_online(&mut self) {
-        self.outbox.put_first(self.topics.status().into(), b"online".to_vec());
+        let expiry = self.options.message_expiry;
+        self.renew_at = expiry.map(|expiry| Instant::now() + expiry / RENEWED);
+        self.outbox
+            .put_first(self.topics.status().into(), b"online".to_vec(), expiry.map(seconds));
     }
 
     /// Ends the connection for this reason, and tells the broker. Once the status is `online`, the last will is true: whoever
     /// waits for the gateway learns that it is away.
     fn give_up(&mut self, why: &str) {
         let true_now = self.is_ready();
-        if let BrokerLink::Open(session) = self.lost(why) {
-            session.connection.give_up(true_now);
-        }
+        self.link.give_up(why, true_now);
+        self.down();
     }
 
-    /// There is no connection any more; returns what was there. Dropping it aborts its task and closes the socket.
-    fn lost(&mut self, why: &str) -> BrokerLink {
-        let now = Instant::now();
-        if self.is_ready() {
-            // The next broker, or this one with another configuration, may take more.
-            self.will = WillForm::default();
-        }
-        let held = match &self.link {
-            BrokerLink::Open(BrokerSession {
-                phase: Phase::Ready { since, .. },
-                ..
-            }) => now.saturating_duration_since(*since),
-            _ => Duration::ZERO,
-        };
-        let wait = self.back_off.after(held);
-        let before = std::mem::replace(&mut self.link, BrokerLink::Disconnected { retry_at: now + wait });
+    /// There is no connection any more.
+    fn lost(&mut self, why: &str) {
+        drop(self.link.lost(why));
+        self.down();
+    }
+
+    fn down(&mut self) {
         self.outbox.lost();
-        self.look_at = now;
+        self.look_at = Instant::now();
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
-        if self.outages.permit(why, now) {
-            let (host, port) = (&self.options.host, self.options.port);
-            let hint = if why.contains("SessionTakenOver") {
-                "; another client has the same `client_id`: give each gateway a name or a `client_id` of its own"
-            } else {
-                ""
-            };
-            tracing::warn!(target: "drivegate::north::mqtt", "no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
-        } else {
-            tracing::debug!(target: "drivegate::north::mqtt", "no connection to the broker: {why}");
-        }
-        if why == CLOSED && self.takeovers.closed(now) {
-            let words = Takeovers::words(&self.options.client_id);
-            tracing::warn!(target: "drivegate::north::mqtt", "{}:{}: {words}", self.options.host, self.options.port);
-        }
-        before
     }
 
     fn on_message(&mut self, message: Incoming) {
@@ -370,14 +310,16 @@ impl Client {
         }
     }
 
+    /// Publishes `online` again: somebody published another status, or it would expire.
     fn repair_status(&mut self, now: Instant) {
-        if self.is_ready() && self.repair.take(now) {
+        let renews = self.renew_at.is_some_and(|at| now >= at);
+        if self.is_ready() && (self.repair.take(now) || renews) {
             self.publish_online();
         }
     }
 
     fn is_ready(&self) -> bool {
-        matches!(&self.link, BrokerLink::Open(session) if matches!(session.phase, Phase::Ready { .. }))
+        self.link.ready().is_some()
     }
 
     fn on_ended(&mut self, ended: Finished) {
@@ -398,7 +340,7 @@ impl Client {
                     self.outbox.put(topic, payload);
                 }
                 for line in self.publisher.take_reduced() {
-                    tracing::warn!(target: "drivegate::north::mqtt", "broker {}:{}: {line}", self.options.host, self.options.port);
+                    tracing::warn!(target: "drivegate::north::mqtt", "broker {}: {line}", self.link.broker());
                 }
                 next
             }
@@ -425,16 +367,10 @@ impl Client {
 
     async fn check(&mut self, now: Instant) {
         self.update_plant();
-        match &mut self.link {
-            BrokerLink::Disconnected { retry_at } if now >= *retry_at => self.connect().await,
-            BrokerLink::Disconnected { .. } => {}
-            BrokerLink::Open(session) => match session.phase {
-                Phase::Subscribing { since, .. } if now.saturating_duration_since(since) > SUBSCRIBE_TIMEOUT => {
-                    self.give_up("the broker does not answer the subscription");
-                }
-                phase if session.connection.is_silent(phase.limits(), now) => self.give_up("the broker is silent"),
-                _ => {}
-            },
+        match self.link.due(now) {
+            Due::Connect => self.connect().await,
+            Due::GiveUp(why) => self.give_up(why),
+            Due::Nothing => {}
         }
         self.repair_status(now);
         if self.retry.is_due(now) {
@@ -464,29 +400,14 @@ impl Client {
         self.publisher.adopt(&plant, discovery);
         self.observed = plant;
         self.remember_topics();
-        if let BrokerLink::Open(session) = &self.link
-            && let Some(limits) = session.phase.limits()
-            && !limits.wildcards
-        {
+        if let Some(limits) = self.link.limits().filter(|limits| !limits.wildcards) {
             self.subscribe(limits);
         }
     }
 
     async fn connect(&mut self) {
-        let options = self.options.clone();
-        // Read for each attempt, so that renewed certificates are used without a restart.
-        let config = tokio::task::spawn_blocking(move || tls::client_config(&options)).await;
-        let config = config.map_err(|error| error.to_string());
-        match config.and_then(|config| config.map_err(|error| error.to_string())) {
-            Ok(config) => {
-                let will = self.will.will(self.topics.status(), "offline", true);
-                let connection = Connection::open(&self.options, &self.options.client_id, will, config);
-                self.link = BrokerLink::Open(BrokerSession {
-                    connection,
-                    phase: Phase::Connecting,
-                });
-            }
-            Err(why) => drop(self.lost(&why)),
+        if let Err(why) = self.link.connect(self.topics.status(), b"offline".to_vec(), true).await {
+            self.lost(&why);
         }
     }
 
@@ -495,12 +416,7 @@ impl Client {
         self.outbox.drop_gone(Kind::Event, self.store.gone());
         self.outbox.drop_gone(Kind::History, self.history.gone());
         self.store.load(self.outbox.room(Kind::Event));
-        if let BrokerLink::Open(BrokerSession {
-            phase: Phase::Ready { limits, .. },
-            ..
-        }) = &self.link
-        {
-            let limits = *limits;
+        if let Some(limits) = self.link.ready() {
             self.history.load(self.outbox.room(Kind::History));
             self.announce();
             self.publish(limits);
@@ -511,7 +427,7 @@ impl Client {
 
     fn publish(&mut self, limits: BrokerLimits) {
         let now = Instant::now();
-        while let BrokerLink::Open(BrokerSession { connection, .. }) = &mut self.link
+        while self.link.is_up()
             && let Some((key, message)) = self.outbox.next(limits.window, now >= self.history_at)
         {
             if connection::packet_size(&message) > limits.max_packet {
@@ -525,7 +441,7 @@ impl Client {
                 continue;
             }
             let acknowledged = message.acknowledged && limits.acknowledges;
-            if !connection.publish(message, limits) {
+            if !self.link.publish(message) {
                 break;
             }
             if matches!(key, Key::Queued(Kind::History, _)) {
@@ -562,6 +478,7 @@ impl Client {
         }
         // The client that a reload puts in its place goes on with them.
         self.stats.mqtt.keep_unread(Some(self.events));
+        self.stats.mqtt.keep_broker(LinkOf::Topics, Some(self.link.broker()));
         let orders = self.commands.leave(self.outbox.into_results());
         self.stats.mqtt.keep_orders(Some(orders));
     }
@@ -571,7 +488,7 @@ impl Client {
         while self.is_ready() && !self.commands.is_idle() {
             self.publish_waiting();
             tokio::select! {
-                event = next(&mut self.link), if self.receives() => self.on_connection_event(event),
+                event = self.link.next(), if self.receives() => self.on_connection_event(event),
                 event = self.events.recv() => self.on_event(event),
                 ended = self.commands.finished() => self.on_ended(ended),
                 loaded = self.store.next() => self.on_loaded(Kind::Event, loaded),
@@ -587,7 +504,7 @@ impl Client {
             self.publish_waiting();
             let quiet = self.commands.is_idle() && self.outbox.urgent() == 0;
             if !offline_queued && (quiet || tokio::time::Instant::now() >= last_results) {
-                self.outbox.put_first(status.as_str().into(), b"offline".to_vec());
+                self.outbox.put_first(status.as_str().into(), b"offline".to_vec(), None);
                 offline_queued = true;
                 continue;
             }
@@ -595,20 +512,17 @@ impl Client {
                 break;
             }
             tokio::select! {
-                event = next(&mut self.link), if self.receives() => self.on_connection_event(event),
+                event = self.link.next(), if self.receives() => self.on_connection_event(event),
                 event = self.events.recv() => self.on_event(event),
                 ended = self.commands.finished() => self.on_ended(ended),
                 loaded = self.store.next() => self.on_loaded(Kind::Event, loaded),
                 () = tokio::time::sleep_until(last_results), if !offline_queued => {}
             }
         }
-        if let BrokerLink::Open(session) = &mut self.link
-            && let Some(limits) = session.phase.limits()
-            && session.connection.disconnect(limits)
-        {
+        if self.link.disconnect() {
             // The broker counts what is still under way from it as delivered.
             loop {
-                match next(&mut self.link).await {
+                match self.link.next().await {
                     ConnectionEvent::Lost(_) => break,
                     ConnectionEvent::Message(message) => self.on_message(*message),
                     _ => {}

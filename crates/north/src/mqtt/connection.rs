@@ -5,6 +5,7 @@
 //! outbox until [`ConnectionEvent::Room`].
 
 use std::collections::{HashMap, HashSet};
+use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -18,14 +19,16 @@ use rumqttc::{
     RetainForwardRule, StateError, SubscribeReasonCode, TlsConfiguration, Transport,
 };
 use rustls::ClientConfig;
+use tokio::net::TcpStream;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
-use super::Options;
 use super::broker_limits::{BrokerLimits, Lack};
+use super::dial::CONNECT_TIMEOUT;
 use super::outbox::Message;
 use super::request::Incoming;
 use super::silence::{KEEP_ALIVE_S, Silence, Verdict};
+use super::{Broker, Options};
 use crate::tls_words;
 
 /// Why a broker refuses filters with wildcards.
@@ -51,8 +54,6 @@ const SUBSCRIBE_BYTES: usize = 8 << 10;
 const SEND_BUFFER: u32 = 256 << 10;
 /// Time for the DISCONNECT of a connection that the gateway gives up.
 const LAST_PACKET: Duration = Duration::from_millis(500);
-/// Time limit for TCP, TLS and CONNACK.
-const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// An event of the connection.
 #[derive(Debug)]
@@ -193,16 +194,20 @@ impl Drop for Connection {
 }
 
 impl Connection {
-    /// Starts to connect as this client, with this last will.
-    pub(super) fn open(
+    /// Starts to connect to `broker` as this client, with this last will; `dial` makes the TCP connection.
+    pub(super) fn open<Dialled>(
         options: &Options,
-        client_id: &str,
+        (broker, client_id): (&Broker, &str),
         will: LastWill,
         tls: Option<Arc<ClientConfig>>,
-    ) -> Connection {
-        let (client, eventloop) = AsyncClient::builder(mqtt_options(options, client_id, will, tls))
-            .capacity(REQUESTS)
-            .build();
+        dial: impl Fn(NetworkOptions) -> Dialled + Send + Sync + 'static,
+    ) -> Connection
+    where
+        Dialled: Future<Output = io::Result<TcpStream>> + Send + 'static,
+    {
+        let mut mqtt = mqtt_options(options, (broker, client_id), will, tls);
+        mqtt.set_socket_connector(move |_, network| dial(network));
+        let (client, eventloop) = AsyncClient::builder(mqtt).capacity(REQUESTS).build();
         let (sender, event) = mpsc::channel(EVENTS);
         let backlog = Arc::<Backlog>::default();
         let task = tokio::spawn(poll(eventloop, sender, backlog.clone()));
@@ -368,10 +373,14 @@ pub(super) fn packet_size(message: &Message) -> usize {
     message.topic.len() + message.payload.len() + correlation + PACKET_OVERHEAD
 }
 
-fn mqtt_options(options: &Options, client_id: &str, will: LastWill, tls: Option<Arc<ClientConfig>>) -> MqttOptions {
-    // rumqttc requires IPv6 addresses without brackets; TLS would take one with brackets for a name.
-    let host = options.host.trim_start_matches('[').trim_end_matches(']');
-    let mut mqtt = MqttOptions::new(client_id, (host, options.port));
+fn mqtt_options(
+    options: &Options,
+    (broker, client_id): (&Broker, &str),
+    will: LastWill,
+    tls: Option<Arc<ClientConfig>>,
+) -> MqttOptions {
+    // TLS would take an IPv6 address with brackets for a name.
+    let mut mqtt = MqttOptions::new(client_id, (broker.bare_host(), broker.port));
     let mut properties = ConnectProperties::new();
     properties.max_packet_size = Some(MAX_PACKET);
     properties.receive_maximum = Some(RECEIVE_MAXIMUM);

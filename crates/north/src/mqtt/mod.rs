@@ -11,20 +11,23 @@
 //!
 //! `payload`, `publisher`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and
 //! in which order; `offline` drives `commands` without a broker. `broker_limits`, `silence`, `retry` and `takeover` judge what the broker does,
-//! without I/O as well. `client` is the task that owns them. `connection` wraps
+//! without I/O as well, `back_off` chooses the broker. `client` is the task that owns them. `link` is the way to one of the brokers,
+//! for both clients: it owns the `connection`, which wraps
 //! rumqttc, which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are
-//! sent again from the outbox. `sparkplug` is a client of its own, on a connection of its own.
+//! sent again from the outbox. `sparkplug` is a client of its own, on a link of its own.
 
 mod back_off;
 mod broker_limits;
 mod client;
 mod commands;
 mod connection;
+mod dial;
 #[cfg(test)]
 pub(super) mod fixture;
 mod history;
 mod home_assistant;
 mod journal;
+mod link;
 mod offline;
 mod outage_log;
 mod outbox;
@@ -67,14 +70,37 @@ impl fmt::Debug for Secret {
     }
 }
 
+/// Where a broker is.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Broker {
+    /// Host; an IPv6 address with or without brackets.
+    pub host: String,
+    /// Port.
+    pub port: u16,
+}
+
+impl fmt::Display for Broker {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.bare_host() {
+            host if host.contains(':') => write!(f, "[{host}]:{}", self.port),
+            host => write!(f, "{host}:{}", self.port),
+        }
+    }
+}
+
+impl Broker {
+    /// The host, an IPv6 address without brackets.
+    fn bare_host(&self) -> &str {
+        self.host.trim_start_matches('[').trim_end_matches(']')
+    }
+}
+
 /// Configuration of the MQTT client.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// Host of the broker.
-    pub host: String,
-    /// Port of the broker.
-    pub port: u16,
-    /// TLS (`mqtts://`).
+    /// The brokers, in the order in which they are tried; at least one.
+    pub brokers: Vec<Broker>,
+    /// TLS (`mqtts://`), of all of them.
     pub tls: bool,
     /// Client id.
     pub client_id: String,
@@ -96,6 +122,8 @@ pub struct Options {
     pub event_qos: Qos,
     /// Time after which the broker drops telemetry; never if absent.
     pub expiry: Option<Duration>,
+    /// Time after which a broker drops the status `online`, and telemetry at the latest, unless it is renewed; never if absent.
+    pub message_expiry: Option<Duration>,
     /// Minimum time between two publications of a topic.
     pub min_interval: Duration,
     /// Maximum time between two publications of a topic.

@@ -105,6 +105,8 @@ struct Slot {
     sent: Option<Vec<u8>>,
     /// It must arrive and lasts: the status, discovery, and the end of a topic.
     lasting: bool,
+    /// What lasts expires all the same after this time, s.
+    expiry: Option<u32>,
     in_flight: bool,
     /// The broker refused it; it waits for [`Outbox::retry`].
     put_back: bool,
@@ -191,15 +193,16 @@ impl Outbox {
 
     fn put_slot(&mut self, topic: Arc<str>, payload: Vec<u8>, lasting: bool) {
         let slot = self.latest.entry(topic.clone()).or_default();
-        slot.lasting = lasting;
+        (slot.lasting, slot.expiry) = (lasting, None);
         if slot.waiting.replace(payload).is_none() {
             self.order.push_back(topic);
         }
     }
 
-    /// As [`Outbox::put_lasting`], published before everything else.
-    pub(super) fn put_first(&mut self, topic: Arc<str>, payload: Vec<u8>) {
+    /// As [`Outbox::put_lasting`], published before everything else; the broker drops it after `expiry`, s, if there is one.
+    pub(super) fn put_first(&mut self, topic: Arc<str>, payload: Vec<u8>, expiry: Option<u32>) {
         let slot = self.latest.entry(topic.clone()).or_default();
+        slot.expiry = expiry;
         (slot.waiting, slot.lasting, slot.put_back) = (Some(payload), true, false);
         self.order.retain(|t| *t != topic);
         self.order.push_front(topic);
@@ -387,7 +390,7 @@ impl Outbox {
                 payload,
                 retain: true,
                 acknowledged,
-                expiry: self.delivery.expiry.filter(|_| !lasting),
+                expiry: if lasting { slot.expiry } else { self.delivery.expiry },
                 correlation: None,
             };
             Some((Key::Latest(topic.clone()), message))

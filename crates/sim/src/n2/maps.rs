@@ -62,7 +62,7 @@ pub(crate) fn of(model: &ModelOptions) -> &'static Map {
         ModelOptions::Nx(nx) if nx.hvac_control => &HVX,
         ModelOptions::Nx(_) => &NX,
         ModelOptions::Teco(_) => &TECO,
-        ModelOptions::Cx(_) => &NONE,
+        ModelOptions::Cx(_) | ModelOptions::Profile(_) => &NONE,
     }
 }
 

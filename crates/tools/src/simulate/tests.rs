@@ -123,20 +123,29 @@ fn the_documentation_names_every_fault() {
 #[test]
 fn every_built_in_profile_can_be_simulated() {
     let profiles = Profiles::built_in();
-    let simulated = profiles.iter().filter(|profile| profile.simulator.is_some());
-    for name in simulated.map(|profile| &profile.name) {
+    for profile in profiles.iter() {
+        let name = &profile.name;
         let args = parse(&format!("--profile {name}")).unwrap();
         let line = args.applied_to(args.line().unwrap());
-        let profile = profiles.get(name).unwrap();
         assert_eq!(Some(&line.rules.protocol), profile.protocols.first(), "{name}");
+        let baud = line.rules.format.baud;
         assert!(
-            profile.bauds.contains(&line.rules.format.baud),
-            "{name}: {}",
-            line.rules.format
+            profile.bauds.is_empty() || profile.bauds.contains(&baud),
+            "{name}: {baud}"
         );
-        let word = format!("{} ", profile.simulator.as_deref().unwrap());
         let address = line.drives[0].model.trip_address().to_string();
-        assert!(trip_registers().replace(',', " ").contains(&word) && trip_registers().contains(&address));
+        let help = trip_registers().replace(',', " ");
+        match &line.drives[0].model {
+            ModelOptions::Profile(of) => {
+                let own = profile.simulator.is_some() || profile.control.is_none();
+                assert!(own && of.turnaround == Some(profile.turnaround), "{name}");
+                assert_eq!(address, "9998", "{name}");
+            }
+            _ => {
+                let word = format!("{} ", profile.simulator.as_deref().unwrap());
+                assert!(help.contains(&word) && help.contains(&address), "{name}");
+            }
+        }
     }
     let line = |words: &str| {
         let args = parse(words).unwrap();
@@ -154,6 +163,68 @@ fn every_built_in_profile_can_be_simulated() {
     assert_eq!(line("--profile vacon-cx").rules.format.to_string(), "19200 8N2");
     assert_eq!(line("--profile vacon-nx-n2").rules.format.to_string(), "9600 8N1");
     assert_eq!(line("").rules.format.to_string(), "38400 8N1");
+}
+
+/// A profile of the user: by its file, by a directory, with values; and what is wrong with them.
+#[test]
+fn profiles_of_the_user_are_simulated() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name).display().to_string();
+    let write = |name: &str, text: &str| std::fs::write(path(name), text).unwrap();
+    let meter = "name = \"meter\"\nprotocols = [\"modbus-rtu\"]\nbauds = [9600]\nturnaround = \"7ms\"\n\
+                 [[range]]\ntable = \"input\"\nfirst = 0\nlast = 9\nread = 4\n\
+                 [[point]]\nname = \"voltage\"\nat = \"input 0\"\nscale = 0.1\nunit = \"V\"\nclass = \"fast\"\n\
+                 [[point]]\nname = \"tariff\"\nat = \"input 1\"\ntexts = { 1 = \"day\", 2 = \"night\" }\n\
+                 [[point]]\nname = \"serial\"\nat = \"input 2\"\ntype = \"string:3\"\n";
+    write("meter.toml", meter);
+    let error_of = |words: &str| parse(words).unwrap().line().unwrap_err();
+    let file = path("meter.toml");
+    let args = parse(&format!(
+        "--profile {file} --set voltage=231.5 --set tariff=night --set serial=A1"
+    ))
+    .unwrap();
+    let line = args.applied_to(args.line().unwrap());
+    assert_eq!(line.rules.format.baud, 9600);
+    let ModelOptions::Profile(of) = &line.drives[0].model else {
+        panic!("{:?}", line.drives[0].model);
+    };
+    assert_eq!(of.turnaround, Some(Duration::from_millis(7)));
+    let given: Vec<&Given> = of.values.values().collect();
+    assert_eq!(
+        given,
+        [
+            &Given::Number(231.5),
+            &Given::Number(2.0),
+            &Given::Text("A1".to_string())
+        ]
+    );
+    let dir = directory.path().display();
+    assert!(
+        parse(&format!("--profile meter --profile-dir {dir}"))
+            .unwrap()
+            .line()
+            .is_ok()
+    );
+    for (words, wanted) in [
+        (format!("--profile {file} --set voltag=1"), "did you mean `voltage`?"),
+        (format!("--profile {file} --set voltage"), "write POINT=VALUE"),
+        (
+            format!("--profile {file} --set voltage=high"),
+            "`high` is not a value of `voltage`",
+        ),
+        ("--set voltage=1".to_string(), "come from its simulated motor"),
+        (format!("--profile {}", path("none.toml")), "none.toml"),
+    ] {
+        let error = error_of(&words);
+        assert!(error.contains(wanted), "{words}: {error}");
+    }
+    write(
+        "odd.toml",
+        &meter.replace("name = \"meter\"", "name = \"odd\"\nsimulator = \"odd\""),
+    );
+    assert!(error_of(&format!("--profile {}", path("odd.toml"))).contains("unknown simulator `odd`"));
+    write("bad.toml", "name = \"bad\"");
+    assert!(error_of(&format!("--profile {}", path("bad.toml"))).contains("protocols"));
 }
 
 #[test]

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use tokio::signal::unix::{SignalKind, signal};
 
+use crate::sim::simulated_drive::SimulatedDrive;
 use crate::sim::statistics::Statistics;
 use crate::sim::wire::SimulatedBus;
 
@@ -24,6 +25,8 @@ pub(super) fn serve(lines: &[SimulatedBus]) -> io::Result<()> {
 async fn watch(lines: &[SimulatedBus]) -> io::Result<()> {
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut terminate = signal(SignalKind::terminate())?;
+    let mut trip = signal(SignalKind::user_defined1())?;
+    let mut panel = signal(SignalKind::user_defined2())?;
     let mut second = tokio::time::interval(Duration::from_secs(1));
     let live = io::stdout().is_terminal();
     let (mut before, mut then) = (total(lines), Instant::now());
@@ -31,6 +34,11 @@ async fn watch(lines: &[SimulatedBus]) -> io::Result<()> {
         tokio::select! {
             _ = interrupt.recv() => break,
             _ = terminate.recv() => break,
+            _ = trip.recv() => every_drive(lines, |drive| drive.trip(1)),
+            _ = panel.recv() => every_drive(lines, |drive| {
+                let remote = drive.state().remote;
+                drive.set_remote(!remote);
+            }),
             _ = second.tick(), if live => {
                 let (now, at) = (total(lines), Instant::now());
                 let seconds = at.duration_since(then).as_secs_f64().max(0.001);
@@ -45,6 +53,14 @@ async fn watch(lines: &[SimulatedBus]) -> io::Result<()> {
         println!();
     }
     Ok(())
+}
+
+fn every_drive(lines: &[SimulatedBus], act: impl Fn(&mut SimulatedDrive)) {
+    for line in lines {
+        for address in 0..=u8::MAX {
+            line.with_drive(address, |drive, _| act(drive));
+        }
+    }
 }
 
 fn total(lines: &[SimulatedBus]) -> Statistics {

@@ -157,6 +157,13 @@ fn bbmd_requests_are_refused_and_those_not_allowed_hear_nothing() {
         bench.datagram(5, &request);
         assert_eq!(bench.server.transmit().unwrap().1, bvlc::result(code));
     }
+    // An own broadcast that comes back is nothing that came.
+    let before = bench.server.counters();
+    let own = bench.server.options.address;
+    bench
+        .server
+        .receive(own, &bvlc::broadcast(&[1, 0]), &bench.plant, bench.now);
+    assert_eq!(bench.server.counters(), before);
     let stranger = "192.0.2.9:47808".parse().unwrap();
     let all = who_is(Some((npdu::GLOBAL, Mac::ALL)), None, None);
     let mut forwarded = vec![0x81, 4];

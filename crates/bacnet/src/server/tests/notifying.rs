@@ -117,3 +117,38 @@ fn any_property_of_any_object_and_no_other() {
     bench.server.set_devices(vec![device(100, None, 0)]);
     assert_eq!(bench.server.counters().subscriptions, 0, "its device is there no more");
 }
+
+#[test]
+fn clocks_and_what_does_not_fit_are_not_subscribed_to() {
+    let mut bench = Bench::of(1, 240);
+    let own = ObjectId::new(ObjectType::DEVICE, 101);
+    let of_property = |property: PropertyId| {
+        written(|w| {
+            w.context_unsigned(0, 8)
+                .context_object(1, own)
+                .context_bool(2, false)
+                .context_unsigned(3, 0);
+            w.open(4).context_property(0, property).close(4);
+        })
+    };
+    for property in [
+        PropertyId::LOCAL_TIME,
+        PropertyId::LOCAL_DATE,
+        PropertyId::ACTIVE_COV_SUBSCRIPTIONS,
+        PropertyId::OBJECT_LIST,
+        PropertyId::ALL,
+    ] {
+        let answers = bench.ask(5, Some(1), 1, c::SUBSCRIBE_COV_PROPERTY, &of_property(property));
+        assert_eq!(answers, [apdu::error(1, 28, Error::NOT_COV_PROPERTY)], "{property:?}");
+    }
+    bench.later(Duration::from_secs(2));
+    assert_eq!((bench.out().len(), bench.server.counters().subscriptions), (0, 0));
+    let answers = bench.ask(
+        5,
+        Some(1),
+        2,
+        c::SUBSCRIBE_COV_PROPERTY,
+        &of_property(PropertyId::OBJECT_NAME),
+    );
+    assert_eq!(answers.len(), 2);
+}

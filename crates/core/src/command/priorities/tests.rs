@@ -251,3 +251,34 @@ fn outcomes_settle_slots() {
         assert_eq!(Settled::of(&outcome), settled);
     }
 }
+
+#[test]
+fn a_stop_is_what_leaves_no_active_to_govern() {
+    let mut all = Priorities::default();
+    assert!(all.stops(16, Some(false)) && all.stops(16, None), "without any slot");
+    assert!(!all.stops(1, Some(true)));
+    write(&mut all, Run, "a", 8, Some(1.0));
+    assert!(all.stops(8, Some(false)) && all.stops(1, Some(false)) && all.stops(8, None));
+    assert!(!all.stops(9, Some(false)), "it does not govern");
+    write(&mut all, Run, "b", 5, Some(0.0));
+    assert!(!all.stops(5, None), "it hands over to an active");
+    assert!(all.stops(8, None), "it gives nobody anything");
+}
+
+#[test]
+fn an_order_that_was_planned_follows_only_from_what_still_stands() {
+    let mut all = Priorities::default();
+    write(&mut all, Run, "a", 8, Some(1.0));
+    write(&mut all, Run, "b", 5, Some(0.0));
+    let null = SlotWrite::new(Run, 5, None);
+    let Follows::Order(_, entry) = all.plan(&null) else {
+        panic!()
+    };
+    let null = null.in_favour_of(&entry);
+    assert!(all.still_follows(&null));
+    let mut stopped = all.clone();
+    assert!(elsewhere(&mut stopped, SourceKind::Mqtt, effect(Some(false), false)));
+    assert!(!stopped.still_follows(&null), "a stop withdrew the active");
+    write(&mut all, Run, "c", 8, Some(1.0));
+    assert!(!all.still_follows(&null), "it is another one's order");
+}

@@ -1,11 +1,13 @@
 //! Raw values: address, format and conversion to engineering units.
 
 mod form;
+mod standing;
 
 use super::super::model::{Kind, Text, Value, tidy, tidy_product};
 use crate::codec::Table;
 
 pub use form::{Form, Order};
+pub use standing::Part;
 
 /// Whole numbers up to here are exact as a number with a fraction.
 const EXACT: u64 = 1 << 53;

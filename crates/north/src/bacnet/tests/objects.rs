@@ -144,6 +144,15 @@ fn the_tables_for_the_integrator_are_whole() {
             .all(|row| row.contains('"') || row.split(';').count() == columns),
         "{rows:#?}"
     );
+    let speed = rows
+        .iter()
+        .find(|row| row.starts_with("hall.p1.actual_speed;"))
+        .unwrap();
+    assert_eq!(
+        speed.split(';').nth(12),
+        Some("0.1"),
+        "ten times the resolution, as it is read"
+    );
     assert!(ede.state_texts.contains("offline;not_ready;ready;running;fault"));
     assert!(ede.units.contains("27;Hz"));
 }

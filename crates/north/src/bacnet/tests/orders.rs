@@ -177,6 +177,59 @@ fn who_comes_to_govern_is_judged_anew_and_gives_its_slot_back_when_refused() {
 }
 
 #[test]
+fn a_stop_between_plan_and_acceptance_keeps_the_next_slot_from_starting() {
+    let bench = Bench::new();
+    bench.order("127.0.0.5", RUN, 8, on(true), done());
+    bench.order("127.0.0.7", RUN, 5, on(false), done());
+    let drive = bench.drive();
+    let null = SlotWrite::new(Commanded::Run, 5, None);
+    let Follows::Order(_, entry) = drive.priorities(|all| all.plan(&null)) else {
+        panic!("no order")
+    };
+    assert_eq!(bench.elsewhere(ModelPoint::Run, Value::Bool(false)), None);
+    bench.carry_out(done());
+    let run = drive.image.spec.profile.model_index(ModelPoint::Run).unwrap();
+    let order = Order::Points(vec![(run, entry.value)]);
+    let null = null.in_favour_of(&entry);
+    let mut placed = drive.place_slot(
+        order,
+        null,
+        entry.origin,
+        Duration::from_secs(2),
+        (bench.now, bench.now),
+    );
+    let outcome = placed.answer().expect("refused at once").outcome;
+    assert_eq!(outcome, Outcome::Replaced);
+    assert_eq!(writes::error(&outcome), Err(Error::SERVICE_REQUEST_DENIED));
+    assert_eq!(bench.slots(RUN), [(5, Datum::Bool(false))]);
+}
+
+#[test]
+fn what_hands_over_to_an_active_is_no_stop() {
+    use drivegate_bacnet::services::{PropertyRef, WriteItem};
+    let bench = Bench::new();
+    let stops = |priority: u32, value: Data| {
+        let property = PropertyRef {
+            property: PropertyId::PRESENT_VALUE,
+            index: None,
+        };
+        let item = WriteItem {
+            object: RUN,
+            property,
+            value: Some(value),
+            priority: Some(priority),
+        };
+        bench.view.stops(DEVICE, &item)
+    };
+    assert!(stops(8, Data::Null) && stops(16, Data::Enumerated(0)));
+    bench.order("127.0.0.5", RUN, 8, on(true), done());
+    bench.order("127.0.0.7", RUN, 5, on(false), done());
+    assert!(!stops(5, Data::Null), "the active at 8 would start the motor");
+    assert!(!stops(9, Data::Enumerated(0)), "it does not govern");
+    assert!(stops(3, Data::Enumerated(0)) && !stops(300, Data::Enumerated(0)));
+}
+
+#[test]
 fn a_pulse_leaves_nothing_behind() {
     let bench = Bench::new();
     let reset = ObjectId::new(ObjectType::BINARY_VALUE, 3);

@@ -114,8 +114,8 @@ async fn commanded(
     body: Body,
     asked: Instant,
 ) -> Result<CommandReply, Response> {
-    let (operating, cookies, address) = (&app.operating, app.cookies(reached), reached.peer.ip());
-    let operator = operating.commander(&parts.headers, &cookies, address).await;
+    let (operating, cookies) = (&app.operating, app.cookies(reached));
+    let operator = operating.commander(&parts.headers, &cookies, reached).await;
     let operator = operator.map_err(IntoResponse::into_response)?;
     let payload = body::read(body, reached, MAX_PAYLOAD).await?;
     let plant = app.plant.load_full();
@@ -163,9 +163,12 @@ impl Waiting {
 impl Operator {
     /// As the audit shows it. All that a user does counts as one client.
     pub(super) fn origin(&self) -> Origin {
-        let client = format!("{} {}", SourceKind::Http.name(), self.user);
+        if self.kind == SourceKind::LocalSocket {
+            return Origin::new(self.kind, self.user.to_string()).with_login(self.login.clone());
+        }
+        let client = format!("{} {}", self.kind.name(), self.user);
         let who = format!("{} {}", self.user, self.address);
-        Origin::of(client.into(), SourceKind::Http, who).with_login(self.login.clone())
+        Origin::of(client.into(), self.kind, who).with_login(self.login.clone())
     }
 }
 
@@ -288,7 +291,7 @@ pub(in crate::http) async fn commands_of(
     headers: header::HeaderMap,
 ) -> Response {
     let cookies = app.cookies(&reached);
-    let operator = match app.operating.operator(&headers, &cookies, reached.peer.ip()).await {
+    let operator = match app.operating.operator(&headers, &cookies, &reached).await {
         Ok(operator) => operator,
         Err(denied) => return denied.into_response(),
     };
@@ -335,7 +338,7 @@ pub(in crate::http) async fn heartbeat(
     headers: header::HeaderMap,
 ) -> Response {
     let cookies = app.cookies(&reached);
-    let operator = match app.operating.commander(&headers, &cookies, reached.peer.ip()).await {
+    let operator = match app.operating.commander(&headers, &cookies, &reached).await {
         Ok(operator) => operator,
         Err(denied) => return denied.into_response(),
     };

@@ -31,9 +31,10 @@ pub(super) use self::cookies::Cookies;
 use self::sessions::{IDLE, Secrets, Session, Sessions};
 use self::throttle::{Source, Throttle};
 use self::verifier::Verifier;
+use super::routes::Reached;
 use super::users::{MAX_PASSWORD, User, Users};
 use crate::NorthStats;
-use crate::command::Authority;
+use crate::command::{Authority, SourceKind};
 use crate::log_throttle::LogThrottle;
 
 pub(crate) use self::commands::PostedCommands;
@@ -85,8 +86,24 @@ pub(super) struct Operator {
     /// See [`crate::command::Origin::with_login`].
     login: Arc<str>,
     address: IpAddr,
+    /// The way in.
+    kind: SourceKind,
     /// The cookie of its session; `None` for a program.
     cookie: Option<String>,
+}
+
+impl Operator {
+    /// Who came through the local socket.
+    fn local(uid: u32, address: IpAddr) -> Operator {
+        let user: Arc<str> = format!("uid {uid}").into();
+        Operator {
+            login: format!("{} {user}", SourceKind::LocalSocket.name()).into(),
+            user,
+            address,
+            kind: SourceKind::LocalSocket,
+            cookie: None,
+        }
+    }
 }
 
 /// Why a request is not answered as one of a user.
@@ -191,8 +208,12 @@ impl Operating {
         &self,
         headers: &HeaderMap,
         cookies: &Cookies,
-        address: IpAddr,
+        reached: &Reached,
     ) -> Result<Operator, Denied> {
+        let address = reached.peer.ip();
+        if let Some(local) = &reached.local {
+            return Ok(Operator::local(local.uid, address));
+        }
         if headers.contains_key(header::AUTHORIZATION) {
             let credentials = basic(headers).ok_or(Denied::NotLoggedIn)?;
             let user = self.verified(&credentials, address, Source::of(address)).await?;
@@ -200,6 +221,7 @@ impl Operating {
                 login: user.clone(),
                 user,
                 address,
+                kind: SourceKind::Http,
                 cookie: None,
             });
         }
@@ -209,6 +231,7 @@ impl Operating {
             user: session.user,
             login: session.login,
             address,
+            kind: SourceKind::Http,
             cookie: Some(cookie),
         })
     }
@@ -226,10 +249,14 @@ impl Operating {
         &self,
         headers: &HeaderMap,
         cookies: &Cookies,
-        address: IpAddr,
+        reached: &Reached,
     ) -> Result<Operator, Denied> {
+        if reached.local.is_some() {
+            // No browser comes through a socket, and its file says who may.
+            return self.operator(headers, cookies, reached).await;
+        }
         is_own_origin(headers)?;
-        let operator = self.operator(headers, cookies, address).await?;
+        let operator = self.operator(headers, cookies, reached).await?;
         if let Some(cookie) = &operator.cookie {
             self.check_csrf(headers, cookie)?;
         }
@@ -334,6 +361,7 @@ impl Operating {
             user: user.clone(),
             login: session.login.clone(),
             address,
+            kind: SourceKind::Http,
             cookie: Some(cookie.clone()),
         };
         self.used(&operator, now);
@@ -408,11 +436,15 @@ pub(super) fn is_operating(path: &str) -> bool {
         rest.split_once('/')
             .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat"))
     };
-    matches!(
-        path,
-        "/api/v1/login" | "/api/v1/logout" | "/api/v1/session" | "/api/v1/stop"
-    ) || path.starts_with("/assets/operate.")
+    is_session(path)
+        || path == "/api/v1/stop"
+        || path.starts_with("/assets/operate.")
         || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive)
+}
+
+/// Whether that is about the session of a user.
+pub(super) fn is_session(path: &str) -> bool {
+    matches!(path, "/api/v1/login" | "/api/v1/logout" | "/api/v1/session")
 }
 
 /// Whether a request may be one of those that change something, while commands are on.

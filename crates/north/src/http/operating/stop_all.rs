@@ -22,7 +22,7 @@ pub(in crate::http) async fn stop(
 ) -> Response {
     let (parts, body) = request.into_parts();
     let cookies = app.cookies(&reached);
-    let operator = app.operating.commander(&parts.headers, &cookies, reached.peer.ip());
+    let operator = app.operating.commander(&parts.headers, &cookies, &reached);
     let operator = match operator.await {
         Ok(operator) => operator,
         Err(denied) => return denied.into_response(),

@@ -1,22 +1,11 @@
-//! What the broker answers: to the last will, to the subscriptions, and to messages that it refuses.
+//! What is subscribed to, and messages that the broker refuses.
 
 use rumqttc::PubAckReason;
 
-use super::discovery::{report_refused, subscriptions};
+use super::discovery::subscriptions;
 use super::*;
-use crate::mqtt::broker_limits::Lack;
-use crate::mqtt::connection::NO_WILDCARDS;
 
 impl Client {
-    pub(super) fn connected(&mut self, limits: BrokerLimits) {
-        let since = Instant::now();
-        if let BrokerLink::Open(session) = &mut self.link {
-            // A client that reads `online` may send commands, so the subscription comes first.
-            session.phase = Phase::Subscribing { limits, since };
-        }
-        self.subscribe(limits);
-    }
-
     pub(super) fn subscribe(&mut self, limits: BrokerLimits) {
         let plant = (!limits.wildcards).then_some(self.observed.as_ref());
         self.subscriptions = subscriptions(
@@ -27,42 +16,8 @@ impl Client {
             plant,
         );
         let filters = self.subscriptions.iter().map(Subscription::filter).collect();
-        if let BrokerLink::Open(session) = &mut self.link
-            && !session.connection.subscribe(filters, limits)
-        {
+        if !self.link.subscribe(filters) {
             self.give_up("the subscription could not be sent");
-        }
-    }
-
-    /// The broker answered the subscriptions.
-    pub(super) fn subscribed(&mut self, phase: Phase, refused: &[Option<String>]) {
-        if let Phase::Subscribing { limits, since } = phase
-            && limits.wildcards
-            && refused.iter().flatten().any(|why| why == NO_WILDCARDS)
-            && let BrokerLink::Open(session) = &mut self.link
-        {
-            let limits = BrokerLimits {
-                wildcards: false,
-                ..limits
-            };
-            session.phase = Phase::Subscribing { limits, since };
-            return self.subscribe(limits);
-        }
-        report_refused(&self.subscriptions, refused);
-        if let Phase::Subscribing { limits, since } = phase {
-            self.ready(limits, since);
-        }
-    }
-
-    /// The broker refused the connection because of the last will: another one follows with less, at once, if there is less.
-    pub(super) fn lessen_will(&mut self, lack: Lack) {
-        if self.will.lessen(lack) {
-            tracing::debug!(target: "drivegate::north::mqtt", "the broker refuses the last will ({lack:?}); trying a lesser one");
-            self.link = BrokerLink::Disconnected {
-                retry_at: Instant::now(),
-            };
-        } else {
-            drop(self.lost("the broker refuses the last will in every form"));
         }
     }
 

@@ -1,14 +1,16 @@
 use arc_swap::ArcSwap;
 
-use super::super::{Buffer, Qos, Telemetry, fixture};
+use super::super::{Broker, Buffer, Qos, Telemetry, fixture};
 use super::*;
 use crate::event::{BURST, EventKind};
 use crate::process_image::{BusImage, BusSpec};
 
 fn options(buffer: Option<Buffer>) -> Options {
     Options {
-        host: "127.0.0.1".to_string(),
-        port: 1,
+        brokers: vec![Broker {
+            host: "127.0.0.1".to_string(),
+            port: 1,
+        }],
         tls: false,
         client_id: "test".to_string(),
         username: None,
@@ -24,6 +26,7 @@ fn options(buffer: Option<Buffer>) -> Options {
         telemetry_qos: Qos::AtMostOnce,
         event_qos: Qos::AtLeastOnce,
         expiry: None,
+        message_expiry: None,
         min_interval: Duration::from_millis(100),
         max_interval: Duration::from_secs(60),
         commands: true,

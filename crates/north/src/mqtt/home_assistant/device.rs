@@ -83,7 +83,8 @@ impl Device {
             ),
             Kind::Drive { drive, gateway } => {
                 let spec = &drive.image.spec;
-                let mut head = self.head(sources, &spec.name, made(&spec.profile.title), Some(gateway));
+                let title = spec.profile.described();
+                let mut head = self.head(sources, &spec.name, made(&title), Some(gateway));
                 head.insert("avty".into(), entity::of_drive_availability(sources, spec));
                 (head, entity::of_drive(sources, &self.id, spec))
             }

@@ -73,7 +73,7 @@ fn leader_first_then_results_events_and_telemetry_in_turn() {
     }
     outbox.push_result(event("r1"));
     outbox.push_result(event("r2"));
-    outbox.put_first(topic("status"), Vec::new());
+    outbox.put_first(topic("status"), Vec::new(), None);
     assert!(outbox.next(0, true).is_none());
     let sent = drain(&mut outbox, 100);
     let order = [
@@ -242,7 +242,7 @@ fn what_the_broker_refuses_for_now_is_published_again_in_its_order() {
 fn the_status_is_repeated_whatever_the_reason_and_telemetry_only_for_a_while() {
     let mut outbox = outbox();
     for for_now in [true, false] {
-        outbox.put_first(topic("status"), vec![1]);
+        outbox.put_first(topic("status"), vec![1], None);
         outbox.put(topic("t"), vec![2]);
         assert_eq!(drain(&mut outbox, 10).len(), 2);
         (1..=2).for_each(|packet| outbox.numbered(packet).unwrap());
@@ -266,10 +266,10 @@ fn the_status_is_repeated_whatever_the_reason_and_telemetry_only_for_a_while() {
 #[test]
 fn a_new_status_does_not_wait_for_the_retry() {
     let mut outbox = outbox();
-    outbox.put_first(topic("status"), vec![1]);
+    outbox.put_first(topic("status"), vec![1], None);
     drain(&mut outbox, 10);
     outbox.numbered(1).unwrap();
     assert!(outbox.put_back(1, true).is_some());
-    outbox.put_first(topic("status"), vec![0]);
+    outbox.put_first(topic("status"), vec![0], None);
     assert_eq!(drain(&mut outbox, 10), [("status".to_string(), vec![0])]);
 }

@@ -7,18 +7,16 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use rustls::ClientConfig;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
-use super::super::back_off::BackOff;
-use super::super::broker_limits::{BrokerLimits, WillForm};
-use super::super::connection::{self, CLOSED, Connection, ConnectionEvent, SUBSCRIBE_TIMEOUT};
-use super::super::outage_log::OutageLog;
+use super::super::Options as BrokerOptions;
+use super::super::back_off::chance;
+use super::super::broker_limits::BrokerLimits;
+use super::super::connection::{self, ConnectionEvent};
+use super::super::link::{BrokerLink, Due, Step};
 use super::super::outbox::Message;
 use super::super::request::Incoming;
-use super::super::takeover::Takeovers;
-use super::super::{Options as BrokerOptions, tls};
 use super::bd_seq::BdSeq;
 use super::model::{self, DriveMetrics, Moment, millis};
 use super::orders::{Finished, Orders};
@@ -29,6 +27,7 @@ use super::{Options, model::COMMAND_ERROR, model::COMMAND_RESULT};
 use crate::log_throttle::LogThrottle;
 use crate::plant::{Plant, SharedPlant};
 use crate::process_image::Snapshot;
+use crate::stats::LinkOf;
 use crate::{MqttLoss, NorthStats};
 
 /// Maximum time between two checks of the connection and the plant.
@@ -47,6 +46,17 @@ const FILE: Duration = Duration::from_secs(1);
 /// Least time between two log lines of one kind.
 const LOGGED: Duration = Duration::from_secs(60);
 
+/// Time that a broker has to say that the primary host is online, before another one is tried.
+const HOST: Duration = Duration::from_secs(5);
+/// Longest wait for the births when the host comes online, and for the next connection when it went offline: nodes follow one
+/// another.
+const SPREAD: Duration = Duration::from_secs(2);
+
+/// When the births follow if the host is online now.
+fn births_at() -> Instant {
+    Instant::now() + SPREAD.mul_f64(chance())
+}
+
 /// Runs the edge node until `cancel`.
 pub(in crate::mqtt) async fn run(
     options: Options,
@@ -60,7 +70,7 @@ pub(in crate::mqtt) async fn run(
         let look_at = tokio::time::Instant::from_std(client.look_at);
         tokio::select! {
             () = cancel.cancelled() => break,
-            event = next(&mut client.link) => client.on_event(event).await,
+            event = client.link.next() => client.on_event(event).await,
             finished = client.orders.finished() => client.on_finished(finished),
             () = client.fresh.notified() => client.look(),
             () = tokio::time::sleep_until(look_at) => client.on_time().await,
@@ -70,34 +80,6 @@ pub(in crate::mqtt) async fn run(
     client.shut_down().await;
 }
 
-/// The next event of the connection; pending while there is none. Cancel safe.
-async fn next(link: &mut Link) -> ConnectionEvent {
-    match link {
-        Link::Down { .. } => std::future::pending().await,
-        Link::Up(up) => up.connection.next().await,
-    }
-}
-
-#[derive(Debug)]
-enum Link {
-    /// No connection; the next attempt follows then.
-    Down { retry_at: Instant },
-    /// A connection that the broker may not have accepted yet.
-    Up(Up),
-}
-
-#[derive(Debug)]
-struct Up {
-    connection: Connection,
-    bd_seq: u8,
-    opened: Instant,
-    /// Once the broker has accepted it.
-    limits: Option<BrokerLimits>,
-    subscribed: bool,
-    /// Acknowledgements that are awaited: of the death of the node.
-    unacknowledged: bool,
-}
-
 struct Drive {
     metrics: DriveMetrics,
     seen: Option<Arc<Snapshot>>,
@@ -105,7 +87,6 @@ struct Drive {
 }
 
 struct Client {
-    client_id: String,
     topics: Topics,
     broker: BrokerOptions,
     plant: SharedPlant,
@@ -124,11 +105,13 @@ struct Client {
     look_at: Instant,
     check_at: Instant,
     buses_at: Instant,
-    link: Link,
-    will: WillForm,
-    back_off: BackOff,
-    outages: OutageLog,
-    takeovers: Takeovers,
+    link: BrokerLink,
+    /// Number of the connection.
+    number: u8,
+    /// Whether the acknowledgement of the death of the node is awaited.
+    unacknowledged: bool,
+    /// When another broker is tried, because the primary host is not online at this one.
+    host_until: Option<Instant>,
     waits_logged: bool,
     not_understood: LogThrottle,
 }
@@ -151,8 +134,10 @@ impl Client {
             history: options.history,
             min_interval: broker.min_interval,
         };
+        let client_id = format!("{}-sparkplug", broker.client_id);
+        let kept = stats.mqtt.keep_broker(LinkOf::Node, None);
         let mut client = Client {
-            client_id: format!("{}-sparkplug", broker.client_id),
+            link: BrokerLink::new(broker.clone(), client_id, "Sparkplug: ", kept.as_ref()),
             topics,
             broker,
             plant,
@@ -169,11 +154,9 @@ impl Client {
             look_at: now,
             check_at: now,
             buses_at: now,
-            link: Link::Down { retry_at: now },
-            will: WillForm::default(),
-            back_off: BackOff::default(),
-            outages: OutageLog::default(),
-            takeovers: Takeovers::default(),
+            number: 0,
+            unacknowledged: false,
+            host_until: None,
             waits_logged: false,
             not_understood: LogThrottle::every(LOGGED),
         };
@@ -207,8 +190,8 @@ impl Client {
             self.tell(place, now, SystemTime::now());
         }
         self.tell_node(now, SystemTime::now());
-        if matches!(&self.link, Link::Up(Up { limits: Some(limits), .. }) if !limits.wildcards) {
-            self.subscribe();
+        if let Some(limits) = self.link.limits().filter(|limits| !limits.wildcards) {
+            self.subscribe(limits);
         }
     }
 
@@ -274,45 +257,30 @@ impl Client {
             self.adopt();
         }
         self.stats.mqtt.lost(MqttLoss::History, self.session.take_lost());
-        match &mut self.link {
-            Link::Down { retry_at } if now >= *retry_at => self.connect().await,
-            Link::Down { .. } => {}
-            Link::Up(up) => {
-                let late = now.saturating_duration_since(up.opened) > SUBSCRIBE_TIMEOUT;
-                if up.limits.is_some() && !up.subscribed && late {
-                    self.give_up("the broker does not answer the subscription");
-                } else if up.connection.is_silent(up.limits, now) {
-                    self.give_up("the broker is silent");
-                }
-            }
+        match self.link.due(now) {
+            Due::Connect => self.connect().await,
+            Due::GiveUp(why) => self.give_up(why),
+            Due::Nothing if self.host_until.is_some_and(|until| now >= until) => self.look_elsewhere().await,
+            Due::Nothing => {}
+        }
+    }
+
+    /// The primary host is not online at this broker: it may be at another one.
+    async fn look_elsewhere(&mut self) {
+        self.host_until = None;
+        if self.session.is_waiting() {
+            tracing::debug!(target: "drivegate::north::mqtt", "Sparkplug: the primary host is not online at the broker at {}", self.link.broker());
+            self.end_connection(SPREAD.mul_f64(chance())).await;
         }
     }
 
     async fn connect(&mut self) {
-        let bd_seq = self.next_number().await;
-        let options = self.broker.clone();
-        // Read for each attempt, so that renewed certificates are used without a restart.
-        let config = tokio::task::spawn_blocking(move || tls::client_config(&options)).await;
-        let config = config.map_err(|error| error.to_string());
-        match config.and_then(|config| config.map_err(|error| error.to_string())) {
-            Ok(config) => self.open(bd_seq, config),
-            Err(why) => drop(self.lost(&why)),
-        }
-    }
-
-    fn open(&mut self, bd_seq: u8, config: Option<Arc<ClientConfig>>) {
-        let death = self.session.will(bd_seq, tick().millis);
+        self.number = self.next_number().await;
+        let death = self.session.will(self.number, tick().millis);
         let topic = self.topics.of(death.kind, None);
-        let will = self.will.will(topic, death.payload.encoded(), false);
-        let now = Instant::now();
-        self.link = Link::Up(Up {
-            connection: Connection::open(&self.broker, &self.client_id, will, config),
-            bd_seq,
-            opened: now,
-            limits: None,
-            subscribed: false,
-            unacknowledged: false,
-        });
+        if let Err(why) = self.link.connect(topic, death.payload.encoded(), false).await {
+            self.lost(&why);
+        }
     }
 
     /// The number of the next connection, kept on disk; a disk that is too slow is not waited for.
@@ -344,37 +312,27 @@ impl Client {
     }
 
     async fn on_event(&mut self, event: ConnectionEvent) {
-        let Link::Up(up) = &mut self.link else { return };
-        let now = Instant::now();
-        match event {
-            ConnectionEvent::Connected(limits) => {
-                (up.limits, up.opened) = (Some(limits), now);
+        match self.link.take(event) {
+            Step::Accepted(limits) => {
                 self.bd_seq.accepted();
-                self.session.opened(up.bd_seq, limits.max_packet);
-                self.subscribe();
+                self.session.opened(self.number, limits.max_packet);
+                self.subscribe(limits);
             }
-            ConnectionEvent::Subscribed(refused) => self.subscribed(&refused),
-            ConnectionEvent::Refuses(lack) => self.lessen_will(lack, now),
-            ConnectionEvent::Acked(_) | ConnectionEvent::Refused(..) => up.unacknowledged = false,
-            ConnectionEvent::Message(message) => self.on_message(&message).await,
-            ConnectionEvent::Sent(_) | ConnectionEvent::Room | ConnectionEvent::Alive => {}
-            ConnectionEvent::Stuck(why) => self.give_up(why),
-            ConnectionEvent::Lost(why) => drop(self.lost(&why)),
+            Step::Subscribe(limits) => self.subscribe(limits),
+            Step::Subscribed(refused, ready) => self.subscribed(&refused, ready),
+            Step::Acked(_) | Step::Refused(..) => self.unacknowledged = false,
+            Step::Message(message) => self.on_message(&message).await,
+            Step::GiveUp(why) => self.give_up(why),
+            Step::Lost(why) => self.lost(&why),
+            Step::Sent(_) | Step::Nothing => {}
         }
     }
 
     fn ready(&mut self, limits: BrokerLimits) {
-        for lost in limits.losses() {
-            tracing::warn!(target: "drivegate::north::mqtt", "Sparkplug: the broker {lost}");
-        }
-        tracing::info!(
-            target: "drivegate::north::mqtt", "Sparkplug: connected to the broker at {}:{} as {}",
-            self.broker.host,
-            self.broker.port,
-            self.topics.node()
-        );
-        self.outages.end();
+        self.link.log_ready(limits, &format!(" as {}", self.topics.node()));
         self.session.subscribed();
+        let alone = self.broker.brokers.len() < 2;
+        self.host_until = (!alone && self.session.is_waiting()).then(|| Instant::now() + HOST);
         if self.session.is_waiting() && !std::mem::replace(&mut self.waits_logged, true) {
             let state = self.topics.state().unwrap_or_default();
             let old = self.topics.old_state().unwrap_or_default();
@@ -386,11 +344,11 @@ impl Client {
 
     async fn on_message(&mut self, message: &Incoming) {
         match self.topics.parse(&message.topic) {
-            Some(Received::State(form)) => match self.session.host_state(form, &message.payload) {
+            Some(Received::State(form)) => match self.session.host_state(form, &message.payload, births_at()) {
                 Ok(false) => {}
                 Ok(true) => {
                     tracing::info!(target: "drivegate::north::mqtt", "Sparkplug: the primary host is offline; values are kept until it is back");
-                    self.end_connection().await;
+                    self.end_connection(SPREAD.mul_f64(chance())).await;
                 }
                 Err(why) => self.not_understood(&message.topic, &why),
             },
@@ -500,14 +458,7 @@ impl Client {
 
     /// Whether another message may follow.
     fn send(&mut self, message: Message) -> bool {
-        let Link::Up(Up {
-            connection,
-            limits: Some(limits),
-            ..
-        }) = &mut self.link
-        else {
-            return false;
-        };
+        let Some(limits) = self.link.limits() else { return false };
         if connection::packet_size(&message) > limits.max_packet {
             // Without it the sequence has a gap, and a birth lacks its metrics.
             let (topic, most) = (&message.topic, limits.max_packet);
@@ -516,7 +467,7 @@ impl Client {
             self.give_up(&why);
             return false;
         }
-        if !connection.publish(message.clone(), *limits) {
+        if !self.link.publish(message.clone()) {
             self.held = Some(message);
             return false;
         }
@@ -528,82 +479,54 @@ impl Client {
     /// born.
     fn give_up(&mut self, why: &str) {
         let true_now = self.session.is_alive();
-        if let Link::Up(up) = self.lost(why) {
-            up.connection.give_up(true_now);
-        }
+        self.link.give_up(why, true_now);
+        self.down();
     }
 
-    /// There is no connection any more; returns what was there.
-    fn lost(&mut self, why: &str) -> Link {
-        let now = Instant::now();
-        if self.outages.permit(why, now) {
-            let (host, port) = (&self.broker.host, self.broker.port);
-            let hint = match why.contains("SessionTakenOver") {
-                true => "; another client has the same client id: give each gateway a name or a `client_id` of its own",
-                false => "",
-            };
-            tracing::warn!(target: "drivegate::north::mqtt", "Sparkplug: no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
-        } else {
-            tracing::debug!(target: "drivegate::north::mqtt", "Sparkplug: no connection to the broker: {why}");
-        }
-        if why == CLOSED && self.takeovers.closed(now) {
-            let words = Takeovers::words(&self.client_id);
-            tracing::warn!(target: "drivegate::north::mqtt", "Sparkplug: {}:{}: {words}", self.broker.host, self.broker.port);
-        }
-        self.down(now)
+    /// There is no connection any more.
+    fn lost(&mut self, why: &str) {
+        drop(self.link.lost(why));
+        self.down();
     }
 
-    /// Without a connection; the next attempt follows after a while. Dropping what is returned aborts its task and closes the
-    /// socket.
-    fn down(&mut self, now: Instant) -> Link {
-        let held = match &self.link {
-            Link::Up(up) if up.subscribed => now.saturating_duration_since(up.opened),
-            _ => Duration::ZERO,
-        };
-        if !held.is_zero() {
-            // The next broker, or this one with another configuration, may take more.
-            self.will = WillForm::default();
-        }
-        let retry_at = now + self.back_off.after(held);
-        self.held = None;
+    fn down(&mut self) {
+        (self.held, self.host_until) = (None, None);
         self.session.closed();
-        self.look_at = now;
-        std::mem::replace(&mut self.link, Link::Down { retry_at })
+        self.look_at = Instant::now();
     }
 
-    /// Declares the node dead and disconnects, within half a second; after that time the broker publishes the last will.
-    async fn end_connection(&mut self) {
+    /// Declares the node dead and disconnects, within half a second; after that time the broker publishes the last will. The next
+    /// attempt follows after `wait`.
+    async fn end_connection(&mut self, wait: Duration) {
         if tokio::time::timeout(END, self.disconnect()).await.is_err() {
             tracing::warn!(target: "drivegate::north::mqtt", "Sparkplug: the orderly disconnect timed out; the broker publishes the last will");
         }
-        drop(self.down(Instant::now()));
+        self.link.close(wait);
+        self.down();
     }
 
     async fn disconnect(&mut self) {
         self.held = None;
-        let accepted = matches!(&self.link, Link::Up(up) if up.subscribed);
-        if !accepted {
+        if self.link.ready().is_none() {
             return;
         }
         let death = self.session.end(tick().millis);
         let death = self.message(death, true);
-        while let Link::Up(up) = &mut self.link {
-            let Some(limits) = up.limits else { return };
-            if up.connection.publish(death.clone(), limits) {
-                up.unacknowledged = limits.acknowledges;
+        while let Some(limits) = self.link.limits() {
+            if self.link.publish(death.clone()) {
+                self.unacknowledged = limits.acknowledges;
                 break;
             }
             if self.is_lost_next().await {
                 return;
             }
         }
-        while matches!(&self.link, Link::Up(up) if up.unacknowledged) {
+        while self.unacknowledged {
             if self.is_lost_next().await {
                 return;
             }
         }
-        if matches!(&self.link, Link::Up(Up { connection, limits: Some(limits), .. }) if connection.disconnect(*limits))
-        {
+        if self.link.disconnect() {
             while !self.is_lost_next().await {}
         }
     }
@@ -611,16 +534,12 @@ impl Client {
     /// Waits for the next event of a connection that ends: whether it is lost, or is to be closed without DISCONNECT. The broker counts a command that comes meanwhile as
     /// delivered, so it is carried out.
     async fn is_lost_next(&mut self) -> bool {
-        match next(&mut self.link).await {
+        match self.link.next().await {
             ConnectionEvent::Lost(_) => return true,
             ConnectionEvent::Message(message) => self.on_device_command(&message),
             // The broker did not take the death of the node: it publishes the last will instead.
             ConnectionEvent::Refused(..) => return true,
-            ConnectionEvent::Acked(_) => {
-                if let Link::Up(up) = &mut self.link {
-                    up.unacknowledged = false;
-                }
-            }
+            ConnectionEvent::Acked(_) => self.unacknowledged = false,
             _ => {}
         }
         false
@@ -632,14 +551,16 @@ impl Client {
         let until = tokio::time::Instant::now() + LAST_ORDERS;
         while !self.orders.is_idle() && self.session.is_alive() && tokio::time::Instant::now() < until {
             tokio::select! {
-                event = next(&mut self.link) => self.on_event(event).await,
+                event = self.link.next() => self.on_event(event).await,
                 finished = self.orders.finished() => self.on_finished(finished),
                 () = tokio::time::sleep_until(until) => {}
             }
             self.publish();
         }
         self.publish();
-        self.end_connection().await;
+        let broker = self.link.broker();
+        self.end_connection(Duration::ZERO).await;
+        self.stats.mqtt.keep_broker(LinkOf::Node, Some(broker));
         self.stats.mqtt.keep_node_orders(Some(self.orders.leave()));
     }
 }

@@ -61,8 +61,8 @@ enum Phase {
     Away,
     /// Connected; the primary host is not online.
     Waiting,
-    /// Connected; the birth of the node comes next.
-    NodeBirth,
+    /// Connected; the birth of the node comes next, at this time at the earliest.
+    NodeBirth(Option<Instant>),
     /// The births of the devices follow, from this place on.
     DeviceBirths(usize),
     Live,
@@ -310,7 +310,7 @@ impl Session {
     pub(super) fn subscribed(&mut self) {
         if self.phase == Phase::Away {
             self.phase = match self.may_be_born() {
-                true => Phase::NodeBirth,
+                true => Phase::NodeBirth(None),
                 false => Phase::Waiting,
             };
         }
@@ -340,15 +340,16 @@ impl Session {
         self.phase == Phase::Waiting
     }
 
-    /// A message about the primary host. Returns whether the connection is to be given up: the host went offline.
+    /// A message about the primary host. If it makes it online, the births follow at `births_at`. Returns whether the connection is
+    /// to be given up: the host went offline.
     ///
     /// # Errors
     /// Why the message is not understood; nothing changes.
-    pub(super) fn host_state(&mut self, form: StateForm, payload: &[u8]) -> Result<bool, String> {
+    pub(super) fn host_state(&mut self, form: StateForm, payload: &[u8], births_at: Instant) -> Result<bool, String> {
         self.host.take(form, payload)?;
         match (self.phase, self.host.is_online()) {
-            (Phase::Waiting, true) => self.phase = Phase::NodeBirth,
-            (Phase::NodeBirth | Phase::DeviceBirths(_) | Phase::Live, false) => return Ok(true),
+            (Phase::Waiting, true) => self.phase = Phase::NodeBirth(Some(births_at)),
+            (Phase::NodeBirth(_) | Phase::DeviceBirths(_) | Phase::Live, false) => return Ok(true),
             _ => {}
         }
         Ok(false)
@@ -433,7 +434,8 @@ impl Session {
     pub(super) fn next(&mut self, tick: Tick) -> Result<Packet, Option<Instant>> {
         match self.phase {
             Phase::Away | Phase::Waiting => Err(None),
-            Phase::NodeBirth => Ok(self.node_birth(tick)),
+            Phase::NodeBirth(Some(at)) if at > tick.now => Err(Some(at)),
+            Phase::NodeBirth(_) => Ok(self.node_birth(tick)),
             Phase::DeviceBirths(from) => match self.next_born(from) {
                 Some(place) => {
                     self.phase = Phase::DeviceBirths(place + 1);

@@ -73,12 +73,12 @@ impl Order {
         }
     }
 
-    fn low_word_first(self) -> bool {
+    pub(super) fn low_word_first(self) -> bool {
         matches!(self, Order::Cdab | Order::Dcba)
     }
 
     /// The word with its high byte high.
-    fn word(self, word: u16) -> u16 {
+    pub(super) fn word(self, word: u16) -> u16 {
         match self {
             Order::Abcd | Order::Cdab => word,
             Order::Badc | Order::Dcba => word.swap_bytes(),

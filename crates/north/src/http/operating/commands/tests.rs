@@ -11,7 +11,9 @@ fn operator(user: &str, login: &str) -> Operator {
         user: user.into(),
         login: login.into(),
         address: [192, 0, 2, 1].into(),
+        kind: SourceKind::Http,
         cookie: None,
+        kind: SourceKind::Http,
     }
 }
 

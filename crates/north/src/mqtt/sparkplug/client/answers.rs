@@ -1,25 +1,14 @@
-//! What the broker answers to the last will and to the subscriptions, and births that fit into its packets.
+//! What the broker answers to the subscriptions, and births that fit into its packets.
 
 use rumqttc::mqttbytes::QoS;
 use rumqttc::mqttbytes::v5::Filter;
 
 use super::*;
-use crate::mqtt::broker_limits::Lack;
-use crate::mqtt::connection::{NO_WILDCARDS, PACKET_OVERHEAD, commanding};
+use crate::mqtt::connection::{PACKET_OVERHEAD, commanding};
 use crate::mqtt::sparkplug::session::FIXED_METRICS;
 use crate::mqtt::sparkplug::topics::Kind;
 
 impl Client {
-    /// The broker refused the connection because of the last will: another one follows with less, at once, if there is less.
-    pub(super) fn lessen_will(&mut self, lack: Lack, now: Instant) {
-        if self.will.lessen(lack) {
-            tracing::debug!(target: "drivegate::north::mqtt", "Sparkplug: the broker refuses the last will ({lack:?}); trying a lesser one");
-            self.link = Link::Down { retry_at: now };
-        } else {
-            drop(self.lost("the broker refuses the last will in every form"));
-        }
-    }
-
     pub(super) fn filters(&self, limits: BrokerLimits) -> Vec<Filter> {
         let drives = self
             .drives
@@ -32,39 +21,19 @@ impl Client {
         )
     }
 
-    pub(super) fn subscribe(&mut self) {
-        let Link::Up(Up {
-            limits: Some(limits), ..
-        }) = &self.link
-        else {
-            return;
-        };
-        let limits = *limits;
+    pub(super) fn subscribe(&mut self, limits: BrokerLimits) {
         let filters = self.filters(limits);
-        if let Link::Up(up) = &mut self.link
-            && !up.connection.subscribe(filters, limits)
-        {
+        if !self.link.subscribe(filters) {
             self.give_up("the subscription could not be sent");
         }
     }
 
     /// The broker answered the subscriptions.
-    pub(super) fn subscribed(&mut self, refused: &[Option<String>]) {
-        let Link::Up(Up {
-            limits: Some(limits),
-            subscribed,
-            ..
-        }) = &mut self.link
-        else {
-            return;
-        };
-        if limits.wildcards && refused.iter().flatten().any(|why| why == NO_WILDCARDS) {
-            limits.wildcards = false;
-            return self.subscribe();
+    pub(super) fn subscribed(&mut self, refused: &[Option<String>], ready: Option<BrokerLimits>) {
+        if let Some(limits) = self.link.limits() {
+            self.report_refused(&self.filters(limits), refused);
         }
-        let (limits, again) = (*limits, std::mem::replace(subscribed, true));
-        self.report_refused(&self.filters(limits), refused);
-        if !again {
+        if let Some(limits) = ready {
             self.ready(limits);
         }
     }
@@ -78,7 +47,7 @@ impl Client {
             {
                 tracing::error!(
                     target: "drivegate::north::mqtt", "the broker refuses a Sparkplug subscription ({why}); allow client {} to subscribe to {}",
-                    self.client_id,
+                    self.link.client_id(),
                     filter.path
                 );
             }
@@ -87,10 +56,7 @@ impl Client {
 
     /// A birth without the metrics for which the broker's packets are too small; the session leaves them out from now on.
     pub(super) fn fitted(&mut self, mut packet: Packet) -> Packet {
-        let Link::Up(Up {
-            limits: Some(limits), ..
-        }) = &self.link
-        else {
+        let Some(limits) = self.link.limits() else {
             return packet;
         };
         let (most, all) = (limits.max_packet, packet.payload.metrics.len());

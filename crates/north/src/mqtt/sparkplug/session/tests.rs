@@ -50,6 +50,8 @@ struct Bench {
     start: Instant,
     /// ms since the start.
     time: u64,
+    /// ms from the host's word that it is online to the births.
+    births_after: u64,
     host: Watcher,
 }
 
@@ -186,6 +188,7 @@ impl Bench {
             session: Session::new(rules),
             start: Instant::now(),
             time: 1_000,
+            births_after: 0,
             host: Watcher::default(),
         };
         let devices = (0..devices).map(|n| (format!("p{n}"), definitions(&["a", "b"])));
@@ -216,7 +219,10 @@ impl Bench {
         let state = STATE
             .replace("ONLINE", &online.to_string())
             .replace("TIME", &time.to_string());
-        self.session.host_state(StateForm::Object, state.as_bytes()).unwrap()
+        let at = self.tick().now + Duration::from_millis(self.births_after);
+        self.session
+            .host_state(StateForm::Object, state.as_bytes(), at)
+            .unwrap()
     }
 
     /// Sends up to `most` messages that are due; returns how many.
@@ -695,4 +701,30 @@ fn what_was_left_out_of_a_birth_is_in_no_data() {
     session.subscribed();
     next_metrics(&mut session, Kind::NodeBirth, at(40));
     assert_eq!(next_metrics(&mut session, Kind::DeviceBirth, at(40)).len(), 3);
+}
+
+#[test]
+fn births_wait_for_their_time_after_the_host_came_online() {
+    let rules = Rules {
+        history: false,
+        ..rules("scada")
+    };
+    let mut bench = Bench::new(rules, 1);
+    (bench.births_after, bench.time) = (1_500, 10_000);
+    bench.tell(0, true, 1.0);
+    bench.connect(0);
+    bench.session.subscribed();
+    assert!(!bench.state(true, 100));
+    bench.time = 11_499;
+    let due = bench.session.next(bench.tick()).unwrap_err();
+    assert_eq!(due, Some(bench.start + Duration::from_millis(11_500)));
+    // Offline before the births: the connection ends, and nothing was sent.
+    assert!(bench.state(false, 101), "the connection is given up");
+    bench.connect(1);
+    bench.session.subscribed();
+    assert!(!bench.state(true, 102));
+    bench.time = 12_998;
+    assert_eq!(bench.send(9), 0);
+    bench.time = 12_999;
+    assert_eq!(bench.send(9), 2, "the births of the node and its device");
 }

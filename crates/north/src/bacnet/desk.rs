@@ -1,0 +1,206 @@
+//! What stands between the protocol and the drives: writes that wait, slots that wait for a reading, leases, drives that come back. No
+//! sockets, no clock: `task` and `offline` bring both.
+
+use std::collections::{BTreeSet, HashMap, HashSet};
+use std::net::SocketAddrV4;
+use std::sync::Arc;
+use std::time::Instant;
+
+use drivegate_bacnet::{Application as _, Options as ServerOptions, Server};
+
+use super::Options;
+use super::view::View;
+use super::writes::{self, Begun, Waiting};
+use crate::command::{Outcome, Settled};
+use crate::plant::{Plant, SharedPlant};
+use crate::process_image::{LeaseAction, Machine};
+
+/// The name of the vendor without an identifier of one's own.
+const VENDOR: &str = "drivegate";
+
+/// The address of a server, and the bits of the mask of its network.
+pub(super) type At = (SocketAddrV4, u8);
+
+/// How a write ended.
+pub(super) struct Ended {
+    token: u64,
+    machine: Machine,
+    slot: Option<u64>,
+    outcome: Outcome,
+}
+
+impl Ended {
+    pub(super) fn of(token: u64, waiting: Waiting, outcome: Outcome) -> Ended {
+        let Waiting { machine, slot, .. } = waiting;
+        Ended {
+            token,
+            machine,
+            slot,
+            outcome,
+        }
+    }
+}
+
+/// The protocol, what it shows, and what it waits for.
+#[derive(Debug)]
+pub(super) struct Desk {
+    plant: SharedPlant,
+    pub(super) view: View,
+    pub(super) server: Server,
+    /// Drives that answered when they were looked at last.
+    present: HashSet<u32>,
+    /// Leases that ran out so far, by device.
+    leases: HashMap<u32, u64>,
+    /// Devices of which a slot waits for the next reading.
+    uncertain: BTreeSet<u32>,
+}
+
+fn server_of((address, prefix): At, view: &View, now: Instant) -> Server {
+    let options = ServerOptions {
+        address,
+        prefix,
+        network: view.options.network,
+        vendor: (view.options.vendor, VENDOR.into()),
+        version: crate::version::VERSION.into(),
+        bbmd: None,
+    };
+    Server::new(options, view.devices(), now)
+}
+
+impl Desk {
+    pub(super) fn new(options: Arc<Options>, plant: SharedPlant, at: At, now: Instant) -> Desk {
+        let view = View::new(plant.load_full(), options);
+        Desk {
+            server: server_of(at, &view, now),
+            plant,
+            view,
+            present: HashSet::new(),
+            leases: HashMap::new(),
+            uncertain: BTreeSet::new(),
+        }
+    }
+
+    /// It says that it is there.
+    pub(super) fn start(&mut self, now: Instant) {
+        self.view.look(now);
+        self.server.start(&self.view, now);
+    }
+
+    /// Clients know nothing of what was before: address or numbers are others.
+    pub(super) fn start_anew(&mut self, at: At, now: Instant) {
+        self.server = server_of(at, &self.view, now);
+        self.start(now);
+    }
+
+    pub(super) fn newest_plant(&self) -> Arc<Plant> {
+        self.plant.load_full()
+    }
+
+    /// Whether a reload brought another plant.
+    pub(super) fn is_outdated(&self) -> bool {
+        !Arc::ptr_eq(&self.plant.load(), &self.view.plant)
+    }
+
+    /// Shows the plant as it is now, with these options.
+    pub(super) fn see(&mut self, options: Arc<Options>) {
+        self.view = View::new(self.plant.load_full(), options);
+        self.server.set_devices(self.view.devices());
+    }
+
+    /// A datagram came.
+    pub(super) fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
+        self.view.look(now);
+        self.server.receive(from, datagram, &self.view, now);
+    }
+
+    /// What that device shows may have changed.
+    pub(super) fn changed(&mut self, device: u32, now: Instant) {
+        self.view.look(now);
+        self.server.changed(device, &self.view, now);
+    }
+
+    /// Takes up what clients wrote until something waits for its drive.
+    pub(super) fn next_order(&mut self, now: Instant) -> Option<(u64, Waiting)> {
+        self.view.look(now);
+        while let Some(job) = self.server.take_job() {
+            match writes::begin(&self.view, &job, now) {
+                Begun::Answered(result) => self.server.written(job.token, result, &self.view, now),
+                Begun::Waits(waiting) => return Some((job.token, *waiting)),
+            }
+        }
+        None
+    }
+
+    /// The drive answered, or did not.
+    pub(super) fn ended(&mut self, ended: &Ended, now: Instant) {
+        let plant = self.plant.load();
+        if let (Some(slot), Some(drive)) = (ended.slot, plant.drive_at(&ended.machine)) {
+            let settled = Settled::of(&ended.outcome);
+            drive.priorities(|all| all.settle(slot, settled, now));
+            if settled == Settled::Unknown {
+                let device = self.view.options.device + u32::from(drive.image.spec.unit);
+                self.uncertain.insert(device);
+            }
+        }
+        self.view.look(now);
+        let result = writes::error(&ended.outcome);
+        self.server.written(ended.token, result, &self.view, now);
+    }
+
+    /// Does what time has made due.
+    pub(super) fn poll(&mut self, now: Instant) {
+        self.view.look(now);
+        self.note_leases();
+        self.resolve_slots(now);
+        self.announce(now);
+        self.server.poll(&self.view, now);
+    }
+
+    /// A drive that comes back says so.
+    fn announce(&mut self, now: Instant) {
+        let answers: HashSet<u32> = self
+            .view
+            .drives
+            .keys()
+            .copied()
+            .filter(|device| self.view.answers(*device))
+            .collect();
+        for device in answers.difference(&self.present) {
+            self.server.announce(*device, &self.view, now);
+        }
+        self.present = answers;
+    }
+
+    /// A lease that ended without a stop gives the slots of its client back, too.
+    fn note_leases(&mut self) {
+        for (device, drive) in &self.view.drives {
+            let image = &drive.handle.image;
+            let stops = image
+                .spec
+                .supervision
+                .as_ref()
+                .is_none_or(|lease| lease.action == LeaseAction::Stop);
+            let count = image.supervisions();
+            let before = self.leases.insert(*device, count);
+            if !stops && before.is_some_and(|before| before < count) {
+                drive.handle.priorities(|all| all.silenced());
+            }
+        }
+    }
+
+    /// Settles what is not known by what the drives show.
+    fn resolve_slots(&mut self, now: Instant) {
+        let drives = &self.view.drives;
+        self.uncertain.retain(|device| {
+            let Some(drive) = drives.get(device) else { return false };
+            let reading = drive.handle.reading(now);
+            drive.handle.priorities(|all| {
+                all.resolve(|what, since| {
+                    let sample = reading.model(what.point());
+                    sample.good().filter(|_| sample.at.is_some_and(|at| at > since))
+                });
+                all.is_uncertain()
+            })
+        });
+    }
+}

@@ -1,0 +1,75 @@
+//! The server without sockets and runtime, for tests in virtual time.
+
+use std::net::SocketAddrV4;
+use std::sync::Arc;
+use std::time::Instant;
+
+use drivegate_bacnet::To;
+
+use super::Options;
+use super::desk::{Desk, Ended};
+use super::writes::Waiting;
+use crate::plant::SharedPlant;
+
+/// A server without sockets. Time is an argument.
+#[derive(Debug)]
+pub struct Offline {
+    options: Arc<Options>,
+    desk: Desk,
+    waiting: Vec<(u64, Waiting)>,
+}
+
+impl Offline {
+    /// A server at the address of `options`, on a network with a mask of 8 bits.
+    pub fn new(options: Options, plant: SharedPlant, now: Instant) -> Offline {
+        let (options, at) = (Arc::new(options.clone()), (options.listen, 8));
+        let mut desk = Desk::new(options.clone(), plant, at, now);
+        desk.start(now);
+        Offline {
+            options,
+            desk,
+            waiting: Vec::new(),
+        }
+    }
+
+    /// A datagram came. What it orders is in the queue of its bus when this returns.
+    pub fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
+        self.desk.receive(from, datagram, now);
+        self.take_up(now);
+    }
+
+    /// Tells the clients what became of their writes by now.
+    pub fn collect(&mut self, now: Instant) {
+        let mut place = 0;
+        while let Some((_, waiting)) = self.waiting.get_mut(place) {
+            match waiting.placed.answer() {
+                None => place += 1,
+                Some(answer) => {
+                    let (token, waiting) = self.waiting.remove(place);
+                    self.desk.ended(&Ended::of(token, waiting, answer.outcome), now);
+                }
+            }
+        }
+        self.take_up(now);
+    }
+
+    /// Does what time has made due; to be called ten times a second.
+    pub fn poll(&mut self, now: Instant) {
+        if self.desk.is_outdated() {
+            self.desk.see(self.options.clone());
+        }
+        self.desk.poll(now);
+        self.take_up(now);
+    }
+
+    fn take_up(&mut self, now: Instant) {
+        while let Some(order) = self.desk.next_order(now) {
+            self.waiting.push(order);
+        }
+    }
+
+    /// The next datagram that it sends.
+    pub fn transmit(&mut self) -> Option<(To, Vec<u8>)> {
+        self.desk.server.transmit()
+    }
+}

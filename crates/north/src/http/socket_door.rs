@@ -1,0 +1,86 @@
+//! The HTTP API at the local socket. Whoever may open the socket may do everything: no login, no token, any `Host`.
+
+use std::net::{IpAddr, Ipv4Addr};
+use std::pin::pin;
+use std::sync::Arc;
+
+use axum::Router;
+use hyper::body::Incoming;
+use hyper::server::conn::http1;
+use hyper::service::{Service, service_fn};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+
+use super::access::Access;
+use super::hosts::Hosts;
+use super::in_use::InUse;
+use super::operating::Operating;
+use super::routes::{self, Client, LocalUser, Reached};
+use super::{Coverage, GRACE, HEAD_TIMEOUT, MAX_HEAD};
+use crate::NorthStats;
+use crate::connection_limit::Place;
+use crate::plant::SharedPlant;
+
+/// Serves the connections of the local socket that speak HTTP.
+#[derive(Debug)]
+pub(crate) struct SocketDoor {
+    router: Router,
+}
+
+impl SocketDoor {
+    pub(crate) fn new(plant: &SharedPlant, stats: &Arc<NorthStats>, cancel: CancellationToken) -> SocketDoor {
+        let operating = Arc::new(Operating::new(stats.clone()));
+        SocketDoor {
+            router: routes::router(plant.clone(), stats.clone(), operating, cancel),
+        }
+    }
+
+    /// Answers the requests of a client until it leaves, falls silent or yields to another one; a reply that is being made
+    /// is finished.
+    pub(crate) async fn serve(&self, stream: impl AsyncRead + AsyncWrite + Unpin, user: LocalUser, place: &Arc<Place>) {
+        let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
+        let reached = Reached {
+            address,
+            peer: (address, 0).into(),
+            access: Arc::new(Access {
+                hosts: Hosts::new("", &[]),
+                tokens: None,
+            }),
+            refusals: Arc::default(),
+            tls: false,
+            local: Some(user),
+            place: Some(place.clone()),
+        };
+        let client = Client {
+            address,
+            coverage: Coverage::Everything,
+        };
+        let router = TowerToHyperService::new(self.router.clone());
+        let service = service_fn(|mut request: hyper::Request<Incoming>| {
+            let in_use = InUse::new(place.clone());
+            request.extensions_mut().insert(client);
+            request.extensions_mut().insert(reached.clone());
+            let reply = router.call(request);
+            async move { reply.await.map(|reply| reply.map(|body| in_use.until_end_of(body))) }
+        });
+        let connection = http1::Builder::new()
+            .timer(TokioTimer::new())
+            .header_read_timeout(HEAD_TIMEOUT)
+            .max_buf_size(MAX_HEAD)
+            .serve_connection(TokioIo::new(stream), service);
+        let mut connection = pin!(connection);
+        let ended = tokio::select! {
+            ended = connection.as_mut() => ended,
+            () = place.closing().cancelled() => {
+                connection.as_mut().graceful_shutdown();
+                timeout(GRACE, connection).await.unwrap_or(Ok(()))
+            }
+        };
+        if let Err(error) = ended {
+            tracing::debug!(target: "drivegate::http", "HTTP connection of the local socket ended: {error}");
+        }
+    }
+}

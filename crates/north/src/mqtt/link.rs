@@ -1,0 +1,342 @@
+//! The link of a client to one of its brokers: which broker is tried next and when, the last will in the form that it takes, the
+//! subscriptions, silence, and the log of outages. What is published and received is up to the client.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use rumqttc::PubAckReason;
+use rumqttc::mqttbytes::v5::Filter;
+
+use super::back_off::Rotation;
+use super::broker_limits::{BrokerLimits, WillForm};
+use super::connection::{CLOSED, Connection, ConnectionEvent, NO_WILDCARDS, SUBSCRIBE_TIMEOUT};
+use super::dial::Dial;
+use super::outage_log::OutageLog;
+use super::outbox::Message;
+use super::request::Incoming;
+use super::takeover::Takeovers;
+use super::{Broker, Options, tls};
+
+/// What an event of the connection means for the client.
+#[derive(Debug)]
+pub(super) enum Step {
+    /// The broker accepted the connection: the client subscribes.
+    Accepted(BrokerLimits),
+    /// The broker takes no wildcards: the client subscribes again.
+    Subscribe(BrokerLimits),
+    /// The broker answered the subscriptions: of each, in order, the reason if it refused it. The first time on this connection,
+    /// with what the broker can do: the client may publish from now on.
+    Subscribed(Vec<Option<String>>, Option<BrokerLimits>),
+    /// The oldest published message with an acknowledgement was sent with this packet id.
+    Sent(u16),
+    /// The broker acknowledged the message.
+    Acked(u16),
+    /// The broker refused the message; the connection goes on.
+    Refused(u16, PubAckReason),
+    /// A message on a topic that was subscribed to.
+    Message(Box<Incoming>),
+    /// The client is to give the connection up, for this reason.
+    GiveUp(&'static str),
+    /// There is no connection any more, for this reason: the client calls [`BrokerLink::lost`].
+    Lost(String),
+    /// Nothing, or room for more.
+    Nothing,
+}
+
+/// What is due at the link.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Due {
+    Nothing,
+    /// The next attempt to connect.
+    Connect,
+    /// The connection is to be given up, for this reason.
+    GiveUp(&'static str),
+}
+
+#[derive(Debug)]
+enum State {
+    /// No connection; the next attempt follows then.
+    Down { retry_at: Instant },
+    /// A connection that the broker may not have accepted yet.
+    Up(Connection, Phase),
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Phase {
+    Connecting,
+    Subscribing { limits: BrokerLimits, since: Instant },
+    Ready { limits: BrokerLimits, since: Instant },
+}
+
+impl Phase {
+    /// What the broker can do, once it is known.
+    fn limits(&self) -> Option<&BrokerLimits> {
+        match self {
+            Phase::Connecting => None,
+            Phase::Subscribing { limits, .. } | Phase::Ready { limits, .. } => Some(limits),
+        }
+    }
+}
+
+/// The link of one client.
+#[derive(Debug)]
+pub(super) struct BrokerLink {
+    options: Arc<Options>,
+    client_id: String,
+    /// What its lines in the log begin with.
+    prefix: &'static str,
+    state: State,
+    rotation: Rotation,
+    dial: Dial,
+    will: WillForm,
+    /// Of each broker.
+    outages: Vec<OutageLog>,
+    takeovers: Takeovers,
+}
+
+impl BrokerLink {
+    /// Begins with the broker `kept`, if it is still one of them: it worked before a reload.
+    pub(super) fn new(options: Options, client_id: String, prefix: &'static str, kept: Option<&Broker>) -> BrokerLink {
+        let brokers = &options.brokers;
+        let first = kept.and_then(|kept| brokers.iter().position(|broker| broker == kept));
+        BrokerLink {
+            rotation: Rotation::new(brokers.len(), first.unwrap_or(0)),
+            outages: brokers.iter().map(|_| OutageLog::default()).collect(),
+            options: Arc::new(options),
+            client_id,
+            prefix,
+            state: State::Down {
+                retry_at: Instant::now(),
+            },
+            dial: Dial::default(),
+            will: WillForm::default(),
+            takeovers: Takeovers::default(),
+        }
+    }
+
+    /// The broker whose turn it is.
+    pub(super) fn broker(&self) -> Broker {
+        let broker = self.options.brokers.get(self.rotation.current());
+        broker.cloned().unwrap_or_default()
+    }
+
+    pub(super) fn client_id(&self) -> &str {
+        &self.client_id
+    }
+
+    pub(super) fn is_up(&self) -> bool {
+        matches!(self.state, State::Up(..))
+    }
+
+    /// What the broker can do, once it accepted the connection.
+    pub(super) fn limits(&self) -> Option<BrokerLimits> {
+        match &self.state {
+            State::Up(_, phase) => phase.limits().copied(),
+            State::Down { .. } => None,
+        }
+    }
+
+    /// What the broker can do, once it answered the subscriptions.
+    pub(super) fn ready(&self) -> Option<BrokerLimits> {
+        match &self.state {
+            State::Up(_, Phase::Ready { limits, .. }) => Some(*limits),
+            _ => None,
+        }
+    }
+
+    /// The next event of the connection; pending while there is none. Cancel safe.
+    pub(super) async fn next(&mut self) -> ConnectionEvent {
+        match &mut self.state {
+            State::Down { .. } => std::future::pending().await,
+            State::Up(connection, _) => connection.next().await,
+        }
+    }
+
+    /// Applies an event.
+    pub(super) fn take(&mut self, event: ConnectionEvent) -> Step {
+        let State::Up(_, phase) = &mut self.state else {
+            return Step::Nothing;
+        };
+        match event {
+            ConnectionEvent::Connected(limits) => {
+                let since = Instant::now();
+                *phase = Phase::Subscribing { limits, since };
+                Step::Accepted(limits)
+            }
+            ConnectionEvent::Subscribed(answers) => answered(phase, answers),
+            ConnectionEvent::Sent(packet) => Step::Sent(packet),
+            ConnectionEvent::Acked(packet) => Step::Acked(packet),
+            ConnectionEvent::Refused(packet, why) => Step::Refused(packet, why),
+            ConnectionEvent::Message(message) => Step::Message(message),
+            ConnectionEvent::Room | ConnectionEvent::Alive => Step::Nothing,
+            ConnectionEvent::Stuck(why) => Step::GiveUp(why),
+            ConnectionEvent::Lost(why) => Step::Lost(why),
+            // Another connection follows at once with a lesser will, if there is one.
+            ConnectionEvent::Refuses(lack) if self.will.lessen(lack) => {
+                tracing::debug!(target: "drivegate::north::mqtt", "{}the broker refuses the last will ({lack:?}); trying a lesser one", self.prefix);
+                self.state = State::Down {
+                    retry_at: Instant::now(),
+                };
+                Step::Nothing
+            }
+            ConnectionEvent::Refuses(_) => Step::Lost("the broker refuses the last will in every form".to_string()),
+        }
+    }
+
+    /// What is due now.
+    pub(super) fn due(&mut self, now: Instant) -> Due {
+        match &mut self.state {
+            State::Down { retry_at } if now >= *retry_at => Due::Connect,
+            State::Down { .. } => Due::Nothing,
+            State::Up(_, Phase::Subscribing { since, .. })
+                if now.saturating_duration_since(*since) > SUBSCRIBE_TIMEOUT =>
+            {
+                Due::GiveUp("the broker does not answer the subscription")
+            }
+            State::Up(connection, phase) => match connection.is_silent(phase.limits().copied(), now) {
+                true => Due::GiveUp("the broker is silent"),
+                false => Due::Nothing,
+            },
+        }
+    }
+
+    /// Starts to connect to the broker whose turn it is, with this last will.
+    ///
+    /// # Errors
+    /// Why it cannot: then the client calls [`BrokerLink::lost`].
+    pub(super) async fn connect(&mut self, topic: String, payload: Vec<u8>, retain: bool) -> Result<(), String> {
+        let options = self.options.clone();
+        // Read for each attempt, so that renewed certificates are used without a restart.
+        let config = tokio::task::spawn_blocking(move || tls::client_config(&options)).await;
+        let config = config.map_err(|error| error.to_string())?;
+        let config = config.map_err(|error| error.to_string())?;
+        let will = self.will.will(topic, payload, retain);
+        let (broker, dial, round) = (self.broker(), self.dial.clone(), self.rotation.round());
+        let way = move |options| dial.clone().connect(broker.clone(), round, options);
+        let target = (&self.broker(), self.client_id.as_str());
+        let connection = Connection::open(&self.options, target, will, config, way);
+        self.state = State::Up(connection, Phase::Connecting);
+        Ok(())
+    }
+
+    /// Subscribes; false if the connection does not take it.
+    pub(super) fn subscribe(&mut self, filters: Vec<Filter>) -> bool {
+        match &mut self.state {
+            State::Up(connection, phase) => match phase.limits() {
+                Some(limits) => connection.subscribe(filters, *limits),
+                None => true,
+            },
+            State::Down { .. } => true,
+        }
+    }
+
+    /// Publishes a message; false if there is no room, or no connection.
+    pub(super) fn publish(&mut self, message: Message) -> bool {
+        match &mut self.state {
+            State::Up(connection, phase) => phase
+                .limits()
+                .copied()
+                .is_some_and(|limits| connection.publish(message, limits)),
+            State::Down { .. } => false,
+        }
+    }
+
+    /// Disconnects in order, so that the broker does not publish the last will; false without a connection that it accepted.
+    pub(super) fn disconnect(&self) -> bool {
+        match &self.state {
+            State::Up(connection, phase) => phase.limits().is_some_and(|limits| connection.disconnect(*limits)),
+            State::Down { .. } => false,
+        }
+    }
+
+    /// The client may publish: logged, with what is lost with this broker.
+    pub(super) fn log_ready(&mut self, limits: BrokerLimits, named: &str) {
+        let (prefix, broker) = (self.prefix, self.broker());
+        tracing::info!(target: "drivegate::north::mqtt", "{prefix}connected to the broker at {broker}{named}");
+        for lost in limits.losses() {
+            tracing::warn!(target: "drivegate::north::mqtt", "{prefix}the broker at {broker} {lost}");
+        }
+        if let Some(outages) = self.outages.get_mut(self.rotation.current()) {
+            outages.end();
+        }
+    }
+
+    /// Ends the connection for this reason, and tells the broker. The last will is published if it is `true_now`.
+    pub(super) fn give_up(&mut self, why: &str, true_now: bool) {
+        if let Some(connection) = self.lost(why) {
+            connection.give_up(true_now);
+        }
+    }
+
+    /// There is no connection any more, for this reason; returns what was there. Dropping it aborts its task and closes the
+    /// socket.
+    pub(super) fn lost(&mut self, why: &str) -> Option<Connection> {
+        let (now, prefix, broker) = (Instant::now(), self.prefix, self.broker());
+        let place = self.rotation.current();
+        let before = self.turn_to_next(None, now);
+        if self
+            .outages
+            .get_mut(place)
+            .is_some_and(|outages| outages.permit(why, now))
+        {
+            let hint = match why.contains("SessionTakenOver") {
+                true => "; another client has the same client id: give each gateway a name or a `client_id` of its own",
+                false => "",
+            };
+            let next = match self.rotation.is_single() {
+                true => "reconnecting".to_string(),
+                false => format!("the next one is {}", self.broker()),
+            };
+            tracing::warn!(target: "drivegate::north::mqtt", "{prefix}no connection to the broker at {broker}: {why}{hint}; {next}");
+        } else {
+            tracing::debug!(target: "drivegate::north::mqtt", "{prefix}no connection to the broker at {broker}: {why}");
+        }
+        if why == CLOSED && self.takeovers.closed(now) {
+            let words = Takeovers::words(&self.client_id);
+            tracing::warn!(target: "drivegate::north::mqtt", "{prefix}{broker}: {words}");
+        }
+        before
+    }
+
+    /// Closes the connection, if there is one; the next attempt follows after `wait`.
+    pub(super) fn close(&mut self, wait: Duration) {
+        drop(self.turn_to_next(Some(wait), Instant::now()));
+    }
+
+    /// Without a connection; the next attempt, to the next broker, follows after `wait` or as the rotation wants.
+    fn turn_to_next(&mut self, wait: Option<Duration>, now: Instant) -> Option<Connection> {
+        let held = match &self.state {
+            State::Up(_, Phase::Ready { since, .. }) => Some(now.saturating_duration_since(*since)),
+            _ => None,
+        };
+        if held.is_some() || !self.rotation.is_single() {
+            // The next broker, or this one with another configuration, may take more.
+            self.will = WillForm::default();
+        }
+        let usual = self.rotation.next(held.unwrap_or_default());
+        let retry_at = now + wait.unwrap_or(usual);
+        match std::mem::replace(&mut self.state, State::Down { retry_at }) {
+            State::Up(connection, _) => Some(connection),
+            State::Down { .. } => None,
+        }
+    }
+}
+
+/// The broker answered the subscriptions.
+fn answered(phase: &mut Phase, answers: Vec<Option<String>>) -> Step {
+    match phase {
+        Phase::Connecting => Step::Nothing,
+        Phase::Ready { .. } => Step::Subscribed(answers, None),
+        Phase::Subscribing { limits, .. }
+            if limits.wildcards && answers.iter().flatten().any(|why| why == NO_WILDCARDS) =>
+        {
+            limits.wildcards = false;
+            Step::Subscribe(*limits)
+        }
+        Phase::Subscribing { limits, since } => {
+            let (limits, since) = (*limits, *since);
+            *phase = Phase::Ready { limits, since };
+            Step::Subscribed(answers, Some(limits))
+        }
+    }
+}

@@ -1,0 +1,329 @@
+//! What the points of a drive of any profile show.
+
+use super::super::SimTime;
+use super::super::model::{Model, unsigned};
+use super::wishes::{Bits, Key, Wish, fulfilled};
+use super::words::Shows;
+use super::{AT_REFERENCE_BAND, Given, ProfileDrive};
+use crate::codec::Table;
+use crate::drive::control::{Mask, OwnWord, Run, Until};
+use crate::drive::profile::{Form, Part, PollClass, Raw};
+use crate::drive::{Derived, ModelPoint, Point, Profile, Source};
+
+/// kW of the simulated motor.
+const NOMINAL_POWER: f64 = 3.0;
+/// Nm of the simulated motor.
+const NOMINAL_TORQUE: f64 = 19.9;
+
+impl ProfileDrive {
+    pub(super) fn kilowatts(&self) -> f64 {
+        self.body.motor.power(&self.ratings) / 100.0 * NOMINAL_POWER
+    }
+
+    /// Values that no motor changes: as given, else such as the unit has them.
+    pub(super) fn fill_in(&mut self) {
+        let profile = self.profile();
+        for parameter in &profile.parameters.named {
+            let key = (Table::Holding, parameter.address);
+            let scale = if parameter.label.scale > 0.0 {
+                parameter.label.scale
+            } else {
+                1.0
+            };
+            let least = parameter.range.as_ref().map_or(0.0, |range| *range.start() / scale);
+            self.registers.place(
+                key,
+                Part {
+                    mask: u16::MAX,
+                    value: unsigned(least),
+                },
+            );
+        }
+        // Those with a scale in another register come after it.
+        let (scaled, plain): (Vec<usize>, Vec<usize>) = (0..profile.points.len())
+            .partition(|index| raw_of(&profile, *index).is_some_and(|raw| raw.scale_from.is_some()));
+        for index in plain.into_iter().chain(scaled) {
+            let Some((point, raw)) = profile.points.get(index).and_then(|point| Some((point, point.raw()?))) else {
+                continue;
+            };
+            let given = self.options.values.get(&index).cloned();
+            if self.is_kept_back(point, raw) && given.is_none() {
+                continue;
+            }
+            match given.or_else(|| usual(point, raw)) {
+                Some(Given::Text(text)) => self.put(raw, &raw.text_parts(&text)),
+                Some(Given::Number(number)) => match raw.state_parts() {
+                    Some(_) => {}
+                    None => self.put_number(&profile, raw, number),
+                },
+                None => {}
+            }
+        }
+    }
+
+    /// Commands hold 0 until somebody writes.
+    fn is_kept_back(&self, point: &Point, raw: &Raw) -> bool {
+        let is_place = |control: &crate::drive::control::Control| {
+            let places = super::said::places(control);
+            places.iter().any(|place| raw.covers(place.table, place.address))
+        };
+        let reference = matches!(
+            point.model,
+            Some(ModelPoint::SpeedReference | ModelPoint::FrequencyReference)
+        );
+        reference || self.control.as_ref().is_some_and(is_place)
+    }
+
+    fn put(&mut self, raw: &Raw, parts: &[Part]) {
+        for (address, part) in raw.addresses().zip(parts) {
+            self.registers.place((raw.table, address), *part);
+        }
+    }
+
+    fn put_number(&mut self, profile: &Profile, raw: &Raw, number: f64) {
+        let power = raw.scale_from.and_then(|index| {
+            let from = raw_of(profile, index)?;
+            let words: Option<Vec<u16>> = from
+                .addresses()
+                .map(|address| self.registers.get(from.table, address))
+                .collect();
+            from.decode(&words?, profile.points.get(index)?.kind())
+        });
+        let number = if is_signed(raw) { number } else { number.abs() };
+        let parts = raw.number_parts(number, power.map_or(0, |power| power.as_f64() as i64));
+        self.put(raw, &parts);
+    }
+
+    /// The reference as another master writes it.
+    pub(super) fn set_reference(&mut self, percent: f64) {
+        let profile = self.profile();
+        for (model, value) in [
+            (ModelPoint::SpeedReference, percent),
+            (ModelPoint::FrequencyReference, percent * self.ratings.maximum / 100.0),
+        ] {
+            let point = profile.model_point(model).filter(|point| point.write);
+            let target = point
+                .and_then(|point| point.write_to)
+                .and_then(|index| profile.points.get(index));
+            if let Some(raw) = target.or(point).and_then(Point::raw) {
+                self.put_number(&profile, &raw.clone(), value);
+            }
+        }
+    }
+
+    /// Brings all registers up to date.
+    pub(super) fn show(&mut self, now: SimTime) {
+        let profile = self.profile();
+        for (index, point) in profile.points.iter().enumerate() {
+            if let (Some(raw), Some(number)) = (point.raw(), self.figure(index, point))
+                && raw.state_parts().is_none()
+                && !self.is_written(point, raw)
+            {
+                self.put_number(&profile, raw, number);
+            }
+        }
+        let wishes = self.wishes(&profile, now);
+        let registers = &self.registers;
+        let fixed = fulfilled(&wishes, |(table, address)| registers.get(table, address).unwrap_or(0));
+        for (key, part) in fixed {
+            self.registers.place(key, part);
+        }
+    }
+
+    /// Whether only a master changes it.
+    fn is_written(&self, point: &Point, raw: &Raw) -> bool {
+        let own = self.control.as_ref().is_some_and(|control| {
+            let at = raw.covers(control.at.table, control.at.address);
+            at && (control.own_word == OwnWord::Read || point.class == PollClass::Never)
+        });
+        own || point.write && point.write_to.is_none()
+    }
+
+    /// What the motor makes of a point.
+    fn figure(&self, index: usize, point: &Point) -> Option<f64> {
+        let (motor, ratings) = (&self.body.motor, &self.ratings);
+        if self.options.values.contains_key(&index) || self.control.is_none() {
+            return None;
+        }
+        let fault = f64::from(self.body.latch.fault());
+        if let Some(model) = point.model {
+            return Some(match model {
+                ModelPoint::ActualSpeed => motor.output / ratings.maximum * 100.0,
+                ModelPoint::OutputFrequency => motor.output,
+                ModelPoint::MotorSpeed => motor.rpm(ratings),
+                ModelPoint::MotorCurrent => motor.current(ratings),
+                ModelPoint::MotorTorque => motor.torque,
+                ModelPoint::MotorPower => motor.power(ratings),
+                ModelPoint::MotorVoltage => motor.voltage(ratings),
+                ModelPoint::DcLinkVoltage => motor.dc_link(ratings, &self.load),
+                ModelPoint::HeatsinkTemperature => motor.heatsink,
+                ModelPoint::Energy => self.energy,
+                ModelPoint::OperatingHours => self.hours,
+                ModelPoint::FaultCode => fault,
+                ModelPoint::SpeedReference => self.target() / ratings.maximum * 100.0,
+                ModelPoint::FrequencyReference => self.target(),
+                _ => return None,
+            });
+        }
+        let is_mask = |other: &Point| matches!(other.source, Source::Derived(Derived::LowestBit { of }) if of == index);
+        if self.options.profile.points.iter().any(is_mask) {
+            // The lowest bit, counted from 1, is the code.
+            let bit = self.body.latch.fault().checked_sub(1);
+            return Some(bit.map_or(0.0, |bit| f64::from(1u32 << bit.min(15))));
+        }
+        let name = point.name.as_str();
+        match point.unit.as_str() {
+            "Hz" if name.contains("reference") => Some(self.target()),
+            "Hz" if name.contains("output") => Some(motor.output),
+            "kW" if name.contains("power") => Some(self.kilowatts()),
+            "W" if name.contains("power") => Some(self.kilowatts() * 1000.0),
+            "Nm" if name.contains("torque") => Some(motor.torque / 100.0 * NOMINAL_TORQUE),
+            "rpm" if name.contains("speed") => Some(motor.rpm(ratings)),
+            "%" if name.contains("thermal") => Some(motor.heat),
+            "" if name.contains("fault") && !name.contains("last") => Some(fault),
+            _ => None,
+        }
+    }
+
+    /// The states that registers are to show, the ones that count most first.
+    fn wishes(&self, profile: &Profile, now: SimTime) -> Vec<Wish> {
+        let mut wishes: Vec<(u8, Wish)> = Vec::new();
+        for (index, point) in profile.points.iter().enumerate() {
+            let Some((rank, is)) = self.state_of(index, point) else {
+                continue;
+            };
+            let (any, want) = match &point.source {
+                Source::Raw(raw) if self.is_written(point, raw) => continue,
+                Source::Raw(raw) => match raw.state_parts() {
+                    Some((parts, inverted)) => (vec![bits(raw, &parts)], is != inverted),
+                    None => continue,
+                },
+                Source::Derived(Derived::State { any }) => {
+                    (any.iter().filter_map(|mask| masked(profile, mask)).collect(), is)
+                }
+                Source::Derived(_) => continue,
+            };
+            wishes.push((rank, Wish { any, want }));
+        }
+        wishes.extend(self.sequence(profile, now));
+        let shows = Shows {
+            position: self.shown_position(now),
+            running: self.body.shows_running(),
+            commanded: self.run.is_some(),
+            faulted: self.body.latch.fault() != 0,
+            word: self.word,
+        };
+        if let Some((address, part)) = self.family.and_then(|family| (family.status)(&shows)) {
+            let any = vec![vec![((Table::Holding, address), part)]];
+            wishes.push((0, Wish { any, want: true }));
+        }
+        wishes.sort_by_key(|(rank, _)| *rank);
+        wishes.into_iter().map(|(_, wish)| wish).collect()
+    }
+
+    /// The states of the start sequence: the one that it has come to, and none that it has not.
+    fn sequence(&self, profile: &Profile, now: SimTime) -> Vec<(u8, Wish)> {
+        let Some(Run::Steps(steps)) = self.control.as_ref().map(|control| &control.run) else {
+            return Vec::new();
+        };
+        let position = self.shown_position(now);
+        let wish = |(step, step_of): (usize, &crate::drive::control::Step)| {
+            let Until::State(mask) = step_of.until else {
+                return None;
+            };
+            let is = step + 1 == position;
+            // A motor that runs shows that and no step.
+            if step < position && (!is || self.run.is_some()) {
+                return None;
+            }
+            let any = masked(profile, &mask).into_iter().collect();
+            Some((2, Wish { any, want: is }))
+        };
+        steps.iter().enumerate().filter_map(wish).collect()
+    }
+
+    /// Whether a state is so, and how much it counts.
+    fn state_of(&self, index: usize, point: &Point) -> Option<(u8, bool)> {
+        if let Some(Given::Number(number)) = self.options.values.get(&index) {
+            return Some((0, *number != 0.0));
+        }
+        let (motor, target) = (&self.body.motor, self.target());
+        let running = self.body.shows_running();
+        let fault = self.body.latch.fault() != 0;
+        Some(match point.model {
+            Some(ModelPoint::Fault) => (1, fault),
+            Some(ModelPoint::Running) => (3, running),
+            Some(ModelPoint::Reversed) => (4, self.body.turns_reverse(target)),
+            Some(ModelPoint::Remote) => (4, self.remote),
+            Some(ModelPoint::Warning) => (5, false),
+            Some(ModelPoint::AtReference) => (5, running && (motor.output - target).abs() < AT_REFERENCE_BAND),
+            Some(ModelPoint::ZeroSpeed) => (5, motor.output == 0.0),
+            Some(ModelPoint::Ready) => (6, self.ready()),
+            Some(_) => return None,
+            None if point.write => return None,
+            None => match &point.blocks {
+                Some(blocks) => (7, !blocks.when),
+                None => (8, point.name.contains("clockwise") && !self.body.turns_reverse(target)),
+            },
+        })
+    }
+}
+
+fn raw_of(profile: &Profile, index: usize) -> Option<&Raw> {
+    profile.points.get(index).and_then(Point::raw)
+}
+
+fn bits(raw: &Raw, parts: &[Part]) -> Bits {
+    let keys = raw.addresses().map(|address| -> Key { (raw.table, address) });
+    keys.zip(parts.iter().copied())
+        .filter(|(_, part)| part.mask != 0)
+        .collect()
+}
+
+fn masked(profile: &Profile, mask: &Mask) -> Option<Bits> {
+    let raw = raw_of(profile, mask.point)?;
+    Some(bits(raw, &raw.masked(mask.mask, mask.is)))
+}
+
+fn is_signed(raw: &Raw) -> bool {
+    raw.form.is_signed() || matches!(raw.form, Form::F32 | Form::F64)
+}
+
+/// What a point without a motor behind it usually holds, within what it takes.
+fn usual(point: &Point, raw: &Raw) -> Option<Given> {
+    if let Form::Text { .. } = raw.form {
+        return Some(Given::Text("SIM-0001".to_string()));
+    }
+    if let Some((code, _)) = point.texts.first_key_value() {
+        return Some(Given::Number(*code as f64));
+    }
+    let name = point.name.as_str();
+    let number: f64 = match point.unit.as_str() {
+        "V" if name.contains("dc") => 540.0,
+        "V" => 230.0,
+        "mV" => 230_000.0,
+        "A" => 5.2,
+        "mA" => 12.5,
+        "kW" | "kVA" | "kvar" => 2.4,
+        "W" | "VA" | "var" => 2400.0,
+        "kWh" | "kvarh" => 1234.5,
+        "Wh" | "MWh" => 1234.0,
+        "Hz" => 50.0,
+        "°C" => 35.5,
+        "%" => 42.0,
+        "h" => 310.0,
+        "s" | "min" | "bar" => 3.0,
+        "ms" => 500.0,
+        "rpm" => 0.0,
+        _ if name.contains("fault") || name.contains("alarm") || name.contains("error") => 0.0,
+        // Status words, and powers of ten.
+        _ if point.hidden => 0.0,
+        _ if name.contains("scale") || name.contains("exponent") => 0.0,
+        _ => 1.0,
+    };
+    let within = point
+        .range
+        .as_ref()
+        .map_or(number, |range| number.clamp(*range.start(), *range.end()));
+    Some(Given::Number(within))
+}

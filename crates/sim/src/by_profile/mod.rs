@@ -1,0 +1,488 @@
+//! A drive or meter of any profile: its registers come from the points of the profile, what it does with its control word from the
+//! hand-written [`words`] where the family is known, else from `[control]` ([`said`]). Pure.
+
+mod figures;
+mod registers;
+mod said;
+#[cfg(test)]
+mod tests;
+mod wishes;
+mod words;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use self::registers::Registers;
+use self::words::{Does, FAMILIES, Family, Known, Told};
+use super::SimTime;
+use super::model::{AT_REFERENCE_BAND, Body, Command, Model, UPDATE_PERIOD};
+use super::motor::{Feed, Load, Ratings};
+use super::parameter_set::Writes;
+use super::random::Random;
+use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::drive::control::{Always, Control, OwnWord, Place, Reset, Run, Setting, Until};
+use crate::drive::profile::Form;
+use crate::drive::{Bound, ModelPoint, Profile, Source, Value};
+
+/// Time that a drive takes to come to the next state of its start sequence.
+const SETTLE: Duration = Duration::from_millis(30);
+/// Maximum frequency where the profile does not say one, Hz.
+const MAXIMUM: f64 = 50.0;
+/// Where a fault can be caused, and next to it panel control: the first pair that the profile does not have.
+const TRIP_ADDRESSES: [u16; 3] = [9998, 19_998, 29_998];
+
+/// Options of a drive of any profile.
+#[derive(Debug, Clone)]
+pub struct ProfileOptions {
+    /// What it is.
+    pub profile: Arc<Profile>,
+    /// The registers that no real drive has are there: a fault code trips, and 1 behind it gives the drive to its panel.
+    pub trip_register: bool,
+    /// Time before a reply; none leaves it to the line.
+    pub turnaround: Option<Duration>,
+    /// What points without a motor behind them hold, by index.
+    pub values: BTreeMap<usize, Given>,
+}
+
+/// The value of a point as given.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Given {
+    /// In the unit of the point; 1 is true.
+    Number(f64),
+    /// A text.
+    Text(String),
+}
+
+impl ProfileOptions {
+    /// A drive of that profile.
+    pub fn new(profile: &Arc<Profile>) -> ProfileOptions {
+        ProfileOptions {
+            profile: Arc::clone(profile),
+            trip_register: false,
+            turnaround: Some(profile.turnaround),
+            values: BTreeMap::new(),
+        }
+    }
+
+    /// Whether drives of the profile can be simulated: those of an N2 board cannot, nor does a name that nobody knows say anything.
+    pub fn knows(profile: &Profile) -> bool {
+        let named = profile.simulator.as_deref();
+        let known = named.is_none_or(|name| name == BY_CONTROL || FAMILIES.iter().any(|family| family.name == name));
+        known && !profile.protocols.contains(&crate::codec::Protocol::N2)
+    }
+
+    /// PDU address of the holding register that trips it; the next one gives it to its panel.
+    pub fn trip_address(&self) -> u16 {
+        let is_free = |address: &u16| {
+            let ranges = &self.profile.ranges;
+            !ranges.iter().any(|range| {
+                range.table == Table::Holding
+                    && range.addresses.start() <= &(address + 1)
+                    && range.addresses.end() >= address
+            })
+        };
+        let [first, ..] = TRIP_ADDRESSES;
+        TRIP_ADDRESSES.into_iter().find(is_free).unwrap_or(first)
+    }
+}
+
+/// `simulator` of a profile whose drive does what `[control]` says though its base is known by hand.
+const BY_CONTROL: &str = "control";
+
+/// A simulated drive of any profile.
+#[derive(Debug, Clone)]
+pub struct ProfileDrive {
+    options: ProfileOptions,
+    family: Option<Family>,
+    control: Option<Control>,
+    registers: Registers,
+    ratings: Ratings,
+    load: Load,
+    body: Body,
+    /// The control word that counted last.
+    word: u16,
+    /// How far the start sequence has come, and when that shows.
+    position: usize,
+    shows_at: SimTime,
+    /// The run command that holds: in reverse or not.
+    run: Option<bool>,
+    reverse: bool,
+    coasts: bool,
+    remote: bool,
+    /// kWh.
+    energy: f64,
+    hours: f64,
+}
+
+impl ProfileDrive {
+    /// A drive that is switched on at `now`, with the motor at rest.
+    pub fn new(options: ProfileOptions, now: SimTime) -> ProfileDrive {
+        let load = Load::default();
+        let profile = Arc::clone(&options.profile);
+        let control = profile.control.clone().or_else(|| control_of(&profile));
+        let name = profile.simulator.as_deref();
+        let family = FAMILIES.into_iter().find(|family| Some(family.name) == name);
+        let ratings = Ratings {
+            maximum: maximum(&profile),
+            acceleration: 3.0,
+            deceleration: 3.0,
+            voltage: 400.0,
+            frequency: 50.0,
+            speed: 1440.0,
+            current: 6.3,
+            cos_phi: 0.82,
+        };
+        let mut drive = ProfileDrive {
+            registers: Registers::new(&profile, control.as_ref()),
+            family,
+            control,
+            ratings,
+            body: Body::new(&load, now),
+            load,
+            word: 0,
+            position: 0,
+            shows_at: now,
+            run: None,
+            reverse: false,
+            coasts: false,
+            remote: true,
+            energy: 487.0,
+            hours: 310.25,
+            options,
+        };
+        drive.fill_in();
+        drive.refresh();
+        drive
+    }
+
+    fn profile(&self) -> Arc<Profile> {
+        Arc::clone(&self.options.profile)
+    }
+
+    /// How far the start sequence has come as the status shows it.
+    fn shown_position(&self, now: SimTime) -> usize {
+        match now >= self.shows_at {
+            true => self.position,
+            false => self.position.saturating_sub(1),
+        }
+    }
+
+    /// A value that was written to a place that may take commands.
+    fn told(&mut self, place: Place, word: u16, now: SimTime) {
+        let Some(control) = self.control.clone() else {
+            return;
+        };
+        if !self.remote {
+            return;
+        }
+        let registers = &self.registers;
+        let known = Known {
+            before: self.word,
+            position: self.shown_position(now),
+            faulted: self.body.latch.fault() != 0,
+            reverse: self.reverse,
+            at: &|table, address| registers.get(table, address).unwrap_or(0),
+        };
+        let told = match self.family {
+            Some(family) if place == control.at => Some((family.word)(&known, word)),
+            Some(family) => (family.other)(place.table, place.address, word).or_else(|| {
+                // Another direction, say: the control word is looked at anew.
+                let again = (family.word)(&known, self.word);
+                let plain = Told { resets: false, ..again };
+                matches!(plain.does, Does::Runs { .. }).then_some(plain)
+            }),
+            None if said::places(&control).contains(&place) => Some(said::told(&control, &known, place, word)),
+            None => None,
+        };
+        let Some(told) = told else {
+            return;
+        };
+        if place == control.at {
+            self.word = told.word;
+        }
+        self.obey(told, now);
+    }
+
+    fn obey(&mut self, told: Told, now: SimTime) {
+        let once = self.acts_once();
+        let restarts = self.family.map_or_else(
+            || self.control.as_ref().is_some_and(|control| control.restarts_on_reset),
+            |family| family.restarts_on_reset,
+        );
+        if told.resets && self.body.latch.fault() != 0 {
+            self.body.latch.reset();
+            // Otherwise the run command has to be seen off first.
+            if restarts || self.run.is_none() {
+                self.body.latch.obeys(false);
+            }
+        }
+        let faulted = self.body.latch.fault() != 0;
+        match told.does {
+            Does::Nothing => {}
+            Does::Prepares(position) => {
+                self.halt();
+                self.come_to(if faulted { 0 } else { position }, now);
+            }
+            Does::Runs { .. } if faulted && once => {}
+            Does::Runs { reverse } => {
+                (self.run, self.reverse, self.coasts) = (Some(reverse), reverse, false);
+                self.position = self.position.max(self.steps().saturating_sub(1));
+            }
+            Does::Stops => {
+                self.halt();
+                self.position = 0;
+            }
+            Does::Coasts => {
+                self.halt();
+                (self.position, self.coasts) = (0, true);
+            }
+            Does::Trips => self.trip(1),
+        }
+    }
+
+    /// Whether a run command acts when it is written and does not stand.
+    fn acts_once(&self) -> bool {
+        let said = || self.control.as_ref().is_some_and(said::acts_once);
+        self.family.map_or_else(said, |family| family.acts_once)
+    }
+
+    /// Another state of the start sequence; one that it is in already does not take time.
+    fn come_to(&mut self, position: usize, now: SimTime) {
+        if self.position < position {
+            let step = position.saturating_sub(1);
+            let time = match self.control.as_ref().map(|control| &control.run) {
+                Some(Run::Steps(steps)) => steps.get(step).map_or(SETTLE, |step| match step.until {
+                    Until::Time(time) => time,
+                    Until::Written => Duration::ZERO,
+                    Until::State(_) => SETTLE,
+                }),
+                _ => Duration::ZERO,
+            };
+            self.shows_at = now + time;
+        }
+        self.position = position;
+    }
+
+    fn steps(&self) -> usize {
+        match self.control.as_ref().map(|control| &control.run) {
+            Some(Run::Steps(steps)) => steps.len(),
+            _ => 0,
+        }
+    }
+
+    /// The run command ends; a pulse shorter than a step counts.
+    fn halt(&mut self) {
+        self.run = None;
+        self.body.latch.obeys(false);
+    }
+
+    /// The reference, Hz, with its sign.
+    fn reference(&self) -> f64 {
+        let hertz = |model: ModelPoint, factor: f64| self.commanded(model).map(|value| value * factor);
+        let frequency = hertz(ModelPoint::FrequencyReference, 1.0);
+        let speed = || hertz(ModelPoint::SpeedReference, self.ratings.maximum / 100.0);
+        let found = frequency.or_else(speed).unwrap_or(self.ratings.maximum);
+        found.clamp(-self.ratings.maximum, self.ratings.maximum)
+    }
+
+    /// The value of a reference that is written to a register.
+    fn commanded(&self, model: ModelPoint) -> Option<f64> {
+        let point = self.options.profile.model_point(model).filter(|point| point.write)?;
+        let target = point.write_to.and_then(|index| self.options.profile.points.get(index));
+        let point = target.unwrap_or(point);
+        let raw = point.raw()?;
+        let words: Option<Vec<u16>> = raw
+            .addresses()
+            .map(|address| self.registers.get(raw.table, address))
+            .collect();
+        raw.decode(&words?, point.kind()).map(Value::as_f64)
+    }
+
+    /// Gives the drive to its panel, which lets it stand, or back to the bus, which has to command it anew.
+    fn give_to_bus(&mut self, on: bool) {
+        if self.remote != on {
+            (self.remote, self.position) = (on, 0);
+            self.run = None;
+            self.body.latch.obeys(false);
+        }
+    }
+}
+
+impl Model for ProfileDrive {
+    fn body(&self) -> &Body {
+        &self.body
+    }
+
+    fn body_mut(&mut self) -> &mut Body {
+        &mut self.body
+    }
+
+    fn step(&mut self, _now: SimTime) {
+        self.body.running = self.body.latch.obeys(self.run.is_some());
+        let feed = if self.body.running {
+            Feed::To(self.target())
+        } else if self.body.latch.fault() == 0 && self.body.motor.fed && self.body.motor.output != 0.0 && !self.coasts {
+            Feed::To(0.0)
+        } else {
+            Feed::Off
+        };
+        let seconds = UPDATE_PERIOD.as_secs_f64();
+        self.body.motor.step(seconds, feed, &self.ratings, &self.load);
+        let hours = seconds / 3600.0;
+        self.energy += self.kilowatts().max(0.0) * hours;
+        self.hours += hours;
+    }
+
+    fn ready(&self) -> bool {
+        self.body.latch.fault() == 0
+    }
+
+    fn target(&self) -> f64 {
+        let reference = self.reference();
+        if self.run.unwrap_or(self.reverse) {
+            -reference
+        } else {
+            reference
+        }
+    }
+
+    fn remote(&self) -> bool {
+        self.remote
+    }
+
+    fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply> {
+        self.advance(now);
+        Some(self.reply(request, now).unwrap_or_else(Reply::Exception))
+    }
+
+    fn malformed(&mut self, pdu: &[u8], exception: Exception, _now: SimTime) -> Option<Exception> {
+        let known = pdu.first().is_some_and(|function| self.has_function(*function));
+        Some(if known { exception } else { Exception::FUNCTION })
+    }
+
+    fn broadcast(&mut self, request: &RequestPdu, now: SimTime) {
+        self.advance(now);
+        if request.is_write() {
+            let _refused_in_silence = self.reply(request, now);
+        }
+    }
+
+    fn power_on(&mut self, now: SimTime) {
+        let fresh = ProfileDrive::new(self.options.clone(), now);
+        let kept = self.registers.clone();
+        *self = ProfileDrive {
+            energy: self.energy,
+            hours: self.hours,
+            remote: self.remote,
+            ..fresh
+        };
+        let profile = self.profile();
+        self.registers.keep_settings(&kept, &profile, self.control.as_ref());
+        self.refresh();
+    }
+
+    fn trip(&mut self, fault: u16) {
+        if fault != 0 && self.body.latch.fault() == 0 {
+            self.body.trip(fault);
+            self.position = 0;
+            if self.acts_once() || self.steps() > 0 {
+                self.run = None;
+            }
+        }
+    }
+
+    fn parameter_writes(&self) -> BTreeMap<u16, Writes> {
+        BTreeMap::new()
+    }
+
+    fn fill_parameters(&mut self, _random: &mut Random) {}
+
+    fn usual_faults(&self) -> &'static [u16] {
+        &[1, 2, 3]
+    }
+
+    fn command(&mut self, command: Command) {
+        match command.run {
+            true => {
+                (self.run, self.reverse, self.coasts) = (Some(command.reverse), command.reverse, false);
+                self.position = self.steps().saturating_sub(1);
+            }
+            false => self.halt(),
+        }
+        let percent = f64::from(command.reference) / 100.0;
+        self.set_reference(percent);
+    }
+
+    fn set_reset(&mut self, on: bool) {
+        if on {
+            self.body.latch.reset();
+            self.body.latch.obeys(self.run.is_some());
+        }
+    }
+
+    fn set_remote(&mut self, on: bool) {
+        self.give_to_bus(on);
+    }
+}
+
+/// The commands of a profile without `[control]`, from its points of plain bits.
+fn control_of(profile: &Profile) -> Option<Control> {
+    let bit = |model: ModelPoint| {
+        let point = profile.model_point(model).filter(|point| point.write)?;
+        let Source::Raw(raw) = &point.source else {
+            return None;
+        };
+        let Form::Bit { bit, invert } = raw.form else {
+            return None;
+        };
+        let mask = 1u16 << bit.min(15);
+        let setting = Setting {
+            place: None,
+            mask,
+            value: if invert { 0 } else { mask },
+            once: false,
+        };
+        let place = Place {
+            table: raw.table,
+            address: raw.address,
+        };
+        Some((place, setting))
+    };
+    let (at, run) = bit(ModelPoint::Run)?;
+    let placed = |model: ModelPoint| {
+        bit(model).map(|(place, setting)| Setting {
+            place: (place != at).then_some(place),
+            ..setting
+        })
+    };
+    Some(Control {
+        at,
+        own_word: OwnWord::Read,
+        always: Always::default(),
+        stop: Setting {
+            value: !run.value & run.mask,
+            ..run
+        },
+        run: Run::One(run),
+        reverse: placed(ModelPoint::Reverse),
+        fault_reset: placed(ModelPoint::FaultReset).map(|setting| Reset {
+            setting,
+            hold: UPDATE_PERIOD,
+        }),
+        restarts_on_reset: false,
+    })
+}
+
+/// The frequency at 100 %, Hz.
+fn maximum(profile: &Profile) -> f64 {
+    let ends = profile.points.iter().filter_map(|point| match &point.source {
+        Source::Derived(derived) => derived.band(),
+        Source::Raw(_) => None,
+    });
+    let mut fixed = ends.filter_map(|(_, _, maximum)| match maximum {
+        Bound::Fixed(hertz) => Some(hertz),
+        Bound::Point(_) => None,
+    });
+    fixed.find(|hertz| (1.0..=600.0).contains(hertz)).unwrap_or(MAXIMUM)
+}

@@ -1,0 +1,85 @@
+//! What a drive does with the words that it gets, as `[control]` of its profile says it: for drives that are not known by hand.
+
+use super::words::{Does, Known, Told};
+use crate::drive::control::{Control, Place, Run, Setting, Step};
+
+fn place_of(setting: &Setting, control: &Control) -> Place {
+    setting.place.unwrap_or(control.at)
+}
+
+/// What is written to one of the places of the profile's commands.
+pub(super) fn told(control: &Control, known: &Known<'_>, place: Place, word: u16) -> Told {
+    let own = place == control.at;
+    let here = |setting: &Setting| place_of(setting, control) == place;
+    let holds = |setting: &Setting| match place_of(setting, control) {
+        at if at == place => setting.holds(word),
+        at if at == control.at => setting.holds(known.before),
+        at => setting.holds((known.at)(at.table, at.address)),
+    };
+    let resets = control.fault_reset.is_some_and(|reset| {
+        let stood = own && reset.setting.holds(known.before);
+        here(&reset.setting) && reset.setting.holds(word) && !stood
+    });
+    let reverse = || control.reverse.as_ref().is_some_and(holds);
+    let does = match (&control.run, next_step(control, known.position, place, word)) {
+        (Run::Steps(steps), Some(step)) if step + 1 == steps.len() => Does::Runs { reverse: reverse() },
+        (Run::Steps(_), Some(step)) => Does::Prepares(step + 1),
+        _ if here(&control.stop) && holds(&control.stop) => Does::Stops,
+        // A word without its constant bits is no command.
+        _ if own && !control.always.holds(word) => Does::Nothing,
+        (Run::One(run), _) if holds(run) && concerns_run(control, place) => Does::Runs { reverse: reverse() },
+        (Run::Pair { forward, reverse }, _) if here(forward) || here(reverse) => {
+            match (holds(forward), holds(reverse)) {
+                (true, false) => Does::Runs { reverse: false },
+                (false, true) => Does::Runs { reverse: true },
+                _ => Does::Nothing,
+            }
+        }
+        _ => Does::Nothing,
+    };
+    Told { does, resets, word }
+}
+
+/// The farthest step of the sequence whose word that is and whose turn it can be.
+fn next_step(control: &Control, position: usize, place: Place, word: u16) -> Option<usize> {
+    let Run::Steps(steps) = &control.run else {
+        return None;
+    };
+    let direction = control.reverse.filter(|reverse| reverse.place.is_none());
+    let free = direction.map_or(0, |reverse| reverse.mask);
+    let is = |step: &Step| {
+        place_of(&step.write, control) == place && (word ^ step.write.value) & step.write.mask & !free == 0
+    };
+    let whole = place != control.at || control.always.holds(word);
+    let reached = steps.iter().take(position + 1);
+    reached
+        .enumerate()
+        .filter(|(_, step)| whole && is(step))
+        .map(|(step, _)| step)
+        .max()
+}
+
+/// Whether a write there can start the motor or turn it round.
+fn concerns_run(control: &Control, place: Place) -> bool {
+    let mut of_run = control.runs().into_iter().chain(control.reverse);
+    of_run.any(|setting| place_of(&setting, control) == place)
+}
+
+/// Every place that takes commands.
+pub(super) fn places(control: &Control) -> Vec<Place> {
+    let steps: &[Step] = match &control.run {
+        Run::Steps(steps) => steps,
+        Run::One(_) | Run::Pair { .. } => &[],
+    };
+    let settings = control.runs().into_iter().chain(steps.iter().map(|step| step.write));
+    let settings = settings.chain([control.stop]).chain(control.reverse);
+    let settings = settings.chain(control.fault_reset.map(|reset| reset.setting));
+    std::iter::once(control.at)
+        .chain(settings.filter_map(|setting| setting.place))
+        .collect()
+}
+
+/// Whether the run command acts when it is written and does not stand.
+pub(super) fn acts_once(control: &Control) -> bool {
+    control.runs().iter().all(|setting| setting.once)
+}

@@ -1,0 +1,374 @@
+//! What the families do with the words that they get, by hand from their manuals: no profile is read here.
+
+use crate::codec::Table;
+use crate::drive::profile::Part;
+
+/// What a drive does with a word.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Does {
+    /// It goes on as before.
+    Nothing,
+    /// It has come so far in its start sequence; the motor is not fed.
+    Prepares(usize),
+    /// It runs.
+    Runs {
+        /// In reverse, apart from the sign of the reference.
+        reverse: bool,
+    },
+    /// It brings the motor down; its start sequence begins anew.
+    Stops,
+    /// It lets the motor coast; likewise.
+    Coasts,
+    /// An external fault.
+    Trips,
+}
+
+/// All that a word does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Told {
+    pub(super) does: Does,
+    /// It resets a fault, before anything else.
+    pub(super) resets: bool,
+    /// The word that counts from now on.
+    pub(super) word: u16,
+}
+
+/// What a drive knows when it gets a word.
+#[derive(Clone, Copy)]
+pub(super) struct Known<'d> {
+    /// The word that counted last.
+    pub(super) before: u16,
+    /// How far it has come in its start sequence.
+    pub(super) position: usize,
+    pub(super) faulted: bool,
+    /// The direction that it was told last.
+    pub(super) reverse: bool,
+    /// What stands at other addresses.
+    pub(super) at: &'d dyn Fn(Table, u16) -> u16,
+}
+
+/// A family that is known by hand.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Family {
+    /// Name in profiles.
+    pub(super) name: &'static str,
+    /// What it does with the control word.
+    pub(super) word: fn(&Known<'_>, u16) -> Told,
+    /// What it does with another register or coil.
+    pub(super) other: fn(Table, u16, u16) -> Option<Told>,
+    /// Its words act when they are written; none of them stands.
+    pub(super) acts_once: bool,
+    /// A reset while a run command stands starts the motor.
+    pub(super) restarts_on_reset: bool,
+    /// Its status word beyond what a profile makes of it: PDU address of the holding register and bits.
+    pub(super) status: fn(&Shows) -> Option<(u16, Part)>,
+}
+
+/// The state that a status word shows.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Shows {
+    pub(super) position: usize,
+    pub(super) running: bool,
+    /// A run command holds; else a running motor comes down.
+    pub(super) commanded: bool,
+    pub(super) faulted: bool,
+    pub(super) word: u16,
+}
+
+const fn family(name: &'static str, word: fn(&Known<'_>, u16) -> Told) -> Family {
+    Family {
+        name,
+        word,
+        other: |_, _, _| None,
+        acts_once: false,
+        restarts_on_reset: false,
+        status: |_| None,
+    }
+}
+
+pub(super) const FAMILIES: [Family; 16] = [
+    Family {
+        status: |shows| Some((3, off_status(shows))),
+        ..family("abb", abb)
+    },
+    Family {
+        status: |shows| Some((109, off_status(shows))),
+        ..family("profidrive", profidrive)
+    },
+    family("danfoss", danfoss),
+    family("cia402", cia402),
+    family("yaskawa", yaskawa),
+    Family {
+        other: delta_reset,
+        acts_once: true,
+        status: |shows| Some((0x2101, delta_status(shows))),
+        ..family("delta", delta)
+    },
+    Family {
+        acts_once: true,
+        ..family("invt", invt)
+    },
+    family("mitsubishi", mitsubishi),
+    family("invertek", invertek),
+    family("weg", weg),
+    Family {
+        other: fuji_reset,
+        restarts_on_reset: true,
+        ..family("fuji", fuji)
+    },
+    family("toshiba", toshiba),
+    Family {
+        acts_once: true,
+        ..family("ls", ls)
+    },
+    family("teco-f510", teco),
+    family("vacon-10", vacon),
+    Family {
+        other: hitachi_coils,
+        ..family("hitachi", hitachi)
+    },
+];
+
+const fn is(word: u16, mask: u16) -> bool {
+    word & mask == mask
+}
+
+const fn any(word: u16, mask: u16) -> bool {
+    word & mask != 0
+}
+
+fn told(does: Does, resets: bool, word: u16) -> Told {
+    Told { does, resets, word }
+}
+
+fn rises(known: &Known<'_>, word: u16, bit: u16) -> bool {
+    any(word & !known.before, bit)
+}
+
+fn runs(reverse: bool) -> Does {
+    Does::Runs { reverse }
+}
+
+/// Two bits for two directions; both together are no run command.
+fn pair(bits: u16) -> Does {
+    match bits {
+        1 => runs(false),
+        2 => runs(true),
+        _ => Does::Stops,
+    }
+}
+
+/// OFF1 to OFF3 are bits 0 to 2, also without bit 10, without which all else counts for nothing; a run command needs bits 0 to 6,
+/// and bit 0 must have been off before.
+fn off_words(known: &Known<'_>, word: u16, reverse: bool) -> Told {
+    let valid = is(word, 0x0400);
+    let word = if valid { word } else { known.before & (word | !0x0007) };
+    let does = match word {
+        _ if !is(word, 0x0006) => Does::Coasts,
+        _ if !is(word, 0x0001) => Does::Prepares(1),
+        _ if !is(word, 0x0008) => Does::Coasts,
+        _ if is(word, 0x007F) && known.position > 0 => runs(reverse),
+        _ => Does::Nothing,
+    };
+    told(does, rises(known, word, 0x0080), word)
+}
+
+/// Bits 0 ready to switch on, 1 ready, 2 operation, 3 fault, 4 and 5 OFF2 and OFF3 inactive, 6 switching on inhibited.
+fn off_status(shows: &Shows) -> Part {
+    let ready = shows.position > 0 && !shows.faulted;
+    let bits = [
+        ready,
+        ready && is(shows.word, 0x0001),
+        shows.running,
+        shows.faulted,
+        is(shows.word, 0x0002),
+        is(shows.word, 0x0004),
+        shows.position == 0,
+    ];
+    let value = bits
+        .iter()
+        .zip(0u16..)
+        .fold(0, |word, (on, bit)| word | u16::from(*on) << bit);
+    Part { mask: 0x007F, value }
+}
+
+fn abb(known: &Known<'_>, word: u16) -> Told {
+    off_words(known, word, false)
+}
+
+fn profidrive(known: &Known<'_>, word: u16) -> Told {
+    off_words(known, word, is(word, 0x0800))
+}
+
+/// Without bit 10 a word is ignored; bits 2 to 5 off brake, coast, stop quickly and freeze.
+fn danfoss(known: &Known<'_>, word: u16) -> Told {
+    if !is(word, 0x0400) {
+        return told(Does::Nothing, false, known.before);
+    }
+    let does = match word {
+        _ if !is(word, 0x0008) => Does::Coasts,
+        _ if !is(word, 0x0054) => Does::Stops,
+        // Frozen, or a jog.
+        _ if !is(word, 0x0020) || any(word, 0x0100) => Does::Nothing,
+        _ => runs(is(word, 0x8000)),
+    };
+    told(does, rises(known, word, 0x0080), word)
+}
+
+/// 6 shutdown, 7 switch on, 15 enable operation, each from the state before it.
+fn cia402(known: &Known<'_>, word: u16) -> Told {
+    let does = match word & 0x000F {
+        _ if known.faulted => Does::Coasts,
+        low if !is(low, 0x0002) => Does::Coasts,
+        low if !is(low, 0x0004) => Does::Stops,
+        0x06 | 0x0E => Does::Prepares(1),
+        0x07 if known.position >= 1 => Does::Prepares(2),
+        0x0F if known.position >= 2 => runs(is(word, 0x0800)),
+        _ => Does::Nothing,
+    };
+    told(does, rises(known, word, 0x0080), word)
+}
+
+/// Bit 2 is an external fault; a reset counts only without a run command.
+fn yaskawa(known: &Known<'_>, word: u16) -> Told {
+    let does = if is(word, 0x0004) { Does::Trips } else { pair(word & 3) };
+    told(does, rises(known, word, 0x0008) && !any(word, 3), word)
+}
+
+/// Bits 1 and 0 run (10) or stop (01), bits 5 and 4 say the direction; 0 does nothing.
+fn delta(known: &Known<'_>, word: u16) -> Told {
+    let reverse = match word >> 4 & 3 {
+        1 => false,
+        2 => true,
+        _ => known.reverse,
+    };
+    let does = match word & 3 {
+        1 => Does::Stops,
+        2 => runs(reverse),
+        _ => Does::Nothing,
+    };
+    told(does, false, word)
+}
+
+/// 00 stopped, 01 stopping, 11 running.
+fn delta_status(shows: &Shows) -> Part {
+    let value = match (shows.running, shows.commanded) {
+        (false, _) => 0,
+        (true, false) => 1,
+        (true, true) => 3,
+    };
+    Part { mask: 3, value }
+}
+
+/// 0x2002: bit 0 external fault, bit 1 reset, bit 2 base block.
+fn delta_reset(table: Table, address: u16, word: u16) -> Option<Told> {
+    let does = match word {
+        _ if is(word, 1) => Does::Trips,
+        _ if is(word, 4) => Does::Coasts,
+        _ => Does::Nothing,
+    };
+    ((table, address) == (Table::Holding, 0x2002)).then(|| told(does, is(word, 2), word))
+}
+
+/// Codes that act when they are written; jogs are not simulated.
+fn invt(_: &Known<'_>, word: u16) -> Told {
+    let does = match word {
+        1 | 2 => pair(word),
+        5 => Does::Stops,
+        6 => Does::Coasts,
+        _ => Does::Nothing,
+    };
+    told(does, word == 7, word)
+}
+
+fn mitsubishi(_: &Known<'_>, word: u16) -> Told {
+    told(pair(word >> 1 & 3), false, word)
+}
+
+/// Bit 3 coasts, bit 1 is the second ramp.
+fn invertek(known: &Known<'_>, word: u16) -> Told {
+    let does = match word {
+        _ if is(word, 0x0008) => Does::Coasts,
+        _ if is(word, 0x0001) => runs(false),
+        _ => Does::Stops,
+    };
+    told(does, rises(known, word, 0x0004), word)
+}
+
+/// Bits 0 and 1 both, bit 2 forward; without bit 4 the panel commands.
+fn weg(known: &Known<'_>, word: u16) -> Told {
+    let does = match word {
+        _ if !is(word, 0x0010) => Does::Nothing,
+        _ if !is(word, 0x0002) => Does::Coasts,
+        _ if is(word, 0x0001) && !any(word, 0x0040) => runs(!is(word, 0x0004)),
+        _ => Does::Stops,
+    };
+    told(does, rises(known, word, 0x0080), word)
+}
+
+/// Rising bit 15 resets, and the run command that stands starts the motor then.
+fn fuji(known: &Known<'_>, word: u16) -> Told {
+    told(pair(word & 3), rises(known, word, 0x8000), word)
+}
+
+/// S14: 1 resets.
+fn fuji_reset(table: Table, address: u16, word: u16) -> Option<Told> {
+    ((table, address) == (Table::Holding, 0x070E)).then(|| told(Does::Nothing, is(word, 1), word))
+}
+
+/// Bits 15 and 10 run; bit 9 reverse, bit 11 coasts, bit 12 emergency off, bit 13 resets.
+fn toshiba(known: &Known<'_>, word: u16) -> Told {
+    let does = match word {
+        _ if is(word, 0x1000) => Does::Trips,
+        _ if !is(word, 0x8000) => Does::Nothing,
+        _ if is(word, 0x0800) => Does::Coasts,
+        _ if is(word, 0x0400) => runs(is(word, 0x0200)),
+        _ => Does::Stops,
+    };
+    told(does, rises(known, word, 0x2000), word)
+}
+
+/// Bit 0 stops, bits 1 and 2 run, bit 3 resets, bit 4 is the emergency stop; 0 does nothing.
+fn ls(known: &Known<'_>, word: u16) -> Told {
+    let does = match word & 0x07 {
+        _ if is(word, 0x0010) => Does::Coasts,
+        1 => Does::Stops,
+        2 => runs(false),
+        4 => runs(true),
+        _ => Does::Nothing,
+    };
+    told(does, rises(known, word, 0x0008), word)
+}
+
+/// Bit 2 is an external fault.
+fn teco(known: &Known<'_>, word: u16) -> Told {
+    let does = match word {
+        _ if is(word, 0x0004) => Does::Trips,
+        _ if is(word, 0x0001) => runs(is(word, 0x0002)),
+        _ => Does::Stops,
+    };
+    told(does, rises(known, word, 0x0008), word)
+}
+
+fn vacon(known: &Known<'_>, word: u16) -> Told {
+    let does = if is(word, 1) { runs(is(word, 2)) } else { Does::Stops };
+    told(does, rises(known, word, 0x0004), word)
+}
+
+/// Coil 0 runs, coil 1 = 1 is reverse.
+fn hitachi(known: &Known<'_>, word: u16) -> Told {
+    let does = match word {
+        0 => Does::Stops,
+        _ => runs((known.at)(Table::Coil, 1) != 0),
+    };
+    told(does, false, word)
+}
+
+/// Coil 2 is an external trip, coil 3 resets.
+fn hitachi_coils(table: Table, address: u16, word: u16) -> Option<Told> {
+    match (table, address) {
+        (Table::Coil, 2) if word != 0 => Some(told(Does::Trips, false, word)),
+        (Table::Coil, 3) => Some(told(Does::Nothing, word != 0, word)),
+        _ => None,
+    }
+}
