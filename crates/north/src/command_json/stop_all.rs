@@ -23,14 +23,17 @@ struct Body {
 /// # Errors
 /// It is not clear which.
 pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), String> {
+    let unclear = |why: String| {
+        let shown = excerpt(payload);
+        format!(
+            "{shown} does not say which drives to stop ({why}), so no stop was sent; write {{}}, {{\"bus\": \"NAME\"}} or {{\"group\": \"NAME\"}}"
+        )
+    };
     let body = match payload.trim_ascii() {
         [] => Body::default(),
-        payload => serde_json::from_slice(payload).map_err(|error| {
-            let shown = excerpt(payload);
-            format!(
-                "{shown} does not say which drives to stop ({error}), so no stop was sent; write {{}}, {{\"bus\": \"NAME\"}} or {{\"group\": \"NAME\"}}"
-            )
-        })?,
+        // A list would be taken for an object without keys.
+        object @ [b'{', ..] => serde_json::from_slice(object).map_err(|error| unclear(error.to_string()))?,
+        _ => return Err(unclear("it is no JSON object".to_string())),
     };
     let scope = match (body.bus, body.group) {
         (None, None) => Scope::Gateway,
@@ -63,6 +66,7 @@ mod tests {
         );
         for bad in [
             "1",
+            "[]",
             "{\"bus\": 1}",
             "{\"drive\": \"d\"}",
             "{\"bus\": \"b\", \"group\": \"g\"}",
