@@ -159,6 +159,7 @@ fn plant(drives: u16) -> Result<Plant, Box<dyn Error>> {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        stop_all: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     })

@@ -36,6 +36,7 @@ pub use drivegate_core::history;
 pub use drivegate_core::parameters;
 pub use drivegate_core::plant;
 pub use drivegate_core::process_image;
+pub use drivegate_core::stop_all;
 pub use drivegate_core::version;
 pub use drivegate_gateway::config;
 pub use drivegate_gateway::daemon;

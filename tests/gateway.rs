@@ -32,6 +32,7 @@ mod gateway {
     mod restart;
     mod restoring;
     mod slow_log;
+    mod stop_all;
     mod trace;
     mod trying;
     mod user_profiles;

@@ -156,6 +156,7 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        stop_all: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     };

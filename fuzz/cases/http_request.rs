@@ -16,6 +16,7 @@ static SERVER: LazyLock<Offline> = LazyLock::new(|| {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        stop_all: Default::default(),
         parameters: Default::default(),
         history: Default::default(),
     };

@@ -65,6 +65,7 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        stop_all: Default::default(),
         parameters: Default::default(),
         history: Default::default(),
     }))

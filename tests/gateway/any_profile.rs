@@ -53,6 +53,9 @@ fn examples() -> Vec<(String, String)> {
     blocks.map(|(text, _)| (name(text), text.to_string())).collect()
 }
 
+/// What a drive of an example is sent, in the order of the comment below.
+type Words = (u16, u16, u16, &'static [u16], u16, f64);
+
 #[test]
 fn the_examples_of_the_page_are_simulated() {
     let examples = examples();
@@ -69,7 +72,7 @@ fn the_examples_of_the_page_are_simulated() {
     is_shown(&site, "voltage_l1", &json!(231.5));
     is_shown(&site, "serial_number", &json!("SN-42"));
     // The address of the reference, its count at 25 Hz, the words that start, one that stops, and the frequency in reverse.
-    let drives: [(u16, u16, u16, &[u16], u16, f64); 2] = [
+    let drives: [Words; 2] = [
         (0x2502, 2500, 0x2501, &[1], 0, 25.0),
         (8502, 250, 8501, &[6, 7, 15], 7, 25.0),
     ];

@@ -120,6 +120,7 @@ impl Rig {
             events: events.clone(),
             writes,
             recordings: Default::default(),
+            stop_all: Arc::default(),
             parameters: Default::default(),
             history: Default::default(),
         };

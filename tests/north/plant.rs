@@ -53,6 +53,7 @@ pub(crate) fn plant(gateway: &str, stale_after: Duration, buses: Vec<BusHandle>)
         events: Events::default(),
         writes: Arc::default(),
         recordings: Default::default(),
+        stop_all: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     }

@@ -538,6 +538,7 @@ fn whatever_clients_try_nothing_goes_out_for_an_hour() {
         events: scene.events.clone(),
         writes: scene.writes.clone(),
         recordings: Default::default(),
+        stop_all: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     };

@@ -101,6 +101,7 @@ impl Rig {
             events,
             writes,
             recordings: Default::default(),
+            stop_all: Arc::default(),
             parameters: Default::default(),
             history: Default::default(),
         };
@@ -179,6 +180,7 @@ impl Rig {
             events: self.plant.events.clone(),
             writes: self.plant.writes.clone(),
             recordings: Default::default(),
+            stop_all: Arc::default(),
             parameters: Default::default(),
             history: Default::default(),
         }))

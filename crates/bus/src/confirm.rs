@@ -5,16 +5,13 @@ use std::time::{Duration, Instant};
 use crate::command::{Order, Receipt, written};
 use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, PollClass, Profile, Value};
-use crate::process_image::{Reading, Unavailable};
+use crate::process_image::Reading;
 
 /// Commands to one drive that are watched at one time; beyond that the oldest stays "acknowledged".
 const WATCHED: usize = 8;
 /// A motor whose speed fell by more than that, in Hz, or in percent where no frequency is read, is on its way to a stop.
 /// Less is ripple.
 const RIPPLE: f64 = 0.25;
-
-/// Causes (`blocks` of a point in the profile) by which a motor may turn whatever the drive does with it.
-const FED_OTHERWISE: [&str; 2] = ["bypass", "fire_mode"];
 
 /// On a busy line the next read may come late: so many times the time for confirmation pass before that is reported.
 const UNREAD: u32 = 5;
@@ -140,33 +137,6 @@ fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> 
             })
         }
     }
-}
-
-/// Why a motor may turn though the drive stands: the point that says so, or does not say otherwise yet. One that the drive
-/// refuses, or that is not polled, says nothing.
-fn may_turn(reading: &Reading<'_>) -> Option<String> {
-    let points = (0..).zip(&reading.spec.profile.points);
-    let reasons = points.filter_map(|(index, point)| {
-        let blocks = point.blocks.as_ref()?;
-        if !FED_OTHERWISE.contains(&blocks.cause.as_str()) {
-            return None;
-        }
-        match reading.sample(index).good() {
-            Some(value) if value.as_bool() == blocks.when => {
-                let state = if value.as_bool() { "on" } else { "off" };
-                Some(format!("`{}` is {state}: {}", point.name, blocks.remedy))
-            }
-            Some(_) => None,
-            None => {
-                let raw = point.raw()?;
-                let is_awaited = reading.words(raw.table, raw.address, raw.form.items()) == Err(Unavailable::Stale);
-                is_awaited.then(|| format!("`{}` is not known", point.name))
-            }
-        }
-    });
-    let reasons: Vec<String> = reasons.collect();
-    let motor = "the motor may turn though the drive stands";
-    (!reasons.is_empty()).then(|| format!("{motor}, {}", reasons.join(", ")))
 }
 
 /// How fast the motor turns, whatever the direction: its output frequency, which falls to zero, as a percentage of a band
@@ -310,7 +280,7 @@ impl Confirmations {
             if !watch.is_over(now) || watch.is_open(now) {
                 let was_read = &mut watch.was_read;
                 let stops = watch.effects.contains(&Effect::Stops);
-                watch.unseen = stops.then(|| may_turn(reading)).flatten();
+                watch.unseen = stops.then(|| reading.may_turn()).flatten();
                 let unseen = watch.unseen.is_some();
                 watch.effects.retain(|effect| {
                     let shown = shows(*effect, reading, since);

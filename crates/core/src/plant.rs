@@ -23,6 +23,7 @@ use crate::event::{Event, Events, RefusedCommand};
 use crate::history::{History, Recordings};
 use crate::parameters::Vault;
 use crate::process_image::{Access, BusImage, DriveImage, Machine, Reading};
+use crate::stop_all::StopAll;
 
 pub use self::exchange::{Exchange, Question, Target};
 pub use self::placed::{Placed, Shown};
@@ -96,6 +97,8 @@ pub struct Plant {
     pub writes: Arc<WriteStats>,
     /// What the recorder has kept.
     pub recordings: Arc<Recordings>,
+    /// Orders that stop all drives.
+    pub stop_all: Arc<StopAll>,
     /// Readings of parameters.
     pub parameters: Arc<Vault>,
     /// The past of the drives.

@@ -28,6 +28,7 @@ use crate::north::{NorthStats, ServerError, bacnet, http, local, modbus_tcp, mqt
 use crate::parameters::{Store, Vault};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
+use crate::stop_all::LOOK;
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
 const STOP_SLACK: Duration = Duration::from_millis(300);
@@ -79,6 +80,7 @@ pub struct Daemon {
     keeper: Option<Keeper>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
+    stopper: tokio::task::JoinHandle<()>,
     pulse: Pulse,
     /// Who is asked to reload, and the file that the gateway runs with.
     control: Option<Control>,
@@ -119,6 +121,7 @@ impl Daemon {
             events: events.clone(),
             writes: writes.clone(),
             recordings: recordings.clone(),
+            stop_all: Arc::default(),
             parameters: vault.clone(),
             history: history.clone(),
         };
@@ -142,7 +145,8 @@ impl Daemon {
             history,
             recorder: None,
             keeper: None,
-            reporter: report_refusals(shared),
+            reporter: report_refusals(shared.clone()),
+            stopper: stop_all(shared),
             pulse: Pulse::default(),
             control,
         };
@@ -318,6 +322,7 @@ impl Daemon {
             events: self.events.clone(),
             writes: self.writes.clone(),
             recordings: self.recordings.clone(),
+            stop_all: self.plant.load().stop_all.clone(),
             parameters: self.vault.clone(),
             history: self.history.clone(),
         }));
@@ -536,6 +541,7 @@ impl Daemon {
         })
         .await;
         self.reporter.abort();
+        self.stopper.abort();
         if let Some(reader) = &self.reader {
             reader.abort();
         }
@@ -620,6 +626,19 @@ async fn at_once<T: Send + 'static>(
     // A bus thread that panicked has ended the process.
     let stopped = futures_util::future::join_all(stopping).await;
     stopped.into_iter().filter_map(Result::ok).collect()
+}
+
+/// Watches the orders that stop all drives.
+fn stop_all(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
+    let orders = plant.load().stop_all.clone();
+    tokio::spawn(async move {
+        loop {
+            orders.begun().await;
+            while orders.look(&plant.load(), Instant::now()) {
+                tokio::time::sleep(LOOK).await;
+            }
+        }
+    })
 }
 
 /// Reports refusals of the plant whose count is due.

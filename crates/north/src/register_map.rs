@@ -19,6 +19,10 @@ use crate::process_image::Reading;
 pub const FIRST: u16 = 0x8000;
 /// Unit id of the gateway itself.
 pub const GATEWAY_UNIT: u8 = 255;
+/// Register of unit 255 to which 1 is written to stop all drives.
+pub const STOP_ALL: u16 = 0x0100;
+/// Register of unit 255 that counts the controlled drives that are not known to stand.
+pub const NOT_STANDING: u16 = 0x8101;
 
 const COMMAND_WORD: u16 = 0x8100;
 const SPEED_REFERENCE: u16 = 0x8101;

@@ -35,6 +35,7 @@ mod run;
 mod scan;
 mod schema;
 mod simulate;
+mod stop_all_command;
 mod token;
 mod trace;
 mod trial;
@@ -52,6 +53,7 @@ use drivegate_core::history;
 use drivegate_core::parameters;
 use drivegate_core::plant;
 use drivegate_core::process_image;
+use drivegate_core::stop_all;
 use drivegate_core::version;
 use drivegate_gateway::config;
 use drivegate_gateway::daemon;
@@ -126,6 +128,7 @@ commands! {
     Listen => listen,
     Read => read,
     Write => write,
+    StopAll => stop_all_command,
     Why => why,
     Diagnose => diagnose,
     Record => record,

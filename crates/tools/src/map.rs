@@ -157,6 +157,7 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        stop_all: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     })

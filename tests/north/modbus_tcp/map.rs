@@ -70,6 +70,7 @@ fn plant(settings: &Settings) -> Plant {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        stop_all: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     }

@@ -216,6 +216,31 @@ impl Master {
         (chosen, blocked)
     }
 
+    /// The broadcast of a stop of all drives, which goes before their own stops where it can go at once.
+    pub(super) fn broadcast_stop(&mut self, now: Instant) -> Option<Turn> {
+        let queue = self.bus.queue.clone();
+        let mut pending = queue.lock();
+        let chosen = pending.first_of_all(now)?;
+        let Master {
+            drives,
+            sessions,
+            n2_late,
+            strangers,
+            ..
+        } = self;
+        let mut late = Late {
+            sessions,
+            n2_late,
+            strangers,
+        };
+        late.may_pass_on(pending.get(chosen)?, drives, now)
+            .is_ok_and(|may| may)
+            .then_some(())?;
+        let command = pending.take(chosen)?;
+        drop(pending);
+        self.begin_passed_on(command, None, now)
+    }
+
     /// The broadcast of the shutdown, if it may go: the line is free for it.
     ///
     /// # Errors

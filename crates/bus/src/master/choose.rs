@@ -101,6 +101,11 @@ impl Master {
     /// One decision; none where it changed what is to be decided on.
     fn decide(&mut self, now: Instant) -> Option<Result<Turn, Instant>> {
         self.purge(now);
+        if self.shutdown.is_none()
+            && let Some(turn) = self.broadcast_stop(now)
+        {
+            return Some(Ok(turn));
+        }
         let mut commands = self.commands(now);
         if self.shutdown.is_none()
             && !commands.waits(Urgency::Stop)

@@ -74,6 +74,8 @@ pub struct PassedOn {
     pub stops: Vec<usize>,
     /// What it means for the priority arrays of those that hear it.
     pub effects: Vec<(usize, Effect)>,
+    /// It stops all that hear it, and goes before all that waits.
+    pub first: bool,
     /// Where the frame of the reply goes, as the drive sent it.
     pub frame: oneshot::Sender<Vec<u8>>,
 }

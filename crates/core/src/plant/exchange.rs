@@ -63,6 +63,15 @@ impl BusHandle {
     /// Passes a request on to the line, in the share of background exchanges. When this returns it is in the queue of the bus, or
     /// answered. What may write is an order to every drive that hears it, with its place among their other orders.
     pub fn ask(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
+        self.pass_on(question, false, writes, now)
+    }
+
+    /// The same of a broadcast that stops every drive of the bus: it goes before all that waits, stops included.
+    pub fn ask_first(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
+        self.pass_on(question, true, writes, now)
+    }
+
+    fn pass_on(&self, question: Question, first: bool, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
         let (spec, drives) = (&self.image.spec, &self.image.drives);
         let (drive, address, name) = match question.target {
             Target::Drive(index) => {
@@ -114,6 +123,7 @@ impl BusHandle {
                 reach,
                 stops,
                 effects,
+                first,
                 frame: sender,
             }),
         };

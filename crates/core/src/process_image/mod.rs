@@ -97,6 +97,8 @@ pub struct DriveSpec {
     pub unit: u8,
     /// Its family.
     pub profile: Arc<Profile>,
+    /// Group of drives that are stopped together.
+    pub group: Option<String>,
     /// Whether it may be commanded.
     pub access: Access,
     /// Limits of commands in engineering units, by point name.
@@ -500,6 +502,7 @@ impl DriveSpec {
             unit: address,
             turnaround: profile.turnaround,
             profile,
+            group: None,
             access: Access::Monitor,
             limits: BTreeMap::new(),
             supervision: None,

@@ -53,6 +53,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let address = address.read(reader);
     let unit = read_unit(reader, address);
     let profile = read_profile(reader, around, address);
+    let group = DRIVE.group.read(reader);
     let access = DRIVE.access.get(reader);
     let frequency_range = read_frequencies(reader);
     let limits = read_limits(reader, profile.as_deref(), frequency_range.as_ref());
@@ -71,6 +72,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             unit,
             turnaround: turnaround.unwrap_or(profile.turnaround),
             profile,
+            group,
             access,
             limits,
             supervision,

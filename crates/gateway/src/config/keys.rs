@@ -304,6 +304,8 @@ keys! {
         profile: String = Text("^[a-z][a-z0-9-]*$", "the name of a profile"), required;
         /// Modbus TCP unit id, unique on each listener of `[modbus_tcp]`. 255 is the gateway itself.
         unit: u8 = Number(1..=254, Some((255, "unit 255 is the gateway itself"))), or "the address";
+        /// Drives that [stop all](commands.md#stop-all) can stop together.
+        group: String = Name("-_"), or "none";
         /// `"monitor"`: every write is refused. `"control"`: writes by authorised clients are passed on.
         access: Access = Words(&[("monitor", Access::Monitor), ("control", Access::Control)]), default "monitor";
         /// Limits for written values by point, in the point's unit, within the drive's own range. A value outside is

@@ -512,6 +512,7 @@ mod tests {
             events: Default::default(),
             writes: Default::default(),
             recordings: Default::default(),
+            stop_all: Arc::default(),
             parameters: Default::default(),
             history: Default::default(),
         };

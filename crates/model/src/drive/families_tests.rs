@@ -469,6 +469,16 @@ fn limits_and_lines() {
     }
 }
 
+/// A title says what is doubtful of its profile.
+#[test]
+fn titles_of_unverified_profiles() {
+    for profile in Profiles::built_in().iter() {
+        let doubt = profile.described().ends_with(" (not verified on hardware)");
+        assert_eq!(doubt, !profile.verified, "{}", profile.name);
+        assert!(profile.described().starts_with(&profile.title));
+    }
+}
+
 /// What every family whose manual is at hand can be commanded, and that parameters and outputs of N2 are written on change only.
 #[test]
 fn commands_of_every_family() {

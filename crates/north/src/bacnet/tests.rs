@@ -87,6 +87,7 @@ impl Bench {
             events: Default::default(),
             writes: Default::default(),
             recordings: Default::default(),
+            stop_all: Arc::default(),
             parameters: Default::default(),
             history: Default::default(),
         };

@@ -139,6 +139,7 @@ pub(super) fn router(
             get(operating::commands_of).post(operating::command),
         )
         .route("/api/v1/drives/{name}/heartbeat", post(operating::heartbeat))
+        .route("/api/v1/stop", post(operating::stop))
         .fallback(unknown)
         .with_state(app.clone())
         .layer(middleware::from_fn_with_state(app, guard))

@@ -34,7 +34,7 @@ pub async fn answer(request: &Request, shared: &SharedPlant, origin: Origin, ask
         Request::Record(request) => record(request, plant, &origin).await.map(Outcome::Record),
         Request::Params(request) => params(request, plant, origin).map(Outcome::Params),
         Request::ParamsRestore(request) => restore(request, shared, origin).await.map(Outcome::ParamsRestore),
-        Request::Reload(_) | Request::Health(_) => {
+        Request::Reload(_) | Request::Health(_) | Request::StopAll(_) => {
             let message = "this is not a request to a drive";
             Err(Failure::new(FailureCode::BadRequest, message))
         }

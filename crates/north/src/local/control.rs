@@ -1,11 +1,14 @@
 //! Orders of local clients to the gateway itself rather than to a drive.
 
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use tokio::sync::{mpsc, oneshot};
 
-use super::protocol::{Failure, FailureCode, HealthOutcome, OfGateway, ReloadOutcome};
+use super::protocol::{Failure, FailureCode, HealthOutcome, OfGateway, ReloadOutcome, StopAllRequest};
+use crate::command::Origin;
 use crate::plant::Plant;
+use crate::stop_all::{NothingToStop, Scope, StopReport, WAIT};
 use crate::{NorthStats, readiness};
 
 /// Orders that wait; there are no more clients than that.
@@ -90,6 +93,35 @@ pub(crate) async fn reload(
     let order = ReloadOrder { who, answer };
     control.orders.send(order).await.map_err(|_| stops())?;
     outcome.await.map_err(|_| stops())
+}
+
+/// Stops all drives, and waits for what becomes of them.
+///
+/// # Errors
+/// It is another gateway, or there is nothing to stop.
+pub(super) async fn stop_all(
+    control: Option<&Control>,
+    asked: &StopAllRequest,
+    plant: &Plant,
+    origin: &Origin,
+) -> Result<StopReport, Failure> {
+    let gateway = OfGateway {
+        config: asked.config.clone(),
+    };
+    is_meant(control, &gateway)?;
+    let scope = match (&asked.bus, &asked.group) {
+        (None, None) => Scope::Gateway,
+        (Some(bus), None) => Scope::Bus(bus.clone()),
+        (None, Some(group)) => Scope::Group(group.clone()),
+        (Some(_), Some(_)) => {
+            let message = "both a bus and a group are named, so no stop was sent";
+            return Err(Failure::new(FailureCode::BadRequest, message));
+        }
+    };
+    let order = plant.stop_all.order(plant, &scope, origin, WAIT, Instant::now());
+    let order = order.map_err(|why: NothingToStop| Failure::new(FailureCode::BadRequest, why.to_string()))?;
+    let stops = |_| Failure::new(FailureCode::Stopping, "the gateway stops");
+    order.report.await.map_err(stops)
 }
 
 /// Whether the gateway is ready, as `/readyz` says.

@@ -74,6 +74,9 @@ impl Asked {
             Request::Reload(asked) => control::reload(control, asked, origin.who.to_string())
                 .await
                 .map(Outcome::Reload),
+            Request::StopAll(asked) => control::stop_all(control, asked, &plant, &origin)
+                .await
+                .map(Outcome::StopAll),
             Request::Health(asked) => control::health(control, asked, &plant, &self.stats).map(Outcome::Health),
             of_drive => Ok(answer(of_drive, &self.plant, origin, came).await),
         };

@@ -14,6 +14,8 @@
 //! {"v":1,"gateway":"plant","params_restore":{"number":4,"stage":"working","done":2,"total":12,"plan":"…"}}
 //! {"v":1,"reload":{"config":"/etc/drivegate/drivegate.toml"}}
 //! {"v":1,"gateway":"plant","reload":{"errors":[],"warnings":[],"changes":["changed: MQTT"]}}
+//! {"v":1,"stop_all":{"bus":"line-1"}}
+//! {"v":1,"gateway":"plant","stop_all":{"ok":true,"drives":[{"drive":"pump-1","outcome":"standing","reason":null}]}}
 //! {"v":1,"health":{}}
 //! {"v":1,"gateway":"plant","health":{"ready":true,"reasons":[]}}
 //! {"v":1,"gateway":"plant","write":{"ok":true,"result":"confirmed","message":"…","latency_ms":9.1,"confirmed_ms":31.4}}
@@ -31,6 +33,7 @@ use crate::drive::{ModelPoint, Point, Quality, Sample};
 use crate::parameters::{Plan, RestoreStage, RestoreStatus, Status};
 use crate::plant::Shown;
 use crate::process_image::{BusSpec, DriveSpec, value_or_null};
+use crate::stop_all::StopReport;
 
 /// Version of requests and responses. A field that is added does not change it.
 pub const VERSION: u64 = 1;
@@ -55,6 +58,8 @@ pub enum Request {
     Params(ParamsRequest),
     /// Parameters restored to one drive.
     ParamsRestore(RestoreRequest),
+    /// All drives are stopped.
+    StopAll(StopAllRequest),
     /// The gateway reads its configuration anew.
     Reload(OfGateway),
     /// Whether the gateway is ready.
@@ -68,6 +73,21 @@ pub struct OfGateway {
     /// The one that runs with this configuration file, an absolute path without links; absent: whichever answers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub config: Option<String>,
+}
+
+/// All drives are stopped, of a bus or of a group where one is named.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StopAllRequest {
+    /// As of [`OfGateway`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub config: Option<String>,
+    /// Name of a bus.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bus: Option<String>,
+    /// Name of a group.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub group: Option<String>,
 }
 
 /// Why a drive does not run.
@@ -256,6 +276,8 @@ pub enum Outcome {
     Params(ParamsOutcome),
     /// A restore goes on, or is over.
     ParamsRestore(RestoreOutcome),
+    /// What became of the stops.
+    StopAll(StopReport),
     /// The configuration was read anew.
     Reload(ReloadOutcome),
     /// The gateway is ready, or not.

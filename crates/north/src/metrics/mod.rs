@@ -212,6 +212,7 @@ mod tests {
             events: Events::default(),
             writes: Arc::new(WriteStats::default()),
             recordings: Default::default(),
+            stop_all: Arc::default(),
             parameters: Default::default(),
             history: Default::default(),
         }

@@ -5,6 +5,8 @@ use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::Instant;
 
+use tokio::sync::oneshot;
+
 use super::client::Client;
 use super::frame::Header;
 use crate::codec::n2::Object;
@@ -61,35 +63,50 @@ pub(super) enum Progress {
     Pending(PendingRequest),
     /// Its outcome is known.
     Done(Box<ForwardedRequest>, Outcome),
+    /// Of a stop of all drives: whether every drive acknowledged it.
+    Stopped(Header, RequestPdu, bool),
 }
 
-/// A forwarded request whose command is in the queue; nothing is left to do but wait.
+/// A request whose command is in the queue; nothing is left to do but wait. What it was is `None` once it is answered.
 #[derive(Debug)]
-pub(super) struct PendingRequest {
-    /// `None` once it is answered.
-    forwarded: Option<Box<ForwardedRequest>>,
-    placed: Placed,
+pub(super) enum PendingRequest {
+    /// One that is forwarded.
+    Forwarded(Option<Box<ForwardedRequest>>, Placed),
+    /// A stop of all drives.
+    StopAll(Option<(Header, RequestPdu)>, oneshot::Receiver<bool>),
 }
 
-/// A forwarded request of which the bus has answered a command.
+/// A request of which the bus has answered a command.
 #[derive(Debug)]
-pub(super) struct AnsweredRequest {
-    forwarded: Box<ForwardedRequest>,
-    outcome: Outcome,
+pub(super) enum AnsweredRequest {
+    /// One that is forwarded.
+    Forwarded(Box<ForwardedRequest>, Outcome),
+    /// A stop of all drives, and whether every drive acknowledged it.
+    StopAll(Header, RequestPdu, bool),
 }
 
 impl Future for PendingRequest {
     type Output = AnsweredRequest;
 
     fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<AnsweredRequest> {
-        match (self.placed.poll_answer(cx), self.forwarded.take()) {
-            (Poll::Ready(answer), Some(forwarded)) => Poll::Ready(AnsweredRequest {
-                forwarded,
-                outcome: answer.outcome,
-            }),
-            (_, forwarded) => {
-                self.forwarded = forwarded;
-                Poll::Pending
+        match &mut *self {
+            PendingRequest::Forwarded(forwarded, placed) => {
+                let Poll::Ready(answer) = placed.poll_answer(cx) else {
+                    return Poll::Pending;
+                };
+                forwarded.take().map_or(Poll::Pending, |forwarded| {
+                    Poll::Ready(AnsweredRequest::Forwarded(forwarded, answer.outcome))
+                })
+            }
+            PendingRequest::StopAll(request, acknowledged) => {
+                let Poll::Ready(all) = Pin::new(acknowledged).poll(cx) else {
+                    return Poll::Pending;
+                };
+                // Without an answer nothing is known: the process ends.
+                let all = all.unwrap_or(false);
+                request.take().map_or(Poll::Pending, |(header, request)| {
+                    Poll::Ready(AnsweredRequest::StopAll(header, request, all))
+                })
             }
         }
     }
@@ -116,10 +133,7 @@ impl ForwardedRequest {
                 let (authority, rest) = (client.rights.authority(), (what.as_str(), refusal));
                 let drive = &forwarded.drive;
                 let placed = drive.place_stop(stop, rest, client.origin(), authority, DEFAULT_EXPIRY, now);
-                Progress::Pending(PendingRequest {
-                    forwarded: Some(forwarded),
-                    placed,
-                })
+                Progress::Pending(PendingRequest::Forwarded(Some(forwarded), placed))
             }
             BusWork::Refused(refusal) => {
                 let what = describe::request(&forwarded.request);
@@ -149,10 +163,7 @@ impl ForwardedRequest {
         let placed = self
             .drive
             .place_asked(order, origin, authority, DEFAULT_EXPIRY, asked, now);
-        Progress::Pending(PendingRequest {
-            forwarded: Some(self),
-            placed,
-        })
+        Progress::Pending(PendingRequest::Forwarded(Some(self), placed))
     }
 
     /// Requests the next object of a read, if any is left.
@@ -182,23 +193,27 @@ impl ForwardedRequest {
 
 impl AnsweredRequest {
     /// Continues a read with its next object, until one fails; any other request is done.
-    pub(super) fn go_on(mut self, client: &Client, now: Instant) -> Progress {
-        let Some(read) = &mut self.forwarded.read else {
-            return Progress::Done(self.forwarded, self.outcome);
+    pub(super) fn go_on(self, client: &Client, now: Instant) -> Progress {
+        let (mut forwarded, outcome) = match self {
+            AnsweredRequest::Forwarded(forwarded, outcome) => (forwarded, outcome),
+            AnsweredRequest::StopAll(header, request, all) => return Progress::Stopped(header, request, all),
+        };
+        let Some(read) = &mut forwarded.read else {
+            return Progress::Done(forwarded, outcome);
         };
         let (skip, take) = read.asked;
-        match self.outcome {
+        match outcome {
             Outcome::Acknowledged(Reply::Registers(got)) => read.words.extend(got.iter().skip(skip).take(take)),
             Outcome::Acknowledged(Reply::Bits(got)) => {
                 read.words
                     .extend(got.iter().skip(skip).take(take).map(|bit| u16::from(*bit)));
             }
             Outcome::Acknowledged(_) => {
-                return Progress::Done(self.forwarded, Outcome::Exception(Exception::DEVICE_FAILURE));
+                return Progress::Done(forwarded, Outcome::Exception(Exception::DEVICE_FAILURE));
             }
-            outcome => return Progress::Done(self.forwarded, outcome),
+            outcome => return Progress::Done(forwarded, outcome),
         }
-        self.forwarded.read_on(client, now)
+        forwarded.read_on(client, now)
     }
 }
 

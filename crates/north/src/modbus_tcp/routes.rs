@@ -5,6 +5,7 @@ use std::sync::Arc;
 use arc_swap::ArcSwap;
 
 use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
+use crate::stop_all::Scope;
 
 /// Names of the visible buses; `None` for all.
 type VisibleBuses = Option<Vec<String>>;
@@ -86,6 +87,19 @@ impl Routes {
     pub(super) fn drive(&self, unit: u8) -> Option<&DriveHandle> {
         let index = self.units.get(usize::from(unit)).copied().flatten()?;
         self.drives.get(usize::from(index))
+    }
+
+    /// All drives.
+    pub(super) fn drives(&self) -> &[DriveHandle] {
+        &self.drives
+    }
+
+    /// All of these drives, to stop them.
+    pub(super) fn scope(&self) -> Scope {
+        match &*self.buses {
+            Some(buses) => Scope::Buses(buses.clone()),
+            None => Scope::Gateway,
+        }
     }
 
     /// The bus at that index of the configuration, if it is visible.

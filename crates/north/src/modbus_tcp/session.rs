@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use futures_util::FutureExt;
+use tokio::sync::oneshot;
 
 use super::client::Client;
 use super::forwarded_request::{AnsweredRequest, BusWork, ForwardedRequest, PendingRequest, Progress, read_parts};
@@ -19,7 +20,10 @@ use crate::drive::{Profile, State};
 use crate::log_throttle::LogThrottle;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, Unavailable};
-use crate::register_map::{self, BusFigures, BusState, CommandWrite, DriveView, FIRST, GATEWAY_UNIT};
+use crate::register_map::{
+    self, BusFigures, BusState, CommandWrite, DriveView, FIRST, GATEWAY_UNIT, NOT_STANDING, STOP_ALL,
+};
+use crate::stop_all;
 
 /// Function codes that write.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
@@ -34,6 +38,8 @@ enum Decision {
     Exception(Exception),
     /// Forwarded to the drive, or refused on the way.
     Drive(ForwardedRequest, BusWork),
+    /// The stops of all drives are in the queues of their buses.
+    StopAll(RequestPdu, oneshot::Receiver<bool>),
 }
 
 impl From<Exception> for Decision {
@@ -115,6 +121,10 @@ impl ClientSession {
                 let step = forwarded.send(work, &self.client, asked, now);
                 return self.follow(step, now, out);
             }
+            Decision::StopAll(request, acknowledged) => {
+                let request = Some((frame.header, request));
+                return Some(PendingRequest::StopAll(request, acknowledged));
+            }
         }
         None
     }
@@ -136,6 +146,13 @@ impl ClientSession {
             match step {
                 Progress::Done(forwarded, outcome) => {
                     self.answer(&forwarded, &outcome, now, out);
+                    return None;
+                }
+                Progress::Stopped(header, request, all) => {
+                    match all {
+                        true => self.put(header, &request, &Reply::Written, out),
+                        false => self.put_exception(header, request.function(), Exception::DEVICE_FAILURE, out),
+                    }
                     return None;
                 }
                 Progress::Pending(mut waiting) => match (&mut waiting).now_or_never() {
@@ -187,7 +204,7 @@ impl ClientSession {
 
     fn decide(&self, frame: &Frame<'_>, now: Instant) -> Decision {
         if frame.header.unit == GATEWAY_UNIT {
-            return self.gateway(frame).unwrap_or_else(Decision::from);
+            return self.gateway(frame, now).unwrap_or_else(Decision::from);
         }
         let Some(drive) = self.routes.drive(frame.header.unit) else {
             return Exception::GATEWAY_PATH.into();
@@ -251,13 +268,20 @@ impl ClientSession {
     }
 
     /// Unit 255: input registers, and the same as holding registers, since many clients read nothing else.
-    fn gateway(&self, frame: &Frame<'_>) -> Result<Decision, Exception> {
+    fn gateway(&self, frame: &Frame<'_>, now: Instant) -> Result<Decision, Exception> {
         if WRITES.contains(&frame.function) {
-            return Err(Exception::FUNCTION);
+            return self.stop_all(frame, now);
         }
         let request = RequestPdu::decode(frame.pdu)?;
         let plant = &self.routes.plant;
         let reply = match request {
+            RequestPdu::Read { table, start, count } if !table.is_bits() && start >= FIRST => {
+                if (start, count) != (NOT_STANDING, 1) {
+                    return Err(Exception::ADDRESS);
+                }
+                let drives = stop_all::not_standing(self.routes.drives(), now);
+                Reply::Registers(vec![u16::try_from(drives).unwrap_or(u16::MAX - 1)])
+            }
             RequestPdu::Read { table, start, count } if !table.is_bits() => {
                 let bus = |place: usize| self.routes.bus(place).map(figures);
                 Reply::Registers(register_map::gateway(start, count, bus)?)
@@ -273,6 +297,34 @@ impl ClientSession {
             _ => return Err(Exception::FUNCTION),
         };
         Ok(Decision::Reply(request, reply))
+    }
+
+    /// A write to unit 255: 1 at the register that stops all drives that the listener serves.
+    fn stop_all(&self, frame: &Frame<'_>, now: Instant) -> Result<Decision, Exception> {
+        if self.client.rights.authority() != Authority::Write {
+            return Err(Exception::FUNCTION);
+        }
+        let request = RequestPdu::decode(frame.pdu)?;
+        let value = match &request {
+            RequestPdu::WriteRegister {
+                address: STOP_ALL,
+                value,
+            } => *value,
+            RequestPdu::WriteRegisters {
+                start: STOP_ALL,
+                values,
+            } if values.len() == 1 => values.first().copied().unwrap_or_default(),
+            _ => return Err(Exception::FUNCTION),
+        };
+        if value != 1 {
+            return Err(Exception::VALUE);
+        }
+        let (plant, scope, origin) = (&self.routes.plant, self.routes.scope(), self.client.origin());
+        match plant.stop_all.order(plant, &scope, &origin, stop_all::WAIT, now) {
+            Ok(order) => Ok(Decision::StopAll(request, order.acknowledged)),
+            // Nothing here may be written.
+            Err(_) => Err(Exception::FUNCTION),
+        }
     }
 
     fn raw_read(&self, header: Header, drive: &DriveHandle, request: RequestPdu, now: Instant) -> Decision {

@@ -18,7 +18,7 @@ use self::buffering::buffers;
 use self::discovery::{announcer, discovery_topics, report_refused};
 use self::repair::Repair;
 use super::broker_limits::BrokerLimits;
-use super::commands::{Commands, FinishedCommand, Rules};
+use super::commands::{Commands, Finished, Rules};
 use super::connection::{self, ConnectionEvent, Subscription};
 use super::home_assistant::{Announcer, Sources};
 use super::link::{BrokerLink, Due, Step};
@@ -322,8 +322,8 @@ impl Client {
         self.link.ready().is_some()
     }
 
-    fn on_ended(&mut self, ended: FinishedCommand) {
-        let result = self.commands.result(ended, SystemTime::now());
+    fn on_ended(&mut self, ended: Finished) {
+        let result = self.commands.answer(ended, SystemTime::now());
         self.outbox.push_result(result);
     }
 

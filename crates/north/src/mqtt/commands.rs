@@ -3,17 +3,21 @@
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 use std::time::{Instant, SystemTime};
+
+use tokio::sync::oneshot;
 
 use super::outbox::Message;
 use super::payload::Topics;
 use super::reply::{Reply, ResponseTopics};
 use super::request::{self, Incoming};
 use crate::command::{Answer, Authority, Order, Origin, Parts, Refusal, SourceKind, stop_of};
-use crate::command_json::{Id, Repetition, SharedMemory, excerpt, unknown_drive};
+use crate::command_json::{Id, Repetition, SharedMemory, excerpt, stop_all, unknown_drive};
 use crate::plant::{Placed, Plant, Shown};
+use crate::stop_all::StopReport;
 
 /// Limits of the commands that wait for the bus. Only stops can be so many: the queues of the buses accept fewer other
 /// commands.
@@ -36,6 +40,7 @@ pub(super) struct Commands {
     waiting: PendingCommands,
     /// In the order of acknowledgement.
     confirming: PendingCommands,
+    stopping: Vec<PendingStop>,
     memory: SharedMemory,
     rules: Rules,
 }
@@ -54,6 +59,7 @@ pub(super) struct Rules {
 pub(crate) struct OrdersLeft {
     waiting: PendingCommands,
     confirming: PendingCommands,
+    stopping: Vec<PendingStop>,
     /// Those that the broker has not acknowledged.
     pub(super) results: Vec<Message>,
 }
@@ -65,6 +71,22 @@ struct PendingCommand {
     id: Option<Id>,
     reply: Reply,
     placed: Placed,
+}
+
+/// A stop of all drives that is not finished.
+#[derive(Debug)]
+struct PendingStop {
+    reply: Reply,
+    report: oneshot::Receiver<StopReport>,
+}
+
+/// What is finished.
+#[derive(Debug)]
+pub(super) enum Finished {
+    /// A command.
+    Command(FinishedCommand),
+    /// A stop of all drives.
+    StopAll(Reply, StopReport),
 }
 
 /// A command whose result is known.
@@ -91,6 +113,7 @@ impl Commands {
             client: SourceKind::Mqtt.name().into(),
             waiting: left.waiting,
             confirming: left.confirming,
+            stopping: left.stopping,
             memory,
             rules,
         }
@@ -101,6 +124,7 @@ impl Commands {
         OrdersLeft {
             waiting: self.waiting,
             confirming: self.confirming,
+            stopping: self.stopping,
             results,
         }
     }
@@ -123,6 +147,9 @@ impl Commands {
         now: Instant,
         time: SystemTime,
     ) -> Option<Message> {
+        if incoming.topic == self.topics.stop_all() {
+            return self.stop_all(&incoming, plant, now);
+        }
         let target = self.topics.parse_set(&incoming.topic)?;
         if incoming.retain && incoming.payload.is_empty() {
             return None; // a retained message was cleared
@@ -193,6 +220,35 @@ impl Commands {
         self.follow(pending, time)
     }
 
+    /// Takes a stop of all drives. Returns the answer where no stop is sent.
+    fn stop_all(&mut self, incoming: &Incoming, plant: &Plant, now: Instant) -> Option<Message> {
+        if incoming.retain && incoming.payload.is_empty() {
+            return None; // a retained message was cleared
+        }
+        let reply = Reply::to(incoming, self.topics.result(), "", &self.rules.responses);
+        let refuse = |why: String| Some(reply.with(refused_stop(&why)));
+        if incoming.retain {
+            return refuse("the message was retained, so no stop was sent; publish it without retain".to_string());
+        }
+        let (scope, wait) = match stop_all(&incoming.payload) {
+            Ok(wanted) => wanted,
+            Err(why) => return refuse(why),
+        };
+        let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
+        let who = who
+            .as_deref()
+            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
+        let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, who);
+        match plant.stop_all.order(plant, &scope, &origin, wait, now) {
+            Ok(order) => {
+                let report = order.report;
+                self.stopping.push(PendingStop { reply, report });
+                None
+            }
+            Err(why) => refuse(why.to_string()),
+        }
+    }
+
     /// Whether a command that does more than stop may be taken.
     fn may_take(
         &mut self,
@@ -228,12 +284,12 @@ impl Commands {
     }
 
     /// The next command that finishes; pending while there is none. Cancel safe.
-    pub(super) async fn finished(&mut self) -> FinishedCommand {
+    pub(super) async fn finished(&mut self) -> Finished {
         poll_fn(|cx| self.poll_finished(cx)).await
     }
 
     /// A command that has finished, if there is one.
-    pub(super) fn try_finished(&mut self) -> Option<FinishedCommand> {
+    pub(super) fn try_finished(&mut self) -> Option<Finished> {
         match self.poll_finished(&mut Context::from_waker(Waker::noop())) {
             Poll::Ready(finished) => Some(finished),
             Poll::Pending => None,
@@ -242,7 +298,26 @@ impl Commands {
 
     /// An acknowledged command no longer occupies the queue for the bus. If too many wait for confirmation, the oldest
     /// finishes as "acknowledged".
-    fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<FinishedCommand> {
+    fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<Finished> {
+        match self.poll_stopped(cx) {
+            Poll::Ready((reply, report)) => Poll::Ready(Finished::StopAll(reply, report)),
+            Poll::Pending => self.poll_command(cx).map(Finished::Command),
+        }
+    }
+
+    /// There are no more of them than orders that the gateway keeps.
+    fn poll_stopped(&mut self, cx: &mut Context<'_>) -> Poll<(Reply, StopReport)> {
+        for (index, stop) in self.stopping.iter_mut().enumerate() {
+            if let Poll::Ready(report) = Pin::new(&mut stop.report).poll(cx) {
+                // Without a report the process ends, and nothing is proven.
+                let report = report.unwrap_or_default();
+                return Poll::Ready((self.stopping.remove(index).reply, report));
+            }
+        }
+        Poll::Pending
+    }
+
+    fn poll_command(&mut self, cx: &mut Context<'_>) -> Poll<FinishedCommand> {
         while let Some(mut pending) = self.waiting.take(|r| r.placed.poll_answer(cx).is_ready()) {
             match pending.placed.answer() {
                 Some(answer) if !answer.outcome.is_ok() => return Poll::Ready(pending.end(answer, Shown::default())),
@@ -261,8 +336,17 @@ impl Commands {
         finished.map_or(Poll::Pending, Poll::Ready)
     }
 
+    /// The one answer to what is finished, at `time`.
+    pub(super) fn answer(&mut self, finished: Finished, time: SystemTime) -> Message {
+        match finished {
+            Finished::Command(finished) => self.result(finished, time),
+            // Strings and words can always be serialized.
+            Finished::StopAll(reply, report) => reply.with(serde_json::to_vec(&report).unwrap_or_default()),
+        }
+    }
+
     /// The one result of a finished command, at `time`.
-    pub(super) fn result(&mut self, finished: FinishedCommand, time: SystemTime) -> Message {
+    fn result(&mut self, finished: FinishedCommand, time: SystemTime) -> Message {
         let message = finished
             .reply
             .message(finished.id, &finished.answer, finished.shown, time);
@@ -274,8 +358,14 @@ impl Commands {
 
     /// Whether all commands are finished.
     pub(super) fn is_idle(&self) -> bool {
-        self.waiting.is_empty() && self.confirming.is_empty()
+        self.waiting.is_empty() && self.confirming.is_empty() && self.stopping.is_empty()
     }
+}
+
+/// The answer where no stop is sent.
+fn refused_stop(why: &str) -> Vec<u8> {
+    let answer = serde_json::json!({ "ok": false, "drives": [], "error": why });
+    answer.to_string().into_bytes()
 }
 
 fn repeats(why: &str) -> String {

@@ -40,6 +40,7 @@ pub(crate) fn plant(drives: &[&str]) -> Plant {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        stop_all: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     }

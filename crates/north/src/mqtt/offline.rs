@@ -73,7 +73,7 @@ impl Offline {
     pub fn poll(&mut self, now: Instant) -> Vec<Published> {
         let time = self.time(now);
         while let Some(ended) = self.commands.try_finished() {
-            let result = self.commands.result(ended, time);
+            let result = self.commands.answer(ended, time);
             self.results.push(result.into());
             self.work(now);
         }

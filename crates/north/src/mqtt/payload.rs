@@ -53,8 +53,18 @@ impl Topics {
     }
 
     /// The filters of all set topics.
-    pub(super) fn set_filters(&self) -> [String; 2] {
-        [self.drive("+", "set"), self.drive("+", "set/+")]
+    pub(super) fn set_filters(&self) -> [String; 3] {
+        [self.drive("+", "set"), self.drive("+", "set/+"), self.stop_all()]
+    }
+
+    /// Where all drives are stopped.
+    pub(super) fn stop_all(&self) -> String {
+        format!("{}/set/stop", self.root)
+    }
+
+    /// Where the answers to that go.
+    pub(super) fn result(&self) -> String {
+        format!("{}/result", self.root)
     }
 
     /// The set topics of each drive of this plant, for a broker that takes no wildcards.
@@ -66,7 +76,9 @@ impl Topics {
             let whole = self.drive(&spec.name, "set");
             std::iter::once(whole).chain(points).collect::<Vec<String>>()
         };
-        plant.drives().flat_map(of_drive).collect()
+        std::iter::once(self.stop_all())
+            .chain(plant.drives().flat_map(of_drive))
+            .collect()
     }
 
     /// Which drive and point a topic sets; `None` for any other topic.
@@ -358,10 +370,13 @@ mod tests {
         ] {
             assert_eq!(parse(other), None, "{other}");
         }
-        let [whole, single] = topics.set_filters();
         assert_eq!(
-            (whole.as_str(), single.as_str()),
-            ("plant/a/hall/drive/+/set", "plant/a/hall/drive/+/set/+")
+            topics.set_filters(),
+            [
+                "plant/a/hall/drive/+/set",
+                "plant/a/hall/drive/+/set/+",
+                "plant/a/hall/set/stop"
+            ]
         );
     }
 

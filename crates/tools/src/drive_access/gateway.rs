@@ -88,6 +88,7 @@ fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
         | Request::Why(_)
         | Request::Record(_)
         | Request::Params(_)
+        | Request::StopAll(_)
         | Request::Reload(_)
         | Request::Health(_) => "try again",
         Request::ParamsRestore(_) => {

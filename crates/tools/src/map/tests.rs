@@ -34,6 +34,7 @@ fn plant() -> Plant {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        stop_all: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     }

@@ -49,6 +49,14 @@ impl Pending {
         number.map(|number| Chosen { rank, number })
     }
 
+    /// The broadcast that goes before all that waits, stops included.
+    pub fn first_of_all(&self, now: Instant) -> Option<Chosen> {
+        let goes_first = |c: &&Command| c.passed_on.as_ref().is_some_and(|p| p.first) && c.expires > now;
+        let rank = Urgency::Stop;
+        let number = self.waiting.iter().find(goes_first).map(|c| c.number);
+        number.map(|number| Chosen { rank, number })
+    }
+
     /// The command that was chosen.
     pub fn get(&self, chosen: Chosen) -> Option<&Command> {
         self.waiting.iter().find(|c| c.number == chosen.number)

@@ -162,7 +162,7 @@ impl Waiting {
 
 impl Operator {
     /// As the audit shows it. All that a user does counts as one client.
-    fn origin(&self) -> Origin {
+    pub(super) fn origin(&self) -> Origin {
         if self.kind == SourceKind::LocalSocket {
             return Origin::new(self.kind, self.user.to_string()).with_login(self.login.clone());
         }

@@ -8,6 +8,7 @@ mod commands;
 mod cookies;
 mod login;
 mod sessions;
+mod stop_all;
 mod throttle;
 mod verifier;
 
@@ -39,6 +40,7 @@ use crate::log_throttle::LogThrottle;
 pub(crate) use self::commands::PostedCommands;
 pub(super) use self::commands::{command, commands_of, heartbeat};
 pub(super) use self::login::{log_in, log_out, session};
+pub(super) use self::stop_all::stop;
 
 /// A password that a program sends with each request is not hashed anew for that long.
 const VERIFIED: Duration = Duration::from_secs(300);
@@ -435,6 +437,7 @@ pub(super) fn is_operating(path: &str) -> bool {
             .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat"))
     };
     is_session(path)
+        || path == "/api/v1/stop"
         || path.starts_with("/assets/operate.")
         || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive)
 }
@@ -451,7 +454,7 @@ pub(super) fn may_change(method: &Method, path: &str) -> bool {
 
 /// Whether it is a command: that is served in whatever way the client got in.
 pub(super) fn is_command(method: &Method, path: &str) -> bool {
-    may_change(method, path) && path.ends_with("/commands")
+    may_change(method, path) && (path.ends_with("/commands") || path == "/api/v1/stop")
 }
 
 #[cfg(test)]

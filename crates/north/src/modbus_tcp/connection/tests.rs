@@ -47,6 +47,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        stop_all: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     };

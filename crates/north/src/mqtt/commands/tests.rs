@@ -72,7 +72,7 @@ impl Bench {
 
     fn finished(&mut self) -> Option<Json> {
         let ended = self.commands.try_finished()?;
-        Some(json(&self.commands.result(ended, SystemTime::UNIX_EPOCH)))
+        Some(json(&self.commands.answer(ended, SystemTime::UNIX_EPOCH)))
     }
 
     /// The drive acknowledges the next command; its effect has not been read yet.
@@ -666,3 +666,5 @@ fn a_start_that_came_before_a_stop_and_is_taken_behind_it_is_not_executed() {
     assert_eq!((&result["ok"], &result["result"]), (&false.into(), &"purged".into()));
     assert_eq!(bench.queued(), 1, "the stop");
 }
+
+mod stop_all;

@@ -26,6 +26,7 @@ impl Bench {
                 reach: vec![1, 2],
                 effects: Vec::new(),
                 stops: if value == STOP { vec![1, 2] } else { Vec::new() },
+                first: false,
                 frame,
             }),
         };

@@ -86,6 +86,7 @@ fn what_a_tool_sends_to_all_is_refused_for_one_and_its_stop_withdraws() {
                 reach: vec![1, 2],
                 stops: if run { Vec::new() } else { vec![1, 2] },
                 effects: vec![(1, effect(run)), (2, effect(run))],
+                first: false,
                 frame: oneshot::channel().0,
             }),
         };

@@ -13,7 +13,6 @@ fn operator(user: &str, login: &str) -> Operator {
         address: [192, 0, 2, 1].into(),
         kind: SourceKind::Http,
         cookie: None,
-        kind: SourceKind::Http,
     }
 }
 

@@ -1,0 +1,267 @@
+//! Stop all: every controlled drive of the gateway, of a bus or of a group, each with a stop of its own that is watched until
+//! the motor stands.
+//!
+//! One mechanism for all north sides: [`StopAll::order`] places the stops before it returns, a task of the gateway calls
+//! [`StopAll::look`] while an order is under way, and [`StopAll::begun`] wakes it. Where every drive of a bus is concerned and
+//! known to obey it, one broadcast goes before their stops. Pure: time is an argument.
+
+mod one_stop;
+mod scope;
+mod standstill;
+pub mod stop_of_line;
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Waker};
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+use tokio::sync::{Notify, oneshot};
+
+pub use self::scope::{NothingToStop, Scope};
+pub use self::standstill::Standstill;
+
+use self::one_stop::OneStop;
+use self::stop_of_line::stop_of_line;
+use crate::command::{Authority, Origin};
+use crate::plant::{BusHandle, DriveHandle, Exchange, Plant, Question, Target};
+use crate::process_image::{Access, Machine};
+
+/// Time after which an order is answered though not every drive stands, unless it says otherwise.
+pub const WAIT: Duration = Duration::from_secs(10);
+/// Longest such time.
+pub const LONGEST_WAIT: Duration = Duration::from_secs(60);
+/// Time between two looks at an order that is under way.
+pub const LOOK: Duration = Duration::from_millis(20);
+/// Time for the broadcast to go onto the line; the stops of the drives do not wait for it.
+const BROADCAST: Duration = Duration::from_millis(500);
+/// Orders that wait for their answers; beyond that the oldest is answered with what is known.
+const MOST_ORDERS: usize = 256;
+
+/// What became of a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stopped {
+    /// It acknowledged its stop, and a read since shows that the motor stands.
+    Standing,
+    /// It acknowledged its stop, and the motor still turns.
+    Stopping,
+    /// Neither is known.
+    Unproven,
+}
+
+/// One drive in the answer.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StoppedDrive {
+    /// Its name.
+    pub drive: String,
+    /// What became of it.
+    pub outcome: Stopped,
+    /// Why it is not known to stand.
+    #[serde(default)]
+    pub reason: Option<String>,
+}
+
+/// The one answer to an order.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StopReport {
+    /// Every drive stands.
+    pub ok: bool,
+    /// All drives that were to be stopped, in the order of the configuration.
+    pub drives: Vec<StoppedDrive>,
+}
+
+impl StopReport {
+    fn new(drives: Vec<StoppedDrive>) -> StopReport {
+        let ok = drives.iter().all(|drive| drive.outcome == Stopped::Standing);
+        StopReport { ok, drives }
+    }
+}
+
+/// Where the answers to an order arrive. A sender that is gone means that the process ends.
+#[derive(Debug)]
+pub struct StopOrder {
+    /// Once every stop was acknowledged, or failed for the first time: whether none failed.
+    pub acknowledged: oneshot::Receiver<bool>,
+    /// Once every drive stands, or the time is over.
+    pub report: oneshot::Receiver<StopReport>,
+}
+
+/// The orders that are under way.
+#[derive(Debug, Default)]
+pub struct StopAll {
+    state: Mutex<State>,
+    begun: Notify,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// Each machine once, for all orders that concern it.
+    stops: Vec<OneStop>,
+    orders: Vec<UnderWay>,
+    /// Dropped, they are taken back where they were not sent.
+    broadcasts: Vec<(Exchange, Instant)>,
+}
+
+/// One order.
+#[derive(Debug)]
+struct UnderWay {
+    machines: Vec<Machine>,
+    until: Instant,
+    acknowledged: Option<oneshot::Sender<bool>>,
+    report: oneshot::Sender<StopReport>,
+}
+
+impl StopAll {
+    /// Stops all drives of `scope` as `origin`, who may write. When this returns every stop is in the queue of its bus. A drive whose
+    /// stop still waits for its acknowledgement joins that; any other has a new one, whatever is known of it.
+    ///
+    /// # Errors
+    /// There is no such bus or group, or nothing of it is controlled.
+    pub fn order(
+        &self,
+        plant: &Plant,
+        scope: &Scope,
+        origin: &Origin,
+        wait: Duration,
+        now: Instant,
+    ) -> Result<StopOrder, NothingToStop> {
+        let drives = scope.drives(plant)?;
+        let (acknowledged, acknowledgement) = oneshot::channel();
+        let (report, reported) = oneshot::channel();
+        let mut state = self.state();
+        state.place(plant, &drives, origin, now);
+        if state.orders.len() >= MOST_ORDERS {
+            let oldest = state.orders.remove(0);
+            state.answer(oldest, plant, now);
+        }
+        state.orders.push(UnderWay {
+            machines: drives.iter().map(DriveHandle::machine).collect(),
+            until: now + wait.min(LONGEST_WAIT),
+            acknowledged: Some(acknowledged),
+            report,
+        });
+        drop(state);
+        self.begun.notify_one();
+        Ok(StopOrder {
+            acknowledged: acknowledgement,
+            report: reported,
+        })
+    }
+
+    /// Waits until an order is under way.
+    pub async fn begun(&self) {
+        self.begun.notified().await;
+    }
+
+    /// Looks what became of the stops, orders those again that failed, and answers what is done. Whether an order is still under
+    /// way.
+    pub fn look(&self, plant: &Plant, now: Instant) -> bool {
+        let mut state = self.state();
+        state.look(plant, now);
+        !state.orders.is_empty()
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn place(&mut self, plant: &Plant, drives: &[DriveHandle], origin: &Origin, now: Instant) {
+        let machines: Vec<Machine> = drives.iter().map(DriveHandle::machine).collect();
+        let waits = |stop: &OneStop| stop.waits_for_acknowledgement();
+        let joins: Vec<Machine> = self
+            .stops
+            .iter()
+            .filter(|stop| waits(stop))
+            .map(|stop| stop.machine.clone())
+            .collect();
+        self.stops
+            .retain(|stop| waits(stop) || !machines.contains(&stop.machine));
+        for bus in &plant.buses {
+            let is_of_bus = |machine: &&Machine| machine.port == bus.image.spec.port;
+            let concerned = machines.iter().filter(is_of_bus).count();
+            let new = machines
+                .iter()
+                .filter(is_of_bus)
+                .any(|machine| !joins.contains(machine));
+            if new && concerned == bus.image.drives.len() {
+                let exchange = broadcast(plant, bus, origin, now);
+                self.broadcasts
+                    .extend(exchange.map(|exchange| (exchange, now + BROADCAST)));
+            }
+        }
+        for (drive, machine) in drives.iter().zip(machines) {
+            if !joins.contains(&machine) {
+                self.stops.push(OneStop::place(drive, machine, origin, now));
+            }
+        }
+    }
+
+    fn look(&mut self, plant: &Plant, now: Instant) {
+        let mut cx = Context::from_waker(Waker::noop());
+        self.broadcasts
+            .retain_mut(|(exchange, until)| exchange.poll(&mut cx).is_pending() && now < *until);
+        self.stops.iter_mut().for_each(|stop| stop.look(plant, now));
+        for mut order in std::mem::take(&mut self.orders) {
+            let concerned = || self.stops.iter().filter(|stop| order.machines.contains(&stop.machine));
+            let is_answered = concerned().all(|stop| stop.is_acknowledged() || stop.has_failed());
+            let all = concerned().all(OneStop::is_acknowledged);
+            let stands = concerned().all(|stop| stop.outcome(plant, now).outcome == Stopped::Standing);
+            let over = stands || now >= order.until;
+            if let Some(acknowledged) = order.acknowledged.take_if(|_| is_answered || over) {
+                // Its client may have gone.
+                let _ = acknowledged.send(all);
+            }
+            match over {
+                true => self.answer(order, plant, now),
+                false => self.orders.push(order),
+            }
+        }
+        let orders = &self.orders;
+        self.stops
+            .retain(|stop| orders.iter().any(|order| order.machines.contains(&stop.machine)));
+    }
+
+    fn answer(&self, order: UnderWay, plant: &Plant, now: Instant) {
+        let of = |machine: &Machine| {
+            let stop = self.stops.iter().find(|stop| stop.machine == *machine)?;
+            Some(stop.outcome(plant, now))
+        };
+        let report = StopReport::new(order.machines.iter().filter_map(of).collect());
+        // Its client may have gone.
+        let _ = order.report.send(report);
+    }
+}
+
+/// The broadcast that stops every drive of the bus, where they are known to obey it and one of them answers.
+fn broadcast(plant: &Plant, bus: &BusHandle, origin: &Origin, now: Instant) -> Option<Exchange> {
+    let drives = &bus.image.drives;
+    let online = drives.iter().any(|image| image.snapshot().link.is_online());
+    let specs = drives.iter().map(|image| &image.spec);
+    let pdu = stop_of_line(bus.image.spec.protocol, specs).filter(|_| online && bus.image.is_up())?;
+    let question = Question {
+        target: Target::Address(0),
+        pdu,
+        may_write: true,
+        asked: now,
+        expires: now + BROADCAST,
+        origin: origin.clone(),
+    };
+    Some(bus.ask_first(question, &plant.writes, now))
+}
+
+/// How many of these drives are controlled and not known to stand.
+pub fn not_standing<'d>(drives: impl IntoIterator<Item = &'d DriveHandle>, now: Instant) -> usize {
+    let controlled = drives
+        .into_iter()
+        .filter(|drive| drive.image.spec.access == Access::Control);
+    let stands = |drive: &&DriveHandle| drive.reading(now).standstill(None) == Standstill::Stands;
+    controlled.filter(|drive| !stands(drive)).count()
+}
+
+/// What a client that stops all may do at a drive: it was asked before the order was taken.
+const MAY_WRITE: Authority = Authority::Write;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,150 @@
+//! The stop of one drive: placed, placed again where it failed, acknowledged.
+
+use std::time::{Duration, Instant};
+
+use super::{MAY_WRITE, Standstill, Stopped, StoppedDrive};
+use crate::command::{Answer, DEFAULT_EXPIRY, Order, Origin, Outcome};
+use crate::drive::{ModelPoint, Value};
+use crate::plant::{DriveHandle, Placed, Plant};
+use crate::process_image::Machine;
+
+/// Wait before a stop that failed is placed again; twice as long each time.
+const AGAIN: Duration = Duration::from_millis(100);
+/// Longest such wait.
+const LONGEST_AGAIN: Duration = Duration::from_secs(1);
+
+/// The stop of one drive.
+#[derive(Debug)]
+pub(super) struct OneStop {
+    pub(super) machine: Machine,
+    drive: String,
+    origin: Origin,
+    step: Step,
+    /// What became of it the last time that it failed.
+    failed: Option<String>,
+    /// Wait before the next try.
+    pause: Duration,
+}
+
+#[derive(Debug)]
+enum Step {
+    /// It is in the queue of its bus, or on its way.
+    Placed(Placed),
+    /// It failed, and is placed again then.
+    Again(Instant),
+    /// The drive acknowledged it then.
+    Acknowledged(Instant),
+    /// It cannot be given to the drive.
+    Refused,
+}
+
+impl OneStop {
+    /// Places the stop.
+    pub(super) fn place(drive: &DriveHandle, machine: Machine, origin: &Origin, now: Instant) -> OneStop {
+        let mut stop = OneStop {
+            machine,
+            drive: drive.image.spec.name.clone(),
+            origin: origin.clone(),
+            step: Step::Refused,
+            failed: None,
+            pause: AGAIN,
+        };
+        stop.try_at(drive, now);
+        stop
+    }
+
+    fn try_at(&mut self, drive: &DriveHandle, now: Instant) {
+        let profile = &drive.image.spec.profile;
+        self.step = match profile.model_index(ModelPoint::Run) {
+            Some(run) => {
+                let order = Order::Points(vec![(run, Value::Bool(false))]);
+                Step::Placed(drive.place(order, self.origin.clone(), MAY_WRITE, DEFAULT_EXPIRY, now))
+            }
+            None => {
+                self.failed = Some(format!("its profile `{}` has no `run`", profile.name));
+                Step::Refused
+            }
+        };
+    }
+
+    /// Whether a drive that acknowledges it acknowledges one that is ordered now.
+    pub(super) fn waits_for_acknowledgement(&self) -> bool {
+        matches!(self.step, Step::Placed(_))
+    }
+
+    pub(super) fn is_acknowledged(&self) -> bool {
+        matches!(self.step, Step::Acknowledged(_))
+    }
+
+    /// Whether it failed at least once.
+    pub(super) fn has_failed(&self) -> bool {
+        self.failed.is_some()
+    }
+
+    /// Looks what became of it, and places it again where it failed. A reload may have put the drive elsewhere.
+    pub(super) fn look(&mut self, plant: &Plant, now: Instant) {
+        match &mut self.step {
+            Step::Placed(placed) => {
+                let accepted = placed.accepted();
+                let Some(Answer { outcome, latency }) = placed.answer() else {
+                    return;
+                };
+                self.step = match outcome {
+                    outcome if outcome.is_ok() => Step::Acknowledged(accepted + latency),
+                    Outcome::Refused(refusal) => {
+                        self.failed = Some(refusal.to_string());
+                        Step::Refused
+                    }
+                    outcome => {
+                        self.failed = Some(outcome.to_string());
+                        let at = now + self.pause;
+                        self.pause = LONGEST_AGAIN.min(2 * self.pause);
+                        Step::Again(at)
+                    }
+                };
+            }
+            Step::Again(at) if now >= *at => match plant.drive_at(&self.machine) {
+                Some(drive) => self.try_at(&drive, now),
+                None => {
+                    self.failed = Some("the drive is not configured any more".to_string());
+                    self.step = Step::Refused;
+                }
+            },
+            Step::Again(_) | Step::Acknowledged(_) | Step::Refused => {}
+        }
+    }
+
+    /// What is known of the drive.
+    pub(super) fn outcome(&self, plant: &Plant, now: Instant) -> StoppedDrive {
+        let (outcome, reason) = match (&self.step, plant.drive_at(&self.machine)) {
+            (Step::Acknowledged(at), Some(drive)) => match drive.reading(now).standstill(Some(*at)) {
+                Standstill::Stands => (Stopped::Standing, None),
+                Standstill::Turns(what) => (
+                    Stopped::Stopping,
+                    Some(format!("it acknowledged its stop and still turns: {what}")),
+                ),
+                Standstill::Unknown(why) => (Stopped::Unproven, Some(format!("it acknowledged its stop, and {why}"))),
+            },
+            (Step::Acknowledged(_), None) => (
+                Stopped::Unproven,
+                Some("it acknowledged its stop and is not configured any more".to_string()),
+            ),
+            (Step::Refused, _) => {
+                let why = self.failed.as_deref().unwrap_or_default();
+                (Stopped::Unproven, Some(format!("its stop was not sent: {why}")))
+            }
+            (Step::Placed(_) | Step::Again(_), _) => {
+                let why = match &self.failed {
+                    Some(why) => format!("it did not acknowledge its stop: {why}"),
+                    None => "its stop still waits for its turn on the line".to_string(),
+                };
+                (Stopped::Unproven, Some(why))
+            }
+        };
+        StoppedDrive {
+            drive: self.drive.clone(),
+            outcome,
+            reason,
+        }
+    }
+}

@@ -1,0 +1,80 @@
+//! Which drives an order stops.
+
+use crate::plant::{DriveHandle, Plant};
+use crate::process_image::Access;
+
+/// Which drives an order stops; of them those that are controlled.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Scope {
+    /// All of the gateway.
+    Gateway,
+    /// Those of the bus of that name.
+    Bus(String),
+    /// Those of these buses.
+    Buses(Vec<String>),
+    /// Those with that `group`.
+    Group(String),
+}
+
+/// Why an order stops nothing.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum NothingToStop {
+    /// There is no such bus or group.
+    #[error("there is no {kind} `{name}`, so no stop was sent; known: {}", .known.join(", "))]
+    Unknown {
+        /// `bus` or `group`.
+        kind: &'static str,
+        /// What was asked for.
+        name: String,
+        /// What there is.
+        known: Vec<String>,
+    },
+    /// No drive of it is controlled.
+    #[error("none of these drives has access = \"control\", so no stop was sent")]
+    NotControlled,
+}
+
+impl Scope {
+    /// The drives to stop, bus by bus.
+    ///
+    /// # Errors
+    /// There are none.
+    pub fn drives(&self, plant: &Plant) -> Result<Vec<DriveHandle>, NothingToStop> {
+        let mut found = false;
+        let mut drives: Vec<DriveHandle> = Vec::new();
+        for drive in plant.drives().filter(|drive| self.has(drive)) {
+            found = true;
+            if drive.image.spec.access == Access::Control {
+                drives.push(drive);
+            }
+        }
+        let unknown = |kind, name: &String, mut known: Vec<String>| {
+            known.sort();
+            known.dedup();
+            let name = name.clone();
+            NothingToStop::Unknown { kind, name, known }
+        };
+        match (self, found, drives.is_empty()) {
+            (Scope::Bus(name), false, _) => {
+                let buses = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
+                Err(unknown("bus", name, buses.collect()))
+            }
+            (Scope::Group(name), false, _) => {
+                let groups = plant.drives().filter_map(|drive| drive.image.spec.group.clone());
+                Err(unknown("group", name, groups.collect()))
+            }
+            (_, _, true) => Err(NothingToStop::NotControlled),
+            _ => Ok(drives),
+        }
+    }
+
+    fn has(&self, drive: &DriveHandle) -> bool {
+        let spec = &drive.image.spec;
+        match self {
+            Scope::Gateway => true,
+            Scope::Bus(name) => spec.bus == *name,
+            Scope::Buses(names) => names.contains(&spec.bus),
+            Scope::Group(name) => spec.group.as_ref() == Some(name),
+        }
+    }
+}

@@ -1,0 +1,74 @@
+//! The body of a stop of all drives.
+
+use std::time::Duration;
+
+use serde::Deserialize;
+
+use super::excerpt;
+use crate::stop_all::{LONGEST_WAIT, Scope, WAIT};
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Body {
+    #[serde(default)]
+    bus: Option<String>,
+    #[serde(default)]
+    group: Option<String>,
+    #[serde(default)]
+    wait_s: Option<f64>,
+}
+
+/// Which drives are to be stopped, and how long the answer waits for them to stand. An empty body stops all.
+///
+/// # Errors
+/// It is not clear which.
+pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), String> {
+    let body = match payload.trim_ascii() {
+        [] => Body::default(),
+        payload => serde_json::from_slice(payload).map_err(|error| {
+            let shown = excerpt(payload);
+            format!(
+                "{shown} does not say which drives to stop ({error}), so no stop was sent; write {{}}, {{\"bus\": \"NAME\"}} or {{\"group\": \"NAME\"}}"
+            )
+        })?,
+    };
+    let scope = match (body.bus, body.group) {
+        (None, None) => Scope::Gateway,
+        (Some(bus), None) => Scope::Bus(bus),
+        (None, Some(group)) => Scope::Group(group),
+        (Some(_), Some(_)) => {
+            return Err("both `bus` and `group` are given, so no stop was sent; write one of them".to_string());
+        }
+    };
+    // A wait that is none is no reason not to stop.
+    let wait = body.wait_s.filter(|wait| *wait >= 0.0).unwrap_or(WAIT.as_secs_f64());
+    Ok((scope, Duration::from_secs_f64(wait.min(LONGEST_WAIT.as_secs_f64()))))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn says_which_drives() {
+        let all = Ok((Scope::Gateway, WAIT));
+        assert_eq!(stop_all(b""), all);
+        assert_eq!(stop_all(b" {} "), all);
+        assert_eq!(stop_all(b"{\"wait_s\": -1}"), all);
+        assert_eq!(stop_all(b"{\"bus\": \"b\"}"), Ok((Scope::Bus("b".to_string()), WAIT)));
+        let group = Scope::Group("g".to_string());
+        assert_eq!(
+            stop_all(b"{\"group\": \"g\", \"wait_s\": 1e9}"),
+            Ok((group, LONGEST_WAIT))
+        );
+        for bad in [
+            "1",
+            "{\"bus\": 1}",
+            "{\"drive\": \"d\"}",
+            "{\"bus\": \"b\", \"group\": \"g\"}",
+            "{",
+        ] {
+            assert!(stop_all(bad.as_bytes()).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,150 @@
+//! Stop all from every side, each by a client of its own: mbpoll, mosquitto, curl and the command line.
+
+use serde_json::{Value as Json, json};
+
+use crate::support::process::{Running, drivegate, mbpoll_read, mbpoll_write, until, write_registers};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, drive};
+use crate::support::tools::{feed, run, tool};
+
+const STOP_ALL: u16 = 0x0100;
+const NOT_STANDING: u16 = 0x8101;
+/// The password of `alice`.
+const PASSWORD: &str = "correct horse battery";
+
+/// Drives 1 and 2 take commands, 3 is monitored; 2 is in the group `fans`.
+struct Plant {
+    site: Site,
+    _others: [Running; 3],
+}
+
+fn plant() -> Plant {
+    let drives = controlled("pump-1", 1, "") + &controlled("fan-1", 2, "group = \"fans\"") + &drive("pump-3", 3, "");
+    let http = format!("{HTTP}commands = true\nusers_file = \"users\"\n");
+    let site = Site::of(&[LINE1, &drives, MODBUS_TCP, MQTT, &http]);
+    let file = site.path("users");
+    let program = std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"));
+    let added = feed(
+        program,
+        &["user", "add", "--file", &file, "alice"],
+        &format!("{PASSWORD}\n"),
+    );
+    assert!(added.status.success(), "{added:?}");
+    let simulator = site.simulate(&["--addresses", "1-3", "--baud", "38400"]);
+    let broker = site.broker();
+    let gateway = site.run_ready();
+    site.until_connected(true);
+    Plant {
+        site,
+        _others: [simulator, broker, gateway],
+    }
+}
+
+impl Plant {
+    fn start(&self) {
+        for (unit, name) in [(1, "pump-1"), (2, "fan-1")] {
+            self.site.until_state(name, "ready");
+            write_registers(self.site.modbus, unit, 0x8101, &[5000]);
+            write_registers(self.site.modbus, unit, 0x8100, &[1]);
+        }
+        for name in ["pump-1", "fan-1"] {
+            self.site.until_point(name, "output_frequency", 25.0);
+        }
+    }
+
+    fn not_standing(&self) -> u16 {
+        until("the count", || mbpoll_read(self.site.modbus, 255, NOT_STANDING, 1).ok())[0]
+    }
+
+    fn curl(&self, body: &str) -> (u16, Json) {
+        let url = format!("http://127.0.0.1:{}/api/v1/stop", self.site.http);
+        let user = format!("alice:{PASSWORD}");
+        let arguments = ["-s", "-u", &user, "-d", body, "-w", "\n%{http_code}", &url];
+        let output = run(&tool("curl"), &arguments);
+        let text = String::from_utf8(output.stdout).unwrap();
+        let (body, status) = text.rsplit_once('\n').unwrap();
+        (status.parse().unwrap(), serde_json::from_str(body).unwrap())
+    }
+
+    fn mosquitto(&self, payload: &str) -> Json {
+        let port = self.site.mqtt.to_string();
+        let client = ["-h", "127.0.0.1", "-p", &port, "-V", "5", "-q", "1", "-W", "60"];
+        let request = ["-t", "drivegate/test/set/stop", "-e", "answers/1", "-m", payload];
+        let output = run(&tool("mosquitto_rr"), &[&client[..], &request].concat());
+        serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {output:?}"))
+    }
+
+    fn command_line(&self, arguments: &[&str]) -> (i32, String) {
+        let config = self.site.config();
+        let output = drivegate(&[&["stop-all", "--config", &config], arguments].concat())
+            .output()
+            .unwrap();
+        let text = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
+        (output.status.code().unwrap(), text)
+    }
+
+    fn all_stand(&self) {
+        assert_eq!(self.not_standing(), 0);
+        for name in ["pump-1", "fan-1"] {
+            assert_eq!(self.site.point(name, "running"), false, "{name}");
+        }
+    }
+}
+
+fn both_stand() -> Json {
+    json!({ "ok": true, "drives": [
+        { "drive": "pump-1", "outcome": "standing", "reason": null },
+        { "drive": "fan-1", "outcome": "standing", "reason": null },
+    ] })
+}
+
+#[test]
+fn from_every_side() {
+    let plant = plant();
+    plant.start();
+    assert_eq!(plant.not_standing(), 2);
+    assert_eq!(plant.curl("{}"), (200, both_stand()));
+    plant.all_stand();
+
+    plant.start();
+    assert_eq!(plant.mosquitto(""), both_stand());
+    plant.all_stand();
+
+    plant.start();
+    mbpoll_write(plant.site.modbus, 255, STOP_ALL, &[1]).unwrap();
+    until("standstill", || (plant.not_standing() == 0).then_some(()));
+    plant.all_stand();
+
+    plant.start();
+    let (code, text) = plant.command_line(&[]);
+    assert_eq!((code, text.as_str()), (0, "pump-1: standing\nfan-1: standing\n"));
+    plant.all_stand();
+
+    // One group alone.
+    plant.start();
+    let (status, answer) = plant.curl("{\"group\": \"fans\"}");
+    assert_eq!(
+        (status, &answer["drives"][0]["drive"]),
+        (200, &json!("fan-1")),
+        "{answer}"
+    );
+    assert_eq!(plant.not_standing(), 1);
+    assert_eq!(plant.site.point("pump-1", "running"), true);
+
+    // What is not understood stops nothing and says so.
+    let refused = mbpoll_write(plant.site.modbus, 255, STOP_ALL, &[2]).unwrap_err();
+    assert!(refused.contains("Illegal data value"), "{refused}");
+    assert_eq!(plant.curl("{\"bus\": \"line9\"}").0, 404);
+    assert_eq!(plant.curl("[]").0, 422);
+    assert_eq!(plant.mosquitto("{\"drive\": 1}")["ok"], false);
+    let (code, text) = plant.command_line(&["--bus", "line9"]);
+    assert!(code == 1 && text.contains("known: line1"), "{code} {text}");
+    assert_eq!(plant.site.point("pump-1", "running"), true);
+
+    // Not without a login.
+    let url = format!("http://127.0.0.1:{}/api/v1/stop", plant.site.http);
+    let nobody = run(
+        &tool("curl"),
+        &["-s", "-o", "/dev/null", "-d", "{}", "-w", "%{http_code}", &url],
+    );
+    assert_eq!(nobody.stdout, b"401");
+}
