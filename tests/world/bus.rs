@@ -105,7 +105,7 @@ impl Parts {
         Arc::make_mut(&mut profile).turnaround = line.turnaround;
         let drives = (1..=line.drives).filter(|address| !line.dead.contains(address));
         let drives = drives.map(|address| {
-            let mut model = ModelOptions::by_name(profile.simulator.as_deref().unwrap()).unwrap();
+            let mut model = ModelOptions::of_profile(&profile).unwrap();
             model.take_turnaround_of_line();
             DriveOptions::new(address, model)
         });

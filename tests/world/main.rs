@@ -20,6 +20,7 @@ mod bus;
 mod clients;
 mod compound;
 mod connection;
+mod control;
 mod cost;
 mod diagnosis;
 mod drives;
