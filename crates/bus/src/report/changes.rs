@@ -105,6 +105,15 @@ impl Watched {
     }
 }
 
+/// Why a motor started or stopped, by who gave the command.
+fn cause(who: &str) -> String {
+    match who.split_once(' ') {
+        Some(("supervision", _)) => ": supervision timed out".to_string(),
+        Some(("shutdown", _)) => ": the gateway shuts down".to_string(),
+        _ => format!(": ordered by {who}"),
+    }
+}
+
 impl Report {
     /// Starts, stops, warnings and control places that changed with the last poll. What holds at the first read is no
     /// event; what changed while the drive was offline is one.
@@ -125,7 +134,7 @@ impl Report {
             let by = (point == ModelPoint::Running).then(|| self.who(name, change, now));
             let mut text = format!("drive {name} {words}");
             match &by {
-                Some(Some(who)) => text += &format!(": ordered by {who}"),
+                Some(Some(who)) => text += &cause(who),
                 Some(None) if reading.is_set(ModelPoint::Fault) => text += ": it has a fault",
                 Some(None) => {
                     text += ", without a command from this gateway: at the drive, by another master or by itself"

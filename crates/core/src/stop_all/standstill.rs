@@ -44,7 +44,7 @@ impl Reading<'_> {
             (_, _, Some(hertz)) if hertz > STANDS => Standstill::Turns(format!("`output_frequency` {hertz:.1} Hz")),
             (Some(false), _, Some(_)) => Standstill::Stands,
             _ if !self.tells_standstill() => Standstill::Unknown(
-                "standstill cannot be seen: the drive tells no `zero_speed` and no frequency".to_string(),
+                "standstill cannot be seen: the drive has no `zero_speed` and no frequency".to_string(),
             ),
             _ => Standstill::Unknown("it was not read since".to_string()),
         }

@@ -350,6 +350,30 @@ mod tests {
         all.iter().copied().filter(|word| of(control, place, *word)).collect()
     }
 
+    /// The direction that stands in the word of a sequence does not make it another command.
+    #[test]
+    fn a_run_command_reads_as_one_in_either_direction() {
+        use crate::drive::profile::Profiles;
+        use crate::drive::{Derived, ModelPoint, Source};
+
+        for (name, forward, reverse) in [("schneider-altivar", 0x000F, 0x080F), ("siemens-g120", 0x047F, 0x0C7F)] {
+            let profile = Profiles::built_in().get(name).unwrap().clone();
+            let read = |point: ModelPoint, word: u64| match &profile.model_point(point).unwrap().source {
+                Source::Derived(Derived::State { any }) => any.iter().any(|state| state.holds(word)),
+                other => panic!("{name}: {other:?}"),
+            };
+            assert!(
+                read(ModelPoint::Run, forward) && read(ModelPoint::Run, reverse),
+                "{name}"
+            );
+            assert!(
+                !read(ModelPoint::Reverse, forward) && read(ModelPoint::Reverse, reverse),
+                "{name}"
+            );
+            assert!(!read(ModelPoint::Run, forward & !9), "{name}");
+        }
+    }
+
     /// Words that run and stop, by hand from the manuals' figures (`control-words.md`), for each form.
     #[test]
     fn words_that_run_and_stop() {

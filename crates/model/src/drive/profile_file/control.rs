@@ -384,19 +384,24 @@ pub(super) fn made_points(control: &Control, points: &[Point], before: usize) ->
             first + helpers.len() - 1
         })
     };
-    let mut state = |setting: &Setting| Mask {
+    // The direction stands in the words of a sequence as commanded.
+    let free = match (&control.run, control.reverse) {
+        (Run::Steps(_), Some(reverse)) if reverse.place.is_none() => reverse.mask,
+        _ => 0,
+    };
+    let mut state = |setting: &Setting, free: u16| Mask {
         point: index_of(setting.place.unwrap_or(control.at)),
-        mask: u64::from(setting.mask),
-        is: u64::from(setting.value),
+        mask: u64::from(setting.mask & !free),
+        is: u64::from(setting.value & !free),
     };
     let reset = control.fault_reset.map(|reset| reset.setting);
     let reversed = match &control.run {
         Run::Pair { reverse, .. } => Some(*reverse),
         Run::One(_) | Run::Steps(_) => control.reverse,
     };
-    let of_run = control.runs().iter().map(&mut state).collect();
-    let of_reverse = reversed.as_ref().map(&mut state).into_iter().collect();
-    let of_reset = reset.as_ref().map(&mut state).into_iter().collect();
+    let of_run = control.runs().iter().map(|run| state(run, free)).collect();
+    let of_reverse = reversed.iter().map(|reverse| state(reverse, 0)).collect();
+    let of_reset = reset.iter().map(|reset| state(reset, 0)).collect();
     let made: [(ModelPoint, Vec<Mask>); 3] = [
         (ModelPoint::Run, of_run),
         (ModelPoint::Reverse, of_reverse),
