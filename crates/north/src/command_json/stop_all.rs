@@ -33,7 +33,7 @@ pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), String> {
         [] => Body::default(),
         // A list would be taken for an object without keys.
         object @ [b'{', ..] => serde_json::from_slice(object).map_err(|error| unclear(error.to_string()))?,
-        _ => return Err(unclear("it is no JSON object".to_string())),
+        _ => return Err(unclear("it is not a JSON object".to_string())),
     };
     let scope = match (body.bus, body.group) {
         (None, None) => Scope::Gateway,
