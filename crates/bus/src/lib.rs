@@ -11,6 +11,7 @@
 //! - [`n2_session`] and [`n2_late_replies`]: what N2 needs beyond that, for the whole line.
 //! - [`listener`]: the bus without its thread on a line that another master owns: it decodes and never sends.
 //! - `line_diagnosis`: feeds [`crate::diagnosis`] and shows what comes of it.
+//! - [`proof`]: whether the commands of a profile are safe, tried with the commands of the bus itself.
 //! - [`news`]: what the master has to say; `report` applies it to the process image, to events and to the log.
 //!
 //! Only `line_loop` and [`prober`] do I/O and look at the clock; everything else takes time as an argument. `report` and
