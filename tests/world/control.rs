@@ -118,6 +118,8 @@ impl World {
             6 if self.resets() => drop(self.order(&[("fault_reset", 1.0)])),
             7 => {
                 self.rig.with_drive(1, |drive, _| drive.trip(3));
+                // Nothing but a new run command starts it after that, no reset either.
+                self.allowed = Allowed::Stands;
                 self.look(&[("a fault", 1.0)]);
             }
             8 if self.resets() => drop(self.order(&[("run", 0.0), ("fault_reset", 1.0)])),
