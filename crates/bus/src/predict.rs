@@ -51,7 +51,7 @@ pub struct Prediction {
     pub fast_cycle: Option<Duration>,
     /// Time from round to round of the slow class; absent without slow requests.
     pub slow_cycle: Option<Duration>,
-    /// Share of the line that the cadences ask for; above 1 no schedule can carry them.
+    /// Share of the line that the configured cycles would need; above 1 no schedule can carry them.
     pub demand: f64,
     /// Share of the line that will be in use, 0..=1.
     pub load: f64,

@@ -1,4 +1,4 @@
-//! What an exchange that is over means: for the drive, its samples, the schedule and the command.
+//! Applies the result of a transaction: to the drive, its samples, the schedule and the command.
 
 use std::time::{Duration, Instant};
 

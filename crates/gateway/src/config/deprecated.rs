@@ -1,4 +1,4 @@
-//! What an earlier version took and this one still takes, with a warning that says what to write instead: keys that have
+//! Deprecated keys, each with a warning that says what to write instead: keys that have
 //! another name now, and durations beyond what a key allows now. Each for one minor version.
 
 use std::ops::RangeInclusive;

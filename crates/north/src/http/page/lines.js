@@ -18,7 +18,9 @@ const short = (ms) => (ms >= 1000 ? `${plain(Math.round(ms / 10) / 100)} s` : `$
 function showCycle(element, cadence, up) {
   const known = up && cadence.cycle_ms !== null;
   const late = known && cadence.cycle_ms > 1.2 * cadence.aim_ms;
-  text(element, `${known ? short(cadence.cycle_ms) : "—"} (${t("aim {time}", { time: short(cadence.aim_ms) })})${late ? ` ! ${t("late")}` : ""}`);
+  const time = short(cadence.aim_ms);
+  const target = late ? t("target {time}: too slow", { time }) : t("target {time}", { time });
+  text(element, `${known ? short(cadence.cycle_ms) : "—"} (${target})`);
   className(element, late ? "value slow" : "value");
 }
 

@@ -223,7 +223,7 @@ class Plot {
     if (this.aim !== null) {
       const y = place(this.y(this.aim));
       const aim = draw("line", { class: "aim", x1: LEFT, x2: LEFT + this.width, y1: y, y2: y });
-      const label = draw("text", { class: "at-aim", x: LEFT + 4, y: this.y(this.aim) + 13 }, t("aim {time}", { time: `${this.figure(this.aim)} ${this.unit}` }));
+      const label = draw("text", { class: "at-aim", x: LEFT + 4, y: this.y(this.aim) + 13 }, t("target {time}", { time: `${this.figure(this.aim)} ${this.unit}` }));
       drawn.push(aim, label);
     }
     return drawn;
