@@ -1,6 +1,6 @@
 //! Proves the commands of a profile with `[control]`: every state of a drive, every command, each frame lost, refused or repeated,
 //! a stop and the end of its time at every step. It runs the commands of the bus themselves ([`super::command_run`]), not a copy,
-//! against the worst drive that has such a profile. Pure.
+//! against the worst drive that has such a profile. Pure: the time of day is only where its own time begins.
 
 mod drive;
 

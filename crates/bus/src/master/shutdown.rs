@@ -11,7 +11,7 @@ use super::Master;
 use crate::command::{Answer, NotStopped, Origin, Outcome, SourceKind, Stopping, WriteStats};
 use crate::drive::{ModelPoint, Value};
 use crate::drive_state::FRESH;
-use crate::plant::{BusHandle, Exchange, Question, Target};
+use crate::plant::{BusHandle, Exchange, Question};
 use crate::process_image::{Access, OnShutdown};
 use crate::stop_of_line::stop_of_line;
 
@@ -179,14 +179,7 @@ fn broadcast(bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Option<
     let online = drives.iter().any(|image| image.snapshot().link.is_online());
     let pdu =
         stop_of_line(bus.image.spec.protocol, drives.iter().map(|image| &image.spec)).filter(|_| all && online)?;
-    let question = Question {
-        target: Target::Address(0),
-        pdu,
-        may_write: true,
-        asked: now,
-        expires: now + BROADCAST,
-        origin: Origin::new(SourceKind::Shutdown, "on_shutdown"),
-    };
+    let question = Question::broadcast(pdu, Origin::new(SourceKind::Shutdown, "on_shutdown"), now, BROADCAST);
     Some(bus.ask(question, writes, now))
 }
 

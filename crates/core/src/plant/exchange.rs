@@ -41,6 +41,20 @@ pub struct Question {
     pub origin: Origin,
 }
 
+impl Question {
+    /// A broadcast of the gateway's own or of a client, which nobody answers.
+    pub fn broadcast(pdu: RequestPdu, origin: Origin, asked: Instant, within: Duration) -> Question {
+        Question {
+            target: Target::Address(0),
+            pdu,
+            may_write: true,
+            asked,
+            expires: asked + within,
+            origin,
+        }
+    }
+}
+
 /// An exchange that was asked for. Dropping it takes it back while it was not sent.
 #[derive(Debug)]
 pub struct Exchange {

@@ -23,7 +23,7 @@ pub use self::standstill::Standstill;
 use self::one_stop::OneStop;
 use self::stop_of_line::stop_of_line;
 use crate::command::{Authority, Origin};
-use crate::plant::{BusHandle, DriveHandle, Exchange, Plant, Question, Target};
+use crate::plant::{BusHandle, DriveHandle, Exchange, Plant, Question};
 use crate::process_image::{Access, Machine};
 
 /// Time after which an order is answered though not every drive stands, unless it says otherwise.
@@ -240,14 +240,7 @@ fn broadcast(plant: &Plant, bus: &BusHandle, origin: &Origin, now: Instant) -> O
     let online = drives.iter().any(|image| image.snapshot().link.is_online());
     let specs = drives.iter().map(|image| &image.spec);
     let pdu = stop_of_line(bus.image.spec.protocol, specs).filter(|_| online && bus.image.is_up())?;
-    let question = Question {
-        target: Target::Address(0),
-        pdu,
-        may_write: true,
-        asked: now,
-        expires: now + BROADCAST,
-        origin: origin.clone(),
-    };
+    let question = Question::broadcast(pdu, origin.clone(), now, BROADCAST);
     Some(bus.ask_first(question, &plant.writes, now))
 }
 

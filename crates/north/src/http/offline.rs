@@ -1,6 +1,5 @@
 //! The routes without a socket, for the fuzzer.
 
-use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::{fmt, io};
 
@@ -13,8 +12,6 @@ use tokio::runtime::{Builder, Runtime};
 use tokio_util::sync::CancellationToken;
 
 use super::Coverage;
-use super::access::Access;
-use super::hosts::Hosts;
 use super::operating::Operating;
 use super::routes::{self, Client, Reached};
 use crate::plant::SharedPlant;
@@ -46,21 +43,9 @@ impl Offline {
             CancellationToken::new(),
         );
         let service = TowerToHyperService::new(router);
-        let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
-        let reached = Reached {
-            address,
-            peer: (address, 0).into(),
-            access: Arc::new(Access {
-                hosts: Hosts::new("", &[]),
-                tokens: None,
-            }),
-            refusals: Arc::default(),
-            tls: false,
-            local: None,
-            place: None,
-        };
+        let reached = Reached::within(None, None);
         let client = Client {
-            address,
+            address: reached.address,
             coverage: Coverage::Everything,
         };
         let runtime = Builder::new_current_thread().enable_time().build()?;

@@ -1,7 +1,7 @@
 //! The routes of the HTTP server.
 
 use std::fmt::Write as _;
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -17,6 +17,7 @@ use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
 use super::access::{Access, AccessError};
+use super::hosts::Hosts;
 use super::operating::{self, Cookies, Operating};
 use super::params::Parameters;
 use super::{
@@ -93,6 +94,25 @@ pub(super) struct Reached {
 
 /// Only at the socket.
 const RELOAD: &str = "/api/v1/reload";
+
+impl Reached {
+    /// A request of this machine that came over no network: through the local socket, or from a test of the interface.
+    pub(super) fn within(local: Option<LocalUser>, place: Option<Arc<Place>>) -> Reached {
+        let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
+        Reached {
+            address,
+            peer: (address, 0).into(),
+            access: Arc::new(Access {
+                hosts: Hosts::new("", &[]),
+                tokens: None,
+            }),
+            refusals: Arc::default(),
+            tls: false,
+            local,
+            place,
+        }
+    }
+}
 
 /// All routes.
 pub(super) fn router(

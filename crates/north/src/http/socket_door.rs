@@ -1,6 +1,5 @@
 //! The HTTP API at the local socket. Whoever may open the socket may do everything: no login, no token, any `Host`.
 
-use std::net::{IpAddr, Ipv4Addr};
 use std::pin::pin;
 use std::sync::Arc;
 
@@ -14,8 +13,6 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
-use super::access::Access;
-use super::hosts::Hosts;
 use super::in_use::InUse;
 use super::operating::Operating;
 use super::routes::{self, Client, LocalUser, Reached};
@@ -41,21 +38,9 @@ impl SocketDoor {
     /// Answers the requests of a client until it leaves, falls silent or yields to another one; a reply that is being made
     /// is finished.
     pub(crate) async fn serve(&self, stream: impl AsyncRead + AsyncWrite + Unpin, user: LocalUser, place: &Arc<Place>) {
-        let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
-        let reached = Reached {
-            address,
-            peer: (address, 0).into(),
-            access: Arc::new(Access {
-                hosts: Hosts::new("", &[]),
-                tokens: None,
-            }),
-            refusals: Arc::default(),
-            tls: false,
-            local: Some(user),
-            place: Some(place.clone()),
-        };
+        let reached = Reached::within(Some(user), Some(place.clone()));
         let client = Client {
-            address,
+            address: reached.address,
             coverage: Coverage::Everything,
         };
         let router = TowerToHyperService::new(self.router.clone());

@@ -1,4 +1,5 @@
-//! The local socket: what `drivegate read`, `write`, `record`, `reload` and `health` speak to, on the machine of the gateway.
+//! The local socket: what `drivegate read`, `write`, `record`, `reload` and `health` connect to, on the machine of the gateway. A
+//! client whose first byte is not `{` is served the HTTP API (`http/socket_door.rs`).
 //!
 //! Who may connect is decided by the permissions of the socket's file, and whoever may connect may command, as far as the
 //! drives allow it. Commands go the way of all others ([`crate::plant::DriveHandle::place`]) and are audited with the user
