@@ -50,6 +50,7 @@ use self::hosts::Host;
 use self::in_use::InUse;
 use self::operating::Operating;
 pub(super) use self::operating::PostedCommands;
+pub use self::operating::basic_authorization;
 pub(super) use self::routes::LocalUser;
 use self::routes::Reached;
 pub use self::socket_door::InProcess;

@@ -433,6 +433,17 @@ fn basic(headers: &HeaderMap) -> Option<Credentials> {
     })
 }
 
+/// The header of HTTP Basic for `USER:PASSWORD`.
+pub fn basic_authorization(user_and_password: &str) -> String {
+    let mut text = vec![0; Encoding::B64.encoded_len(user_and_password.as_bytes())];
+    // The buffer fits.
+    let text = Encoding::B64
+        .encode(user_and_password.as_bytes(), &mut text)
+        .unwrap_or_default();
+    let padding = "=".repeat(text.len().next_multiple_of(4) - text.len());
+    format!("Basic {text}{padding}")
+}
+
 /// Whether a path belongs to commands; without them there is nothing at it.
 pub(super) fn is_operating(path: &str) -> bool {
     let of_drive = |rest: &str| {
