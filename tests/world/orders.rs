@@ -190,7 +190,7 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
             let values = vec![u16::from(on), 0, unique.2[0]];
             (profile.name == "vacon-nx").then_some((
                 Order::Write(RequestPdu::WriteRegisters {
-                    start: raw.address,
+                    start: place.address,
                     values,
                 }),
                 Some(unique),
