@@ -11,6 +11,7 @@
 import { clock, text } from "./common.js";
 import { build } from "./controls.js";
 import { check, isLoggedIn, onSession, post } from "./session.js";
+import "./stop_all.js";
 import { notStopped, stopped } from "./stops.js";
 import { t, wordsOf } from "./texts.js";
 
