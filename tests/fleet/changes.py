@@ -30,7 +30,7 @@ def certificate(name):
 def plain_broker(configuration, gateway):
     url = f"mqtt://localhost:{gateway.plant.broker_plain}"
     (gateway.directory / "wrong-password").write_text("wrong")
-    configuration["mqtt"] = {"url": url, "user": "fleet", "password_file": "wrong-password"}
+    configuration["mqtt"] = {"url": url, "username": "fleet", "password_file": "wrong-password"}
 
 
 def http_certificate(name):
@@ -101,7 +101,7 @@ INVALID = {
     "key of another certificate": lambda configuration, gateway: configuration["http"].update(
         key=gateway.plant.certificates.path("broker.key")),
     "commands without users": section("http", commands=True),
-    "no password file": section("mqtt", user="fleet", password_file="absent"),
+    "no password file": section("mqtt", username="fleet", password_file="absent"),
     "no authority of the broker": section("mqtt", ca="absent.crt"),
     "broker without a scheme": section("mqtt", url="localhost:1883"),
     "address without a port": section("modbus_tcp", listen=["127.0.0.1"]),

@@ -119,7 +119,7 @@ class Gateway:
 
         def bus(name, drives):
             return {"name": name, "port": str(self.directory / f"line-{name}"), "baud": BAUD, "cycle": "200ms",
-                    "slow_cycle": "2s", "drive": drives}
+                    "slow_cycle": "2s", "response_timeout": "300ms", "retries": 3, "drive": drives}
 
         certificates = self.plant.certificates
         return {
@@ -239,10 +239,19 @@ password_file {passwords}
         """Each drive runs, and its lease is renewed from now on."""
         for gateway in self.gateways:
             for drive in gateway.drives:
-                status, text = ask(gateway.socket, f"/api/v1/drives/{drive}/commands", '{"run": true, "speed_reference": 50}')
-                assert status == 200, text
+                until(f"the start of {gateway.name} {drive}", lambda: self.command(gateway, drive), 10)
         threading.Thread(target=self.renew, daemon=True).start()
         until("the motors", lambda: all(self.running(gateway) for gateway in self.gateways))
+        until("the count of starts", lambda: all(self.has_counted(gateway) for gateway in self.gateways))
+
+    @staticmethod
+    def command(gateway, drive):
+        path = f"/api/v1/drives/{drive}/commands"
+        return ask(gateway.socket, path, '{"run": true, "speed_reference": 50}')[0] == 200
+
+    @staticmethod
+    def has_counted(gateway):
+        return gateway.metric("drivegate_drive_starts_total") == len(gateway.drives)
 
     def renew(self):
         while not self.renewing.wait(2):

@@ -151,7 +151,7 @@ def bad_changes(plant, controller, cases):
             expect(words in controller.output, f"`{words}` is not said")
             shares += [judge(g, before[g.name], g is canary and is_tried) for g in plant.gateways]
             expect(writes(plant) == written, "a drive was written to")
-        except Wrong as wrong:
+        except (Wrong, SystemExit) as wrong:
             raise Wrong(f"{name}: {wrong}\n{controller.output}") from wrong
         said = [line for line in controller.output.splitlines() if '"msg"' in line]
         reason = json.loads(said[0][said[0].index("{"):])["msg"] if said else ""
@@ -256,7 +256,7 @@ def secrets(plant, controller):
     variables.write_text(f"drivegate_secrets_dir: {folder}\ndrivegate_secrets:\n  mqtt: !vault |{text}\n")
     configurations = base(plant)
     configurations[canary.name]["mqtt"] = {
-        "url": f"mqtt://localhost:{plant.broker_plain}", "user": "fleet", "password_file": "secrets/mqtt", "topics": ["state"],
+        "url": f"mqtt://localhost:{plant.broker_plain}", "username": "fleet", "password_file": "secrets/mqtt", "topics": ["state"],
     }
     options = ["--limit", canary.name, "-e", f"@{variables}", "--vault-password-file", key]
     expect(controller.roll_out(configurations, *options) == 0, controller.output)

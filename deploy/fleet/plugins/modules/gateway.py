@@ -124,8 +124,9 @@ class Bad(Exception):
 
 
 def lines(text):
-    """Of what drivegate prints to standard error."""
-    return [line[len("error: ") :] if line.startswith("error: ") else line for line in text.splitlines() if line]
+    """The errors that drivegate prints to standard error; all of it if there are none."""
+    errors = [line[len("error: ") :] for line in text.splitlines() if line.startswith("error: ")]
+    return errors or [line for line in text.splitlines() if line]
 
 
 class Gateway:
