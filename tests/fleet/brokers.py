@@ -32,15 +32,15 @@ class Node:
                                             cwd=self.directory, env=os.environ | environment, start_new_session=True)
         until(f"{self.broker.name} {self.number}", lambda: listens(self.port), 60)
 
-    def signal(self, number):
+    def send(self, number):
         os.killpg(self.process.pid, number)
 
     def end(self, number=signal.SIGKILL):
-        self.signal(number)
+        self.send(number)
         try:
             self.process.wait(30)
         except subprocess.TimeoutExpired:
-            self.signal(signal.SIGKILL)
+            self.send(signal.SIGKILL)
             self.process.wait()
 
 
@@ -77,7 +77,7 @@ class Broker:
     def end(self):
         for node in self.nodes:
             if node.process and node.process.poll() is None:
-                node.signal(signal.SIGCONT)
+                node.send(signal.SIGCONT)
                 node.end()
 
 

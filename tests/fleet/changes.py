@@ -86,6 +86,7 @@ INVALID = {
     "format of seven data bits": bus_a(lambda bus: bus.update(format="7E1")),
     "unknown protocol": bus_a(lambda bus: bus.update(protocol="profibus")),
     "protocol without the profile": bus_a(lambda bus: bus.update(protocol="n2")),
+    "ASCII on a line of RTU": bus_a(lambda bus: bus.update(protocol="modbus-ascii", format="7N2")),
     "cycle without a unit": bus_a(lambda bus: bus.update(cycle="200")),
     "no port": bus_a(lambda bus: bus.pop("port")),
     "one port twice": lambda configuration, gateway: configuration["bus"][0].update(port=configuration["bus"][1]["port"]),
@@ -107,6 +108,7 @@ INVALID = {
     "address without a port": section("modbus_tcp", listen=["127.0.0.1"]),
     "network that is none": section("modbus_tcp", write=["10.0.0.0/99"]),
     "https certificate expired": http_certificate("expired"),
+    "client certificate expired": certificate("expired"),
 }
 
 # What the gateway refuses, or what makes it worse: tried, and taken back.
@@ -121,7 +123,6 @@ WORSE = {
         ca=gateway.plant.certificates.path("strange.crt")),
     "broker without TLS": lambda configuration, gateway: configuration.update(
         mqtt={"url": f"mqtt://localhost:{gateway.plant.broker_tls}"}),
-    "client certificate expired": certificate("expired"),
     "wrong password": plain_broker,
     "no broker any more": without("mqtt"),
     "no Modbus TCP any more": without("modbus_tcp"),
@@ -130,7 +131,6 @@ WORSE = {
     "baud 9600": bus_a(lambda bus: bus.update(baud=9600)),
     "baud 19200": bus_a(lambda bus: bus.update(baud=19200)),
     "baud 115200": bus_a(lambda bus: bus.update(baud=115200)),
-    "ASCII on a line of RTU": bus_a(lambda bus: bus.update(protocol="modbus-ascii", format="7N2")),
     "port that is not there": bus_a(lambda bus: bus.update(port="/dev/absent")),
     "line of another gateway": line_of_another,
     "lines swapped": lines_swapped,

@@ -16,8 +16,8 @@ import time
 
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
-sys.path.insert(0, str(ROOT / "deploy/fleet/plugins/filter"))
-from to_toml import to_toml  # noqa: E402
+sys.path.insert(0, str(ROOT / "deploy/fleet/plugins/module_utils"))
+from toml_text import to_toml  # noqa: E402
 
 BAUD = 38400
 CYCLE = 0.2

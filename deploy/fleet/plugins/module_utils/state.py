@@ -13,13 +13,14 @@ import urllib.parse
 PATIENCE = 10
 DEFAULT_SOCKET = "/run/drivegate/drivegate.sock"
 
+CONFIGURED, CONNECTED = "drivegate_mqtt_configured", "drivegate_mqtt_connected"
 # Metrics of which 1 is good (or absent: what has it is gone), and what to say otherwise.
 ONES = {
     "drivegate_drive_up": "drive {drive} is offline",
     "drivegate_bus_up": "bus {bus} is down",
     "drivegate_listener_up": "server {server} does not listen",
-    "drivegate_mqtt_configured": "[mqtt] is gone",
-    "drivegate_mqtt_connected": "no connection to the broker",
+    CONFIGURED: "[mqtt] is gone",
+    CONNECTED: "no connection to the broker",
     "drivegate_bacnet_bbmd_registered": "no registration at the BBMD",
 }
 # Metrics of which 0 is good, or as few as before. What is gone is worse for a lease: its drive has none any more.
@@ -149,6 +150,8 @@ def of_metrics(before, after, drives):
         name, labels = json.loads(key)
         now = after.get(key)
         if "drive" in labels and labels["drive"] not in drives:
+            continue
+        if name == CONNECTED and after.get(key.replace(CONNECTED, CONFIGURED)) != 1:
             continue
         if name in ONES and was == 1 and now != 1:
             kind = next(iter(labels), "")
