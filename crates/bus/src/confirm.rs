@@ -73,15 +73,13 @@ pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
             let Some((table, items)) = written(pdu) else {
                 return effects;
             };
-            if profile.control_language().is_some() {
-                let run = items
-                    .iter()
-                    .find_map(|(address, word)| profile.runs_by(table, *address, *word));
-                let index = profile.model_index(ModelPoint::Run);
-                add(index
-                    .zip(run)
-                    .and_then(|(index, run)| effect_of(profile, index, Value::Bool(run))));
-            }
+            let run = items
+                .iter()
+                .find_map(|(address, word)| profile.runs_by(table, *address, *word));
+            let index = profile.model_index(ModelPoint::Run);
+            add(index
+                .zip(run)
+                .and_then(|(index, run)| effect_of(profile, index, Value::Bool(run))));
             let word_at = |address| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word);
             for (index, point) in profile.points.iter().enumerate().filter(|(_, p)| p.write && !p.pulse) {
                 let Some(raw) = point.raw().filter(|r| r.table == table) else {

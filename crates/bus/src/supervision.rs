@@ -393,11 +393,7 @@ fn written_run(reading: &Reading<'_>, words: &KnownWords) -> Option<bool> {
     let profile = &reading.spec.profile;
     let place = profile.run_place()?;
     let word = words.get(place.table, place.address)?;
-    Some(
-        profile
-            .runs_by(place.table, place.address, word)
-            .unwrap_or(profile.control.is_none()),
-    )
+    Some(profile.runs_by(place.table, place.address, word).unwrap_or(false))
 }
 
 /// Whether an action failed that ended so: not where somebody else's order took its place, or the bus starts anew.

@@ -349,8 +349,12 @@ fn show(config: &Path, of: &str, names: Option<&Path>) -> Result<ExitCode, ExitC
         };
         table.add_row([id.to_string(), raw, text]);
     }
+    let counters = match file.counters.as_str() {
+        "" => String::new(),
+        counters => format!("counted by the drive: {counters}\n"),
+    };
     let head = format!(
-        "{} ({}), read {}; identification: {}; {}\n",
+        "{} ({}), read {}; identification: {}; {}\n{counters}",
         file.drive,
         file.family,
         file.time,

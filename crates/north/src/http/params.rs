@@ -26,6 +26,9 @@ struct LastReading<'a> {
     identification: &'a str,
     application: String,
     time: &'a str,
+    /// What the drive counted of its line (function 08), in words.
+    #[serde(skip_serializing_if = "str::is_empty")]
+    counters: &'a str,
     checksum: String,
     missing: usize,
     parameters: Vec<ParameterRow<'a>>,
@@ -87,6 +90,7 @@ impl<'a> LastReading<'a> {
             identification: &file.identification,
             application: file.application(),
             time: &file.time,
+            counters: &file.counters,
             checksum: file.checksum(),
             missing: file.missing(),
             parameters: parameters.collect(),

@@ -165,6 +165,9 @@ impl Serialize for StateObject<'_> {
         map.serialize_entry("age_ms", &self.age.map(|a| a.as_millis() as u64))?;
         map.serialize_entry("fault_text", &self.fault_text)?;
         map.serialize_entry("blocked_by", &self.shown.blocked_by)?;
+        if !self.profile.verified {
+            map.serialize_entry("profile_verified", &false)?;
+        }
         if self.omitted > 0 {
             map.serialize_entry("omitted", &self.omitted)?;
         }
@@ -435,6 +438,26 @@ mod tests {
             (&object["mode"], &object["mode_text"]),
             (&serde_json::Value::Null, &"".into())
         );
+        assert_eq!(object.get("profile_verified"), None, "nothing doubtful");
+        let doubtful = Profile::parse("m.toml", &format!("verified = false\n{source}"), false).unwrap();
+        let of = StateContent {
+            state: None,
+            quality: Quality::Good,
+            blocked_by: Vec::new(),
+            points: Vec::new(),
+        };
+        let object = StateObject {
+            shown: &of,
+            names: &[],
+            indices: &[],
+            profile: &doubtful,
+            fault_text: String::new(),
+            age: None,
+            wall: SystemTime::UNIX_EPOCH,
+            historical: false,
+            omitted: 0,
+        };
+        assert_eq!(serde_json::to_value(&object).unwrap()["profile_verified"], false);
     }
 
     #[test]

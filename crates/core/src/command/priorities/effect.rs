@@ -96,7 +96,7 @@ fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
         raw.decode(&[*word], crate::drive::model::Kind::Bool)
     };
     let by_control = || {
-        let control = profile.control_language().filter(|control| control.at.table == table)?;
+        let control = profile.control.as_ref().filter(|control| control.at.table == table)?;
         let (_, word) = items.iter().find(|(address, _)| *address == control.at.address)?;
         control.direction_of(*word)
     };
@@ -114,13 +114,14 @@ mod tests {
     use super::*;
     use crate::codec::RequestPdu;
     use crate::drive::Value;
-    use crate::drive::profile::Profiles;
+    use crate::drive::profile::{Form, Profiles};
 
     #[test]
     fn points_and_registers_say_the_same() {
         let profiles = Profiles::built_in();
         for profile in profiles.iter() {
-            let Some((raw, bit, invert)) = profile.run_bit() else {
+            let run = profile.model_point(ModelPoint::Run).and_then(|run| run.raw());
+            let Some((raw, Form::Bit { bit, invert })) = run.map(|raw| (raw, raw.form)) else {
                 continue;
             };
             let point = |point: ModelPoint| profile.model_index(point).unwrap();
