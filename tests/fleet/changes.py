@@ -143,3 +143,6 @@ WORSE = {
     "drive renamed": drive_a1(lambda drive: drive.update(name="pump")),
     "bus removed": lambda configuration, gateway: configuration["bus"].pop(0),
 }
+
+# Of these the bus `b` is not untouched.
+BOTH_BUSES = {"lines swapped"}

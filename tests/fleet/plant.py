@@ -21,7 +21,7 @@ from toml_text import to_toml  # noqa: E402
 
 BAUD = 38400
 CYCLE = 0.2
-LEASE = 10
+LEASE = 20
 
 
 class Local(http.client.HTTPConnection):
@@ -237,10 +237,10 @@ password_file {passwords}
 
     def run_motors(self):
         """Each drive runs, and its lease is renewed from now on."""
+        threading.Thread(target=self.renew, daemon=True).start()
         for gateway in self.gateways:
             for drive in gateway.drives:
                 until(f"the start of {gateway.name} {drive}", lambda: self.command(gateway, drive), 10)
-        threading.Thread(target=self.renew, daemon=True).start()
         until("the motors", lambda: all(self.running(gateway) for gateway in self.gateways))
         until("the count of starts", lambda: all(self.has_counted(gateway) for gateway in self.gateways))
 
