@@ -19,6 +19,7 @@ mod gateway {
     mod demo;
     mod drive_access;
     mod families;
+    mod fleet;
     mod history;
     mod listening;
     mod living;

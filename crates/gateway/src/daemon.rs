@@ -12,7 +12,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 
-use self::leases::Leases;
+use self::leases::Parted;
 pub use self::pulse::Pulse;
 use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
@@ -60,6 +60,8 @@ pub struct Daemon {
     settings: Settings,
     plant: SharedPlant,
     buses: Vec<(BusSettings, BusTask)>,
+    /// What drives had that reloads have left out.
+    parted: Parted,
     events: Events,
     writes: Arc<WriteStats>,
     stats: Arc<NorthStats>,
@@ -130,6 +132,7 @@ impl Daemon {
             plant: shared.clone(),
             settings: settings.clone(),
             buses: Vec::new(),
+            parted: Parted::default(),
             events,
             writes,
             stats: Arc::default(),
@@ -249,7 +252,7 @@ impl Daemon {
             .into_iter()
             .partition(|(before, _)| settings.buses.contains(before));
         // Ports are closed before a changed bus opens one of them. A bus that restarts keeps the leases of its drives.
-        let mut leases = Leases::default();
+        let (mut leases, parted) = self.parted.recall(Instant::now());
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
         let mut learned: BTreeMap<String, Learned> = BTreeMap::new();
         self.watch(&kept);
@@ -260,16 +263,18 @@ impl Daemon {
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
         }
         let mut handovers: BTreeMap<String, Handover> = BTreeMap::new();
+        let known = [stopped.clone(), parted].concat();
         for (bus, task) in prepared {
-            task.handle().take_over(&stopped, Instant::now());
+            task.handle().take_over(&known, Instant::now());
             let handover = Handover {
-                leases: leases.of(&bus),
+                leases: leases.of(&bus, Instant::now()),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
                 learned: learned.get(&bus.spec.port).copied(),
             };
             handovers.insert(bus.spec.name.clone(), handover);
             kept.push((bus, task));
         }
+        self.parted.keep(&leases, &stopped, Instant::now());
         for event in leases.ended(SystemTime::now()) {
             self.events.publish(event);
         }
