@@ -13,14 +13,6 @@ use crate::history::History;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
 
-/// An error reply.
-#[derive(Debug, Serialize)]
-pub(super) struct ErrorReply {
-    pub(super) error: String,
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub(super) known: Vec<String>,
-}
-
 /// One point in time on both clocks.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Clock {

@@ -7,6 +7,9 @@
 mod commands;
 mod cookies;
 mod login;
+pub(super) mod parameters;
+mod record;
+mod restart;
 mod sessions;
 mod stop_all;
 mod throttle;
@@ -31,7 +34,7 @@ pub(super) use self::cookies::Cookies;
 use self::sessions::{IDLE, Secrets, Session, Sessions};
 use self::throttle::{Source, Throttle};
 use self::verifier::Verifier;
-use super::routes::Reached;
+use super::routes::{LocalUser, Reached};
 use super::users::{MAX_PASSWORD, User, Users};
 use crate::NorthStats;
 use crate::command::{Authority, SourceKind};
@@ -40,6 +43,7 @@ use crate::log_throttle::LogThrottle;
 pub(crate) use self::commands::PostedCommands;
 pub(super) use self::commands::{command, commands_of, heartbeat};
 pub(super) use self::login::{log_in, log_out, session};
+pub(super) use self::record::record;
 pub(super) use self::stop_all::stop;
 
 /// A password that a program sends with each request is not hashed anew for that long.
@@ -94,13 +98,12 @@ pub(super) struct Operator {
 
 impl Operator {
     /// Who came through the local socket.
-    fn local(uid: u32, address: IpAddr) -> Operator {
-        let user: Arc<str> = format!("uid {uid}").into();
+    fn local(local: &LocalUser, address: IpAddr) -> Operator {
         Operator {
-            login: format!("{} {user}", SourceKind::LocalSocket.name()).into(),
-            user,
+            login: format!("{} {}", local.kind.name(), local.who).into(),
+            user: local.who.clone(),
             address,
-            kind: SourceKind::LocalSocket,
+            kind: local.kind,
             cookie: None,
         }
     }
@@ -212,7 +215,7 @@ impl Operating {
     ) -> Result<Operator, Denied> {
         let address = reached.peer.ip();
         if let Some(local) = &reached.local {
-            return Ok(Operator::local(local.uid, address));
+            return Ok(Operator::local(local, address));
         }
         if headers.contains_key(header::AUTHORIZATION) {
             let credentials = basic(headers).ok_or(Denied::NotLoggedIn)?;
@@ -430,6 +433,17 @@ fn basic(headers: &HeaderMap) -> Option<Credentials> {
     })
 }
 
+/// The header of HTTP Basic for `USER:PASSWORD`.
+pub fn basic_authorization(user_and_password: &str) -> String {
+    let mut text = vec![0; Encoding::B64.encoded_len(user_and_password.as_bytes())];
+    // The buffer fits.
+    let text = Encoding::B64
+        .encode(user_and_password.as_bytes(), &mut text)
+        .unwrap_or_default();
+    let padding = "=".repeat(text.len().next_multiple_of(4) - text.len());
+    format!("Basic {text}{padding}")
+}
+
 /// Whether a path belongs to commands; without them there is nothing at it.
 pub(super) fn is_operating(path: &str) -> bool {
     let of_drive = |rest: &str| {
@@ -449,7 +463,12 @@ pub(super) fn is_session(path: &str) -> bool {
 
 /// Whether a request may be one of those that change something, while commands are on.
 pub(super) fn may_change(method: &Method, path: &str) -> bool {
-    *method == Method::POST && is_operating(path)
+    let of_drive = |rest: &str| {
+        rest.split_once('/')
+            .is_some_and(|(_, what)| matches!(what, "recordings" | "params/reading" | "params/restore"))
+    };
+    let changes = is_operating(path) || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive);
+    *method == Method::POST && changes
 }
 
 /// Whether it is a command: that is served in whatever way the client got in.
