@@ -1,6 +1,7 @@
 //! What the north sides see: images to read from, queues to write into. No clock: time is an argument.
 
 mod exchange;
+mod hold;
 mod placed;
 mod why;
 
@@ -58,6 +59,7 @@ impl BusHandle {
                 let same = |image: &Arc<DriveImage>| bus.image.spec.machine(&image.spec) == machine;
                 Some((bus, bus.image.drives.iter().position(same)?))
             });
+            let holding = known.and_then(|(bus, place)| bus.queue.lock().holding(place));
             let (commander, stops, priorities) = match known {
                 Some((bus, place)) => {
                     if let Some(image) = bus.image.drives.get(place) {
@@ -73,7 +75,12 @@ impl BusHandle {
                     Priorities::default(),
                 ),
             };
-            self.queue.lock().take_over(index, commander, stops, priorities);
+            let mut queue = self.queue.lock();
+            queue.take_over(index, commander, stops, priorities);
+            if let Some(holding) = holding {
+                queue.take_over_holding(index, holding);
+            }
+            drop(queue);
             // What is only monitored from now on is sent nothing.
             if let Some((bus, place)) = known.filter(|_| drive.spec.access == Access::Control) {
                 bus.queue.hand_over(place, &self.queue, index, now);
@@ -486,6 +493,12 @@ impl DriveHandle {
             Err(Refusal::NotKnown(_)) if !self.bus_up() => Err(Outcome::BusDown),
             Err(Refusal::NotKnown(_)) if !online => Err(Outcome::Offline),
             Err(refusal) => Err(Outcome::Refused(refusal)),
+            Ok(admitted) => match self.hold_refuses(&admitted, origin, reading.now) {
+                Some(refusal) => Err(Outcome::Refused(refusal)),
+                None => Ok(admitted),
+            },
+        }
+        .and_then(|admitted| match Ok(admitted) {
             Ok(admitted) if admitted.urgency != Urgency::Stop && !self.bus_up() => Err(Outcome::BusDown),
             Ok(_) if !self.takes_stops() => Err(Outcome::BusDown),
             // A stop goes to a drive that does not answer too: it may be back.
@@ -495,7 +508,8 @@ impl DriveHandle {
                 Some(refusal) => Err(Outcome::Refused(refusal)),
                 None => Ok(admitted),
             },
-        }
+            Err(outcome) => Err(outcome),
+        })
     }
 
     /// Answers an order that is not sent. Reads that nothing answers are no commands, and no event.

@@ -1,0 +1,149 @@
+//! The hold of a drive, as the north sides ask for it.
+
+use std::time::{Instant, SystemTime};
+
+use super::{DriveHandle, Plant};
+use crate::command::{
+    self, Admitted, Asks, Authority, Effect, HoldView, Origin, Refusal, Rules, Told, Urgency, Verb, What,
+};
+use crate::event::{Event, EventKind};
+
+impl DriveHandle {
+    /// Why an order of a client is not taken, where somebody else holds the drive.
+    pub(super) fn hold_refuses(&self, admitted: &Admitted, origin: &Origin, now: Instant) -> Option<Refusal> {
+        if !self.bus.queue.is_guarded() || admitted.urgency == Urgency::Read {
+            return None;
+        }
+        let effect = Effect::of(&admitted.order, &self.image.spec.profile);
+        let asks = Asks::by(&admitted.order, admitted.urgency, effect);
+        self.bus.queue.lock().hold_refuses(self.index, origin, asks, now)
+    }
+
+    /// Whether `[authority]` is on.
+    pub fn is_guarded(&self) -> bool {
+        self.bus.queue.is_guarded()
+    }
+
+    /// What a client does with the hold; what is told of it then. A refusal is audited, counted and published like that of a
+    /// command.
+    ///
+    /// # Errors
+    /// The refusal.
+    pub fn hold(&self, verb: Verb, origin: &Origin, authority: Authority, now: Instant) -> Result<HoldView, Refusal> {
+        match self.act(verb, origin, authority, now) {
+            Ok(view) => Ok(view),
+            Err(refusal) => {
+                self.refuse(&format!("hold={}", verb.name()), refusal.clone(), origin.clone(), now);
+                Err(refusal)
+            }
+        }
+    }
+
+    fn act(&self, verb: Verb, origin: &Origin, authority: Authority, now: Instant) -> Result<HoldView, Refusal> {
+        command::authority(&self.reading(now), authority)?;
+        if let (Some(why), Verb::Take | Verb::Break) = (self.image.hold.why(), verb) {
+            return Err(Refusal::NotAllowed(why.to_string()));
+        }
+        let mut queue = self.bus.queue.lock();
+        let acted = queue.hold_act(self.index, origin, verb, now).unwrap_or_else(|| {
+            Err(Refusal::NotAllowed(
+                "nobody holds drives here: [authority] is off; set its mode".to_string(),
+            ))
+        });
+        let view = queue.hold_view(self.index, None, now);
+        drop(queue);
+        // What was begun for another one may have to end.
+        self.bus.queue.wake();
+        acted?;
+        if verb != Verb::Release {
+            self.image.renew_lease(now);
+        }
+        view.map(|(view, _)| view)
+            .ok_or_else(|| Refusal::NotAllowed("[authority] was turned off".to_string()))
+    }
+
+    /// What is told of the hold, and whether that client holds the drive; nothing while `[authority]` is off.
+    pub fn hold_view(&self, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
+        match self.bus.queue.is_guarded() {
+            true => self.bus.queue.lock().hold_view(self.index, origin, now),
+            false => None,
+        }
+    }
+
+    /// The heartbeat of a client that may command: the lease of the drive runs anew, unless another client's silence counts, and
+    /// so does its hold.
+    pub fn heartbeat(&self, origin: &Origin, now: Instant) {
+        if !self.bus.queue.is_guarded() {
+            return self.image.renew_lease(now);
+        }
+        let mut queue = self.bus.queue.lock();
+        queue.hold_renewed(self.index, origin, now);
+        let renews = queue.hold_renews(self.index, origin);
+        drop(queue);
+        if renews {
+            self.image.renew_lease(now);
+        }
+    }
+
+    /// A client gave back what it had asked for, and nothing is sent for it.
+    pub fn said_stop(&self, origin: &Origin) {
+        if self.bus.queue.is_guarded() {
+            self.bus.queue.lock().hold_said_stop(self.index, origin);
+        }
+    }
+
+    /// Whether a restore of parameters may begin for that client: it is judged once, so that none is left half done.
+    ///
+    /// # Errors
+    /// The refusal.
+    pub fn may_begin_restore(&self, origin: &Origin, now: Instant) -> Result<(), Refusal> {
+        if !self.bus.queue.is_guarded() {
+            return Ok(());
+        }
+        let mut queue = self.bus.queue.lock();
+        queue.hold_refuses(self.index, origin, Asks::Other, now).map_or(Ok(()), Err)
+    }
+}
+
+impl Plant {
+    /// Publishes what happened to the holds of the drives until `now`, which is `time` on the calendar; to be called several times a
+    /// second.
+    pub fn tell_holds(&self, now: Instant, time: SystemTime) {
+        for bus in self.buses.iter().filter(|bus| bus.queue.is_guarded()) {
+            let mut queue = bus.queue.lock();
+            let told = queue.take_told(now);
+            let rules = queue.rules().cloned();
+            drop(queue);
+            let (Some(rules), false) = (rules, told.is_empty()) else {
+                continue;
+            };
+            for (drive, told) in told {
+                let Some(image) = bus.image.drives.get(drive) else {
+                    continue;
+                };
+                let (kind, text) = words(&told, &rules);
+                self.events.publish(Event {
+                    bus: bus.image.spec.name.clone(),
+                    drive: Some(image.spec.name.clone()),
+                    ..Event::new(kind, time, text)
+                });
+                // Whoever shows the drive shows its hold.
+                image.update(|_| {});
+            }
+        }
+    }
+}
+
+/// The event of what happened to a hold.
+fn words(told: &Told, rules: &Rules) -> (EventKind, String) {
+    let named = |claim: &command::Claim| format!("{} ({})", claim.name, rules.rank(claim.rank));
+    let who = named(&told.who);
+    match &told.what {
+        What::Held => (EventKind::Held, format!("{who} holds the drive")),
+        What::Released(why) => (EventKind::Released, format!("{who} holds the drive no more: {why}")),
+        What::Broken(by) => (
+            EventKind::HoldBroken,
+            format!("{} took the drive from {who}", named(by)),
+        ),
+    }
+}
