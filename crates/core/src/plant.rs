@@ -482,34 +482,31 @@ impl DriveHandle {
         authority: Authority,
     ) -> Result<Admitted, Outcome> {
         let online = reading.snapshot.link.is_online();
-        let held_back = |admitted: &Admitted| {
-            let effect = Effect::of(&admitted.order, &self.image.spec.profile);
-            let queue = self.bus.queue.lock();
-            queue
-                .held_back(self.index, origin, effect)
-                .filter(|_| admitted.urgency == Urgency::Command)
+        let admitted = match command::admit(order, reading, authority) {
+            Err(Refusal::NotKnown(_)) if !self.bus_up() => return Err(Outcome::BusDown),
+            Err(Refusal::NotKnown(_)) if !online => return Err(Outcome::Offline),
+            admitted => admitted.map_err(Outcome::Refused)?,
         };
-        match command::admit(order, reading, authority) {
-            Err(Refusal::NotKnown(_)) if !self.bus_up() => Err(Outcome::BusDown),
-            Err(Refusal::NotKnown(_)) if !online => Err(Outcome::Offline),
-            Err(refusal) => Err(Outcome::Refused(refusal)),
-            Ok(admitted) => match self.hold_refuses(&admitted, origin, reading.now) {
-                Some(refusal) => Err(Outcome::Refused(refusal)),
-                None => Ok(admitted),
-            },
+        if let Some(refusal) = self.hold_refuses(&admitted, origin, reading.now) {
+            return Err(Outcome::Refused(refusal));
         }
-        .and_then(|admitted| match Ok(admitted) {
-            Ok(admitted) if admitted.urgency != Urgency::Stop && !self.bus_up() => Err(Outcome::BusDown),
-            Ok(_) if !self.takes_stops() => Err(Outcome::BusDown),
-            // A stop goes to a drive that does not answer too: it may be back.
-            Ok(admitted) if !online && admitted.urgency != Urgency::Stop => Err(Outcome::Offline),
-            // Judged once more when it is accepted.
-            Ok(admitted) => match held_back(&admitted) {
-                Some(refusal) => Err(Outcome::Refused(refusal)),
-                None => Ok(admitted),
-            },
-            Err(outcome) => Err(outcome),
-        })
+        let is_stop = admitted.urgency == Urgency::Stop;
+        if (!is_stop && !self.bus_up()) || !self.takes_stops() {
+            return Err(Outcome::BusDown);
+        }
+        // A stop goes to a drive that does not answer too: it may be back.
+        if !online && !is_stop {
+            return Err(Outcome::Offline);
+        }
+        let held_back = || {
+            let effect = Effect::of(&admitted.order, &self.image.spec.profile);
+            self.bus.queue.lock().held_back(self.index, origin, effect)
+        };
+        // Judged once more when it is accepted.
+        match (admitted.urgency == Urgency::Command).then(held_back).flatten() {
+            Some(refusal) => Err(Outcome::Refused(refusal)),
+            None => Ok(admitted),
+        }
     }
 
     /// Answers an order that is not sent. Reads that nothing answers are no commands, and no event.

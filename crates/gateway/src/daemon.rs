@@ -270,6 +270,10 @@ impl Daemon {
             handovers.insert(bus.spec.name.clone(), handover);
             kept.push((bus, task));
         }
+        let after: Vec<&BusHandle> = kept.iter().map(|(_, task)| task.handle()).collect();
+        for bus in &stopped {
+            bus.end_holds(&after, &self.events, Instant::now(), SystemTime::now());
+        }
         for event in leases.ended(SystemTime::now()) {
             self.events.publish(event);
         }
@@ -285,6 +289,9 @@ impl Daemon {
             };
             let drives = &task.handle().image.drives;
             drives.iter().for_each(|drive| drive.set_stale_floor(floor));
+        }
+        for (_, task) in &kept {
+            task.handle().queue.set_authority(settings.authority.clone());
         }
         let machines = |handles: &mut dyn Iterator<Item = &BusHandle>| -> BTreeMap<String, Machine> {
             let of_bus = |bus: &BusHandle| {
@@ -647,7 +654,9 @@ fn report_refusals(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
         let mut ticks = tokio::time::interval(REFUSALS_REPORTED);
         loop {
             ticks.tick().await;
-            plant.load().report_refusals(Instant::now());
+            let plant = plant.load();
+            plant.report_refusals(Instant::now());
+            plant.tell_holds(Instant::now(), SystemTime::now());
         }
     })
 }

@@ -2,11 +2,73 @@
 
 use std::time::{Instant, SystemTime};
 
-use super::{DriveHandle, Plant};
+use super::{BusHandle, DriveHandle, Plant};
 use crate::command::{
-    self, Admitted, Asks, Authority, Effect, HoldView, Origin, Refusal, Rules, Told, Urgency, Verb, What,
+    self, Admitted, Asks, Authority, Command, Effect, HoldView, Origin, Refusal, Rules, Told, Urgency, Verb, What,
 };
-use crate::event::{Event, EventKind};
+use crate::event::{Event, EventKind, Events};
+
+impl BusHandle {
+    /// Whether an order of that client renews the lease of a drive.
+    pub fn renews(&self, drive: usize, origin: &Origin) -> bool {
+        !self.queue.is_guarded() || self.queue.lock().hold_renews(drive, origin)
+    }
+
+    /// Publishes what happened to the holds of its drives.
+    pub fn tell_holds(&self, events: &Events, now: Instant, time: SystemTime) {
+        if !self.queue.is_guarded() {
+            return;
+        }
+        let mut queue = self.queue.lock();
+        let told = queue.take_told(now);
+        let rules = queue.rules().cloned();
+        drop(queue);
+        let Some(rules) = rules else { return };
+        for (drive, told) in told {
+            let Some(image) = self.image.drives.get(drive) else {
+                continue;
+            };
+            let (kind, text) = words(&told, &rules);
+            events.publish(Event {
+                bus: self.image.spec.name.clone(),
+                drive: Some(image.spec.name.clone()),
+                ..Event::new(kind, time, text)
+            });
+            // Whoever shows the drive shows its hold.
+            image.update(|_| {});
+        }
+    }
+
+    /// After a reload: the holds of machines that are in none of these buses have ended, and that is told.
+    pub fn end_holds(&self, after: &[&BusHandle], events: &Events, now: Instant, time: SystemTime) {
+        if !self.queue.is_guarded() {
+            return;
+        }
+        for (index, drive) in self.image.drives.iter().enumerate() {
+            let machine = self.image.spec.machine(&drive.spec);
+            let is_there = |bus: &&BusHandle| {
+                let mut drives = bus.image.drives.iter();
+                drives.any(|drive| bus.image.spec.machine(&drive.spec) == machine)
+            };
+            if !after.iter().any(is_there) {
+                let why = "a reload changed bus, address or profile of the drive";
+                self.queue.lock().hold_ends(index, why);
+            }
+        }
+        self.tell_holds(events, now, time);
+    }
+
+    /// Why a command that was accepted is not begun at its turn, and whether it renews the lease of its drive.
+    pub fn judges_turn(&self, command: &Command, now: Instant) -> (Option<Refusal>, bool) {
+        if !self.queue.is_guarded() {
+            return (None, true);
+        }
+        let queue = self.queue.lock();
+        let mut origins = std::iter::once(&command.ticket).chain(command.joined.iter().map(|(ticket, _)| ticket));
+        let renews = origins.any(|ticket| queue.hold_renews(command.drive, ticket.origin()));
+        (queue.hold_stops_turn(command, now), renews)
+    }
+}
 
 impl DriveHandle {
     /// Why an order of a client is not taken, where somebody else holds the drive.
@@ -101,7 +163,9 @@ impl DriveHandle {
             return Ok(());
         }
         let mut queue = self.bus.queue.lock();
-        queue.hold_refuses(self.index, origin, Asks::Other, now).map_or(Ok(()), Err)
+        queue
+            .hold_refuses(self.index, origin, Asks::Other, now)
+            .map_or(Ok(()), Err)
     }
 }
 
@@ -109,28 +173,9 @@ impl Plant {
     /// Publishes what happened to the holds of the drives until `now`, which is `time` on the calendar; to be called several times a
     /// second.
     pub fn tell_holds(&self, now: Instant, time: SystemTime) {
-        for bus in self.buses.iter().filter(|bus| bus.queue.is_guarded()) {
-            let mut queue = bus.queue.lock();
-            let told = queue.take_told(now);
-            let rules = queue.rules().cloned();
-            drop(queue);
-            let (Some(rules), false) = (rules, told.is_empty()) else {
-                continue;
-            };
-            for (drive, told) in told {
-                let Some(image) = bus.image.drives.get(drive) else {
-                    continue;
-                };
-                let (kind, text) = words(&told, &rules);
-                self.events.publish(Event {
-                    bus: bus.image.spec.name.clone(),
-                    drive: Some(image.spec.name.clone()),
-                    ..Event::new(kind, time, text)
-                });
-                // Whoever shows the drive shows its hold.
-                image.update(|_| {});
-            }
-        }
+        self.buses
+            .iter()
+            .for_each(|bus| bus.tell_holds(&self.events, now, time));
     }
 }
 

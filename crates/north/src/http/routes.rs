@@ -159,6 +159,10 @@ pub(super) fn router(
             get(operating::commands_of).post(operating::command),
         )
         .route("/api/v1/drives/{name}/heartbeat", post(operating::heartbeat))
+        .route(
+            "/api/v1/drives/{name}/hold",
+            get(operating::hold_of).post(operating::hold),
+        )
         .route("/api/v1/stop", post(operating::stop))
         .fallback(unknown)
         .with_state(app.clone())

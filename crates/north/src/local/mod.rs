@@ -28,7 +28,7 @@ use tokio_util::sync::CancellationToken;
 use self::path::Bound;
 use self::protocol::{Failure, FailureCode, MAX_REQUEST, Outcome, Request, Response, VERSION};
 use crate::NorthStats;
-use crate::command::{Authority, Origin, SourceKind};
+use crate::command::{Authority, Origin, Proof, SourceKind};
 use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Limits, Newcomer};
 use crate::http::{LocalUser, SocketDoor};
 use crate::plant::{Plant, SharedPlant};
@@ -177,7 +177,7 @@ async fn serve(stream: UnixStream, asked: Arc<Asked>, permit: ConnectionPermit) 
     // Without a user id there is nobody to hold the command against.
     let Ok(peer) = stream.peer_cred() else { return };
     let place = permit.place();
-    let origin = Origin::new(SourceKind::LocalSocket, format!("uid {}", peer.uid()));
+    let origin = Origin::new(SourceKind::LocalSocket, format!("uid {}", peer.uid())).proven(Proof::Uid(peer.uid()));
     // What is found at once may have come since.
     let mut since = Instant::now();
     let mut stream = BufReader::new(stream);

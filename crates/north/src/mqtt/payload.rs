@@ -22,6 +22,16 @@ pub(super) struct Topics {
 pub(super) struct SetTopic<'t> {
     pub(super) drive: &'t str,
     pub(super) point: Option<&'t str>,
+    /// WHO in `as/WHO`.
+    pub(super) who: Option<&'t str>,
+}
+
+/// The topic at which the hold of a drive is taken, renewed, released or broken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct HoldTopic<'t> {
+    pub(super) drive: &'t str,
+    /// Without one it is nobody's.
+    pub(super) who: Option<&'t str>,
 }
 
 impl Topics {
@@ -57,6 +67,60 @@ impl Topics {
         [self.drive("+", "set"), self.drive("+", "set/+"), self.stop_all()]
     }
 
+    /// The filters of those of the topics that name a client, and of the holds.
+    pub(super) fn authority_filters(&self) -> [String; 5] {
+        [
+            self.drive("+", "as/+/set"),
+            self.drive("+", "as/+/set/+"),
+            self.drive("+", "as/+/hold"),
+            self.drive("+", "hold"),
+            format!("{}/as/+/stop", self.root),
+        ]
+    }
+
+    /// The same for these clients, for a broker that takes no wildcards.
+    pub(super) fn authority_topics(&self, plant: &Plant, clients: &[String]) -> Vec<String> {
+        let of_drive = |drive: DriveHandle| {
+            let spec = &drive.image.spec;
+            let points = || spec.profile.points.iter().filter(|point| point.is_commanded());
+            let of_client = |who: &String| {
+                let leaf = |leaf: &str| self.drive(&spec.name, &format!("as/{who}/{leaf}"));
+                let points = points().map(|point| leaf(&format!("set/{}", point.name)));
+                [leaf("set"), leaf("hold")]
+                    .into_iter()
+                    .chain(points)
+                    .collect::<Vec<_>>()
+            };
+            let hold = self.drive(&spec.name, "hold");
+            std::iter::once(hold)
+                .chain(clients.iter().flat_map(of_client))
+                .collect::<Vec<_>>()
+        };
+        let stops = clients.iter().map(|who| format!("{}/as/{who}/stop", self.root));
+        stops.chain(plant.drives().flat_map(of_drive)).collect()
+    }
+
+    /// Who stops all drives by that topic, where it is one of these: WHO in `as/WHO`, if it has one.
+    pub(super) fn parse_stop_all<'t>(&self, topic: &'t str) -> Option<Option<&'t str>> {
+        let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix('/')?;
+        if rest == "set/stop" {
+            return Some(None);
+        }
+        let who = rest.strip_prefix("as/")?.strip_suffix("/stop")?;
+        (!who.contains('/')).then_some(Some(who))
+    }
+
+    /// Whose hold of which drive a topic is about; `None` for any other topic.
+    pub(super) fn parse_hold<'t>(&self, topic: &'t str) -> Option<HoldTopic<'t>> {
+        let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix("/drive/")?;
+        let levels: Vec<&str> = rest.split('/').collect();
+        match levels.as_slice() {
+            [drive, "hold"] => Some(HoldTopic { drive, who: None }),
+            [drive, "as", who, "hold"] => Some(HoldTopic { drive, who: Some(who) }),
+            _ => None,
+        }
+    }
+
     /// Where all drives are stopped.
     pub(super) fn stop_all(&self) -> String {
         format!("{}/set/stop", self.root)
@@ -84,10 +148,15 @@ impl Topics {
     /// Which drive and point a topic sets; `None` for any other topic.
     pub(super) fn parse_set<'t>(&self, topic: &'t str) -> Option<SetTopic<'t>> {
         let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix("/drive/")?;
-        let mut levels = rest.split('/');
-        let (drive, set) = (levels.next()?, levels.next()?);
-        let point = levels.next();
-        (set == "set" && levels.next().is_none()).then_some(SetTopic { drive, point })
+        let levels: Vec<&str> = rest.split('/').collect();
+        let (drive, who, point) = match levels.as_slice() {
+            [drive, "set"] => (drive, None, None),
+            [drive, "set", point] => (drive, None, Some(*point)),
+            [drive, "as", who, "set"] => (drive, Some(*who), None),
+            [drive, "as", who, "set", point] => (drive, Some(*who), Some(*point)),
+            _ => return None,
+        };
+        Some(SetTopic { drive, point, who })
     }
 }
 

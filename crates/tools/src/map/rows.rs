@@ -110,6 +110,17 @@ fn entry_row(profile: &Profile, plan: &Plan, entry: &Entry, access: Access) -> R
         Content::Age => ("age", "ms", "of the process data; 65534 at most; 0xFFFF never read"),
         Content::Command => ("command", "", "bits: 0 run, 1 reverse, 2 fault_reset (0 to 1)"),
         Content::Heartbeat => ("heartbeat", "", "any write renews the supervision; reads 0"),
+        Content::Holder => (
+            "holder",
+            "",
+            "0 nobody, 1 this client, 2 another, 3 local control place, 4 reserved after a stop; 0xFFFF without [authority]",
+        ),
+        Content::HoldLeft => ("hold_left", "s", "0xFFFF without [authority], and under local control"),
+        Content::Hold => (
+            "hold",
+            "",
+            "with [authority] only: write 1 take or renew, 0 release, 2 break; reads 1 for the holder",
+        ),
         Content::Point(point) => (point.name(), point.unit(), ""),
     };
     let view = match entry.address {

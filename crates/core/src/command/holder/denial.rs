@@ -57,7 +57,8 @@ impl Denial {
                 Refusal::HeldByOther(holder(by, *left, keeps))
             }
             Denial::NeedsTake(by) => {
-                let keeps = "stopped the drive while this client went on with run; stop, or take the drive, before run".to_string();
+                let keeps = "stopped the drive while this client went on with run; stop, or take the drive, before run"
+                    .to_string();
                 Refusal::NeedsTake(holder(by, Duration::ZERO, keeps))
             }
             Denial::Local => Refusal::HeldByOther(Box::new(Holder {

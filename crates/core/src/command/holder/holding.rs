@@ -78,8 +78,8 @@ pub struct HoldView {
     pub holder: Option<Arc<str>>,
     /// The name of its rank.
     pub rank: Option<Arc<str>>,
-    /// Seconds left, rounded up; 0 if nothing is.
-    pub left_s: u64,
+    /// Seconds left, rounded up; 0 while nobody has it, none of the local control place.
+    pub left_s: Option<u64>,
 }
 
 /// What happened to a hold, for an event.
@@ -193,7 +193,11 @@ impl Holding {
         }
         if let Some((by, left)) = self.held(now).filter(|(by, _)| !by.is(who)) {
             let breaks = who.breaks && by.is_below(who) && asks.takes();
-            return if breaks { Ok(()) } else { Err(Denial::Held(by.clone(), left)) };
+            return if breaks {
+                Ok(())
+            } else {
+                Err(Denial::Held(by.clone(), left))
+            };
         }
         if let Some((by, left)) = self.reserved(now).filter(|(by, _)| who.is_below(by)) {
             return Err(Denial::Reserved(by.clone(), left));
@@ -226,14 +230,7 @@ impl Holding {
     }
 
     /// An order was accepted.
-    pub fn accepted(
-        &mut self,
-        who: Option<&Claim>,
-        asks: Asks,
-        rules: &Rules,
-        now: Instant,
-        told: &mut Vec<Told>,
-    ) {
+    pub fn accepted(&mut self, who: Option<&Claim>, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
         self.settle(rules, now, told);
         let repeats = asks == Asks::Stop && who.is_some_and(|who| self.repeats(who));
         self.note_word(who, asks);
@@ -424,14 +421,14 @@ impl Holding {
             state,
             holder: Some(by.name.clone()),
             rank: Some(rules.rank(by.rank)),
-            left_s: seconds(left),
+            left_s: Some(seconds(left)),
         };
         if self.local {
             return HoldView {
                 state: HoldState::Local,
                 holder: Some("local".into()),
                 rank: Some("local".into()),
-                left_s: 0,
+                left_s: None,
             };
         }
         let held = self.held(now).map(|held| of(HoldState::Held, held));
@@ -440,7 +437,7 @@ impl Holding {
             state: HoldState::Free,
             holder: None,
             rank: None,
-            left_s: 0,
+            left_s: Some(0),
         })
     }
 

@@ -6,8 +6,8 @@ use std::time::Instant;
 
 use super::{CommandQueue, Pending};
 use crate::command::{
-    Asks, Claim, Command, Denial, HoldView, Holding, Mode, Origin, Outcome, Refusal, Rules, SourceKind, Told,
-    Urgency, Verb,
+    Asks, Claim, Command, Denial, HoldView, Holding, Mode, Origin, Outcome, Refusal, Rules, SourceKind, Told, Urgency,
+    Verb,
 };
 
 /// What is told of holds waits for the gateway, which asks several times a second; beyond that the oldest is dropped.
@@ -27,11 +27,7 @@ pub(super) struct Holds {
 
 impl Holds {
     /// The rules and the holding of a drive, and where it is told what happened; nothing while `[authority]` is off.
-    fn with<T>(
-        &mut self,
-        drive: usize,
-        change: impl FnOnce(&mut Holding, &Rules, &mut Vec<Told>) -> T,
-    ) -> Option<T> {
+    fn with<T>(&mut self, drive: usize, change: impl FnOnce(&mut Holding, &Rules, &mut Vec<Told>) -> T) -> Option<T> {
         let rules = self.rules.as_ref()?;
         let mut told = Vec::new();
         let changed = change(self.drives.entry(drive).or_default(), rules, &mut told);
@@ -63,16 +59,27 @@ impl Pending {
             return;
         }
         let drives: Vec<usize> = self.holds.drives.keys().copied().collect();
-        for drive in drives {
-            self.holds.with(drive, |holding, _, told| match &rules {
-                Some(rules) => holding.keep_known(rules, told),
-                None => holding.end("a reload turned [authority] off", told),
-            });
+        match rules {
+            Some(_) => {
+                self.holds.rules = rules;
+                for drive in drives {
+                    self.holds
+                        .with(drive, |holding, rules, told| holding.keep_known(rules, told));
+                }
+            }
+            None => {
+                for drive in drives {
+                    self.hold_ends(drive, "a reload turned [authority] off");
+                }
+                self.holds.drives.clear();
+                self.holds.rules = None;
+            }
         }
-        if rules.is_none() {
-            self.holds.drives.clear();
-        }
-        self.holds.rules = rules;
+    }
+
+    /// The hold of a drive ends, for that reason.
+    pub fn hold_ends(&mut self, drive: usize, why: &str) {
+        self.holds.with(drive, |holding, _, told| holding.end(why, told));
     }
 
     /// Why an order of that client is not accepted, where the hold of the drive keeps it. A run that is refused behind a stop is
@@ -104,7 +111,12 @@ impl Pending {
         command.reach().iter().find_map(|drive| {
             // What it has accepted of stops is sent.
             let asks = Some(Asks::of(command, *drive)).filter(|asks| *asks != Asks::Stop)?;
-            let denial = self.holds.drives.get(drive)?.judge(who.as_ref(), asks, rules, now).err()?;
+            let denial = self
+                .holds
+                .drives
+                .get(drive)?
+                .judge(who.as_ref(), asks, rules, now)
+                .err()?;
             Some(denial.refusal(rules))
         })
     }
@@ -142,7 +154,8 @@ impl Pending {
     /// A client was heard of: its heartbeat came, or its order was carried out.
     pub fn hold_renewed(&mut self, drive: usize, origin: &Origin, now: Instant) {
         let Some(who) = self.holds.claim(origin) else { return };
-        self.holds.with(drive, |holding, rules, _| holding.renew(&who, rules, now));
+        self.holds
+            .with(drive, |holding, rules, _| holding.renew(&who, rules, now));
     }
 
     /// Whether the silence of that client is the one that counts for supervision: it holds the drive, or did last, or nobody
@@ -196,7 +209,8 @@ impl Pending {
     /// Why what the client began is not continued, where another one has taken the drive since.
     pub fn hold_ends_run(&self, drive: usize, origin: &Origin, now: Instant) -> Option<Refusal> {
         let rules = self.holds.rules.as_ref().filter(|_| origin.kind.is_client())?;
-        let who = rules.claim_of(origin);
+        let who = rules.claim_of(origin).filter(|_| rules.mode == Mode::Exclusive);
+        who.as_ref()?;
         let holding = self.holds.drives.get(&drive)?;
         let denial = holding.judge(who.as_ref(), Asks::Steer, rules, now).err()?;
         Some(denial.refusal(rules))
@@ -210,14 +224,16 @@ impl Pending {
 
     /// Whether the local control place of a drive has it now.
     pub fn set_local(&mut self, drive: usize, local: bool) {
-        self.holds.with(drive, |holding, _, told| holding.set_local(local, told));
+        self.holds
+            .with(drive, |holding, _, told| holding.set_local(local, told));
     }
 
     /// Ends what its time has ended, and tells what happened since the last call.
     pub fn take_told(&mut self, now: Instant) -> Vec<(usize, Told)> {
         let drives: Vec<usize> = self.holds.drives.keys().copied().collect();
         for drive in drives {
-            self.holds.with(drive, |holding, rules, told| holding.settle(rules, now, told));
+            self.holds
+                .with(drive, |holding, rules, told| holding.settle(rules, now, told));
         }
         std::mem::take(&mut self.holds.told)
     }
@@ -248,7 +264,9 @@ impl Pending {
     }
 
     /// Goes on with the hold of the same machine before a reload.
-    pub fn take_over_holding(&mut self, drive: usize, holding: Holding) {
+    pub fn take_over_holding(&mut self, drive: usize, mut holding: Holding) {
+        // The next reading says it anew.
+        holding.set_local(false, &mut Vec::new());
         self.holds.drives.insert(drive, holding);
     }
 }
@@ -257,7 +275,8 @@ impl CommandQueue {
     /// From now on these rules hold for the drives of the bus; none: `[authority]` is off.
     pub fn set_authority(&self, rules: Option<Arc<Rules>>) {
         let mut pending = self.lock();
-        self.guarded.store(rules.is_some(), std::sync::atomic::Ordering::Release);
+        self.guarded
+            .store(rules.is_some(), std::sync::atomic::Ordering::Release);
         pending.set_rules(rules);
     }
 

@@ -77,7 +77,7 @@ fn status(outcome: &Outcome) -> StatusCode {
         Outcome::Acknowledged(_) => StatusCode::OK,
         Outcome::Refused(Refusal::NotAllowed(_)) => StatusCode::FORBIDDEN,
         Outcome::Refused(Refusal::UnknownDrive(_)) => StatusCode::NOT_FOUND,
-        Outcome::Refused(Refusal::HeldByOther(_)) => StatusCode::CONFLICT,
+        Outcome::Refused(Refusal::HeldByOther(_) | Refusal::NeedsTake(_)) => StatusCode::CONFLICT,
         Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
         Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::NotStopped => StatusCode::CONFLICT,
         // Of what was not carried out.
@@ -164,11 +164,13 @@ impl Operator {
     /// As the audit shows it. All that a user does counts as one client.
     pub(super) fn origin(&self) -> Origin {
         if self.kind == SourceKind::LocalSocket {
-            return Origin::new(self.kind, self.user.to_string()).with_login(self.login.clone());
+            let origin = Origin::new(self.kind, self.user.to_string());
+            return origin.with_login(self.login.clone()).proven(self.proof.clone());
         }
         let client = format!("{} {}", self.kind.name(), self.user);
         let who = format!("{} {}", self.user, self.address);
-        Origin::of(client.into(), self.kind, who).with_login(self.login.clone())
+        let origin = Origin::of(client.into(), self.kind, who);
+        origin.with_login(self.login.clone()).proven(self.proof.clone())
     }
 }
 
@@ -372,7 +374,7 @@ fn renew(drive: &DriveHandle, operator: &Operator, now: Instant) -> Result<(), &
     }
     match drive.commander() {
         Some(login) if login == operator.login => {
-            drive.image.renew_lease(now);
+            drive.heartbeat(&operator.origin(), now);
             Ok(())
         }
         _ => Err("this login was not the last to command the drive; nothing was renewed"),

@@ -6,6 +6,7 @@
 
 mod commands;
 mod cookies;
+mod hold;
 mod login;
 mod sessions;
 mod stop_all;
@@ -34,11 +35,12 @@ use self::verifier::Verifier;
 use super::routes::Reached;
 use super::users::{MAX_PASSWORD, User, Users};
 use crate::NorthStats;
-use crate::command::{Authority, SourceKind};
+use crate::command::{Authority, Proof, SourceKind};
 use crate::log_throttle::LogThrottle;
 
 pub(crate) use self::commands::PostedCommands;
 pub(super) use self::commands::{command, commands_of, heartbeat};
+pub(super) use self::hold::{hold, hold_of};
 pub(super) use self::login::{log_in, log_out, session};
 pub(super) use self::stop_all::stop;
 
@@ -88,6 +90,7 @@ pub(super) struct Operator {
     address: IpAddr,
     /// The way in.
     kind: SourceKind,
+    proof: Proof,
     /// The cookie of its session; `None` for a program.
     cookie: Option<String>,
 }
@@ -101,6 +104,7 @@ impl Operator {
             user,
             address,
             kind: SourceKind::LocalSocket,
+            proof: Proof::Uid(uid),
             cookie: None,
         }
     }
@@ -219,6 +223,7 @@ impl Operating {
             let user = self.verified(&credentials, address, Source::of(address)).await?;
             return Ok(Operator {
                 login: user.clone(),
+                proof: Proof::User(user.clone()),
                 user,
                 address,
                 kind: SourceKind::Http,
@@ -228,6 +233,7 @@ impl Operating {
         let cookie = cookies.session(headers).ok_or(Denied::NotLoggedIn)?;
         let session = self.session(&cookie, Instant::now()).ok_or(Denied::SessionEnded)?;
         Ok(Operator {
+            proof: Proof::User(session.user.clone()),
             user: session.user,
             login: session.login,
             address,
@@ -362,6 +368,7 @@ impl Operating {
             login: session.login.clone(),
             address,
             kind: SourceKind::Http,
+            proof: Proof::User(user.clone()),
             cookie: Some(cookie.clone()),
         };
         self.used(&operator, now);
@@ -434,7 +441,7 @@ fn basic(headers: &HeaderMap) -> Option<Credentials> {
 pub(super) fn is_operating(path: &str) -> bool {
     let of_drive = |rest: &str| {
         rest.split_once('/')
-            .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat"))
+            .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat" | "hold"))
     };
     is_session(path)
         || path == "/api/v1/stop"
