@@ -5,6 +5,8 @@ use std::time::{Duration, SystemTime};
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
+use crate::command::HoldView;
+use crate::command_json::HoldFields;
 use crate::drive::{ModelPoint, Point, Profile, Quality, State, Value};
 use crate::event::Event;
 use crate::plant::{BusHandle, DriveHandle, Plant};
@@ -174,6 +176,8 @@ pub(super) struct StateContent {
     pub(super) quality: Quality,
     /// Why the motor does not run, in one word each.
     pub(super) blocked_by: Vec<String>,
+    /// Who holds it; none where `[authority]` is off.
+    pub(super) hold: Option<HoldFields>,
     /// Value (only if good) and quality of each published point.
     pub(super) points: Vec<(Option<Value>, Quality)>,
 }
@@ -198,8 +202,15 @@ impl StateContent {
             state: reading.state(),
             quality: reading.overall(),
             blocked_by,
+            hold: None,
             points: points.map(shown).collect(),
         }
+    }
+
+    /// The same with who holds the drive.
+    pub(super) fn with_hold(mut self, hold: Option<HoldView>) -> StateContent {
+        self.hold = hold.map(HoldFields::from);
+        self
     }
 }
 
@@ -234,6 +245,12 @@ impl Serialize for StateObject<'_> {
         map.serialize_entry("age_ms", &self.age.map(|a| a.as_millis() as u64))?;
         map.serialize_entry("fault_text", &self.fault_text)?;
         map.serialize_entry("blocked_by", &self.shown.blocked_by)?;
+        if let Some(hold) = &self.shown.hold {
+            map.serialize_entry("hold", &hold.hold)?;
+            map.serialize_entry("holder", &hold.holder)?;
+            map.serialize_entry("holder_rank", &hold.holder_rank)?;
+            map.serialize_entry("hold_left_s", &hold.hold_left_s)?;
+        }
         if self.omitted > 0 {
             map.serialize_entry("omitted", &self.omitted)?;
         }

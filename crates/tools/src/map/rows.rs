@@ -150,14 +150,25 @@ fn entry_row(profile: &Profile, plan: &Plan, entry: &Entry, access: Access) -> R
         scale: format!("{}", 1.0 / entry.per_unit),
         unit: unit.to_string(),
         not_available: match entry.content {
-            Content::Status | Content::Heartbeat => "",
-            Content::State | Content::Age | Content::Command | Content::Point(_) => entry.form.not_available(),
+            Content::Status | Content::Heartbeat | Content::Hold => "",
+            Content::State
+            | Content::Age
+            | Content::Command
+            | Content::Holder
+            | Content::HoldLeft
+            | Content::Point(_) => entry.form.not_available(),
         },
         access: if writable { "read, write" } else { "read" },
         source: match entry.content {
             Content::Point(point) => point_source(profile, plan, point),
             Content::Command => command_source(profile),
-            Content::Status | Content::State | Content::Age | Content::Heartbeat => "gateway".to_string(),
+            Content::Status
+            | Content::State
+            | Content::Age
+            | Content::Heartbeat
+            | Content::Holder
+            | Content::HoldLeft
+            | Content::Hold => "gateway".to_string(),
         },
         note: note.to_string(),
     }
