@@ -20,6 +20,7 @@ mod gateway {
     mod drive_access;
     mod families;
     mod history;
+    mod holder;
     mod listening;
     mod living;
     mod local_socket;
