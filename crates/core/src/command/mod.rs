@@ -28,7 +28,9 @@ pub use background::{
 };
 pub use compound::{Parts, StopEnd, joined, stop_of};
 pub use frequency_range::{FrequencyRange, is_range_end};
-pub use holder::{Asks, Claim, Denial, HoldState, HoldView, Holding, Mode, Principal, Proof, Rules, Told, Verb, What};
+pub use holder::{
+    Asks, Claim, Denial, HoldState, HoldView, Holding, KeptReservation, Mode, Principal, Proof, Rules, Told, Verb, What,
+};
 pub use parameter::ParameterOrder;
 pub use priorities::{
     Commanded, Effect, Entry, Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, SlotWrite,

@@ -4,9 +4,11 @@ use std::time::{Instant, SystemTime};
 
 use super::{BusHandle, DriveHandle, Plant};
 use crate::command::{
-    self, Admitted, Asks, Authority, Command, Effect, HoldView, Origin, Refusal, Rules, Told, Urgency, Verb, What,
+    self, Admitted, Asks, Authority, Command, Effect, HoldView, KeptReservation, Origin, Refusal, Rules, Told, Urgency,
+    Verb, What,
 };
 use crate::event::{Event, EventKind, Events};
+use crate::process_image::Machine;
 
 impl BusHandle {
     /// Whether an order of that client renews the lease of a drive.
@@ -67,6 +69,20 @@ impl BusHandle {
         let mut origins = std::iter::once(&command.ticket).chain(command.joined.iter().map(|(ticket, _)| ticket));
         let renews = origins.any(|ticket| queue.hold_renews(command.drive, ticket.origin()));
         (queue.hold_stops_turn(command, now), renews)
+    }
+}
+
+impl BusHandle {
+    fn reservations(&self, now: Instant, time: SystemTime) -> Vec<(Instant, KeptReservation)> {
+        let queue = self.queue.lock();
+        let drives = self.image.drives.iter().enumerate();
+        let kept = drives.filter_map(|(index, image)| {
+            let (until, who, rank, lease) = queue.reservation(index, now)?;
+            let machine = self.image.spec.machine(&image.spec);
+            let stopped = time.checked_sub(lease.saturating_sub(until.saturating_duration_since(now)))?;
+            Some((until, KeptReservation::new(machine, (who, rank), stopped, lease)))
+        });
+        kept.collect()
     }
 }
 
@@ -170,6 +186,31 @@ impl DriveHandle {
 }
 
 impl Plant {
+    /// The reservations that stand, with when they end: what is kept for the next start. `now` is `time` on the calendar.
+    pub fn reservations(&self, now: Instant, time: SystemTime) -> Vec<(Instant, KeptReservation)> {
+        let of_bus = |bus: &BusHandle| bus.reservations(now, time);
+        let guarded = self.buses.iter().filter(|bus| bus.queue.is_guarded());
+        guarded.flat_map(of_bus).collect()
+    }
+
+    /// Goes on with reservations of before the start.
+    pub fn restore_reservations(&self, kept: &[KeptReservation], now: Instant, time: SystemTime) {
+        for one in kept {
+            let machine = Machine {
+                port: one.port.clone(),
+                address: one.address,
+                profile: one.profile.clone(),
+            };
+            let Some(drive) = self.drive_at(&machine) else { continue };
+            let mut queue = drive.bus.queue.lock();
+            let rules = queue.rules().cloned();
+            let goes_on = rules.and_then(|rules| one.goes_on(&rules, now, time));
+            if let Some((who, until)) = goes_on {
+                queue.reserve(drive.index, who, until);
+            }
+        }
+    }
+
     /// Publishes what happened to the holds of the drives until `now`, which is `time` on the calendar; to be called several times a
     /// second.
     pub fn tell_holds(&self, now: Instant, time: SystemTime) {

@@ -410,6 +410,21 @@ impl Holding {
         }
     }
 
+    /// The reservation that stands: for whom, and until when.
+    pub fn reservation(&self) -> Option<(&Claim, Instant)> {
+        match &self.state {
+            State::Reserved(by, until) => Some((by, *until)),
+            State::Free | State::Held(..) => None,
+        }
+    }
+
+    /// A stop before the start of the process reserved the drive.
+    pub fn reserve(&mut self, who: Claim, until: Instant) {
+        if let State::Free = self.state {
+            self.state = State::Reserved(who, until);
+        }
+    }
+
     /// Whether that client holds the drive.
     pub fn is_held_by(&self, who: &Claim, now: Instant) -> bool {
         self.held(now).is_some_and(|(by, _)| by.is(who))

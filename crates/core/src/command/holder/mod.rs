@@ -7,11 +7,13 @@
 mod asks;
 mod denial;
 mod holding;
+mod kept;
 mod principal;
 
 pub use asks::Asks;
 pub use denial::Denial;
 pub use holding::{HoldState, HoldView, Holding, Told, Verb, What};
+pub use kept::KeptReservation;
 pub use principal::{Claim, Mode, Principal, Proof, Rules};
 
 #[cfg(test)]

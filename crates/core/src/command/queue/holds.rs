@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use super::{CommandQueue, Pending};
 use crate::command::{
@@ -256,6 +256,19 @@ impl Pending {
     /// The rules, where `[authority]` is on.
     pub fn rules(&self) -> Option<&Arc<Rules>> {
         self.holds.rules.as_ref()
+    }
+
+    /// The reservation of a drive: until when, for whom by name and rank, and for how long such a one lasts.
+    pub fn reservation(&self, drive: usize, now: Instant) -> Option<(Instant, String, String, Duration)> {
+        let rules = self.holds.rules.as_ref()?;
+        let (who, until) = self.holds.drives.get(&drive)?.reservation()?;
+        let rank = rules.rank(who.rank).to_string();
+        (until > now).then(|| (until, who.name.to_string(), rank, rules.lease))
+    }
+
+    /// A stop before the start of the process reserved the drive.
+    pub fn reserve(&mut self, drive: usize, who: Claim, until: Instant) {
+        self.holds.with(drive, |holding, _, _| holding.reserve(who, until));
     }
 
     /// The hold of a drive, for the bus that takes the place of this one.
