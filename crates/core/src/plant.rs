@@ -302,7 +302,7 @@ impl DriveHandle {
 
     /// Whether the drive of `reading` runs, and why not.
     pub fn why(&self, reading: &Reading<'_>) -> Explanation {
-        explain(reading, &self.bus.image, &self.writes)
+        self.with_reservation(explain(reading, &self.bus.image, &self.writes), reading.now)
     }
 
     /// Whether the bus is open.

@@ -4,9 +4,10 @@ use std::time::{Instant, SystemTime};
 
 use super::{BusHandle, DriveHandle, Plant};
 use crate::command::{
-    self, Admitted, Asks, Authority, Command, Effect, HoldView, KeptReservation, Origin, Refusal, Rules, Told, Urgency,
-    Verb, What,
+    self, Admitted, Asks, Authority, Command, Effect, HoldState, HoldView, KeptReservation, Origin, Refusal, Rules,
+    Told, Urgency, Verb, What,
 };
+use crate::drive::why::{Cause, Explanation};
 use crate::event::{Event, EventKind, Events};
 use crate::process_image::Machine;
 
@@ -148,6 +149,17 @@ impl DriveHandle {
         }
     }
 
+    /// The name of that client among the principals, and the ranks below its own; nothing where it is none.
+    pub fn rank_of(&self, origin: &Origin) -> Option<(String, Vec<String>)> {
+        let rules = match self.bus.queue.is_guarded() {
+            true => self.bus.queue.lock().rules().cloned()?,
+            false => return None,
+        };
+        let claim = rules.claim_of(origin)?;
+        let below = rules.ranks.iter().skip(claim.rank + 1).map(ToString::to_string);
+        Some((claim.name.to_string(), below.collect()))
+    }
+
     /// The heartbeat of a client that may command: the lease of the drive runs anew, unless another client's silence counts, and
     /// so does its hold.
     pub fn heartbeat(&self, origin: &Origin, now: Instant) {
@@ -161,6 +173,31 @@ impl DriveHandle {
         if renews {
             self.image.renew_lease(now);
         }
+    }
+
+    /// With the stop behind which the drive is reserved.
+    pub(super) fn with_reservation(&self, mut why: Explanation, now: Instant) -> Explanation {
+        let view = self.hold_view(None, now).map(|(view, _)| view);
+        let Some(view) = view.filter(|view| view.state == HoldState::Reserved && why.runs == Some(false)) else {
+            return why;
+        };
+        let (who, rank) = (view.holder.unwrap_or_default(), view.rank.unwrap_or_default());
+        let left = view.left_s.unwrap_or_default();
+        let mut evidence = format!("{who} ({rank}) stopped it; reserved for another {left} s");
+        let mut remedy = format!("wait, or have {who} release it; ranks from {rank} up take it");
+        if let Some(repeater) = self.bus.queue.lock().repeater(self.index) {
+            evidence += &format!("; {repeater} repeats its stop, which ended the hold of another client");
+            remedy = format!(
+                "set cyclic = true for principal `{repeater}` if it writes its command word all the time; else {remedy}"
+            );
+        }
+        why.causes.push(Cause {
+            cause: HoldState::Reserved.name().to_string(),
+            evidence,
+            age_ms: None,
+            remedy,
+        });
+        why
     }
 
     /// A client gave back what it had asked for, and nothing is sent for it.

@@ -226,7 +226,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
         }
         if let Some((view, _)) = drive.hold_view(None, now) {
             if let (HoldState::Held, Some(rank)) = (view.state, &view.rank) {
-                all.add(held, labels.with("rank", rank), SeriesValue::Value(1.0));
+                all.add(held, labels.with("rank", rank.to_string()), SeriesValue::Value(1.0));
             }
             let count = drive.bus.queue.lock().unheld(drive.index);
             all.add(unheld, labels.clone(), SeriesValue::Count(count));

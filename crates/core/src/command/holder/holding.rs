@@ -10,6 +10,8 @@ use super::{Asks, Claim, Denial, Mode, Rules};
 const FORGOTTEN_AFTER: u32 = 10;
 /// The name of the gateway's own stop of a drive whose client fell silent.
 const SUPERVISION: &str = "supervision";
+/// Clients whose last word is remembered.
+const MOST_STOOD: usize = 256;
 
 /// What a client does with the hold of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -129,8 +131,10 @@ pub struct Holding {
     last: Option<Claim>,
     /// No more of them than principals.
     waiting: Vec<Waiting>,
-    /// The cyclic clients whose last word was a stop.
+    /// The clients whose last word was a stop.
     stood: Vec<Arc<str>>,
+    /// One that is not cyclic and ended the hold of another by a stop that repeated its last one.
+    repeater: Option<Arc<str>>,
 }
 
 impl Holding {
@@ -233,6 +237,10 @@ impl Holding {
     pub fn accepted(&mut self, who: Option<&Claim>, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
         self.settle(rules, now, told);
         let repeats = asks == Asks::Stop && who.is_some_and(|who| self.repeats(who));
+        let ends = |who: &&Claim| asks == Asks::Stop && self.held(now).is_some_and(|(by, _)| !by.is(who));
+        if let Some(who) = who.filter(|who| self.stood.contains(&who.name)).filter(ends) {
+            self.repeater = Some(who.name.clone());
+        }
         self.note_word(who, asks);
         match (asks, who) {
             (Asks::Nothing, _) => {}
@@ -393,8 +401,9 @@ impl Holding {
         self.last = self.last.take().filter(|last| rules.knows(last));
         self.last.iter_mut().for_each(rank_of);
         self.waiting.retain(|waiting| rules.knows(&waiting.who));
-        let is_cyclic = |name: &Arc<str>| rules.principals.iter().any(|p| p.cyclic && p.name == *name);
-        self.stood.retain(is_cyclic);
+        let is_known = |name: &Arc<str>| rules.principals.iter().any(|p| p.name == *name);
+        self.stood.retain(is_known);
+        self.repeater = None;
     }
 
     /// Ends the hold, for that reason.
@@ -408,6 +417,11 @@ impl Holding {
             None => true,
             Some(last) => who.is_some_and(|who| who.is(last)),
         }
+    }
+
+    /// The client whose repeated stops end the holds of others: it should be cyclic.
+    pub fn repeater(&self) -> Option<&Arc<str>> {
+        self.repeater.as_ref()
     }
 
     /// The reservation that stands: for whom, and until when.
@@ -462,11 +476,15 @@ impl Holding {
     }
 
     fn note_word(&mut self, who: Option<&Claim>, asks: Asks) {
-        let Some(who) = who.filter(|who| who.cyclic) else {
-            return;
-        };
+        let Some(who) = who else { return };
         match asks {
-            Asks::Stop if !self.stood.contains(&who.name) => self.stood.push(who.name.clone()),
+            Asks::Stop if !self.stood.contains(&who.name) => {
+                // Beside the principals there may be any number of users of the machine.
+                if self.stood.len() >= MOST_STOOD {
+                    self.stood.remove(0);
+                }
+                self.stood.push(who.name.clone());
+            }
             Asks::Run => self.stood.retain(|name| *name != who.name),
             Asks::Stop | Asks::Steer | Asks::Other | Asks::Nothing => {}
         }

@@ -330,6 +330,14 @@ fn a_cyclic_client_stops_once() {
     assert_eq!(drive.order("cycle", Asks::Run), "held_by_other");
     assert_eq!(drive.order("cycle", Asks::Stop), "ok", "the change to stop is one");
     assert_eq!(drive.state(), "reserved cycle 30");
+    // One that is not said to be cyclic is found out.
+    let mut drive = Drive::new();
+    drive.order("plc", Asks::Stop);
+    drive.act("op", Verb::Take);
+    assert_eq!(drive.holding.repeater(), None);
+    drive.order("plc", Asks::Stop);
+    assert_eq!(drive.state(), "reserved plc 30");
+    assert_eq!(drive.holding.repeater().map(|name| &**name), Some("plc"));
     // Whoever insists, stops.
     let mut drive = Drive::new();
     let cycle = drive.who("cycle").unwrap();

@@ -248,6 +248,11 @@ impl Pending {
         Some((holding.view(rules, now), own))
     }
 
+    /// The client whose repeated stops end the holds of others.
+    pub fn repeater(&self, drive: usize) -> Option<Arc<str>> {
+        self.holds.drives.get(&drive)?.repeater().cloned()
+    }
+
     /// Orders that were carried out in advisory mode though another client held the drive.
     pub fn unheld(&self, drive: usize) -> u64 {
         self.holds.unheld.get(&drive).copied().unwrap_or_default()

@@ -324,11 +324,14 @@ fn description(drive: &DriveHandle, operator: &Operator) -> Json_ {
             })
         })
         .collect();
+    let rank = drive.rank_of(&operator.origin());
     json!({
         "drive": spec.name,
         "points": points,
         "lease_ms": spec.supervision.as_ref().map(|lease| u64::try_from(lease.timeout.as_millis()).unwrap_or(u64::MAX)),
         "commanded_last": drive.commander().as_ref() == Some(&operator.login),
+        "principal": rank.as_ref().map(|(name, _)| name),
+        "outranks": rank.map(|(_, below)| below),
     })
 }
 
