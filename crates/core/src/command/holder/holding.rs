@@ -419,6 +419,14 @@ impl Holding {
         }
     }
 
+    /// The holder, unless its hold was seen to end.
+    pub fn holder(&self) -> Option<&Arc<str>> {
+        match &self.state {
+            State::Held(by, _) => Some(&by.name),
+            State::Free | State::Reserved(..) => None,
+        }
+    }
+
     /// The client whose repeated stops end the holds of others: it should be cyclic.
     pub fn repeater(&self) -> Option<&Arc<str>> {
         self.repeater.as_ref()

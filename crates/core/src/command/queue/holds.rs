@@ -19,7 +19,7 @@ pub(super) struct Holds {
     rules: Option<Arc<Rules>>,
     drives: BTreeMap<usize, Holding>,
     told: Vec<(usize, Told)>,
-    /// Drives that another client took from their holder since the bus last asked.
+    /// Drives that a client took since the bus last asked.
     taken: Vec<usize>,
     /// Orders that were carried out, or would have been refused, though another client held the drive.
     unheld: BTreeMap<usize, u64>,
@@ -30,7 +30,13 @@ impl Holds {
     fn with<T>(&mut self, drive: usize, change: impl FnOnce(&mut Holding, &Rules, &mut Vec<Told>) -> T) -> Option<T> {
         let rules = self.rules.as_ref()?;
         let mut told = Vec::new();
-        let changed = change(self.drives.entry(drive).or_default(), rules, &mut told);
+        let holding = self.drives.entry(drive).or_default();
+        let before = holding.holder().cloned();
+        let changed = change(holding, rules, &mut told);
+        let is_new = holding.holder().is_some_and(|holder| Some(holder) != before.as_ref());
+        if is_new && !self.taken.contains(&drive) {
+            self.taken.push(drive);
+        }
         self.told.extend(told.into_iter().map(|told| (drive, told)));
         let beyond = self.told.len().saturating_sub(MOST_TOLD);
         self.told.drain(..beyond);
@@ -179,9 +185,6 @@ impl Pending {
         })?;
         if acted.is_ok() && matches!(verb, Verb::Take | Verb::Break) {
             self.drop_of_others(drive, now);
-            if verb == Verb::Break && !self.holds.taken.contains(&drive) {
-                self.holds.taken.push(drive);
-            }
         }
         Some(acted.map_err(|denial: Denial| denial.refusal(&rules)))
     }
@@ -201,7 +204,7 @@ impl Pending {
         }
     }
 
-    /// Drives that were taken from their holder since the last call: nothing that was begun for it goes on.
+    /// Drives that have another holder since the last call: nothing that was begun for others goes on.
     pub fn take_taken(&mut self) -> Vec<usize> {
         std::mem::take(&mut self.holds.taken)
     }
