@@ -27,7 +27,7 @@ pub(super) fn parse_rank(text: &str) -> Result<String, Finding> {
     match !text.is_empty() && text.len() <= 64 && text.chars().all(is_name) {
         true => Ok(text.to_string()),
         false => Err(Finding::new(
-            format!("`{text}` is no name of a rank"),
+            format!("`{text}` is not a name of a rank"),
             "use letters, digits, - and _",
         )),
     }
@@ -148,8 +148,8 @@ fn unique(tables: &[Reader<'_>], principals: &[Option<Principal>]) {
             if let Some(other) = other {
                 table.problem(
                     key,
-                    format!("{key} = {value} is told of principal `{other}` already"),
-                    "a client must be one principal: name it once, or write a longer prefix",
+                    format!("{key} = {value} names principal `{other}` already"),
+                    "name each client once, or write a longer prefix",
                 );
             }
         }

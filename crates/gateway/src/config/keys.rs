@@ -625,7 +625,7 @@ keys! {
 
     /// [Who holds a drive](commands.md#who-holds-a-drive), where several clients command it.
     AUTHORITY: AuthorityTable {
-        /// `"exclusive"`: only its holder commands a drive, stops apart. `"advisory"`: all is told, nothing refused.
+        /// `"exclusive"`: only its holder commands a drive, stops apart. `"advisory"`: all is reported, nothing refused.
         mode: Option<authority::Mode> = Words(&[
             ("off", None), ("advisory", Some(authority::Mode::Advisory)), ("exclusive", Some(authority::Mode::Exclusive)),
         ]), default "off";
@@ -660,9 +660,9 @@ keys! {
         sparkplug: bool = Flag, default false;
         /// Its addresses over BACnet; the longest prefix counts.
         bacnet: Vec<IpNet> = NETWORKS, default [];
-        /// Its user, or user id, at the local socket. Whoever else opens the socket has the first rank.
+        /// Its user, or user id, at the local socket. Anyone else there has the first rank.
         socket: String = STRING, or "none";
-        /// It writes its command word all the time, as most PLCs do: a word that repeats its last stop is no new stop.
+        /// It writes its command word all the time, as most PLCs do: a word that repeats its last stop is not a new stop.
         cyclic: bool = Flag, default false;
     }
 

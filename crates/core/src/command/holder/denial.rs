@@ -42,7 +42,7 @@ impl Denial {
         };
         match self {
             Denial::Nobody => Refusal::NotAllowed(
-                "this client is no principal of [authority], so it may only stop; nothing was written".to_string(),
+                "this client is not a principal of [authority], so it may only stop; nothing was written".to_string(),
             ),
             Denial::Held(by, left) => {
                 let keeps = format!("holds the drive for {} s, unless that is renewed", seconds(*left));
