@@ -441,6 +441,31 @@ mod tests {
     use crate::process_image::{DriveImage, DriveSpec, Link};
 
     #[test]
+    fn topics_that_name_a_client_are_recognised() {
+        let topics = Topics::new("plant/a", "hall");
+        let set = |topic| topics.parse_set(topic).map(|t| (t.drive, t.who, t.point));
+        assert_eq!(set("plant/a/hall/drive/p1/as/x/set"), Some(("p1", Some("x"), None)));
+        assert_eq!(
+            set("plant/a/hall/drive/p1/as/x/set/run"),
+            Some(("p1", Some("x"), Some("run")))
+        );
+        assert_eq!(set("plant/a/hall/drive/p1/as/set"), None);
+        let hold = |topic| topics.parse_hold(topic).map(|t| (t.drive, t.who));
+        assert_eq!(hold("plant/a/hall/drive/p1/hold"), Some(("p1", None)));
+        assert_eq!(hold("plant/a/hall/drive/p1/as/x/hold"), Some(("p1", Some("x"))));
+        assert_eq!(hold("plant/a/hall/drive/p1/as/x/y/hold"), None);
+        assert_eq!(topics.parse_stop_all("plant/a/hall/set/stop"), Some(None));
+        assert_eq!(topics.parse_stop_all("plant/a/hall/as/x/stop"), Some(Some("x")));
+        for other in [
+            "plant/a/hall/as/x/y/stop",
+            "plant/a/hall/as/stop",
+            "plant/b/hall/set/stop",
+        ] {
+            assert_eq!(topics.parse_stop_all(other), None, "{other}");
+        }
+    }
+
+    #[test]
     fn set_topics_are_recognised() {
         let topics = Topics::new("plant/a", "hall");
         let parse = |topic| topics.parse_set(topic).map(|t| (t.drive, t.point));
@@ -494,6 +519,7 @@ mod tests {
         let profile = Profile::parse("m.toml", source, false).unwrap();
         let state = |value: Option<i64>| {
             let shown = StateContent {
+                hold: None,
                 state: Some(State::NotReady),
                 quality: Quality::Good,
                 blocked_by: Vec::new(),

@@ -372,12 +372,17 @@ fn renew(drive: &DriveHandle, operator: &Operator, now: Instant) -> Result<(), &
     if spec.access != Access::Control {
         return Err("the drive is only monitored; nothing was renewed");
     }
+    let origin = operator.origin();
+    if drive.hold_view(Some(&origin), now).is_some_and(|(_, own)| own) {
+        drive.heartbeat(&origin, now);
+        return Ok(());
+    }
     if spec.supervision.is_none() {
         return Err("the drive has no `supervision`, so there is no lease to renew");
     }
     match drive.commander() {
         Some(login) if login == operator.login => {
-            drive.heartbeat(&operator.origin(), now);
+            drive.heartbeat(&origin, now);
             Ok(())
         }
         _ => Err("this login was not the last to command the drive; nothing was renewed"),
