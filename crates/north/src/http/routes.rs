@@ -25,7 +25,7 @@ use super::{
     Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, expect, line, page, points, query, recordings,
     streams, trend,
 };
-use crate::command::SourceKind;
+use crate::command::{Proof, SourceKind};
 use crate::connection_limit::{ConnectionLimit, Limits, Place};
 use crate::local::control::{self, Control};
 use crate::log_throttle::LogThrottle;
@@ -75,6 +75,8 @@ pub(crate) struct LocalUser {
     pub(crate) kind: SourceKind,
     /// Likewise, who.
     pub(crate) who: Arc<str>,
+    /// What the connection proves of it.
+    pub(crate) proof: Proof,
     /// The gateway itself, where that has a configuration file.
     pub(crate) control: Option<Control>,
 }
@@ -174,6 +176,10 @@ pub(super) fn router(
             get(operating::commands_of).post(operating::command),
         )
         .route("/api/v1/drives/{name}/heartbeat", post(operating::heartbeat))
+        .route(
+            "/api/v1/drives/{name}/hold",
+            get(operating::hold_of).post(operating::hold),
+        )
         .route("/api/v1/stop", post(operating::stop))
         .fallback(unknown)
         .with_state(app.clone())

@@ -93,6 +93,8 @@ impl InProcess {
         let user = LocalUser {
             kind: SourceKind::CommandLine,
             who: who.into(),
+            // Whoever may open the port holds it as whoever opens the socket does.
+            proof: Proof::Uid(rustix::process::geteuid().as_raw()),
             control: None,
         };
         InProcess {

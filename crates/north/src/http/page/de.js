@@ -126,6 +126,11 @@ const texts = {
   "Speed reference": "Drehzahlsollwert",
   "Start": "Start",
   "Start now": "Jetzt starten",
+  "Take over and start": "Übernehmen und starten",
+  "Take over and start …": "Übernehmen und starten …",
+  "held by {holder} ({rank}), {left} s left": "belegt von {holder} ({rank}), noch {left} s",
+  "stopped by {holder} ({rank}), reserved for {left} s": "gestoppt von {holder} ({rank}), noch {left} s reserviert",
+  "under local control": "Vor-Ort-Steuerung",
   "Start {direction}": "Start {direction}",
   "Start {drive}": "{drive} starten",
   "Start {drive} {direction}, {reference}? The motor turns.": "{drive} {direction} starten, {reference}? Der Motor dreht sich.",
@@ -293,9 +298,9 @@ const words = {
   not_confirmed: "nicht bestätigt", restarted: "neu gestartet", unlike_profile: "anders als Profil", selection_differs: "Prozessdaten anders als Profil", foreign_command: "fremder Befehl",
   parameters_changed: "Parameter geändert", restore_unfinished: "Rückspielen unvollendet", recording: "Aufzeichnung", bus_up: "Leitung verbunden",
   bus_down: "Leitung unterbrochen", diagnosis: "Diagnose", reload_refused: "Neuladen abgelehnt", lost: "verloren", refused_stop: "Stopp abgelehnt",
-  line_errors: "Leitungsfehler", point: "Grenzwert", command: "Befehl",
+  released: "freigegeben", hold_broken: "übernommen", line_errors: "Leitungsfehler", point: "Grenzwert", command: "Befehl",
   // Why a drive does not run.
-  no_dc_link: "kein Zwischenkreis", held: "gesperrt", order_refused: "Startbefehl abgelehnt", order_expired: "Startbefehl abgelaufen",
+  no_dc_link: "kein Zwischenkreis", held: "belegt", reserved: "nach Stopp reserviert", order_refused: "Startbefehl abgelehnt", order_expired: "Startbefehl abgelaufen",
   order_unanswered: "Startbefehl unbeantwortet", stopped_by_order: "durch Befehl gestoppt", fault_was_reset: "Störung wurde quittiert",
   stopped_by_gateway: "vom Gateway gestoppt", other_master: "anderer Master", no_run_order: "kein Startbefehl", reference_zero: "Sollwert null",
   direction_blocked: "Drehrichtung gesperrt", not_known: "nicht bekannt", local_control: "Vor-Ort-Steuerung", undervoltage: "Unterspannung", bypass: "Bypass",
@@ -305,7 +310,7 @@ const words = {
   expired: "abgelaufen", replaced: "ersetzt", purged: "durch Stopp verworfen", withdrawn: "zurückgezogen", not_taken: "nicht übernommen", interrupted: "unterbrochen",
   not_stopped: "nicht gestoppt", stop_only: "nur Stopp", queue_full: "Warteschlange voll", shutting_down: "Gateway wird beendet", not_allowed: "nicht erlaubt",
   not_writable: "nicht schreibbar", bad_value: "falscher Wert", shutdown: "Beenden", local_socket: "lokaler Zugang", command_line: "Kommandozeile", schedule: "Zeitplan",
-  slot: "Werkzeugzugang",
+  slot: "Werkzeugzugang", held_by_other: "von anderem belegt", needs_take: "erst übernehmen",
   // How sure a diagnosis is.
   fits: "passt", likely: "wahrscheinlich", certain: "sicher",
 };
