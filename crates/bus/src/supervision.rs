@@ -51,6 +51,15 @@ impl Lease {
         Lease(State::Held(since))
     }
 
+    /// The same when its time stood for so long.
+    #[must_use]
+    pub fn after(self, stood: Duration) -> Lease {
+        match self.0 {
+            State::Held(since) => Lease(State::Held(since + stood)),
+            _ => self,
+        }
+    }
+
     /// What ends with it where no drive goes on with it, in words; nothing of one that has ended, or never began.
     pub fn ends(self) -> Option<&'static str> {
         match self.0 {

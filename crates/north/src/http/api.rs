@@ -6,6 +6,7 @@ use std::time::{Duration, Instant, SystemTime};
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
+use crate::command_json::HoldFields;
 use crate::diagnosis::{self, Counted, Verdict};
 use crate::drive::why::Cause;
 use crate::drive::{self, ModelPoint, Quality, State};
@@ -68,6 +69,10 @@ pub(super) struct Drive<'d> {
     /// Why it takes no commands but stops.
     #[serde(skip_serializing_if = "Option::is_none")]
     held: Option<String>,
+    /// Who holds it, where `[authority]` is on.
+    #[serde(flatten)]
+    #[schema(value_type = HoldFields)]
+    hold: Option<HoldFields>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
     /// `null` where the drive does not say whether it runs.
@@ -111,6 +116,7 @@ impl<'d> Drive<'d> {
             blocked_by: why.words(),
             why: why.causes,
             held: image.hold.why().map(|why| why.to_string()),
+            hold: drive.hold_view(None, clock.now).map(|(view, _)| view.into()),
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
             starts: tells_running.then_some(totals.starts),

@@ -27,8 +27,8 @@ use super::{
     Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, expect, line, page, points, query, recordings,
     streams, trend,
 };
-use crate::command::SourceKind;
-use crate::command_json::{CommandResult, StopBody};
+use crate::command::{Proof, SourceKind};
+use crate::command_json::{CommandResult, HoldReply, StopBody};
 use crate::connection_limit::{ConnectionLimit, Limits, Place};
 use crate::history::Entry;
 use crate::local::control::{self, Control};
@@ -80,6 +80,8 @@ pub(crate) struct LocalUser {
     pub(crate) kind: SourceKind,
     /// Likewise, who.
     pub(crate) who: Arc<str>,
+    /// What the connection proves of it.
+    pub(crate) proof: Proof,
     /// The gateway itself, where that has a configuration file.
     pub(crate) control: Option<Control>,
 }
@@ -247,6 +249,16 @@ fn described() -> Api {
             "/api/v1/drives/{name}/heartbeat",
             Doc::text("Renews the lease of a drive; 204", TEXT),
             operating::heartbeat,
+        )
+        .get(
+            "/api/v1/drives/{name}/hold",
+            Doc::object::<HoldReply<'_>>("Who holds a drive"),
+            operating::hold_of,
+        )
+        .post(
+            "/api/v1/drives/{name}/hold",
+            Doc::object::<HoldReply<'_>>("Takes, renews, releases or breaks the hold").body::<operating::HoldAct>(),
+            operating::hold,
         )
         .get("/api/v1/buses", Doc::list::<api::Bus<'_>>("All buses"), buses)
         .get(

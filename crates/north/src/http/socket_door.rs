@@ -20,7 +20,7 @@ use super::operating::Operating;
 use super::routes::{self, Client, LocalUser, Reached};
 use super::{Coverage, GRACE, HEAD_TIMEOUT, MAX_HEAD};
 use crate::NorthStats;
-use crate::command::{Authority, SourceKind};
+use crate::command::{Authority, Proof, SourceKind};
 use crate::connection_limit::{ConnectionLimit, Limits, Newcomer, Place};
 use crate::plant::SharedPlant;
 
@@ -93,6 +93,8 @@ impl InProcess {
         let user = LocalUser {
             kind: SourceKind::CommandLine,
             who: who.into(),
+            // Whoever may open the port holds it as whoever opens the socket does.
+            proof: Proof::Uid(rustix::process::geteuid().as_raw()),
             control: None,
         };
         InProcess {

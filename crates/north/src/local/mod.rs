@@ -22,7 +22,7 @@ use tokio_util::sync::CancellationToken;
 
 use self::path::Bound;
 use crate::NorthStats;
-use crate::command::{Authority, SourceKind};
+use crate::command::{Authority, Proof, SourceKind};
 use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Limits, Newcomer};
 use crate::http::{LocalUser, SocketDoor};
 use crate::plant::SharedPlant;
@@ -148,6 +148,7 @@ async fn serve(stream: UnixStream, door: Arc<Door>, permit: ConnectionPermit) {
             let user = LocalUser {
                 kind: SourceKind::LocalSocket,
                 who: format!("uid {}", peer.uid()).into(),
+                proof: Proof::Uid(peer.uid()),
                 control: door.control.clone(),
             };
             door.http.serve(stream, user, place).await;

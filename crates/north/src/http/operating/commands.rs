@@ -81,7 +81,7 @@ fn status(outcome: &Outcome) -> StatusCode {
         Outcome::Acknowledged(_) => StatusCode::OK,
         Outcome::Refused(Refusal::NotAllowed(_)) => StatusCode::FORBIDDEN,
         Outcome::Refused(Refusal::UnknownDrive(_)) => StatusCode::NOT_FOUND,
-        Outcome::Refused(Refusal::HeldByOther(_)) => StatusCode::CONFLICT,
+        Outcome::Refused(Refusal::HeldByOther(_) | Refusal::NeedsTake(_)) => StatusCode::CONFLICT,
         Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
         Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::NotStopped => StatusCode::CONFLICT,
         // Of what was not carried out.
@@ -193,11 +193,13 @@ impl Operator {
     /// As the audit shows it. All that a user does counts as one client.
     pub(in crate::http) fn origin(&self) -> Origin {
         if self.kind != SourceKind::Http {
-            return Origin::new(self.kind, self.user.to_string()).with_login(self.login.clone());
+            let origin = Origin::new(self.kind, self.user.to_string());
+            return origin.with_login(self.login.clone()).proven(self.proof.clone());
         }
         let client = format!("{} {}", self.kind.name(), self.user);
         let who = format!("{} {}", self.user, self.address);
-        Origin::of(client.into(), self.kind, who).with_login(self.login.clone())
+        let origin = Origin::of(client.into(), self.kind, who);
+        origin.with_login(self.login.clone()).proven(self.proof.clone())
     }
 }
 
@@ -341,6 +343,10 @@ pub(in crate::http) struct Commandable<'d> {
     lease_ms: Option<u64>,
     /// This login commanded the drive last.
     commanded_last: bool,
+    /// Name of the client in `[authority]`.
+    principal: Option<String>,
+    /// The ranks below its own.
+    outranks: Option<Vec<String>>,
 }
 
 #[derive(Debug, Serialize, utoipa::ToSchema)]
@@ -373,11 +379,15 @@ fn description<'d>(drive: &'d DriveHandle, operator: &Operator) -> Commandable<'
         }
     };
     let lease = spec.supervision.as_ref().map(|lease| lease.timeout.as_millis());
+    let rank = drive.rank_of(&operator.origin());
+    let (principal, outranks) = rank.unzip();
     Commandable {
         drive: &spec.name,
         points: writable.map(point).collect(),
         lease_ms: lease.map(|lease| u64::try_from(lease).unwrap_or(u64::MAX)),
         commanded_last: drive.commander().as_ref() == Some(&operator.login),
+        principal,
+        outranks,
     }
 }
 
@@ -415,12 +425,17 @@ fn renew(drive: &DriveHandle, operator: &Operator, now: Instant) -> Result<(), &
     if spec.access != Access::Control {
         return Err("the drive is only monitored; nothing was renewed");
     }
+    let origin = operator.origin();
+    if drive.hold_view(Some(&origin), now).is_some_and(|(_, own)| own) {
+        drive.heartbeat(&origin, now);
+        return Ok(());
+    }
     if spec.supervision.is_none() {
         return Err("the drive has no `supervision`, so there is no lease to renew");
     }
     match drive.commander() {
         Some(login) if login == operator.login => {
-            drive.image.renew_lease(now);
+            drive.heartbeat(&origin, now);
             Ok(())
         }
         _ => Err("this login was not the last to command the drive; nothing was renewed"),

@@ -6,6 +6,7 @@
 
 mod commands;
 mod cookies;
+mod hold;
 mod login;
 pub(super) mod parameters;
 mod record;
@@ -37,11 +38,12 @@ use self::verifier::Verifier;
 use super::routes::{LocalUser, Reached};
 use super::users::{MAX_PASSWORD, User, Users};
 use crate::NorthStats;
-use crate::command::{Authority, SourceKind};
+use crate::command::{Authority, Proof, SourceKind};
 use crate::log_throttle::LogThrottle;
 
 pub(crate) use self::commands::PostedCommands;
 pub(super) use self::commands::{Commandable, command, commands_of, heartbeat};
+pub(super) use self::hold::{HoldAct, hold, hold_of};
 pub(super) use self::login::{SessionReply, log_in, log_out, session};
 pub(super) use self::record::record;
 pub(super) use self::stop_all::stop;
@@ -92,6 +94,7 @@ pub(super) struct Operator {
     address: IpAddr,
     /// The way in.
     kind: SourceKind,
+    proof: Proof,
     /// The cookie of its session; `None` for a program.
     cookie: Option<String>,
 }
@@ -104,6 +107,7 @@ impl Operator {
             user: local.who.clone(),
             address,
             kind: local.kind,
+            proof: local.proof.clone(),
             cookie: None,
         }
     }
@@ -222,6 +226,7 @@ impl Operating {
             let user = self.verified(&credentials, address, Source::of(address)).await?;
             return Ok(Operator {
                 login: user.clone(),
+                proof: Proof::User(user.clone()),
                 user,
                 address,
                 kind: SourceKind::Http,
@@ -231,6 +236,7 @@ impl Operating {
         let cookie = cookies.session(headers).ok_or(Denied::NotLoggedIn)?;
         let session = self.session(&cookie, Instant::now()).ok_or(Denied::SessionEnded)?;
         Ok(Operator {
+            proof: Proof::User(session.user.clone()),
             user: session.user,
             login: session.login,
             address,
@@ -365,6 +371,7 @@ impl Operating {
             login: session.login.clone(),
             address,
             kind: SourceKind::Http,
+            proof: Proof::User(user.clone()),
             cookie: Some(cookie.clone()),
         };
         self.used(&operator, now);
@@ -448,7 +455,7 @@ pub fn basic_authorization(user_and_password: &str) -> String {
 pub(super) fn is_operating(path: &str) -> bool {
     let of_drive = |rest: &str| {
         rest.split_once('/')
-            .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat"))
+            .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat" | "hold"))
     };
     is_session(path)
         || path == "/api/v1/stop"
