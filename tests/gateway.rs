@@ -21,6 +21,7 @@ mod gateway {
     mod families;
     mod fleet;
     mod history;
+    mod holder;
     mod listening;
     mod living;
     mod local_socket;

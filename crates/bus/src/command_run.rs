@@ -20,7 +20,9 @@ use self::parameter::ParameterRun;
 use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_of, unsendable, write_on_change};
 use super::confirm::{self, Effect};
 use crate::codec::{Exception, Reply, Table};
-use crate::command::{Command, Interruption, Order, Outcome, Receipt, Refusal, SourceKind, Ticket, Touched, Urgency};
+use crate::command::{
+    Command, Interruption, Order, Origin, Outcome, Receipt, Refusal, SourceKind, Ticket, Touched, Urgency,
+};
 use crate::drive::Profile;
 
 /// Stops to a drive that go before the end of a pulse that was begun.
@@ -107,6 +109,8 @@ pub struct CommandRun {
     started: bool,
     /// A stop as it was ordered, for a bus that takes the place of this one.
     stop: Option<Order>,
+    /// The silence of whoever gave it is the one that counts for supervision.
+    pub renews: bool,
 }
 
 impl CommandRun {
@@ -189,6 +193,7 @@ impl CommandRun {
             reads_back,
             started: false,
             stop,
+            renews: true,
         }
     }
 
@@ -246,6 +251,16 @@ impl CommandRun {
         let own = [SourceKind::Supervision, SourceKind::Shutdown];
         let kind = |ticket: &Ticket| ticket.origin().kind;
         self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| !own.contains(&kind(ticket)))
+    }
+
+    /// Whether it renews the lease of its drive: a client gave it whose silence counts.
+    pub fn is_heard(&self) -> bool {
+        self.renews && self.is_of_client()
+    }
+
+    /// Those who gave it.
+    pub fn origins(&self) -> impl Iterator<Item = &Origin> {
+        self.tickets.iter().map(Ticket::origin)
     }
 
     /// Whether a tool gave it: its share of the line is that of background exchanges.
@@ -534,6 +549,13 @@ impl CommandRun {
         // The stop that came in is on its way.
         self.started = false;
         self.cut_off(self.unless_begun(Outcome::Purged, Interruption::Stop));
+        self.actions.is_empty().then(|| self.success())
+    }
+
+    /// Another client took the drive: it goes no further, but the motor is left as it is. The outcome, if it is over by that.
+    pub fn taken(&mut self, refusal: Refusal) -> Option<Outcome> {
+        self.started = false;
+        self.cut_off(self.unless_begun(Outcome::Refused(refusal), Interruption::Taken));
         self.actions.is_empty().then(|| self.success())
     }
 

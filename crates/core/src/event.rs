@@ -81,11 +81,17 @@ pub enum EventKind {
     RestoreUnfinished,
     /// A verdict about a line came, became firmer, or went.
     Diagnosis,
+    /// A client took hold of a drive.
+    Held,
+    /// The hold of a client ended.
+    Released,
+    /// A client took a drive from its holder.
+    HoldBroken,
 }
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 25] = [
+    pub const ALL: [EventKind; 28] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -111,6 +117,9 @@ impl EventKind {
         EventKind::ParametersChanged,
         EventKind::RestoreUnfinished,
         EventKind::Diagnosis,
+        EventKind::Held,
+        EventKind::Released,
+        EventKind::HoldBroken,
     ];
 
     /// Whether somebody should look: the log has it as a warning.
@@ -140,6 +149,9 @@ impl EventKind {
             | EventKind::BusUp
             | EventKind::Recording
             | EventKind::ForeignCommand
+            | EventKind::Held
+            | EventKind::Released
+            | EventKind::HoldBroken
             | EventKind::ParametersChanged => false,
         }
     }
@@ -172,6 +184,9 @@ impl EventKind {
             EventKind::ParametersChanged => "parameters_changed",
             EventKind::RestoreUnfinished => "restore_unfinished",
             EventKind::Diagnosis => "diagnosis",
+            EventKind::Held => "held",
+            EventKind::Released => "released",
+            EventKind::HoldBroken => "hold_broken",
         }
     }
 }
@@ -479,8 +494,8 @@ mod tests {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised
                 | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
-                ParametersChanged | RestoreUnfinished => false,
-                Diagnosis => true,
+                ParametersChanged | RestoreUnfinished | Diagnosis | Held | Released => false,
+                HoldBroken => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

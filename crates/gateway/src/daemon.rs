@@ -4,6 +4,7 @@ mod changes;
 mod file_limit;
 mod leases;
 mod pulse;
+mod reservations;
 mod server;
 
 use std::collections::BTreeMap;
@@ -14,6 +15,7 @@ use arc_swap::ArcSwap;
 
 use self::leases::Parted;
 pub use self::pulse::Pulse;
+use self::reservations::ReservationsFile;
 use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::line_state::Learned;
@@ -83,6 +85,9 @@ pub struct Daemon {
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
     stopper: tokio::task::JoinHandle<()>,
+    reservations: ReservationsFile,
+    /// Keeps reservations on disk.
+    reserver: tokio::task::JoinHandle<()>,
     pulse: Pulse,
     /// Who is asked to reload, and the file that the gateway runs with.
     control: Option<Control>,
@@ -128,6 +133,7 @@ impl Daemon {
             history: history.clone(),
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
+        let reservations = ReservationsFile::default();
         let mut daemon = Daemon {
             plant: shared.clone(),
             settings: settings.clone(),
@@ -149,7 +155,9 @@ impl Daemon {
             recorder: None,
             keeper: None,
             reporter: report_refusals(shared.clone()),
-            stopper: stop_all(shared),
+            stopper: stop_all(shared.clone()),
+            reserver: reservations::keep(shared, reservations.clone()),
+            reservations,
             pulse: Pulse::default(),
             control,
         };
@@ -163,6 +171,8 @@ impl Daemon {
         daemon.apply_params(&settings);
         daemon.hold_unfinished(&settings).await;
         daemon.replace_buses(&settings, prepared).await;
+        daemon.apply_reservations(&settings);
+        reservations::restore(&daemon.reservations, &daemon.plant.load());
         daemon.apply_mqtt(&settings).await?;
         // The servers that report readiness come last.
         let servers = daemon.prepare_servers(&settings).await?;
@@ -230,6 +240,7 @@ impl Daemon {
         self.hold_unfinished(&settings).await;
         self.commit_servers(servers).await;
         self.replace_buses(&settings, prepared).await;
+        self.apply_reservations(&settings);
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
         self.apply_audit(&settings).await;
@@ -275,6 +286,10 @@ impl Daemon {
             kept.push((bus, task));
         }
         self.parted.keep(&leases, &stopped, Instant::now());
+        let after: Vec<&BusHandle> = kept.iter().map(|(_, task)| task.handle()).collect();
+        for bus in &stopped {
+            bus.end_holds(&after, &self.events, Instant::now(), SystemTime::now());
+        }
         for event in leases.ended(SystemTime::now()) {
             self.events.publish(event);
         }
@@ -290,6 +305,9 @@ impl Daemon {
             };
             let drives = &task.handle().image.drives;
             drives.iter().for_each(|drive| drive.set_stale_floor(floor));
+        }
+        for (_, task) in &kept {
+            task.handle().queue.set_authority(settings.authority.clone());
         }
         let machines = |handles: &mut dyn Iterator<Item = &BusHandle>| -> BTreeMap<String, Machine> {
             let of_bus = |bus: &BusHandle| {
@@ -485,6 +503,13 @@ impl Daemon {
         applied
     }
 
+    /// Keeps reservations where the gateway keeps its state.
+    fn apply_reservations(&self, settings: &Settings) {
+        let kept = settings.keeps_history && settings.authority.is_some();
+        let dir = kept.then_some(settings.state_dir.as_path());
+        reservations::keep_in(&self.reservations, dir);
+    }
+
     /// Opens the local socket if one is configured. The gateway runs without it if it cannot be opened; a reload tries
     /// again.
     async fn apply_local(&mut self, settings: &Settings) {
@@ -547,6 +572,7 @@ impl Daemon {
         .await;
         self.reporter.abort();
         self.stopper.abort();
+        self.reserver.abort();
         if let Some(reader) = &self.reader {
             reader.abort();
         }
@@ -652,7 +678,9 @@ fn report_refusals(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
         let mut ticks = tokio::time::interval(REFUSALS_REPORTED);
         loop {
             ticks.tick().await;
-            plant.load().report_refusals(Instant::now());
+            let plant = plant.load();
+            plant.report_refusals(Instant::now());
+            plant.tell_holds(Instant::now(), SystemTime::now());
         }
     })
 }

@@ -1,17 +1,20 @@
 //! The command queue of a bus: bounded, ordered, with replacing, purging and expiry.
 
 mod handover;
+mod holds;
 mod passed_on;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use rustix::event::{EventfdFlags, eventfd};
 use tokio::sync::oneshot;
 
+use self::holds::Holds;
 use super::background::{Background, BackgroundRequest};
 use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal, SourceKind, Urgency};
 
@@ -51,6 +54,8 @@ pub struct Pending {
     commanders: BTreeMap<usize, Arc<str>>,
     /// Who commands by priorities, by drive.
     priorities: BTreeMap<usize, Priorities>,
+    /// Who holds the drives.
+    holds: Holds,
     /// The stops that the gateway wants before it ends, until the bus takes note of it.
     stopping: Option<Stopping>,
 }
@@ -123,6 +128,10 @@ impl Pending {
             command.answer(&Outcome::ShuttingDown, now);
             return;
         }
+        if let Some(refusal) = self.hold_refuses_command(&command, now) {
+            command.answer(&Outcome::Refused(refusal), now);
+            return;
+        }
         if command.urgency == Urgency::Stop {
             self.note_stop(command.drive, now);
             self.push_stop(command, now);
@@ -181,6 +190,7 @@ impl Pending {
             who: format!("the BACnet client {}", protects.client),
             rank: format!("priority {priority}"),
             keeps: format!("keeps `{what}` until it gives that slot back"),
+            left_s: None,
         })))
     }
 
@@ -191,6 +201,7 @@ impl Pending {
 
     /// Keeps who gave a command that is taken in.
     fn note_accepted(&mut self, command: &Command, now: Instant) {
+        self.hold_accepted(command, now);
         let origin = command.ticket.origin();
         if command.urgency != Urgency::Read {
             for drive in command.reach() {
@@ -495,6 +506,8 @@ fn same_points(older: &Order, newer: &Order) -> bool {
 pub struct CommandQueue {
     pending: Mutex<Pending>,
     background: Mutex<Background>,
+    /// Whether `[authority]` is on.
+    guarded: AtomicBool,
     wake: OwnedFd,
 }
 
@@ -508,6 +521,7 @@ impl CommandQueue {
         Ok(CommandQueue {
             pending: Mutex::default(),
             background: Mutex::default(),
+            guarded: AtomicBool::new(false),
             wake,
         })
     }

@@ -6,20 +6,13 @@ use std::time::{Duration, Instant, SystemTime};
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
+use crate::command_json::HoldFields;
 use crate::diagnosis::{self, Counted, Verdict};
 use crate::drive::why::Cause;
 use crate::drive::{self, ModelPoint, Quality, State};
 use crate::history::History;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
-
-/// An error reply.
-#[derive(Debug, Serialize)]
-pub(super) struct ErrorReply {
-    pub(super) error: String,
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub(super) known: Vec<String>,
-}
 
 /// One point in time on both clocks.
 #[derive(Debug, Clone, Copy)]
@@ -73,6 +66,9 @@ pub(super) struct Drive<'d> {
     /// Why it takes no commands but stops.
     #[serde(skip_serializing_if = "Option::is_none")]
     held: Option<String>,
+    /// Who holds it, where `[authority]` is on.
+    #[serde(flatten)]
+    hold: Option<HoldFields>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
     /// `null` where the drive does not say whether it runs.
@@ -115,6 +111,7 @@ impl<'d> Drive<'d> {
             blocked_by: why.words(),
             why: why.causes,
             held: image.hold.why().map(|why| why.to_string()),
+            hold: drive.hold_view(None, clock.now).map(|(view, _)| view.into()),
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
             starts: tells_running.then_some(totals.starts),

@@ -13,6 +13,8 @@ pub struct Effect {
     pub reverse: Option<bool>,
     /// A reference.
     pub reference: bool,
+    /// A raw word at the place of the run command that is no stop.
+    pub word: bool,
 }
 
 impl Effect {
@@ -21,6 +23,7 @@ impl Effect {
         run: Some(true),
         reverse: None,
         reference: true,
+        word: true,
     };
 
     /// What an order does to a drive of that profile.
@@ -100,12 +103,19 @@ fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
         let (_, word) = items.iter().find(|(address, _)| *address == control.at.address)?;
         control.direction_of(*word)
     };
+    let commands = |address: u16| {
+        let control = profile.control.as_ref().map(|control| control.at);
+        let mut places = profile.run_place().into_iter().chain(control);
+        places.any(|place| (place.table, place.address) == (table, address))
+    };
+    let no_stop = |(address, word): &(u16, u16)| commands(*address) && !profile.is_stop(table, *address, *word);
     Effect {
         run,
         reverse: bit(ModelPoint::Reverse)
             .map(|value| value.as_bool())
             .or_else(by_control),
         reference: covered(ModelPoint::SpeedReference) || covered(ModelPoint::FrequencyReference),
+        word: items.iter().any(no_stop),
     }
 }
 

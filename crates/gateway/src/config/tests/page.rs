@@ -22,6 +22,8 @@ fn with_tables(page: &str) -> String {
         ("[mqtt.sparkplug]", "Sparkplug"),
         ("[http]", "Http"),
         ("[bacnet]", "Bacnet"),
+        ("[authority]", "AuthorityTable"),
+        ("[[authority.principal]]", "PrincipalTable"),
         ("[audit]", "AuditTable"),
         ("[recordings]", "Recordings"),
         ("[params]", "Params"),
