@@ -361,7 +361,7 @@ def fault(site, host, name, harm, heal, wait):
     worker.join()
     took = time.monotonic() - began
     states = len(host.client.seen(lambda topic: topic.endswith("/state"))) - before
-    commands = [number for number, (at, _) in host.sent.items() if began <= at < began + took - 3]
+    commands = [number for number, (at, _) in list(host.sent.items()) if began <= at < began + took - 3]
     results = host.results()
     silent = [number for number in commands if number not in results]
     print(f"  {name}: {len(away)} gateways were away, the last was back {back - began:.1f} s after the fault; "

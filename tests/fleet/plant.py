@@ -239,8 +239,11 @@ password_file {passwords}
             until(f"the start of {gateway.name}", lambda: gateway.socket.exists() and self.is_whole(gateway), 120)
 
     def is_whole(self, gateway):
-        drives = gateway.drive_states()
-        return all(each["online"] for each in drives.values()) and gateway.metric("drivegate_mqtt_connected") == 1
+        try:
+            drives = gateway.drive_states()
+            return all(each["online"] for each in drives.values()) and gateway.metric("drivegate_mqtt_connected") == 1
+        except OSError:
+            return False
 
     def run_motors(self):
         """Each drive runs, and its lease is renewed from now on."""
