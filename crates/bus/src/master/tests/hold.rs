@@ -82,6 +82,7 @@ fn only_the_holder_is_on_the_wire_and_every_stop() {
             (ModelPoint::FaultReset, Value::Bool(true)),
         ];
         for (point, value) in points {
+            drive(&plant, 0).heartbeat(&who("plc"), rig.now);
             let mut refused = place(&rig, &plant, name, point, value);
             rig.run(Time::from_millis(60));
             let expected = if name == "stranger" {
