@@ -20,7 +20,7 @@ use super::operating::Operating;
 use super::routes::{self, Client, LocalUser, Reached};
 use super::{Coverage, GRACE, HEAD_TIMEOUT, MAX_HEAD};
 use crate::NorthStats;
-use crate::command::{Authority, SourceKind};
+use crate::command::{Authority, Proof, SourceKind};
 use crate::connection_limit::{ConnectionLimit, Limits, Newcomer, Place};
 use crate::plant::SharedPlant;
 

@@ -556,6 +556,7 @@ mod tests {
             state: None,
             quality: Quality::Good,
             blocked_by: Vec::new(),
+            hold: None,
             points: Vec::new(),
         };
         let object = StateObject {

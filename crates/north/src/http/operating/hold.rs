@@ -9,7 +9,7 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
-use super::super::api::ErrorReply;
+use crate::http::messages::ErrorReply;
 use super::super::body;
 use super::super::routes::{AppState, Reached, no_drive};
 use crate::command::{Authority, Verb};
