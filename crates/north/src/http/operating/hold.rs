@@ -9,11 +9,11 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
-use crate::http::messages::ErrorReply;
 use super::super::body;
 use super::super::routes::{AppState, Reached, no_drive};
 use crate::command::{Authority, Verb};
 use crate::command_json::{HoldReply, MAX_PAYLOAD};
+use crate::http::messages::ErrorReply;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
