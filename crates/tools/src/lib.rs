@@ -15,6 +15,7 @@ mod demo;
 mod diagnose;
 mod drive_access;
 mod health;
+mod hold_command;
 mod inventory;
 mod listen;
 mod loading;
@@ -128,6 +129,7 @@ commands! {
     Read => read,
     Write => write,
     StopAll => stop_all_command,
+    Hold => hold_command,
     Why => why,
     Diagnose => diagnose,
     Record => record,
