@@ -81,11 +81,15 @@ pub enum EventKind {
     RestoreUnfinished,
     /// A verdict about a line came, became firmer, or went.
     Diagnosis,
+    /// A start was refused, since it came too often or too soon.
+    Guarded,
+    /// A start was refused, or a motor stopped, since an interlock does not hold.
+    Interlock,
 }
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 25] = [
+    pub const ALL: [EventKind; 27] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -111,6 +115,8 @@ impl EventKind {
         EventKind::ParametersChanged,
         EventKind::RestoreUnfinished,
         EventKind::Diagnosis,
+        EventKind::Guarded,
+        EventKind::Interlock,
     ];
 
     /// Whether somebody should look: the log has it as a warning.
@@ -128,6 +134,7 @@ impl EventKind {
             | EventKind::BusDown
             | EventKind::Diagnosis
             | EventKind::RestoreUnfinished
+            | EventKind::Interlock
             | EventKind::ReloadRefused => true,
             EventKind::Online
             | EventKind::FaultEnd
@@ -140,6 +147,7 @@ impl EventKind {
             | EventKind::BusUp
             | EventKind::Recording
             | EventKind::ForeignCommand
+            | EventKind::Guarded
             | EventKind::ParametersChanged => false,
         }
     }
@@ -172,6 +180,8 @@ impl EventKind {
             EventKind::ParametersChanged => "parameters_changed",
             EventKind::RestoreUnfinished => "restore_unfinished",
             EventKind::Diagnosis => "diagnosis",
+            EventKind::Guarded => "guarded",
+            EventKind::Interlock => "interlock",
         }
     }
 }
@@ -369,10 +379,15 @@ impl Events {
     /// Publishes that a command was refused: the first of a kind at once, then one event a second for each client, which
     /// stands for all of them.
     pub fn publish_refusal(&self, refused: RefusedCommand<'_>, now: Instant) {
+        let kind = match refused.reason {
+            "guarded" => EventKind::Guarded,
+            "interlocked" => EventKind::Interlock,
+            _ => EventKind::RefusedCommand,
+        };
         let event = Event {
             bus: refused.bus.to_string(),
             drive: Some(refused.drive.to_string()),
-            ..Event::new(EventKind::RefusedCommand, SystemTime::now(), refused.text)
+            ..Event::new(kind, SystemTime::now(), refused.text)
         };
         let mut store = self.store();
         let passed = store
