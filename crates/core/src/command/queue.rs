@@ -201,7 +201,10 @@ impl Pending {
     pub fn stop_waits(&self, drive: usize, now: Instant) -> Option<Instant> {
         let guards = self.guards.as_ref()?;
         let ordinary = |c: &Command| c.is_ordinary && c.drive == drive;
-        self.waiting.iter().any(ordinary).then(|| guards.stop_waits(drive, now))?
+        self.waiting
+            .iter()
+            .any(ordinary)
+            .then(|| guards.stop_waits(drive, now))?
     }
 
     /// Whether that command waits.
@@ -297,7 +300,10 @@ impl Pending {
             self.stopped.push(drive);
         }
         // A second stop waits for nothing, nor does the first one any more.
-        let others = self.waiting.iter_mut().filter(|c| c.drive == drive && c.urgency == Urgency::Stop);
+        let others = self
+            .waiting
+            .iter_mut()
+            .filter(|c| c.drive == drive && c.urgency == Urgency::Stop);
         others.for_each(|c| c.is_ordinary = false);
         let bare = stop.is_bare_stop();
         let alike = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop && c.is_bare_stop() == bare;

@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 use super::MOST_STARTS;
 use crate::process_image::Machine;
 
-
 /// Form of the file.
 const VERSION: u32 = 1;
 /// Motors in a file at most; more are none of ours.
@@ -95,7 +94,9 @@ impl Saved {
             ));
         }
         if saved.motors.len() > MOST_MOTORS || saved.motors.iter().any(|motor| motor.starts.len() > most) {
-            return Err(format!("it has more than {MOST_MOTORS} motors, or {most} starts of one"));
+            return Err(format!(
+                "it has more than {MOST_MOTORS} motors, or {most} starts of one"
+            ));
         }
         Ok(saved)
     }

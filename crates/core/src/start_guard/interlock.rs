@@ -15,11 +15,21 @@ pub struct Unmet {
     is: bool,
     /// What is known of the point instead.
     but: String,
+    was_read: bool,
+}
+
+impl Unmet {
+    /// Whether the point was read since the gateway started.
+    pub fn was_read(&self) -> bool {
+        self.was_read
+    }
 }
 
 impl fmt::Display for Unmet {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Unmet { drive, point, is, but } = self;
+        let Unmet {
+            drive, point, is, but, ..
+        } = self;
         write!(f, "`{point}` of {drive} must be {is} and {but}")
     }
 }
@@ -27,8 +37,9 @@ impl fmt::Display for Unmet {
 impl Interlock {
     /// Whether it does not hold. Only a good sample holds.
     pub(super) fn unmet(&self, around: &Around, now: Instant) -> Option<Unmet> {
-        let but = self.differs(around, now)?;
+        let (but, was_read) = self.differs(around, now)?;
         Some(Unmet {
+            was_read,
             drive: self.drive.clone(),
             point: self.point.clone(),
             is: self.is,
@@ -36,23 +47,29 @@ impl Interlock {
         })
     }
 
-    fn differs(&self, around: &Around, now: Instant) -> Option<String> {
+    /// What is known of the point where it does not hold, and whether it was ever read.
+    fn differs(&self, around: &Around, now: Instant) -> Option<(String, bool)> {
         let Some(image) = around.images.get(&self.drive) else {
-            return Some("there is no such drive".to_string());
+            return Some(("there is no such drive".to_string(), true));
         };
         let Some(index) = image.spec.profile.point_index(&self.point) else {
-            return Some("the drive has no such point".to_string());
+            return Some(("the drive has no such point".to_string(), true));
         };
         let reading = image.reading(now, around.stale_after);
         let sample = reading.sample(index);
-        let age = || sample.at.map_or(0.0, |at| now.saturating_duration_since(at).as_secs_f64());
-        match sample.good().map(Value::as_bool) {
-            Some(is) if is == self.is => None,
-            Some(is) => Some(format!("is {is}")),
-            None if !reading.snapshot.link.is_online() => Some("is not known: the drive is offline".to_string()),
-            None if sample.at.is_none() => Some("was never read".to_string()),
-            None if sample.quality == Quality::Stale => Some(format!("is stale: read {:.1} s ago", age())),
-            None => Some("is not known: its value is bad".to_string()),
-        }
+        let age = || {
+            sample
+                .at
+                .map_or(0.0, |at| now.saturating_duration_since(at).as_secs_f64())
+        };
+        let but = match sample.good().map(Value::as_bool) {
+            Some(is) if is == self.is => return None,
+            Some(is) => format!("is {is}"),
+            None if !reading.snapshot.link.is_online() => "is not known: the drive is offline".to_string(),
+            None if sample.at.is_none() => "was never read".to_string(),
+            None if sample.quality == Quality::Stale => format!("is stale: read {:.1} s ago", age()),
+            None => "is not known: its value is bad".to_string(),
+        };
+        Some((but, sample.at.is_some()))
     }
 }

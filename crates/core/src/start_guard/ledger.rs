@@ -314,7 +314,10 @@ impl Ledger {
     }
 
     pub(super) fn refused(&self, machine: &Machine) -> BTreeMap<Reason, u64> {
-        self.motors.get(machine).map(|entry| entry.refused.clone()).unwrap_or_default()
+        self.motors
+            .get(machine)
+            .map(|entry| entry.refused.clone())
+            .unwrap_or_default()
     }
 
     fn is_behind(&self) -> bool {
@@ -333,7 +336,9 @@ impl Ledger {
         }
         let at = |at: Instant| match at.checked_duration_since(now) {
             Some(later) => time + later,
-            None => time.checked_sub(now.saturating_duration_since(at)).unwrap_or(SystemTime::UNIX_EPOCH),
+            None => time
+                .checked_sub(now.saturating_duration_since(at))
+                .unwrap_or(SystemTime::UNIX_EPOCH),
         };
         let known = self.motors.iter().filter(|(_, entry)| !entry.motor.is_forgotten(now));
         let motors = known.map(|(machine, entry)| {

@@ -90,7 +90,10 @@ impl Motor {
 
     /// Why it may not be started now, beside its group.
     pub(super) fn hindered(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
-        self.too_often(guard, now).into_iter().chain(self.too_soon(guard, now)).max_by_key(|wait| wait.retry_after)
+        self.too_often(guard, now)
+            .into_iter()
+            .chain(self.too_soon(guard, now))
+            .max_by_key(|wait| wait.retry_after)
     }
 
     fn too_often(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
@@ -236,7 +239,9 @@ impl Motor {
     pub(super) fn is_ordinary_stop(&self, client: &str, last_stop: Option<Instant>) -> bool {
         let own = |started: &Started| started.by.as_deref() == Some(client);
         let first = |started: &Started| last_stop.is_none_or(|stop| stop < started.at);
-        self.started.as_ref().is_some_and(|started| own(started) && first(started))
+        self.started
+            .as_ref()
+            .is_some_and(|started| own(started) && first(started))
     }
 
     /// Until when an ordinary stop waits; none where the motor does not run for certain.

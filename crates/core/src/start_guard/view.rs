@@ -90,13 +90,7 @@ impl BusGuards {
     }
 
     /// Why an order with that effect is not accepted; counted. One that may wait does so until `waits_until`.
-    pub fn refuses(
-        &self,
-        drive: usize,
-        effect: Effect,
-        waits_until: Option<Instant>,
-        now: Instant,
-    ) -> Option<Refusal> {
+    pub fn refuses(&self, drive: usize, effect: Effect, waits_until: Option<Instant>, now: Instant) -> Option<Refusal> {
         let of = self.of_drive(drive).filter(|_| effect.run == Some(true))?;
         let mut ledger = self.shared.lock();
         if !ledger.motor(&of.machine)?.is_started_by_run() {
@@ -162,9 +156,6 @@ impl BusGuards {
         match self.judge(&ledger, &started, command, now) {
             Err((of, refused)) => {
                 ledger.count_refused(&of.machine, refused.reason);
-                if refused.reason == Reason::StateFile {
-                    started.iter().for_each(|of| ledger.withdraw(&of.machine));
-                }
                 Clearance::Refused(refusal(refused))
             }
             Ok(Some(until)) => Clearance::Wait(until),
@@ -185,7 +176,9 @@ impl BusGuards {
             if let Some(refused) = self.interlocked(of, now) {
                 return Err((of, refused));
             }
-            let cleared = ledger.motor(&of.machine).is_some_and(|motor| motor.is_cleared(command.number));
+            let cleared = ledger
+                .motor(&of.machine)
+                .is_some_and(|motor| motor.is_cleared(command.number));
             if cleared {
                 continue;
             }
@@ -260,7 +253,7 @@ impl BusGuards {
     /// Why not: an interlock does not hold any more, or the motor, which ran when the order was judged, has stopped.
     pub fn may_write(&self, drive: usize, number: u64, now: Instant) -> Result<(), Refusal> {
         let Some(of) = self.of_drive(drive) else { return Ok(()) };
-        let mut ledger = self.shared.lock();
+        let ledger = self.shared.lock();
         let Some(motor) = ledger.motor(&of.machine).filter(|motor| motor.is_started_by_run()) else {
             return Ok(());
         };
@@ -273,12 +266,17 @@ impl BusGuards {
             true => self.interlocked(of, now),
             false => Some(stopped()),
         };
-        match refused {
-            None => Ok(()),
-            Some(refused) => {
-                ledger.count_refused(&of.machine, refused.reason);
-                Err(refusal(refused))
-            }
+        refused.map_or(Ok(()), |refused| Err(refusal(refused)))
+    }
+
+    /// A begun command was refused so.
+    pub fn count_refused(&self, drive: usize, refusal: &Refusal) {
+        let reason = match refusal {
+            Refusal::Guarded(guarded) => guarded.reason,
+            _ => Reason::Interlock,
+        };
+        if let Some(of) = self.of_drive(drive) {
+            self.shared.lock().count_refused(&of.machine, reason);
         }
     }
 

@@ -220,6 +220,8 @@ fn of_refusal(refusal: &Refusal) -> Error {
         | Refusal::NotKnown(_)
         | Refusal::MotorRuns(_)
         | Refusal::OtherValue(_)
-        | Refusal::HeldByOther(_) => Error::SERVICE_REQUEST_DENIED,
+        | Refusal::HeldByOther(_)
+        | Refusal::Guarded(_)
+        | Refusal::Interlocked(_) => Error::SERVICE_REQUEST_DENIED,
     }
 }

@@ -73,6 +73,9 @@ pub(super) struct Drive<'d> {
     /// Why it takes no commands but stops.
     #[serde(skip_serializing_if = "Option::is_none")]
     held: Option<String>,
+    /// For how long an ordinary stop still waits.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    stop_waits_ms: Option<u64>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
     /// `null` where the drive does not say whether it runs.
@@ -115,6 +118,7 @@ impl<'d> Drive<'d> {
             blocked_by: why.words(),
             why: why.causes,
             held: image.hold.why().map(|why| why.to_string()),
+            stop_waits_ms: drive.stop_waits(clock.now).map(millis),
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
             starts: tells_running.then_some(totals.starts),

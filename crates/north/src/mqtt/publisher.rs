@@ -252,7 +252,12 @@ impl Publisher {
             let fresh = drive.is_fresh();
             let (names, indices) = (&drive.names, &drive.indices);
             let reading = drive.drive.reading(now);
-            let shown = StateContent::of(&reading, indices.iter().copied(), drive.drive.why(&reading).words());
+            let shown = StateContent::of(
+                &reading,
+                indices.iter().copied(),
+                drive.drive.why(&reading).words(),
+                drive.drive.stop_waits(now),
+            );
             let render = |shown: &StateContent| {
                 let fits = drive.fits;
                 render((names, indices, fits), &reading, shown, wall, true)
@@ -377,7 +382,12 @@ impl DriveTopics {
     fn tick(&mut self, pace: PublishInterval, most: usize, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
         let drive = self.drive.clone();
         let reading = drive.reading(now);
-        let shown = StateContent::of(&reading, self.indices.iter().copied(), self.drive.why(&reading).words());
+        let shown = StateContent::of(
+            &reading,
+            self.indices.iter().copied(),
+            self.drive.why(&reading).words(),
+            self.drive.stop_waits(now),
+        );
         let mut look_at = now + LOOK.min(pace.max);
         for point in &mut self.points {
             let payload = match point.source {
