@@ -41,6 +41,7 @@ mod scenario;
 mod selection;
 mod situations;
 mod slot;
+mod start_guard;
 mod stop_all;
 mod world;
 

@@ -494,8 +494,8 @@ mod tests {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised
                 | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
-                ParametersChanged | RestoreUnfinished => false,
-                Diagnosis => true,
+                ParametersChanged | RestoreUnfinished | Diagnosis | Guarded => false,
+                Interlock => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

@@ -55,10 +55,15 @@ impl Keeper {
 
     /// Writes what there is, as far as the disk takes it, and ends the thread. A disk that hangs holds it up for good: wait with
     /// a limit.
-    pub async fn stop(self) {
-        let Keeper { end, mut ended, .. } = self;
-        end.store(true, Ordering::Relaxed);
-        while ended.changed().await.is_ok() {}
+    pub async fn stop(mut self) {
+        self.end.store(true, Ordering::Relaxed);
+        while self.ended.changed().await.is_ok() {}
+    }
+}
+
+impl Drop for Keeper {
+    fn drop(&mut self) {
+        self.end.store(true, Ordering::Relaxed);
     }
 }
 

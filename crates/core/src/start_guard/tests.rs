@@ -3,8 +3,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::*;
 use crate::codec::{LineFormat, Protocol, RequestPdu, Table};
-use crate::command::tests_support::{answered, command_of};
-use crate::command::{Effect, Outcome, Refusal};
+use crate::command::{
+    BackgroundRequest, Effect, NO_DRIVE, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind, Ticket, Touched,
+};
 use crate::drive::profile::Profiles;
 use crate::process_image::{Access, BusSpec, DriveImage, DriveSpec, Link};
 
@@ -68,9 +69,9 @@ impl Bench {
         image.update(|snapshot| {
             snapshot.link = Link::Online(SystemTime::now());
             snapshot.fast_at = Some(at);
-            // Status word, output frequency and speed of process data.
-            snapshot.store(Table::Holding, 2100, &[if running { 0x03 } else { 0x01 }, 0, 0, 0], at);
-            snapshot.store(Table::Input, 2100, &[if running { 0x03 } else { 0x01 }, 0, 0, 0], at);
+            // The status word: running, or at zero speed; then the output frequency.
+            let words = if running { [0x03, 0, 0, 2500] } else { [0x41, 0, 0, 0] };
+            snapshot.store(Table::Holding, 2100, &words, at);
         });
         self.guards.look(drive, &image.reading(at, SECOND));
     }
@@ -91,18 +92,37 @@ impl Bench {
 
     fn clear_waiting(&self, drives: &[usize], number: u64, waits: bool, seconds: f64) -> Clearance {
         let now = self.at(seconds);
-        let mut command = command_of(drives, RequestPdu::WriteRegister { address: 2000, value: 1 }, now + 2 * SECOND);
-        command.effects = drives.iter().map(|drive| (*drive, RUN)).collect();
+        let origin = Origin::new(SourceKind::Mqtt, "c");
+        let (ticket, _) = Ticket::new(origin, "d", String::new(), true, now, Arc::default());
+        let request = BackgroundRequest {
+            drive: NO_DRIVE,
+            pdu: RequestPdu::WriteRegister {
+                address: 2000,
+                value: 1,
+            },
+            pace: Pace::Brisk,
+            expires: now + 2 * SECOND,
+            ticket,
+            passed_on: Some(PassedOn {
+                address: 0,
+                may_write: true,
+                reach: drives.to_vec(),
+                stops: Vec::new(),
+                effects: drives.iter().map(|drive| (*drive, RUN)).collect(),
+                first: false,
+                frame: tokio::sync::oneshot::channel().0,
+            }),
+        };
+        let mut command = request.into_command(Touched::Anything);
         (command.number, command.waits) = (number, waits);
-        let clearance = self.guards.clear(&command, now);
-        answered(command, now);
-        clearance
+        self.guards.clear(&command, now)
     }
 
     /// Starts a drive and sees it run, then stops it and sees it stand a second later.
     fn start_and_stop(&self, drive: usize, number: u64, seconds: f64) {
         assert_eq!(self.clear(&[drive], number, seconds), Clearance::Go, "at {seconds} s");
-        self.guards.start_written(drive, number, &Arc::from("c"), self.at(seconds));
+        self.guards
+            .start_written(drive, number, &Arc::from("c"), self.at(seconds));
         self.read(drive, true, seconds + 0.1);
         self.guards.stop_written(drive, self.at(seconds + 0.5));
         self.read(drive, false, seconds + 1.0);
@@ -138,13 +158,24 @@ fn the_window_of_an_hour_slides() {
     let Some(Refusal::Guarded(wait)) = bench.guards.refuses(0, RUN, None, bench.at(1300.0)) else {
         unreachable!()
     };
-    assert_eq!(wait.retry_after, Duration::from_secs(2310), "when the first one is an hour old");
+    assert_eq!(
+        wait.retry_after,
+        Duration::from_secs(2310),
+        "when the first one is an hour old"
+    );
     assert_eq!(wait.retry_after_ms(), 2_310_000);
-    assert!(wait.why.contains("3 starts within the last hour") && wait.why.contains("39 min"), "{wait}");
+    assert!(
+        wait.why.contains("3 starts within the last hour") && wait.why.contains("39 min"),
+        "{wait}"
+    );
     assert_eq!(bench.refused(0, 3609.9), Some("starts_per_hour"));
     assert_eq!(bench.refused(0, 3610.0), None);
     bench.start_and_stop(0, 4, 3610.0);
-    assert_eq!(bench.refused(0, 4199.0), Some("starts_per_hour"), "the second one counts until 4200 s");
+    assert_eq!(
+        bench.refused(0, 4199.0),
+        Some("starts_per_hour"),
+        "the second one counts until 4200 s"
+    );
     assert_eq!(bench.refused(0, 4200.0), None);
     let counted = bench.guards.refused(0);
     assert_eq!(counted.get(&Reason::StartsPerHour), Some(&4), "{counted:?}");
@@ -162,7 +193,11 @@ fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
     assert_eq!(bench.clear(&[0], 2, 1.2), Clearance::Go);
     bench.guards.start_written(0, 2, &Arc::from("c"), bench.at(1.2));
     bench.guards.stop_written(0, bench.at(2.0));
-    assert_eq!(bench.refused(0, 2.01), Some("starts_per_hour"), "what was read before the stop says nothing");
+    assert_eq!(
+        bench.refused(0, 2.01),
+        Some("starts_per_hour"),
+        "what was read before the stop says nothing"
+    );
     // It coasts down: a read behind the stop shows it running.
     bench.read(0, true, 2.1);
     assert_eq!(bench.refused(0, 2.2), None);
@@ -199,15 +234,24 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     assert_eq!(bench.refused(0, 0.0), Some("min_off"), "never read");
     bench.read(0, false, 1.0);
     bench.read(0, false, 20.0);
-    assert_eq!((bench.refused(0, 30.9), bench.refused(0, 31.0)), (Some("min_off"), None));
+    assert_eq!(
+        (bench.refused(0, 30.9), bench.refused(0, 31.0)),
+        (Some("min_off"), None)
+    );
     bench.start_and_stop(0, 1, 40.0);
-    assert_eq!((bench.refused(0, 70.9), bench.refused(0, 71.0)), (Some("min_off"), None));
+    assert_eq!(
+        (bench.refused(0, 70.9), bench.refused(0, 71.0)),
+        (Some("min_off"), None)
+    );
     // Away, it may have run meanwhile.
     bench.images[0].update(|snapshot| snapshot.link = Link::Offline(SystemTime::now()));
     bench.guards.look(0, &bench.images[0].reading(bench.at(80.0), SECOND));
     assert_eq!(bench.refused(0, 80.0), Some("min_off"));
     bench.read(0, false, 90.0);
-    assert_eq!((bench.refused(0, 119.0), bench.refused(0, 120.0)), (Some("min_off"), None));
+    assert_eq!(
+        (bench.refused(0, 119.0), bench.refused(0, 120.0)),
+        (Some("min_off"), None)
+    );
     // One that waits is taken in if it can go in time.
     bench.read(1, false, 100.0);
     let until = |seconds| Some(bench.at(seconds));
@@ -229,19 +273,32 @@ fn drives_of_a_group_start_one_after_the_other() {
     };
     let bench = Bench::of(guard, Vec::new());
     (0..3).for_each(|drive| bench.read(drive, false, 0.0));
-    assert_eq!(reason(bench.clear(&[0, 1], 1, 1.0)), "stagger", "never two by one order");
+    assert_eq!(
+        reason(bench.clear(&[0, 1], 1, 1.0)),
+        "stagger",
+        "never two by one order"
+    );
     assert_eq!(bench.clear(&[0], 2, 2.0), Clearance::Go);
     // Cleared and not written: it may be at any time.
     assert_eq!(reason(bench.clear(&[1], 3, 7.5)), "stagger");
     bench.guards.start_written(0, 2, &Arc::from("c"), bench.at(8.0));
-    assert_eq!((reason(bench.clear(&[1], 3, 12.9)), bench.clear(&[1], 3, 13.0)), ("stagger", Clearance::Go));
+    assert_eq!(
+        (reason(bench.clear(&[1], 3, 12.9)), bench.clear(&[1], 3, 13.0)),
+        ("stagger", Clearance::Go)
+    );
     // What was cleared and not written counts from when it was.
     bench.guards.settle(1, 3);
-    assert_eq!((bench.refused(0, 17.9), bench.refused(0, 18.0)), (Some("stagger"), None));
+    assert_eq!(
+        (bench.refused(0, 17.9), bench.refused(0, 18.0)),
+        (Some("stagger"), None)
+    );
     // A drive without a guard is not held back, and its starts count for the others.
     assert_eq!(bench.clear(&[2], 4, 18.0), Clearance::Go);
     bench.guards.start_written(2, 4, &Arc::from("c"), bench.at(18.0));
-    assert_eq!((bench.refused(0, 22.9), bench.refused(0, 23.0)), (Some("stagger"), None));
+    assert_eq!(
+        (bench.refused(0, 22.9), bench.refused(0, 23.0)),
+        (Some("stagger"), None)
+    );
 }
 
 #[test]
@@ -258,7 +315,11 @@ fn only_a_good_point_holds_an_interlock() {
         Some(refusal @ Refusal::Interlocked(_)) => refusal.to_string(),
         other => format!("{other:?}"),
     };
-    assert!(text(0.0).contains("`running` of d3 must be true and is not known: the drive is offline"), "{}", text(0.0));
+    assert!(
+        text(0.0).contains("`running` of d3 must be true and is not known: the drive is offline"),
+        "{}",
+        text(0.0)
+    );
     bench.read(2, false, 1.0);
     assert!(text(1.0).contains("must be true and is false"), "{}", text(1.0));
     bench.read(2, true, 2.0);
@@ -297,12 +358,18 @@ fn a_start_waits_until_it_is_on_disk() {
     let saved = Saved::from_json(&saved.to_json()).unwrap();
     next.shared.keep(&saved, next.start, time + 60 * SECOND);
     next.read(0, false, 0.0);
-    assert_eq!((next.refused(0, 3500.0), next.refused(0, 3603.0)), (Some("starts_per_hour"), None));
+    assert_eq!(
+        (next.refused(0, 3500.0), next.refused(0, 3603.0)),
+        (Some("starts_per_hour"), None)
+    );
     // A clock that was set back makes nothing older.
     let next = Bench::of(per_hour(1), Vec::new());
     next.shared.keep(&saved, next.start, time - 7200 * SECOND);
     next.read(0, false, 0.0);
-    assert_eq!((next.refused(0, 3599.0), next.refused(0, 3600.0)), (Some("starts_per_hour"), None));
+    assert_eq!(
+        (next.refused(0, 3599.0), next.refused(0, 3600.0)),
+        (Some("starts_per_hour"), None)
+    );
 }
 
 #[test]
@@ -315,7 +382,9 @@ fn a_start_that_cannot_be_counted_is_refused_and_is_none() {
     let (generation, _) = bench.shared.to_write(bench.at(1.0), time).unwrap();
     bench.shared.wrote(generation, Err("starts.json: no space".to_string()));
     let refused = bench.clear(&[0], 1, 1.1);
-    let Clearance::Refused(refusal) = &refused else { unreachable!("{refused:?}") };
+    let Clearance::Refused(refusal) = &refused else {
+        unreachable!("{refused:?}")
+    };
     assert!(refusal.to_string().contains("starts.json: no space"), "{refusal}");
     // A disk that hangs is not waited for.
     assert_eq!(reason(bench.clear(&[0], 2, 2.0)), "wait");
@@ -346,8 +415,13 @@ fn counters_belong_to_the_machine_over_a_reload() {
     specs[2].profile = Profiles::built_in().get("vacon-cx").unwrap().clone();
     let after = BusGuards::of(&bench.shared, &bench.bus, &specs).unwrap();
     assert!(after.refuses(2, RUN, None, bench.at(10.0)).is_none());
-    specs.iter_mut().for_each(|spec| (spec.guard, spec.staggers) = (None, false));
-    assert!(BusGuards::of(&bench.shared, &bench.bus, &specs).is_none(), "nothing to look after");
+    specs
+        .iter_mut()
+        .for_each(|spec| (spec.guard, spec.staggers) = (None, false));
+    assert!(
+        BusGuards::of(&bench.shared, &bench.bus, &specs).is_none(),
+        "nothing to look after"
+    );
 }
 
 #[test]
@@ -365,8 +439,14 @@ fn min_run_delays_the_first_stop_of_the_client_that_started_the_motor() {
     assert_eq!(waits(1.5), Some(bench.at(21.0)), "not read since");
     bench.read(0, true, 2.0);
     assert!(bench.guards.is_ordinary_stop(0, "c", None));
-    assert!(bench.guards.is_ordinary_stop(0, "c", Some(bench.at(0.5))), "a stop before the start");
-    assert!(!bench.guards.is_ordinary_stop(0, "c", Some(bench.at(2.0))), "a second stop");
+    assert!(
+        bench.guards.is_ordinary_stop(0, "c", Some(bench.at(0.5))),
+        "a stop before the start"
+    );
+    assert!(
+        !bench.guards.is_ordinary_stop(0, "c", Some(bench.at(2.0))),
+        "a second stop"
+    );
     assert!(!bench.guards.is_ordinary_stop(0, "another", None));
     assert_eq!((waits(10.0), waits(21.0)), (Some(bench.at(21.0)), None));
     // It is seen to stand, or not seen at all: nothing is waited for.
@@ -382,7 +462,7 @@ fn files_of_others_are_refused_with_a_reason() {
     for (text, why) in [
         ("{", "EOF"),
         ("{\"drivegate_starts\": 2, \"motors\": []}", "version 2"),
-        ("[]", "invalid type"),
+        ("[]", "invalid length"),
     ] {
         let error = Saved::from_json(text.as_bytes()).unwrap_err();
         assert!(error.contains(why), "{text}: {error}");
@@ -397,7 +477,13 @@ fn files_of_others_are_refused_with_a_reason() {
 
 #[test]
 fn times_for_people_are_never_0() {
-    for (millis, text) in [(1, "0.1 s"), (950, "1.0 s"), (9_900, "9.9 s"), (12_345, "13 s"), (200_000, "4 min")] {
+    for (millis, text) in [
+        (1, "0.1 s"),
+        (950, "1.0 s"),
+        (9_900, "9.9 s"),
+        (12_345, "13 s"),
+        (200_000, "4 min"),
+    ] {
         assert_eq!(shown(Duration::from_millis(millis)), text);
     }
 }
