@@ -72,10 +72,13 @@ fn starts_are_refused_and_wait_and_stops_pass() {
     let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
     assert_eq!((status, &answer["result"]), (409, &json!("interlocked")), "{answer}");
     let message = answer["error"]["message"].as_str().unwrap();
-    assert!(message.contains("`running` of fan-2 must be true and is false"), "{message}");
+    assert!(
+        message.contains("`running` of fan-2 must be true and is false"),
+        "{message}"
+    );
     let refused = mbpoll_write(site.modbus, 1, COMMAND, &[1]).unwrap_err();
     assert!(refused.to_lowercase().contains("busy"), "{refused}");
-    let answer = site.order("drivegate/test/drive/pump-1/set", "{\"run\": true}");
+    let answer = site.ask("pump-1/set", "{\"run\": true}");
     assert_eq!(answer["result"], "interlocked", "{answer}");
     assert_eq!(api(site.http, "pump-1")["blocked_by"][1], "interlocked");
 
@@ -89,19 +92,29 @@ fn starts_are_refused_and_wait_and_stops_pass() {
     assert_eq!((status, &answer["result"]), (409, &json!("guarded")), "{answer}");
     let retry = answer["retry_after_ms"].as_u64().unwrap();
     assert!((1..=4000).contains(&retry), "{answer}");
-    let answer = site.order("drivegate/test/drive/pump-1/set", "{\"run\": true}");
-    assert!(answer["result"] == "guarded" && answer["retry_after_ms"].is_u64(), "{answer}");
+    let answer = site.ask("pump-1/set", "{\"run\": true}");
+    assert!(
+        answer["result"] == "guarded" && answer["retry_after_ms"].is_u64(),
+        "{answer}"
+    );
     let refused = mbpoll_write(site.modbus, 1, COMMAND, &[1]).unwrap_err();
     assert!(refused.to_lowercase().contains("busy"), "{refused}");
     let shown = api(site.http, "pump-1");
     let words = shown["blocked_by"].as_array().unwrap();
     assert!(words.contains(&json!("guarded")), "{shown}");
-    let (status, answer) = curl(&site, "pump-1", "{\"run\": true, \"wait\": true, \"expires_ms\": 20000}");
+    let (status, answer) = curl(
+        &site,
+        "pump-1",
+        "{\"run\": true, \"wait\": true, \"expires_ms\": 20000}",
+    );
     assert_eq!((status, &answer["result"]), (200, &json!("confirmed")), "{answer}");
     assert!(answer["latency_ms"].as_f64().unwrap() > 100.0, "{answer}");
     assert!(metric(&site, "min_off") >= Some(3) && metric(&site, "interlock") >= Some(3));
     let (_, events) = get(site.http, "/api/v1/events").unwrap();
-    assert!(events.contains("\"guarded\"") && events.contains("\"interlock\""), "{events}");
+    assert!(
+        events.contains("\"guarded\"") && events.contains("\"interlock\""),
+        "{events}"
+    );
 
     // Killed and started anew, it has not forgotten the starts.
     stop(&site);
@@ -122,10 +135,15 @@ fn starts_are_refused_and_wait_and_stops_pass() {
     // Under another name it is the same motor.
     site.change("name = \"pump-1\"", "name = \"pump-9\"");
     gateway.signal("HUP");
-    until("the new name", || get(site.http, "/api/v1/drives/pump-9").filter(|(status, _)| *status == 200));
+    until("the new name", || {
+        get(site.http, "/api/v1/drives/pump-9").filter(|(status, _)| *status == 200)
+    });
     site.until_state("pump-9", "ready");
     let (status, answer) = curl(&site, "pump-9", "{\"run\": true}");
-    assert!(status == 409 && answer["retry_after_ms"].as_u64() > Some(60_000), "{answer}");
+    assert!(
+        status == 409 && answer["retry_after_ms"].as_u64() > Some(60_000),
+        "{answer}"
+    );
     drop::<Running>(gateway);
 }
 
@@ -146,7 +164,10 @@ fn a_disk_that_takes_nothing_refuses_starts_and_no_stops() {
     let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
     assert_eq!((status, &answer["result"]), (409, &json!("guarded")), "{answer}");
     let message = answer["error"]["message"].as_str().unwrap();
-    assert!(message.contains("its start cannot be counted") && message.contains("starts.json"), "{message}");
+    assert!(
+        message.contains("its start cannot be counted") && message.contains("starts.json"),
+        "{message}"
+    );
     // What was refused did not count.
     std::fs::remove_dir(site.file("state/starts.partial")).unwrap();
     starts(&site, "pump-1");

@@ -126,8 +126,8 @@ impl Pending {
             command.answer(&Outcome::ShuttingDown, now);
             return;
         }
+        command.is_ordinary = self.is_ordinary(&command);
         if command.urgency == Urgency::Stop {
-            command.is_ordinary = self.is_ordinary(&command);
             self.note_stop(command.drive, now);
             self.push_stop(command, now);
             return;
@@ -193,7 +193,8 @@ impl Pending {
             SourceKind::ModbusTcp | SourceKind::Mqtt | SourceKind::Sparkplug | SourceKind::Bacnet | SourceKind::Slot
         );
         let last = self.stopped_at.get(&stop.drive).copied();
-        let guards = self.guards.as_ref().filter(|_| delayed && !stop.is_urgent);
+        let delayed = delayed && stop.urgency == Urgency::Stop && !stop.is_urgent;
+        let guards = self.guards.as_ref().filter(|_| delayed);
         guards.is_some_and(|guards| guards.is_ordinary_stop(stop.drive, origin.client(), last))
     }
 

@@ -478,16 +478,30 @@ fn guards_and_interlocks_of_a_drive() {
         ),
         "group = \"wet\"",
     ));
-    let [pump, valve] = &all.buses[0].drives[..] else { unreachable!() };
+    let [pump, valve] = &all.buses[0].drives[..] else {
+        unreachable!()
+    };
     let guard = pump.guard.unwrap();
-    assert_eq!((guard.starts_per_hour, guard.min_off.as_secs(), guard.stagger.as_secs()), (Some(12), 30, 5));
+    assert_eq!(
+        (guard.starts_per_hour, guard.min_off.as_secs(), guard.stagger.as_secs()),
+        (Some(12), 30, 5)
+    );
     assert!(guard.min_run.is_zero() && pump.interlocks[0].is && pump.interlocks[0].trip);
-    assert!(pump.staggers && valve.staggers, "the valve is of the group whose starts are apart");
-    let alone = settings(&of(&format!("{control}group = \"wet\"\nguard = {{ stagger = \"5s\" }}"), ""));
+    assert!(
+        pump.staggers && valve.staggers,
+        "the valve is of the group whose starts are apart"
+    );
+    let alone = settings(&of(
+        &format!("{control}group = \"wet\"\nguard = {{ stagger = \"5s\" }}"),
+        "",
+    ));
     assert!(!alone.buses[0].drives[1].is_guarded());
     for (pump, says) in [
         ("guard = { min_off = \"1s\" }", "the drive is only monitored"),
-        ("access = \"control\"\nguard = { starts_per_hour = 0 }", "0 is out of range"),
+        (
+            "access = \"control\"\nguard = { starts_per_hour = 0 }",
+            "0 is out of range",
+        ),
         (
             "access = \"control\"\ninterlocks = [{ drive = \"pump\", point = \"ready\" }]",
             "`pump` is an interlock on itself",
@@ -500,7 +514,10 @@ fn guards_and_interlocks_of_a_drive() {
             "access = \"control\"\ninterlocks = [{ drive = \"valve\", point = \"motor_current\" }]",
             "has no point `motor_current` that is true or false and polled",
         ),
-        ("access = \"control\"\ninterlocks = [{ drive = \"valve\" }]", "`point` is missing"),
+        (
+            "access = \"control\"\ninterlocks = [{ drive = \"valve\" }]",
+            "`point` is missing",
+        ),
     ] {
         let errors = load(&of(pump, "")).0.errors;
         let first = errors.first().map(ToString::to_string).unwrap_or_default();
