@@ -307,11 +307,11 @@ impl Play {
 fn no_start_of_an_order_breaks_a_guard() {
     let mut results: BTreeMap<&str, u32> = BTreeMap::new();
     let mut starts = 0;
-    for seed in 0..24 {
+    for seed in 0..8 {
         let family = ["vacon-nx", "vacon-cx", "schneider-altivar", "eaton-hvx"][seed as usize % 4];
         let mut play = Play::new(family, seed);
         play.run(5 * SECOND);
-        for _ in 0..400 {
+        for _ in 0..300 {
             play.order();
             let pause = Duration::from_millis(play.dice.within(1..=4_000));
             play.run(pause);
@@ -325,8 +325,8 @@ fn no_start_of_an_order_breaks_a_guard() {
         }
     }
     let count = |result: &str| results.get(result).copied().unwrap_or_default();
-    assert!(starts > 300, "{starts} starts: {results:?}");
-    assert!(count("guarded") > 300 && count("interlocked") > 30, "{results:?}");
+    assert!(starts > 80, "{starts} starts: {results:?}");
+    assert!(count("guarded") > 200 && count("interlocked") > 20, "{results:?}");
 }
 
 /// The same clients, line and time, with guards and without: the longest way of a stop is the same.
@@ -457,15 +457,14 @@ fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
         rig.run(8 * SECOND);
         assert!(!turns(&mut rig), "{who}");
     }
-    // Over a reload it waits on, and is sent.
+    // Over a reload, after which it is not known for a moment whether the motor runs, it is sent.
     rig.until_state(1, State::Ready);
     start(&mut rig);
     let mut waiting = rig.place(1, stop);
     rig.run(5 * SECOND);
-    rig.restart();
-    rig.run(5 * SECOND);
     assert!(turns(&mut rig) && waiting.answer().is_none());
-    rig.run(15 * SECOND);
+    rig.restart();
+    rig.run(20 * SECOND);
     assert!(!turns(&mut rig) && rig.answered(&mut waiting).is_ok());
     rig.until("it stands", PATIENCE, |rig| rig.state(1) == State::Ready);
 }

@@ -10,6 +10,8 @@ use super::{Guard, Guarded, MOST_STARTS, Reason, shown};
 pub(super) const HOUR: Duration = Duration::from_secs(3600);
 /// A motor that is seen to start so soon after an order that starts it was started by that.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);
+/// For so long after the word that starts it a motor may still read as standing.
+const SETTLES: Duration = Duration::from_secs(1);
 /// For so long after its start a motor counts as running though it was not read since.
 const UNREAD: Duration = Duration::from_secs(2);
 
@@ -167,6 +169,8 @@ impl Motor {
         }
         self.written = Some((number, now));
         self.is_awaited = true;
+        // It is to be seen to stand anew, also where it was never seen to run.
+        self.stands_since = None;
         self.started = Some(Started {
             at: now,
             by: Some(client.clone()),
@@ -193,12 +197,21 @@ impl Motor {
     /// It was read. Whether a start was seen that nobody ordered here.
     pub(super) fn seen(&mut self, seen: Seen) -> bool {
         let Seen { running, stands, at } = seen;
+        let written = self.written.map(|(_, written)| written);
+        if [written, self.stop_written]
+            .into_iter()
+            .flatten()
+            .any(|write| at <= write)
+        {
+            // From before what was written last.
+            return false;
+        }
         let came = running && self.ran == Some(false);
         (self.running, self.ran) = (Some((running, at)), Some(running));
         if running {
             self.stands_since = None;
         } else {
-            if stands {
+            if stands && written.is_none_or(|written| at >= written + SETTLES) {
                 self.stands_since.get_or_insert(at);
             }
             if self.started.as_ref().is_some_and(|started| at > started.at + UNREAD) {

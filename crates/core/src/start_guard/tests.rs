@@ -243,26 +243,41 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
         (bench.refused(0, 70.9), bench.refused(0, 71.0)),
         (Some("min_off"), None)
     );
+    // A start and a stop between two reads: it is to be seen to stand anew.
+    assert_eq!(bench.clear(&[0], 2, 71.0), Clearance::Go);
+    bench.guards.start_written(0, 2, &Arc::from("c"), bench.at(71.0));
+    bench.read(0, false, 71.0);
+    bench.guards.stop_written(0, bench.at(71.1));
+    bench.read(0, false, 71.2);
+    bench.read(0, false, 72.5);
+    assert_eq!(
+        (bench.refused(0, 102.4), bench.refused(0, 102.5)),
+        (Some("min_off"), None)
+    );
+    // Stops to a motor that stands change nothing.
+    bench.guards.stop_written(0, bench.at(102.6));
+    bench.read(0, false, 102.7);
+    assert_eq!(bench.refused(0, 102.8), None);
     // Away, it may have run meanwhile.
     bench.images[0].update(|snapshot| snapshot.link = Link::Offline(SystemTime::now()));
-    bench.guards.look(0, &bench.images[0].reading(bench.at(80.0), SECOND));
-    assert_eq!(bench.refused(0, 80.0), Some("min_off"));
-    bench.read(0, false, 90.0);
+    bench.guards.look(0, &bench.images[0].reading(bench.at(180.0), SECOND));
+    assert_eq!(bench.refused(0, 180.0), Some("min_off"));
+    bench.read(0, false, 190.0);
     assert_eq!(
-        (bench.refused(0, 119.0), bench.refused(0, 120.0)),
+        (bench.refused(0, 219.0), bench.refused(0, 220.0)),
         (Some("min_off"), None)
     );
     // One that waits is taken in if it can go in time.
-    bench.read(1, false, 100.0);
+    bench.read(1, false, 200.0);
     let until = |seconds| Some(bench.at(seconds));
-    assert!(bench.guards.refuses(1, RUN, until(129.0), bench.at(120.0)).is_some());
-    assert_eq!(bench.guards.refuses(1, RUN, until(131.0), bench.at(120.0)), None);
+    assert!(bench.guards.refuses(1, RUN, until(229.0), bench.at(220.0)).is_some());
+    assert_eq!(bench.guards.refuses(1, RUN, until(231.0), bench.at(220.0)), None);
     assert_eq!(
-        bench.clear_waiting(&[1], 9, true, 129.0),
-        Clearance::Wait(bench.at(130.0)),
+        bench.clear_waiting(&[1], 9, true, 229.0),
+        Clearance::Wait(bench.at(230.0)),
         "it goes at its time"
     );
-    assert_eq!(bench.clear_waiting(&[1], 9, true, 130.0), Clearance::Go);
+    assert_eq!(bench.clear_waiting(&[1], 9, true, 230.0), Clearance::Go);
 }
 
 #[test]

@@ -8,7 +8,7 @@ use super::ledger::{Guards, Kept, Ledger};
 use super::{Guard, Guarded, Interlock, Reason, Seen, Unmet, shown};
 use crate::command::{Command, Effect, Refusal};
 use crate::drive::{ModelPoint, Plan};
-use crate::process_image::{BusSpec, DriveSpec, Machine, Reading};
+use crate::process_image::{BusSpec, DriveSpec, Link, Machine, Reading};
 use crate::stop_all::Standstill;
 
 /// Time until a start that waits for the disk is looked at again.
@@ -316,15 +316,15 @@ impl BusGuards {
     pub fn look(&self, drive: usize, reading: &Reading<'_>) {
         let Some(of) = self.of_drive(drive) else { return };
         let seen = seen(reading);
-        let online = reading.snapshot.link.is_online();
+        let is_away = matches!(reading.snapshot.link, Link::Offline(_));
         let mut ledger = self.shared.lock();
         let started = match seen {
             Some(seen) => ledger.seen(&of.machine, seen),
             None => {
-                ledger.with(&of.machine, |motor| match online {
-                    true if !of.tells_running => motor.begin_untold(reading.now),
-                    true => motor.unseen(),
-                    false => motor.away(),
+                ledger.with(&of.machine, |motor| match is_away {
+                    true => motor.away(),
+                    false if !of.tells_running => motor.begin_untold(reading.now),
+                    false => motor.unseen(),
                 });
                 false
             }
