@@ -15,7 +15,7 @@ IN_OWN_TMP := tests/tools/in_own_tmp.sh
 
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
-.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak fleet interop book clean
+.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak fleet fleet-rollout fleet-cluster interop book clean
 .PHONY: package-tools deb image release test-package test-static test-image
 
 help: ## Show this list
@@ -84,6 +84,17 @@ soak: build tools ## Run the gateway for HOURS under faults, floods and hostile 
 N ?= 100
 fleet: tools build ## Run N gateways with one broker and one Prometheus on this machine; prints what they cost
 	.tools/venv/bin/python tests/fleet/fleet.py --gateways $(N)
+
+PARTS ?=
+fleet-rollout: tools build ## Roll out good and bad configurations to 20 gateways with Ansible, which it installs; takes half an hour. PARTS="good cut-off" runs these
+	tests/fleet/install.sh ansible
+	cd deploy/fleet && ANSIBLE_COLLECTIONS_PATH=playbooks/collections ../../.tools/ansible/bin/ansible-lint --offline
+	.tools/ansible/bin/python tests/fleet/rollout.py $(addprefix --part ,$(PARTS))
+
+BROKERS ?= mosquitto rmqttd ejabberd
+fleet-cluster: tools build ## Run gateways with brokers that are clusters, and harm their nodes; builds rmqttd, which takes many minutes. BROKERS=ejabberd runs that one
+	tests/fleet/install.sh $(BROKERS)
+	.tools/venv/bin/python tests/fleet/cluster.py $(addprefix --broker ,$(BROKERS))
 
 CHECKS ?=
 interop: ## Run the gateway with Home Assistant, pysparkplug and Node-RED; installs them, which takes minutes. CHECKS=name runs one

@@ -19,7 +19,9 @@ mod gateway {
     mod demo;
     mod drive_access;
     mod families;
+    mod fleet;
     mod history;
+    mod holder;
     mod listening;
     mod living;
     mod local_socket;

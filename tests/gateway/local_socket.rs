@@ -1,6 +1,6 @@
 //! The local socket of a gateway: whose it is, what becomes of its file, and what commands through it do beside others.
 
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::fs::{FileTypeExt, PermissionsExt};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
@@ -14,7 +14,7 @@ use super::drive_access::{Line, Ran, ran};
 use crate::support::process::{self, Running, free_port, mbpoll_read, mbpoll_write, until};
 use crate::support::tools::tool;
 
-/// A client that speaks the protocol itself.
+/// A client that writes and reads HTTP itself.
 struct Client(BufReader<UnixStream>);
 
 impl Client {
@@ -24,23 +24,53 @@ impl Client {
         Client(BufReader::new(stream))
     }
 
-    fn send(&mut self, line: &str) {
-        self.0.get_mut().write_all(line.as_bytes()).unwrap();
+    fn send(&mut self, text: &str) {
+        self.0.get_mut().write_all(text.as_bytes()).unwrap();
     }
 
-    /// The next response; `None` when the gateway has closed the connection.
-    fn next(&mut self) -> Option<Value> {
+    /// The next line without its end; `None` when the gateway has closed the connection.
+    fn line(&mut self) -> Option<String> {
         let mut line = String::new();
         match self.0.read_line(&mut line) {
             Ok(0) | Err(_) => None,
-            Ok(_) => Some(serde_json::from_str(&line).unwrap()),
+            Ok(_) => Some(line.trim_end().to_string()),
         }
     }
 
-    fn ask(&mut self, request: &Value) -> Value {
-        self.send(&format!("{request}\n"));
+    /// Status and body of the next reply; `None` when the gateway has closed the connection.
+    fn next(&mut self) -> Option<(u16, Value)> {
+        let status = self.line()?.split(' ').nth(1)?.parse().ok()?;
+        let mut length = 0;
+        while let Some(header) = self.line().filter(|line| !line.is_empty()) {
+            if let Some(value) = header.to_ascii_lowercase().strip_prefix("content-length: ") {
+                length = value.parse().unwrap();
+            }
+        }
+        let mut body = vec![0; length];
+        self.0.read_exact(&mut body).ok()?;
+        Some((status, serde_json::from_slice(&body).unwrap_or_default()))
+    }
+
+    fn get(&mut self, path: &str) -> (u16, Value) {
+        self.send(&get(path));
         self.next().unwrap()
     }
+
+    fn post(&mut self, path: &str, body: &Value) -> (u16, Value) {
+        self.send(&post(path, &body.to_string()));
+        self.next().unwrap()
+    }
+}
+
+fn get(path: &str) -> String {
+    format!("GET {path} HTTP/1.1\r\nhost: gateway\r\n\r\n")
+}
+
+fn post(path: &str, body: &str) -> String {
+    format!(
+        "POST {path} HTTP/1.1\r\nhost: gateway\r\ncontent-length: {}\r\n\r\n{body}",
+        body.len()
+    )
 }
 
 fn exists(socket: &Path) -> bool {
@@ -176,46 +206,51 @@ fn clients_that_fall_silent_flood_or_read_nothing_harm_nobody() {
     until("a read", || {
         (line.command("read", &["pump-1", "run"]).code == 0).then_some(())
     });
-    let read = json!({"v": 1, "read": {"drive": "pump-1"}});
-    // One that never reads what it asks for: it loses its connection, and meanwhile others are served.
+    let points = "/api/v1/drives/pump-1/points";
+    // One that never reads what it asks for: meanwhile others are served.
     let mut deaf = Client::connect(&line.socket());
     deaf.0
         .get_ref()
         .set_write_timeout(Some(Duration::from_millis(200)))
         .unwrap();
-    let request = format!("{read}\n");
-    while deaf.0.get_mut().write_all(request.as_bytes()).is_ok() {}
+    while deaf.0.get_mut().write_all(get(points).as_bytes()).is_ok() {}
     assert_eq!(line.command("read", &["pump-1", "run"]).code, 0);
-    // Rubbish, one line after the other, is answered.
-    let mut client = Client::connect(&line.socket());
-    for (sent, code) in [
-        ("run", "bad_request"),
-        ("{}", "bad_request"),
-        (r#"{"v":2,"read":{"drive":"pump-1"}}"#, "bad_request"),
-        (r#"{"v":1,"read":{"drive":"pump-9"}}"#, "unknown_drive"),
-        (r#"{"v":1,"read":{"drive":"pump-1","points":["x"]}}"#, "unknown_point"),
-    ] {
-        client.send(&format!("{sent}\n"));
-        let response = client.next().unwrap();
-        assert_eq!((&response["v"], &response["gateway"]), (&json!(1), &json!("plant")));
-        assert_eq!(response["error"]["code"], code, "{sent}: {response}");
+    // What is not HTTP is told so.
+    for rubbish in ["{\"v\":1,\"read\":{\"drive\":\"pump-1\"}}\n", "run\n", "\0"] {
+        let mut client = Client::connect(&line.socket());
+        client.send(rubbish);
+        let told: Value = serde_json::from_str(&client.line().unwrap()).unwrap();
+        assert!(told["error"].as_str().unwrap().contains("serves HTTP"), "{told}");
+        assert_eq!(client.line(), None, "closed");
     }
-    assert_eq!(client.ask(&read)["read"]["points"][0]["point"], "ready");
-    // A line without end, and a command that was not ended.
-    client.send(&"x".repeat(64 * 1024));
-    assert_eq!(client.next().unwrap()["error"]["code"], "bad_request");
-    assert_eq!(client.next(), None, "closed");
+    let mut client = Client::connect(&line.socket());
+    for (path, status) in [
+        ("/api/v1/drives/pump-9/points", 404),
+        ("/api/v1/drives/pump-1/points?names=x", 404),
+        ("/api/v1/drives/pump-1/points?name=run", 400),
+        ("/api/v1/drives/pump-1/params/restore", 409),
+        (points, 200),
+    ] {
+        let (given, reply) = client.get(path);
+        assert_eq!(given, status, "{path}: {reply}");
+    }
+    assert_eq!(client.get(points).1[0]["point"], "ready");
+    // A head without end, and a command that was not ended.
+    client.send(&format!("GET /{}", "x".repeat(32 * 1024)));
+    assert!(client.next().is_none_or(|(status, _)| (400..500).contains(&status)));
+    assert_eq!(client.line(), None, "closed");
     let mut cut = Client::connect(&line.socket());
-    cut.send(r#"{"v":1,"write":{"drive":"pump-1","points":[{"point":"run","value":true}]}}"#);
+    let command = post("/api/v1/drives/pump-1/commands", "{\"run\":true}");
+    cut.send(command.strip_suffix('}').unwrap());
     cut.0.get_ref().shutdown(std::net::Shutdown::Write).unwrap();
-    assert_eq!(cut.next(), None);
+    assert!(cut.next().is_none_or(|(status, _)| status != 200));
     // Clients that say nothing are in nobody's way: the one that is silent longest is told so and closed.
     let mut silent: Vec<Client> = (0..40).map(|_| Client::connect(&line.socket())).collect();
-    let busy = silent[0].next().unwrap();
-    assert_eq!(busy["error"]["code"], "busy");
-    assert_eq!(silent[0].next(), None, "closed");
+    let (status, busy) = silent[0].next().unwrap();
+    assert!(status == 503 && busy["error"].is_string(), "{busy}");
+    assert_eq!(silent[0].line(), None, "closed");
     assert_eq!(line.value("run"), false);
-    assert_eq!(silent[39].ask(&read)["read"]["points"][0]["point"], "ready");
+    assert_eq!(silent[39].get(points).1[0]["point"], "ready");
     drop(silent);
 }
 
@@ -402,9 +437,8 @@ fn a_stop_that_comes_in_between_is_not_undone() {
                 scope.spawn(move || {
                     let mut client = Client::connect(socket);
                     for on in [true, false, true, false] {
-                        let set = json!([{"point": point, "value": on}]);
                         // A stop may cut it short, which is an answer too.
-                        client.ask(&json!({"v": 1, "write": {"drive": "fan-1", "points": set}}));
+                        client.post("/api/v1/drives/fan-1/commands", &json!({ point: on }));
                     }
                 });
             }

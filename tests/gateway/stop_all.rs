@@ -147,4 +147,38 @@ fn from_every_side() {
         &["-s", "-o", "/dev/null", "-d", "{}", "-w", "%{http_code}", &url],
     );
     assert_eq!(nobody.stdout, b"401");
+    // The command line over the network, as a user or as nobody.
+    let (url, login) = (
+        format!("http://127.0.0.1:{}", plant.site.http),
+        plant.site.path("login"),
+    );
+    std::fs::write(&login, format!("alice:{PASSWORD}\n")).unwrap();
+    let ran = |arguments: &[&str], login: &[&str]| {
+        let output = drivegate(&[arguments, &["--url", &url], login].concat())
+            .output()
+            .unwrap();
+        let text = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
+        (output.status.code().unwrap(), text)
+    };
+    let alice = ["--token-file", &login];
+    let (code, text) = ran(&["write", "pump-1", "speed_reference=30"], &alice);
+    assert!(code == 0 && text.contains("through the gateway"), "{text}");
+    let (code, text) = ran(&["read", "pump-1", "running", "slot_fault_response"], &alice);
+    assert!(code == 0 && text.matches("good").count() == 2, "{text}");
+    let (code, text) = ran(&["read", "pump-1", "running", "slot_fault_response"], &[]);
+    assert!(code == 1 && text.contains("it is not polled"), "{text}");
+    let (code, text) = ran(&["why", "pump-1"], &[]);
+    assert_eq!((code, text.as_str()), (0, "pump-1 runs\n"));
+    for refused in [
+        &["write", "pump-1", "run=false"][..],
+        &["stop-all"],
+        &["record", "pump-1"],
+    ] {
+        let (code, text) = ran(refused, &[]);
+        assert!(code == 1 && text.contains("USER:PASSWORD"), "{refused:?}: {text}");
+    }
+    assert_eq!(plant.site.point("pump-1", "running"), true);
+    let (code, text) = ran(&["stop-all"], &alice);
+    assert_eq!((code, text.as_str()), (0, "pump-1: standing\nfan-1: standing\n"));
+    plant.all_stand();
 }

@@ -259,9 +259,9 @@ impl Bench {
     /// Whether the drive is told to run.
     fn runs(&mut self) -> bool {
         let profile = self.rig.bus.profile.clone();
-        let (raw, ..) = profile.run_bit().unwrap();
-        let word = self.register(raw.table, raw.address);
-        !profile.is_stop(raw.table, raw.address, word)
+        let place = profile.run_place().unwrap();
+        let word = self.register(place.table, place.address);
+        !profile.is_stop(place.table, place.address, word)
     }
 
     /// The reference that the drive has.

@@ -162,7 +162,7 @@ impl World {
 #[test]
 fn stops_stand_and_all_heals_for_every_family_of_the_language() {
     let built_in = Profiles::built_in();
-    let families = built_in.iter().filter(|profile| profile.control.is_some());
+    let families = built_in.iter().filter(|profile| profile.control_table().is_some());
     let mut count = 0;
     for profile in families {
         // Names live as long as the tests do.

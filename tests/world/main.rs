@@ -26,6 +26,7 @@ mod diagnosis;
 mod drives;
 mod families;
 mod history;
+mod holder;
 mod listener;
 mod listening;
 mod matrix;

@@ -164,15 +164,16 @@ pub fn percent_reference(profile: &Profile, percent: f64, maximum: f64) -> Optio
 pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, Option<Unique>)> {
     let run = |on: bool| (profile.model_index(ModelPoint::Run).unwrap(), Value::Bool(on));
     let (reference, value, unique) = unique_reference(profile, number);
-    let (raw, bit, _) = profile.run_bit().unwrap();
-    let raw_run = |on: bool| match raw.table {
+    let place = profile.run_place().unwrap();
+    let started = profile.control.as_ref().unwrap().runs()[0].applied(0);
+    let raw_run = |on: bool| match place.table {
         Table::Coil => RequestPdu::WriteCoil {
-            address: raw.address,
+            address: place.address,
             on,
         },
         _ => RequestPdu::WriteRegister {
-            address: raw.address,
-            value: u16::from(on) << bit,
+            address: place.address,
+            value: if on { started } else { 0 },
         },
     };
     let model =
@@ -189,7 +190,7 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
             let values = vec![u16::from(on), 0, unique.2[0]];
             (profile.name == "vacon-nx").then_some((
                 Order::Write(RequestPdu::WriteRegisters {
-                    start: raw.address,
+                    start: place.address,
                     values,
                 }),
                 Some(unique),
@@ -283,10 +284,10 @@ pub fn sets(pdu: &RequestPdu, (table, address, words): &Unique) -> bool {
 
 /// What a write does to the run command: sets it, takes it away, or nothing.
 pub fn run_command(profile: &Profile, pdu: &RequestPdu) -> Option<bool> {
-    let (raw, ..) = profile.run_bit()?;
+    let place = profile.run_place()?;
     let (table, items) = written(pdu)?;
     let (address, word) = items
         .into_iter()
-        .find(|(at, _)| table == raw.table && *at == raw.address)?;
+        .find(|(at, _)| table == place.table && *at == place.address)?;
     Some(!profile.is_stop(table, address, word))
 }

@@ -112,6 +112,8 @@ pub struct CommandRun {
     stop: Option<Order>,
     /// The order by which it starts a motor whose starts count.
     pub(super) start: Option<Start>,
+    /// The silence of whoever gave it is the one that counts for supervision.
+    pub renews: bool,
 }
 
 impl CommandRun {
@@ -195,6 +197,7 @@ impl CommandRun {
             started: false,
             stop,
             start: None,
+            renews: true,
         }
     }
 
@@ -254,6 +257,16 @@ impl CommandRun {
     pub fn is_of_client(&self) -> bool {
         let kind = |ticket: &Ticket| ticket.origin().kind;
         self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| kind(ticket).is_client())
+    }
+
+    /// Whether it renews the lease of its drive: a client gave it whose silence counts.
+    pub fn is_heard(&self) -> bool {
+        self.renews && self.is_of_client()
+    }
+
+    /// Those who gave it.
+    pub fn origins(&self) -> impl Iterator<Item = &Origin> {
+        self.tickets.iter().map(Ticket::origin)
     }
 
     /// Whether a tool gave it: its share of the line is that of background exchanges.
@@ -554,6 +567,13 @@ impl CommandRun {
         // The stop that came in is on its way.
         self.started = false;
         self.cut_off(self.unless_begun(Outcome::Purged, Interruption::Stop));
+        self.actions.is_empty().then(|| self.success())
+    }
+
+    /// Another client took the drive: it goes no further, but the motor is left as it is. The outcome, if it is over by that.
+    pub fn taken(&mut self, refusal: Refusal) -> Option<Outcome> {
+        self.started = false;
+        self.cut_off(self.unless_begun(Outcome::Refused(refusal), Interruption::Taken));
         self.actions.is_empty().then(|| self.success())
     }
 

@@ -73,15 +73,13 @@ pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
             let Some((table, items)) = written(pdu) else {
                 return effects;
             };
-            if profile.control_language().is_some() {
-                let run = items
-                    .iter()
-                    .find_map(|(address, word)| profile.runs_by(table, *address, *word));
-                let index = profile.model_index(ModelPoint::Run);
-                add(index
-                    .zip(run)
-                    .and_then(|(index, run)| effect_of(profile, index, Value::Bool(run))));
-            }
+            let run = items
+                .iter()
+                .find_map(|(address, word)| profile.runs_by(table, *address, *word));
+            let index = profile.model_index(ModelPoint::Run);
+            add(index
+                .zip(run)
+                .and_then(|(index, run)| effect_of(profile, index, Value::Bool(run))));
             let word_at = |address| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word);
             for (index, point) in profile.points.iter().enumerate().filter(|(_, p)| p.write && !p.pulse) {
                 let Some(raw) = point.raw().filter(|r| r.table == table) else {
@@ -149,17 +147,23 @@ fn speed(reading: &Reading<'_>) -> Option<f64> {
     reading.model(point).good().map(|value| value.as_f64().abs())
 }
 
+/// An effect that is waited for.
+#[derive(Debug, Clone, Copy)]
+struct Awaited {
+    effect: Effect,
+    /// Whether the drive was read since, as far as it could show it: not every value is read in every round.
+    was_read: bool,
+}
+
 /// An acknowledged command whose effect is waited for.
 #[derive(Debug)]
 struct Watch {
-    effects: Vec<Effect>,
+    effects: Vec<Awaited>,
     since: Instant,
     within: Duration,
     /// Least speed since the acknowledgement, and when it last fell.
     slowest: Option<f64>,
     fell_at: Instant,
-    /// Whether the drive was read since, as far as it could show an effect.
-    was_read: bool,
     /// What it was, for people.
     what: String,
     /// Why its effect cannot be seen, as it was last.
@@ -175,21 +179,41 @@ impl Watch {
         now.saturating_duration_since(self.since) >= self.within
     }
 
+    fn has(&self, effect: Effect) -> bool {
+        self.effects.iter().any(|awaited| awaited.effect == effect)
+    }
+
     /// Whether a motor that is to stop still slows down.
     fn slows_down(&self, now: Instant) -> bool {
-        self.effects.contains(&Effect::Stops) && now.saturating_duration_since(self.fell_at) < self.within
+        self.has(Effect::Stops) && now.saturating_duration_since(self.fell_at) < self.within
+    }
+
+    /// Whether it is too early to say that an effect is missing that was not read.
+    fn waits_for_reads(&self, now: Instant) -> bool {
+        now.saturating_duration_since(self.since) < self.within * UNREAD
     }
 
     /// Whether it is too early to say that the effect is missing: the motor still slows down, or the drive was not read.
     fn is_open(&self, now: Instant) -> bool {
-        let unread = !self.was_read && now.saturating_duration_since(self.since) < self.within * UNREAD;
-        unread || self.slows_down(now)
+        let unread = self.effects.iter().any(|awaited| !awaited.was_read);
+        (unread && self.waits_for_reads(now)) || self.slows_down(now)
+    }
+
+    /// What can be said now to be missing, which is waited for no longer.
+    fn take_missing(&mut self, now: Instant) -> Vec<Awaited> {
+        let waits = self.waits_for_reads(now);
+        let (missing, open) = self
+            .effects
+            .drain(..)
+            .partition(|awaited: &Awaited| awaited.was_read || !waits);
+        self.effects = open;
+        missing
     }
 
     /// For people: what was not seen.
-    fn report(&self, profile: &Profile) -> String {
+    fn report(&self, missing: &[Awaited], profile: &Profile, now: Instant) -> String {
         let Watch { what, within, .. } = self;
-        if !self.was_read {
+        if missing.iter().all(|awaited| !awaited.was_read) {
             let within = *within * UNREAD;
             return format!(
                 "acknowledged {what} but was not read within {within:?}; whether it took effect is unknown"
@@ -198,7 +222,10 @@ impl Watch {
         if let Some(unseen) = &self.unseen {
             return format!("acknowledged {what}, and whether it took effect is not known: {unseen}");
         }
-        let missing: Vec<String> = self.effects.iter().map(|e| e.missing(profile)).collect();
+        let passed = now.saturating_duration_since(self.since).as_secs();
+        let within = (*within).max(Duration::from_secs(passed));
+        let read = missing.iter().filter(|awaited| awaited.was_read);
+        let missing: Vec<String> = read.map(|awaited| awaited.effect.missing(profile)).collect();
         let missing = missing.join(", ");
         format!("acknowledged {what} but did not show it within {within:?}: {missing}")
     }
@@ -246,7 +273,7 @@ impl Confirmations {
     pub fn watch(&mut self, effects: Vec<Effect>, receipts: Vec<Receipt>, reading: &Reading<'_>, now: Instant) {
         self.0.retain(|w| {
             let pointless = |old: &Effect| effects.iter().any(|new| new.same_subject(*old));
-            !w.effects.iter().any(pointless)
+            !w.effects.iter().any(|awaited| pointless(&awaited.effect))
         });
         if effects.is_empty() {
             return;
@@ -254,13 +281,16 @@ impl Confirmations {
         if self.0.len() >= WATCHED {
             self.0.remove(0);
         }
+        let unread = |effect| Awaited {
+            effect,
+            was_read: false,
+        };
         self.0.push(Watch {
-            effects,
+            effects: effects.into_iter().map(unread).collect(),
             since: now,
             within: reading.spec.profile.confirm_within,
             slowest: speed(reading),
             fell_at: now,
-            was_read: false,
             what: receipts
                 .first()
                 .map(|receipt| receipt.what().to_string())
@@ -278,14 +308,13 @@ impl Confirmations {
             let since = watch.since;
             watch.note_speed(reading, now);
             if !watch.is_over(now) || watch.is_open(now) {
-                let was_read = &mut watch.was_read;
-                let stops = watch.effects.contains(&Effect::Stops);
+                let stops = watch.has(Effect::Stops);
                 watch.unseen = stops.then(|| reading.may_turn()).flatten();
                 let unseen = watch.unseen.is_some();
-                watch.effects.retain(|effect| {
-                    let shown = shows(*effect, reading, since);
-                    *was_read |= shown.is_some();
-                    shown != Some(true) || (unseen && *effect == Effect::Stops)
+                watch.effects.retain_mut(|awaited| {
+                    let shown = shows(awaited.effect, reading, since);
+                    awaited.was_read |= shown.is_some();
+                    shown != Some(true) || (unseen && awaited.effect == Effect::Stops)
                 });
             }
             if watch.is_over(now) {
@@ -301,8 +330,8 @@ impl Confirmations {
         }
     }
 
-    /// What showed no effect in time, in words, each once. Of a motor that still slows down, and of a drive that was not
-    /// read since, nothing is said yet, but nobody waits for it any longer.
+    /// What showed no effect in time, in words, each once. Of a motor that still slows down, and of what was not read since,
+    /// nothing is said yet, but nobody waits for it any longer.
     pub fn expire(&mut self, profile: &Profile, now: Instant) -> Vec<Unconfirmed> {
         let mut late = Vec::new();
         self.0.retain_mut(|watch| {
@@ -310,15 +339,19 @@ impl Confirmations {
                 return true;
             }
             watch.let_go();
-            if watch.is_open(now) {
+            if watch.slows_down(now) {
                 return true;
             }
-            late.push(Unconfirmed {
-                text: watch.report(profile),
-                does_not_run: watch.was_read && watch.effects.contains(&Effect::Runs),
-                own: watch.own,
-            });
-            false
+            let missing = watch.take_missing(now);
+            if !missing.is_empty() {
+                let runs = |awaited: &Awaited| awaited.was_read && awaited.effect == Effect::Runs;
+                late.push(Unconfirmed {
+                    text: watch.report(&missing, profile, now),
+                    does_not_run: missing.iter().any(runs),
+                    own: watch.own,
+                });
+            }
+            !watch.effects.is_empty()
         });
         late
     }

@@ -7,15 +7,12 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot::Receiver;
 use tokio::sync::oneshot::error::TryRecvError;
 
-use crate::codec::{Reply, RequestPdu};
+use crate::codec::Reply;
 use crate::command::{Answer, BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket, WriteStats};
 use crate::diagnosis::CountedByDrive;
 use crate::line_diagnosis::LineDiagnosis;
 use crate::plant::BusHandle;
 
-/// First subfunction: messages, damaged ones, exceptions, messages to the drive, those without an answer.
-const FIRST: u16 = 0x0B;
-const COUNTERS: usize = 5;
 /// Pause between two readings of a drive.
 const PAUSE: Duration = Duration::from_secs(30);
 /// Pause before a counter is asked for again whose reply was lost.
@@ -76,8 +73,8 @@ impl DriveCounters {
                     let counted = std::mem::take(counted);
                     match online && diagnosis.has_errors(*drive) {
                         true => {
-                            let next = FIRST + counted.len().min(COUNTERS) as u16;
-                            State::Reading(counted, ask(bus, *drive, next, writes, now))
+                            let answer = ask(bus, *drive, &counted, writes, now);
+                            State::Reading(counted, answer)
                         }
                         false => State::Idle(now + AGAIN, counted),
                     }
@@ -89,21 +86,14 @@ impl DriveCounters {
                         ..
                     }) => {
                         counted.push(count);
-                        match counted.as_slice() {
-                            [messages, damaged, exceptions, own, unanswered] => {
-                                let counted = CountedByDrive {
-                                    messages: *messages,
-                                    damaged: *damaged,
-                                    exceptions: *exceptions,
-                                    own: *own,
-                                    unanswered: *unanswered,
-                                };
-                                diagnosis.counted_by_drive(*drive, counted);
+                        match CountedByDrive::complete(counted) {
+                            Some(all) => {
+                                diagnosis.counted_by_drive(*drive, all);
                                 State::Idle(now + PAUSE, Vec::new())
                             }
-                            so_far => {
-                                let next = FIRST + so_far.len().min(COUNTERS) as u16;
-                                State::Reading(std::mem::take(counted), ask(bus, *drive, next, writes, now))
+                            None => {
+                                let answer = ask(bus, *drive, counted, writes, now);
+                                State::Reading(std::mem::take(counted), answer)
                             }
                         }
                     }
@@ -120,14 +110,21 @@ impl DriveCounters {
     }
 }
 
-fn ask(bus: &BusHandle, drive: usize, subfunction: u16, writes: &Arc<WriteStats>, now: Instant) -> Receiver<Answer> {
+/// Asks for the counter behind those that were read.
+fn ask(bus: &BusHandle, drive: usize, so_far: &[u16], writes: &Arc<WriteStats>, now: Instant) -> Receiver<Answer> {
     let name = bus.image.drives.get(drive).map_or("", |drive| drive.spec.name.as_str());
     let origin = Origin::new(SourceKind::Schedule, "diagnosis");
-    let what = format!("counter {subfunction:02X}h of the drive");
-    let (ticket, answer) = Ticket::new(origin, name, what, false, now, writes.clone());
+    let (ticket, answer) = Ticket::new(
+        origin,
+        name,
+        "a counter of the drive".to_string(),
+        false,
+        now,
+        writes.clone(),
+    );
     let request = BackgroundRequest {
         drive,
-        pdu: RequestPdu::Diagnostics { subfunction, data: 0 },
+        pdu: CountedByDrive::request(so_far),
         pace: Pace::Slow,
         expires: now + EXPIRY,
         ticket,

@@ -9,7 +9,7 @@ use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
 use super::vain_stops::VainStops;
 use crate::codec::Reply;
-use crate::command::{Command, Interruption, LastWritten, Outcome, Urgency};
+use crate::command::{Command, Interruption, LastWritten, Origin, Outcome, Refusal, Urgency};
 use crate::drive::ModelPoint;
 use crate::process_image::{DriveImage, Reading};
 
@@ -43,6 +43,11 @@ pub(super) struct DriveState {
     pub(super) written: LastWritten,
     /// A start (true) or a stop was acknowledged, and the guards have not taken note of it.
     pub(super) acknowledged: Option<bool>,
+    /// Whether `[authority]` is on: then those are kept whose orders were carried out.
+    pub(super) guarded: bool,
+    pub(super) carried_out: Vec<Origin>,
+    /// Its local control place has it, as far as was told.
+    pub(super) local: bool,
 }
 
 /// What the begun commands of a drive want.
@@ -76,6 +81,9 @@ impl DriveState {
             was_read: false,
             written: LastWritten::default(),
             acknowledged: None,
+            guarded: false,
+            carried_out: Vec::new(),
+            local: false,
         }
     }
 
@@ -109,7 +117,7 @@ impl DriveState {
 
     /// Until when a begun order of a client holds the lease.
     pub(super) fn client_holds_until(&self) -> Option<Instant> {
-        let of_client = self.runs.iter().flatten().filter(|run| run.is_of_client());
+        let of_client = self.runs.iter().flatten().filter(|run| run.is_heard());
         of_client.map(CommandRun::expires).max()
     }
 
@@ -180,8 +188,11 @@ impl DriveState {
             // A bit of another command must not bring back what an unanswered stop took away.
             self.words.forget();
         }
-        if run.is_of_client() && run.reached_the_wire() {
+        if run.is_heard() && run.reached_the_wire() {
             self.supervision.renew(now);
+        }
+        if self.guarded && outcome.is_ok() {
+            self.carried_out.extend(run.origins().cloned());
         }
         if urgency == Urgency::Stop && run.has_begun() {
             // Stops without end must not make each other news.
@@ -220,15 +231,17 @@ impl DriveState {
         if step.pdu.is_write() && urgency != Urgency::Stop && !run.is_reference_only() {
             self.stopped = None;
         }
-        if run.is_of_client() {
+        if run.is_heard() {
             self.supervision.renew(now);
         }
     }
 
     /// It heard an order that is no begun command: one to several drives, or one that is not decoded.
-    pub(super) fn heard_order(&mut self, now: Instant) {
+    pub(super) fn heard_order(&mut self, renews: bool, now: Instant) {
         self.stopped = None;
-        self.supervision.renew(now);
+        if renews {
+            self.supervision.renew(now);
+        }
     }
 
     /// Whether a stop was acknowledged after which no command was sent that is neither stop nor reference.
@@ -257,6 +270,18 @@ impl DriveState {
         }
     }
 
+    /// Another client took the drive: what `refuses` says of the begun command goes no further.
+    pub(super) fn taken(&mut self, refuses: impl Fn(&Origin) -> Option<Refusal>, image: &DriveImage, now: Instant) {
+        let taken = |run: &mut CommandRun| {
+            let refusal = run.origins().find_map(&refuses)?;
+            run.taken(refusal)
+        };
+        let outcome = self.run(Urgency::Command).and_then(taken);
+        if let Some(outcome) = outcome {
+            self.end(Urgency::Command, &outcome, image, now);
+        }
+    }
+
     /// What supervision wants and was begun, but not sent, is taken back: a client commands the drive again.
     pub(super) fn withdraw_supervision(&mut self, now: Instant) {
         for run in &mut self.runs {
@@ -273,7 +298,7 @@ impl DriveState {
         self.stopped = None;
         for urgency in [Urgency::Command, Urgency::Read] {
             if let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::take) {
-                if run.is_of_client() && run.reached_the_wire() {
+                if run.is_heard() && run.reached_the_wire() {
                     self.supervision.renew(now);
                 }
                 run.abandon(Outcome::Offline, Interruption::Offline, now);
@@ -290,7 +315,7 @@ impl DriveState {
     /// The stop of a client that is begun, for the bus that takes the place of this one.
     pub(super) fn take_stop(&mut self, drive: usize, now: Instant) -> Option<Command> {
         let run = self.runs.get_mut(slot(Urgency::Stop))?.take()?;
-        if run.is_of_client() && run.reached_the_wire() {
+        if run.is_heard() && run.reached_the_wire() {
             self.supervision.renew(now);
         }
         match run.into_stop(drive) {
@@ -305,7 +330,7 @@ impl DriveState {
     /// Everything that was begun is answered; what was acknowledged stays so.
     pub(super) fn close(&mut self, unbegun: &Outcome, why: Interruption, now: Instant) {
         for run in self.runs.iter_mut().filter_map(Option::take) {
-            if run.is_of_client() && run.reached_the_wire() {
+            if run.is_heard() && run.reached_the_wire() {
                 self.supervision.renew(now);
             }
             run.abandon(unbegun.clone(), why, now);

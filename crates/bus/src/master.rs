@@ -6,6 +6,7 @@
 
 mod background;
 mod choose;
+mod hold;
 mod remains;
 mod results;
 mod shutdown;
@@ -18,6 +19,7 @@ pub use self::remains::Remains;
 
 use self::background::Begun;
 use self::choose::Turns;
+use self::hold::look_at_hold;
 use self::shutdown::Shutdown;
 use super::BusOptions;
 use super::command_run::StepPurpose;
@@ -313,6 +315,7 @@ impl Master {
         let Master {
             bus, drives, writes, ..
         } = self;
+        let guarded = bus.queue.is_guarded();
         for (index, (drive, image)) in drives.iter_mut().zip(&bus.image.drives).enumerate() {
             if !drive.confirmations.is_empty() {
                 if std::mem::take(&mut drive.was_read) {
@@ -320,6 +323,9 @@ impl Master {
                 }
                 let late = drive.confirmations.expire(&image.spec.profile, now);
                 news.extend(late.into_iter().map(|late| News::NotConfirmed(index, late)));
+            }
+            if drive.guarded || guarded {
+                look_at_hold(bus, index, image, drive, guarded, now);
             }
             if image.spec.supervision.is_some() {
                 supervise(bus, index, image, drive, writes, now, news);

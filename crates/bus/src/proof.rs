@@ -12,8 +12,9 @@ use self::drive::{Drive, Start};
 use super::command_run::{CommandRun, KnownWords, Next, Step};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Admitted, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats, written};
-use crate::drive::control::{Control, Place, Run, Setting};
-use crate::drive::{ModelPoint, Profile, Value};
+use crate::drive::control::{Control, OwnWord, Place, Run, Setting};
+use crate::drive::profile::Form;
+use crate::drive::{ModelPoint, Profile, Raw, Value};
 
 /// Requests after which a command should have ended, reads of a state for which it waits among them.
 const MOST_FRAMES: usize = 1000;
@@ -124,12 +125,11 @@ const COMMANDS: [Sets; 10] = [
 /// # Errors
 /// A counterexample.
 pub fn prove(profile: &Profile) -> Result<Proof, Box<Counterexample>> {
-    if let Some(control) = profile.control_language() {
-        overlaps(profile, control)?;
-        return explore(profile, control);
-    }
-    let control = profile.control_of_bits();
-    control.map_or(Ok(Proof::default()), |control| explore(profile, &control))
+    let Some(control) = &profile.control else {
+        return Ok(Proof::default());
+    };
+    overlaps(profile, control)?;
+    explore(profile, control)
 }
 
 fn explore(profile: &Profile, control: &Control) -> Result<Proof, Box<Counterexample>> {
@@ -162,15 +162,20 @@ impl Proof {
     }
 }
 
-/// No other writable point may share a register with the commands.
+/// No other writable point may share a register with the commands, but one that has bits of its own in a word whose other bits are
+/// kept.
 fn overlaps(profile: &Profile, control: &Control) -> Result<(), Box<Counterexample>> {
     let is_own = |point: ModelPoint| profile.model_index(point);
     let own = [ModelPoint::Run, ModelPoint::Reverse, ModelPoint::FaultReset].map(is_own);
     let points = profile.points.iter().enumerate();
     for (index, point) in points.filter(|(_, point)| point.is_commanded()) {
-        let covers = point
-            .raw()
-            .is_some_and(|raw| !own.contains(&Some(index)) && raw.covers(control.at.table, control.at.address));
+        let shares = |raw: &Raw| match raw.form {
+            Form::Bit { bit, .. } if control.own_word == OwnWord::Kept => takes(control, 1u16 << bit.min(15)),
+            _ => true,
+        };
+        let covers = point.raw().is_some_and(|raw| {
+            !own.contains(&Some(index)) && raw.covers(control.at.table, control.at.address) && shares(raw)
+        });
         if covers {
             return Err(Box::new(Counterexample {
                 what: format!("point `{}` writes into the control word, past [control]", point.name),
@@ -181,6 +186,19 @@ fn overlaps(profile: &Profile, control: &Control) -> Result<(), Box<Counterexamp
         }
     }
     Ok(())
+}
+
+/// Whether a command has these bits of the control word.
+fn takes(control: &Control, bits: u16) -> bool {
+    let reset = control.fault_reset.map(|reset| reset.setting);
+    let all = control
+        .runs()
+        .into_iter()
+        .chain([control.stop])
+        .chain(control.reverse)
+        .chain(reset);
+    all.filter(|setting| setting.place.is_none())
+        .any(|setting| setting.mask & bits != 0)
 }
 
 /// One command to a drive in one state.
@@ -469,7 +487,7 @@ impl<'p> Case<'p> {
         }
         if self.is_stop() && event == Event::None {
             // Bits of a word stay as the drive has them, which takes a read before where that is not known.
-            let reads = usize::from(self.profile.control_language().is_none() && !self.known);
+            let reads = usize::from(self.control.own_word == OwnWord::Kept && !self.known);
             let writes = |frame: &&String| frame.contains(" = ");
             let first = progress.frames.iter().take(1 + reads).find(writes);
             if !outcome.is_ok() || runs || first.is_none() {

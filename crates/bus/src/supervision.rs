@@ -51,6 +51,15 @@ impl Lease {
         Lease(State::Held(since))
     }
 
+    /// The same when its time stood for so long.
+    #[must_use]
+    pub fn after(self, stood: Duration) -> Lease {
+        match self.0 {
+            State::Held(since) => Lease(State::Held(since + stood)),
+            _ => self,
+        }
+    }
+
     /// What ends with it where no drive goes on with it, in words; nothing of one that has ended, or never began.
     pub fn ends(self) -> Option<&'static str> {
         match self.0 {
@@ -393,11 +402,7 @@ pub(super) fn written_run(reading: &Reading<'_>, words: &KnownWords) -> Option<b
     let profile = &reading.spec.profile;
     let place = profile.run_place()?;
     let word = words.get(place.table, place.address)?;
-    Some(
-        profile
-            .runs_by(place.table, place.address, word)
-            .unwrap_or(profile.control.is_none()),
-    )
+    Some(profile.runs_by(place.table, place.address, word).unwrap_or(false))
 }
 
 /// Whether an action failed that ended so: not where somebody else's order took its place, or the bus starts anew.

@@ -85,11 +85,17 @@ pub enum EventKind {
     Guarded,
     /// A start was refused, or a motor stopped, since an interlock does not hold.
     Interlock,
+    /// A client took hold of a drive.
+    Held,
+    /// The hold of a client ended.
+    Released,
+    /// A client took a drive from its holder.
+    HoldBroken,
 }
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 27] = [
+    pub const ALL: [EventKind; 30] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -117,6 +123,9 @@ impl EventKind {
         EventKind::Diagnosis,
         EventKind::Guarded,
         EventKind::Interlock,
+        EventKind::Held,
+        EventKind::Released,
+        EventKind::HoldBroken,
     ];
 
     /// Whether somebody should look: the log has it as a warning.
@@ -148,6 +157,9 @@ impl EventKind {
             | EventKind::Recording
             | EventKind::ForeignCommand
             | EventKind::Guarded
+            | EventKind::Held
+            | EventKind::Released
+            | EventKind::HoldBroken
             | EventKind::ParametersChanged => false,
         }
     }
@@ -182,6 +194,9 @@ impl EventKind {
             EventKind::Diagnosis => "diagnosis",
             EventKind::Guarded => "guarded",
             EventKind::Interlock => "interlock",
+            EventKind::Held => "held",
+            EventKind::Released => "released",
+            EventKind::HoldBroken => "hold_broken",
         }
     }
 }
@@ -494,8 +509,8 @@ mod tests {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised
                 | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
-                ParametersChanged | RestoreUnfinished | Diagnosis | Guarded => false,
-                Interlock => true,
+                ParametersChanged | RestoreUnfinished | Diagnosis | Guarded | Interlock | Held | Released => false,
+                HoldBroken => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

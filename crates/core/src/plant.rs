@@ -1,6 +1,7 @@
 //! What the north sides see: images to read from, queues to write into. No clock: time is an argument.
 
 mod exchange;
+mod hold;
 mod placed;
 mod why;
 
@@ -58,6 +59,7 @@ impl BusHandle {
                 let same = |image: &Arc<DriveImage>| bus.image.spec.machine(&image.spec) == machine;
                 Some((bus, bus.image.drives.iter().position(same)?))
             });
+            let holding = known.and_then(|(bus, place)| bus.queue.lock().holding(place));
             let (commander, stops, priorities) = match known {
                 Some((bus, place)) => {
                     if let Some(image) = bus.image.drives.get(place) {
@@ -73,7 +75,12 @@ impl BusHandle {
                     Priorities::default(),
                 ),
             };
-            self.queue.lock().take_over(index, commander, stops, priorities);
+            let mut queue = self.queue.lock();
+            queue.take_over(index, commander, stops, priorities);
+            if let Some(holding) = holding {
+                queue.take_over_holding(index, holding);
+            }
+            drop(queue);
             // What is only monitored from now on is sent nothing.
             if let Some((bus, place)) = known.filter(|_| drive.spec.access == Access::Control) {
                 bus.queue.hand_over(place, &self.queue, index, now);
@@ -330,7 +337,8 @@ impl DriveHandle {
 
     /// Whether the drive of `reading` runs, and why not.
     pub fn why(&self, reading: &Reading<'_>) -> Explanation {
-        let mut explanation = explain(reading, &self.bus.image, &self.writes);
+        let explanation = explain(reading, &self.bus.image, &self.writes);
+        let mut explanation = self.with_reservation(explanation, reading.now);
         let guards = self.bus.queue.guards().filter(|_| explanation.runs == Some(false));
         if let Some(hindrance) = guards.and_then(|guards| guards.hindrance(self.index, reading.now)) {
             explanation.add(why::guarded(&hindrance));
@@ -525,30 +533,33 @@ impl DriveHandle {
         expires: Instant,
     ) -> Result<Admitted, Outcome> {
         let online = reading.snapshot.link.is_online();
-        let held_back = |admitted: &Admitted| {
-            if admitted.urgency != Urgency::Command {
-                return None;
-            }
+        let admitted = match command::admit(order, reading, authority) {
+            Err(Refusal::NotKnown(_)) if !self.bus_up() => return Err(Outcome::BusDown),
+            Err(Refusal::NotKnown(_)) if !online => return Err(Outcome::Offline),
+            admitted => admitted.map_err(Outcome::Refused)?,
+        };
+        if let Some(refusal) = self.hold_refuses(&admitted, origin, reading.now) {
+            return Err(Outcome::Refused(refusal));
+        }
+        let is_stop = admitted.urgency == Urgency::Stop;
+        if (!is_stop && !self.bus_up()) || !self.takes_stops() {
+            return Err(Outcome::BusDown);
+        }
+        // A stop goes to a drive that does not answer too: it may be back.
+        if !online && !is_stop {
+            return Err(Outcome::Offline);
+        }
+        let held_back = || {
             let effect = Effect::of(&admitted.order, &self.image.spec.profile);
             let until = (self.manner == Manner::Waits).then_some(expires);
             let queue = self.bus.queue.lock();
-            queue
-                .held_back(self.index, origin, effect)
-                .or_else(|| queue.guarded(self.index, effect, until, reading.now))
+            let held_back = queue.held_back(self.index, origin, effect);
+            held_back.or_else(|| queue.guarded(self.index, effect, until, reading.now))
         };
-        match command::admit(order, reading, authority) {
-            Err(Refusal::NotKnown(_)) if !self.bus_up() => Err(Outcome::BusDown),
-            Err(Refusal::NotKnown(_)) if !online => Err(Outcome::Offline),
-            Err(refusal) => Err(Outcome::Refused(refusal)),
-            Ok(admitted) if admitted.urgency != Urgency::Stop && !self.bus_up() => Err(Outcome::BusDown),
-            Ok(_) if !self.takes_stops() => Err(Outcome::BusDown),
-            // A stop goes to a drive that does not answer too: it may be back.
-            Ok(admitted) if !online && admitted.urgency != Urgency::Stop => Err(Outcome::Offline),
-            // Judged once more when it is accepted.
-            Ok(admitted) => match held_back(&admitted) {
-                Some(refusal) => Err(Outcome::Refused(refusal)),
-                None => Ok(admitted),
-            },
+        // Judged once more when it is accepted.
+        match (admitted.urgency == Urgency::Command).then(held_back).flatten() {
+            Some(refusal) => Err(Outcome::Refused(refusal)),
+            None => Ok(admitted),
         }
     }
 

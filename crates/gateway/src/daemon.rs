@@ -4,6 +4,7 @@ mod changes;
 mod file_limit;
 mod leases;
 mod pulse;
+mod reservations;
 mod server;
 
 use std::collections::BTreeMap;
@@ -12,8 +13,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 
-use self::leases::Leases;
+use self::leases::Parted;
 pub use self::pulse::Pulse;
+use self::reservations::ReservationsFile;
 use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::line_state::Learned;
@@ -61,6 +63,8 @@ pub struct Daemon {
     settings: Settings,
     plant: SharedPlant,
     buses: Vec<(BusSettings, BusTask)>,
+    /// What drives had that reloads have left out.
+    parted: Parted,
     events: Events,
     writes: Arc<WriteStats>,
     stats: Arc<NorthStats>,
@@ -86,6 +90,9 @@ pub struct Daemon {
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
     stopper: tokio::task::JoinHandle<()>,
+    reservations: ReservationsFile,
+    /// Keeps reservations on disk.
+    reserver: tokio::task::JoinHandle<()>,
     pulse: Pulse,
     /// Who is asked to reload, and the file that the gateway runs with.
     control: Option<Control>,
@@ -131,10 +138,12 @@ impl Daemon {
             history: history.clone(),
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
+        let reservations = ReservationsFile::default();
         let mut daemon = Daemon {
             plant: shared.clone(),
             settings: settings.clone(),
             buses: Vec::new(),
+            parted: Parted::default(),
             events,
             writes,
             stats: Arc::default(),
@@ -153,7 +162,9 @@ impl Daemon {
             guards: Arc::default(),
             starts: None,
             reporter: report_refusals(shared.clone()),
-            stopper: stop_all(shared),
+            stopper: stop_all(shared.clone()),
+            reserver: reservations::keep(shared, reservations.clone()),
+            reservations,
             pulse: Pulse::default(),
             control,
         };
@@ -169,6 +180,8 @@ impl Daemon {
         daemon.apply_params(&settings);
         daemon.hold_unfinished(&settings).await;
         daemon.replace_buses(&settings, prepared).await;
+        daemon.apply_reservations(&settings);
+        reservations::restore(&daemon.reservations, &daemon.plant.load());
         daemon.apply_mqtt(&settings).await?;
         // The servers that report readiness come last.
         let servers = daemon.prepare_servers(&settings).await?;
@@ -237,6 +250,7 @@ impl Daemon {
         self.hold_unfinished(&settings).await;
         self.commit_servers(servers).await;
         self.replace_buses(&settings, prepared).await;
+        self.apply_reservations(&settings);
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
         self.apply_audit(&settings).await;
@@ -259,7 +273,7 @@ impl Daemon {
             .into_iter()
             .partition(|(before, _)| settings.buses.contains(before));
         // Ports are closed before a changed bus opens one of them. A bus that restarts keeps the leases of its drives.
-        let mut leases = Leases::default();
+        let (mut leases, parted) = self.parted.recall(Instant::now());
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
         let mut learned: BTreeMap<String, Learned> = BTreeMap::new();
         self.watch(&kept);
@@ -270,15 +284,21 @@ impl Daemon {
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
         }
         let mut handovers: BTreeMap<String, Handover> = BTreeMap::new();
+        let known = [stopped.clone(), parted].concat();
         for (bus, task) in prepared {
-            task.handle().take_over(&stopped, Instant::now());
+            task.handle().take_over(&known, Instant::now());
             let handover = Handover {
-                leases: leases.of(&bus),
+                leases: leases.of(&bus, Instant::now()),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
                 learned: learned.get(&bus.spec.port).copied(),
             };
             handovers.insert(bus.spec.name.clone(), handover);
             kept.push((bus, task));
+        }
+        self.parted.keep(&leases, &stopped, Instant::now());
+        let after: Vec<&BusHandle> = kept.iter().map(|(_, task)| task.handle()).collect();
+        for bus in &stopped {
+            bus.end_holds(&after, &self.events, Instant::now(), SystemTime::now());
         }
         for event in leases.ended(SystemTime::now()) {
             self.events.publish(event);
@@ -295,6 +315,9 @@ impl Daemon {
             };
             let drives = &task.handle().image.drives;
             drives.iter().for_each(|drive| drive.set_stale_floor(floor));
+        }
+        for (_, task) in &kept {
+            task.handle().queue.set_authority(settings.authority.clone());
         }
         let machines = |handles: &mut dyn Iterator<Item = &BusHandle>| -> BTreeMap<String, Machine> {
             let of_bus = |bus: &BusHandle| {
@@ -519,6 +542,13 @@ impl Daemon {
         applied
     }
 
+    /// Keeps reservations where the gateway keeps its state.
+    fn apply_reservations(&self, settings: &Settings) {
+        let kept = settings.keeps_history && settings.authority.is_some();
+        let dir = kept.then_some(settings.state_dir.as_path());
+        reservations::keep_in(&self.reservations, dir);
+    }
+
     /// Opens the local socket if one is configured. The gateway runs without it if it cannot be opened; a reload tries
     /// again.
     async fn apply_local(&mut self, settings: &Settings) {
@@ -581,6 +611,7 @@ impl Daemon {
         .await;
         self.reporter.abort();
         self.stopper.abort();
+        self.reserver.abort();
         if let Some(reader) = &self.reader {
             reader.abort();
         }
@@ -687,7 +718,9 @@ fn report_refusals(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
         let mut ticks = tokio::time::interval(REFUSALS_REPORTED);
         loop {
             ticks.tick().await;
-            plant.load().report_refusals(Instant::now());
+            let plant = plant.load();
+            plant.report_refusals(Instant::now());
+            plant.tell_holds(Instant::now(), SystemTime::now());
         }
     })
 }

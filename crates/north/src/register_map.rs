@@ -11,6 +11,7 @@ pub(crate) use command::{CommandContext, CommandWrite, command, without_reset};
 pub use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, gateway};
 
 use crate::codec::Exception;
+use crate::command::{HoldState, HoldView};
 use crate::drive::tidy;
 use crate::drive::{ModelPoint, State, Value};
 use crate::process_image::Reading;
@@ -27,7 +28,9 @@ pub const NOT_STANDING: u16 = 0x8101;
 const COMMAND_WORD: u16 = 0x8100;
 const SPEED_REFERENCE: u16 = 0x8101;
 const FREQUENCY_REFERENCE: u16 = 0x8102;
-const HEARTBEAT: u16 = 0x8103;
+pub(crate) const HEARTBEAT: u16 = 0x8103;
+/// Where a client takes, renews, releases or breaks the hold of the drive.
+pub(crate) const HOLD: u16 = 0x8104;
 
 /// "Not available" of a signed register.
 const NO_I16: u16 = 0x8000;
@@ -133,6 +136,12 @@ pub enum Content {
     Command,
     /// Any write renews the supervision; reads 0.
     Heartbeat,
+    /// Who holds the drive.
+    Holder,
+    /// For how long.
+    HoldLeft,
+    /// Whether the client holds it; takes, renews, releases or breaks the hold. Only where `[authority]` is on.
+    Hold,
 }
 
 /// One value of the map.
@@ -162,7 +171,7 @@ const fn point(address: u16, point: ModelPoint, form: Form, per_unit: f64) -> En
 }
 
 /// The common model, from 0x8000 on.
-const COMMON: [Entry; 17] = [
+const COMMON: [Entry; 19] = [
     entry(0x8000, Content::Status, Form::U16, 1.0),
     entry(0x8001, Content::State, Form::U16, 1.0),
     entry(0x8002, Content::Age, Form::U16, 1.0),
@@ -180,14 +189,17 @@ const COMMON: [Entry; 17] = [
     point(0x800F, ModelPoint::OperatingHours, Form::U32, 1.0),
     point(0x8011, ModelPoint::SpeedReference, Form::I16, 100.0),
     point(0x8012, ModelPoint::FrequencyReference, Form::I16, 100.0),
+    entry(0x8013, Content::Holder, Form::U16, 1.0),
+    entry(0x8014, Content::HoldLeft, Form::U16, 1.0),
 ];
 
 /// The command block, from 0x8100 on.
-const COMMAND: [Entry; 4] = [
+const COMMAND: [Entry; 5] = [
     entry(COMMAND_WORD, Content::Command, Form::U16, 1.0),
     point(SPEED_REFERENCE, ModelPoint::SpeedReference, Form::I16, 100.0),
     point(FREQUENCY_REFERENCE, ModelPoint::FrequencyReference, Form::U16, 100.0),
     entry(HEARTBEAT, Content::Heartbeat, Form::U16, 1.0),
+    entry(HOLD, Content::Hold, Form::U16, 1.0),
 ];
 
 /// The float block, from 0x8200 on.
@@ -218,7 +230,7 @@ impl Entry {
 
     /// Whether the entry can be written.
     pub fn is_command(&self) -> bool {
-        (COMMAND_WORD..=HEARTBEAT).contains(&self.address)
+        (COMMAND_WORD..=HOLD).contains(&self.address)
     }
 
     fn registers(&self, view: &DriveView<'_>) -> [u16; 2] {
@@ -229,6 +241,9 @@ impl Entry {
             Content::Point(point) => self.form.registers_of(view.good(point), self.per_unit),
             Content::Command => [view.command(), 0],
             Content::Heartbeat => [0, 0],
+            Content::Holder => [view.holder(), 0],
+            Content::HoldLeft => [view.hold_left(), 0],
+            Content::Hold => [u16::from(view.hold.as_ref().is_some_and(|(_, own)| *own)), 0],
         }
     }
 }
@@ -248,13 +263,26 @@ pub(crate) struct DriveView<'r> {
     reading: &'r Reading<'r>,
     bus: BusState,
     stale: bool,
+    /// Its hold, and whether it is the client's own; none where `[authority]` is off.
+    hold: Option<(HoldView, bool)>,
 }
 
 impl<'r> DriveView<'r> {
     /// The drive as in `reading`; while its bus is down no value is good.
     pub(crate) fn new(reading: &'r Reading<'r>, bus: BusState) -> DriveView<'r> {
         let stale = bus == BusState::Down || reading.is_stale();
-        DriveView { reading, bus, stale }
+        DriveView {
+            reading,
+            bus,
+            stale,
+            hold: None,
+        }
+    }
+
+    /// The same with its hold, and whether it is the client's own.
+    pub(crate) fn with_hold(mut self, hold: Option<(HoldView, bool)>) -> DriveView<'r> {
+        self.hold = hold;
+        self
     }
 
     /// Registers of the blocks from 0x8000 on, all from the same reading. A drive that is offline or stale has a state
@@ -265,7 +293,9 @@ impl<'r> DriveView<'r> {
     pub(crate) fn registers(&self, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
         let (start, end) = (u32::from(start), u32::from(start) + u32::from(count));
         let inside = |block: &&&[Entry]| {
-            block.first().is_some_and(|e| u32::from(e.address) <= start) && block.last().is_some_and(|e| end <= e.end())
+            let mapped = |e: &&Entry| e.content != Content::Hold || self.hold.is_some();
+            let last = block.iter().rev().find(mapped);
+            block.first().is_some_and(|e| u32::from(e.address) <= start) && last.is_some_and(|e| end <= e.end())
         };
         let block = BLOCKS.iter().find(inside).ok_or(Exception::ADDRESS)?;
         let mut registers = Vec::with_capacity(usize::from(count));
@@ -305,6 +335,24 @@ impl<'r> DriveView<'r> {
         } else {
             self.reading.state()
         }
+    }
+
+    /// 0 nobody, 1 this client, 2 another one, 3 the local control place, 4 reserved after a stop.
+    fn holder(&self) -> u16 {
+        match &self.hold {
+            None => NO_U16,
+            Some((view, own)) => match view.state {
+                HoldState::Free => 0,
+                HoldState::Held => 2 - u16::from(*own),
+                HoldState::Local => 3,
+                HoldState::Reserved => 4,
+            },
+        }
+    }
+
+    fn hold_left(&self) -> u16 {
+        let left = self.hold.as_ref().and_then(|(view, _)| view.left_s);
+        left.map_or(NO_U16, |left| left.min(65_534) as u16)
     }
 
     fn age_ms(&self) -> u16 {

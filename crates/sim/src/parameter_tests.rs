@@ -166,6 +166,48 @@ fn the_parameters_of_any_drive_go_to_any_other_of_its_family_and_back() {
     assert!(written > 1000, "{written}");
 }
 
+/// Function 08 behind the parameters, where the family counts; without it the reading is whole all the same.
+#[test]
+fn the_counters_of_a_drive_are_read_behind_its_parameters() {
+    for (profile, known) in families() {
+        let mut bench = Bench::new(&profile);
+        let file = bench.read(known.clone());
+        // The counters are read one after the other, and count themselves.
+        let (received, own) = (known.len() + 1, known.len() + 4);
+        let of = format!("{received} messages received, 0 damaged ones, {own} to this drive");
+        match profile.counts_messages {
+            true => assert!(file.counters.starts_with(&of), "{}: {}", profile.name, file.counters),
+            false => assert_eq!(file.counters, "", "{}", profile.name),
+        }
+        assert_eq!(ParameterFile::parse(&file.text()), Ok(file.clone()), "{}", profile.name);
+
+        // One that refuses function 08, and one that answers nothing behind its last parameter.
+        for end in [Outcome::Exception(Exception(1)), Outcome::TimedOut] {
+            let mut reading = Reading::new(profile.clone(), known.clone());
+            let mut last = 0;
+            while let Some(pdu) = reading.request() {
+                let outcome = match pdu {
+                    RequestPdu::Diagnostics { .. } => end.clone(),
+                    pdu => match bench.ask(pdu) {
+                        Reply::Exception(exception) => Outcome::Exception(exception),
+                        reply => Outcome::Acknowledged(reply),
+                    },
+                };
+                last += u32::from(reading.progress().0 == reading.progress().1);
+                assert_eq!(reading.answered(&outcome), Next::Go);
+            }
+            let without = reading.file("d", "none", "2026-03-02T07:40:12Z", &Names::default());
+            assert_eq!(
+                (without.counters.as_str(), &without.values),
+                ("", &file.values),
+                "{}",
+                profile.name
+            );
+            assert!(last <= 5, "{}: asked {last} times", profile.name);
+        }
+    }
+}
+
 /// Each parameter was written once, and the memory that keeps it as often.
 fn check_wear(bench: &mut Bench, plan: &Plan) {
     let (profile, is_n2) = (bench.profile.clone(), bench.is_n2());

@@ -228,7 +228,7 @@ fn proved(settings: &Settings) -> BTreeMap<&str, usize> {
     let drives = settings.buses.iter().flat_map(commanded);
     let mut proved = BTreeMap::new();
     for profile in drives.map(|drive| &drive.profile) {
-        if profile.control.is_some() && !proved.contains_key(profile.name.as_str()) {
+        if profile.control_table().is_some() && !proved.contains_key(profile.name.as_str()) {
             let cases = proof::prove(profile).map_or(0, |proof| proof.commands);
             proved.insert(profile.name.as_str(), cases);
         }

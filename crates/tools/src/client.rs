@@ -1,85 +1,48 @@
-//! A client of a running gateway's HTTP server, for commands that show its state.
+//! The client of all commands that ask a gateway: HTTP over its local socket, over the network, or within the process.
 
+mod door;
+mod events;
+mod exchange;
 mod gateway;
+mod url;
 
-use std::collections::VecDeque;
-use std::fmt;
-use std::future::poll_fn;
-use std::pin::Pin;
-use std::str::FromStr;
+use std::error::Error as _;
+use std::io;
+use std::path::PathBuf;
 use std::time::Duration;
 
-use hyper::body::{Body as _, Bytes, Incoming};
-use hyper::client::conn::http1::{self, Connection};
-use hyper::{Request, Response, StatusCode, Uri, header};
-use hyper_util::rt::TokioIo;
-use serde::Deserialize;
+use hyper::StatusCode;
+use serde::de::DeserializeOwned;
 use tokio::time::timeout;
 
-pub(super) use self::gateway::Gateway;
-use self::gateway::Stream;
+pub(crate) use self::door::Door;
+use self::door::NotConnected;
+pub(crate) use self::events::EventStream;
+use self::exchange::Opened;
+pub(crate) use self::exchange::{Asked, Reply};
+pub(crate) use self::gateway::Gateway;
+pub(crate) use self::url::Url;
+use crate::north::http::messages::{ErrorReply, Expected};
 
-/// Time for the connection and the head of the reply.
-const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
-/// A stream that is silent for this long is dead: the gateway sends a comment every 10 s.
-const SILENCE: Duration = Duration::from_secs(35);
-/// Longest reply that is not a stream, longest line of a stream.
-const MOST_BYTES: usize = 1 << 20;
-/// Largest document: some thousand drives with all their points.
-const MOST_DOCUMENT: usize = 1 << 26;
-
-/// Address of a gateway's HTTP server: `http://host:port`, with a path behind a proxy that adds one.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Url {
-    tls: bool,
-    /// An IPv6 address without its brackets.
-    host: String,
-    port: u16,
-    authority: String,
-    path: String,
-}
-
-impl FromStr for Url {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Url, String> {
-        let form = "write it as http://127.0.0.1:9488";
-        let uri: Uri = text.parse().map_err(|why| format!("{why}; {form}"))?;
-        let tls = match uri.scheme_str() {
-            Some("http") => false,
-            Some("https") => true,
-            _ => return Err(format!("http:// is missing; {form}")),
-        };
-        let authority = uri.authority().map(ToString::to_string).unwrap_or_default();
-        if authority.contains('@') || uri.query().is_some() {
-            return Err(format!("user, password and query are not supported; {form}"));
-        }
-        let host = uri.host().unwrap_or_default();
-        Ok(Url {
-            tls,
-            host: host.trim_start_matches('[').trim_end_matches(']').to_string(),
-            port: uri.port_u16().unwrap_or(if tls { 443 } else { 80 }),
-            authority,
-            path: uri.path().trim_end_matches('/').to_string(),
-        })
-    }
-}
-
-impl fmt::Display for Url {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let scheme = if self.tls { "https" } else { "http" };
-        write!(f, "{scheme}://{}{}", self.authority, self.path)
-    }
-}
+/// Time for a connection.
+const CONNECT: Duration = Duration::from_secs(10);
+/// How often a request that only reads is sent in all where the connection is cut off: a gateway that just ends does that, and
+/// has gone a moment later.
+const TRIES: u32 = 5;
+/// Pause before the next of them.
+const PAUSE: Duration = Duration::from_millis(200);
 
 /// Why a gateway sent nothing; the messages say what, where and what to do.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum ClientError {
+pub(crate) enum ClientError {
     /// Nothing listens there, or the connection is blocked.
     #[error(
         "cannot reach the gateway: {1}; {0}; start it with an [http] section, or pass its `listen` address with --url"
     )]
-    Unreachable(Url, String),
+    Unreachable(String, String),
+    /// No gateway of the configuration is at its sockets.
+    #[error("no running gateway was found: {}; start it with this file, use sudo, or join the group of the socket", .0.told())]
+    NotFound(NotFound),
     /// A file of the command line cannot be used.
     #[error("{0}")]
     File(String),
@@ -87,368 +50,166 @@ pub(super) enum ClientError {
     #[error("no TLS connection: {0}")]
     Tls(String),
     /// The gateway refused, with a reason.
-    #[error("{error}; {url}; {remedy}")]
-    Refused {
-        /// The gateway.
-        url: Box<Url>,
-        /// Its message.
-        error: String,
-        /// What to do.
-        remedy: String,
-    },
+    #[error("{0}")]
+    Refused(String),
+    /// The reply did not come, or not whole.
+    #[error("{0}")]
+    Lost(String),
     /// The reply is not that of a gateway.
     #[error("{1}; {0}; check that this is the address of drivegate's [http] section")]
-    Strange(Url, String),
+    Strange(String, String),
     /// The stream ended early.
     #[error(
         "the gateway ended the stream{1}; {0}; it was stopped, or a reload removed the bus: start it and try again"
     )]
-    Ended(Url, String),
+    Ended(String, String),
     /// Nothing was received for too long.
     #[error("the gateway stopped responding; {0}; check the gateway and the network, then try again")]
-    Silent(Url),
+    Silent(String),
 }
 
-/// The body of an error reply.
-#[derive(Debug, Deserialize)]
-struct Problem {
-    error: String,
-    #[serde(default)]
-    known: Vec<String>,
-}
-
-/// An event of a stream.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct StreamEvent {
-    /// Its name; empty for an ordinary one.
-    pub(super) name: String,
-    /// Its text.
-    pub(super) data: String,
-}
-
-/// A stream of server-sent events.
-#[derive(Debug)]
-pub(super) struct EventStream {
-    url: Url,
-    wire: Wire,
-    body: Incoming,
-    parser: Parser,
-}
-
-impl EventStream {
-    /// Requests a stream; `path` begins with a slash.
-    ///
-    /// # Errors
-    /// When the gateway cannot be reached, refuses, or is not a gateway.
-    pub(super) async fn open(gateway: &Gateway, path: &str) -> Result<EventStream, ClientError> {
-        let url = &gateway.url;
-        let late = || ClientError::Unreachable(url.clone(), "no reply within 10 s".to_string());
-        let (wire, response) = timeout(OPEN_TIMEOUT, ask(gateway, path)).await.map_err(|_| late())??;
-        let kind = response.headers().get(header::CONTENT_TYPE);
-        let is_stream = kind.is_some_and(|kind| kind.as_bytes().starts_with(b"text/event-stream"));
-        let status = response.status();
-        let stream = EventStream {
-            url: url.clone(),
-            wire,
-            body: response.into_body(),
-            parser: Parser::default(),
-        };
-        if status == StatusCode::OK && is_stream {
-            return Ok(stream);
-        }
-        Err(timeout(OPEN_TIMEOUT, stream.refusal(status))
-            .await
-            .map_err(|_| late())?)
-    }
-
-    /// The next event. Cancel safe.
-    ///
-    /// # Errors
-    /// When the stream is over.
-    pub(super) async fn next(&mut self) -> Result<StreamEvent, ClientError> {
-        loop {
-            if let Some(event) = self.parser.take() {
-                return Ok(event);
-            }
-            let Ok(chunk) = timeout(SILENCE, self.chunk()).await else {
-                return Err(ClientError::Silent(self.url.clone()));
-            };
-            let bytes = match chunk {
-                Some(Ok(bytes)) => bytes,
-                Some(Err(error)) => return Err(ClientError::Ended(self.url.clone(), format!(" ({error})"))),
-                None => return Err(ClientError::Ended(self.url.clone(), String::new())),
-            };
-            self.parser
-                .feed(&bytes)
-                .map_err(|why| ClientError::Strange(self.url.clone(), why))?;
-        }
-    }
-
-    async fn chunk(&mut self) -> Option<hyper::Result<Bytes>> {
-        loop {
-            let frame = self
-                .wire
-                .with(poll_fn(|cx| Pin::new(&mut self.body).poll_frame(cx)))
-                .await?;
-            match frame.map(hyper::body::Frame::into_data) {
-                Ok(Ok(bytes)) => return Some(Ok(bytes)),
-                // Trailers.
-                Ok(Err(_)) => {}
-                Err(error) => return Some(Err(error)),
-            }
-        }
-    }
-
-    /// The error in a reply that is not a stream.
-    async fn refusal(mut self, status: StatusCode) -> ClientError {
-        let mut text = Vec::new();
-        while let Some(Ok(bytes)) = self.chunk().await {
-            text.extend_from_slice(&bytes);
-            if text.len() > MOST_BYTES {
-                break;
-            }
-        }
-        let url = self.url;
-        match serde_json::from_slice::<Problem>(&text) {
-            Ok(Problem { error, known }) => ClientError::Refused {
-                remedy: match known.as_slice() {
-                    [] if status == StatusCode::UNAUTHORIZED || status == StatusCode::FORBIDDEN => {
-                        "pass a token with scope `read` with --token-file".to_string()
-                    }
-                    [] if status == StatusCode::MISDIRECTED_REQUEST => "reload the gateway after that".to_string(),
-                    [] => "try again later".to_string(),
-                    known => format!("known: {}", known.join(", ")),
-                },
-                url: Box::new(url),
-                error,
-            },
-            Err(_) => ClientError::Strange(url, format!("the server answered `{status}` without a stream")),
-        }
+impl From<ClientError> for String {
+    fn from(error: ClientError) -> String {
+        error.to_string()
     }
 }
 
-/// Requests a document; `path` begins with a slash.
-///
-/// # Errors
-/// When the gateway cannot be reached, refuses, or is not a gateway.
-pub(super) async fn get_json(gateway: &Gateway, path: &str) -> Result<serde_json::Value, ClientError> {
-    let url = &gateway.url;
-    let late = || ClientError::Unreachable(url.clone(), "no reply within 10 s".to_string());
-    let whole = async {
-        let (wire, response) = ask(gateway, path).await?;
-        let status = response.status();
-        let mut stream = EventStream {
-            url: url.clone(),
-            wire,
-            body: response.into_body(),
-            parser: Parser::default(),
-        };
-        if status != StatusCode::OK {
-            return Err(stream.refusal(status).await);
-        }
-        let mut text = Vec::new();
-        while let Some(chunk) = stream.chunk().await {
-            let chunk = chunk.map_err(|error| ClientError::Ended(url.clone(), format!(" ({error})")))?;
-            text.extend_from_slice(&chunk);
-            if text.len() > MOST_DOCUMENT {
-                return Err(ClientError::Strange(url.clone(), "the reply is too long".to_string()));
-            }
-        }
-        serde_json::from_slice(&text)
-            .map_err(|error| ClientError::Strange(url.clone(), format!("the reply is not JSON ({error})")))
-    };
-    timeout(OPEN_TIMEOUT, whole).await.map_err(|_| late())?
-}
-
-/// Requests a short text, such as that of `/readyz`, and whether its status is 200.
-///
-/// # Errors
-/// When the gateway cannot be reached, or the server is another one.
-pub(super) async fn get_text(gateway: &Gateway, path: &str) -> Result<(bool, String), ClientError> {
-    let url = &gateway.url;
-    let late = || ClientError::Unreachable(url.clone(), "no reply within 10 s".to_string());
-    let whole = async {
-        let (wire, response) = ask(gateway, path).await?;
-        let status = response.status();
-        if !matches!(status, StatusCode::OK | StatusCode::SERVICE_UNAVAILABLE) {
-            let why = format!("the server answered `{status}`");
-            return Err(ClientError::Strange(url.clone(), why));
-        }
-        let mut stream = EventStream {
-            url: url.clone(),
-            wire,
-            body: response.into_body(),
-            parser: Parser::default(),
-        };
-        let mut text = Vec::new();
-        while let Some(chunk) = stream.chunk().await {
-            let chunk = chunk.map_err(|error| ClientError::Ended(url.clone(), format!(" ({error})")))?;
-            text.extend_from_slice(&chunk);
-            if text.len() > MOST_BYTES {
-                return Err(ClientError::Strange(url.clone(), "the reply is too long".to_string()));
-            }
-        }
-        Ok((status == StatusCode::OK, String::from_utf8_lossy(&text).into_owned()))
-    };
-    timeout(OPEN_TIMEOUT, whole).await.map_err(|_| late())?
-}
-
-async fn ask(gateway: &Gateway, path: &str) -> Result<(Wire, Response<Incoming>), ClientError> {
-    let url = &gateway.url;
-    let unreachable = |why: String| ClientError::Unreachable(url.clone(), why);
-    let token = gateway.token()?;
-    let stream = gateway.connect().await?;
-    let strange = |error: hyper::Error| ClientError::Strange(url.clone(), format!("not an HTTP reply ({error})"));
-    let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await.map_err(strange)?;
-    let mut wire = Wire(Some(Box::pin(connection)));
-    let mut request = Request::get(format!("{}{path}", url.path))
-        .header(header::HOST, &url.authority)
-        .header(header::ACCEPT, "text/event-stream, application/json");
-    if let Some(token) = token {
-        request = request.header(header::AUTHORIZATION, format!("Bearer {token}"));
-    }
-    let request = request
-        .body(String::new())
-        .map_err(|error| unreachable(error.to_string()))?;
-    let response = wire.with(sender.send_request(request)).await.map_err(strange)?;
-    Ok((wire, response))
-}
-
-/// The connection, which is polled only while a reply or event is awaited.
-struct Wire(Option<Pin<Box<Connected>>>);
-
-type Connected = Connection<TokioIo<Box<dyn Stream>>, String>;
-
-impl fmt::Debug for Wire {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Wire")
-    }
-}
-
-impl Wire {
-    async fn with<T>(&mut self, wanted: impl Future<Output = T>) -> T {
-        let mut wanted = std::pin::pin!(wanted);
-        poll_fn(|cx| {
-            // How the connection ended shows in the result of the awaited future.
-            if self.0.as_mut().is_some_and(|wire| wire.as_mut().poll(cx).is_ready()) {
-                self.0 = None;
-            }
-            wanted.as_mut().poll(cx)
-        })
-        .await
-    }
-}
-
-/// Parses the bytes of a stream into events.
+/// Why there is no gateway at its sockets.
 #[derive(Debug, Default)]
-struct Parser {
-    line: Vec<u8>,
-    name: String,
-    data: String,
-    ready: VecDeque<StreamEvent>,
+pub(crate) struct NotFound {
+    /// Sockets that cannot be opened.
+    pub(crate) closed: Vec<String>,
+    /// Other gateways.
+    pub(crate) others: Vec<String>,
+    file: Option<PathBuf>,
 }
 
-impl Parser {
-    fn feed(&mut self, bytes: &[u8]) -> Result<(), String> {
-        for &byte in bytes {
-            if byte == b'\n' {
-                let line = std::mem::take(&mut self.line);
-                self.take_line(String::from_utf8_lossy(&line).trim_end_matches('\r'));
-            } else {
-                self.line.push(byte);
-            }
-            if self.line.len() + self.data.len() > MOST_BYTES {
-                return Err("an event is too long".to_string());
-            }
+impl NotFound {
+    fn told(&self) -> String {
+        let reasons: Vec<&str> = self.closed.iter().chain(&self.others).map(String::as_str).collect();
+        let why = match reasons.is_empty() {
+            true => "no gateway listens".to_string(),
+            false => reasons.join(", "),
+        };
+        match &self.file {
+            Some(file) => format!("{why}; {}", file.display()),
+            None => why,
         }
-        Ok(())
+    }
+}
+
+/// A client of the first gateway that is the expected one.
+#[derive(Debug, Clone)]
+pub(crate) struct Client {
+    doors: Vec<Door>,
+    /// `None`: whichever answers.
+    expected: Option<Expected>,
+    /// The configuration, for messages.
+    file: Option<PathBuf>,
+}
+
+impl Client {
+    /// Of whichever gateway is there.
+    pub(crate) fn through(door: Door) -> Client {
+        Client {
+            doors: vec![door],
+            expected: None,
+            file: None,
+        }
     }
 
-    fn take_line(&mut self, line: &str) {
-        if line.is_empty() {
-            let (name, data) = (std::mem::take(&mut self.name), std::mem::take(&mut self.data));
-            if !data.is_empty() {
-                self.ready.push_back(StreamEvent { name, data });
-            }
-            return;
-        }
-        // A line that begins with a colon is a comment: a field without a name.
-        let (field, value) = line.split_once(':').unwrap_or((line, ""));
-        let value = value.strip_prefix(' ').unwrap_or(value);
-        match field {
-            "event" => self.name = value.to_string(),
-            "data" => {
-                if !self.data.is_empty() {
-                    self.data.push('\n');
+    /// Where it looks.
+    pub(crate) fn doors(&self) -> &[Door] {
+        &self.doors
+    }
+
+    /// Sends a request, and waits for the head of its reply.
+    ///
+    /// # Errors
+    /// No gateway is found, or it does not answer.
+    async fn open(&self, asked: &Asked) -> Result<Opened, ClientError> {
+        let mut missed = NotFound {
+            file: self.file.clone(),
+            ..NotFound::default()
+        };
+        for door in &self.doors {
+            let opened = match self.open_at(door, asked).await {
+                Ok(opened) => opened,
+                Err(NotConnected::Nobody) => continue,
+                Err(NotConnected::Because(why)) if door.is_network() => {
+                    missed.closed.push(why);
+                    let why = missed.closed.join(", ");
+                    return Err(ClientError::Unreachable(door.to_string(), why));
                 }
-                self.data.push_str(value);
+                Err(NotConnected::Because(why)) => {
+                    missed.closed.push(why);
+                    continue;
+                }
+                Err(NotConnected::Final(error)) => return Err(error),
+            };
+            if opened.status != StatusCode::MISDIRECTED_REQUEST || door.is_network() {
+                return Ok(opened);
             }
-            _ => {}
+            let reply: Option<ErrorReply> = opened.whole(asked).await?.parsed();
+            let why = reply.map_or("another gateway".to_string(), |reply| reply.error);
+            missed.others.push(format!("at {door} {why}"));
+        }
+        Err(ClientError::NotFound(missed))
+    }
+
+    async fn open_at(&self, door: &Door, asked: &Asked) -> Result<Opened, NotConnected> {
+        let authorization = door.authorization().map_err(NotConnected::Final)?;
+        let mut tries = 1;
+        loop {
+            let stream = match timeout(CONNECT, door.connect()).await {
+                Ok(stream) => stream?,
+                Err(_) => return Err(NotConnected::Because("no connection within 10 s".to_string())),
+            };
+            let sent = Opened::send(stream, door, authorization.as_deref(), self.expected.as_ref(), asked);
+            let place = || door.to_string();
+            let error = match timeout(asked.within, sent).await {
+                Ok(Ok(opened)) => return Ok(opened),
+                Ok(Err(error)) => error,
+                Err(_) => return Err(NotConnected::Final(asked.late(&place()))),
+            };
+            if door.is_network() {
+                let why = format!("not an HTTP reply ({error})");
+                return Err(NotConnected::Final(ClientError::Strange(place(), why)));
+            }
+            if tries == TRIES || !asked.only_reads() || !is_cut_off(&error) {
+                return Err(NotConnected::Final(asked.lost(&place(), &error.to_string())));
+            }
+            tries += 1;
+            tokio::time::sleep(PAUSE).await;
         }
     }
 
-    fn take(&mut self) -> Option<StreamEvent> {
-        self.ready.pop_front()
+    /// Sends a request, and waits for its reply.
+    ///
+    /// # Errors
+    /// No gateway is found, or it does not answer.
+    pub(crate) async fn ask(&self, asked: &Asked) -> Result<Reply, ClientError> {
+        self.open(asked).await?.whole(asked).await
+    }
+
+    /// The document at `path`, which begins with a slash.
+    ///
+    /// # Errors
+    /// No gateway is found, or it refuses.
+    pub(crate) async fn view<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
+        let asked = Asked::view(path);
+        self.ask(&asked).await?.accepted(&asked)
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
+fn is_cut_off(error: &hyper::Error) -> bool {
+    use io::ErrorKind::{BrokenPipe, ConnectionReset, UnexpectedEof};
+    let cause = error.source().and_then(|cause| cause.downcast_ref::<io::Error>());
+    let is_cut = |error: &io::Error| matches!(error.kind(), BrokenPipe | ConnectionReset | UnexpectedEof);
+    error.is_incomplete_message() || error.is_closed() || error.is_canceled() || cause.is_some_and(is_cut)
+}
 
-    #[test]
-    fn urls() {
-        let url: Url = "http://127.0.0.1:9488".parse().unwrap();
-        assert_eq!(
-            (url.host.as_str(), url.port, url.path.as_str()),
-            ("127.0.0.1", 9488, "")
-        );
-        let url: Url = "http://[::1]/plant/".parse().unwrap();
-        assert_eq!((url.host.as_str(), url.port, url.path.as_str()), ("::1", 80, "/plant"));
-        assert_eq!(url.to_string(), "http://[::1]/plant");
-        let url: Url = "https://gateway.example".parse().unwrap();
-        assert_eq!((url.tls, url.host.as_str(), url.port), (true, "gateway.example", 443));
-        assert_eq!(url.to_string(), "https://gateway.example");
-        for (bad, why) in [
-            ("127.0.0.1:9488", "http:// is missing"),
-            ("gateway", "http:// is missing"),
-            ("http://me:secret@gateway", "not supported"),
-            ("http://gateway/?a=b", "not supported"),
-            ("http://", "write it as"),
-            ("", "write it as"),
-        ] {
-            let error = bad.parse::<Url>().unwrap_err();
-            assert!(error.contains(why), "{bad}: {error}");
-        }
-    }
-
-    #[test]
-    fn events_in_any_pieces() {
-        let text = b"retry: 2000\r\n: open\n\ndata: {\"a\":1}\n\n: alive\n\nevent: lagged\ndata:{\"lost\":3}\ndata: x\n\ndata: cut";
-        let all = [
-            StreamEvent {
-                name: String::new(),
-                data: "{\"a\":1}".to_string(),
-            },
-            StreamEvent {
-                name: "lagged".to_string(),
-                data: "{\"lost\":3}\nx".to_string(),
-            },
-        ];
-        for size in 1..=text.len() {
-            let mut parser = Parser::default();
-            for piece in text.chunks(size) {
-                parser.feed(piece).unwrap();
-            }
-            let taken: Vec<StreamEvent> = std::iter::from_fn(|| parser.take()).collect();
-            assert_eq!(taken, all, "pieces of {size}");
-        }
-    }
-
-    #[test]
-    fn an_event_without_end_is_refused() {
-        let mut parser = Parser::default();
-        let piece = [b'x'; 4096];
-        assert!((0..300).any(|_| parser.feed(&piece).is_err()));
-    }
+/// A name as a part of a path or query.
+pub(crate) fn encoded(name: &str) -> String {
+    percent_encoding::utf8_percent_encode(name, percent_encoding::NON_ALPHANUMERIC).to_string()
 }

@@ -3,10 +3,9 @@
 use std::fmt::Write;
 use std::process::ExitCode;
 
-use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
 use serde::Deserialize;
 
-use super::client::{Gateway, get_json};
+use super::client::{Gateway, encoded};
 use super::{EXIT_FAILED, printable, report};
 use crate::diagnosis::{Counted, Verdict};
 
@@ -51,11 +50,11 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 async fn diagnose(args: &Args) -> Result<String, String> {
-    let get = async |path: &str| get_json(&args.gateway, path).await.map_err(|error| error.to_string());
+    let client = args.gateway.viewer()?;
     let names: Vec<String> = match &args.bus {
         Some(name) => vec![name.clone()],
         None => {
-            let buses = get("/api/v1/buses").await?;
+            let buses: serde_json::Value = client.view("/api/v1/buses").await?;
             let names = buses
                 .as_array()
                 .into_iter()
@@ -66,8 +65,11 @@ async fn diagnose(args: &Args) -> Result<String, String> {
     };
     let mut all = Vec::new();
     for name in names {
-        let name = utf8_percent_encode(&name, NON_ALPHANUMERIC);
-        all.push(get(&format!("/api/v1/buses/{name}/diagnosis")).await?);
+        all.push(
+            client
+                .view(&format!("/api/v1/buses/{}/diagnosis", encoded(&name)))
+                .await?,
+        );
     }
     if args.json {
         return Ok(serde_json::to_string_pretty(&all).unwrap_or_default() + "\n");

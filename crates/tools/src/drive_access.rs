@@ -1,28 +1,42 @@
-//! What `read` and `write` share: the drive they are about, and the way to it.
+//! What commands about one drive share: the drive, and the way to it.
 //!
-//! A running gateway owns the line, so a command asks it through its local socket; only where none runs does the command
-//! open the port itself, with the gateway's own bus. Either way the same function answers, so the answers are the same.
+//! A running gateway owns the line, so a command asks it, at its local socket or by `--url`; only where none runs does the
+//! command start the gateway's own bus in this process, and ask that. Either way the same routes answer, so the answers are
+//! the same.
 
+mod conversation;
 mod direct;
-mod gateway;
 mod parameters;
 
-use std::path::Path;
 use std::process::ExitCode;
+use std::sync::Arc;
 
-use self::direct::Direct;
+use self::conversation::Conversation;
+pub(super) use self::direct::Needs;
+use super::client::{Asked, Client, ClientError, Door, Gateway, NotFound, Reply, encoded};
 use super::{EXIT_CONFIG, EXIT_USAGE, report};
-use crate::config::{BusSettings, LogFormat, LogSettings, Settings, environment};
+use crate::config::{BusSettings, Settings, environment};
 use crate::document::{candidates, nearest};
-use crate::north::local::protocol::{Expected, Outcome, Request};
+use crate::drive::Profile;
+use crate::north::http::messages::{Expected, ExpectedDrive};
+use crate::north::local::SocketPath;
 use crate::process_image::DriveSpec;
 
-/// The drive that a command is about.
-#[derive(Debug, Clone)]
+/// The drive that a command is about, and the gateway to ask.
+#[derive(Debug)]
 pub(super) struct Target {
-    pub(super) settings: Settings,
-    pub(super) bus: BusSettings,
-    pub(super) spec: DriveSpec,
+    pub(super) drive: String,
+    client: Client,
+    /// `None`: the gateway knows what it is, and there is no line here.
+    configured: Option<Box<Configured>>,
+}
+
+/// The drive as the configuration has it.
+#[derive(Debug, Clone)]
+struct Configured {
+    settings: Settings,
+    bus: BusSettings,
+    spec: DriveSpec,
 }
 
 /// Which way a request went.
@@ -34,8 +48,18 @@ pub(super) enum Way {
     Direct,
 }
 
-/// Reads the configuration and finds the drive in it; an exit code when there is none, which was reported.
-pub(super) fn target(config: &Path, drive: &str) -> Result<Target, ExitCode> {
+/// The drive, of the configuration unless the gateway is named by its address; an exit code when there is none, which was
+/// reported.
+pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, ExitCode> {
+    let drive_name = drive.to_string();
+    if let Some(client) = gateway.network() {
+        return Ok(Target {
+            drive: drive_name,
+            client,
+            configured: None,
+        });
+    }
+    let config = gateway.config();
     let loaded = Settings::load(config, environment());
     report::errors(&loaded.errors);
     let settings = loaded.settings.ok_or(ExitCode::from(EXIT_CONFIG))?;
@@ -56,65 +80,109 @@ pub(super) fn target(config: &Path, drive: &str) -> Result<Target, ExitCode> {
         });
         return Err(ExitCode::from(EXIT_USAGE));
     };
-    Ok(Target { settings, bus, spec })
+    let expected = ExpectedDrive::new(&settings.gateway, &bus.spec, &spec);
+    Ok(Target {
+        drive: drive_name,
+        client: Client::at(&settings.socket, Expected::Drive(expected)),
+        configured: Some(Box::new(Configured { settings, bus, spec })),
+    })
 }
 
 impl Target {
-    /// Index of the point of that name.
-    ///
-    /// # Errors
-    /// The message when there is none.
-    pub(super) fn point(&self, name: &str) -> Result<usize, String> {
-        let profile = &self.spec.profile;
-        profile.point_index(name).ok_or_else(|| {
-            let remedy = match candidates(name, profile.points.iter().map(|p| p.name.as_str())).as_slice() {
-                [] => format!("`drivegate profiles show {}` lists them", profile.name),
-                near => format!("did you mean `{}`?", near.join("`, `")),
-            };
-            format!(
-                "profile `{}` has no point `{name}`; command line; {remedy}",
-                profile.name
-            )
-        })
+    /// The profile, where it is known here.
+    pub(super) fn profile(&self) -> Option<&Arc<Profile>> {
+        self.configured.as_ref().map(|configured| &configured.spec.profile)
     }
 
-    /// What a gateway must run with to be the one of this configuration.
-    pub(super) fn expected(&self) -> Expected {
-        Expected::new(&self.settings.gateway, &self.bus.spec, &self.spec)
+    /// Where the API has that of the drive.
+    pub(super) fn path(&self, what: &str) -> String {
+        format!("/api/v1/drives/{}/{what}", encoded(&self.drive))
     }
 
     /// Sends the request to the running gateway.
     ///
     /// # Errors
-    /// Why there is no outcome, as a message.
-    pub(super) fn ask_gateway(&self, request: &Request) -> Result<Outcome, String> {
-        let asked = super::runtime()?.block_on(gateway::ask(self, request))?;
-        asked.map_err(|not_found| format!("{}; the local socket; start the gateway", not_found.0))
+    /// Why there is no reply, as a message.
+    pub(super) fn ask_gateway(&self, asked: &Asked) -> Result<Reply, String> {
+        super::runtime()?
+            .block_on(self.client.ask(asked))
+            .map_err(|error| match (error, &self.configured) {
+                (ClientError::NotFound(missed), Some(configured)) => {
+                    let why = configured.told(&missed, self.client.doors());
+                    format!("{why}; the local socket; start the gateway")
+                }
+                (error, _) => error.to_string(),
+            })
     }
 
-    /// Sends the request to the running gateway or, where there is none, carries it out on the line.
+    /// Sends the request to the running gateway or, where there is none, to the parts of one in this process, once its bus
+    /// knows what the request `needs`.
     ///
     /// # Errors
-    /// Why there is no outcome, as a message.
-    pub(super) fn ask(&self, request: &Request) -> Result<(Outcome, Way), String> {
+    /// Why there is no reply, as a message.
+    pub(super) fn ask(&self, asked: &Asked, needs: Needs<'_>) -> Result<(Reply, Way), String> {
         super::runtime()?.block_on(async {
-            let not_found = match gateway::ask(self, request).await? {
-                Ok(outcome) => return Ok((outcome, Way::Gateway)),
-                Err(not_found) => not_found,
-            };
-            log_audit_only();
-            let direct = Direct::start(self, &not_found).await?;
-            let outcome = direct.ask(request).await;
-            direct.stop().await;
-            Ok((outcome, Way::Direct))
+            let (conversation, reply) = Conversation::begin(self, asked, needs).await?;
+            let way = conversation.way();
+            conversation.end().await;
+            Ok((reply, way))
         })
     }
 }
 
-/// The command reports what happens itself; of the log only the audit is left.
-fn log_audit_only() {
-    super::log::start_in_order(&LogSettings {
-        level: "off,audit=info".to_string(),
-        format: LogFormat::Auto,
-    });
+/// Index of the point of that name.
+///
+/// # Errors
+/// The message when there is none.
+pub(super) fn point(profile: &Profile, name: &str) -> Result<usize, String> {
+    profile.point_index(name).ok_or_else(|| {
+        let remedy = match candidates(name, profile.points.iter().map(|p| p.name.as_str())).as_slice() {
+            [] => format!("`drivegate profiles show {}` lists them", profile.name),
+            near => format!("did you mean `{}`?", near.join("`, `")),
+        };
+        format!(
+            "profile `{}` has no point `{name}`; command line; {remedy}",
+            profile.name
+        )
+    })
+}
+
+impl Configured {
+    /// Why no gateway was asked, for the message when the port cannot be opened either.
+    ///
+    /// # Errors
+    /// One may run all the same, and the line must not be tried.
+    fn not_found(&self, missed: &NotFound, doors: &[Door]) -> Result<String, String> {
+        // A serial port is locked by its owner; with a device server there would be two masters on the line.
+        if !missed.closed.is_empty() && self.bus.spec.port.contains("://") {
+            return Err(format!(
+                "{}; bus `{}`; use sudo, or join the group of the socket",
+                missed.closed.join(", "),
+                self.bus.spec.name
+            ));
+        }
+        if !missed.others.is_empty() {
+            let others = missed.others.join(", ");
+            report::note(&format!("{others}; the command opens the port itself"));
+        }
+        Ok(self.told(missed, doors))
+    }
+
+    fn told(&self, missed: &NotFound, doors: &[Door]) -> String {
+        let reasons: Vec<&str> = missed.closed.iter().chain(&missed.others).map(String::as_str).collect();
+        match &self.settings.socket {
+            _ if !reasons.is_empty() => reasons.join(", "),
+            SocketPath::Off => "`socket` of [gateway] is off, so a running gateway cannot be asked".to_string(),
+            SocketPath::At(path) => format!("no gateway listens at {}", path.display()),
+            SocketPath::Default => {
+                let sockets = doors.iter().filter_map(|door| match door {
+                    Door::Socket(path) => path.parent(),
+                    _ => None,
+                });
+                let mut directories: Vec<String> = sockets.map(|dir| dir.display().to_string()).collect();
+                directories.dedup();
+                format!("no gateway listens in {}", directories.join(" or "))
+            }
+        }
+    }
 }

@@ -18,7 +18,6 @@ mod health;
 mod inventory;
 mod listen;
 mod loading;
-mod local_client;
 mod log;
 mod map;
 mod params;

@@ -7,12 +7,13 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
+use super::client::Gateway;
 use super::drive_access::target;
-use super::{DEFAULT_CONFIG, EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::config::{Settings, environment};
 use crate::drive::parameters::RawValue;
 use crate::files;
-use crate::north::local::protocol::ParamsOutcome;
+use crate::north::http::messages::{ParameterReading, ReadParameters};
 use crate::parameters::{Names, ParameterFile, Store, differences, read as read_file};
 
 /// Reads, compares, restores and shows the parameters of drives.
@@ -27,9 +28,8 @@ use crate::parameters::{Names, ParameterFile, Store, differences, read as read_f
   drivegate params list
   drivegate params show pump-1")]
 pub(super) struct Args {
-    /// Configuration file.
-    #[arg(long = "config", value_name = "FILE", default_value = DEFAULT_CONFIG, global = true)]
-    config: PathBuf,
+    #[command(flatten)]
+    gateway: Gateway,
     #[command(subcommand)]
     action: Action,
 }
@@ -111,13 +111,14 @@ struct ReadArgs {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
+    let (gateway, config) = (&args.gateway, args.gateway.config());
     let done = match &args.action {
-        Action::Read(read) => read_drive(&args.config, read),
-        Action::Diff { before, after } => diff(&args.config, before, after),
-        Action::Restore(args_of_it) => restore::restore(&args.config, args_of_it),
-        Action::Clone { from, to, how } => restore::clone(&args.config, from, to, how),
-        Action::List { drive } => list(&args.config, drive.as_deref()),
-        Action::Show { of, names } => show(&args.config, of, names.as_deref()),
+        Action::Read(read) => read_drive(gateway, read),
+        Action::Diff { before, after } => diff(gateway, before, after),
+        Action::Restore(args_of_it) => restore::restore(gateway, args_of_it),
+        Action::Clone { from, to, how } => restore::clone(gateway, from, to, how),
+        Action::List { drive } => list(config, drive.as_deref()),
+        Action::Show { of, names } => show(config, of, names.as_deref()),
     };
     done.unwrap_or_else(|code| code)
 }
@@ -127,9 +128,9 @@ fn failed(message: &str) -> ExitCode {
     ExitCode::from(EXIT_FAILED)
 }
 
-fn read_drive(config: &Path, args: &ReadArgs) -> Result<ExitCode, ExitCode> {
+fn read_drive(gateway: &Gateway, args: &ReadArgs) -> Result<ExitCode, ExitCode> {
     let names = names(args.names.as_deref())?;
-    let (file, profile) = read_from_drive(config, &args.drive, args.afresh, args.brisk)?;
+    let (file, profile) = read_from_drive(gateway, &args.drive, args.how())?;
     let file = match names {
         Some(names) => file.named(&profile, &names),
         None => file,
@@ -158,12 +159,21 @@ fn read_drive(config: &Path, args: &ReadArgs) -> Result<ExitCode, ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+impl ReadArgs {
+    fn how(&self) -> ReadParameters {
+        ReadParameters {
+            afresh: self.afresh,
+            brisk: self.brisk,
+        }
+    }
+}
+
 type Found = (ParameterFile, std::sync::Arc<crate::drive::Profile>);
 
-fn read_from_drive(config: &Path, drive: &str, afresh: bool, brisk: bool) -> Result<Found, ExitCode> {
-    let target = target(config, drive)?;
+fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Result<Found, ExitCode> {
+    let target = target(gateway, drive)?;
     let mut line = StatusLine::default();
-    let text = target.read_parameters((afresh, brisk), |outcome| {
+    let text = target.read_parameters(how, |outcome| {
         if outcome.total > 0 {
             line.show(&reading_in_words(outcome));
         }
@@ -171,8 +181,22 @@ fn read_from_drive(config: &Path, drive: &str, afresh: bool, brisk: bool) -> Res
     line.end();
     let file = text.map_err(|why| failed(&why)).and_then(|text| {
         ParameterFile::parse(&text).map_err(|why| failed(&format!("the gateway's file is not understood: {why}")))
-    });
-    Ok((file?, target.spec.profile.clone()))
+    })?;
+    let profile = match target.profile() {
+        Some(profile) => profile.clone(),
+        None => built_in(&file.family)?,
+    };
+    Ok((file, profile))
+}
+
+fn built_in(family: &str) -> Result<std::sync::Arc<crate::drive::Profile>, ExitCode> {
+    let profiles = crate::drive::profile::Profiles::built_in();
+    let profile = profiles.get(family).cloned();
+    profile.ok_or_else(|| {
+        failed(&format!(
+            "profile `{family}` is not built in; --names; name the list in [params]"
+        ))
+    })
 }
 
 /// Pause between two lines of progress that nobody watches on a terminal.
@@ -217,7 +241,7 @@ impl StatusLine {
     }
 }
 
-fn reading_in_words(outcome: &ParamsOutcome) -> String {
+fn reading_in_words(outcome: &ParameterReading) -> String {
     let rest = match (&outcome.waits, outcome.remaining_s) {
         (Some(why), _) => format!("waits: {why}"),
         (None, Some(seconds)) => format!("about {} left", seconds_in_words(seconds)),
@@ -235,15 +259,15 @@ fn seconds_in_words(seconds: f64) -> String {
 }
 
 /// A file where there is one, else the drive of that name, which is read.
-fn file_or_drive(config: &Path, of: &str) -> Result<ParameterFile, ExitCode> {
+fn file_or_drive(gateway: &Gateway, of: &str) -> Result<ParameterFile, ExitCode> {
     match Path::new(of).is_file() {
         true => read_file(Path::new(of)).map_err(|why| failed(&format!("{why}; name a file that `params read` wrote"))),
-        false => Ok(read_from_drive(config, of, false, false)?.0),
+        false => Ok(read_from_drive(gateway, of, ReadParameters::default())?.0),
     }
 }
 
-fn diff(config: &Path, before: &str, after: &str) -> Result<ExitCode, ExitCode> {
-    let (before, after) = (file_or_drive(config, before)?, file_or_drive(config, after)?);
+fn diff(gateway: &Gateway, before: &str, after: &str) -> Result<ExitCode, ExitCode> {
+    let (before, after) = (file_or_drive(gateway, before)?, file_or_drive(gateway, after)?);
     if before.family != after.family {
         report::error(&format!(
             "`{}` is of family {}, `{}` of {}; command line; compare drives of one family",
@@ -324,16 +348,8 @@ fn show(config: &Path, of: &str, names: Option<&Path>) -> Result<ExitCode, ExitC
     };
     let file = match names {
         Some(names) => {
-            let profiles = crate::drive::profile::Profiles::built_in();
-            let profile = profiles.get(&file.family);
-            let unknown = || {
-                failed(&format!(
-                    "profile `{}` is not built in; --names; name the list in [params]",
-                    file.family
-                ))
-            };
-            let profile = profile.ok_or_else(unknown)?;
-            file.named(profile, &names)
+            let profile = built_in(&file.family)?;
+            file.named(&profile, &names)
         }
         None => file,
     };
@@ -349,8 +365,12 @@ fn show(config: &Path, of: &str, names: Option<&Path>) -> Result<ExitCode, ExitC
         };
         table.add_row([id.to_string(), raw, text]);
     }
+    let counters = match file.counters.as_str() {
+        "" => String::new(),
+        counters => format!("counted by the drive: {counters}\n"),
+    };
     let head = format!(
-        "{} ({}), read {}; identification: {}; {}\n",
+        "{} ({}), read {}; identification: {}; {}\n{counters}",
         file.drive,
         file.family,
         file.time,

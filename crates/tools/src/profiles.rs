@@ -257,7 +257,7 @@ fn show(profile: &Profile) -> String {
         text += "\nCommissioning\n";
         text += &commissioning(profile);
     }
-    if let Some(control) = &profile.control {
+    if let Some(control) = profile.control_table() {
         text += "\nCommands\n";
         for (what, words) in commands::lines(profile, control) {
             // Writing to a String cannot fail.

@@ -2,9 +2,10 @@
 
 use std::process::ExitCode;
 
-use super::drive_access::{Target, target};
+use super::client::{Asked, Gateway, encoded};
+use super::drive_access::{Needs, Target, point, target};
 use super::{EXIT_FAILED, EXIT_USAGE, report};
-use crate::north::local::protocol::{Outcome, PointValue, ReadRequest, Request, Word};
+use crate::north::http::messages::{PointValue, Word};
 
 /// Reads points of a drive once, through the running gateway or directly.
 #[derive(Debug, clap::Args)]
@@ -17,7 +18,7 @@ Without points: all that are polled. state and fault_text are made of points. A 
 the port itself.")]
 pub(super) struct Args {
     #[command(flatten)]
-    config: super::ConfigFile,
+    gateway: Gateway,
     /// Name of the drive.
     drive: String,
     /// Names of points.
@@ -28,11 +29,14 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let target = match target(&args.config.path, &args.drive) {
+    let target = match target(&args.gateway, &args.drive) {
         Ok(target) => target,
         Err(code) => return code,
     };
-    let unknown = |name: &String| target.point(name).err().filter(|_| Word::of(name).is_none());
+    let unknown = |name: &String| {
+        let unknown = point(target.profile()?, name).err();
+        unknown.filter(|_| Word::of(name).is_none())
+    };
     if let Some(message) = args.points.iter().find_map(unknown) {
         report::error(&message);
         return ExitCode::from(EXIT_USAGE);
@@ -47,15 +51,13 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 fn rows(target: &Target, points: &[String]) -> Result<Vec<PointValue>, String> {
-    let request = Request::Read(ReadRequest {
-        drive: target.spec.name.clone(),
-        expect: Some(target.expected()),
-        points: points.to_vec(),
-    });
-    match target.ask(&request)?.0 {
-        Outcome::Read(read) => Ok(read.points),
-        other => Err(other.not_asked_for()),
-    }
+    let names = match points {
+        [] => String::new(),
+        names => format!("?names={}", encoded(&names.join(","))),
+    };
+    let asked = Asked::get(target.path("points") + &names);
+    let (reply, _) = target.ask(&asked, Needs::Points(points))?;
+    Ok(reply.accepted(&asked)?)
 }
 
 fn print(args: &Args, rows: &[PointValue]) -> ExitCode {

@@ -2,9 +2,10 @@
 
 use std::process::ExitCode;
 
+use super::client::{Asked, Gateway};
 use super::drive_access::target;
 use super::{EXIT_FAILED, report};
-use crate::north::local::protocol::{Outcome, RecordRequest, Request};
+use crate::north::http::messages::Recorded;
 
 /// Makes the running gateway record a drive: the time before now, and the time after.
 ///
@@ -15,31 +16,27 @@ use crate::north::local::protocol::{Outcome, RecordRequest, Request};
   drivegate recordings --config drivegate.toml show 20260302T074012.118Z-pump-1")]
 pub(super) struct Args {
     #[command(flatten)]
-    config: super::ConfigFile,
+    gateway: Gateway,
     /// Name of the drive.
     drive: String,
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let target = match target(&args.config.path, &args.drive) {
+    let target = match target(&args.gateway, &args.drive) {
         Ok(target) => target,
         Err(code) => return code,
     };
-    let request = Request::Record(RecordRequest {
-        drive: target.spec.name.clone(),
-        expect: Some(target.expected()),
-    });
-    match target.ask_gateway(&request) {
-        Ok(Outcome::Record(record)) => {
+    let asked = Asked::post(target.path("recordings"), &serde_json::json!({}));
+    let asked = asked.if_refused("set max_count of [recordings] above 0 and reload");
+    let reply = target.ask_gateway(&asked);
+    match reply.and_then(|reply| Ok(reply.accepted::<Recorded>(&asked)?)) {
+        Ok(record) => {
             report::note(&format!("it is complete in {:.0} s", record.after_s));
             report::print(&format!("{}\n", record.id))
         }
-        Ok(other) => failed(&other.not_asked_for()),
-        Err(message) => failed(&message),
+        Err(message) => {
+            report::error(&message);
+            ExitCode::from(EXIT_FAILED)
+        }
     }
-}
-
-fn failed(message: &str) -> ExitCode {
-    report::error(message);
-    ExitCode::from(EXIT_FAILED)
 }

@@ -1,10 +1,15 @@
-//! `drivegate reload`: the running gateway reads its configuration anew.
+//! `drivegate reload`: the running gateway reads its configuration again.
 
+use std::path::Path;
 use std::process::ExitCode;
 
-use super::local_client::{NotAsked, ask_gateway};
+use hyper::StatusCode;
+
+use super::client::{Asked, Client};
 use super::{ConfigFile, EXIT_CONFIG, EXIT_FAILED, report};
-use crate::north::local::protocol::{Outcome, ReloadOutcome, Request};
+use crate::config::{Settings, environment};
+use crate::north::http::messages::ReloadOutcome;
+use crate::north::local::SocketPath;
 
 /// Lets the running gateway reload its configuration, and waits for the outcome.
 ///
@@ -19,19 +24,30 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> ExitCode {
     super::block_on(async {
-        let why = match ask_gateway(&args.config.path, Request::Reload).await {
-            Ok(Outcome::Reload(outcome)) => return reported(&outcome),
-            Ok(outcome) => outcome.not_asked_for(),
-            Err(NotAsked::Because(why)) => why,
-            Err(NotAsked::Off) => format!(
-                "`socket` of [gateway] is off, so the running gateway cannot be asked; {}; use `systemctl reload drivegate`, \
-                 which does not report the outcome",
-                args.config.path.display()
-            ),
-        };
-        report::error(&why);
-        ExitCode::from(EXIT_FAILED)
+        match reload(&args.config.path).await {
+            Ok(outcome) => reported(&outcome),
+            Err(why) => {
+                report::error(&why);
+                ExitCode::from(EXIT_FAILED)
+            }
+        }
     })
+}
+
+async fn reload(config: &Path) -> Result<ReloadOutcome, String> {
+    if Settings::socket_of(config, environment()) == SocketPath::Off {
+        return Err(format!(
+            "`socket` of [gateway] is off, so the running gateway cannot be asked; {}; use `systemctl reload drivegate`, \
+             which does not report the outcome",
+            config.display()
+        ));
+    }
+    let asked = Asked::post("/api/v1/reload", &serde_json::json!({})).if_lost("look at its log");
+    let reply = Client::of_configuration(config)?.ask(&asked).await?;
+    match reply.status {
+        StatusCode::OK | StatusCode::UNPROCESSABLE_ENTITY => Ok(reply.document()?),
+        _ => Err(reply.refusal(&asked).to_string()),
+    }
 }
 
 fn reported(outcome: &ReloadOutcome) -> ExitCode {

@@ -11,10 +11,9 @@ use std::process::ExitCode;
 
 use self::staging::Staging;
 use super::archive::{self, Manifest, Root};
-use super::local_client::ask_gateway;
+use super::client::{Asked, Client};
 use super::{ConfigFile, EXIT_CONFIG, EXIT_FAILED, report};
 use crate::config::{Loaded, Settings, environment};
-use crate::north::local::protocol::Request;
 
 /// Sets a gateway up again from a file that `backup` wrote.
 ///
@@ -73,7 +72,7 @@ fn restore(args: &Args) -> Result<String, Refused> {
     let config = &args.config.path;
     let name = config.file_name().ok_or("--config names no file".to_string())?;
     let runtime = super::runtime()?;
-    if runtime.block_on(ask_gateway(config, Request::Health)).is_ok() {
+    if runtime.block_on(is_running(config)) {
         return Err(Refused::Because(
             "the gateway runs: stop it first (systemctl stop drivegate)".to_string(),
         ));
@@ -131,6 +130,14 @@ fn restore(args: &Args) -> Result<String, Refused> {
     }
     let placed = staging.place()?;
     Ok(summary(&manifest, &placed))
+}
+
+/// Whether the gateway of the configuration answers.
+async fn is_running(config: &Path) -> bool {
+    match Client::of_configuration(config) {
+        Ok(client) => client.ask(&Asked::view("/readyz")).await.is_ok(),
+        Err(_) => false,
+    }
 }
 
 fn absolute(path: &Path) -> PathBuf {

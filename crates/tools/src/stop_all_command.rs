@@ -2,9 +2,10 @@
 
 use std::process::ExitCode;
 
-use super::local_client::{NotAsked, ask_gateway};
-use super::{ConfigFile, EXIT_FAILED, printable, report};
-use crate::north::local::protocol::{OfGateway, Outcome, Request, StopAllRequest};
+use serde_json::json;
+
+use super::client::{Asked, Gateway};
+use super::{EXIT_FAILED, printable, report};
 use crate::stop_all::{StopReport, Stopped};
 
 /// Stops every controlled drive through the running gateway, and waits up to 10 s for them to stand.
@@ -17,7 +18,7 @@ use crate::stop_all::{StopReport, Stopped};
   drivegate stop-all --config drivegate.toml --group pumps")]
 pub(super) struct Args {
     #[command(flatten)]
-    config: ConfigFile,
+    gateway: Gateway,
     /// Only the drives of this bus.
     #[arg(long, value_name = "BUS")]
     bus: Option<String>,
@@ -27,32 +28,36 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let request = |of: OfGateway| {
-        Request::StopAll(StopAllRequest {
-            config: of.config,
-            bus: args.bus.clone(),
-            group: args.group.clone(),
-        })
-    };
     super::block_on(async {
-        let why = match ask_gateway(&args.config.path, request).await {
-            Ok(Outcome::StopAll(stopped)) => {
+        match stop_all(args).await {
+            Ok(stopped) => {
                 report::print(&shown(&stopped));
-                return match stopped.ok {
+                match stopped.ok {
                     true => ExitCode::SUCCESS,
                     false => ExitCode::from(EXIT_FAILED),
-                };
+                }
             }
-            Ok(outcome) => outcome.not_asked_for(),
-            Err(NotAsked::Because(why)) => why,
-            Err(NotAsked::Off) => format!(
-                "`socket` of [gateway] is off, so the running gateway cannot be asked; {}; use POST /api/v1/stop",
-                args.config.path.display()
-            ),
-        };
-        report::error(&why);
-        ExitCode::from(EXIT_FAILED)
+            Err(why) => {
+                report::error(&why);
+                ExitCode::from(EXIT_FAILED)
+            }
+        }
     })
+}
+
+async fn stop_all(args: &Args) -> Result<StopReport, String> {
+    let scope = match (&args.bus, &args.group) {
+        (Some(bus), _) => json!({ "bus": bus }),
+        (None, Some(group)) => json!({ "group": group }),
+        (None, None) => json!({}),
+    };
+    let asked = Asked::post("/api/v1/stop", &scope).if_lost("whether the drives stopped is not known: look at them");
+    let reply = args.gateway.client()?.ask(&asked).await?;
+    match reply.parsed() {
+        // Of either status.
+        Some(stopped) => Ok(stopped),
+        None => Err(reply.refusal(&asked).to_string()),
+    }
 }
 
 /// A line for each drive, those that are not proven to stand first.

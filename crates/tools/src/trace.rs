@@ -8,12 +8,11 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, SystemTime};
 
-use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
 use serde::Deserialize;
 use tokio::signal::unix::{SignalKind, signal};
 
 use self::pcap::Capture;
-use super::client::{EventStream, Gateway};
+use super::client::{EventStream, Gateway, encoded};
 use super::{EXIT_FAILED, printable, report};
 use crate::process_image::Direction;
 
@@ -63,10 +62,11 @@ async fn trace(args: &Args) -> Result<(), String> {
     let mut terminate = signal(SignalKind::terminate()).map_err(signals)?;
     let path = match &args.bus {
         None => "/api/v1/trace".to_string(),
-        Some(bus) => format!("/api/v1/trace?bus={}", utf8_percent_encode(bus, NON_ALPHANUMERIC)),
+        Some(bus) => format!("/api/v1/trace?bus={}", encoded(bus)),
     };
+    let client = args.gateway.viewer()?;
     let mut stream = tokio::select! {
-        stream = EventStream::open(&args.gateway, &path) => stream.map_err(|error| error.to_string())?,
+        stream = EventStream::open(&client, &path) => stream.map_err(|error| error.to_string())?,
         _ = interrupt.recv() => return Ok(()),
         _ = terminate.recv() => return Ok(()),
     };

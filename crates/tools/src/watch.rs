@@ -7,7 +7,7 @@ use std::time::Duration;
 use serde_json::Value;
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::client::{Gateway, get_json};
+use super::client::{Client, Gateway};
 use super::{EXIT_FAILED, printable, report};
 
 /// Refresh interval.
@@ -42,9 +42,10 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 async fn watch(args: &Args) -> Result<ExitCode, String> {
+    let client = args.gateway.viewer()?;
     let live = !args.once && io::stdout().is_terminal();
     if !live {
-        return Ok(report::print(&page(&args.gateway).await?));
+        return Ok(report::print(&page(&client).await?));
     }
     let signals = |error: io::Error| format!("cannot handle signals: {error}; the system; free file descriptors");
     let mut interrupt = signal(SignalKind::interrupt()).map_err(signals)?;
@@ -57,7 +58,7 @@ async fn watch(args: &Args) -> Result<ExitCode, String> {
             _ = tick.tick() => {}
         }
         // Survive a restart of the gateway.
-        let text = match page(&args.gateway).await {
+        let text = match page(&client).await {
             Ok(text) => text,
             Err(why) => format!("{why}\n\ntrying again\n"),
         };
@@ -73,13 +74,9 @@ async fn watch(args: &Args) -> Result<ExitCode, String> {
     }
 }
 
-async fn page(gateway: &Gateway) -> Result<String, String> {
-    let buses = get_json(gateway, "/api/v1/buses")
-        .await
-        .map_err(|error| error.to_string())?;
-    let drives = get_json(gateway, "/api/v1/drives")
-        .await
-        .map_err(|error| error.to_string())?;
+async fn page(client: &Client) -> Result<String, String> {
+    let buses = client.view("/api/v1/buses").await?;
+    let drives = client.view("/api/v1/drives").await?;
     Ok(format!("{}\n{}", lines(&buses), table(&drives)))
 }
 

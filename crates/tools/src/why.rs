@@ -4,11 +4,10 @@ use std::fmt::Write;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use super::drive_access::target;
+use super::client::{Asked, Gateway};
+use super::drive_access::{Needs, Target, target};
 use super::{EXIT_FAILED, printable, report};
-use crate::drive::Profile;
-use crate::drive::why::Explanation;
-use crate::north::local::protocol::{Outcome, Request, WhyRequest};
+use crate::north::http::messages::Why;
 
 /// Says why a drive does not run: each cause with its evidence, its age and what to do.
 #[derive(Debug, clap::Args)]
@@ -20,7 +19,7 @@ A running gateway is asked through its local socket, and knows who commanded the
 opens the port itself and reads the drive.")]
 pub(super) struct Args {
     #[command(flatten)]
-    config: super::ConfigFile,
+    gateway: Gateway,
     /// Name of the drive.
     drive: String,
     /// JSON instead of text.
@@ -29,23 +28,13 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let target = match target(&args.config.path, &args.drive) {
+    let target = match target(&args.gateway, &args.drive) {
         Ok(target) => target,
         Err(code) => return code,
     };
-    let request = Request::Why(WhyRequest {
-        drive: target.spec.name.clone(),
-        expect: Some(target.expected()),
-    });
-    let outcome = target.ask(&request).and_then(|(outcome, _)| match outcome {
-        Outcome::Why(explanation) => Ok(explanation),
-        other => Err(other.not_asked_for()),
-    });
-    match outcome {
-        Ok(explanation) if args.json => {
-            report::print(&(serde_json::to_string_pretty(&explanation).unwrap_or_default() + "\n"))
-        }
-        Ok(explanation) => report::print(&text(&args.drive, &explanation, &target.spec.profile)),
+    match why(&target) {
+        Ok(why) if args.json => report::print(&(serde_json::to_string_pretty(&why).unwrap_or_default() + "\n")),
+        Ok(why) => report::print(&text(&args.drive, &why)),
         Err(message) => {
             report::error(&message);
             ExitCode::from(EXIT_FAILED)
@@ -53,7 +42,14 @@ pub(super) fn run(args: &Args) -> ExitCode {
     }
 }
 
-fn text(drive: &str, explanation: &Explanation, profile: &Profile) -> String {
+fn why(target: &Target) -> Result<Why, String> {
+    let asked = Asked::get(target.path("why"));
+    let (reply, _) = target.ask(&asked, Needs::All)?;
+    Ok(reply.accepted(&asked)?)
+}
+
+fn text(drive: &str, why: &Why) -> String {
+    let explanation = &why.explanation;
     let mut text = match explanation.runs {
         Some(true) => format!("{drive} runs\n"),
         Some(false) => format!("{drive} does not run\n"),
@@ -74,11 +70,11 @@ fn text(drive: &str, explanation: &Explanation, profile: &Profile) -> String {
             explanation.not_told.join(", ")
         );
     }
-    if !profile.verified {
+    if !why.profile_verified {
         let _ = write!(
             text,
             "\n  the profile {} is not verified on hardware: what it takes the drive's state for may be wrong\n",
-            profile.name
+            printable::line(&why.profile)
         );
     }
     text
@@ -96,8 +92,7 @@ fn seconds(age: Duration) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drive::profile::Profiles;
-    use crate::drive::why::Cause;
+    use crate::drive::why::{Cause, Explanation};
 
     #[test]
     fn each_cause_has_its_evidence_its_age_and_a_remedy() {
@@ -114,15 +109,18 @@ mod tests {
         };
         let expected = "fan-1 does not run\n\n  interlocked: interlocked is on (0.1 s ago)\n      close it\n\n  \
                         not known, because the drive does not tell: enable input\n";
-        let profiles = Profiles::built_in();
-        let [known, doubtful] = ["vacon-nx", "yaskawa-v1000"].map(|name| profiles.get(name).unwrap());
-        assert_eq!(text("fan-1", &explanation, known), expected);
-        let doubt = text("fan-1", &explanation, doubtful);
+        let of = |explanation: &Explanation, profile: &str, profile_verified| Why {
+            explanation: explanation.clone(),
+            profile: profile.to_string(),
+            profile_verified,
+        };
+        assert_eq!(text("fan-1", &of(&explanation, "vacon-nx", true)), expected);
+        let doubt = text("fan-1", &of(&explanation, "yaskawa-v1000", false));
         assert!(doubt.starts_with(expected) && doubt.contains("yaskawa-v1000 is not verified on hardware"));
         let runs = Explanation {
             runs: Some(true),
             ..Explanation::default()
         };
-        assert_eq!(text("fan-1", &runs, known), "fan-1 runs\n");
+        assert_eq!(text("fan-1", &of(&runs, "vacon-nx", true)), "fan-1 runs\n");
     }
 }

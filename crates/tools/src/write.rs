@@ -2,11 +2,14 @@
 
 use std::process::ExitCode;
 
-use super::drive_access::{Target, Way, target};
+use serde::{Deserialize, Serialize, Serializer};
+use serde_json::Value as Json;
+
+use super::client::{Asked, Gateway};
+use super::drive_access::{Needs, Target, Way, point, target};
 use super::{EXIT_FAILED, EXIT_USAGE, printable, report};
 use crate::drive::model::Kind;
-use crate::drive::{Point, RESTART_COMMUNICATION, Value};
-use crate::north::local::protocol::{Outcome, Request, Setting, WriteOutcome, WriteRequest};
+use crate::drive::{Point, Profile, RESTART_COMMUNICATION, Value};
 use crate::process_image::value_or_null;
 
 /// Commands a drive once, through the running gateway or directly.
@@ -20,7 +23,7 @@ Several points are sent as one command, in a safe order. The drive must have acc
 Without a gateway nothing supervises a motor that the command has started.")]
 pub(super) struct Args {
     #[command(flatten)]
-    config: super::ConfigFile,
+    gateway: Gateway,
     /// Name of the drive.
     drive: String,
     /// What to set.
@@ -28,13 +31,47 @@ pub(super) struct Args {
     values: Vec<String>,
 }
 
+/// One value of a command, and how it is shown.
+#[derive(Debug)]
+struct Setting {
+    point: String,
+    value: Json,
+    shown: String,
+}
+
+/// The body of a command, with all that was given: what is given twice is for the gateway to refuse.
+struct Body<'s>(&'s [Setting]);
+
+impl Serialize for Body<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_map(self.0.iter().map(|setting| (&setting.point, &setting.value)))
+    }
+}
+
+/// How a command ended.
+#[derive(Debug, Deserialize)]
+struct Written {
+    ok: bool,
+    result: String,
+    latency_ms: f64,
+    confirmed_ms: Option<f64>,
+    error: Option<WriteError>,
+    /// What is known where no read shows the effect.
+    note: Option<String>,
+}
+
+#[derive(Debug, Deserialize)]
+struct WriteError {
+    message: String,
+}
+
 pub(super) fn run(args: &Args) -> ExitCode {
-    let target = match target(&args.config.path, &args.drive) {
+    let target = match target(&args.gateway, &args.drive) {
         Ok(target) => target,
         Err(code) => return code,
     };
-    let settings: Result<Vec<(Setting, String)>, String> =
-        args.values.iter().map(|text| parse(&target, text)).collect();
+    let setting = |text: &String| parse(target.profile().map(|profile| &**profile), text);
+    let settings: Result<Vec<Setting>, String> = args.values.iter().map(setting).collect();
     let settings = match settings {
         Ok(settings) => settings,
         Err(message) => {
@@ -42,7 +79,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
             return ExitCode::from(EXIT_USAGE);
         }
     };
-    match command(&target, settings) {
+    match command(&target, &settings) {
         Ok(text) => report::print(&text),
         Err(message) => {
             report::error(&message);
@@ -51,46 +88,53 @@ pub(super) fn run(args: &Args) -> ExitCode {
     }
 }
 
-/// `speed_reference=50`, `run=true`, `mode=auto`: what is set, and how it is shown.
-fn parse(target: &Target, text: &str) -> Result<(Setting, String), String> {
-    let (name, text) = text.split_once('=').ok_or_else(|| {
+/// `speed_reference=50`, `run=true`, `mode=auto`.
+fn parse(profile: Option<&Profile>, text: &str) -> Result<Setting, String> {
+    let (name, value) = text.split_once('=').ok_or_else(|| {
         format!("expected POINT=VALUE, got `{text}`; command line; write for example speed_reference=50")
     })?;
-    let profile = &target.spec.profile;
-    if name.trim() == RESTART_COMMUNICATION && profile.counts_messages {
-        return match text.trim() {
-            "true" => Ok((
-                Setting {
-                    point: RESTART_COMMUNICATION.to_string(),
-                    value: true.into(),
-                },
-                format!("{RESTART_COMMUNICATION}=true"),
-            )),
-            other => Err(format!(
-                "`{other}` is not a value of `{RESTART_COMMUNICATION}`; write true"
-            )),
-        };
+    let (name, value) = (name.trim(), value.trim());
+    match profile {
+        // The gateway knows the point.
+        None => Ok(Setting {
+            point: name.to_string(),
+            value: serde_json::from_str(value)
+                .ok()
+                .filter(|value: &Json| value.is_boolean() || value.is_number())
+                .unwrap_or_else(|| value.into()),
+            shown: format!("{name}={value}"),
+        }),
+        Some(profile) if name == RESTART_COMMUNICATION && profile.counts_messages => match value {
+            "true" => Ok(Setting {
+                point: name.to_string(),
+                value: true.into(),
+                shown: format!("{name}=true"),
+            }),
+            other => Err(format!("`{other}` is not a value of `{name}`; write true")),
+        },
+        Some(profile) => of_profile(profile, name, value),
     }
-    let index = target.point(name.trim())?;
-    let point = target.spec.profile.points.get(index);
+}
+
+fn of_profile(profile: &Profile, name: &str, text: &str) -> Result<Setting, String> {
+    let point = profile.points.get(point(profile, name)?);
     let point = point.ok_or_else(|| format!("there is no point `{name}`; command line; name another"))?;
-    let value = value_of(point, text.trim())?;
+    let value = value_of(point, text)?;
     let meaning = point
         .text_of(value)
         .map(|meaning| format!(" ({meaning})"))
         .unwrap_or_default();
     let shown = format!("{}={value}{meaning} {}", point.name, point.unit);
     // The text of an enumeration is left to the gateway: its profile says which code that is.
-    let is_meaning = point.kind() != Kind::Bool && point.texts.values().any(|meaning| meaning == text.trim());
-    let setting = Setting {
+    let is_meaning = point.kind() != Kind::Bool && point.texts.values().any(|meaning| meaning == text);
+    Ok(Setting {
         point: point.name.clone(),
-        value: if is_meaning {
-            text.trim().into()
-        } else {
-            value_or_null(Some(value))
+        value: match is_meaning {
+            true => text.into(),
+            false => value_or_null(Some(value)),
         },
-    };
-    Ok((setting, shown.trim_end().to_string()))
+        shown: shown.trim_end().to_string(),
+    })
 }
 
 fn value_of(point: &Point, text: &str) -> Result<Value, String> {
@@ -113,25 +157,30 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
     }
 }
 
-fn command(target: &Target, settings: Vec<(Setting, String)>) -> Result<String, String> {
-    let (points, shown): (Vec<Setting>, Vec<String>) = settings.into_iter().unzip();
-    let what = format!("{} {}", target.spec.name, shown.join(" "));
-    let request = Request::Write(WriteRequest {
-        drive: target.spec.name.clone(),
-        expect: Some(target.expected()),
-        points,
-    });
-    match target.ask(&request)? {
-        (Outcome::Write(write), way) if write.ok => Ok(acknowledged(&what, &write, way)),
-        (Outcome::Write(write), _) => Err(format!("{what}: {} ({})", write.message, write.result)),
-        (other, _) => Err(other.not_asked_for()),
+fn command(target: &Target, settings: &[Setting]) -> Result<String, String> {
+    let shown: Vec<&str> = settings.iter().map(|setting| setting.shown.as_str()).collect();
+    let what = format!("{} {}", target.drive, shown.join(" "));
+    let names: Vec<String> = settings.iter().map(|setting| setting.point.clone()).collect();
+    let asked = Asked::post(target.path("commands"), &Body(settings))
+        .if_lost("whether the drive took the command is not known: read before you repeat it");
+    let (reply, way) = target.ask(&asked, Needs::Commands(&names))?;
+    let Some(written) = reply.parsed::<Written>() else {
+        return Err(reply.refusal(&asked).to_string());
+    };
+    match &written.error {
+        None if written.ok => Ok(acknowledged(&what, &written, way)),
+        error => {
+            let message = error.as_ref().map_or("", |error| error.message.as_str());
+            let note = written.note.as_ref().map_or(String::new(), |note| format!("; {note}"));
+            Err(format!("{what}: {message}{note} ({})", written.result))
+        }
     }
 }
 
-fn acknowledged(what: &str, write: &WriteOutcome, way: Way) -> String {
+fn acknowledged(what: &str, write: &Written, way: Way) -> String {
     let confirmed = match write.confirmed_ms {
         Some(after) => format!("confirmed after {after:.0} ms"),
-        None => match &write.known {
+        None => match &write.note {
             Some(known) => format!("not confirmed by a read: {}", printable::line(known)),
             None => "not confirmed by a read".to_string(),
         },

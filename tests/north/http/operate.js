@@ -132,7 +132,7 @@ async function operate(browser) {
   await logIn(browser, "correct horse");
   await browser.until("the login is shown", "document.querySelector('.login-known').innerText.includes('alice')");
   await browser.until("the stop button", seen(stopButton));
-  assert.strictEqual(await browser.run("document.querySelectorAll('.operate-stop').length"), 1, "fan-2 is only monitored");
+  assert.strictEqual(await browser.run("document.querySelectorAll('.operate .operate-stop').length"), 1, "fan-2 is only monitored");
   await browser.until("the limits", "document.querySelector('.operate-reference').innerText.includes('from 0 to 80 %')");
   await accessible(browser, "after the login");
   // A reference outside the limits is not sent, one inside is.
@@ -165,9 +165,25 @@ async function operate(browser) {
   await browser.press(stopButton);
   await browser.until("the stop", result("Stop: "));
   await browser.until("it stands", "!document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  // All drives at once: asked back once, and told when they stand.
+  await browser.press("button[aria-label='Start pump-1']");
+  await browser.press("button[aria-label='Start now: pump-1']");
+  await browser.until("it runs again", "document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  await browser.press("#stop-all");
+  await browser.until("the question", seen("#stops .operate-stop"));
+  await accessible(browser, "while stop all asks");
+  await browser.press("#stops .operate-button");
+  assert.ok(await browser.run("document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')"), "cancelled");
+  await browser.press("#stop-all");
+  await browser.press("#stops .operate-stop");
+  await browser.until("all stand", "document.getElementById('stops').innerText.includes('Every drive stands: 1 of 1')");
+  await browser.until("it stands", "!document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  await browser.press("#stops .operate-button");
+  assert.strictEqual(await browser.run("document.getElementById('stops').innerText"), "");
   await browser.press("#login .login-known button");
   await browser.until("the logout", seen("#login .login-open"));
   assert.strictEqual(await browser.run("document.querySelectorAll('.operate button').length"), 0, "nothing to press after the logout");
+  assert.ok(!(await browser.run(seen("#stop-all"))), "nor all drives");
 }
 
 // A drive that runs is stopped in a page whose session ended: the page says what happened.

@@ -131,7 +131,7 @@ fn kinds() -> Vec<(&'static str, u8, Vec<u8>, &'static str)> {
         (
             "03 beyond the end of a block",
             NX,
-            words(3, &[0x8012, 2]),
+            words(3, &[0x8014, 2]),
             "02 02 02 02 0A 02 02 02 02 02 02 02",
         ),
         (
@@ -535,13 +535,13 @@ fn examples() -> Vec<(&'static str, u8, Vec<u8>, Vec<u8>)> {
         (
             "out of the common model",
             1,
-            words(3, &[0x8012, 2]),
+            words(3, &[0x8014, 2]),
             refused(3, no_address),
         ),
         (
             "after the common model",
             1,
-            words(3, &[0x8013, 1]),
+            words(3, &[0x8015, 1]),
             refused(3, no_address),
         ),
         (

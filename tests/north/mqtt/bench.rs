@@ -585,6 +585,7 @@ pub(crate) fn options(port: u16) -> Options {
         commands: true,
         require_id: false,
         response_topics: Vec::new(),
+        principals: None,
         buffer: None,
         home_assistant: None,
         sparkplug: None,

@@ -28,12 +28,14 @@ pub(super) enum Word {
     Run(Option<bool>),
     /// That word of a sequence.
     Sequence(usize, Option<bool>),
-    /// Before a reset: the reset is not set, nor the run command of a motor that stands.
-    ResetLow,
-    /// The reset.
-    ResetHigh,
+    /// Before a pulse of these bits, a reset as a rule: they are not set, nor the run command of a motor that stands.
+    ResetLow(Setting),
+    /// The pulse.
+    ResetHigh(Setting),
     /// Behind it.
-    ResetEnd,
+    ResetEnd(Setting),
+    /// Bits that are no command of `[control]`.
+    Others(Setting),
 }
 
 impl Word {
@@ -139,9 +141,13 @@ pub(super) struct Ordered {
 impl Ordered {
     /// Takes the value, if the point follows from `[control]`.
     pub(super) fn takes(&mut self, profile: &Profile, index: usize, value: Value) -> bool {
-        let is = |point: ModelPoint| profile.model_index(point) == Some(index);
+        let is = |point: ModelPoint| {
+            let model = profile.model_index(point);
+            let written = model.and_then(|model| profile.points.get(model)?.write_to);
+            written.or(model) == Some(index)
+        };
         let on = value.as_bool();
-        if profile.control_language().is_none() {
+        if profile.control.is_none() {
             return false;
         }
         if is(ModelPoint::Run) {
@@ -156,9 +162,14 @@ impl Ordered {
         true
     }
 
+    /// Whether the value says whether the motor is to run.
+    pub(super) fn says_run(mut self, profile: &Profile, index: usize, value: Value) -> bool {
+        self.takes(profile, index, value) && self.run.is_some()
+    }
+
     /// The actions, in the order that is safe. `stopped`: a stop went before them.
     pub(super) fn actions(self, profile: &Profile, stop: bool, stopped: bool) -> Vec<Action> {
-        let Some(control) = profile.control_language() else {
+        let Some(control) = profile.control.as_ref() else {
             return Vec::new();
         };
         let mut actions = Vec::new();
@@ -192,7 +203,7 @@ impl Ordered {
 
 fn stops(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Action> {
     let mut actions = Vec::new();
-    match control.stop.place {
+    match control.stop.place.or(coil_of(control)) {
         None => actions.push(Action::Word(Word::Stop(reverse))),
         Some(place) => actions.push(Action::Send(write(place, control.stop.applied(0), profile))),
     }
@@ -209,6 +220,11 @@ fn stops(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Act
     actions
 }
 
+/// The control word where it is a coil, which has no other bits.
+fn coil_of(control: &Control) -> Option<Place> {
+    Some(control.at).filter(|at| at.table == Table::Coil)
+}
+
 fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
     let Some(reset) = control.fault_reset else {
         return Vec::new();
@@ -218,18 +234,14 @@ fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
     let mut actions = Vec::new();
     match setting.place {
         None => {
-            actions.extend([
-                Action::Word(Word::ResetLow),
-                hold.clone(),
-                Action::Word(Word::ResetHigh),
-            ]);
-            if !setting.once {
-                actions.extend([hold, Action::Word(Word::ResetEnd)]);
+            actions.extend(pulse(setting, reset.hold));
+            if setting.once {
+                actions.truncate(3);
             }
         }
         Some(place) => {
             if !stopped {
-                actions.extend([Action::Word(Word::ResetLow), hold.clone()]);
+                actions.extend([Action::Word(Word::ResetLow(setting)), hold.clone()]);
             }
             let (high, low) = (setting.applied(0), low_of(&setting));
             if !setting.once {
@@ -242,6 +254,17 @@ fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
         }
     }
     actions
+}
+
+/// A pulse of these bits of the control word.
+pub(super) fn pulse(setting: Setting, hold: Duration) -> [Action; 5] {
+    [
+        Action::Word(Word::ResetLow(setting)),
+        Action::Hold(hold),
+        Action::Word(Word::ResetHigh(setting)),
+        Action::Hold(hold),
+        Action::Word(Word::ResetEnd(setting)),
+    ]
 }
 
 /// The word of a place of its own between two resets.
@@ -272,7 +295,7 @@ fn runs(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Acti
             }
             actions
         }
-        Run::One(setting) => match setting.place {
+        Run::One(setting) => match setting.place.or(coil_of(control)) {
             None => vec![Action::Word(Word::Run(reverse))],
             Some(place) => vec![Action::Send(write(place, setting.applied(0), profile))],
         },
@@ -296,7 +319,7 @@ fn write(place: Place, word: u16, profile: &Profile) -> RequestPdu {
 
 /// Whether the first word of a sequence can be left out, and all but the last: the motor runs by this very command.
 pub(super) fn is_prepared(profile: &Profile, words: &KnownWords, running: bool) -> bool {
-    let Some(control) = profile.control_language().filter(|_| running) else {
+    let Some(control) = profile.control.as_ref().filter(|_| running) else {
         return false;
     };
     let own = words.get(control.at.table, control.at.address);
@@ -305,7 +328,7 @@ pub(super) fn is_prepared(profile: &Profile, words: &KnownWords, running: bool) 
 
 /// The request of a word with the control word as it is known; the read of that where it has to be asked for.
 pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Known) -> Made {
-    let Some(control) = profile.control_language() else {
+    let Some(control) = profile.control.as_ref() else {
         return Made::Nothing;
     };
     let at = control.at;
@@ -315,8 +338,16 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
     }
     // A word that nobody can ask for may have been taken away elsewhere: a motor that stands keeps standing.
     let is_told = known.check == Check::Read;
-    let base = match own {
-        Some(own) => control.without_reset(own),
+    let pulsed = match word {
+        Word::ResetLow(setting) | Word::ResetHigh(setting) | Word::ResetEnd(setting) => Some(setting),
+        _ => None,
+    };
+    if matches!(word, Word::ResetLow(_)) && known.running && pulsed.is_some_and(|pulsed| pulsed.place.is_some()) {
+        // The word of a motor that runs stays as it is.
+        return Made::Nothing;
+    }
+    let base = match own.map(|own| control.without_reset(own)) {
+        Some(own) => pulsed.map_or(own, |pulsed| pulsed.released(own)),
         None if known.running && !word.names_run() => {
             return Made::Refused(Refusal::NotKnown(
                 "what the drive was commanded last is not known; say with the same command whether the motor is to run"
@@ -359,26 +390,33 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
             let word = step.write.applied(kept);
             sent(reverse.map_or(word, |reverse| control.with_direction(word, reverse)))
         }
-        Word::ResetLow => reset_low(control, own, base, known, sent),
-        Word::ResetHigh => {
-            let reset = control.fault_reset.map(|reset| reset.setting);
-            reset.map_or(Made::Nothing, |reset| sent(reset.applied(kept)))
-        }
-        Word::ResetEnd if known.running => sent(kept),
-        Word::ResetEnd => sent(control.stop_word(base)),
+        Word::ResetLow(reset) => reset_low(control, reset, own, base, known, sent),
+        Word::ResetHigh(reset) => sent(reset.applied(stays)),
+        Word::ResetEnd(_) => sent(stays),
+        Word::Others(bits) => sent(bits.applied(stays)),
     }
 }
 
-/// Whether the drive is asked for its word first: where a bit stays as it has it. A stop and a start do without.
+/// Whether the drive is asked for its word first: where a bit stays as it has it. A stop and a start do without, unless the other
+/// bits of the word are to be kept and it is not known.
 fn asks_first(word: Word, control: &Control, own: Option<u16>, known: Known) -> bool {
     let is_coil = matches!(control.at.table, Table::Coil | Table::DiscreteInput);
-    if control.own_word == OwnWord::Shadow || is_coil || known.blind {
+    if is_coil || known.blind || known.check != Check::NotYet {
         return false;
     }
-    match word {
-        Word::Stop(_) | Word::ResetEnd => false,
-        Word::ResetHigh | Word::Run(_) | Word::Sequence(..) => own.is_none() && known.check == Check::NotYet,
-        Word::Direction(_) | Word::ResetLow => known.check == Check::NotYet,
+    match (control.own_word, word) {
+        (OwnWord::Shadow, _) => false,
+        (OwnWord::Read, Word::Stop(_) | Word::ResetEnd(_)) => false,
+        (OwnWord::Read, Word::ResetHigh(_) | Word::Run(_) | Word::Sequence(..)) => own.is_none(),
+        (OwnWord::Read, Word::Direction(_) | Word::ResetLow(_) | Word::Others(_)) => true,
+        (OwnWord::Kept, word) => own.is_none_or(|own| {
+            // A run command that the order does not name may have been taken away elsewhere since the word was read, and to
+            // write it would start the motor.
+            let is_taken_away = !known.running && matches!(word, Word::ResetLow(_));
+            let stops = is_taken_away || control.is_stop(control.at, own);
+            let is_low = known.running && matches!(word, Word::ResetLow(pulse) if pulse.released(own) == own);
+            !known.names_run && !stops && !is_low
+        }),
     }
 }
 
@@ -401,9 +439,16 @@ fn run_word(control: &Control, kept: u16, reverse: Option<bool>, words: &KnownWo
     }
 }
 
-fn reset_low(control: &Control, own: Option<u16>, base: u16, known: Known, sent: impl Fn(u16) -> Made) -> Made {
-    let stops = |reset: &Setting| reset.place.is_none() && control.runs().iter().any(|run| !reset.agrees(run));
-    if known.running && control.fault_reset.is_some_and(|reset| stops(&reset.setting)) {
+fn reset_low(
+    control: &Control,
+    reset: Setting,
+    own: Option<u16>,
+    base: u16,
+    known: Known,
+    sent: impl Fn(u16) -> Made,
+) -> Made {
+    let stops = reset.place.is_none() && control.runs().iter().any(|run| !reset.agrees(run));
+    if known.running && stops {
         return Made::Refused(Refusal::NotAllowed(
             "the motor runs, and the reset of this family would stop it; nothing was written".to_string(),
         ));
@@ -426,12 +471,12 @@ fn read_of(place: Place) -> Step {
 
 /// Whether that word of a sequence is its last, which starts the motor.
 pub(super) fn is_last(profile: &Profile, number: usize) -> bool {
-    let run = profile.control_language().map(|control| &control.run);
+    let run = profile.control.as_ref().map(|control| &control.run);
     matches!(run, Some(Run::Steps(steps)) if number + 1 == steps.len())
 }
 
 /// The place of `[control]` whose word is learned as the drive reports it; none where it reports something else.
 pub fn read_place(profile: &Profile) -> Option<Place> {
-    let control = profile.control_language()?;
+    let control = profile.control.as_ref()?;
     (control.own_word == OwnWord::Read).then_some(control.at)
 }

@@ -3,14 +3,15 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-use super::control::{AwaitedState, Ordered, Word};
+use super::control::{self, AwaitedState, Ordered, Word};
 use super::known_words::KnownWords;
 use super::parameter::ParameterRun;
 use crate::codec::n2::Session;
 use crate::codec::{RequestPdu, Table};
 use crate::command::{Refusal, written};
+use crate::drive::control::Setting;
 use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Point, Profile, Raw, Value};
+use crate::drive::{Point, Profile, Raw, Value};
 
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Action {
@@ -26,15 +27,13 @@ pub(super) enum Action {
     Release(RequestPdu),
     /// Bits of one word; its other bits stay as they are known.
     Bits { raw: Raw, changes: Vec<(u8, bool)> },
-    /// Takes the run command away from a motor that stands, where it is no bit of the word with the reset bit.
-    Disarm { raw: Raw, bit: u8, invert: bool },
-    /// Takes the reset bit (and the run bit of a motor that stands) away, if set.
+    /// Takes a bit away that is written as a pulse and is not in the control word, if set.
     PulseLow { raw: Raw, bit: u8, invert: bool },
-    /// Sets the reset bit.
+    /// Sets it.
     PulseHigh { raw: Raw, bit: u8, invert: bool },
-    /// Takes the reset bit away again.
+    /// Takes it away again.
     PulseEnd { raw: Raw, bit: u8, invert: bool },
-    /// Two update periods of the drive.
+    /// Two update periods of the drive, as a rule.
     Hold(Duration),
     /// A word of the control register by `[control]` of the profile.
     Word(Word),
@@ -81,7 +80,7 @@ impl Action {
     pub(super) fn is_reset(&self) -> bool {
         matches!(
             self,
-            Action::PulseHigh { .. } | Action::Word(Word::ResetHigh) | Action::ResetElsewhere(_)
+            Action::PulseHigh { .. } | Action::Word(Word::ResetHigh(_)) | Action::ResetElsewhere(_)
         )
     }
 
@@ -89,7 +88,7 @@ impl Action {
     pub(super) fn ends_reset(&self) -> bool {
         matches!(
             self,
-            Action::PulseEnd { .. } | Action::Word(Word::ResetEnd) | Action::ResetOver(_)
+            Action::PulseEnd { .. } | Action::Word(Word::ResetEnd(_)) | Action::ResetOver(_)
         )
     }
 }
@@ -157,21 +156,29 @@ pub(super) fn unsendable(profile: &Profile, values: &[(usize, Value)]) -> Option
 
 /// Whether a command says whether the motor is to run.
 pub(super) fn names_run(profile: &Profile, values: &[(usize, Value)]) -> bool {
-    if profile.control_language().is_some() {
-        return values
-            .iter()
-            .any(|(index, _)| profile.model_index(ModelPoint::Run) == Some(*index));
-    }
-    let Some((run, bit, _)) = profile.run_bit() else {
+    let Some(control) = &profile.control else {
         return false;
     };
-    let is_run = |raw: &Raw| match raw.form {
-        Form::Bit { bit: of, .. } => of == bit,
-        Form::Bits { first, count } => (first..first.saturating_add(count)).contains(&bit),
-        _ => true,
-    };
-    let raws = values.iter().filter_map(|(index, _)| profile.points.get(*index)?.raw());
-    raws.filter(|raw| raw.covers(run.table, run.address)).any(is_run)
+    let place = control.run_place();
+    let bits = control.runs().iter().fold(0, |bits, run| bits | run.mask);
+    let is_run = |raw: &Raw| (raw.table, raw.address) != (place.table, place.address) || bits_of(raw) & bits != 0;
+    values.iter().any(|(index, value)| {
+        let raw = profile.points.get(*index).and_then(|point| point.raw());
+        let covers = raw.is_some_and(|raw| raw.covers(place.table, place.address) && is_run(raw));
+        covers || Ordered::default().says_run(profile, *index, *value)
+    })
+}
+
+/// The bits of its first word that a raw value takes.
+fn bits_of(raw: &Raw) -> u16 {
+    match raw.form {
+        Form::Bit { bit, .. } => 1u16.checked_shl(bit.into()).unwrap_or_default(),
+        Form::Bits { first, count } => {
+            let bits = first..first.saturating_add(count);
+            bits.fold(0, |mask, bit| mask | 1u16.checked_shl(bit.into()).unwrap_or_default())
+        }
+        _ => u16::MAX,
+    }
 }
 
 /// The actions of a command. `stopped`: it is the rest of an order whose stop went before it.
@@ -180,6 +187,10 @@ pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool, 
     let mut pulses = VecDeque::new();
     let mut words: BTreeMap<(Table, u16), WordChange> = BTreeMap::new();
     let mut control = Ordered::default();
+    let at = profile
+        .control
+        .as_ref()
+        .map(|control| (control.at.table, control.at.address));
     for (index, value) in values {
         if control.takes(profile, *index, *value) {
             continue;
@@ -188,55 +199,30 @@ pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool, 
             continue;
         };
         let Some(raw) = point.raw() else { continue };
+        let is_control = Some((raw.table, raw.address)) == at && raw.table == Table::Holding;
         match raw.form {
             Form::Bit { bit, invert } if point.pulse => {
                 if value.as_bool() {
-                    let hold = Action::Hold(2 * profile.update_period);
-                    let elsewhere = |run: &Raw| (run.table, run.address) != (raw.table, raw.address);
-                    // A stop takes the run command away itself, before the reset.
-                    let disarmed = stopped || (stop && names_run(profile, values));
-                    let run = profile.run_bit().filter(|_| !disarmed);
-                    if let Some((run, bit, invert)) = run.filter(|(run, ..)| elsewhere(run)) {
-                        let raw = run.clone();
-                        pulses.push_back(Action::Disarm { raw, bit, invert });
-                    }
-                    pulses.push_back(Action::PulseLow {
-                        raw: raw.clone(),
-                        bit,
-                        invert,
-                    });
-                    pulses.push_back(hold.clone());
-                    pulses.push_back(Action::PulseHigh {
-                        raw: raw.clone(),
-                        bit,
-                        invert,
-                    });
-                    pulses.push_back(hold);
-                    pulses.push_back(Action::PulseEnd {
-                        raw: raw.clone(),
-                        bit,
-                        invert,
+                    let hold = 2 * profile.update_period;
+                    pulses.extend(match is_control {
+                        true => control::pulse(setting_of(&[(bit, !invert)]), hold),
+                        false => pulse(raw, bit, invert, hold),
                     });
                 }
             }
-            Form::Bit { bit, invert } => {
-                let entry = words
-                    .entry((raw.table, raw.address))
-                    .or_insert_with(|| (raw.clone(), Vec::new()));
-                entry.1.push((bit, value.as_bool() != invert));
-            }
-            Form::Bits { first, count } => {
+            Form::Bit { .. } | Form::Bits { .. } => {
+                // Admitted values fit; one that does not is left out rather than sent wrong.
                 let Some(word) = raw.encode(*value, 0).ok().and_then(|words| words.first().copied()) else {
                     continue;
                 };
                 let entry = words
                     .entry((raw.table, raw.address))
                     .or_insert_with(|| (raw.clone(), Vec::new()));
-                let bits = first..first.saturating_add(count);
-                entry.1.extend(bits.map(|bit| (bit, (word >> bit) & 1 == 1)));
+                let bits = bits_of(raw);
+                let changed = (0..16u8).filter(|bit| (bits >> bit) & 1 == 1);
+                entry.1.extend(changed.map(|bit| (bit, (word >> bit) & 1 == 1)));
             }
             _ => {
-                // Admitted values fit; one that does not is left out rather than sent wrong.
                 let pdu = raw
                     .encode(*value, 0)
                     .ok()
@@ -245,18 +231,66 @@ pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool, 
             }
         }
     }
-    // The run command of a drive whose bits are coils goes first in a stop, and last, behind the direction, otherwise.
-    let run = profile.run_bit().map(|(raw, ..)| (raw.table, raw.address));
-    let run = run.and_then(|place| words.remove(&place));
-    let others = words.into_values();
-    let action = |(raw, changes): WordChange| Action::Bits { raw, changes };
-    let words = control.actions(profile, stop, stopped);
+    let others = words
+        .into_iter()
+        .map(|(place, (raw, changes))| match Some(place) == at {
+            true if raw.table == Table::Holding => Action::Word(Word::Others(setting_of(&changes))),
+            _ => Action::Bits { raw, changes },
+        });
+    // A stop goes first, a run command last.
+    let commands = control.actions(profile, stop, stopped);
     if stop {
-        let bits = run.into_iter().chain(others).map(action);
-        words.into_iter().chain(bits).chain(numbers).chain(pulses).collect()
+        commands
+            .into_iter()
+            .chain(others)
+            .chain(numbers)
+            .chain(pulses)
+            .collect()
     } else {
-        let bits = others.chain(run).map(action);
-        numbers.into_iter().chain(pulses).chain(bits).chain(words).collect()
+        numbers
+            .into_iter()
+            .chain(pulses)
+            .chain(others)
+            .chain(commands)
+            .collect()
+    }
+}
+
+/// A bit of another register or coil, set for a time.
+fn pulse(raw: &Raw, bit: u8, invert: bool, hold: Duration) -> [Action; 5] {
+    let raw = || raw.clone();
+    [
+        Action::PulseLow {
+            raw: raw(),
+            bit,
+            invert,
+        },
+        Action::Hold(hold),
+        Action::PulseHigh {
+            raw: raw(),
+            bit,
+            invert,
+        },
+        Action::Hold(hold),
+        Action::PulseEnd {
+            raw: raw(),
+            bit,
+            invert,
+        },
+    ]
+}
+
+/// Bits of the control word, and what they become.
+fn setting_of(changes: &[(u8, bool)]) -> Setting {
+    let bits = |of: &dyn Fn(bool) -> bool| {
+        let of = changes.iter().filter(|(_, on)| of(*on));
+        of.fold(0u16, |word, (bit, _)| word | (1 << bit))
+    };
+    Setting {
+        place: None,
+        mask: bits(&|_| true),
+        value: bits(&|on| on),
+        once: false,
     }
 }
 
@@ -291,21 +325,10 @@ pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, kn
             Check::Read => (!words.has(*table, items)).then(|| execute(pdu)),
             Check::InVain => Some(execute(pdu)),
         },
-        Action::Disarm { .. } if known.running => None,
-        Action::Disarm { raw, bit, invert } => bits(action, raw, vec![(*bit, *invert)], words, profile, known),
         Action::Bits { raw, changes } => bits(action, raw, changes.clone(), words, profile, known),
         Action::PulseHigh { raw, bit, invert } => bits(action, raw, vec![(*bit, !invert)], words, profile, known),
         Action::PulseEnd { raw, bit, invert } => bits(action, raw, vec![(*bit, *invert)], words, profile, known),
-        Action::PulseLow { raw, bit, invert } => {
-            let mut changes = vec![(*bit, *invert)];
-            // A reset must not start the motor: a run bit left over from before the fault is taken away.
-            if !known.running
-                && let Some(run) = standing_run_bit(profile, raw)
-            {
-                changes.push(run);
-            }
-            bits(action, raw, changes, words, profile, known)
-        }
+        Action::PulseLow { raw, bit, invert } => bits(action, raw, vec![(*bit, *invert)], words, profile, known),
     }
 }
 
@@ -318,7 +341,7 @@ fn bits(
     profile: &Profile,
     known: Known,
 ) -> Option<Step> {
-    let only_if_set = matches!(action, Action::PulseLow { .. } | Action::Disarm { .. });
+    let only_if_set = matches!(action, Action::PulseLow { .. });
     let address = raw.address;
     if raw.table == Table::Coil {
         let on = changes.first().is_some_and(|(_, on)| *on);
@@ -350,15 +373,6 @@ fn bits(
     if (only_if_set || kept) && value == old {
         return None;
     }
-    // A run bit that the command does not name may have been taken away elsewhere since the word was read, and to write
-    // it would start the motor: the drive is asked, and if it does not report it, a motor that stands keeps standing.
-    let stands = standing_run_bit(profile, raw).map_or(value, |run| set(value, run));
-    let value = match known.check {
-        _ if known.names_run || value == stands => value,
-        Check::NotYet => return Some(read),
-        Check::InVain if !known.running => stands,
-        Check::Read | Check::InVain => value,
-    };
     Some(Step::new(
         StepPurpose::Execute,
         RequestPdu::WriteRegister { address, value },
@@ -375,15 +389,6 @@ fn mask(address: u16, changes: &[(u8, bool)]) -> RequestPdu {
         address,
         and_mask: !(bits(true) | bits(false)),
         or_mask: bits(true),
-    }
-}
-
-/// The run bit, if it is in the same word, as it is where the motor is to stand.
-fn standing_run_bit(profile: &Profile, of: &Raw) -> Option<(u8, bool)> {
-    let run = profile.model_point(ModelPoint::Run)?.raw()?;
-    match run.form {
-        Form::Bit { bit, invert } if run.table == of.table && run.address == of.address => Some((bit, invert)),
-        _ => None,
     }
 }
 

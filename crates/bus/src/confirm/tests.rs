@@ -185,6 +185,51 @@ fn a_drive_that_was_not_read_since_is_not_said_to_run_on() {
     assert!(reports[0].contains("was not read within 10s"), "{reports:?}");
 }
 
+/// A busy line reads the motor in every round and the control word now and then.
+#[test]
+fn what_is_read_seldom_is_not_missing_before_it_was_read() {
+    let order = |bench: &mut Bench, reverse: bool| {
+        let points = [("run", true), ("reverse", reverse)];
+        let index = |name: &str| bench.drive.spec.profile.point_index(name).unwrap();
+        let values = points.map(|(name, on)| (index(name), Value::Bool(on)));
+        bench.acknowledge(&Order::Points(values.to_vec()));
+    };
+    let mut bench = Bench::new();
+    order(&mut bench, false);
+    bench.read(2100, &[2]);
+    bench.now += Duration::from_secs(3);
+    assert!(bench.expired().is_empty(), "its direction was not read since");
+    bench.now += Duration::from_secs(4);
+    bench.read(2000, &[1]);
+    assert!(bench.expired().is_empty() && bench.confirmations.is_empty());
+
+    // What was read is told in time, and what is read later then.
+    order(&mut bench, true);
+    bench.read(2100, &[0]);
+    bench.now += Duration::from_secs(2);
+    let reports = bench.expired();
+    assert!(reports[0].ends_with("within 2s: the motor does not run"), "{reports:?}");
+    bench.now += Duration::from_secs(4);
+    bench.read(2000, &[1]);
+    let reports = bench.expired();
+    assert!(
+        reports[0].ends_with("within 6s: `reverse` does not read true"),
+        "{reports:?}"
+    );
+    assert!(bench.confirmations.is_empty());
+
+    // Never read: not known, once.
+    order(&mut bench, true);
+    bench.read(2100, &[2]);
+    bench.now += Duration::from_secs(9);
+    assert!(bench.expired().is_empty());
+    bench.now += Duration::from_secs(2);
+    let reports = bench.expired();
+    assert!(reports[0].contains("was not read within 10s"), "{reports:?}");
+    bench.now += Duration::from_secs(60);
+    assert!(bench.expired().is_empty() && bench.confirmations.is_empty());
+}
+
 #[test]
 fn while_the_motor_slows_down_nobody_waits_any_longer_and_nothing_is_told() {
     let mut bench = Bench::new();

@@ -282,7 +282,14 @@ impl Master {
     ) -> Option<Turn> {
         let held = command.passed_on.as_ref().and_then(|p| held(p, &self.bus.image.drives));
         let away = command.drive != NO_DRIVE && !self.schedule.is_online(command.drive);
-        let in_vain = held.or(away.then_some(Outcome::Offline));
+        let lost = || {
+            self.bus
+                .queue
+                .lock()
+                .hold_stops_turn(&command, now)
+                .map(Outcome::Refused)
+        };
+        let in_vain = held.or(away.then_some(Outcome::Offline)).or_else(lost);
         if let Some(outcome) = in_vain {
             command.answer(&outcome, now);
             return None;
@@ -417,9 +424,11 @@ impl Master {
         let Some(begun) = &mut self.background else { return };
         begun.sent = true;
         let orders = begun.request.passed_on.as_ref().filter(|_| begun.ordered.is_some());
-        for drive in orders.map_or(&[][..], |passed_on| &passed_on.reach) {
-            if let Some(drive) = self.drives.get_mut(*drive) {
-                drive.heard_order(now);
+        let origin = begun.request.ticket.origin();
+        for index in orders.map_or(&[][..], |passed_on| &passed_on.reach) {
+            let renews = self.bus.renews(*index, origin);
+            if let Some(drive) = self.drives.get_mut(*index) {
+                drive.heard_order(renews, now);
             }
         }
         let Some(starts) = self.starts.as_ref().filter(|_| orders.is_some()) else {
@@ -533,10 +542,11 @@ impl Master {
         let reach = request.passed_on.as_ref().map_or(&[][..], |passed_on| &passed_on.reach);
         let writes = written(&request.pdu);
         for index in reach.iter().copied() {
+            let renews = self.bus.renews(index, request.ticket.origin());
             let Some(drive) = self.drives.get_mut(index) else {
                 continue;
             };
-            drive.heard_order(now);
+            drive.heard_order(renews, now);
             if matches!(outcome, Outcome::Exception(_)) {
                 continue;
             }

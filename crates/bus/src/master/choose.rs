@@ -6,7 +6,7 @@ use super::background::{Late, drop_in_vain, may_go};
 use super::{Before, Master, Purpose, Turn};
 use crate::codec::RequestPdu;
 use crate::command::{
-    Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Outcome, Refusal, StopEnd, Urgency,
+    Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Origin, Outcome, Refusal, StopEnd, Urgency,
     still_keeps_limits,
 };
 use crate::command_run::{CommandRun, Step};
@@ -185,6 +185,20 @@ impl Master {
                 drive.purge(image, now);
             }
         }
+        if self.bus.queue.is_guarded() {
+            self.end_what_was_taken(now);
+        }
+    }
+
+    /// Nothing that was begun for one client goes on when another one took the drive.
+    fn end_what_was_taken(&mut self, now: Instant) {
+        let pending = self.bus.queue.lock().take_taken();
+        for index in pending {
+            if let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) {
+                let refuses = |origin: &Origin| self.bus.queue.lock().hold_ends_run(index, origin, now);
+                drive.taken(refuses, image, now);
+            }
+        }
     }
 
     fn commands(&mut self, now: Instant) -> Commands {
@@ -339,6 +353,11 @@ impl Master {
             command.answer(&Outcome::Refused(Refusal::NotAllowed(why.to_string())), now);
             return;
         }
+        let (lost, renews) = self.bus.judges_turn(&command, now);
+        if let Some(refusal) = lost {
+            command.answer(&Outcome::Refused(refusal), now);
+            return;
+        }
         let reading = image.reading(now, RANGE_AGE);
         let hold = |range: &FrequencyRange| range.holds(&reading, drive.written.range);
         if command.urgency == Urgency::Command && !command.ranges.iter().all(hold) {
@@ -358,7 +377,7 @@ impl Master {
         }
         let start = self.starts.as_ref().and_then(|starts| starts.start_of(&command, index));
         let mut run = CommandRun::new(command, &image.spec.profile);
-        (run.rank, run.start) = (rank, start);
+        (run.rank, run.renews, run.start) = (rank, renews, start);
         drive.begin(run);
     }
 

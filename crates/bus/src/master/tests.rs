@@ -18,6 +18,7 @@ use crate::process_image::{
 use crate::transaction::MAY_BE_LATE;
 
 mod background;
+mod hold;
 mod stop_all;
 
 /// What an exchange takes.

@@ -142,7 +142,11 @@ fn listens(drive: &Reading<'_>) -> String {
     )
 }
 
-fn authority(drive: &Reading<'_>, client: Authority) -> Result<(), Refusal> {
+/// Whether a client may command the drive at all.
+///
+/// # Errors
+/// The refusal.
+pub fn authority(drive: &Reading<'_>, client: Authority) -> Result<(), Refusal> {
     if drive.spec.access == Access::Listen {
         return Err(Refusal::NotAllowed(listens(drive)));
     }

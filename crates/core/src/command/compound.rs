@@ -185,7 +185,7 @@ mod tests {
     #[test]
     fn a_block_with_a_stop_is_sent_behind_its_control_word() {
         let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
-        let (raw, ..) = profile.run_bit().unwrap();
+        let raw = profile.run_place().unwrap();
         let block = |word: u16| RequestPdu::WriteRegisters {
             start: raw.address,
             values: vec![word, 0, 5000],

@@ -12,6 +12,7 @@ mod audit;
 mod background;
 mod compound;
 mod frequency_range;
+mod holder;
 mod parameter;
 mod priorities;
 mod queue;
@@ -19,7 +20,7 @@ mod standing;
 mod ticket;
 mod touched;
 
-pub use admit::{Admitted, admit, converted, may_restore, sets_twice, written};
+pub use admit::{Admitted, admit, authority, converted, may_restore, sets_twice, written};
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
 pub use audit::{SENT, milliseconds, milliseconds_or_null};
 pub use background::{
@@ -27,6 +28,9 @@ pub use background::{
 };
 pub use compound::{Parts, StopEnd, joined, stop_of};
 pub use frequency_range::{FrequencyRange, is_range_end};
+pub use holder::{
+    Asks, Claim, Denial, HoldState, HoldView, Holding, KeptReservation, Mode, Principal, Proof, Rules, Told, Verb, What,
+};
 pub use parameter::ParameterOrder;
 pub use priorities::{
     Commanded, Effect, Entry, Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, SlotWrite,
@@ -145,6 +149,8 @@ pub struct Origin {
     pub who: String,
     client: Arc<str>,
     login: Option<Arc<str>>,
+    proof: Proof,
+    insists: bool,
 }
 
 impl Origin {
@@ -164,7 +170,26 @@ impl Origin {
             who,
             client,
             login: None,
+            proof: Proof::Nothing,
+            insists: false,
         }
+    }
+
+    /// The same, of whom its connection proves that.
+    pub fn proven(mut self, proof: Proof) -> Origin {
+        self.proof = proof;
+        self
+    }
+
+    /// The same; a stop of it is a new one, also where its client repeats its word all the time.
+    pub fn insisting(mut self) -> Origin {
+        self.insists = true;
+        self
+    }
+
+    /// What its connection proves.
+    pub fn proof(&self) -> &Proof {
+        &self.proof
     }
 
     /// The same with a login, which may renew the lease of the drive until another client commands it.
@@ -362,6 +387,8 @@ pub enum Interruption {
     Offline,
     /// The gateway stops, or its bus starts anew.
     ShuttingDown,
+    /// Another client took the drive.
+    Taken,
 }
 
 /// How a command ended.
@@ -520,6 +547,7 @@ impl fmt::Display for Outcome {
                     Interruption::BusDown => "the bus went down",
                     Interruption::Offline => "the drive went offline",
                     Interruption::ShuttingDown => "the gateway stops",
+                    Interruption::Taken => "another client took the drive",
                 };
                 write!(f, "it was started, then {why}; whether the drive took it is unknown")
             }
@@ -567,6 +595,9 @@ pub enum Refusal {
     /// What must hold before the motor is started does not.
     #[error("{0}; it was not sent")]
     Interlocked(String),
+    /// A client that was refused behind a stop goes on with run, or renews what it does not hold.
+    #[error("{0}")]
+    NeedsTake(Box<Holder>),
     /// There is no drive of that name.
     #[error("{0}")]
     UnknownDrive(String),
@@ -587,11 +618,13 @@ pub struct Holder {
     pub rank: String,
     /// What is kept, and how that ends.
     pub keeps: String,
+    /// Seconds until it ends by itself, where it does.
+    pub left_s: Option<u64>,
 }
 
 impl fmt::Display for Holder {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Holder { who, rank, keeps } = self;
+        let Holder { who, rank, keeps, .. } = self;
         write!(f, "{who} ({rank}) {keeps}; it was not sent")
     }
 }
@@ -608,7 +641,16 @@ impl Refusal {
             Refusal::HeldByOther(_) => "held_by_other",
             Refusal::Guarded(_) => "guarded",
             Refusal::Interlocked(_) => "interlocked",
+            Refusal::NeedsTake(_) => "needs_take",
             Refusal::UnknownDrive(_) => Refusal::UNKNOWN_DRIVE,
+        }
+    }
+
+    /// Who keeps the client from the drive, where somebody does.
+    pub fn holder(&self) -> Option<&Holder> {
+        match self {
+            Refusal::HeldByOther(holder) | Refusal::NeedsTake(holder) => Some(holder),
+            _ => None,
         }
     }
 
@@ -618,7 +660,9 @@ impl Refusal {
             Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => Exception::FUNCTION,
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => Exception::ADDRESS,
             Refusal::BadValue(_) => Exception::VALUE,
-            Refusal::HeldByOther(_) | Refusal::Guarded(_) | Refusal::Interlocked(_) => Exception::BUSY,
+            Refusal::HeldByOther(_) | Refusal::NeedsTake(_) | Refusal::Guarded(_) | Refusal::Interlocked(_) => {
+                Exception::BUSY
+            }
             Refusal::UnknownDrive(_) => Exception::GATEWAY_PATH,
         }
     }
@@ -647,9 +691,9 @@ mod tests {
             Refusal::UnknownDrive,
         ];
         let mut outcomes: Vec<Outcome> = refusals.iter().map(|r| Outcome::Refused(r(String::new()))).collect();
-        let held = Refusal::HeldByOther(Box::default());
+        let held = [Refusal::HeldByOther(Box::default()), Refusal::NeedsTake(Box::default())];
+        outcomes.extend(held.map(Outcome::Refused));
         outcomes.extend([
-            Outcome::Refused(held),
             Outcome::Refused(Refusal::Interlocked(String::new())),
             Outcome::Acknowledged(Reply::Written),
             Outcome::TimedOut,

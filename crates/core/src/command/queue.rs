@@ -1,17 +1,20 @@
 //! The command queue of a bus: bounded, ordered, with replacing, purging and expiry.
 
 mod handover;
+mod holds;
 mod passed_on;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use rustix::event::{EventfdFlags, eventfd};
 use tokio::sync::oneshot;
 
+use self::holds::Holds;
 use super::background::{Background, BackgroundRequest};
 use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal, SourceKind, Urgency};
 use crate::start_guard::BusGuards;
@@ -52,6 +55,8 @@ pub struct Pending {
     commanders: BTreeMap<usize, Arc<str>>,
     /// Who commands by priorities, by drive.
     priorities: BTreeMap<usize, Priorities>,
+    /// Who holds the drives.
+    holds: Holds,
     /// The stops that the gateway wants before it ends, until the bus takes note of it.
     stopping: Option<Stopping>,
     /// What keeps motors from being started.
@@ -127,6 +132,10 @@ impl Pending {
             return;
         }
         command.is_ordinary = self.is_ordinary(&command);
+        if let Some(refusal) = self.hold_refuses_command(&command, now) {
+            command.answer(&Outcome::Refused(refusal), now);
+            return;
+        }
         if command.urgency == Urgency::Stop {
             self.note_stop(command.drive, now);
             self.push_stop(command, now);
@@ -230,6 +239,7 @@ impl Pending {
             who: format!("the BACnet client {}", protects.client),
             rank: format!("priority {priority}"),
             keeps: format!("keeps `{what}` until it gives that slot back"),
+            left_s: None,
         })))
     }
 
@@ -240,6 +250,7 @@ impl Pending {
 
     /// Keeps who gave a command that is taken in.
     fn note_accepted(&mut self, command: &Command, now: Instant) {
+        self.hold_accepted(command, now);
         let origin = command.ticket.origin();
         if command.urgency != Urgency::Read {
             for drive in command.reach() {
@@ -549,6 +560,8 @@ fn same_points(older: &Order, newer: &Order) -> bool {
 pub struct CommandQueue {
     pending: Mutex<Pending>,
     background: Mutex<Background>,
+    /// Whether `[authority]` is on.
+    guarded: AtomicBool,
     wake: OwnedFd,
     guards: Option<Arc<BusGuards>>,
 }
@@ -563,6 +576,7 @@ impl CommandQueue {
         Ok(CommandQueue {
             pending: Mutex::default(),
             background: Mutex::default(),
+            guarded: AtomicBool::new(false),
             wake,
             guards: None,
         })

@@ -17,9 +17,12 @@ pub mod rules;
 pub mod signature;
 pub mod words;
 
+use std::fmt;
 use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
+
+use crate::codec::RequestPdu;
 
 pub use figures::{Drive, End, Exchange, Figures, Line};
 
@@ -223,6 +226,32 @@ pub struct CountedByDrive {
 }
 
 impl CountedByDrive {
+    /// The first subfunction of function 08; the others follow it.
+    const FIRST: u16 = 0x0B;
+
+    /// The request for the counter behind those that were read.
+    pub fn request(so_far: &[u16]) -> RequestPdu {
+        let place = u16::try_from(so_far.len().min(4)).unwrap_or_default();
+        RequestPdu::Diagnostics {
+            subfunction: CountedByDrive::FIRST + place,
+            data: 0,
+        }
+    }
+
+    /// All five of them, in the order of their subfunctions; none while some are missing.
+    pub fn complete(counters: &[u16]) -> Option<CountedByDrive> {
+        let &[messages, damaged, exceptions, own, unanswered] = counters else {
+            return None;
+        };
+        Some(CountedByDrive {
+            messages,
+            damaged,
+            exceptions,
+            own,
+            unanswered,
+        })
+    }
+
     /// What was counted since `before`.
     #[must_use]
     pub fn since(&self, before: &CountedByDrive) -> CountedByDrive {
@@ -254,6 +283,23 @@ impl CountedByDrive {
                  ways are disturbed"
             )),
         }
+    }
+}
+
+impl fmt::Display for CountedByDrive {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let CountedByDrive {
+            messages,
+            damaged,
+            exceptions,
+            own,
+            unanswered,
+        } = self;
+        write!(
+            f,
+            "{messages} messages received, {damaged} damaged ones, {own} to this drive, {unanswered} of them unanswered, \
+             {exceptions} exceptions sent"
+        )
     }
 }
 

@@ -14,13 +14,15 @@ pub const MQTT_HISTORY: &str = "mqtt-history";
 pub const MQTT_TOPICS: &str = "mqtt-topics";
 /// Number of the Sparkplug session.
 pub const SPARKPLUG: &str = "sparkplug-bdseq";
+/// Reservations that stops left behind.
+pub const RESERVATIONS: &str = "reservations.json";
 /// Directory of the recordings.
 pub const RECORDINGS: &str = "recordings";
 /// Directory of the parameters.
 pub const PARAMS: &str = "params";
 
 /// What the names begin with, before a `.` or `-` or their end; counters are written and set aside under other endings.
-const OWN: [&str; 9] = [
+const OWN: [&str; 10] = [
     EVENTS,
     "counters",
     "starts",
@@ -28,6 +30,7 @@ const OWN: [&str; 9] = [
     MQTT_HISTORY,
     MQTT_TOPICS,
     SPARKPLUG,
+    "reservations",
     RECORDINGS,
     PARAMS,
 ];
@@ -54,6 +57,7 @@ mod tests {
             MQTT_HISTORY,
             MQTT_TOPICS,
             SPARKPLUG,
+            RESERVATIONS,
             RECORDINGS,
             PARAMS,
         ] {

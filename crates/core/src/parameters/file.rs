@@ -103,6 +103,8 @@ pub struct ParameterFile {
     pub identification: String,
     /// When it was read, RFC 3339.
     pub time: String,
+    /// What the drive counted of its line by then; empty where its family does not count.
+    pub counters: String,
     /// By name.
     pub values: BTreeMap<Id, Entry>,
 }
@@ -164,7 +166,7 @@ impl ParameterFile {
             .max()
             .unwrap_or(0);
         let mut text = format!(
-            "{HEAD}\ndrive: {}\nfamily: {}\nidentification: {}\napplication: {}\ntime: {}\nchecksum: {}\n\n",
+            "{HEAD}\ndrive: {}\nfamily: {}\nidentification: {}\napplication: {}\ntime: {}\nchecksum: {}\n",
             self.drive,
             self.family,
             self.identification,
@@ -172,6 +174,10 @@ impl ParameterFile {
             self.time,
             self.checksum()
         );
+        if !self.counters.is_empty() {
+            let _ = writeln!(text, "counters: {}", one_line(&self.counters));
+        }
+        text.push('\n');
         for (id, entry) in &self.values {
             let (id, value) = (id.name(), shown(&entry.value));
             let note = match &entry.value {
@@ -220,6 +226,7 @@ impl ParameterFile {
                     "family" => file.family = value,
                     "identification" => file.identification = value,
                     "time" => file.time = value,
+                    "counters" => file.counters = value,
                     "checksum" => checksum = value,
                     "application" => {}
                     other => return Err(wrong(format!("unknown key `{other}`"))),
@@ -307,6 +314,7 @@ mod tests {
             family: "vacon-nx".to_string(),
             identification: "none".to_string(),
             time: "2026-03-02T07:40:12Z".to_string(),
+            counters: "812 messages received, 3 damaged ones".to_string(),
             values: values.collect(),
         }
     }
@@ -320,7 +328,7 @@ mod tests {
             ("1.3", refused, "Acceleration time"),
         ]);
         let text = file.text();
-        let values: Vec<&str> = text.lines().skip(8).collect();
+        let values: Vec<&str> = text.lines().skip(9).collect();
         assert_eq!(
             values,
             [

@@ -10,8 +10,9 @@ use std::time::Duration;
 
 use super::file::{Entry, Id, ParameterFile};
 use super::names::Names;
-use crate::codec::{Exception, RequestPdu, Table};
+use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::Outcome;
+use crate::diagnosis::CountedByDrive;
 use crate::drive::Profile;
 use crate::drive::parameters::{Label, Numbering, RawValue};
 
@@ -52,6 +53,17 @@ pub struct Reading {
     /// What an earlier reading found; empty once the drive is asked for everything.
     known: BTreeSet<u16>,
     total: usize,
+    counters: Counters,
+}
+
+/// The counters that the drive keeps of its line, read behind the parameters where its family has them (function 08).
+#[derive(Debug)]
+enum Counters {
+    /// The family has none, or the drive does not give them.
+    Absent,
+    /// Those read so far, and the tries of the next one.
+    Reading(Vec<u16>, u32),
+    Read(CountedByDrive),
 }
 
 impl Reading {
@@ -63,7 +75,11 @@ impl Reading {
             found: BTreeMap::new(),
             known,
             total: 0,
+            counters: Counters::Absent,
         };
+        if reading.profile.counts_messages {
+            reading.counters = Counters::Reading(Vec::new(), 0);
+        }
         let first: BTreeSet<u16> = match reading.known.is_empty() {
             true => reading.everywhere(),
             false => reading.known.clone(),
@@ -118,7 +134,12 @@ impl Reading {
 
     /// The request to send; nothing when everything was asked.
     pub fn request(&self) -> Option<RequestPdu> {
-        let block = self.todo.front()?;
+        let Some(block) = self.todo.front() else {
+            return match &self.counters {
+                Counters::Reading(so_far, _) => Some(CountedByDrive::request(so_far)),
+                Counters::Absent | Counters::Read(_) => None,
+            };
+        };
         Some(RequestPdu::Read {
             table: Table::Holding,
             start: block.start,
@@ -135,7 +156,7 @@ impl Reading {
     /// The request that [`Reading::request`] gave ended so.
     pub fn answered(&mut self, outcome: &Outcome) -> Next {
         let Some(mut block) = self.todo.pop_front() else {
-            return Next::Go;
+            return self.counted(outcome);
         };
         let words = self.profile.parameter_words();
         match outcome {
@@ -196,6 +217,26 @@ impl Reading {
         }
     }
 
+    /// The drive answered for a counter. The parameters do not wait for counters that it does not give.
+    fn counted(&mut self, outcome: &Outcome) -> Next {
+        if let Counters::Reading(so_far, tries) = &mut self.counters {
+            match outcome {
+                Outcome::Acknowledged(Reply::Diagnostics(count)) => {
+                    so_far.push(*count);
+                    *tries = 0;
+                    if let Some(all) = CountedByDrive::complete(so_far) {
+                        self.counters = Counters::Read(all);
+                    }
+                }
+                Outcome::TimedOut | Outcome::Garbled | Outcome::Unknown(_) | Outcome::Expired if *tries < TRIES => {
+                    *tries += 1;
+                }
+                _ => self.counters = Counters::Absent,
+            }
+        }
+        Next::Go
+    }
+
     fn take(&mut self, address: u16, words: &[u16]) {
         // What lies in the hole of a block is no parameter.
         if self.profile.parameters.id(address).is_none() {
@@ -253,6 +294,10 @@ impl Reading {
             family: self.profile.name.clone(),
             identification: identification.to_string(),
             time: time.to_string(),
+            counters: match &self.counters {
+                Counters::Read(counted) => counted.to_string(),
+                Counters::Absent | Counters::Reading(..) => String::new(),
+            },
             values: values.collect(),
         }
     }

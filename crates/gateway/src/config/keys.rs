@@ -14,7 +14,7 @@ use super::key::{
 };
 use super::log::{self, LogFormat};
 use super::mqtt::TelemetryTopic;
-use super::{bacnet, bus, modbus_tcp, mqtt, north, recordings, values};
+use super::{authority, bacnet, bus, modbus_tcp, mqtt, north, recordings, values};
 use crate::bus::Mode;
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
@@ -179,6 +179,8 @@ keys! {
         http: Present = Own { schema: Http::schema, range: "[http]" }, or "not started";
         /// BACnet/IP server; not started without this section.
         bacnet: Present = Own { schema: Bacnet::schema, range: "[bacnet]" }, or "not started";
+        /// Who holds a drive; off without this section.
+        authority: Present = Own { schema: AuthorityTable::schema, range: "[authority]" }, or "off";
         /// File of all commands; not written without this section.
         audit: Present = Own { schema: AuditTable::schema, range: "[audit]" }, or "not written";
         /// What the recorder keeps.
@@ -648,6 +650,49 @@ keys! {
         dcc_password_file: PathBuf = PATH, or "none";
         /// Buses whose drives are devices; `[]`: all. Units must be unique among them.
         buses: Vec<String> = List { parse: values::any_text, empty: None, range: "names of buses" }, default [];
+    }
+
+    /// [Who holds a drive](commands.md#who-holds-a-drive), where several clients command it.
+    AUTHORITY: AuthorityTable {
+        /// `"exclusive"`: only its holder commands a drive, stops apart. `"advisory"`: all is reported, nothing refused.
+        mode: Option<authority::Mode> = Words(&[
+            ("off", None), ("advisory", Some(authority::Mode::Advisory)), ("exclusive", Some(authority::Mode::Exclusive)),
+        ]), default "off";
+        /// Ranks, the highest first.
+        ranks: Vec<String> = List {
+            parse: authority::parse_rank, empty: Some("name at least one rank"), range: "names of ranks",
+        }, default ["site", "operator", "automation", "remote"];
+        /// How long a hold lasts without renewal, and how long a stop reserves the drive.
+        lease: Duration = Time(Duration::from_secs(1)..=HOUR), default "30s";
+        /// Whether a stop is written when a drive whose run command stands is switched to its local control place, so that nothing
+        /// starts when it is switched back.
+        stop_at_local: bool = Flag, default true;
+        /// Those who may hold drives.
+        principal: Present = Own { schema: || each(PrincipalTable::schema()), range: "[[authority.principal]]" }, or "none";
+    }
+
+    /// One who may hold drives, whichever way in it uses. Rights stay what `allow`, `write`, roles and `commands` say.
+    PRINCIPAL: PrincipalTable {
+        /// Its name.
+        name: String = Name("-_"), required;
+        /// Its rank.
+        rank: String = Name("-_"), required;
+        /// Its addresses over Modbus TCP and TCP slots; the longest prefix counts.
+        modbus_tcp: Vec<IpNet> = NETWORKS, default [];
+        /// The name (CN) in its certificate, over Modbus TCP with TLS.
+        certificate: String = STRING, or "none";
+        /// Its user over HTTP.
+        http_user: String = STRING, or "none";
+        /// WHO in its MQTT topics `…/as/WHO/set`; the access rules of the broker secure them.
+        mqtt: String = Name("-_"), or "none";
+        /// It is the Sparkplug host.
+        sparkplug: bool = Flag, default false;
+        /// Its addresses over BACnet; the longest prefix counts.
+        bacnet: Vec<IpNet> = NETWORKS, default [];
+        /// Its user, or user id, at the local socket. Anyone else there has the first rank.
+        socket: String = STRING, or "none";
+        /// It writes its command word all the time, as most PLCs do: a word that repeats its last stop is not a new stop.
+        cyclic: bool = Flag, default false;
     }
 
     /// File of all commands, in which every change shows; see [the audit file](commands.md#the-audit-file).

@@ -3,6 +3,7 @@
 //! One run reports every error with file, line and key. Nothing is opened but the file itself, the profiles and the
 //! secrets it names. Relative paths are relative to the directory of the file.
 
+mod authority;
 mod bacnet;
 mod bus;
 mod deprecated;
@@ -37,12 +38,13 @@ pub use params::ParamsSettings;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use crate::bus::predict::{self, Prediction};
 use crate::bus::proof;
 use crate::bus::{BusOptions, Mode};
-use crate::command::AuditFileOptions;
+use crate::command::{AuditFileOptions, Rules};
 use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
@@ -94,6 +96,8 @@ pub struct Settings {
     pub http: Option<http::Options>,
     /// Absent: not started.
     pub bacnet: Option<bacnet_server::Options>,
+    /// Who holds drives; absent: off.
+    pub authority: Option<Arc<Rules>>,
     /// File of all commands; absent: not written.
     pub audit: Option<AuditFileOptions>,
     /// What is logged.
@@ -282,6 +286,8 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     let bacnet = bacnet.map(|table| bacnet::read(&table, base, &state_dir, &names));
     let buffer = mqtt.as_ref().and_then(|mqtt| mqtt.as_ref()?.buffer.as_ref());
     let buffer = buffer.map(|buffer| buffer.dir.as_path());
+    let authority = ROOT.authority.table(reader);
+    let authority = authority.map(|table| (authority::read(&table), table));
     let audit = ROOT.audit.table(reader);
     let audit = audit.map(|table| log::read_audit(&table, &state_dir, buffer));
     let recordings = ROOT.recordings.table(reader);
@@ -298,6 +304,22 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         bacnet: bacnet.as_ref(),
     };
     judge(reader, &buses, &clients);
+    if let Some((
+        authority::Authority {
+            rules: Some(Some(rules)),
+            ..
+        },
+        table,
+    )) = &authority
+    {
+        authority::warn_of_nobody(table, rules, &authority::Sides::of(&clients, &buses));
+    }
+    let authority = flipped(authority.map(|(authority, _)| authority.rules))?.flatten();
+    let mut mqtt = mqtt;
+    if let (Some(Some(options)), Some(rules)) = (&mut mqtt, &authority) {
+        let levels = rules.principals.iter().filter_map(|principal| principal.mqtt.clone());
+        options.principals = Some(levels.collect());
+    }
 
     let slots = buses.iter().flat_map(|bus| &bus.slots).map(|slot| slot.slot.clone());
     let slots: Vec<slot_server::Slot> = slots.collect::<Option<_>>()?;
@@ -323,6 +345,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         mqtt: flipped(mqtt)?,
         http: flipped(http.map(|http| http.options))?,
         bacnet: flipped(bacnet.map(|bacnet| bacnet.options))?,
+        authority,
         audit,
         log: log?,
     })

@@ -145,6 +145,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
         commands,
         require_id,
         response_topics,
+        principals: None,
         buffer,
         home_assistant,
         sparkplug,

@@ -6,6 +6,7 @@ use super::BusSettings;
 use crate::bus::stop_of_line::{BROADCAST_PAUSE, stop_of_line};
 use crate::codec::{RequestPdu, Table};
 use crate::document::Finding;
+use crate::drive::control::{OwnWord, Place};
 use crate::drive::plan::WireTime;
 use crate::process_image::{Access, DriveSpec, OnShutdown};
 
@@ -91,22 +92,17 @@ fn is_stopped(drive: &DriveSpec) -> bool {
 
 /// The requests of a stop: the read of the control word, if there is one, and the write.
 fn stop_of(drive: &DriveSpec) -> Option<(Option<RequestPdu>, RequestPdu)> {
-    if let Some(control) = drive.profile.control_language() {
-        let place = control.stop.place.unwrap_or(control.at);
-        let functions = drive.profile.functions;
-        return Some(match place.table {
-            Table::Coil | Table::DiscreteInput => (None, functions.write_coil(place.address, false)),
-            Table::Input | Table::Holding => (None, functions.write_register(place.address, control.stop_word(0))),
-        });
-    }
-    let (raw, _, invert) = drive.profile.run_bit()?;
-    let (table, address) = (raw.table, raw.address);
+    let control = drive.profile.control.as_ref()?;
+    let Place { table, address } = control.stop.place.unwrap_or(control.at);
+    let functions = drive.profile.functions;
+    let word = control.stop_word(0);
     Some(match table {
-        Table::Coil | Table::DiscreteInput => (None, drive.profile.functions.write_coil(address, invert)),
+        Table::Coil | Table::DiscreteInput => (None, functions.write_coil(address, word != 0)),
         Table::Input | Table::Holding => {
             let (start, count) = (address, 1);
             let read = RequestPdu::Read { table, start, count };
-            (Some(read), drive.profile.functions.write_register(address, 0))
+            let is_kept = control.own_word == OwnWord::Kept;
+            (is_kept.then_some(read), functions.write_register(address, word))
         }
     })
 }

@@ -19,6 +19,7 @@ pub(super) fn between(before: &Settings, after: &Settings) -> Vec<String> {
         section("MQTT", &before.mqtt, &after.mqtt),
         section("HTTP", &before.http, &after.http),
         section("BACnet/IP", &before.bacnet, &after.bacnet),
+        section("who holds drives", &before.authority, &after.authority),
         section("the audit file", &before.audit, &after.audit),
     ];
     changes.extend(sections.into_iter().flatten());

@@ -1,17 +1,27 @@
 //! The leases of drives over a reload. A lease belongs to a machine: it goes where that is, whatever it is called then, and where
-//! the new configuration has it no more, an event says that it ended. Pure.
+//! the new configuration has it no more, an event says that it ended. A reload that brings the machine back soon, as one that puts a
+//! former file back does, goes on with what was left. Pure.
 
 use std::collections::BTreeMap;
-use std::time::SystemTime;
+use std::time::{Duration, Instant, SystemTime};
 
 use crate::bus::supervision::Lease;
 use crate::config::BusSettings;
 use crate::event::{Event, EventKind};
+use crate::plant::BusHandle;
 use crate::process_image::{Access, DriveSpec, Machine};
+
+/// How long what a drive had is kept that a reload left out.
+const RETURN: Duration = Duration::from_secs(120);
+/// Buses of which that is kept, the latest ones.
+const MOST_BUSES: usize = 64;
 
 /// What the buses that a reload stopped have left, until somebody goes on with it.
 #[derive(Debug, Default)]
-pub(super) struct Leases(BTreeMap<Machine, Left>);
+pub(super) struct Leases {
+    left: BTreeMap<Machine, Left>,
+    parted: BTreeMap<Machine, (Instant, Lease)>,
+}
 
 /// A lease, and what the drive was called that had it.
 #[derive(Debug)]
@@ -21,36 +31,86 @@ struct Left {
     drive: String,
 }
 
+/// What drives had that reloads have left out.
+#[derive(Debug, Default)]
+pub(super) struct Parted {
+    leases: BTreeMap<Machine, (Instant, Lease)>,
+    buses: Vec<(Instant, BusHandle)>,
+}
+
+impl Parted {
+    /// For a reload at `now`: the leases that may go on, and the buses that know who commanded their drives, the latest first.
+    pub(super) fn recall(&mut self, now: Instant) -> (Leases, Vec<BusHandle>) {
+        let is_kept = |at: &Instant| now.saturating_duration_since(*at) <= RETURN;
+        self.leases.retain(|_, (at, _)| is_kept(at));
+        self.buses.retain(|(at, _)| is_kept(at));
+        let leases = Leases {
+            left: BTreeMap::new(),
+            parted: std::mem::take(&mut self.leases),
+        };
+        (leases, self.buses.iter().rev().map(|(_, bus)| bus.clone()).collect())
+    }
+
+    /// After it: what nobody went on with, and the buses that were stopped.
+    pub(super) fn keep(&mut self, leases: &Leases, stopped: &[BusHandle], now: Instant) {
+        self.leases.clone_from(&leases.parted);
+        let left = leases.left.iter().filter(|(_, left)| left.lease.ends().is_some());
+        self.leases
+            .extend(left.map(|(machine, left)| (machine.clone(), (now, left.lease))));
+        self.buses.extend(stopped.iter().map(|bus| (now, bus.clone())));
+        let excess = self.buses.len().saturating_sub(MOST_BUSES);
+        self.buses.drain(..excess);
+    }
+}
+
 impl Leases {
-    /// A bus was stopped; `leases` are those of its drives, in their order.
+    /// A bus was stopped; `leases` are those of its drives, in their order. A drive that could have none has left none.
     pub(super) fn left(&mut self, bus: &BusSettings, leases: Vec<Lease>) {
-        for (drive, lease) in bus.drives.iter().zip(leases) {
+        let all = bus.drives.iter().zip(leases);
+        for (drive, lease) in all.filter(|(drive, _)| is_commanded(drive) && drive.supervision.is_some()) {
             let left = Left {
                 lease,
                 bus: bus.spec.name.clone(),
                 drive: drive.name.clone(),
             };
-            self.0.insert(bus.spec.machine(drive), left);
+            let machine = bus.spec.machine(drive);
+            self.parted.remove(&machine);
+            self.left.insert(machine, left);
         }
     }
 
-    /// Those with which the drives of a new bus go on, in their order. One that is commanded no more has none.
-    pub(super) fn of(&mut self, bus: &BusSettings) -> Vec<Lease> {
-        let lease = |drive: &DriveSpec| match drive.access {
-            Access::Control => self.0.remove(&bus.spec.machine(drive)).map(|left| left.lease),
-            Access::Monitor | Access::Listen => None,
+    /// Those with which the drives of a new bus go on at `now`, in their order. One that is commanded no more has none. The time of one
+    /// stood while its drive was left out, as while a drive is offline.
+    pub(super) fn of(&mut self, bus: &BusSettings, now: Instant) -> Vec<Lease> {
+        let mut lease = |drive: &DriveSpec| {
+            let machine = bus.spec.machine(drive);
+            if !is_commanded(drive) {
+                return None;
+            }
+            let left = self.left.remove(&machine).map(|left| left.lease);
+            if drive.supervision.is_none() {
+                // Its time stands until a configuration supervises the drive again.
+                self.parted.extend(left.map(|lease| (machine, (now, lease))));
+                return None;
+            }
+            let back = |(at, lease): (Instant, Lease)| lease.after(now.saturating_duration_since(at));
+            left.or_else(|| self.parted.remove(&machine).map(back))
         };
-        bus.drives.iter().map(lease).map(Option::unwrap_or_default).collect()
+        bus.drives
+            .iter()
+            .map(|drive| lease(drive).unwrap_or_default())
+            .collect()
     }
 
     /// What happened to the others.
     pub(super) fn ended(self, time: SystemTime) -> impl Iterator<Item = Event> {
-        self.0.into_iter().filter_map(move |(machine, left)| {
+        self.left.into_iter().filter_map(move |(machine, left)| {
             let ends = left.lease.ends()?;
             let text = format!(
                 "the reload ended the lease of {} ({machine}), which has no drive to command in the new \
-                 configuration: {ends}",
-                left.drive
+                 configuration: {ends}; a reload within {} s that brings the drive back goes on with it",
+                left.drive,
+                RETURN.as_secs()
             );
             Some(Event {
                 bus: left.bus,
@@ -59,6 +119,10 @@ impl Leases {
             })
         })
     }
+}
+
+fn is_commanded(drive: &DriveSpec) -> bool {
+    matches!(drive.access, Access::Control)
 }
 
 #[cfg(test)]

@@ -53,6 +53,9 @@ pub enum OwnWord {
     Read,
     /// It reads as something else, or not at all: the gateway remembers its own.
     Shadow,
+    /// The commands are single bits of it, as the points of the profile name them; its other bits are kept by every command, and
+    /// it is read before it is written while it is not known.
+    Kept,
 }
 
 /// Bits that every word carries.
@@ -103,6 +106,16 @@ impl Setting {
     /// The word with these bits the other way, where that is one bit.
     pub fn undone(&self, word: u16) -> u16 {
         word & !self.mask | !self.value & self.mask
+    }
+
+    /// The word without a pulse of these bits that stands in it: as they are between two pulses. Those of another place are not in
+    /// it.
+    pub fn released(&self, word: u16) -> u16 {
+        match self.place {
+            None if self.value == 0 => word | self.mask,
+            None if self.holds(word) => word & !self.value,
+            _ => word,
+        }
     }
 
     /// Whether a word can have these bits and those of another.
@@ -201,6 +214,9 @@ impl Control {
     /// Whether a client may write that word there as it stands: in the control word only what clearly stops or runs, at other
     /// places only what they are for.
     pub fn admits(&self, place: Place, word: u16) -> bool {
+        if self.own_word == OwnWord::Kept {
+            return true;
+        }
         if place == self.at {
             return self.is_stop(place, word) || self.is_run(place, word) && self.always.holds(word);
         }
@@ -232,11 +248,8 @@ impl Control {
 
     /// The word without a reset that stands in it: its bits as they are between two resets.
     pub fn without_reset(&self, own: u16) -> u16 {
-        match self.fault_reset.map(|reset| reset.setting) {
-            Some(reset) if reset.place.is_none() && reset.value == 0 => own | reset.mask,
-            Some(reset) if reset.place.is_none() && reset.holds(own) => own & !reset.value,
-            _ => own,
-        }
+        let reset = self.fault_reset.map(|reset| reset.setting);
+        reset.map_or(own, |reset| reset.released(own))
     }
 
     /// The word with that direction, where the direction is a setting of the control word.

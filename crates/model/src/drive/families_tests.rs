@@ -497,7 +497,7 @@ fn commands_of_every_family() {
             assert!(found.write, "{name}: {}", point.name());
             assert_eq!(found.pulse, point == ModelPoint::FaultReset, "{name}: {}", point.name());
         }
-        assert!(profile.run_bit().is_some(), "{name}");
+        assert!(profile.control.is_some(), "{name}");
         if profile.protocols == [Protocol::N2] {
             let outputs = profile
                 .points

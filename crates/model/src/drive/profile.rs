@@ -448,27 +448,21 @@ impl Profile {
         }
     }
 
-    /// The run bit: its register or coil, its number, and whether it is inverted.
-    pub fn run_bit(&self) -> Option<(&Raw, u8, bool)> {
-        let raw = self.model_point(ModelPoint::Run)?.raw()?;
-        match raw.form {
-            Form::Bit { bit, invert } => Some((raw, bit, invert)),
-            _ => None,
-        }
-    }
-
-    /// What `[control]` says, where it is more than plain bits: its points are no registers of their own.
-    pub fn control_language(&self) -> Option<&Control> {
-        let is_made = |run: &Point| run.write && run.raw().is_none();
+    /// What `[control]` says; none where points of one bit each say how it is commanded.
+    pub fn control_table(&self) -> Option<&Control> {
         self.control
             .as_ref()
-            .filter(|_| self.model_point(ModelPoint::Run).is_some_and(is_made))
+            .filter(|control| control.own_word != OwnWord::Kept)
     }
 
-    /// The same for a profile whose commands are points of one bit each: what `[control]` would say of it.
-    pub fn control_of_bits(&self) -> Option<Control> {
+    /// What `[control]` would say of a profile whose commands are points of one bit each.
+    pub(super) fn control_of_bits(&self) -> Option<Control> {
         let setting = |point: ModelPoint, on: bool| {
-            let raw = self.model_point(point).filter(|point| point.write)?.raw()?;
+            // A run command that nobody may give is known for what it is all the same.
+            let is_used = |of: &&Point| of.write || point == ModelPoint::Run;
+            let read = self.model_point(point).filter(is_used)?;
+            let written = read.write_to.and_then(|to| self.points.get(to));
+            let raw = written.unwrap_or(read).raw()?;
             let (bit, invert) = match raw.form {
                 Form::Bit { bit, invert } if bit < 16 => (bit, invert),
                 _ => return None,
@@ -490,7 +484,7 @@ impl Profile {
         let reset = setting(ModelPoint::FaultReset, true).map(within);
         Some(Control {
             at,
-            own_word: OwnWord::Read,
+            own_word: OwnWord::Kept,
             always: Always::default(),
             run: Run::One(within(run)),
             stop: within(setting(ModelPoint::Run, false)?),
@@ -511,14 +505,9 @@ impl Profile {
 
     /// Whether that word, written there, is a run command or a stop; `None` where it is neither.
     pub fn runs_by(&self, table: Table, address: u16, word: u16) -> Option<bool> {
-        if let Some(control) = &self.control {
-            let place = Place { table, address };
-            let run = control.is_run(place, word).then_some(true);
-            return run.or(control.is_stop(place, word).then_some(false));
-        }
-        let here = |(raw, ..): &(&Raw, u8, bool)| raw.table == table && raw.address == address;
-        let (_, bit, invert) = self.run_bit().filter(here)?;
-        Some(((word >> bit) & 1 == 1) != invert)
+        let (control, place) = (self.control.as_ref()?, Place { table, address });
+        let run = control.is_run(place, word).then_some(true);
+        run.or(control.is_stop(place, word).then_some(false))
     }
 
     /// Whether a write of these items is skipped if the drive has them already, because it stores them in EEPROM with
@@ -539,8 +528,8 @@ impl Profile {
     /// Whether a register holds settings besides a bit: it is not that of the run command, whose other bits nobody else
     /// changes unnoticed.
     pub fn is_settings(&self, table: Table, address: u16) -> bool {
-        let is_run = |(run, ..): (&Raw, u8, bool)| (run.table, run.address) == (table, address);
-        table == Table::Holding && !self.protocols.contains(&Protocol::N2) && !self.run_bit().is_some_and(is_run)
+        let is_run = self.run_place() == Some(Place { table, address });
+        table == Table::Holding && !self.protocols.contains(&Protocol::N2) && !is_run
     }
 
     /// Whether a write to that table is released afterwards: an analog output of N2.
@@ -551,23 +540,21 @@ impl Profile {
     /// The write that stops every drive of the family on a line when it is sent to all of them: it clears the whole control
     /// word. None where the family knows none.
     pub fn broadcast_stop(&self) -> Option<RequestPdu> {
-        let (raw, ..) = self.run_bit().filter(|_| self.broadcast_stop)?;
-        let pdu = match raw.table {
-            Table::Coil => self.functions.write_coil(raw.address, false),
-            Table::Holding => self.functions.write_register(raw.address, 0),
+        let run = self.run_place().filter(|_| self.broadcast_stop)?;
+        let pdu = match run.table {
+            Table::Coil => self.functions.write_coil(run.address, false),
+            Table::Holding => self.functions.write_register(run.address, 0),
             Table::DiscreteInput | Table::Input => return None,
         };
-        self.is_stop(raw.table, raw.address, 0).then_some(pdu)
+        self.is_stop(run.table, run.address, 0).then_some(pdu)
     }
 
     /// Whether writing `value` to that register (or coil) clears the run command: a stop.
     pub fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
-        if let Some(control) = &self.control {
-            return control.is_stop(Place { table, address }, value);
-        }
-        self.run_bit().is_some_and(|(raw, bit, invert)| {
-            raw.table == table && raw.address == address && ((value >> bit) & 1 == 1) == invert
-        })
+        let place = Place { table, address };
+        self.control
+            .as_ref()
+            .is_some_and(|control| control.is_stop(place, value))
     }
 }
 

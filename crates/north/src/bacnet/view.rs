@@ -345,7 +345,9 @@ impl Application for View {
         let (what, now) = (write.object.to_string(), self.now.get().0);
         let refusal = Refusal::NotAllowed(why.to_string());
         // Its answer says no more than that.
-        drive.handle.refuse(&what, refusal, super::writes::origin(from), now);
+        drive
+            .handle
+            .refuse(&what, refusal, super::writes::origin(from, None), now);
     }
 
     fn stops(&self, device: u32, write: &WriteItem) -> bool {

@@ -8,7 +8,8 @@ use drivegate_bacnet::{Address, Datum, Error, Job};
 use super::objects::Meaning;
 use super::view::View;
 use crate::command::{
-    self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Refusal, SlotWrite, SourceKind,
+    self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite,
+    SourceKind,
 };
 use crate::drive::Value;
 use crate::plant::{DriveHandle, Placed};
@@ -16,6 +17,8 @@ use crate::process_image::Machine;
 
 /// The priority that belongs to minimum on and off times.
 const MINIMUM_TIMES: u8 = 6;
+/// That of a write that names none.
+const LOWEST: u8 = 16;
 
 /// What becomes of a job.
 #[derive(Debug)]
@@ -36,12 +39,13 @@ pub(super) struct Waiting {
 }
 
 /// The client, whatever port it uses.
-pub(super) fn origin(from: &Address) -> Origin {
+pub(super) fn origin(from: &Address, priority: Option<u8>) -> Origin {
     let client = match &from.remote {
         None => format!("bacnet {}", from.ip()),
         Some(_) => format!("bacnet {} behind {}", from.remote_text(), from.ip()),
     };
-    Origin::of(Arc::from(client), SourceKind::Bacnet, from.to_string())
+    let proof = Proof::Bacnet(from.ip().into(), priority.unwrap_or(LOWEST));
+    Origin::of(Arc::from(client), SourceKind::Bacnet, from.to_string()).proven(proof)
 }
 
 /// Takes up a write.
@@ -49,7 +53,7 @@ pub(super) fn begin(view: &View, job: &Job, now: Instant) -> Begun {
     let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
         return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
     };
-    let origin = origin(&job.from);
+    let origin = origin(&job.from, job.priority);
     match (meaning, &job.value) {
         (Meaning::Point(index), Some(value)) => match value_of(value) {
             Some(value) => {
@@ -169,7 +173,11 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
         Some(all.client() == Some(origin.client()))
     })?;
     if governs {
-        handle.image.renew_lease(now);
+        handle.heartbeat(origin, now);
+    }
+    let stops = write.entry.as_ref().is_none_or(|entry| !entry.value.as_bool());
+    if write.what == Commanded::Run && stops {
+        handle.said_stop(origin);
     }
     let (drive, priority) = (&handle.image.spec.name, write.priority);
     let value = write
@@ -221,6 +229,7 @@ fn of_refusal(refusal: &Refusal) -> Error {
         | Refusal::MotorRuns(_)
         | Refusal::OtherValue(_)
         | Refusal::HeldByOther(_)
+        | Refusal::NeedsTake(_)
         | Refusal::Guarded(_)
         | Refusal::Interlocked(_) => Error::SERVICE_REQUEST_DENIED,
     }

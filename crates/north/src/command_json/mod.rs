@@ -1,10 +1,12 @@
 //! Commands as JSON, as MQTT and HTTP have them: what a request means, whether it repeats an earlier one, and its result.
 
+mod hold;
 mod memory;
 mod request;
 mod result;
 mod stop_all;
 
+pub(super) use self::hold::{HoldFields, HoldReply};
 #[cfg(test)]
 pub(super) use self::memory::REMEMBERED;
 pub(super) use self::memory::{Repetition, SharedMemory, Taken};

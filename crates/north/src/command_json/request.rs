@@ -10,7 +10,7 @@ use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value as Json;
 use serde_json::value::RawValue;
 
-use crate::command::{DEFAULT_EXPIRY, Refusal, stop_of};
+use crate::command::{DEFAULT_EXPIRY, Refusal, sets_twice, stop_of};
 use crate::document::nearest;
 use crate::drive::model::Kind;
 use crate::drive::{Profile, Value};
@@ -138,8 +138,8 @@ fn points_of(fields: Fields, profile: &Profile) -> Result<Asked, Refusal> {
     let mut expiry = DEFAULT_EXPIRY;
     let mut points = Vec::new();
     let mut wait = false;
-    let twice = |name: String| format!("{} appears twice; nothing was written", excerpt(name.as_bytes()));
-    let mut refused = fields.twice.map(|name| Refusal::BadValue(twice(name)));
+    let twice = |name: String| sets_twice(excerpt(name.as_bytes()).trim_matches('`'));
+    let mut refused = fields.twice.map(twice);
     for (name, value) in fields.all {
         let understood = match name.as_str() {
             "id" if is_id(&value) => Ok(()),

@@ -23,6 +23,8 @@ pub(crate) struct CommandResult<'r> {
     /// Of a start that must wait: after which it may be tried again.
     #[serde(skip_serializing_if = "Option::is_none")]
     retry_after_ms: Option<u64>,
+    #[serde(flatten)]
+    kept_by: Option<KeptBy>,
     #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
     latency: Duration,
     /// From acceptance to the read that showed the effect.
@@ -40,9 +42,30 @@ pub(crate) struct CommandResult<'r> {
 }
 
 #[derive(Debug, Clone, Serialize)]
-struct ErrorObject {
-    code: &'static str,
-    message: String,
+pub(super) struct ErrorObject {
+    pub(super) code: &'static str,
+    pub(super) message: String,
+}
+
+/// Who keeps the client from the drive.
+#[derive(Debug, Clone, Serialize)]
+struct KeptBy {
+    holder: String,
+    holder_rank: String,
+    hold_left_s: Option<u64>,
+}
+
+/// Of an outcome that somebody else's right to the drive is the reason for.
+fn kept_by(outcome: &Outcome) -> Option<KeptBy> {
+    match outcome {
+        Outcome::Refused(refusal) => refusal.holder().map(|holder| KeptBy {
+            holder: holder.who.clone(),
+            holder_rank: holder.rank.clone(),
+            hold_left_s: holder.left_s,
+        }),
+        Outcome::StopOnly(part) | Outcome::StopFailed(part) => kept_by(part),
+        _ => None,
+    }
 }
 
 impl<'r> CommandResult<'r> {
@@ -73,6 +96,7 @@ impl<'r> CommandResult<'r> {
                 Outcome::Refused(Refusal::Guarded(guarded)) => Some(guarded.retry_after_ms()),
                 _ => None,
             },
+            kept_by: kept_by(&answer.outcome),
             latency: answer.latency,
             confirmed: shown.after,
             note: shown.unseen,

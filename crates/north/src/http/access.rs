@@ -7,8 +7,8 @@ use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
 use axum::http::{StatusCode, Uri};
 use axum::response::{IntoResponse, Response};
 
-use super::api::ErrorReply;
 use super::hosts::{Host, Hosts};
+use super::messages::ErrorReply;
 use super::tokens::{Scope, Tokens};
 
 /// Who is answered.
@@ -124,10 +124,7 @@ impl IntoResponse for AccessError {
                 Some("Bearer realm=\"drivegate\", error=\"insufficient_scope\""),
             ),
         };
-        let error = ErrorReply {
-            error: self.to_string(),
-            known: Vec::new(),
-        };
+        let error = ErrorReply::new(self.to_string());
         let mut response = (status, Json(error)).into_response();
         const CHALLENGE: HeaderName = header::WWW_AUTHENTICATE;
         response

@@ -6,20 +6,13 @@ use std::time::{Duration, Instant, SystemTime};
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
+use crate::command_json::HoldFields;
 use crate::diagnosis::{self, Counted, Verdict};
 use crate::drive::why::Cause;
 use crate::drive::{self, ModelPoint, Quality, State};
 use crate::history::History;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
-
-/// An error reply.
-#[derive(Debug, Serialize)]
-pub(super) struct ErrorReply {
-    pub(super) error: String,
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub(super) known: Vec<String>,
-}
 
 /// One point in time on both clocks.
 #[derive(Debug, Clone, Copy)]
@@ -76,6 +69,9 @@ pub(super) struct Drive<'d> {
     /// For how long an ordinary stop still waits.
     #[serde(skip_serializing_if = "Option::is_none")]
     stop_waits_ms: Option<u64>,
+    /// Who holds it, where `[authority]` is on.
+    #[serde(flatten)]
+    hold: Option<HoldFields>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
     /// `null` where the drive does not say whether it runs.
@@ -119,6 +115,7 @@ impl<'d> Drive<'d> {
             why: why.causes,
             held: image.hold.why().map(|why| why.to_string()),
             stop_waits_ms: drive.stop_waits(clock.now).map(millis),
+            hold: drive.hold_view(None, clock.now).map(|(view, _)| view.into()),
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
             starts: tells_running.then_some(totals.starts),

@@ -8,7 +8,7 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use tokio::time::timeout;
 
-use super::api::ErrorReply;
+use super::messages::ErrorReply;
 use super::routes::Reached;
 
 /// Time limit for the body of a request, from its head on.
@@ -38,9 +38,6 @@ pub(super) async fn read(body: Body, reached: &Reached, most: usize) -> Result<B
             format!("the body did not arrive within {} s", TIMEOUT.as_secs()),
         ),
     };
-    let error = ErrorReply {
-        error,
-        known: Vec::new(),
-    };
+    let error = ErrorReply::new(error);
     Err((status, Json(error)).into_response())
 }

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use crate::local::protocol::RestoreOutcome;
+use super::messages::Restore;
 use crate::parameters::{ParameterFile, RestoreStatus, Status};
 
 /// The parameters of a drive.
@@ -17,7 +17,7 @@ pub(super) struct Parameters<'a> {
     error: Option<&'a str>,
     /// The last restore since the gateway started, or the one that goes on.
     #[serde(skip_serializing_if = "Option::is_none")]
-    restore: Option<RestoreOutcome>,
+    restore: Option<Restore>,
 }
 
 #[derive(Debug, Serialize)]
@@ -26,6 +26,9 @@ struct LastReading<'a> {
     identification: &'a str,
     application: String,
     time: &'a str,
+    /// What the drive counted of its line (function 08), in words.
+    #[serde(skip_serializing_if = "str::is_empty")]
+    counters: &'a str,
     checksum: String,
     missing: usize,
     parameters: Vec<ParameterRow<'a>>,
@@ -69,7 +72,7 @@ impl<'a> Parameters<'a> {
                 waits: status.waits.as_deref(),
             }),
             error: failed.map(String::as_str),
-            restore: restore.map(RestoreOutcome::new),
+            restore: restore.map(Restore::new),
         }
     }
 }
@@ -87,6 +90,7 @@ impl<'a> LastReading<'a> {
             identification: &file.identification,
             application: file.application(),
             time: &file.time,
+            counters: &file.counters,
             checksum: file.checksum(),
             missing: file.missing(),
             parameters: parameters.collect(),

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use percent_encoding::percent_decode_str;
 
-use super::api::ErrorReply;
+use super::messages::ErrorReply;
 use crate::document::parse_duration;
 
 /// Why a query is not understood.

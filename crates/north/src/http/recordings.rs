@@ -7,7 +7,7 @@ use axum::extract::{Path, RawQuery, State};
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 
-use super::api::ErrorReply;
+use super::messages::ErrorReply;
 use super::query::{self, QueryError};
 use super::routes::{AppState, not_found};
 use crate::history::{Recording, export, pcapng};
@@ -93,10 +93,7 @@ pub(super) async fn one(
             response
         }
         Ok(Some(Err(error))) => {
-            let error = ErrorReply {
-                error: error.to_string(),
-                known: Vec::new(),
-            };
+            let error = ErrorReply::new(error.to_string());
             (StatusCode::INTERNAL_SERVER_ERROR, Json(error)).into_response()
         }
         Ok(None) => not_found(format!("there is no recording `{id}`"), Vec::new()),

@@ -18,14 +18,16 @@ use tokio_util::sync::CancellationToken;
 
 use super::access::{Access, AccessError};
 use super::hosts::Hosts;
+use super::messages::{self, Health, Why};
 use super::operating::{self, Cookies, Operating};
 use super::params::Parameters;
 use super::{
-    Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, line, page, query, recordings, streams, trend,
+    Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, expect, line, page, points, query, recordings,
+    streams, trend,
 };
+use crate::command::{Proof, SourceKind};
 use crate::connection_limit::{ConnectionLimit, Limits, Place};
 use crate::local::control::{self, Control};
-use crate::local::protocol::{HealthOutcome, OfGateway};
 use crate::log_throttle::LogThrottle;
 use crate::parameters::ParameterFile;
 use crate::plant::{Plant, SharedPlant};
@@ -66,11 +68,15 @@ pub(super) struct Client {
     pub(super) coverage: Coverage,
 }
 
-/// Who came through the local socket: whoever may open it may do everything.
+/// Who came over no network: whoever may open the local socket may do everything.
 #[derive(Debug, Clone)]
 pub(crate) struct LocalUser {
-    /// Of the client's process.
-    pub(crate) uid: u32,
+    /// The way in, as the audit shows it.
+    pub(crate) kind: SourceKind,
+    /// Likewise, who.
+    pub(crate) who: Arc<str>,
+    /// What the connection proves of it.
+    pub(crate) proof: Proof,
     /// The gateway itself, where that has a configuration file.
     pub(crate) control: Option<Control>,
 }
@@ -140,7 +146,18 @@ pub(super) fn router(
         .route(RELOAD, post(reload))
         .route("/api/v1/drives", get(drives))
         .route("/api/v1/drives/{name}", get(drive))
+        .route("/api/v1/drives/{name}/points", get(points::points))
+        .route("/api/v1/drives/{name}/why", get(why))
+        .route("/api/v1/drives/{name}/recordings", post(operating::record))
         .route("/api/v1/drives/{name}/params", get(params))
+        .route(
+            "/api/v1/drives/{name}/params/reading",
+            get(operating::parameters::progress).post(operating::parameters::read),
+        )
+        .route(
+            "/api/v1/drives/{name}/params/restore",
+            get(operating::parameters::look).post(operating::parameters::restore),
+        )
         .route("/api/v1/drives/{name}/trend", get(trend::trend))
         .route("/api/v1/buses", get(buses))
         .route("/api/v1/buses/{name}", get(line::bus))
@@ -159,6 +176,10 @@ pub(super) fn router(
             get(operating::commands_of).post(operating::command),
         )
         .route("/api/v1/drives/{name}/heartbeat", post(operating::heartbeat))
+        .route(
+            "/api/v1/drives/{name}/hold",
+            get(operating::hold_of).post(operating::hold),
+        )
         .route("/api/v1/stop", post(operating::stop))
         .fallback(unknown)
         .with_state(app.clone())
@@ -193,6 +214,8 @@ async fn guard(
     } else if coverage == Some(Coverage::Health) && !is_urgent {
         let text = "too many connections are open; close some and try again\n";
         (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "5")], text).into_response()
+    } else if let Err((status, why)) = expect::check(request.headers(), &app.plant.load(), &reached) {
+        (status, Json(messages::ErrorReply::new(why))).into_response()
     } else if (is_on && operating::may_change(method, path)) || (is_local && path == RELOAD) {
         next.run(request).await
     } else if !matches!(*method, Method::GET | Method::HEAD) {
@@ -301,7 +324,7 @@ async fn ready(State(app): State<Arc<AppState>>) -> Response {
 async fn health(State(app): State<Arc<AppState>>) -> Response {
     let reasons = readiness::reasons(&app.plant.load(), &app.stats);
     let ready = reasons.is_empty();
-    Json(HealthOutcome { ready, reasons }).into_response()
+    Json(Health { ready, reasons }).into_response()
 }
 
 /// The gateway reads its configuration again: 200 with what changed, 422 with the errors, and it goes on as before.
@@ -312,20 +335,10 @@ async fn reload(Extension(reached): Extension<Reached>, uri: Uri, request: Reque
     if !matches!(*request.method(), Method::POST) {
         return StatusCode::METHOD_NOT_ALLOWED.into_response();
     }
-    let who = format!("uid {}", local.uid);
-    match control::reload(local.control.as_ref(), &OfGateway::default(), who).await {
-        Ok(outcome) if outcome.errors.is_empty() => {
-            let (changes, warnings) = (outcome.changes, outcome.warnings);
-            Json(serde_json::json!({ "changes": changes, "warnings": warnings })).into_response()
-        }
-        Ok(outcome) => {
-            let errors = serde_json::json!({ "errors": outcome.errors });
-            (StatusCode::UNPROCESSABLE_ENTITY, Json(errors)).into_response()
-        }
-        Err(failure) => {
-            let (error, known) = (failure.message, Vec::new());
-            (StatusCode::SERVICE_UNAVAILABLE, Json(api::ErrorReply { error, known })).into_response()
-        }
+    match control::reload(local.control.as_ref(), local.who.to_string()).await {
+        Ok(outcome) if outcome.errors.is_empty() => Json(outcome).into_response(),
+        Ok(outcome) => (StatusCode::UNPROCESSABLE_ENTITY, Json(outcome)).into_response(),
+        Err(why) => (StatusCode::SERVICE_UNAVAILABLE, Json(messages::ErrorReply::new(why))).into_response(),
     }
 }
 
@@ -352,6 +365,21 @@ async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Re
         }
         None => no_drive(&plant, &name),
     }
+}
+
+/// Why a drive does not run.
+async fn why(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
+    let plant = app.plant.load();
+    let Some(drive) = plant.drive(&name) else {
+        return no_drive(&plant, &name);
+    };
+    let profile = &drive.image.spec.profile;
+    Json(Why {
+        explanation: drive.why(&drive.reading(Instant::now())),
+        profile: profile.name.clone(),
+        profile_verified: profile.verified,
+    })
+    .into_response()
 }
 
 /// The last reading of the parameters of a drive, and the one that goes on.
@@ -391,7 +419,7 @@ async fn stored_params(app: &AppState, plant: &Plant, name: &str) -> Result<Opti
         let known = Vec::new();
         (
             StatusCode::INTERNAL_SERVER_ERROR,
-            Json(api::ErrorReply { error, known }),
+            Json(messages::ErrorReply { error, known }),
         )
             .into_response()
     })
@@ -447,5 +475,5 @@ pub(super) fn no_drive(plant: &Plant, name: &str) -> Response {
 
 /// A 404 reply that lists the known names.
 pub(super) fn not_found(error: String, known: Vec<String>) -> response::Response {
-    (StatusCode::NOT_FOUND, Json(api::ErrorReply { error, known })).into_response()
+    (StatusCode::NOT_FOUND, Json(messages::ErrorReply { error, known })).into_response()
 }

@@ -1,7 +1,9 @@
 //! The HTTP API at the local socket. Whoever may open the socket may do everything: no login, no token, any `Host`.
 
+use std::net::{IpAddr, Ipv4Addr};
 use std::pin::pin;
 use std::sync::Arc;
+use std::time::Instant;
 
 use axum::Router;
 use hyper::body::Incoming;
@@ -9,7 +11,7 @@ use hyper::server::conn::http1;
 use hyper::service::{Service, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
-use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::io::{AsyncRead, AsyncWrite, DuplexStream, duplex};
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
@@ -18,11 +20,12 @@ use super::operating::Operating;
 use super::routes::{self, Client, LocalUser, Reached};
 use super::{Coverage, GRACE, HEAD_TIMEOUT, MAX_HEAD};
 use crate::NorthStats;
-use crate::connection_limit::Place;
+use crate::command::{Authority, Proof, SourceKind};
+use crate::connection_limit::{ConnectionLimit, Limits, Newcomer, Place};
 use crate::plant::SharedPlant;
 
 /// Serves the connections of the local socket that speak HTTP.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct SocketDoor {
     router: Router,
 }
@@ -67,5 +70,59 @@ impl SocketDoor {
         if let Err(error) = ended {
             tracing::debug!(target: "drivegate::http", "HTTP connection of the local socket ended: {error}");
         }
+    }
+}
+
+/// The same for a command of this very process, which has buses of its own and no socket.
+#[derive(Debug)]
+pub struct InProcess {
+    door: SocketDoor,
+    user: LocalUser,
+    limit: Arc<ConnectionLimit>,
+    cancel: CancellationToken,
+}
+
+/// Connections of a command, and bytes on their way to it.
+const CONNECTIONS: usize = 4;
+const BUFFER: usize = 64 * 1024;
+
+impl InProcess {
+    /// For `who` started the command.
+    pub fn new(plant: &SharedPlant, stats: &Arc<NorthStats>, who: &str) -> InProcess {
+        let cancel = CancellationToken::new();
+        let user = LocalUser {
+            kind: SourceKind::CommandLine,
+            who: who.into(),
+            // Whoever may open the port holds it as whoever opens the socket does.
+            proof: Proof::Uid(rustix::process::geteuid().as_raw()),
+            control: None,
+        };
+        InProcess {
+            door: SocketDoor::new(plant, stats, cancel.clone()),
+            user,
+            limit: ConnectionLimit::new(Limits::new(CONNECTIONS, CONNECTIONS)),
+            cancel,
+        }
+    }
+
+    /// A connection; `None` while there are too many.
+    pub fn connect(&self) -> Option<DuplexStream> {
+        let newcomer = Newcomer {
+            address: IpAddr::V4(Ipv4Addr::LOCALHOST),
+            listener: 0,
+            cancel: &self.cancel,
+        };
+        let acquired = self.limit.acquire(newcomer, Instant::now(), || Some(Authority::Write));
+        let (permit, _) = acquired.ok()?;
+        let (client, server) = duplex(BUFFER);
+        let (door, user) = (self.door.clone(), self.user.clone());
+        tokio::spawn(async move { door.serve(server, user, permit.place()).await });
+        Some(client)
+    }
+}
+
+impl Drop for InProcess {
+    fn drop(&mut self) {
+        self.cancel.cancel();
     }
 }

@@ -21,7 +21,7 @@ use tokio_stream::wrappers::BroadcastStream;
 use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
 
 use super::routes::{AppState, Client, not_found};
-use super::{api, query};
+use super::{messages, query};
 use crate::codec::{Protocol, describe};
 use crate::command::Authority;
 use crate::connection_limit::{ConnectionPermit, LimitReached, Newcomer, NoPlace};
@@ -130,10 +130,7 @@ fn stream_permit(app: &AppState, client: Client) -> Result<ConnectionPermit, Str
 }
 
 fn full(why: &str) -> Response {
-    let problem = api::ErrorReply {
-        error: format!("{why}; close one and try again"),
-        known: Vec::new(),
-    };
+    let problem = messages::ErrorReply::new(format!("{why}; close one and try again"));
     let retry = [(header::RETRY_AFTER, "5")];
     (StatusCode::SERVICE_UNAVAILABLE, retry, Json(problem)).into_response()
 }

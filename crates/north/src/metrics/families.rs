@@ -11,6 +11,7 @@ use prometheus_client::encoding::{EncodeLabel, EncodeLabelSet, LabelSetEncoder};
 
 use super::model::MODEL;
 use super::process;
+use crate::command::HoldState;
 use crate::drive::{ModelPoint, PollClass, State, Value};
 use crate::history::TriggerKind;
 use crate::plant::{BusHandle, Plant};
@@ -209,6 +210,16 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
         "drivegate_drive_unsupervised",
         "1 if a drive with supervision runs without a lease, else 0.",
     );
+    let held = all.family(
+        Kind::Gauge,
+        "drivegate_drive_held",
+        "1 for the rank of the client that holds the drive; no series while nobody does.",
+    );
+    let unheld = all.family(
+        Kind::Counter,
+        "drivegate_orders_unheld_total",
+        "Orders of clients that did not hold the drive, which advisory mode carried out.",
+    );
     for drive in plant.drives() {
         let image = &drive.image;
         let labels = labels_of(image);
@@ -225,6 +236,13 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
                 let count = counted.get(&reason).copied().unwrap_or_default();
                 all.add(refused, labels.with("reason", reason.name()), SeriesValue::Count(count));
             }
+        }
+        if let Some((view, _)) = drive.hold_view(None, now) {
+            if let (HoldState::Held, Some(rank)) = (view.state, &view.rank) {
+                all.add(held, labels.with("rank", rank.to_string()), SeriesValue::Value(1.0));
+            }
+            let count = drive.bus.queue.lock().unheld(drive.index);
+            all.add(unheld, labels.clone(), SeriesValue::Count(count));
         }
         all.add(up, labels.clone(), flag(reading.snapshot.link.is_online()));
         if let Some(current) = reading.state() {

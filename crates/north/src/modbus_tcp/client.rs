@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use crate::command::{Origin, SourceKind};
+use crate::command::{Origin, Proof, SourceKind};
 use crate::connection_limit::Rights;
 
 /// A connected client.
@@ -14,6 +14,7 @@ pub(super) struct Client {
     pub(super) who: String,
     /// The same without the port: all connections of a client share it.
     client: Arc<str>,
+    proof: Proof,
 }
 
 impl Client {
@@ -28,12 +29,16 @@ impl Client {
             rights: rights.into(),
             who,
             client: client.into(),
+            proof: match name {
+                Some(name) => Proof::Certificate(name.into(), ip),
+                None => Proof::Address(ip),
+            },
         }
     }
 
     /// The origin of its commands.
     pub(super) fn origin(&self) -> Origin {
-        Origin::of(self.client.clone(), SourceKind::ModbusTcp, self.who.as_str())
+        Origin::of(self.client.clone(), SourceKind::ModbusTcp, self.who.as_str()).proven(self.proof.clone())
     }
 }
 

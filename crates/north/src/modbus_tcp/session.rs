@@ -15,13 +15,13 @@ use super::{ServerState, Uncached};
 use crate::ModbusTcpStats;
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Authority, Order, Outcome};
+use crate::command::{Authority, Order, Outcome, Verb};
 use crate::drive::{Profile, State};
 use crate::log_throttle::LogThrottle;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, Unavailable};
 use crate::register_map::{
-    self, BusFigures, BusState, CommandWrite, DriveView, FIRST, GATEWAY_UNIT, NOT_STANDING, STOP_ALL,
+    self, BusFigures, BusState, CommandWrite, DriveView, FIRST, GATEWAY_UNIT, HEARTBEAT, HOLD, NOT_STANDING, STOP_ALL,
 };
 use crate::stop_all;
 
@@ -233,7 +233,7 @@ impl ClientSession {
         };
         match request {
             RequestPdu::Read { table, start, count } if !table.is_bits() && start >= FIRST => {
-                common(drive, request, start, count, now)
+                self.common(drive, request, start, count, now)
             }
             RequestPdu::WriteRegister { address, value } if address >= FIRST => {
                 self.command(frame.header, drive, request, address, &[value], now)
@@ -361,6 +361,45 @@ impl ClientSession {
         }
     }
 
+    /// A read of the blocks from 0x8000 on.
+    fn common(&self, drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
+        let reading = drive.reading(now);
+        let bus = if drive.bus_up() { BusState::Up } else { BusState::Down };
+        let hold = drive.is_guarded().then(|| self.client.origin());
+        let hold = hold.and_then(|origin| drive.hold_view(Some(&origin), now));
+        DriveView::new(&reading, bus)
+            .with_hold(hold)
+            .registers(start, count)
+            .map_or_else(Decision::from, |words| {
+                Decision::Reply(request, Reply::Registers(words))
+            })
+    }
+
+    /// A write to the register of the hold, also in one write with the heartbeat.
+    fn hold(&self, drive: &DriveHandle, request: RequestPdu, start: u16, values: &[u16], now: Instant) -> Decision {
+        let value = match (start, values) {
+            (HOLD, [value]) => *value,
+            (HEARTBEAT, [_, value]) => *value,
+            _ => return Exception::ADDRESS.into(),
+        };
+        let verb = match value {
+            0 => Verb::Release,
+            1 => Verb::Take,
+            2 => Verb::Break,
+            _ => return Exception::VALUE.into(),
+        };
+        let origin = self.client.origin();
+        match drive.hold(verb, &origin, self.client.rights.authority(), now) {
+            Ok(_) => {
+                if start == HEARTBEAT {
+                    drive.heartbeat(&origin, now);
+                }
+                Decision::Reply(request, Reply::Written)
+            }
+            Err(refusal) => refusal.exception().into(),
+        }
+    }
+
     /// A write to the blocks from 0x8000 on by a client that may write to the drive.
     fn command(
         &self,
@@ -371,6 +410,10 @@ impl ClientSession {
         values: &[u16],
         now: Instant,
     ) -> Decision {
+        let last = usize::from(start).saturating_add(values.len().saturating_sub(1));
+        if drive.is_guarded() && start <= HOLD && usize::from(HOLD) <= last {
+            return self.hold(drive, request, start, values, now);
+        }
         let spec = &drive.image.spec;
         let fault = drive.reading(now).state() == Some(State::Fault);
         let write = self.state.command_words.update(&spec.name, |last| {
@@ -392,7 +435,7 @@ impl ClientSession {
             )) => BusWork::Stop(Order::Points(points), refusal),
             // A heartbeat alone is not a command: it is answered at once and not audited.
             Ok((CommandWrite { points, .. }, _)) if points.is_empty() => {
-                drive.image.renew_lease(now);
+                drive.heartbeat(&self.client.origin(), now);
                 return Decision::Reply(request, Reply::Written);
             }
             Ok((CommandWrite { points, .. }, resets)) => {
@@ -407,16 +450,6 @@ impl ClientSession {
 
 fn forwarded(header: Header, drive: &DriveHandle, request: RequestPdu, work: BusWork) -> Decision {
     Decision::Drive(ForwardedRequest::new(header, drive, request), work)
-}
-
-fn common(drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
-    let reading = drive.reading(now);
-    let bus = if drive.bus_up() { BusState::Up } else { BusState::Down };
-    DriveView::new(&reading, bus)
-        .registers(start, count)
-        .map_or_else(Decision::from, |words| {
-            Decision::Reply(request, Reply::Registers(words))
-        })
 }
 
 /// Whether the family has the table that a function code accesses. No family supports 22 and 23.

@@ -11,11 +11,11 @@ use std::time::{Instant, SystemTime};
 use tokio::sync::oneshot;
 
 use super::outbox::Message;
-use super::payload::Topics;
+use super::payload::{HoldTopic, Topics};
 use super::reply::{Reply, ResponseTopics};
 use super::request::{self, Incoming};
-use crate::command::{Answer, Authority, Order, Origin, Parts, Refusal, SourceKind, stop_of};
-use crate::command_json::{Id, Repetition, SharedMemory, excerpt, stop_all, unknown_drive};
+use crate::command::{Answer, Authority, Order, Origin, Parts, Proof, Refusal, SourceKind, Verb, stop_of};
+use crate::command_json::{HoldReply, Id, Repetition, SharedMemory, excerpt, stop_all, unknown_drive};
 use crate::plant::{Placed, Plant, Shown};
 use crate::stop_all::StopReport;
 
@@ -147,8 +147,11 @@ impl Commands {
         now: Instant,
         time: SystemTime,
     ) -> Option<Message> {
-        if incoming.topic == self.topics.stop_all() {
-            return self.stop_all(&incoming, plant, now);
+        if let Some(as_whom) = self.topics.parse_stop_all(&incoming.topic) {
+            return self.stop_all(&incoming, as_whom, plant, now);
+        }
+        if let Some(target) = self.topics.parse_hold(&incoming.topic) {
+            return self.hold(&incoming, target, plant, now);
         }
         let target = self.topics.parse_set(&incoming.topic)?;
         if incoming.retain && incoming.payload.is_empty() {
@@ -156,11 +159,7 @@ impl Commands {
         }
         let result = self.topics.drive(target.drive, "result");
         let reply = Reply::to(&incoming, result, target.drive, &self.rules.responses);
-        let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
-        let who = who
-            .as_deref()
-            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
-        let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, who);
+        let origin = self.origin(&incoming, target.who);
         let what = || excerpt(&incoming.payload);
         let Some(drive) = plant.drive(target.drive) else {
             let name = excerpt(target.drive.as_bytes());
@@ -223,8 +222,57 @@ impl Commands {
         self.follow(pending, time)
     }
 
+    /// Who sent a message: by its topic, which the broker's rules secure, and for the audit by what it says of itself.
+    fn origin(&self, incoming: &Incoming, as_whom: Option<&str>) -> Origin {
+        let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
+        let who = who
+            .as_deref()
+            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
+        let proof = as_whom.map_or(Proof::Nothing, |who| Proof::Topic(who.into()));
+        Origin::of(self.client.clone(), SourceKind::Mqtt, who).proven(proof)
+    }
+
+    /// Takes, renews, releases or breaks the hold of a drive; answered at once.
+    fn hold(&self, incoming: &Incoming, target: HoldTopic<'_>, plant: &Plant, now: Instant) -> Option<Message> {
+        if incoming.retain && incoming.payload.is_empty() {
+            return None; // a retained message was cleared
+        }
+        let result = self.topics.drive(target.drive, "result");
+        let reply = Reply::to(incoming, result, target.drive, &self.rules.responses);
+        let origin = self.origin(incoming, target.who);
+        let what = || format!("hold={}", excerpt(&incoming.payload));
+        let Some(drive) = plant.drive(target.drive) else {
+            let name = excerpt(target.drive.as_bytes());
+            let why = unknown_drive(target.drive, plant);
+            plant.refuse_unknown(name.trim_matches('`'), &what(), why, origin, now);
+            return None;
+        };
+        let text = std::str::from_utf8(&incoming.payload).unwrap_or_default().trim();
+        let done = match Verb::of(text) {
+            _ if incoming.retain => Err(Refusal::NotAllowed(
+                "a retained message is never a command; publish it without the retain flag and clear the topic"
+                    .to_string(),
+            )),
+            None => Err(Refusal::BadValue(
+                "the payload is take, renew, release or break".to_string(),
+            )),
+            Some(verb) => Ok(verb),
+        };
+        let done = match done {
+            Ok(verb) => drive.hold(verb, &origin, Authority::Write, now),
+            Err(refusal) => {
+                drive.refuse(&what(), refusal.clone(), origin, now);
+                Err(refusal)
+            }
+        };
+        let seen = drive.hold_view(None, now).map(|(view, _)| view);
+        // Strings and numbers can always be serialized.
+        let json = serde_json::to_vec(&HoldReply::new(target.drive, done, seen)).unwrap_or_default();
+        Some(reply.with(json))
+    }
+
     /// Takes a stop of all drives. Returns the answer where no stop is sent.
-    fn stop_all(&mut self, incoming: &Incoming, plant: &Plant, now: Instant) -> Option<Message> {
+    fn stop_all(&mut self, incoming: &Incoming, as_whom: Option<&str>, plant: &Plant, now: Instant) -> Option<Message> {
         if incoming.retain && incoming.payload.is_empty() {
             return None; // a retained message was cleared
         }
@@ -237,11 +285,7 @@ impl Commands {
             Ok(wanted) => wanted,
             Err(why) => return refuse(why),
         };
-        let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
-        let who = who
-            .as_deref()
-            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
-        let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, who);
+        let origin = self.origin(incoming, as_whom);
         match plant.stop_all.order(plant, &scope, &origin, wait, now) {
             Ok(order) => {
                 let report = order.report;

@@ -134,6 +134,8 @@ pub struct Options {
     pub require_id: bool,
     /// Filters of response topics that are allowed besides those outside of `base`.
     pub response_topics: Vec<String>,
+    /// The topic levels `as/WHO` of principals; none where `[authority]` is off.
+    pub principals: Option<Vec<String>>,
     /// Disk buffer for events and history while the broker is not connected; in memory only if absent.
     pub buffer: Option<Buffer>,
     /// Discovery prefix of Home Assistant; no discovery if absent.

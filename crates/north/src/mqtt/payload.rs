@@ -5,6 +5,8 @@ use std::time::{Duration, SystemTime};
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
+use crate::command::HoldView;
+use crate::command_json::HoldFields;
 use crate::drive::{ModelPoint, Point, Profile, Quality, State, Value};
 use crate::event::Event;
 use crate::plant::{BusHandle, DriveHandle, Plant};
@@ -22,6 +24,16 @@ pub(super) struct Topics {
 pub(super) struct SetTopic<'t> {
     pub(super) drive: &'t str,
     pub(super) point: Option<&'t str>,
+    /// WHO in `as/WHO`.
+    pub(super) who: Option<&'t str>,
+}
+
+/// The topic at which the hold of a drive is taken, renewed, released or broken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct HoldTopic<'t> {
+    pub(super) drive: &'t str,
+    /// Without one it is nobody's.
+    pub(super) who: Option<&'t str>,
 }
 
 impl Topics {
@@ -57,6 +69,60 @@ impl Topics {
         [self.drive("+", "set"), self.drive("+", "set/+"), self.stop_all()]
     }
 
+    /// The filters of those of the topics that name a client, and of the holds.
+    pub(super) fn authority_filters(&self) -> [String; 5] {
+        [
+            self.drive("+", "as/+/set"),
+            self.drive("+", "as/+/set/+"),
+            self.drive("+", "as/+/hold"),
+            self.drive("+", "hold"),
+            format!("{}/as/+/stop", self.root),
+        ]
+    }
+
+    /// The same for these clients, for a broker that takes no wildcards.
+    pub(super) fn authority_topics(&self, plant: &Plant, clients: &[String]) -> Vec<String> {
+        let of_drive = |drive: DriveHandle| {
+            let spec = &drive.image.spec;
+            let points = || spec.profile.points.iter().filter(|point| point.is_commanded());
+            let of_client = |who: &String| {
+                let leaf = |leaf: &str| self.drive(&spec.name, &format!("as/{who}/{leaf}"));
+                let points = points().map(|point| leaf(&format!("set/{}", point.name)));
+                [leaf("set"), leaf("hold")]
+                    .into_iter()
+                    .chain(points)
+                    .collect::<Vec<_>>()
+            };
+            let hold = self.drive(&spec.name, "hold");
+            std::iter::once(hold)
+                .chain(clients.iter().flat_map(of_client))
+                .collect::<Vec<_>>()
+        };
+        let stops = clients.iter().map(|who| format!("{}/as/{who}/stop", self.root));
+        stops.chain(plant.drives().flat_map(of_drive)).collect()
+    }
+
+    /// Who stops all drives by that topic, where it is one of these: WHO in `as/WHO`, if it has one.
+    pub(super) fn parse_stop_all<'t>(&self, topic: &'t str) -> Option<Option<&'t str>> {
+        let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix('/')?;
+        if rest == "set/stop" {
+            return Some(None);
+        }
+        let who = rest.strip_prefix("as/")?.strip_suffix("/stop")?;
+        (!who.contains('/')).then_some(Some(who))
+    }
+
+    /// Whose hold of which drive a topic is about; `None` for any other topic.
+    pub(super) fn parse_hold<'t>(&self, topic: &'t str) -> Option<HoldTopic<'t>> {
+        let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix("/drive/")?;
+        let levels: Vec<&str> = rest.split('/').collect();
+        match levels.as_slice() {
+            [drive, "hold"] => Some(HoldTopic { drive, who: None }),
+            [drive, "as", who, "hold"] => Some(HoldTopic { drive, who: Some(who) }),
+            _ => None,
+        }
+    }
+
     /// Where all drives are stopped.
     pub(super) fn stop_all(&self) -> String {
         format!("{}/set/stop", self.root)
@@ -84,10 +150,15 @@ impl Topics {
     /// Which drive and point a topic sets; `None` for any other topic.
     pub(super) fn parse_set<'t>(&self, topic: &'t str) -> Option<SetTopic<'t>> {
         let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix("/drive/")?;
-        let mut levels = rest.split('/');
-        let (drive, set) = (levels.next()?, levels.next()?);
-        let point = levels.next();
-        (set == "set" && levels.next().is_none()).then_some(SetTopic { drive, point })
+        let levels: Vec<&str> = rest.split('/').collect();
+        let (drive, who, point) = match levels.as_slice() {
+            [drive, "set"] => (drive, None, None),
+            [drive, "set", point] => (drive, None, Some(*point)),
+            [drive, "as", who, "set"] => (drive, Some(*who), None),
+            [drive, "as", who, "set", point] => (drive, Some(*who), Some(*point)),
+            _ => return None,
+        };
+        Some(SetTopic { drive, point, who })
     }
 }
 
@@ -107,6 +178,8 @@ pub(super) struct StateContent {
     pub(super) blocked_by: Vec<String>,
     /// For how long an ordinary stop still waits, in whole seconds.
     pub(super) stop_waits: Option<u64>,
+    /// Who holds it; none where `[authority]` is off.
+    pub(super) hold: Option<HoldFields>,
     /// Value (only if good) and quality of each published point.
     pub(super) points: Vec<(Option<Value>, Quality)>,
 }
@@ -133,8 +206,15 @@ impl StateContent {
             quality: reading.overall(),
             blocked_by,
             stop_waits: stop_waits.map(|time| u64::try_from(time.as_millis().div_ceil(1000)).unwrap_or(u64::MAX)),
+            hold: None,
             points: points.map(shown).collect(),
         }
+    }
+
+    /// The same with who holds the drive.
+    pub(super) fn with_hold(mut self, hold: Option<HoldView>) -> StateContent {
+        self.hold = hold.map(HoldFields::from);
+        self
     }
 }
 
@@ -171,6 +251,15 @@ impl Serialize for StateObject<'_> {
         map.serialize_entry("blocked_by", &self.shown.blocked_by)?;
         if let Some(seconds) = self.shown.stop_waits {
             map.serialize_entry("stop_waits_ms", &seconds.saturating_mul(1000))?;
+        }
+        if !self.profile.verified {
+            map.serialize_entry("profile_verified", &false)?;
+        }
+        if let Some(hold) = &self.shown.hold {
+            map.serialize_entry("hold", &hold.hold)?;
+            map.serialize_entry("holder", &hold.holder)?;
+            map.serialize_entry("holder_rank", &hold.holder_rank)?;
+            map.serialize_entry("hold_left_s", &hold.hold_left_s)?;
         }
         if self.omitted > 0 {
             map.serialize_entry("omitted", &self.omitted)?;
@@ -362,6 +451,31 @@ mod tests {
     use crate::process_image::{DriveImage, DriveSpec, Link};
 
     #[test]
+    fn topics_that_name_a_client_are_recognised() {
+        let topics = Topics::new("plant/a", "hall");
+        let set = |topic| topics.parse_set(topic).map(|t| (t.drive, t.who, t.point));
+        assert_eq!(set("plant/a/hall/drive/p1/as/x/set"), Some(("p1", Some("x"), None)));
+        assert_eq!(
+            set("plant/a/hall/drive/p1/as/x/set/run"),
+            Some(("p1", Some("x"), Some("run")))
+        );
+        assert_eq!(set("plant/a/hall/drive/p1/as/set"), None);
+        let hold = |topic| topics.parse_hold(topic).map(|t| (t.drive, t.who));
+        assert_eq!(hold("plant/a/hall/drive/p1/hold"), Some(("p1", None)));
+        assert_eq!(hold("plant/a/hall/drive/p1/as/x/hold"), Some(("p1", Some("x"))));
+        assert_eq!(hold("plant/a/hall/drive/p1/as/x/y/hold"), None);
+        assert_eq!(topics.parse_stop_all("plant/a/hall/set/stop"), Some(None));
+        assert_eq!(topics.parse_stop_all("plant/a/hall/as/x/stop"), Some(Some("x")));
+        for other in [
+            "plant/a/hall/as/x/y/stop",
+            "plant/a/hall/as/stop",
+            "plant/b/hall/set/stop",
+        ] {
+            assert_eq!(topics.parse_stop_all(other), None, "{other}");
+        }
+    }
+
+    #[test]
     fn set_topics_are_recognised() {
         let topics = Topics::new("plant/a", "hall");
         let parse = |topic| topics.parse_set(topic).map(|t| (t.drive, t.point));
@@ -415,6 +529,7 @@ mod tests {
         let profile = Profile::parse("m.toml", source, false).unwrap();
         let state = |value: Option<i64>| {
             let shown = StateContent {
+                hold: None,
                 state: Some(State::NotReady),
                 quality: Quality::Good,
                 blocked_by: Vec::new(),
@@ -443,6 +558,27 @@ mod tests {
             (&object["mode"], &object["mode_text"]),
             (&serde_json::Value::Null, &"".into())
         );
+        assert_eq!(object.get("profile_verified"), None, "nothing doubtful");
+        let doubtful = Profile::parse("m.toml", &format!("verified = false\n{source}"), false).unwrap();
+        let of = StateContent {
+            state: None,
+            quality: Quality::Good,
+            blocked_by: Vec::new(),
+            hold: None,
+            points: Vec::new(),
+        };
+        let object = StateObject {
+            shown: &of,
+            names: &[],
+            indices: &[],
+            profile: &doubtful,
+            fault_text: String::new(),
+            age: None,
+            wall: SystemTime::UNIX_EPOCH,
+            historical: false,
+            omitted: 0,
+        };
+        assert_eq!(serde_json::to_value(&object).unwrap()["profile_verified"], false);
     }
 
     #[test]

@@ -252,12 +252,10 @@ impl Publisher {
             let fresh = drive.is_fresh();
             let (names, indices) = (&drive.names, &drive.indices);
             let reading = drive.drive.reading(now);
-            let shown = StateContent::of(
-                &reading,
-                indices.iter().copied(),
-                drive.drive.why(&reading).words(),
-                drive.drive.stop_waits(now),
-            );
+            let hold = drive.drive.hold_view(None, now).map(|(view, _)| view);
+            let words = drive.drive.why(&reading).words();
+            let shown =
+                StateContent::of(&reading, indices.iter().copied(), words, drive.drive.stop_waits(now)).with_hold(hold);
             let render = |shown: &StateContent| {
                 let fits = drive.fits;
                 render((names, indices, fits), &reading, shown, wall, true)
@@ -382,12 +380,15 @@ impl DriveTopics {
     fn tick(&mut self, pace: PublishInterval, most: usize, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
         let drive = self.drive.clone();
         let reading = drive.reading(now);
+        let hold = self.drive.hold_view(None, now).map(|(view, _)| view);
+        let words = self.drive.why(&reading).words();
         let shown = StateContent::of(
             &reading,
             self.indices.iter().copied(),
-            self.drive.why(&reading).words(),
+            words,
             self.drive.stop_waits(now),
-        );
+        )
+        .with_hold(hold);
         let mut look_at = now + LOOK.min(pace.max);
         for point in &mut self.points {
             let payload = match point.source {

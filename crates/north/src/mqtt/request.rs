@@ -215,7 +215,7 @@ mod tests {
             ("NaN", "bad_value", "is not JSON"),
             (r#"{"run": NaN}"#, "bad_value", "is not JSON"),
             (r#"{"speed_reference": 1e999}"#, "bad_value", "is not JSON"),
-            (r#"{"run": true, "run": false}"#, "bad_value", "`run` appears twice"),
+            (r#"{"run": true, "run": false}"#, "bad_value", "sets `run` twice"),
             (
                 r#"{"sped_reference": 5}"#,
                 "not_writable",
@@ -259,7 +259,7 @@ mod tests {
             (r#"{"run": false, "id": {}}"#, "`id` is a number or a string"),
             (
                 r#"{"run": false, "speed_reference": 1, "speed_reference": 2}"#,
-                "appears twice",
+                "twice; name each point once",
             ),
         ] {
             let asked = set(payload).order.expect(payload);

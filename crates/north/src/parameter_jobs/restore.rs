@@ -120,6 +120,9 @@ pub fn carry_out(plant: &SharedPlant, drive: &DriveHandle, number: u64, origin: 
     let spec = &drive.image.spec;
     may_restore(spec)?;
     not_held(drive)?;
+    drive
+        .may_begin_restore(&origin, Instant::now())
+        .map_err(|refusal| refusal.to_string())?;
     let vault = plant.load().parameters.clone();
     let machine = drive.machine();
     let prepared = vault.carry_out(&machine, &spec.name, number)?;

@@ -103,8 +103,8 @@ fn spans_that_leave_a_block() {
     let image = running(now);
     let beyond = [
         (0x7FFF, 2),
-        (0x8012, 2),
-        (0x8013, 1),
+        (0x8014, 2),
+        (0x8015, 1),
         (0x80FF, 1),
         (0x80FF, 2),
         (0x8103, 2),
@@ -496,5 +496,33 @@ fn blocks_have_no_gap() {
             assert_eq!(pair[0].end(), u32::from(pair[1].address));
         }
     }
-    assert_eq!(BLOCKS.map(|b| b.last().unwrap().end()), [0x8013, 0x8104, 0x821A]);
+    assert_eq!(BLOCKS.map(|b| b.last().unwrap().end()), [0x8015, 0x8105, 0x821A]);
+}
+
+#[test]
+fn the_hold_is_mapped_where_authority_is_on() {
+    use crate::command::{HoldState, HoldView};
+    let now = Instant::now();
+    let image = running(now);
+    let reading = image.reading(now, STALE_AFTER);
+    let view = |hold| DriveView::new(&reading, BusState::Up).with_hold(hold);
+    assert_eq!(view(None).registers(0x8013, 2), Ok(vec![0xFFFF, 0xFFFF]));
+    assert_eq!(view(None).registers(0x8104, 1), Err(Exception::ADDRESS));
+    let seen = |state, left_s| HoldView {
+        state,
+        holder: None,
+        rank: None,
+        left_s,
+    };
+    for (state, left, own, expected) in [
+        (HoldState::Free, Some(0), false, [0, 0, 0]),
+        (HoldState::Held, Some(24), true, [1, 24, 1]),
+        (HoldState::Held, Some(24), false, [2, 24, 0]),
+        (HoldState::Local, None, false, [3, 0xFFFF, 0]),
+        (HoldState::Reserved, Some(99_999), false, [4, 65_534, 0]),
+    ] {
+        let view = view(Some((seen(state, left), own)));
+        assert_eq!(view.registers(0x8013, 2).unwrap(), expected[..2], "{state:?}");
+        assert_eq!(view.registers(0x8103, 2).unwrap(), [0, expected[2]], "{state:?}");
+    }
 }

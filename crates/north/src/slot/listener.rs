@@ -9,7 +9,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::terms::{Terms, Tool};
 use super::{MAX_TOOLS, connection, limits};
-use crate::command::Authority;
+use crate::command::{Authority, Proof};
 use crate::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer};
 use crate::line::ServedPort;
 use crate::listener::ConnectionHandler;
@@ -99,7 +99,12 @@ impl ConnectionHandler for SlotListener {
             }
             false => (None, Vec::new()),
         };
-        let tool = Tool::new(served.terms.clone(), &peer.to_string(), &peer.ip().to_string());
+        let tool = Tool::new(
+            served.terms.clone(),
+            &peer.to_string(),
+            &peer.ip().to_string(),
+            Proof::Address(peer.ip()),
+        );
         let connection = connection::Connection::new(stream, Arc::new(tool), port, greeting);
         connection
             .serve(slot.idle_timeout, permit.place(), &self.stopping)

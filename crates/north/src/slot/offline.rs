@@ -8,6 +8,7 @@ use super::Slot;
 use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
 use crate::NorthStats;
+use crate::command::Proof;
 use crate::plant::SharedPlant;
 
 /// One tool of a slot without sockets.
@@ -37,7 +38,7 @@ impl Offline {
     }
 
     fn of(terms: Arc<Terms>, peer: &str) -> Offline {
-        let tool = Arc::new(Tool::new(terms.clone(), peer, peer));
+        let tool = Arc::new(Tool::new(terms.clone(), peer, peer, Proof::Nothing));
         Offline {
             terms,
             dialogue: Dialogue::new(tool),

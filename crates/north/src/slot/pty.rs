@@ -15,6 +15,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
+use crate::command::Proof;
 use crate::line::Pty;
 
 /// Pause before a pseudo-terminal that could not be opened is tried again.
@@ -33,7 +34,8 @@ pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: Cancellation
             Ok(pty) => {
                 tracing::info!(target: "drivegate::north::slot", %bus, path = %path.display(), "tool slot: open");
                 told.clear();
-                let tool = Tool::new(terms.clone(), &path.display().to_string(), "pty");
+                let shown = path.display().to_string();
+                let tool = Tool::new(terms.clone(), &shown, "pty", Proof::Pty(shown.as_str().into()));
                 match Port::new(pty, Arc::new(tool)) {
                     Ok(mut port) => match cancel.run_until_cancelled(port.serve()).await {
                         None => {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::request::{Meaning, Refused, ToolRequest};
 use super::{Slot, SlotAccess};
 use crate::codec::{LineFormat, Protocol, RequestPdu, describe};
-use crate::command::{self, Authority, Order, Origin, Outcome, Parts, Refusal, SourceKind, Urgency};
+use crate::command::{self, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
 use crate::drive::plan::WireTime;
 use crate::plant::{BusHandle, DriveHandle, Exchange, Placed, Plant, Question, SharedPlant, Target, turn_away};
 use crate::process_image::Access;
@@ -91,10 +91,10 @@ pub(super) struct Tool {
 
 impl Tool {
     /// The tool at `peer`; all connections of a `client` share its turns in the queues.
-    pub(super) fn new(terms: Arc<Terms>, peer: &str, client: &str) -> Tool {
+    pub(super) fn new(terms: Arc<Terms>, peer: &str, client: &str, proof: Proof) -> Tool {
         let (kind, bus) = (SourceKind::Slot, &terms.slot.bus);
         let client: Arc<str> = format!("{} {bus} {client}", kind.name()).into();
-        let origin = Origin::of(client, kind, format!("{peer} at {bus}"));
+        let origin = Origin::of(client, kind, format!("{peer} at {bus}")).proven(proof);
         Tool { terms, origin }
     }
 

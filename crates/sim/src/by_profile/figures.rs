@@ -134,7 +134,7 @@ impl ProfileDrive {
     fn is_written(&self, point: &Point, raw: &Raw) -> bool {
         let own = self.control.as_ref().is_some_and(|control| {
             let at = raw.covers(control.at.table, control.at.address);
-            at && (control.own_word == OwnWord::Read || point.class == PollClass::Never)
+            at && (control.own_word != OwnWord::Shadow || point.class == PollClass::Never)
         });
         own || point.write && point.write_to.is_none()
     }

@@ -21,8 +21,7 @@ use super::motor::{Feed, Load, Ratings};
 use super::parameter_set::Writes;
 use super::random::Random;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::drive::control::{Always, Control, OwnWord, Place, Reset, Run, Setting, Until};
-use crate::drive::profile::Form;
+use crate::drive::control::{Control, Place, Run, Until};
 use crate::drive::{Bound, ModelPoint, Profile, Source, Value};
 
 /// Time that a drive takes to come to the next state of its start sequence.
@@ -120,7 +119,7 @@ impl ProfileDrive {
     pub fn new(options: ProfileOptions, now: SimTime) -> ProfileDrive {
         let load = Load::default();
         let profile = Arc::clone(&options.profile);
-        let control = profile.control.clone().or_else(|| control_of(&profile));
+        let control = profile.control.clone();
         let name = profile.simulator.as_deref();
         let family = FAMILIES.into_iter().find(|family| Some(family.name) == name);
         let ratings = Ratings {
@@ -424,54 +423,6 @@ impl Model for ProfileDrive {
     fn set_remote(&mut self, on: bool) {
         self.give_to_bus(on);
     }
-}
-
-/// The commands of a profile without `[control]`, from its points of plain bits.
-fn control_of(profile: &Profile) -> Option<Control> {
-    let bit = |model: ModelPoint| {
-        let point = profile.model_point(model).filter(|point| point.write)?;
-        let Source::Raw(raw) = &point.source else {
-            return None;
-        };
-        let Form::Bit { bit, invert } = raw.form else {
-            return None;
-        };
-        let mask = 1u16 << bit.min(15);
-        let setting = Setting {
-            place: None,
-            mask,
-            value: if invert { 0 } else { mask },
-            once: false,
-        };
-        let place = Place {
-            table: raw.table,
-            address: raw.address,
-        };
-        Some((place, setting))
-    };
-    let (at, run) = bit(ModelPoint::Run)?;
-    let placed = |model: ModelPoint| {
-        bit(model).map(|(place, setting)| Setting {
-            place: (place != at).then_some(place),
-            ..setting
-        })
-    };
-    Some(Control {
-        at,
-        own_word: OwnWord::Read,
-        always: Always::default(),
-        stop: Setting {
-            value: !run.value & run.mask,
-            ..run
-        },
-        run: Run::One(run),
-        reverse: placed(ModelPoint::Reverse),
-        fault_reset: placed(ModelPoint::FaultReset).map(|setting| Reset {
-            setting,
-            hold: UPDATE_PERIOD,
-        }),
-        restarts_on_reset: false,
-    })
 }
 
 /// The frequency at 100 %, Hz.

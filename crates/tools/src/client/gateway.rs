@@ -1,84 +1,134 @@
-//! Which gateway is asked, and the connection to it.
+//! Which gateway is asked.
 
-use std::path::PathBuf;
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::path::{Path, PathBuf};
 
-use rustls_pki_types::ServerName;
-use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::net::TcpStream;
-use tokio_rustls::TlsConnector;
-use tokio_rustls::client::TlsStream;
+use super::door::Network;
+use super::{Client, Door, Url};
+use crate::DEFAULT_CONFIG;
+use crate::config::{Settings, environment};
+use crate::north::http::messages::Expected;
+use crate::north::local::{RuntimeDirectories, SocketPath, absolute};
 
-use super::{ClientError, Url};
-use crate::north::{GATEWAY, client_tls, explain};
-
-/// What to do about a handshake that says nothing of its own.
-const NO_TLS: &str = "pass the CA of the gateway's certificate with --ca, or use http://";
+/// Where `[http]` listens unless it says otherwise.
+const USUAL: &str = "http://127.0.0.1:9488";
 
 /// The options that say which gateway is asked, and how.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct Gateway {
-    /// The gateway's HTTP server.
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:9488")]
-    pub(super) url: Url,
+    /// Configuration file of the gateway, which is asked through its local socket [default: /etc/drivegate/drivegate.toml].
+    #[arg(long, value_name = "FILE", global = true)]
+    config: Option<PathBuf>,
+    /// The gateway's HTTP server instead.
+    #[arg(long, value_name = "URL", global = true, conflicts_with = "config")]
+    url: Option<Url>,
     /// PEM file of the CA that signed the gateway's certificate, for https:// [default: those of the system].
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", global = true, requires = "url")]
     ca: Option<PathBuf>,
-    /// File whose only line is a token of the gateway, with scope `read`.
-    #[arg(long, value_name = "FILE")]
+    /// File whose only line is a token of the gateway, with scope `read`, or USER:PASSWORD of one who may command.
+    #[arg(long, value_name = "FILE", global = true, requires = "url")]
     token_file: Option<PathBuf>,
 }
 
-/// A connection, with TLS or without.
-pub(super) trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
-
-impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
-
 impl Gateway {
-    /// One without a token.
-    pub(crate) fn at(url: Url, ca: Option<PathBuf>) -> Gateway {
-        let token_file = None;
-        Gateway { url, ca, token_file }
+    /// The configuration file.
+    pub(crate) fn config(&self) -> &Path {
+        self.config.as_deref().unwrap_or(Path::new(DEFAULT_CONFIG))
     }
 
-    /// The token to send, if one is configured.
-    ///
-    /// # Errors
-    /// Its file cannot be read.
-    pub(super) fn token(&self) -> Result<Option<String>, ClientError> {
-        let Some(path) = &self.token_file else { return Ok(None) };
-        let text = std::fs::read_to_string(path).map_err(|error| {
-            let shown = path.display();
-            ClientError::File(format!(
-                "cannot read the token: {error}; {shown}; check the path and its permissions"
-            ))
-        })?;
-        Ok(Some(text.trim().to_string()))
-    }
-
-    /// Connects.
-    ///
-    /// # Errors
-    /// Nobody listens, or the TLS handshake fails.
-    pub(super) async fn connect(&self) -> Result<Box<dyn Stream>, ClientError> {
-        let socket = TcpStream::connect((self.url.host.as_str(), self.url.port))
-            .await
-            .map_err(|error| ClientError::Unreachable(self.url.clone(), error.to_string()))?;
-        Ok(match self.url.tls {
-            false => Box::new(socket),
-            true => Box::new(self.with_tls(socket).await?),
-        })
-    }
-
-    async fn with_tls(&self, socket: TcpStream) -> Result<TlsStream<TcpStream>, ClientError> {
-        let config = client_tls(self.ca.as_deref()).map_err(ClientError::File)?;
-        let failed = |why: String| {
-            let (what, remedy) = why.split_once("; ").unwrap_or((&why, NO_TLS));
-            ClientError::Tls(format!("{what}; {}; {remedy}", self.url))
+    /// The HTTP server, if that is asked.
+    pub(crate) fn network(&self) -> Option<Client> {
+        let network = Network {
+            url: self.url.clone()?,
+            ca: self.ca.clone(),
+            token_file: self.token_file.clone(),
         };
-        let name = ServerName::try_from(self.url.host.clone()).map_err(|error| failed(error.to_string()))?;
-        let handshake = TlsConnector::from(config).connect(name, socket);
-        handshake
-            .await
-            .map_err(|error| failed(explain(&error, GATEWAY).unwrap_or_else(|| error.to_string())))
+        Some(Client::through(Door::Network(network)))
     }
+
+    /// A client of the gateway that runs with the configuration, which may be invalid.
+    ///
+    /// # Errors
+    /// It can be asked by no way.
+    pub(crate) fn client(&self) -> Result<Client, String> {
+        match self.network() {
+            Some(client) => Ok(client),
+            None => Client::of_configuration(self.config()),
+        }
+    }
+
+    /// A client that only looks: of whichever gateway is found, unless one is named.
+    ///
+    /// # Errors
+    /// It can be asked by no way.
+    pub(crate) fn viewer(&self) -> Result<Client, String> {
+        let mut client = self.client()?;
+        if self.config.is_none() && self.url.is_none() {
+            client.expected = None;
+            let network = Network {
+                url: USUAL.parse()?,
+                ca: None,
+                token_file: None,
+            };
+            client.doors.push(Door::Network(network));
+        }
+        Ok(client)
+    }
+}
+
+impl Client {
+    /// Of the gateway that runs with that configuration: through its local socket, or where that is off by HTTP.
+    ///
+    /// # Errors
+    /// It can be asked by no way.
+    pub(crate) fn of_configuration(config: &Path) -> Result<Client, String> {
+        let socket = Settings::socket_of(config, environment());
+        let mut client = Client::at(&socket, Expected::Configuration(absolute(config)));
+        if socket == SocketPath::Off {
+            let url = http_of(config)?;
+            let (ca, token_file) = (None, None);
+            client = Client::through(Door::Network(Network { url, ca, token_file }));
+        }
+        client.file = Some(config.to_path_buf());
+        Ok(client)
+    }
+
+    /// Of the gateway that is expected, at its socket.
+    pub(crate) fn at(socket: &SocketPath, expected: Expected) -> Client {
+        let paths = socket.of_client(&RuntimeDirectories::of_this_process());
+        Client {
+            doors: paths.into_iter().map(Door::Socket).collect(),
+            expected: Some(expected),
+            file: None,
+        }
+    }
+}
+
+/// Where the HTTP server of a configuration listens.
+fn http_of(config: &Path) -> Result<Url, String> {
+    let shown = config.display();
+    let settings = Settings::load(config, environment()).settings;
+    let settings = settings.ok_or_else(|| format!("the configuration is invalid; {shown}; see `drivegate check`"))?;
+    let http = settings.http.ok_or_else(|| {
+        format!(
+            "neither the local socket nor [http] is configured, so the gateway cannot be asked; {shown}; \
+            configure one"
+        )
+    })?;
+    if http.identity.is_some() {
+        return Err(format!(
+            "the HTTP server has TLS, and the name in its certificate is not known here; {shown}; pass --url and --ca"
+        ));
+    }
+    format!("http://{}", from_here(http.listen)).parse()
+}
+
+/// The address as a client on this machine has to name it.
+fn from_here(listen: SocketAddr) -> SocketAddr {
+    let address = match listen {
+        SocketAddr::V4(at) if at.ip().is_unspecified() => Ipv4Addr::LOCALHOST.into(),
+        SocketAddr::V6(at) if at.ip().is_unspecified() => Ipv6Addr::LOCALHOST.into(),
+        other => other.ip(),
+    };
+    SocketAddr::new(address, listen.port())
 }

@@ -1,15 +1,16 @@
 //! Without a gateway: the command opens the port itself and is the master for a moment.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::Target;
-use super::gateway::NotFound;
-use crate::command::{Origin, SourceKind};
+use super::Configured;
+use crate::client::{Client, Door};
 use crate::config::{BusSettings, ParamsSettings, Settings};
 use crate::daemon::Daemon;
 use crate::drive::{Point, PollClass, Profile, Quality, Source};
-use crate::north::local::protocol::{Outcome, Request, Word};
-use crate::north::local::{SocketPath, answer};
+use crate::north::http::InProcess;
+use crate::north::http::messages::Word;
+use crate::north::local::SocketPath;
 use crate::plant::DriveHandle;
 use crate::process_image::{OnShutdown, Reading};
 
@@ -23,6 +24,22 @@ const READ: Duration = Duration::from_secs(20);
 /// Time between two looks at the image.
 const LOOK: Duration = Duration::from_millis(5);
 
+/// Cadence of process data where the line is there for parameters.
+const RESTFUL: Duration = Duration::from_secs(1);
+
+/// What the bus must know of the drive before a request is carried out.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Needs<'n> {
+    /// All that is polled.
+    All,
+    /// These points.
+    Points(&'n [String]),
+    /// What commands of these points are turned into: all, if one of them is derived.
+    Commands(&'n [String]),
+    /// What the drive is, for its parameters.
+    Identification,
+}
+
 /// A bus of its own, with the one drive.
 pub(super) struct Direct {
     daemon: Daemon,
@@ -30,12 +47,17 @@ pub(super) struct Direct {
 }
 
 impl Direct {
-    /// Opens the port and waits until the drive answers.
+    /// Opens the port and waits until the drive answers, and has answered what the request needs.
     ///
     /// # Errors
     /// What is wrong, where, and what to do.
-    pub(super) async fn start(target: &Target, not_found: &NotFound) -> Result<Direct, String> {
+    pub(super) async fn start(target: &Configured, needs: Needs<'_>, not_found: &str) -> Result<Direct, String> {
         let mut spec = target.spec.clone();
+        let mut bus = target.bus.clone();
+        if let Needs::Identification = needs {
+            // Nobody looks at its process data.
+            bus.spec.cycle = RESTFUL.max(bus.spec.cycle);
+        }
         // The drive keeps what was commanded when this process ends.
         spec.on_shutdown = OnShutdown::Hold;
         spec.supervision = None;
@@ -54,7 +76,7 @@ impl Direct {
             params,
             buses: vec![BusSettings {
                 drives: vec![spec],
-                ..target.bus.clone()
+                ..bus
             }],
             socket: SocketPath::Off,
             keeps_history: false,
@@ -68,7 +90,10 @@ impl Direct {
         let drive = drive.ok_or_else(|| format!("drive `{name}` is not configured; its bus; try again"))?;
         let direct = Direct { daemon, drive };
         match direct.reach(target, not_found).await {
-            Ok(()) => Ok(direct),
+            Ok(()) => {
+                direct.settled(needs).await;
+                Ok(direct)
+            }
             Err(why) => {
                 direct.stop().await;
                 Err(why)
@@ -76,7 +101,7 @@ impl Direct {
         }
     }
 
-    async fn reach(&self, target: &Target, not_found: &NotFound) -> Result<(), String> {
+    async fn reach(&self, target: &Configured, not_found: &str) -> Result<(), String> {
         let health = || self.drive.bus.image.health();
         let begun = Instant::now();
         until(OPEN, || health().up || (health().tried && begun.elapsed() > TRIED)).await;
@@ -87,7 +112,7 @@ impl Direct {
                 why.as_deref().unwrap_or("it cannot be opened in time"),
                 target.bus.spec.name,
                 target.bus.spec.port,
-                not_found.0
+                not_found
             ));
         }
         let options = &target.bus.options;
@@ -109,12 +134,11 @@ impl Direct {
         Ok(())
     }
 
-    /// Carries the request out, once the drive has answered what it rests on.
-    pub(super) async fn ask(&self, request: &Request) -> Outcome {
+    async fn settled(&self, needs: Needs<'_>) {
         let profile = &self.drive.image.spec.profile;
         let index = |name: &str| profile.point_index(name);
-        let awaited: Vec<usize> = match request {
-            Request::Read(request) if !request.points.is_empty() => {
+        let awaited: Vec<usize> = match needs {
+            Needs::Points(names) if !names.is_empty() => {
                 let of = |name: &String| match (index(name), Word::of(name)) {
                     (Some(index), _) => vec![index],
                     (None, Some(word)) => word
@@ -124,13 +148,10 @@ impl Direct {
                         .collect(),
                     (None, None) => Vec::new(),
                 };
-                request.points.iter().flat_map(of).collect()
+                names.iter().flat_map(of).collect()
             }
-            Request::Params(_) | Request::ParamsRestore(_) => profile.parameters.identification.clone(),
-            // What a command is turned into, and whether it is needed at all, depends on what the drive has.
-            Request::Write(request) if !request.points.iter().any(|set| is_derived(profile, index(&set.point))) => {
-                Vec::new()
-            }
+            Needs::Identification => profile.parameters.identification.clone(),
+            Needs::Commands(names) if !names.iter().any(|name| is_derived(profile, index(name))) => Vec::new(),
             _ => (0..profile.points.len()).collect(),
         };
         let polled: Vec<usize> = awaited.into_iter().filter(|index| is_polled(profile, *index)).collect();
@@ -139,18 +160,20 @@ impl Direct {
             polled.iter().all(|index| is_settled(&reading, *index))
         })
         .await;
-        answer(request, &self.daemon.plant(), origin(), Instant::now()).await
+    }
+
+    /// A client of this bus.
+    pub(super) fn client(&self) -> Client {
+        let user = std::env::var("SUDO_USER").or_else(|_| std::env::var("USER"));
+        let user = user.unwrap_or_else(|_| "unknown".to_string());
+        let door = InProcess::new(&self.daemon.plant(), &self.daemon.stats(), &user);
+        Client::through(Door::InProcess(Arc::new(door)))
     }
 
     /// Closes the port.
     pub(super) async fn stop(self) {
         self.daemon.stop().await;
     }
-}
-
-fn origin() -> Origin {
-    let user = std::env::var("SUDO_USER").or_else(|_| std::env::var("USER"));
-    Origin::new(SourceKind::CommandLine, user.unwrap_or_else(|_| "unknown".to_string()))
 }
 
 fn is_derived(profile: &Profile, index: Option<usize>) -> bool {

@@ -2,104 +2,51 @@
 
 use std::time::Duration;
 
-use super::direct::Direct;
-use super::{Target, gateway, log_audit_only};
-use crate::north::local::protocol::{
-    Outcome, ParamsOutcome, ParamsRequest, Request, RestoreAct, RestoreOutcome, RestoreRequest, Stage,
-};
+use super::{Conversation, Needs, Target};
+use crate::client::Asked;
+use crate::north::http::messages::{ParameterReading, ReadParameters, Restore, RestoreAct, Stage};
 
 /// Time between two looks at how far it is.
 const LOOK: Duration = Duration::from_millis(250);
 
-/// Cadence of process data on a bus of its own.
-const RESTFUL: Duration = Duration::from_secs(1);
-
-/// Several requests about one drive, all by the same way.
-struct Conversation<'t> {
-    target: &'t Target,
-    direct: Option<Direct>,
-}
-
-impl Conversation<'_> {
-    /// Asks the gateway or, where there is none, opens the port; the first answer.
-    async fn begin<'t>(target: &'t Target, request: &Request) -> Result<(Conversation<'t>, Outcome), String> {
-        let not_found = match gateway::ask(target, request).await? {
-            Ok(outcome) => return Ok((Conversation { target, direct: None }, outcome)),
-            Err(not_found) => not_found,
-        };
-        log_audit_only();
-        // Nobody looks at its process data: the line is there for the parameters.
-        let mut alone = target.clone();
-        alone.bus.spec.cycle = RESTFUL.max(alone.bus.spec.cycle);
-        let direct = Direct::start(&alone, &not_found).await?;
-        let outcome = direct.ask(request).await;
-        let direct = Some(direct);
-        Ok((Conversation { target, direct }, outcome))
-    }
-
-    async fn ask(&self, request: &Request) -> Result<Outcome, String> {
-        if let Some(direct) = &self.direct {
-            return Ok(direct.ask(request).await);
-        }
-        let asked = gateway::ask(self.target, request).await?;
-        asked.map_err(|gone| {
-            format!(
-                "the gateway is gone: {}; the local socket; start it and try again",
-                gone.0
-            )
-        })
-    }
-
-    async fn end(self) {
-        if let Some(direct) = self.direct {
-            direct.stop().await;
-        }
-    }
-}
-
 impl Target {
-    /// Reads all parameters of the drive, afresh, briskly, or neither; the text of the file. `progress` is told how far it is.
+    /// Reads all parameters of the drive; the text of the file. `progress` gets how far it is.
     ///
     /// # Errors
     /// Why there is none, as a message.
     pub(crate) fn read_parameters(
         &self,
-        how: (bool, bool),
-        progress: impl FnMut(&ParamsOutcome),
+        how: ReadParameters,
+        progress: impl FnMut(&ParameterReading),
     ) -> Result<String, String> {
         crate::runtime()?.block_on(self.read_all(how, progress))
     }
 
     async fn read_all(
         &self,
-        (afresh, brisk): (bool, bool),
-        mut progress: impl FnMut(&ParamsOutcome),
+        how: ReadParameters,
+        mut progress: impl FnMut(&ParameterReading),
     ) -> Result<String, String> {
-        let request = |begin| {
-            Request::Params(ParamsRequest {
-                drive: self.spec.name.clone(),
-                expect: Some(self.expected()),
-                begin,
-                afresh,
-                brisk,
-            })
-        };
-        let (conversation, mut outcome) = Conversation::begin(self, &request(true)).await?;
+        let remedy = "parameters can be read of drives whose profile lists them, on lines that the gateway owns";
+        let path = self.path("params/reading");
+        let (begin, look) = (Asked::post(&path, &how), Asked::get(&path));
+        let [begin, look] = [begin, look].map(|asked| asked.if_refused(remedy).if_lost("try again"));
+        let (conversation, mut reply) = Conversation::begin(self, &begin, Needs::Identification).await?;
         let text = loop {
-            match outcome {
-                Outcome::Params(ParamsOutcome { file: Some(file), .. }) => break Ok(file),
-                Outcome::Params(ParamsOutcome { error: Some(why), .. }) => {
+            match reply.accepted(&look) {
+                Ok(ParameterReading { file: Some(file), .. }) => break Ok(file),
+                Ok(ParameterReading { error: Some(why), .. }) => {
                     break Err(format!(
                         "the parameters of `{}` were not read: {why}; its bus; try again",
-                        self.spec.name
+                        self.drive
                     ));
                 }
-                Outcome::Params(status) => progress(&status),
-                other => break Err(other.not_asked_for()),
+                Ok(status) => progress(&status),
+                Err(error) => break Err(error.to_string()),
             }
             tokio::time::sleep(LOOK).await;
-            outcome = match conversation.ask(&request(false)).await {
-                Ok(outcome) => outcome,
+            reply = match conversation.ask(&look).await {
+                Ok(reply) => reply,
                 Err(why) => break Err(why),
             };
         };
@@ -107,53 +54,56 @@ impl Target {
         text
     }
 
-    /// Does that with a restore of the drive, and waits until it is over; a restore that is prepared is carried out if `agreed`
-    /// says so. `progress` is told how far it is. The last that was heard of it.
+    /// Does that with a restore of the drive, or only looks at it, and waits until it is over; a restore that is prepared is carried out if `agreed`
+    /// says so. `progress` gets how far it is. The last that is known of it.
     ///
     /// # Errors
-    /// Why it could not be begun, or is not heard of any more, as a message.
+    /// Why it could not be begun, or is not known any more, as a message.
     pub(crate) fn restore_parameters(
         &self,
-        act: RestoreAct,
-        agreed: impl FnMut(&RestoreOutcome) -> bool,
-        progress: impl FnMut(&RestoreOutcome),
-    ) -> Result<RestoreOutcome, String> {
+        act: Option<RestoreAct>,
+        agreed: impl FnMut(&Restore) -> bool,
+        progress: impl FnMut(&Restore),
+    ) -> Result<Restore, String> {
         crate::runtime()?.block_on(self.restore_all(act, agreed, progress))
     }
 
     async fn restore_all(
         &self,
-        act: RestoreAct,
-        mut agreed: impl FnMut(&RestoreOutcome) -> bool,
-        mut progress: impl FnMut(&RestoreOutcome),
-    ) -> Result<RestoreOutcome, String> {
-        let request = |act| {
-            Request::ParamsRestore(RestoreRequest {
-                drive: self.spec.name.clone(),
-                expect: Some(self.expected()),
-                act,
-            })
+        act: Option<RestoreAct>,
+        mut agreed: impl FnMut(&Restore) -> bool,
+        mut progress: impl FnMut(&Restore),
+    ) -> Result<Restore, String> {
+        let path = self.path("params/restore");
+        let request = |act: Option<RestoreAct>| {
+            let asked = match act {
+                Some(act) => Asked::post(&path, &act),
+                None => Asked::get(&path),
+            };
+            asked.if_lost("a started restore continues in the gateway: see `drivegate params restore --look DRIVE`")
         };
-        let (conversation, mut outcome) = Conversation::begin(self, &request(act)).await?;
+        let mut asked = request(act);
+        let (conversation, mut reply) = Conversation::begin(self, &asked, Needs::Identification).await?;
         let ended = loop {
-            let next = match outcome {
-                Outcome::ParamsRestore(status) => match status.stage {
-                    Stage::Prepared if agreed(&status) => RestoreAct::CarryOut { number: status.number },
+            let next = match reply.accepted::<Restore>(&asked) {
+                Ok(status) => match status.stage {
+                    Stage::Prepared if agreed(&status) => Some(RestoreAct::CarryOut { number: status.number }),
                     Stage::Reading | Stage::Working => {
                         progress(&status);
                         tokio::time::sleep(LOOK).await;
-                        RestoreAct::Look
+                        None
                     }
                     _ => break Ok(status),
                 },
-                other => break Err(other.not_asked_for()),
+                Err(error) => break Err(error.to_string()),
             };
-            outcome = match conversation.ask(&request(next)).await {
-                Ok(outcome) => outcome,
+            asked = request(next);
+            reply = match conversation.ask(&asked).await {
+                Ok(reply) => reply,
                 Err(why) => {
                     break Err(format!(
                         "{why}; `drivegate params restore --look {}` shows the restore",
-                        self.spec.name
+                        self.drive
                     ));
                 }
             };

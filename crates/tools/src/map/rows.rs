@@ -110,6 +110,17 @@ fn entry_row(profile: &Profile, plan: &Plan, entry: &Entry, access: Access) -> R
         Content::Age => ("age", "ms", "of the process data; 65534 at most; 0xFFFF never read"),
         Content::Command => ("command", "", "bits: 0 run, 1 reverse, 2 fault_reset (0 to 1)"),
         Content::Heartbeat => ("heartbeat", "", "any write renews the supervision; reads 0"),
+        Content::Holder => (
+            "holder",
+            "",
+            "0 nobody, 1 this client, 2 another, 3 local control place, 4 reserved after a stop; 0xFFFF without [authority]",
+        ),
+        Content::HoldLeft => ("hold_left", "s", "0xFFFF without [authority], and under local control"),
+        Content::Hold => (
+            "hold",
+            "",
+            "with [authority] only: write 1 take or renew, 0 release, 2 break; reads 1 for the holder",
+        ),
         Content::Point(point) => (point.name(), point.unit(), ""),
     };
     let view = match entry.address {
@@ -139,14 +150,25 @@ fn entry_row(profile: &Profile, plan: &Plan, entry: &Entry, access: Access) -> R
         scale: format!("{}", 1.0 / entry.per_unit),
         unit: unit.to_string(),
         not_available: match entry.content {
-            Content::Status | Content::Heartbeat => "",
-            Content::State | Content::Age | Content::Command | Content::Point(_) => entry.form.not_available(),
+            Content::Status | Content::Heartbeat | Content::Hold => "",
+            Content::State
+            | Content::Age
+            | Content::Command
+            | Content::Holder
+            | Content::HoldLeft
+            | Content::Point(_) => entry.form.not_available(),
         },
         access: if writable { "read, write" } else { "read" },
         source: match entry.content {
             Content::Point(point) => point_source(profile, plan, point),
             Content::Command => command_source(profile),
-            Content::Status | Content::State | Content::Age | Content::Heartbeat => "gateway".to_string(),
+            Content::Status
+            | Content::State
+            | Content::Age
+            | Content::Heartbeat
+            | Content::Holder
+            | Content::HoldLeft
+            | Content::Hold => "gateway".to_string(),
         },
         note: note.to_string(),
     }

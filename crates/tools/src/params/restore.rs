@@ -1,13 +1,14 @@
 //! `drivegate params restore` and `clone`: what would be written, then that written.
 
 use std::io::{BufRead as _, IsTerminal as _, Write as _};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
+use super::super::client::Gateway;
 use super::super::drive_access::target;
 use super::super::{EXIT_FAILED, EXIT_USAGE, report};
 use super::{StatusLine, failed, read_file, read_from_drive};
-use crate::north::local::protocol::{RestoreAct, RestoreOutcome, Stage};
+use crate::north::http::messages::{ReadParameters, Restore, RestoreAct, Stage};
 use crate::parameters::{Entry, Id, ParameterFile};
 
 #[derive(Debug, clap::Args)]
@@ -51,16 +52,16 @@ pub(super) struct How {
     dry_run: bool,
 }
 
-pub(super) fn restore(config: &Path, args: &RestoreArgs) -> Result<ExitCode, ExitCode> {
+pub(super) fn restore(gateway: &Gateway, args: &RestoreArgs) -> Result<ExitCode, ExitCode> {
     let again = [
-        (&args.resume, RestoreAct::Resume),
-        (&args.undo, RestoreAct::Undo),
-        (&args.release, RestoreAct::Release),
-        (&args.look, RestoreAct::Look),
+        (&args.resume, Some(RestoreAct::Resume)),
+        (&args.undo, Some(RestoreAct::Undo)),
+        (&args.release, Some(RestoreAct::Release)),
+        (&args.look, None),
     ];
     for (drive, act) in again {
         if let Some(drive) = drive {
-            return carry(config, drive, act, &args.how);
+            return carry(gateway, drive, act, &args.how);
         }
     }
     // clap has made sure of both.
@@ -68,26 +69,30 @@ pub(super) fn restore(config: &Path, args: &RestoreArgs) -> Result<ExitCode, Exi
         return Err(ExitCode::from(EXIT_USAGE));
     };
     let file = read_file(file).map_err(|why| failed(&format!("{why}; name a file that `params read` wrote")))?;
-    write(config, &file, drive, &args.how)
+    write(gateway, &file, drive, &args.how)
 }
 
 /// Reads one drive and restores that to another.
-pub(super) fn clone(config: &Path, from: &str, to: &str, how: &How) -> Result<ExitCode, ExitCode> {
+pub(super) fn clone(gateway: &Gateway, from: &str, to: &str, how: &How) -> Result<ExitCode, ExitCode> {
     if from == to {
         report::error("a drive is not cloned to itself; command line; name two drives");
         return Err(ExitCode::from(EXIT_USAGE));
     }
-    let (file, _) = read_from_drive(config, from, false, true)?;
-    write(config, &file, to, how)
+    let brisk = ReadParameters {
+        brisk: true,
+        ..ReadParameters::default()
+    };
+    let (file, _) = read_from_drive(gateway, from, brisk)?;
+    write(gateway, &file, to, how)
 }
 
-fn write(config: &Path, file: &ParameterFile, drive: &str, how: &How) -> Result<ExitCode, ExitCode> {
+fn write(gateway: &Gateway, file: &ParameterFile, drive: &str, how: &How) -> Result<ExitCode, ExitCode> {
     let act = RestoreAct::Prepare {
         file: without_notes(file).text(),
         only: how.only.clone(),
         force: how.force,
     };
-    carry(config, drive, act, how)
+    carry(gateway, drive, Some(act), how)
 }
 
 /// The file without what is for people, which the gateway has itself.
@@ -103,12 +108,12 @@ fn without_notes(file: &ParameterFile) -> ParameterFile {
     }
 }
 
-fn carry(config: &Path, drive: &str, act: RestoreAct, how: &How) -> Result<ExitCode, ExitCode> {
-    let target = target(config, drive)?;
+fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> Result<ExitCode, ExitCode> {
+    let target = target(gateway, drive)?;
     let line = std::cell::RefCell::new(StatusLine::default());
     let mut refused_to_write = None;
     let shown = std::cell::Cell::new(false);
-    let agreed = |prepared: &RestoreOutcome| {
+    let agreed = |prepared: &Restore| {
         line.borrow().end();
         report::print(&told(prepared));
         shown.set(true);
@@ -120,7 +125,7 @@ fn carry(config: &Path, drive: &str, act: RestoreAct, how: &How) -> Result<ExitC
             }
         }
     };
-    let progress = |status: &RestoreOutcome| {
+    let progress = |status: &Restore| {
         let what = match status.stage {
             Stage::Reading => "addresses read",
             _ => "parameters written",
@@ -163,7 +168,7 @@ fn carry(config: &Path, drive: &str, act: RestoreAct, how: &How) -> Result<ExitC
 }
 
 /// What would be written.
-fn told(prepared: &RestoreOutcome) -> String {
+fn told(prepared: &Restore) -> String {
     let plan = prepared.plan.clone().unwrap_or_default();
     let risks = prepared
         .risks

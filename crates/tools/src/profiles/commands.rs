@@ -8,7 +8,7 @@ use crate::drive::control::{Control, Mask, OwnWord, Place, Run, Setting, Step, U
 /// A line for each command, with its words in hex.
 pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, String)> {
     let own = match control.own_word {
-        OwnWord::Read => "",
+        OwnWord::Read | OwnWord::Kept => "",
         OwnWord::Shadow => ", which does not read as it was written",
     };
     let mut lines = vec![("control word", format!("{}{own}", place(control.at)))];

@@ -7,8 +7,8 @@ use crate::daemon::Daemon;
 use crate::document::Problem;
 use crate::loading::{Loads, NotLoaded};
 use crate::log::LogHandle;
+use crate::north::http::messages::ReloadOutcome;
 use crate::north::local::ReloadOrder;
-use crate::north::local::protocol::ReloadOutcome;
 
 use super::watch::Watch;
 

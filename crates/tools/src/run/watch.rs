@@ -11,7 +11,7 @@ use crate::daemon::{Daemon, Pulse};
 use crate::event::{Event, EventKind};
 use crate::log::LogHandle;
 use crate::north::NorthStats;
-use crate::north::local::protocol::ReloadOutcome;
+use crate::north::http::messages::ReloadOutcome;
 use crate::plant::{Plant, SharedPlant};
 use crate::printable;
 

@@ -137,7 +137,7 @@ fn every_built_in_profile_can_be_simulated() {
         let help = trip_registers().replace(',', " ");
         match &line.drives[0].model {
             ModelOptions::Profile(of) => {
-                let own = profile.simulator.is_some() || profile.control.is_none();
+                let own = profile.simulator.is_some() || profile.control_table().is_none();
                 assert!(own && of.turnaround == Some(profile.turnaround), "{name}");
                 assert_eq!(address, "9998", "{name}");
             }

@@ -13,6 +13,8 @@ pub struct Effect {
     pub reverse: Option<bool>,
     /// A reference.
     pub reference: bool,
+    /// A raw word at the place of the run command that is no stop.
+    pub word: bool,
 }
 
 impl Effect {
@@ -21,6 +23,7 @@ impl Effect {
         run: Some(true),
         reverse: None,
         reference: true,
+        word: true,
     };
 
     /// What an order does to a drive of that profile.
@@ -96,16 +99,23 @@ fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
         raw.decode(&[*word], crate::drive::model::Kind::Bool)
     };
     let by_control = || {
-        let control = profile.control_language().filter(|control| control.at.table == table)?;
+        let control = profile.control.as_ref().filter(|control| control.at.table == table)?;
         let (_, word) = items.iter().find(|(address, _)| *address == control.at.address)?;
         control.direction_of(*word)
     };
+    let commands = |address: u16| {
+        let control = profile.control.as_ref().map(|control| control.at);
+        let mut places = profile.run_place().into_iter().chain(control);
+        places.any(|place| (place.table, place.address) == (table, address))
+    };
+    let no_stop = |(address, word): &(u16, u16)| commands(*address) && !profile.is_stop(table, *address, *word);
     Effect {
         run,
         reverse: bit(ModelPoint::Reverse)
             .map(|value| value.as_bool())
             .or_else(by_control),
         reference: covered(ModelPoint::SpeedReference) || covered(ModelPoint::FrequencyReference),
+        word: items.iter().any(no_stop),
     }
 }
 
@@ -114,13 +124,14 @@ mod tests {
     use super::*;
     use crate::codec::RequestPdu;
     use crate::drive::Value;
-    use crate::drive::profile::Profiles;
+    use crate::drive::profile::{Form, Profiles};
 
     #[test]
     fn points_and_registers_say_the_same() {
         let profiles = Profiles::built_in();
         for profile in profiles.iter() {
-            let Some((raw, bit, invert)) = profile.run_bit() else {
+            let run = profile.model_point(ModelPoint::Run).and_then(|run| run.raw());
+            let Some((raw, Form::Bit { bit, invert })) = run.map(|raw| (raw, raw.form)) else {
                 continue;
             };
             let point = |point: ModelPoint| profile.model_index(point).unwrap();

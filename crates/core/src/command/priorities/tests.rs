@@ -10,8 +10,8 @@ fn client(name: &str) -> Origin {
 fn effect(run: Option<bool>, reference: bool) -> Effect {
     Effect {
         run,
-        reverse: None,
         reference,
+        ..Effect::default()
     }
 }
 

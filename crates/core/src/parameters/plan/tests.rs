@@ -34,6 +34,7 @@ fn file(
         identification: "none".to_string(),
         time: "2026-03-02T07:40:12Z".to_string(),
         values: values.into_iter().map(|(id, value)| (id, entry(value))).collect(),
+        ..ParameterFile::default()
     };
     file.named(profile, &Names::default())
 }

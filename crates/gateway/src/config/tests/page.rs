@@ -24,6 +24,8 @@ fn with_tables(page: &str) -> String {
         ("[mqtt.sparkplug]", "Sparkplug"),
         ("[http]", "Http"),
         ("[bacnet]", "Bacnet"),
+        ("[authority]", "AuthorityTable"),
+        ("[[authority.principal]]", "PrincipalTable"),
         ("[audit]", "AuditTable"),
         ("[recordings]", "Recordings"),
         ("[params]", "Params"),

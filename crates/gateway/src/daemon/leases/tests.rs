@@ -4,11 +4,14 @@ use super::*;
 use crate::bus::supervision::Lease;
 use crate::config::Settings;
 
+const LEASE: &str = "supervision = { timeout = \"5s\" }\n";
+
 /// One bus at that port with these drives: name, address and access.
 fn bus(port: &str, drives: &[(&str, u8, &str)]) -> BusSettings {
     let drive = |(name, address, access): &(&str, u8, &str)| {
         format!(
-            "[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\naccess = \"{access}\"\n"
+            "[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\naccess = \"{access}\"\n{}",
+            if *access == "control" { LEASE } else { "" }
         )
     };
     let text = format!("[gateway]\nname = \"g\"\n[[bus]]\nname = \"line1\"\nport = \"{port}\"\n")
@@ -26,7 +29,7 @@ fn reloaded(before: &BusSettings, after: &BusSettings) -> (Vec<bool>, Vec<String
     let mut leases = Leases::default();
     leases.left(before, vec![Lease::held(Instant::now()), Lease::default()]);
     let of = leases
-        .of(after)
+        .of(after, Instant::now())
         .into_iter()
         .map(|lease| lease.ends().is_some())
         .collect();
@@ -70,6 +73,52 @@ fn a_lease_goes_with_the_machine_and_where_it_ends_that_is_told() {
                 "pump-1: the reload ended the lease of pump-1 (address 1 on /dev/ttyUSB0, profile `vacon-nx`)"
             ),
             "{told:?}"
+        );
+    }
+}
+
+/// Reloads from the first bus to the last one, each so long after the one before; how long ago the lease of `pump-1` was renewed then.
+fn over(buses: &[&BusSettings], pause: Duration) -> Option<Duration> {
+    let (mut parted, mut now) = (Parted::default(), Instant::now());
+    let mut held = vec![Lease::held(now); buses[0].drives.len()];
+    for pair in buses.windows(2) {
+        now += pause;
+        let (mut leases, _) = parted.recall(now);
+        leases.left(pair[0], held);
+        held = leases.of(pair[1], now);
+        parted.keep(&leases, &[], now);
+    }
+    let place = buses[buses.len() - 1]
+        .drives
+        .iter()
+        .position(|drive| drive.name == "pump-1")?;
+    (0..600)
+        .map(Duration::from_secs)
+        .find(|ago| now.checked_sub(*ago).map(Lease::held) == Some(held[place]))
+}
+
+#[test]
+fn a_lease_goes_on_when_a_reload_brings_its_drive_back() {
+    let all = bus("/dev/ttyUSB0", &[("pump-1", 1, "control"), ("pump-2", 2, "control")]);
+    let mut unsupervised = all.clone();
+    unsupervised.drives[0].supervision = None;
+    for without in [
+        bus("/dev/ttyUSB1", &[("pump-1", 1, "control"), ("pump-2", 2, "control")]),
+        bus("/dev/ttyUSB0", &[("pump-1", 5, "control"), ("pump-2", 2, "control")]),
+        bus("/dev/ttyUSB0", &[("pump-1", 1, "monitor"), ("pump-2", 2, "control")]),
+        bus("/dev/ttyUSB0", &[("pump-2", 2, "control")]),
+        unsupervised,
+    ] {
+        // It ran for a pause before the first reload; between the two its time stood.
+        let second = Duration::from_secs(1);
+        assert_eq!(over(&[&all, &without, &all], 7 * second), Some(7 * second));
+        assert_eq!(over(&[&all, &without, &without, &all], 7 * second), Some(7 * second));
+        assert_eq!(over(&[&all, &all, &without], 7 * second), None, "no drive, no lease");
+        assert_eq!(over(&[&all, &without, &all], RETURN + second), None, "too late");
+        assert_eq!(
+            over(&[&all, &without, &all, &all], 7 * second),
+            Some(14 * second),
+            "it runs again"
         );
     }
 }

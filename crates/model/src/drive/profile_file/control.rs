@@ -424,7 +424,7 @@ fn helper(control: &Control, place: Place) -> Point {
     };
     let source = Source::Raw(Raw::plain(place.table, place.address, form));
     let class = match control.own_word {
-        OwnWord::Read => PollClass::Slow,
+        OwnWord::Read | OwnWord::Kept => PollClass::Slow,
         OwnWord::Shadow => PollClass::Never,
     };
     Point {

@@ -308,7 +308,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         .map(|m| points.iter().position(|p| p.model == Some(*m)))
         .collect();
     let bases = parameters_of_bases(base.as_deref(), known);
-    let profile = Profile {
+    let mut profile = Profile {
         name: name.clone().unwrap_or_default(),
         title: reader.or("title", String::new()),
         source: reader.or("source", String::new()),
@@ -343,6 +343,9 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         tree: None,
         warnings: Vec::new(),
     };
+    if profile.control.is_none() {
+        profile.control = profile.control_of_bits();
+    }
     if profile.broadcast_stop && (profile.protocols.contains(&Protocol::N2) || profile.broadcast_stop().is_none()) {
         reader.problem(
             "broadcast_stop",

@@ -11,15 +11,16 @@ use axum::response::{IntoResponse, Response};
 use serde_json::{Value as Json_, json};
 use tokio::sync::{OwnedSemaphorePermit, watch};
 
-use super::super::api::ErrorReply;
 use super::super::body;
+use super::super::messages::ErrorReply;
 use super::super::routes::{AppState, Reached, no_drive};
-use super::{Operating, Operator};
+use super::{Operating, Operator, restart};
 use crate::command::{Answer, Authority, Order, Origin, Outcome, Parts, Refusal, SourceKind, stop_of};
 use crate::command_json::{
     self, CommandResult, Id, MAX_PAYLOAD, Repetition, SharedMemory, Taken, excerpt, find_id, unknown_drive,
 };
 use crate::drive::model::Kind;
+use crate::drive::{ModelPoint, Profile, RESTART_COMMUNICATION, Value};
 use crate::plant::{DriveHandle, Placed, Plant, Shown};
 use crate::process_image::Access;
 
@@ -50,7 +51,9 @@ enum Progress {
 struct Waiting {
     placed: Placed,
     id: Option<Id>,
-    drive: String,
+    drive: DriveHandle,
+    /// It has the motor run.
+    runs: bool,
     /// For those who repeat it; none of a stop, which is always executed.
     shared: Option<(watch::Sender<Option<CommandReply>>, OwnedSemaphorePermit)>,
 }
@@ -77,9 +80,9 @@ fn status(outcome: &Outcome) -> StatusCode {
         Outcome::Acknowledged(_) => StatusCode::OK,
         Outcome::Refused(Refusal::NotAllowed(_)) => StatusCode::FORBIDDEN,
         Outcome::Refused(Refusal::UnknownDrive(_)) => StatusCode::NOT_FOUND,
-        Outcome::Refused(Refusal::HeldByOther(_) | Refusal::Guarded(_) | Refusal::Interlocked(_)) => {
-            StatusCode::CONFLICT
-        }
+        Outcome::Refused(
+            Refusal::HeldByOther(_) | Refusal::NeedsTake(_) | Refusal::Guarded(_) | Refusal::Interlocked(_),
+        ) => StatusCode::CONFLICT,
         Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
         Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::NotStopped => StatusCode::CONFLICT,
         // Of what was not carried out.
@@ -121,6 +124,12 @@ async fn commanded(
     let operator = operator.map_err(IntoResponse::into_response)?;
     let payload = body::read(body, reached, MAX_PAYLOAD).await?;
     let plant = app.plant.load_full();
+    if let Some(drive) = restarts(&payload).then(|| plant.drive(name)).flatten()
+        && drive.image.spec.profile.counts_messages
+    {
+        let (answer, shown) = restart::communication(&drive, operator.origin(), asked).await;
+        return Ok(CommandReply::new(None, name, &answer, shown, SystemTime::now()));
+    }
     let times = (asked, Instant::now(), SystemTime::now());
     let progress = operating.take(&plant, &operator, name, &payload, times);
     match progress {
@@ -157,20 +166,41 @@ impl Waiting {
     async fn finished(mut self) -> CommandReply {
         let answer = self.placed.answered().await;
         self.placed.confirmed().await;
-        let shown = self.placed.shown();
-        CommandReply::new(self.id.as_ref(), &self.drive, &answer, shown, SystemTime::now())
+        let mut shown = self.placed.shown();
+        if self.runs && answer.outcome.is_ok() && shown == Shown::default() {
+            let explanation = self.drive.why(&self.drive.reading(Instant::now()));
+            shown.unseen = explanation.blocked_by().map(|causes| format!("blocked by {causes}"));
+        }
+        let name = &self.drive.image.spec.name;
+        CommandReply::new(self.id.as_ref(), name, &answer, shown, SystemTime::now())
     }
+}
+
+/// Whether that is all that a command asks for.
+fn restarts(payload: &[u8]) -> bool {
+    let wanted = json!({ RESTART_COMMUNICATION: true });
+    serde_json::from_slice::<Json_>(payload).is_ok_and(|asked| asked == wanted)
+}
+
+/// Whether the points have the motor run.
+fn has_run(points: &[(usize, Value)], profile: &Profile) -> bool {
+    let run = profile.model_index(ModelPoint::Run);
+    points
+        .iter()
+        .any(|(index, value)| Some(*index) == run && *value == Value::Bool(true))
 }
 
 impl Operator {
     /// As the audit shows it. All that a user does counts as one client.
-    pub(super) fn origin(&self) -> Origin {
-        if self.kind == SourceKind::LocalSocket {
-            return Origin::new(self.kind, self.user.to_string()).with_login(self.login.clone());
+    pub(in crate::http) fn origin(&self) -> Origin {
+        if self.kind != SourceKind::Http {
+            let origin = Origin::new(self.kind, self.user.to_string());
+            return origin.with_login(self.login.clone()).proven(self.proof.clone());
         }
         let client = format!("{} {}", self.kind.name(), self.user);
         let who = format!("{} {}", self.user, self.address);
-        Origin::of(client.into(), self.kind, who).with_login(self.login.clone())
+        let origin = Origin::of(client.into(), self.kind, who);
+        origin.with_login(self.login.clone()).proven(self.proof.clone())
     }
 }
 
@@ -201,7 +231,8 @@ impl Operating {
             Ok(asked) => asked,
             Err(refusal) => return refuse(refusal, origin),
         };
-        let (stop, order) = (stop_of(&asked.points, profile), Order::Points(asked.points));
+        let (stop, runs) = (stop_of(&asked.points, profile), has_run(&asked.points, profile));
+        let order = Order::Points(asked.points);
         let only_stops = stop.is_some() && matches!(Parts::of(order.clone(), profile), Parts::One(_));
         let (mut refused, mut shared) = (asked.refused, None);
         if refused.is_none() && !only_stops {
@@ -229,7 +260,8 @@ impl Operating {
         };
         Progress::Placed(Waiting {
             placed,
-            drive: name.to_string(),
+            drive,
+            runs,
             shared,
             id,
         })
@@ -327,11 +359,14 @@ fn description(drive: &DriveHandle, operator: &Operator) -> Json_ {
             })
         })
         .collect();
+    let rank = drive.rank_of(&operator.origin());
     json!({
         "drive": spec.name,
         "points": points,
         "lease_ms": spec.supervision.as_ref().map(|lease| u64::try_from(lease.timeout.as_millis()).unwrap_or(u64::MAX)),
         "commanded_last": drive.commander().as_ref() == Some(&operator.login),
+        "principal": rank.as_ref().map(|(name, _)| name),
+        "outranks": rank.map(|(_, below)| below),
     })
 }
 
@@ -354,10 +389,7 @@ pub(in crate::http) async fn heartbeat(
     match renew(&drive, &operator, Instant::now()) {
         Ok(()) => StatusCode::NO_CONTENT.into_response(),
         Err(why) => {
-            let error = ErrorReply {
-                error: why.to_string(),
-                known: Vec::new(),
-            };
+            let error = ErrorReply::new(why.to_string());
             (StatusCode::CONFLICT, Json(error)).into_response()
         }
     }
@@ -372,12 +404,17 @@ fn renew(drive: &DriveHandle, operator: &Operator, now: Instant) -> Result<(), &
     if spec.access != Access::Control {
         return Err("the drive is only monitored; nothing was renewed");
     }
+    let origin = operator.origin();
+    if drive.hold_view(Some(&origin), now).is_some_and(|(_, own)| own) {
+        drive.heartbeat(&origin, now);
+        return Ok(());
+    }
     if spec.supervision.is_none() {
         return Err("the drive has no `supervision`, so there is no lease to renew");
     }
     match drive.commander() {
         Some(login) if login == operator.login => {
-            drive.image.renew_lease(now);
+            drive.heartbeat(&origin, now);
             Ok(())
         }
         _ => Err("this login was not the last to command the drive; nothing was renewed"),

@@ -13,8 +13,8 @@ use axum::response::{IntoResponse, Response};
 use ring::rand::{SecureRandom, SystemRandom};
 use serde::Serialize;
 
-use super::super::api::ErrorReply;
 use super::super::body;
+use super::super::messages::ErrorReply;
 use super::super::routes::{AppState, Reached};
 use super::cookies::{Cookies, known_as};
 use super::sessions::Session;
@@ -46,10 +46,7 @@ impl<'s> SessionReply<'s> {
 
 impl IntoResponse for Denied {
     fn into_response(self) -> Response {
-        let error = ErrorReply {
-            error: self.to_string(),
-            known: Vec::new(),
-        };
+        let error = ErrorReply::new(self.to_string());
         let mut response = (self.status(), Json(error)).into_response();
         let headers = response.headers_mut();
         match self {
@@ -94,10 +91,7 @@ async fn logged_in(
     is_own_origin(&parts.headers).map_err(Denied::into_response)?;
     let body = body::read(body, reached, MAX_LOGIN).await?;
     let given = credentials(&parts.headers, &body).ok_or_else(|| {
-        let error = ErrorReply {
-            error: "send {\"user\": …, \"password\": …} as application/json".to_string(),
-            known: Vec::new(),
-        };
+        let error = ErrorReply::new("send {\"user\": …, \"password\": …} as application/json".to_string());
         (StatusCode::BAD_REQUEST, Json(error)).into_response()
     })?;
     let address = reached.peer.ip();

@@ -6,7 +6,11 @@
 
 mod commands;
 mod cookies;
+mod hold;
 mod login;
+pub(super) mod parameters;
+mod record;
+mod restart;
 mod sessions;
 mod stop_all;
 mod throttle;
@@ -31,15 +35,17 @@ pub(super) use self::cookies::Cookies;
 use self::sessions::{IDLE, Secrets, Session, Sessions};
 use self::throttle::{Source, Throttle};
 use self::verifier::Verifier;
-use super::routes::Reached;
+use super::routes::{LocalUser, Reached};
 use super::users::{MAX_PASSWORD, User, Users};
 use crate::NorthStats;
-use crate::command::{Authority, SourceKind};
+use crate::command::{Authority, Proof, SourceKind};
 use crate::log_throttle::LogThrottle;
 
 pub(crate) use self::commands::PostedCommands;
 pub(super) use self::commands::{command, commands_of, heartbeat};
+pub(super) use self::hold::{hold, hold_of};
 pub(super) use self::login::{log_in, log_out, session};
+pub(super) use self::record::record;
 pub(super) use self::stop_all::stop;
 
 /// A password that a program sends with each request is not hashed anew for that long.
@@ -88,19 +94,20 @@ pub(super) struct Operator {
     address: IpAddr,
     /// The way in.
     kind: SourceKind,
+    proof: Proof,
     /// The cookie of its session; `None` for a program.
     cookie: Option<String>,
 }
 
 impl Operator {
     /// Who came through the local socket.
-    fn local(uid: u32, address: IpAddr) -> Operator {
-        let user: Arc<str> = format!("uid {uid}").into();
+    fn local(local: &LocalUser, address: IpAddr) -> Operator {
         Operator {
-            login: format!("{} {user}", SourceKind::LocalSocket.name()).into(),
-            user,
+            login: format!("{} {}", local.kind.name(), local.who).into(),
+            user: local.who.clone(),
             address,
-            kind: SourceKind::LocalSocket,
+            kind: local.kind,
+            proof: local.proof.clone(),
             cookie: None,
         }
     }
@@ -212,13 +219,14 @@ impl Operating {
     ) -> Result<Operator, Denied> {
         let address = reached.peer.ip();
         if let Some(local) = &reached.local {
-            return Ok(Operator::local(local.uid, address));
+            return Ok(Operator::local(local, address));
         }
         if headers.contains_key(header::AUTHORIZATION) {
             let credentials = basic(headers).ok_or(Denied::NotLoggedIn)?;
             let user = self.verified(&credentials, address, Source::of(address)).await?;
             return Ok(Operator {
                 login: user.clone(),
+                proof: Proof::User(user.clone()),
                 user,
                 address,
                 kind: SourceKind::Http,
@@ -228,6 +236,7 @@ impl Operating {
         let cookie = cookies.session(headers).ok_or(Denied::NotLoggedIn)?;
         let session = self.session(&cookie, Instant::now()).ok_or(Denied::SessionEnded)?;
         Ok(Operator {
+            proof: Proof::User(session.user.clone()),
             user: session.user,
             login: session.login,
             address,
@@ -362,6 +371,7 @@ impl Operating {
             login: session.login.clone(),
             address,
             kind: SourceKind::Http,
+            proof: Proof::User(user.clone()),
             cookie: Some(cookie.clone()),
         };
         self.used(&operator, now);
@@ -430,11 +440,22 @@ fn basic(headers: &HeaderMap) -> Option<Credentials> {
     })
 }
 
+/// The header of HTTP Basic for `USER:PASSWORD`.
+pub fn basic_authorization(user_and_password: &str) -> String {
+    let mut text = vec![0; Encoding::B64.encoded_len(user_and_password.as_bytes())];
+    // The buffer fits.
+    let text = Encoding::B64
+        .encode(user_and_password.as_bytes(), &mut text)
+        .unwrap_or_default();
+    let padding = "=".repeat(text.len().next_multiple_of(4) - text.len());
+    format!("Basic {text}{padding}")
+}
+
 /// Whether a path belongs to commands; without them there is nothing at it.
 pub(super) fn is_operating(path: &str) -> bool {
     let of_drive = |rest: &str| {
         rest.split_once('/')
-            .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat"))
+            .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat" | "hold"))
     };
     is_session(path)
         || path == "/api/v1/stop"
@@ -449,7 +470,12 @@ pub(super) fn is_session(path: &str) -> bool {
 
 /// Whether a request may be one of those that change something, while commands are on.
 pub(super) fn may_change(method: &Method, path: &str) -> bool {
-    *method == Method::POST && is_operating(path)
+    let of_drive = |rest: &str| {
+        rest.split_once('/')
+            .is_some_and(|(_, what)| matches!(what, "recordings" | "params/reading" | "params/restore"))
+    };
+    let changes = is_operating(path) || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive);
+    *method == Method::POST && changes
 }
 
 /// Whether it is a command: that is served in whatever way the client got in.

@@ -8,8 +8,8 @@ use axum::extract::{Extension, Request, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 
-use super::super::api::ErrorReply;
 use super::super::body;
+use super::super::messages::ErrorReply;
 use super::super::routes::{AppState, Reached};
 use crate::command_json::{MAX_PAYLOAD, stop_all};
 use crate::stop_all::NothingToStop;

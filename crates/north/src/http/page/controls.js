@@ -40,6 +40,22 @@ function standingReference({ points }) {
 /// The direction that the drive has been ordered, else the one that it shows: true for reverse.
 const orderedReverse = ({ points }) => [points.reverse, points.reversed].find(isGood)?.value === true;
 
+// ---- Who holds the drive
+
+/// Whether another client holds it.
+const isHeldByOther = ({ json, about }) => json.hold === "held" && json.holder !== about?.principal;
+
+/// Whether this login ranks above the client that holds it.
+const mayTakeOver = (drive) => isHeldByOther(drive) && (drive.about?.outranks ?? []).includes(drive.json.holder_rank);
+
+function holdWords(drive) {
+  const { hold, holder, holder_rank: rank, hold_left_s: left } = drive.json;
+  if (isHeldByOther(drive)) return t("held by {holder} ({rank}), {left} s left", { holder, rank, left });
+  if (hold === "reserved") return t("stopped by {holder} ({rank}), reserved for {left} s", { holder, rank, left });
+  if (hold === "local") return t("under local control");
+  return "";
+}
+
 // ---- The reference
 
 function buildReference(panel, name, { command, tell, known }) {
@@ -93,8 +109,9 @@ function buildQuestion(panel, name, { command, known }) {
   });
   panel.really = button("operate-button operate-start", "", "", () => {
     const [points, what] = panel.order;
+    const takesOver = panel.takesOver;
     panel.close();
-    command(name, points, what);
+    command(name, points, what, takesOver);
   });
   panel.cancel = button("operate-button", t("Cancel"), t("Cancel: do not start {drive}", { drive: name }), () => panel.close());
   panel.question = make("span", "operate-confirm", panel.asked, panel.choice, panel.really, panel.cancel);
@@ -104,6 +121,7 @@ function buildQuestion(panel, name, { command, known }) {
   panel.open = (kind) => {
     const { json } = known(name);
     panel.asking = kind;
+    panel.takesOver = kind === "start" && mayTakeOver(known(name));
     panel.directions[orderedReverse(json) ? 1 : 0].checked = true;
     // Whatever becomes of the drive meanwhile: what was asked is what is done.
     panel.target = !orderedReverse(json);
@@ -134,11 +152,11 @@ function ask(panel, name, { json, about }) {
     panel.order = [{ reverse: isReverse }, t("Direction {direction}", told)];
   } else if (hasReverse(about)) {
     text(panel.asked, t("Start {drive} {direction}, {reference}? The motor turns.", told));
-    text(panel.really, t("Start now"));
+    text(panel.really, panel.takesOver ? t("Take over and start") : t("Start now"));
     panel.order = [{ run: true, reverse: isReverse }, t("Start {direction}", told)];
   } else {
     text(panel.asked, t("Start {drive}, {reference}? The motor turns.", told));
-    text(panel.really, t("Start now"));
+    text(panel.really, panel.takesOver ? t("Take over and start") : t("Start now"));
     panel.order = [{ run: true }, t("Start")];
   }
   panel.really.setAttribute("aria-label", `${panel.really.textContent}: ${name}`);
@@ -154,11 +172,12 @@ export function build(panel, name, actions) {
   buildReference(panel, name, actions);
   panel.result = make("span", "operate-result");
   panel.result.setAttribute("role", "status");
+  panel.holder = make("span", "operate-lease");
   panel.lease = make("span", "operate-lease");
   panel.place.setAttribute("role", "group");
   panel.place.setAttribute("aria-label", t("Commands of {drive}", { drive: name }));
   panel.place.classList.add("operate");
-  panel.place.replaceChildren(panel.stop, make("b", "operate-name", name), panel.start, panel.turn, panel.question, panel.reference, panel.reset, panel.result, panel.lease);
+  panel.place.replaceChildren(panel.stop, make("b", "operate-name", name), panel.start, panel.turn, panel.question, panel.reference, panel.reset, panel.holder, panel.result, panel.lease);
   panel.show = (drive) => show(panel, name, drive);
   panel.built = true;
 }
@@ -173,9 +192,11 @@ function show(panel, name, drive) {
     text(panel.range, limits(point));
   }
   hide(panel.reset, json.state !== "fault");
+  text(panel.holder, holdWords(drive));
   if (panel.asking) return panel.ask();
   const runs = json.state === "running";
   hide(panel.start, runs);
+  text(panel.start, mayTakeOver(drive) ? t("Take over and start …") : t("Start …"));
   hide(panel.turn, !runs || !hasReverse(about));
   text(panel.turn, orderedReverse(json) ? t("Forward …") : t("Reverse …"));
   panel.turn.setAttribute("aria-label", `${name}: ${panel.turn.textContent}`);

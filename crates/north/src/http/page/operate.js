@@ -11,6 +11,7 @@
 import { clock, text } from "./common.js";
 import { build } from "./controls.js";
 import { check, isLoggedIn, onSession, post } from "./session.js";
+import "./stop_all.js";
 import { notStopped, stopped } from "./stops.js";
 import { t, wordsOf } from "./texts.js";
 
@@ -68,13 +69,29 @@ function words(status, json) {
   return json.error || t("The gateway answered {status}.", { status });
 }
 
-async function command(name, points, what) {
+// A start takes the drive first, where somebody may hold it, and takes it over where that was asked.
+async function take(name, takesOver, abort) {
+  const drive = known(name);
+  if (drive.json?.hold === undefined) return null;
+  const act = (action) => post(pathOf(name, "hold"), { action }, ANSWER_MS, abort);
+  const taken = await act("take");
+  const over = taken.status === 409 && takesOver ? await act("break") : taken;
+  return over.status === 200 ? null : over;
+}
+
+async function command(name, points, what, takesOver = false) {
   const drive = known(name);
   const abort = new AbortController();
   drive.pending.add(abort);
   drive.commanded = performance.now();
   tell(name, t("{what}: sent …", { what }), null);
   try {
+    const refused = points.run === true ? await take(name, takesOver, abort) : null;
+    if (refused !== null || abort.signal.aborted) {
+      if (refused !== null && !drive.stopping) tell(name, `${what}: ${words(refused.status, refused.json)}`, false);
+      drive.pending.delete(abort);
+      return;
+    }
     const { status, json } = await send(name, points, ANSWER_MS, abort);
     if (status === 200) drive.ours = true;
     if (!drive.stopping) tell(name, `${what}: ${words(status, json)}`, status === 200);

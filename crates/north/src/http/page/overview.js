@@ -113,7 +113,8 @@ export function showDrive(row, drive) {
   text(row.blocked, blocked);
   hide(row.blocked, !blocked);
   text(row.bus, drive.bus);
-  text(row.address, ` · ${t("address {address}", drive)}`);
+  const doubt = drive.profile_verified === false ? ` · ${t("not verified on hardware")}` : "";
+  text(row.address, ` · ${t("address {address}", drive)}${doubt}`);
   for (const entry of row.cells) {
     const point = drive.points[entry.point];
     showValue(entry, point, drive.quality);

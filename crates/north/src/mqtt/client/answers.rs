@@ -10,7 +10,7 @@ impl Client {
         let plant = (!limits.wildcards).then_some(self.observed.as_ref());
         self.subscriptions = subscriptions(
             &self.topics,
-            self.options.commands,
+            (self.options.commands, self.options.principals.as_deref()),
             self.announcer.as_ref(),
             self.leftovers_known,
             plant,

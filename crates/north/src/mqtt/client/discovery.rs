@@ -25,7 +25,7 @@ pub(super) fn discovery_topics(announcer: Option<&mut Announcer>, plant: &Plant)
 /// What a connection subscribes to; `plant` if the broker takes no wildcards.
 pub(super) fn subscriptions(
     topics: &Topics,
-    commands: bool,
+    (commands, principals): (bool, Option<&[String]>),
     announcer: Option<&Announcer>,
     leftovers_known: bool,
     plant: Option<&Plant>,
@@ -35,10 +35,15 @@ pub(super) fn subscriptions(
         None => topics.set_filters().to_vec(),
         Some(plant) => topics.set_topics(plant),
     });
+    let named = principals.filter(|_| commands).map(|principals| match plant {
+        None => topics.authority_filters().to_vec(),
+        Some(plant) => topics.authority_topics(plant, principals),
+    });
+    let sets = sets.into_iter().chain(named);
     let leftovers = announcer.filter(|_| !leftovers_known && plant.is_none());
     std::iter::once(topics.status())
         .map(subscription(Subscribed::Status))
-        .chain(sets.into_iter().flatten().map(subscription(Subscribed::Commands)))
+        .chain(sets.flatten().map(subscription(Subscribed::Commands)))
         .chain(
             announcer
                 .map(Announcer::birth_topic)

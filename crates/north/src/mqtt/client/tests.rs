@@ -32,6 +32,7 @@ fn options(buffer: Option<Buffer>) -> Options {
         commands: true,
         require_id: false,
         response_topics: Vec::new(),
+        principals: None,
         buffer,
         home_assistant: None,
         sparkplug: None,

@@ -52,6 +52,10 @@ enum Source {
     TextOf(usize),
     State,
     FaultText,
+    HoldState,
+    Holder,
+    HoldRank,
+    HoldLeft,
     CommandResult,
     CommandError,
 }
@@ -90,6 +94,18 @@ impl DriveMetrics {
         }
         if spec.profile.model_index(ModelPoint::FaultCode).is_some() {
             all.push((Source::FaultText, text("fault_text")));
+        }
+        if drive.is_guarded() {
+            all.push((Source::HoldState, text("Hold/State")));
+            all.push((Source::Holder, text("Hold/Holder")));
+            all.push((Source::HoldRank, text("Hold/Rank")));
+            let left = Definition {
+                datatype: DataType::Int64,
+                unit: "s".to_string(),
+                pace: Pace::Figure,
+                ..text("Hold/Left")
+            };
+            all.push((Source::HoldLeft, left));
         }
         if commands {
             all.push((Source::CommandResult, text(COMMAND_RESULT)));
@@ -168,6 +184,20 @@ impl DriveMetrics {
                     value: good.then(|| Datum::Text(reading.fault_text())),
                     quality: code.quality,
                     time: moment.millis_at(code.at.filter(|_| good)),
+                }
+            }
+            Source::HoldState | Source::Holder | Source::HoldRank | Source::HoldLeft => {
+                let view = self.drive.hold_view(None, moment.now).map(|(view, _)| view);
+                let value = view.map(|view| match source {
+                    Source::HoldState => Datum::Text(view.state.name().to_string()),
+                    Source::Holder => Datum::Text(view.holder.unwrap_or_default().to_string()),
+                    Source::HoldRank => Datum::Text(view.rank.unwrap_or_default().to_string()),
+                    _ => Datum::Integer(view.left_s.and_then(|left| i64::try_from(left).ok()).unwrap_or(-1)),
+                });
+                Sample {
+                    quality: if value.is_some() { Quality::Good } else { Quality::Bad },
+                    value,
+                    time: millis(moment.wall),
                 }
             }
             Source::CommandResult | Source::CommandError => {

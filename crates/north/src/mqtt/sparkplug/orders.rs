@@ -14,7 +14,7 @@ use super::model::DriveMetrics;
 use super::session::Session;
 use super::wire::{self, Metric, MetricValue, Payload};
 use crate::command::{
-    Answer, Authority, CONFIRMED, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, SourceKind, stop_of,
+    Answer, Authority, CONFIRMED, DEFAULT_EXPIRY, Order, Origin, Parts, Proof, Refusal, SourceKind, stop_of,
 };
 use crate::command_json::{SharedMemory, Taken, excerpt, resolve, unknown_drive};
 use crate::drive::{Profile, Value};
@@ -106,7 +106,7 @@ impl Orders {
         let who = who
             .as_deref()
             .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
-        let origin = Origin::of(self.client.clone(), SourceKind::Sparkplug, who);
+        let origin = Origin::of(self.client.clone(), SourceKind::Sparkplug, who).proven(Proof::Sparkplug);
         let Some((place, metrics)) = target else {
             let name = excerpt(device.as_bytes());
             let why = unknown_drive(device, plant);

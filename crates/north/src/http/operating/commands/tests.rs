@@ -12,6 +12,7 @@ fn operator(user: &str, login: &str) -> Operator {
         login: login.into(),
         address: [192, 0, 2, 1].into(),
         kind: SourceKind::Http,
+        proof: crate::command::Proof::User(user.into()),
         cookie: None,
     }
 }

@@ -4,8 +4,7 @@
 use std::future::poll_fn;
 use std::time::{Duration, Instant};
 
-use super::protocol::WriteOutcome;
-use crate::codec::RequestPdu;
+use crate::codec::{Reply, RequestPdu};
 use crate::command::{Answer, DEFAULT_EXPIRY, Origin, Outcome, Refusal};
 use crate::drive::RESTART_COMMUNICATION;
 use crate::plant::{DriveHandle, Question, Shown, Target};
@@ -15,16 +14,19 @@ use crate::process_image::Access;
 const BACK: Duration = Duration::from_secs(12);
 const LOOK: Duration = Duration::from_millis(50);
 
+/// What to do where the drive does not answer.
+const NO_ANSWER: &str = "the drive does not answer: check its supply, the wiring and its address";
+
 /// Sends it, and waits until the drive answers again. Nothing is told as done that was not seen.
-pub(super) async fn communication(drive: &DriveHandle, origin: Origin, asked: Instant) -> WriteOutcome {
+pub(super) async fn communication(drive: &DriveHandle, origin: Origin, asked: Instant) -> (Answer, Shown) {
     let (spec, now) = (&drive.image.spec, Instant::now());
     if spec.access != Access::Control {
         let refusal = Refusal::NotAllowed(format!(
             "drive `{}` takes no commands; set access = \"control\"",
             spec.name
         ));
-        return WriteOutcome::new(
-            &drive.refuse(RESTART_COMMUNICATION, refusal, origin, now),
+        return (
+            drive.refuse(RESTART_COMMUNICATION, refusal, origin, now),
             Shown::default(),
         );
     }
@@ -42,24 +44,23 @@ pub(super) async fn communication(drive: &DriveHandle, origin: Origin, asked: In
     let mut exchange = drive.ask_line(question, now);
     let (outcome, _) = poll_fn(|cx| exchange.poll(cx)).await;
     let sent = Instant::now();
-    let answer = |outcome: Outcome| Answer {
-        outcome,
-        latency: sent.saturating_duration_since(now),
-    };
-    let mut told = WriteOutcome::new(&answer(outcome), Shown::default());
     let answers = || drive.image.snapshot().fast_at.is_some_and(|at| at > sent);
     while !answers() && sent.elapsed() < BACK {
         tokio::time::sleep(LOOK).await;
     }
+    let latency = sent.saturating_duration_since(now);
     // In Listen Only Mode the drive does not answer the request that ends it.
-    if told.result == "timeout" && answers() {
-        let millis = |time: Duration| (time.as_secs_f64() * 1e6).round() / 1e3;
-        told.ok = true;
-        told.result = crate::command::CONFIRMED.to_string();
-        told.confirmed_ms = Some(millis(now.elapsed()));
-        told.message = "sent; the drive answers again".to_string();
-    } else if !told.ok {
-        told.message += "; the drive does not answer: check its supply, the wiring and its address";
+    if outcome == Outcome::TimedOut && answers() {
+        let shown = Shown {
+            after: Some(now.elapsed()),
+            unseen: None,
+        };
+        let outcome = Outcome::Acknowledged(Reply::Written);
+        return (Answer { outcome, latency }, shown);
     }
-    told
+    let shown = Shown {
+        after: None,
+        unseen: (!outcome.is_ok()).then(|| NO_ANSWER.to_string()),
+    };
+    (Answer { outcome, latency }, shown)
 }

@@ -1,0 +1,212 @@
+//! Who holds a drive, on the line: no order of one who does not hold it, every stop.
+
+use super::*;
+use crate::command::{Mode, Principal, Proof, Refusal, Rules, Verb};
+use crate::plant::{DriveHandle, Plant};
+use std::time::Duration as Time;
+
+/// The NX says by that bit that the fieldbus controls it.
+const FIELDBUS: (u16, u16) = (2101, 1 << 13);
+
+fn guarded(drives: u8, mode: Mode) -> (Rig, Plant) {
+    let mut rig = Rig::new(drives);
+    let principals = ["op", "plc", "cloud"]
+        .into_iter()
+        .zip(1..)
+        .map(|(name, rank)| Principal {
+            mqtt: Some(name.to_string()),
+            ..Principal::new(name, rank)
+        });
+    let rules = Rules {
+        mode,
+        ranks: ["site", "operator", "automation", "remote"].map(Into::into).to_vec(),
+        lease: Time::from_secs(30),
+        stop_at_local: true,
+        principals: principals.collect(),
+    };
+    rig.bus.queue.set_authority(Some(Arc::new(rules)));
+    for drive in &mut rig.drives {
+        drive.holding.insert(FIELDBUS.0, FIELDBUS.1);
+    }
+    rig.run(Time::from_secs(2));
+    rig.bus.image.update_health(|health| health.up = true);
+    let plant = Plant {
+        gateway: "g".to_string(),
+        stale_after: Time::from_secs(1),
+        buses: vec![rig.bus.clone()],
+        events: Default::default(),
+        writes: rig.stats.clone(),
+        recordings: Default::default(),
+        stop_all: Arc::default(),
+        parameters: Default::default(),
+        history: Default::default(),
+    };
+    (rig, plant)
+}
+
+fn drive(plant: &Plant, index: usize) -> DriveHandle {
+    plant.drives().nth(index).unwrap()
+}
+
+fn who(name: &str) -> Origin {
+    Origin::new(SourceKind::Mqtt, name).proven(Proof::Topic(name.into()))
+}
+
+fn place(rig: &Rig, plant: &Plant, name: &str, point: ModelPoint, value: Value) -> crate::plant::Placed {
+    let drive = drive(plant, 0);
+    let index = drive.image.spec.profile.model_index(point).unwrap();
+    let order = Order::Points(vec![(index, value)]);
+    drive.place(order, who(name), Authority::Write, DEFAULT_EXPIRY, rig.now)
+}
+
+fn code(placed: &mut crate::plant::Placed) -> &'static str {
+    placed.answer().map_or("none", |answer| answer.outcome.code())
+}
+
+fn writes(rig: &Rig, from: usize) -> usize {
+    let wire = rig.wire.get(from..).unwrap_or_default();
+    wire.iter().filter(|(_, turn)| turn.pdu().is_write()).count()
+}
+
+#[test]
+fn only_the_holder_is_on_the_wire_and_every_stop() {
+    let (mut rig, plant) = guarded(1, Mode::Exclusive);
+    let mut run = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
+    rig.run(Time::from_millis(200));
+    assert_eq!((code(&mut run), rig.runs(0)), ("acknowledged", true));
+    let from = rig.wire.len();
+    for name in ["op", "cloud", "stranger"] {
+        let points = [
+            (ModelPoint::Run, Value::Bool(true)),
+            (ModelPoint::SpeedReference, Value::Number(10.0)),
+            (ModelPoint::FaultReset, Value::Bool(true)),
+        ];
+        for (point, value) in points {
+            let mut refused = place(&rig, &plant, name, point, value);
+            rig.run(Time::from_millis(60));
+            let expected = if name == "stranger" {
+                "not_allowed"
+            } else {
+                "held_by_other"
+            };
+            assert_eq!(code(&mut refused), expected, "{name} {point:?}");
+        }
+    }
+    assert_eq!(writes(&rig, from), 0);
+    let mut stop = place(&rig, &plant, "cloud", ModelPoint::Run, Value::Bool(false));
+    rig.run(Time::from_millis(200));
+    assert_eq!((code(&mut stop), rig.runs(0)), ("acknowledged", false));
+    // The stopper ranks below: the PLC takes it by an order.
+    let mut run = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
+    rig.run(Time::from_millis(200));
+    assert_eq!((code(&mut run), rig.runs(0)), ("acknowledged", true));
+    let mut stop = place(&rig, &plant, "stranger", ModelPoint::Run, Value::Bool(false));
+    rig.run(Time::from_millis(200));
+    assert_eq!((code(&mut stop), rig.runs(0)), ("acknowledged", false));
+}
+
+#[test]
+fn advisory_sends_all_and_counts() {
+    let (mut rig, plant) = guarded(1, Mode::Advisory);
+    for name in ["plc", "op", "cloud"] {
+        let mut reference = place(&rig, &plant, name, ModelPoint::SpeedReference, Value::Number(10.0));
+        rig.run(Time::from_millis(200));
+        assert_eq!(code(&mut reference), "acknowledged", "{name}");
+    }
+    assert_eq!(rig.bus.queue.lock().unheld(0), 2);
+}
+
+#[test]
+fn what_waits_when_a_hold_is_broken_is_not_sent() {
+    let (mut rig, plant) = guarded(1, Mode::Exclusive);
+    let mut first = place(&rig, &plant, "plc", ModelPoint::SpeedReference, Value::Number(20.0));
+    rig.run(Time::from_millis(200));
+    assert_eq!(code(&mut first), "acknowledged");
+    let from = rig.wire.len();
+    let mut waits = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
+    let handle = drive(&plant, 0);
+    let refused = handle.hold(Verb::Break, &who("cloud"), Authority::Write, rig.now);
+    assert!(matches!(refused, Err(Refusal::HeldByOther(_))), "{refused:?}");
+    handle.hold(Verb::Break, &who("op"), Authority::Write, rig.now).unwrap();
+    rig.run(Time::from_millis(300));
+    assert_eq!(
+        (code(&mut waits), rig.runs(0), writes(&rig, from)),
+        ("held_by_other", false, 0)
+    );
+}
+
+#[test]
+fn what_has_begun_goes_no_further_when_a_hold_is_broken() {
+    let (mut rig, plant) = guarded(1, Mode::Exclusive);
+    // A reference and run: two steps.
+    let handle = drive(&plant, 0);
+    let profile = handle.image.spec.profile.clone();
+    let index = |point| profile.model_index(point).unwrap();
+    let order = Order::Points(vec![
+        (index(ModelPoint::Run), Value::Bool(true)),
+        (index(ModelPoint::SpeedReference), Value::Number(30.0)),
+    ]);
+    let mut both = handle.place(order, who("plc"), Authority::Write, DEFAULT_EXPIRY, rig.now);
+    let from = rig.wire.len();
+    while writes(&rig, from) == 0 {
+        rig.step();
+    }
+    assert!(!rig.runs(0), "the reference goes first");
+    handle.hold(Verb::Break, &who("op"), Authority::Write, rig.now).unwrap();
+    rig.run(Time::from_millis(300));
+    assert_eq!((code(&mut both), rig.runs(0)), ("interrupted", false));
+}
+
+#[test]
+fn the_turn_is_judged_again() {
+    let (mut rig, plant) = guarded(1, Mode::Exclusive);
+    let mut waits = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
+    // Before its turn a reload removes the client, and another one takes the drive.
+    let rules = rig.bus.queue.lock().rules().cloned().unwrap();
+    let mut fewer = Rules::clone(&rules);
+    fewer.principals.retain(|principal| &*principal.name != "plc");
+    rig.bus.queue.set_authority(Some(Arc::new(fewer)));
+    let from = rig.wire.len();
+    rig.run(Time::from_millis(300));
+    assert_eq!((code(&mut waits), writes(&rig, from)), ("not_allowed", 0));
+}
+
+#[test]
+fn the_silence_of_the_holder_is_the_one_that_counts() {
+    for (name, stops) in [("op", true), ("plc", false)] {
+        let (mut rig, plant) = guarded(1, Mode::Exclusive);
+        drop(place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true)));
+        rig.run(Time::from_millis(100));
+        assert!(rig.runs(0));
+        for _ in 0..20 {
+            drive(&plant, 0).heartbeat(&who(name), rig.now);
+            rig.run(Time::from_millis(100));
+        }
+        assert_eq!(!rig.runs(0), stops, "heartbeats of {name}");
+    }
+}
+
+#[test]
+fn under_local_control_nobody_commands() {
+    let (mut rig, plant) = guarded(1, Mode::Exclusive);
+    drop(place(
+        &rig,
+        &plant,
+        "plc",
+        ModelPoint::SpeedReference,
+        Value::Number(20.0),
+    ));
+    rig.run(Time::from_millis(300));
+    rig.drives[0].holding.insert(FIELDBUS.0, 0);
+    rig.run(Time::from_millis(1500));
+    let view = |now| drive(&plant, 0).hold_view(None, now).unwrap().0.state.name();
+    assert_eq!(view(rig.now), "local");
+    let mut refused = place(&rig, &plant, "plc", ModelPoint::SpeedReference, Value::Number(10.0));
+    assert_eq!(code(&mut refused), "held_by_other");
+    let mut stop = place(&rig, &plant, "stranger", ModelPoint::Run, Value::Bool(false));
+    rig.run(Time::from_millis(300));
+    assert_eq!(code(&mut stop), "acknowledged");
+    rig.drives[0].holding.insert(FIELDBUS.0, FIELDBUS.1);
+    rig.run(Time::from_millis(1500));
+    assert_eq!(view(rig.now), "free");
+}

@@ -1,0 +1,68 @@
+//! What outlives the process: the reservation that a stop left behind. Pure: both clocks are arguments.
+
+use std::time::{Duration, Instant, SystemTime};
+
+use serde::{Deserialize, Serialize};
+
+use super::{Claim, Rules};
+use crate::process_image::Machine;
+
+/// A reservation as it is kept.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct KeptReservation {
+    /// Port of the bus of the machine.
+    pub port: String,
+    /// Its address there.
+    pub address: u8,
+    /// Its profile.
+    pub profile: String,
+    /// Who stopped it.
+    pub who: String,
+    /// The name of its rank then.
+    pub rank: String,
+    /// When, by the clock of the day, ms since 1970.
+    pub stopped_ms: u64,
+    /// For how long.
+    pub lease_ms: u64,
+}
+
+/// Milliseconds of the clock of the day.
+fn milliseconds(time: SystemTime) -> u64 {
+    let since = time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
+}
+
+impl KeptReservation {
+    /// One of that machine, for a client of that name and rank.
+    pub fn new(
+        machine: Machine,
+        (who, rank): (String, String),
+        stopped: SystemTime,
+        lease: Duration,
+    ) -> KeptReservation {
+        KeptReservation {
+            port: machine.port,
+            address: machine.address,
+            profile: machine.profile,
+            who,
+            rank,
+            stopped_ms: milliseconds(stopped),
+            lease_ms: u64::try_from(lease.as_millis()).unwrap_or(u64::MAX),
+        }
+    }
+
+    /// Who it is for, and until when it goes on after a start at `now`, which is `time` on the calendar; nothing where it is over,
+    /// or its rank is no more. Where the clock stands before the stop, all of it is left.
+    pub fn goes_on(&self, rules: &Rules, now: Instant, time: SystemTime) -> Option<(Claim, Instant)> {
+        let rank = rules.ranks.iter().position(|rank| **rank == *self.rank)?;
+        let passed = milliseconds(time).saturating_sub(self.stopped_ms);
+        let left = Duration::from_millis(self.lease_ms.checked_sub(passed)?).min(rules.lease);
+        let who = Claim {
+            name: self.who.as_str().into(),
+            rank,
+            cyclic: false,
+            breaks: false,
+        };
+        (left > Duration::ZERO).then(|| Some((who, now.checked_add(left)?)))?
+    }
+}

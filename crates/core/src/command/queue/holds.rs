@@ -1,0 +1,308 @@
+//! Who holds the drives of the bus: `[authority]`, judged where orders are accepted, and again at their turn.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::{CommandQueue, Pending};
+use crate::command::{
+    Asks, Claim, Command, Denial, HoldView, Holding, Mode, Origin, Outcome, Refusal, Rules, SourceKind, Told, Urgency,
+    Verb,
+};
+
+/// What is told of holds waits for the gateway, which asks several times a second; beyond that the oldest is dropped.
+const MOST_TOLD: usize = 256;
+
+/// The holds of the drives of a bus.
+#[derive(Debug, Default)]
+pub(super) struct Holds {
+    rules: Option<Arc<Rules>>,
+    drives: BTreeMap<usize, Holding>,
+    told: Vec<(usize, Told)>,
+    /// Drives that a client took since the bus last asked.
+    taken: Vec<usize>,
+    /// Orders that were carried out, or would have been refused, though another client held the drive.
+    unheld: BTreeMap<usize, u64>,
+}
+
+impl Holds {
+    /// The rules and the holding of a drive, and where it is told what happened; nothing while `[authority]` is off.
+    fn with<T>(&mut self, drive: usize, change: impl FnOnce(&mut Holding, &Rules, &mut Vec<Told>) -> T) -> Option<T> {
+        let rules = self.rules.as_ref()?;
+        let mut told = Vec::new();
+        let holding = self.drives.entry(drive).or_default();
+        let before = holding.holder().cloned();
+        let changed = change(holding, rules, &mut told);
+        let is_new = holding.holder().is_some_and(|holder| Some(holder) != before.as_ref());
+        if is_new && !self.taken.contains(&drive) {
+            self.taken.push(drive);
+        }
+        self.told.extend(told.into_iter().map(|told| (drive, told)));
+        let beyond = self.told.len().saturating_sub(MOST_TOLD);
+        self.told.drain(..beyond);
+        Some(changed)
+    }
+
+    fn claim(&self, origin: &Origin) -> Option<Claim> {
+        self.rules.as_ref()?.claim_of(origin)
+    }
+
+    /// Why an order of a client does not pass, in exclusive mode. A run that is refused behind a stop is kept.
+    fn refuses(&mut self, drive: usize, origin: &Origin, asks: Asks, now: Instant) -> Option<Refusal> {
+        let rules = self.rules.clone().filter(|_| origin.kind.is_client())?;
+        let who = rules.claim_of(origin);
+        let holding = self.drives.entry(drive).or_default();
+        let denial = holding.judge(who.as_ref(), asks, &rules, now).err()?;
+        holding.refused(who.as_ref(), asks, &denial, &rules, now);
+        (rules.mode == Mode::Exclusive).then(|| denial.refusal(&rules))
+    }
+}
+
+impl Pending {
+    /// From now on these rules hold; none: `[authority]` is off, and nobody holds anything.
+    pub(super) fn set_rules(&mut self, rules: Option<Arc<Rules>>) {
+        if self.holds.rules == rules {
+            return;
+        }
+        let drives: Vec<usize> = self.holds.drives.keys().copied().collect();
+        match rules {
+            Some(_) => {
+                self.holds.rules = rules;
+                for drive in drives {
+                    self.holds
+                        .with(drive, |holding, rules, told| holding.keep_known(rules, told));
+                }
+            }
+            None => {
+                for drive in drives {
+                    self.hold_ends(drive, "a reload turned [authority] off");
+                }
+                self.holds.drives.clear();
+                self.holds.rules = None;
+            }
+        }
+    }
+
+    /// The hold of a drive ends, for that reason.
+    pub fn hold_ends(&mut self, drive: usize, why: &str) {
+        self.holds.with(drive, |holding, _, told| holding.end(why, told));
+    }
+
+    /// Why an order of that client is not accepted, where the hold of the drive keeps it. A run that is refused behind a stop is
+    /// kept.
+    pub fn hold_refuses(&mut self, drive: usize, origin: &Origin, asks: Asks, now: Instant) -> Option<Refusal> {
+        self.holds.refuses(drive, origin, asks, now)
+    }
+
+    /// The same of a command to all that it reaches.
+    pub(super) fn hold_refuses_command(&mut self, command: &Command, now: Instant) -> Option<Refusal> {
+        self.holds.rules.as_ref()?;
+        let origin = command.ticket.origin();
+        let reach = command.reach().iter();
+        reach
+            .map(|drive| (*drive, Asks::of(command, *drive)))
+            .collect::<Vec<_>>()
+            .into_iter()
+            .find_map(|(drive, asks)| self.holds.refuses(drive, origin, asks, now))
+    }
+
+    /// Why a command that was accepted is not sent at its turn: its client has lost the drive since.
+    pub fn hold_stops_turn(&self, command: &Command, now: Instant) -> Option<Refusal> {
+        let rules = self.holds.rules.as_ref()?;
+        let origin = command.ticket.origin();
+        if rules.mode == Mode::Advisory || !origin.kind.is_client() {
+            return None;
+        }
+        let who = rules.claim_of(origin);
+        command.reach().iter().find_map(|drive| {
+            // What it has accepted of stops is sent.
+            let asks = Some(Asks::of(command, *drive)).filter(|asks| *asks != Asks::Stop)?;
+            let denial = self
+                .holds
+                .drives
+                .get(drive)?
+                .judge(who.as_ref(), asks, rules, now)
+                .err()?;
+            Some(denial.refusal(rules))
+        })
+    }
+
+    /// A command is taken in.
+    pub(super) fn hold_accepted(&mut self, command: &Command, now: Instant) {
+        // Of a stop that another bus took in, it was noted there.
+        if self.holds.rules.is_none() || command.urgency == Urgency::Read || command.effects.is_empty() {
+            return;
+        }
+        let origin = command.ticket.origin();
+        let who = self.holds.claim(origin);
+        for drive in command.reach() {
+            let asks = Asks::of(command, *drive);
+            if !origin.kind.is_client() {
+                let supervision = origin.kind == SourceKind::Supervision;
+                if asks == Asks::Stop {
+                    self.holds.with(*drive, |holding, rules, told| {
+                        holding.stopped_by_gateway(supervision, rules, now, told);
+                    });
+                }
+                continue;
+            }
+            let unheld = self.holds.with(*drive, |holding, rules, told| {
+                let unheld = holding.judge(who.as_ref(), asks, rules, now).is_err();
+                holding.accepted(who.as_ref(), asks, rules, now, told);
+                unheld
+            });
+            if unheld == Some(true) {
+                *self.holds.unheld.entry(*drive).or_default() += 1;
+            }
+        }
+    }
+
+    /// A client was heard of: its heartbeat came, or its order was carried out.
+    pub fn hold_renewed(&mut self, drive: usize, origin: &Origin, now: Instant) {
+        let Some(who) = self.holds.claim(origin) else { return };
+        self.holds
+            .with(drive, |holding, rules, _| holding.renew(&who, rules, now));
+    }
+
+    /// Whether the silence of that client is the one that counts for supervision: it holds the drive, or did last, or nobody
+    /// ever did.
+    pub fn hold_renews(&self, drive: usize, origin: &Origin) -> bool {
+        let Some(holding) = self.holds.rules.as_ref().and_then(|_| self.holds.drives.get(&drive)) else {
+            return true;
+        };
+        holding.is_whose_silence_counts(self.holds.claim(origin).as_ref())
+    }
+
+    /// What a client does with the hold of a drive. What another client has waiting there is answered.
+    ///
+    /// # Errors
+    /// Why it may not; none while `[authority]` is off.
+    pub fn hold_act(&mut self, drive: usize, origin: &Origin, verb: Verb, now: Instant) -> Option<Result<(), Refusal>> {
+        let rules = self.holds.rules.clone()?;
+        let who = rules.claim_of(origin);
+        let acted = self.holds.with(drive, |holding, rules, told| {
+            holding.act(who.as_ref(), verb, rules, now, told)
+        })?;
+        if acted.is_ok() && matches!(verb, Verb::Take | Verb::Break) {
+            self.drop_of_others(drive, now);
+        }
+        Some(acted.map_err(|denial: Denial| denial.refusal(&rules)))
+    }
+
+    /// What waits for a drive and is not its holder's any more is not sent.
+    fn drop_of_others(&mut self, drive: usize, now: Instant) {
+        let mut index = 0;
+        while let Some(command) = self.waiting.get(index) {
+            let refusal = match command.reaches(drive) {
+                true => self.hold_stops_turn(command, now),
+                false => None,
+            };
+            match refusal.and_then(|refusal| Some((self.waiting.remove(index)?, refusal))) {
+                Some((command, refusal)) => command.answer(&Outcome::Refused(refusal), now),
+                None => index += 1,
+            }
+        }
+    }
+
+    /// Drives that have another holder since the last call: nothing that was begun for others goes on.
+    pub fn take_taken(&mut self) -> Vec<usize> {
+        std::mem::take(&mut self.holds.taken)
+    }
+
+    /// Why what the client began is not continued, where another one has taken the drive since.
+    pub fn hold_ends_run(&self, drive: usize, origin: &Origin, now: Instant) -> Option<Refusal> {
+        let rules = self.holds.rules.as_ref().filter(|_| origin.kind.is_client())?;
+        let who = rules.claim_of(origin).filter(|_| rules.mode == Mode::Exclusive);
+        who.as_ref()?;
+        let holding = self.holds.drives.get(&drive)?;
+        let denial = holding.judge(who.as_ref(), Asks::Steer, rules, now).err()?;
+        Some(denial.refusal(rules))
+    }
+
+    /// The client stopped, though nothing is sent for it.
+    pub fn hold_said_stop(&mut self, drive: usize, origin: &Origin) {
+        let Some(who) = self.holds.claim(origin) else { return };
+        self.holds.with(drive, |holding, _, _| holding.said_stop(&who));
+    }
+
+    /// Whether the local control place of a drive has it now.
+    pub fn set_local(&mut self, drive: usize, local: bool) {
+        self.holds
+            .with(drive, |holding, _, told| holding.set_local(local, told));
+    }
+
+    /// Ends what its time has ended, and tells what happened since the last call.
+    pub fn take_told(&mut self, now: Instant) -> Vec<(usize, Told)> {
+        let drives: Vec<usize> = self.holds.drives.keys().copied().collect();
+        for drive in drives {
+            self.holds
+                .with(drive, |holding, rules, told| holding.settle(rules, now, told));
+        }
+        std::mem::take(&mut self.holds.told)
+    }
+
+    /// What is told of the hold of a drive, and whether that client holds it.
+    pub fn hold_view(&self, drive: usize, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
+        let rules = self.holds.rules.as_ref()?;
+        let free = Holding::default();
+        let holding = self.holds.drives.get(&drive).unwrap_or(&free);
+        let who = origin.and_then(|origin| rules.claim_of(origin));
+        let own = who.is_some_and(|who| holding.is_held_by(&who, now));
+        Some((holding.view(rules, now), own))
+    }
+
+    /// The client whose repeated stops end the holds of others.
+    pub fn repeater(&self, drive: usize) -> Option<Arc<str>> {
+        self.holds.drives.get(&drive)?.repeater().cloned()
+    }
+
+    /// Orders that were carried out in advisory mode though another client held the drive.
+    pub fn unheld(&self, drive: usize) -> u64 {
+        self.holds.unheld.get(&drive).copied().unwrap_or_default()
+    }
+
+    /// The rules, where `[authority]` is on.
+    pub fn rules(&self) -> Option<&Arc<Rules>> {
+        self.holds.rules.as_ref()
+    }
+
+    /// The reservation of a drive: until when, for whom by name and rank, and for how long such a one lasts.
+    pub fn reservation(&self, drive: usize, now: Instant) -> Option<(Instant, String, String, Duration)> {
+        let rules = self.holds.rules.as_ref()?;
+        let (who, until) = self.holds.drives.get(&drive)?.reservation()?;
+        let rank = rules.rank(who.rank).to_string();
+        (until > now).then(|| (until, who.name.to_string(), rank, rules.lease))
+    }
+
+    /// A stop before the start of the process reserved the drive.
+    pub fn reserve(&mut self, drive: usize, who: Claim, until: Instant) {
+        self.holds.with(drive, |holding, _, _| holding.reserve(who, until));
+    }
+
+    /// The hold of a drive, for the bus that takes the place of this one.
+    pub fn holding(&self, drive: usize) -> Option<Holding> {
+        self.holds.drives.get(&drive).cloned()
+    }
+
+    /// Goes on with the hold of the same machine before a reload.
+    pub fn take_over_holding(&mut self, drive: usize, mut holding: Holding) {
+        // The next reading says it anew.
+        holding.set_local(false, &mut Vec::new());
+        self.holds.drives.insert(drive, holding);
+    }
+}
+
+impl CommandQueue {
+    /// From now on these rules hold for the drives of the bus; none: `[authority]` is off.
+    pub fn set_authority(&self, rules: Option<Arc<Rules>>) {
+        let mut pending = self.lock();
+        self.guarded
+            .store(rules.is_some(), std::sync::atomic::Ordering::Release);
+        pending.set_rules(rules);
+    }
+
+    /// Whether `[authority]` is on: without it, nobody need ask.
+    pub fn is_guarded(&self) -> bool {
+        self.guarded.load(std::sync::atomic::Ordering::Acquire)
+    }
+}

@@ -1,0 +1,272 @@
+//! The hold of a drive, as the north sides ask for it.
+
+use std::time::{Instant, SystemTime};
+
+use super::{BusHandle, DriveHandle, Plant};
+use crate::command::{
+    self, Admitted, Asks, Authority, Command, Effect, HoldState, HoldView, KeptReservation, Origin, Refusal, Rules,
+    Told, Urgency, Verb, What,
+};
+use crate::drive::why::{Cause, Explanation};
+use crate::event::{Event, EventKind, Events};
+use crate::process_image::Machine;
+
+impl BusHandle {
+    /// Whether an order of that client renews the lease of a drive.
+    pub fn renews(&self, drive: usize, origin: &Origin) -> bool {
+        !self.queue.is_guarded() || self.queue.lock().hold_renews(drive, origin)
+    }
+
+    /// Publishes what happened to the holds of its drives.
+    pub fn tell_holds(&self, events: &Events, now: Instant, time: SystemTime) {
+        if !self.queue.is_guarded() {
+            return;
+        }
+        let mut queue = self.queue.lock();
+        let told = queue.take_told(now);
+        let rules = queue.rules().cloned();
+        drop(queue);
+        let Some(rules) = rules else { return };
+        for (drive, told) in told {
+            let Some(image) = self.image.drives.get(drive) else {
+                continue;
+            };
+            let (kind, text) = words(&told, &rules);
+            events.publish(Event {
+                bus: self.image.spec.name.clone(),
+                drive: Some(image.spec.name.clone()),
+                ..Event::new(kind, time, text)
+            });
+            // Whoever shows the drive shows its hold.
+            image.update(|_| {});
+        }
+    }
+
+    /// After a reload: the holds of machines that are in none of these buses have ended, and that is told.
+    pub fn end_holds(&self, after: &[&BusHandle], events: &Events, now: Instant, time: SystemTime) {
+        if !self.queue.is_guarded() {
+            return;
+        }
+        for (index, drive) in self.image.drives.iter().enumerate() {
+            let machine = self.image.spec.machine(&drive.spec);
+            let is_there = |bus: &&BusHandle| {
+                let mut drives = bus.image.drives.iter();
+                drives.any(|drive| bus.image.spec.machine(&drive.spec) == machine)
+            };
+            if !after.iter().any(is_there) {
+                let why = "a reload changed bus, address or profile of the drive";
+                self.queue.lock().hold_ends(index, why);
+            }
+        }
+        self.tell_holds(events, now, time);
+    }
+
+    /// Why a command that was accepted is not begun at its turn, and whether it renews the lease of its drive.
+    pub fn judges_turn(&self, command: &Command, now: Instant) -> (Option<Refusal>, bool) {
+        if !self.queue.is_guarded() {
+            return (None, true);
+        }
+        let queue = self.queue.lock();
+        let mut origins = std::iter::once(&command.ticket).chain(command.joined.iter().map(|(ticket, _)| ticket));
+        let renews = origins.any(|ticket| queue.hold_renews(command.drive, ticket.origin()));
+        (queue.hold_stops_turn(command, now), renews)
+    }
+}
+
+impl BusHandle {
+    fn reservations(&self, now: Instant, time: SystemTime) -> Vec<(Instant, KeptReservation)> {
+        let queue = self.queue.lock();
+        let drives = self.image.drives.iter().enumerate();
+        let kept = drives.filter_map(|(index, image)| {
+            let (until, who, rank, lease) = queue.reservation(index, now)?;
+            let machine = self.image.spec.machine(&image.spec);
+            let stopped = time.checked_sub(lease.saturating_sub(until.saturating_duration_since(now)))?;
+            Some((until, KeptReservation::new(machine, (who, rank), stopped, lease)))
+        });
+        kept.collect()
+    }
+}
+
+impl DriveHandle {
+    /// Why an order of a client is not taken, where somebody else holds the drive.
+    pub(super) fn hold_refuses(&self, admitted: &Admitted, origin: &Origin, now: Instant) -> Option<Refusal> {
+        if !self.bus.queue.is_guarded() || admitted.urgency == Urgency::Read {
+            return None;
+        }
+        let effect = Effect::of(&admitted.order, &self.image.spec.profile);
+        let asks = Asks::by(&admitted.order, admitted.urgency, effect);
+        self.bus.queue.lock().hold_refuses(self.index, origin, asks, now)
+    }
+
+    /// Whether `[authority]` is on.
+    pub fn is_guarded(&self) -> bool {
+        self.bus.queue.is_guarded()
+    }
+
+    /// What a client does with the hold; what is told of it then. A refusal is audited, counted and published like that of a
+    /// command.
+    ///
+    /// # Errors
+    /// The refusal.
+    pub fn hold(&self, verb: Verb, origin: &Origin, authority: Authority, now: Instant) -> Result<HoldView, Refusal> {
+        match self.act(verb, origin, authority, now) {
+            Ok(view) => Ok(view),
+            Err(refusal) => {
+                self.refuse(&format!("hold={}", verb.name()), refusal.clone(), origin.clone(), now);
+                Err(refusal)
+            }
+        }
+    }
+
+    fn act(&self, verb: Verb, origin: &Origin, authority: Authority, now: Instant) -> Result<HoldView, Refusal> {
+        command::authority(&self.reading(now), authority)?;
+        if let (Some(why), Verb::Take | Verb::Break) = (self.image.hold.why(), verb) {
+            return Err(Refusal::NotAllowed(why.to_string()));
+        }
+        let mut queue = self.bus.queue.lock();
+        let acted = queue.hold_act(self.index, origin, verb, now).unwrap_or_else(|| {
+            Err(Refusal::NotAllowed(
+                "nobody holds drives here: [authority] is off; set its mode".to_string(),
+            ))
+        });
+        let view = queue.hold_view(self.index, None, now);
+        drop(queue);
+        // What was begun for another one may have to end.
+        self.bus.queue.wake();
+        acted?;
+        if verb != Verb::Release {
+            self.image.renew_lease(now);
+        }
+        view.map(|(view, _)| view)
+            .ok_or_else(|| Refusal::NotAllowed("[authority] was turned off".to_string()))
+    }
+
+    /// What is told of the hold, and whether that client holds the drive; nothing while `[authority]` is off.
+    pub fn hold_view(&self, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
+        match self.bus.queue.is_guarded() {
+            true => self.bus.queue.lock().hold_view(self.index, origin, now),
+            false => None,
+        }
+    }
+
+    /// The name of that client among the principals, and the ranks below its own; nothing where it is none.
+    pub fn rank_of(&self, origin: &Origin) -> Option<(String, Vec<String>)> {
+        let rules = match self.bus.queue.is_guarded() {
+            true => self.bus.queue.lock().rules().cloned()?,
+            false => return None,
+        };
+        let claim = rules.claim_of(origin)?;
+        let below = rules.ranks.iter().skip(claim.rank + 1).map(ToString::to_string);
+        Some((claim.name.to_string(), below.collect()))
+    }
+
+    /// The heartbeat of a client that may command: the lease of the drive runs anew, unless another client's silence counts, and
+    /// so does its hold.
+    pub fn heartbeat(&self, origin: &Origin, now: Instant) {
+        if !self.bus.queue.is_guarded() {
+            return self.image.renew_lease(now);
+        }
+        let mut queue = self.bus.queue.lock();
+        queue.hold_renewed(self.index, origin, now);
+        let renews = queue.hold_renews(self.index, origin);
+        drop(queue);
+        if renews {
+            self.image.renew_lease(now);
+        }
+    }
+
+    /// With the stop behind which the drive is reserved.
+    pub(super) fn with_reservation(&self, mut why: Explanation, now: Instant) -> Explanation {
+        let view = self.hold_view(None, now).map(|(view, _)| view);
+        let Some(view) = view.filter(|view| view.state == HoldState::Reserved && why.runs == Some(false)) else {
+            return why;
+        };
+        let (who, rank) = (view.holder.unwrap_or_default(), view.rank.unwrap_or_default());
+        let left = view.left_s.unwrap_or_default();
+        let mut evidence = format!("{who} ({rank}) stopped it; reserved for another {left} s");
+        let mut remedy = format!("wait, or have {who} release it; ranks from {rank} up take it");
+        if let Some(repeater) = self.bus.queue.lock().repeater(self.index) {
+            evidence += &format!("; {repeater} repeats its stop, which ended the hold of another client");
+            remedy = format!(
+                "set cyclic = true for principal `{repeater}` if it writes its command word all the time; else {remedy}"
+            );
+        }
+        why.causes.push(Cause {
+            cause: HoldState::Reserved.name().to_string(),
+            evidence,
+            age_ms: None,
+            remedy,
+        });
+        why
+    }
+
+    /// A client gave back what it had asked for, and nothing is sent for it.
+    pub fn said_stop(&self, origin: &Origin) {
+        if self.bus.queue.is_guarded() {
+            self.bus.queue.lock().hold_said_stop(self.index, origin);
+        }
+    }
+
+    /// Whether a restore of parameters may begin for that client: it is judged once, so that none is left half done.
+    ///
+    /// # Errors
+    /// The refusal.
+    pub fn may_begin_restore(&self, origin: &Origin, now: Instant) -> Result<(), Refusal> {
+        if !self.bus.queue.is_guarded() {
+            return Ok(());
+        }
+        let mut queue = self.bus.queue.lock();
+        queue
+            .hold_refuses(self.index, origin, Asks::Other, now)
+            .map_or(Ok(()), Err)
+    }
+}
+
+impl Plant {
+    /// The reservations that stand, with when they end: what is kept for the next start. `now` is `time` on the calendar.
+    pub fn reservations(&self, now: Instant, time: SystemTime) -> Vec<(Instant, KeptReservation)> {
+        let of_bus = |bus: &BusHandle| bus.reservations(now, time);
+        let guarded = self.buses.iter().filter(|bus| bus.queue.is_guarded());
+        guarded.flat_map(of_bus).collect()
+    }
+
+    /// Goes on with reservations of before the start.
+    pub fn restore_reservations(&self, kept: &[KeptReservation], now: Instant, time: SystemTime) {
+        for one in kept {
+            let machine = Machine {
+                port: one.port.clone(),
+                address: one.address,
+                profile: one.profile.clone(),
+            };
+            let Some(drive) = self.drive_at(&machine) else { continue };
+            let mut queue = drive.bus.queue.lock();
+            let rules = queue.rules().cloned();
+            let goes_on = rules.and_then(|rules| one.goes_on(&rules, now, time));
+            if let Some((who, until)) = goes_on {
+                queue.reserve(drive.index, who, until);
+            }
+        }
+    }
+
+    /// Publishes what happened to the holds of the drives until `now`, which is `time` on the calendar; to be called several times a
+    /// second.
+    pub fn tell_holds(&self, now: Instant, time: SystemTime) {
+        self.buses
+            .iter()
+            .for_each(|bus| bus.tell_holds(&self.events, now, time));
+    }
+}
+
+/// The event of what happened to a hold.
+fn words(told: &Told, rules: &Rules) -> (EventKind, String) {
+    let named = |claim: &command::Claim| format!("{} ({})", claim.name, rules.rank(claim.rank));
+    let who = named(&told.who);
+    match &told.what {
+        What::Held => (EventKind::Held, format!("{who} holds the drive")),
+        What::Released(why) => (EventKind::Released, format!("{who} holds the drive no more: {why}")),
+        What::Broken(by) => (
+            EventKind::HoldBroken,
+            format!("{} took the drive from {who}", named(by)),
+        ),
+    }
+}

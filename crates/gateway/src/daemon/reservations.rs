@@ -1,0 +1,91 @@
+//! Reservations that stops left behind outlive the process: they are written beside the stop, never before it.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use crate::command::KeptReservation;
+use crate::files;
+use crate::files::names::RESERVATIONS;
+use crate::plant::{Plant, SharedPlant};
+
+/// How often they are looked at.
+const LOOK: Duration = Duration::from_millis(50);
+/// A file that is longer is none of these.
+const LONGEST: u64 = 1 << 20;
+
+/// The file of the reservations; none while nothing is kept.
+pub(super) type ReservationsFile = Arc<Mutex<Option<PathBuf>>>;
+
+/// What is kept, as far as it changes the file.
+type Seen = Vec<(Instant, String, u8)>;
+
+/// From now on they are in that state directory.
+pub(super) fn keep_in(file: &ReservationsFile, state_dir: Option<&Path>) {
+    let path = state_dir.map(|dir| dir.join(RESERVATIONS));
+    *file.lock().unwrap_or_else(PoisonError::into_inner) = path;
+}
+
+/// Goes on with those of before the start.
+pub(super) fn restore(file: &ReservationsFile, plant: &Plant) {
+    let Some(path) = path(file) else { return };
+    match load(&path) {
+        Ok(kept) => plant.restore_reservations(&kept, Instant::now(), SystemTime::now()),
+        Err(why) => tracing::error!(
+            target: "drivegate::daemon",
+            "cannot read {}: {why}; a drive that was stopped just before the start is reserved no more", path.display()
+        ),
+    }
+}
+
+fn path(file: &ReservationsFile) -> Option<PathBuf> {
+    file.lock().unwrap_or_else(PoisonError::into_inner).clone()
+}
+
+fn load(path: &Path) -> Result<Vec<KeptReservation>, String> {
+    let length = match std::fs::metadata(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        metadata => metadata.map_err(|error| error.to_string())?.len(),
+    };
+    if length > LONGEST {
+        return Err(format!("it has {length} bytes, more than {LONGEST}"));
+    }
+    let text = std::fs::read(path).map_err(|error| error.to_string())?;
+    serde_json::from_slice(&text).map_err(|error| error.to_string())
+}
+
+/// Writes them whenever they change.
+pub(super) fn keep(plant: SharedPlant, file: ReservationsFile) -> tokio::task::JoinHandle<()> {
+    tokio::spawn(async move {
+        let mut seen = Seen::new();
+        let mut told = false;
+        let mut ticks = tokio::time::interval(LOOK);
+        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        loop {
+            ticks.tick().await;
+            let kept = plant.load().reservations(Instant::now(), SystemTime::now());
+            let now: Seen = kept
+                .iter()
+                .map(|(until, one)| (*until, one.port.clone(), one.address))
+                .collect();
+            let Some(path) = path(&file).filter(|_| now != seen) else {
+                continue;
+            };
+            let kept: Vec<KeptReservation> = kept.into_iter().map(|(_, one)| one).collect();
+            let written = tokio::task::spawn_blocking(move || write(&path, &kept)).await;
+            match written {
+                Ok(Ok(())) => (seen, told) = (now, false),
+                Ok(Err(why)) if !std::mem::replace(&mut told, true) => tracing::error!(
+                    target: "drivegate::daemon",
+                    "the reservations that stops leave behind cannot be written: {why}; they end with the process; trying again"
+                ),
+                _ => {}
+            }
+        }
+    })
+}
+
+fn write(path: &Path, kept: &[KeptReservation]) -> Result<(), String> {
+    let text = serde_json::to_vec_pretty(kept).map_err(|error| error.to_string())?;
+    files::replace(path, &text).map_err(|error| format!("{}: {error}", path.display()))
+}

@@ -1,0 +1,89 @@
+//! The hold of a drive as JSON.
+
+use serde::Serialize;
+
+use super::result::ErrorObject;
+use crate::command::{HoldView, Refusal};
+
+/// Who holds a drive, and what became of an act upon that.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct HoldReply<'r> {
+    drive: &'r str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    ok: Option<bool>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    result: Option<&'static str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<ErrorObject>,
+    #[serde(flatten)]
+    hold: HoldFields,
+    /// Whether it is the client's own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    own: Option<bool>,
+}
+
+/// The fields of the hold wherever a drive is told. They are equal whatever time is left, which changes by itself.
+#[derive(Debug, Clone, Default, Serialize)]
+pub(crate) struct HoldFields {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) hold: Option<&'static str>,
+    pub(crate) holder: Option<String>,
+    pub(crate) holder_rank: Option<String>,
+    pub(crate) hold_left_s: Option<u64>,
+}
+
+impl PartialEq for HoldFields {
+    fn eq(&self, other: &HoldFields) -> bool {
+        let told = |fields: &HoldFields| (fields.hold, fields.holder.clone(), fields.holder_rank.clone());
+        told(self) == told(other)
+    }
+}
+
+impl From<HoldView> for HoldFields {
+    fn from(view: HoldView) -> HoldFields {
+        HoldFields {
+            hold: Some(view.state.name()),
+            holder: view.holder.map(|holder| holder.to_string()),
+            holder_rank: view.rank.map(|rank| rank.to_string()),
+            hold_left_s: view.left_s,
+        }
+    }
+}
+
+impl<'r> HoldReply<'r> {
+    /// What is told of a drive.
+    pub(crate) fn of(drive: &'r str, view: HoldView) -> HoldReply<'r> {
+        HoldReply {
+            drive,
+            ok: None,
+            result: None,
+            error: None,
+            hold: view.into(),
+            own: None,
+        }
+    }
+
+    /// What became of an act; `seen` is what is told of the hold where it was refused.
+    pub(crate) fn new(drive: &'r str, done: Result<HoldView, Refusal>, seen: Option<HoldView>) -> HoldReply<'r> {
+        let (hold, refusal) = match done {
+            Ok(view) => (Some(view), None),
+            Err(refusal) => (seen, Some(refusal)),
+        };
+        HoldReply {
+            drive,
+            ok: Some(refusal.is_none()),
+            result: refusal.as_ref().map(Refusal::code),
+            error: refusal.map(|refusal| ErrorObject {
+                code: refusal.code(),
+                message: refusal.to_string(),
+            }),
+            hold: hold.map(HoldFields::from).unwrap_or_default(),
+            own: None,
+        }
+    }
+
+    pub(crate) fn own(mut self, own: bool) -> HoldReply<'r> {
+        self.own = Some(own);
+        self
+    }
+}

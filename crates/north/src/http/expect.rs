@@ -1,0 +1,79 @@
+//! Whether the gateway is the one that a client has in mind, and runs with the configuration that it has in mind.
+
+use std::path::Path;
+
+use axum::http::{HeaderMap, StatusCode};
+use percent_encoding::percent_decode;
+
+use super::messages::{EXPECT, Expected, ExpectedDrive, port_of};
+use super::routes::Reached;
+use crate::local::absolute;
+use crate::plant::Plant;
+
+/// Why a request is not for this gateway, with its status.
+type Unmet = (StatusCode, String);
+
+/// Whether the gateway is what the header [`EXPECT`] says, if there is one.
+///
+/// # Errors
+/// It is another one, or runs with another configuration.
+pub(super) fn check(headers: &HeaderMap, plant: &Plant, reached: &Reached) -> Result<(), Unmet> {
+    let Some(header) = headers.get(EXPECT) else {
+        return Ok(());
+    };
+    let text: Vec<u8> = percent_decode(header.as_bytes()).collect();
+    let expected = serde_json::from_slice(&text).map_err(|error| {
+        (
+            StatusCode::BAD_REQUEST,
+            format!("the header {EXPECT} is not understood: {error}"),
+        )
+    })?;
+    match expected {
+        Expected::Configuration(file) => has_configuration(&file, reached),
+        Expected::Drive(drive) => has_drive(&drive, plant),
+    }
+}
+
+fn has_configuration(wanted: &Path, reached: &Reached) -> Result<(), Unmet> {
+    let local = reached.local.as_ref();
+    let other = match local.and_then(|local| local.control.as_ref()) {
+        Some(control) if absolute(control.config()) == wanted => return Ok(()),
+        Some(control) => format!("the gateway runs with {}", control.config().display()),
+        None => "the gateway runs without a configuration file, or is not asked at its socket".to_string(),
+    };
+    Err((StatusCode::MISDIRECTED_REQUEST, other))
+}
+
+/// What owns the file's port is its gateway, or was before the file was edited; any other gateway has nothing to do with it.
+fn has_drive(expected: &ExpectedDrive, plant: &Plant) -> Result<(), Unmet> {
+    let name = &expected.drive;
+    let names_differ = (plant.gateway != expected.gateway).then(|| {
+        format!(
+            "the gateway is `{}`, the file has `{}`",
+            plant.gateway, expected.gateway
+        )
+    });
+    if !plant.buses.iter().any(|bus| port_of(&bus.image.spec) == expected.port) {
+        let why = names_differ.unwrap_or_else(|| format!("the gateway has no bus on {}", expected.port));
+        return Err((StatusCode::MISDIRECTED_REQUEST, why));
+    }
+    let other = |why: String| Err((StatusCode::PRECONDITION_FAILED, why));
+    if let Some(why) = names_differ {
+        return other(why);
+    }
+    let Some(drive) = plant.drive(name) else {
+        return other(format!("the gateway has no drive `{name}`"));
+    };
+    let runs = ExpectedDrive::new(&plant.gateway, &drive.bus.image.spec, &drive.image.spec);
+    let pairs = [
+        ("port", runs.port, &expected.port),
+        ("address", runs.address.to_string(), &expected.address.to_string()),
+        ("profile", runs.profile, &expected.profile),
+    ];
+    match pairs.into_iter().find(|(_, runs, wanted)| runs != *wanted) {
+        Some((what, runs, wanted)) => other(format!(
+            "the gateway has `{name}` with the {what} `{runs}`, the file has it with `{wanted}`"
+        )),
+        None => Ok(()),
+    }
+}

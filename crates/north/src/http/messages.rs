@@ -1,0 +1,386 @@
+//! What a client and the gateway say to each other beside drives, buses and events. Fields are added, never renamed or removed.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value as Json;
+
+use crate::drive::why::Explanation;
+use crate::drive::{ModelPoint, Point, Quality, Sample};
+use crate::parameters::{Plan, RestoreStage, RestoreStatus, Status};
+use crate::process_image::{BusSpec, DriveSpec, value_or_null};
+
+/// An error reply.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ErrorReply {
+    /// What is wrong, and what to do.
+    pub error: String,
+    /// The names that there are, where one was not known.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub known: Vec<String>,
+}
+
+impl ErrorReply {
+    /// One without names.
+    pub(crate) fn new(error: impl Into<String>) -> ErrorReply {
+        ErrorReply {
+            error: error.into(),
+            known: Vec::new(),
+        }
+    }
+}
+
+/// What a client has in mind, in the header [`EXPECT`]: a gateway that is another one answers 421, and one that runs with
+/// another configuration 412.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum Expected {
+    /// The gateway that runs with this configuration file, an absolute path without links.
+    Configuration(PathBuf),
+    /// The gateway that has this drive.
+    Drive(ExpectedDrive),
+}
+
+/// Header with an [`Expected`] as JSON, percent-encoded.
+pub const EXPECT: &str = "x-drivegate-expect";
+
+/// What the client's configuration file says of gateway and drive.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExpectedDrive {
+    /// Name of the drive.
+    pub drive: String,
+    /// Name of the gateway.
+    pub gateway: String,
+    /// Port of the bus, as [`port_of`] gives it.
+    pub port: String,
+    /// Address on the bus.
+    pub address: u8,
+    /// Name of the profile.
+    pub profile: String,
+}
+
+impl ExpectedDrive {
+    /// What a configuration says.
+    pub fn new(gateway: &str, bus: &BusSpec, drive: &DriveSpec) -> ExpectedDrive {
+        ExpectedDrive {
+            drive: drive.name.clone(),
+            gateway: gateway.to_string(),
+            port: port_of(bus),
+            address: drive.address,
+            profile: drive.profile.name.clone(),
+        }
+    }
+}
+
+/// The port of a bus, the same from whatever directory and by whatever link it is named.
+pub fn port_of(bus: &BusSpec) -> String {
+    if bus.port.contains("://") {
+        return bus.port.clone();
+    }
+    let path = Path::new(&bus.port);
+    let found = path.canonicalize().or_else(|_| std::path::absolute(path));
+    found.map_or_else(|_| bus.port.clone(), |path| path.display().to_string())
+}
+
+/// Why a drive does not run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Why {
+    /// Whether it runs, and why not.
+    #[serde(flatten)]
+    pub explanation: Explanation,
+    /// Name of its profile.
+    pub profile: String,
+    /// Whether the profile was verified on hardware.
+    pub profile_verified: bool,
+}
+
+/// How the parameters of a drive are to be read.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ReadParameters {
+    /// The drive is asked for every address, whatever earlier readings found.
+    pub afresh: bool,
+    /// It may take 18 % of a busy line in place of 1.5 %.
+    pub brisk: bool,
+}
+
+/// What is to be done with a restore.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum RestoreAct {
+    /// The drive is read, and what would be written is found out.
+    Prepare {
+        /// The file of parameters.
+        file: String,
+        /// These alone; empty: all.
+        #[serde(default)]
+        only: Vec<String>,
+        /// What can be forced is a risk, not a refusal.
+        #[serde(default)]
+        force: bool,
+    },
+    /// What the restore of that number found out is written.
+    CarryOut {
+        /// Its number.
+        number: u64,
+    },
+    /// One that was cut off goes on.
+    Resume,
+    /// One that was cut off is taken back.
+    Undo,
+    /// One that was cut off is left as it is.
+    Release,
+}
+
+/// The configuration was read again; it applies unless there are errors.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct ReloadOutcome {
+    /// What must be corrected; the gateway runs as before.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub errors: Vec<String>,
+    /// What works but probably not as intended.
+    #[serde(default)]
+    pub warnings: Vec<String>,
+    /// What changed.
+    #[serde(default)]
+    pub changes: Vec<String>,
+}
+
+/// Whether the gateway is ready.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Health {
+    /// As `/readyz` says.
+    pub ready: bool,
+    /// Why it is not.
+    pub reasons: Vec<String>,
+}
+
+/// A recording that goes on.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Recorded {
+    /// Its id.
+    pub id: String,
+    /// Time until it is complete, s.
+    pub after_s: f64,
+}
+
+/// A reading of parameters.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ParameterReading {
+    /// Its number.
+    pub number: u64,
+    /// Addresses that were asked.
+    pub done: usize,
+    /// Addresses to ask in all.
+    pub total: usize,
+    /// Time that it will still take, s, by what it took so far.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub remaining_s: Option<f64>,
+    /// Why it waits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub waits: Option<String>,
+    /// The file, once it is over.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub file: Option<String>,
+    /// Why it failed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub error: Option<String>,
+}
+
+impl ParameterReading {
+    pub(crate) fn new(status: &Status) -> ParameterReading {
+        let (file, error) = match &status.result {
+            None => (None, None),
+            Some(Ok(file)) => (Some(file.text()), None),
+            Some(Err(why)) => (None, Some(why.clone())),
+        };
+        ParameterReading {
+            number: status.number,
+            done: status.progress.0,
+            total: status.progress.1,
+            remaining_s: status.remaining.map(|time| time.as_secs_f64()),
+            waits: status.waits.clone(),
+            file,
+            error,
+        }
+    }
+}
+
+/// A restore of parameters.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Restore {
+    /// Its number.
+    pub number: u64,
+    /// What it is at.
+    pub stage: Stage,
+    /// Addresses that were read, or parameters that are done.
+    pub done: usize,
+    /// All of them.
+    pub total: usize,
+    /// Why it waits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub waits: Option<String>,
+    /// What is written, and what is to be known of it, for people; once that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plan: Option<String>,
+    /// What the user takes upon himself.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub risks: Vec<String>,
+    /// Why it may not be done.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub reasons: Vec<String>,
+    /// How it ended.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub text: Option<String>,
+}
+
+/// What a restore is at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stage {
+    /// The drive is read.
+    Reading,
+    /// What would be written is known.
+    Prepared,
+    /// It may not be done.
+    Refused,
+    /// Parameters are written.
+    Working,
+    /// It is over.
+    Done,
+    /// It was given up.
+    Failed,
+    /// One that this version does not know.
+    #[serde(other)]
+    Other,
+}
+
+impl Restore {
+    pub(crate) fn new(status: &RestoreStatus) -> Restore {
+        let plan = &status.prepared.plan;
+        let (mut reasons, mut text) = (Vec::new(), None);
+        let stage = match &status.stage {
+            RestoreStage::Reading => Stage::Reading,
+            RestoreStage::Prepared if plan.writes.is_empty() => {
+                text = Some("nothing to restore".to_string());
+                Stage::Done
+            }
+            RestoreStage::Prepared => Stage::Prepared,
+            RestoreStage::Refused(why) => {
+                reasons.clone_from(why);
+                Stage::Refused
+            }
+            RestoreStage::Working => Stage::Working,
+            RestoreStage::Ended(how) => {
+                text = Some(how.clone());
+                Stage::Done
+            }
+            RestoreStage::Failed(why) => {
+                text = Some(why.clone());
+                Stage::Failed
+            }
+        };
+        Restore {
+            number: status.number,
+            stage,
+            done: status.progress.0,
+            total: status.progress.1,
+            waits: status.waits.clone(),
+            plan: (*plan != Plan::default()).then(|| plan.to_string()),
+            risks: status.prepared.risks.clone(),
+            reasons,
+            text,
+        }
+    }
+}
+
+/// A point with what is known of it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PointValue {
+    /// Name.
+    pub point: String,
+    /// `null` unless the quality is good.
+    pub value: Json,
+    /// What the value of an enumeration means.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub text: Option<String>,
+    /// Unit of the value.
+    pub unit: String,
+    /// `good`, `stale` or `bad`.
+    pub quality: String,
+    /// Why there is no value.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub why: Option<String>,
+}
+
+/// The state in one word and the text of the fault. They are no points of a profile; they are read by these names all the
+/// same, as over MQTT and HTTP.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Word {
+    /// `offline`, `not_ready`, `ready`, `running` or `fault`.
+    State,
+    /// Empty without a fault.
+    FaultText,
+}
+
+impl Word {
+    /// The one of that name.
+    pub fn of(name: &str) -> Option<Word> {
+        [Word::State, Word::FaultText]
+            .into_iter()
+            .find(|word| word.name() == name)
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Word::State => "state",
+            Word::FaultText => "fault_text",
+        }
+    }
+
+    /// The points that it comes from.
+    pub fn sources(self) -> &'static [ModelPoint] {
+        match self {
+            Word::State => &[ModelPoint::Fault, ModelPoint::Running, ModelPoint::Ready],
+            Word::FaultText => &[ModelPoint::FaultCode],
+        }
+    }
+}
+
+impl PointValue {
+    /// A word, or the quality of what it comes from, and why it is not good.
+    pub(crate) fn word(word: Word, value: Result<String, (Quality, String)>) -> PointValue {
+        let (value, quality, why) = match value {
+            Ok(text) => (Json::String(text), Quality::Good, None),
+            Err((quality, why)) => (Json::Null, quality, Some(why)),
+        };
+        PointValue {
+            point: word.name().to_string(),
+            value,
+            text: None,
+            unit: String::new(),
+            quality: quality.name().to_string(),
+            why,
+        }
+    }
+
+    /// The point with its sample; `why` is asked only where that is not good.
+    pub(crate) fn new(point: &Point, sample: &Sample, why: impl FnOnce() -> String) -> PointValue {
+        let value = sample.good();
+        PointValue {
+            point: point.name.clone(),
+            value: value_or_null(value),
+            text: value.and_then(|v| point.text_of(v).map(ToString::to_string)),
+            unit: point.unit.clone(),
+            quality: sample.quality.name().to_string(),
+            why: value.is_none().then(why),
+        }
+    }
+
+    /// Whether it has a value.
+    pub fn is_good(&self) -> bool {
+        !self.value.is_null()
+    }
+}

@@ -1,0 +1,216 @@
+//! `GET /api/v1/drives/{name}/points`: points of a drive, with the reason where one has no value.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use axum::Json;
+use axum::extract::{Extension, Path, RawQuery, State};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+
+use super::messages::{PointValue, Word};
+use super::query;
+use super::routes::{AppState, Reached, no_drive, not_found};
+use crate::codec::{Reply, RequestPdu};
+use crate::command::{self, Authority, Order, Origin};
+use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source};
+use crate::plant::DriveHandle;
+use crate::process_image::{Link, Reading, Unavailable, public_points};
+
+/// Most points of one request; a profile has some hundred.
+const MAX_POINTS: usize = 1024;
+/// Time for all points that are not polled and have to be read from the drive.
+const FORWARDED: Duration = Duration::from_secs(10);
+
+/// The points of a drive that are polled, or those of `names`. One that is not polled is read from the drive for whoever may
+/// command it.
+pub(super) async fn points(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    Path(name): Path<String>,
+    RawQuery(query): RawQuery,
+    headers: HeaderMap,
+) -> Response {
+    let names = match query::parameters(query.as_deref(), &["names"]) {
+        Ok([names]) => names.unwrap_or_default(),
+        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
+    };
+    let names: Vec<&str> = names.split(',').filter(|name| !name.is_empty()).collect();
+    let plant = app.plant.load_full();
+    let Some(drive) = plant.drive(&name) else {
+        return no_drive(&plant, &name);
+    };
+    let wanted = match wanted(&drive.image.spec.profile, &names) {
+        Ok(wanted) => wanted,
+        Err(why) => return not_found(why, Vec::new()),
+    };
+    let cookies = app.cookies(&reached);
+    let operator = app.operating.operator(&headers, &cookies, &reached).await.ok();
+    let origin = operator.map(|operator| operator.origin());
+    Json(read(&drive, wanted, origin).await).into_response()
+}
+
+/// What is known of the points; those that are not polled are read as `origin`.
+async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) -> Vec<PointValue> {
+    let profile = &drive.image.spec.profile;
+    let now = Instant::now();
+    // One look at the image, so that all values of one poll are of one poll.
+    let reading = drive.reading(now);
+    let mut points = Vec::with_capacity(wanted.len());
+    for one in wanted {
+        let index = match one {
+            Wanted::Word(word) => {
+                points.push(PointValue::word(word, word_of(word, drive, &reading)));
+                continue;
+            }
+            Wanted::Point(index) => index,
+        };
+        let Some(point) = profile.points.get(index) else {
+            continue;
+        };
+        let not_polled = point.raw().filter(|_| point.class == PollClass::Never);
+        points.push(match (not_polled, &origin) {
+            (Some(raw), Some(origin)) => forwarded(drive, point, raw, origin.clone(), now + FORWARDED).await,
+            _ => PointValue::new(point, &reading.sample(index), || why_not_good(drive, &reading, index)),
+        });
+    }
+    points
+}
+
+/// What is asked for by a name.
+#[derive(Debug, Clone, Copy)]
+enum Wanted {
+    /// A point, by its index.
+    Point(usize),
+    Word(Word),
+}
+
+/// The word, or the quality of what it comes from, and why it is not good.
+fn word_of(word: Word, drive: &DriveHandle, reading: &Reading<'_>) -> Result<String, (Quality, String)> {
+    let profile = &reading.spec.profile;
+    let bad = word
+        .sources()
+        .iter()
+        .filter_map(|point| profile.model_index(*point))
+        .find(|index| {
+            let sample = reading.sample(*index);
+            sample.good().is_none()
+        });
+    let not_good = || {
+        let index = bad.unwrap_or_default();
+        (reading.sample(index).quality, why_not_good(drive, reading, index))
+    };
+    match word {
+        Word::State => reading
+            .state()
+            .map(|state| state.name().to_string())
+            .ok_or_else(not_good),
+        Word::FaultText if bad.is_some() => Err(not_good()),
+        Word::FaultText => Ok(reading.fault_text()),
+    }
+}
+
+fn wanted(profile: &Profile, names: &[&str]) -> Result<Vec<Wanted>, String> {
+    if names.len() > MAX_POINTS {
+        return Err(format!(
+            "{} points are requested; {MAX_POINTS} are allowed",
+            names.len()
+        ));
+    }
+    if names.is_empty() {
+        let all = public_points(profile).into_iter();
+        return Ok(all.map(|(index, _)| Wanted::Point(index)).collect());
+    }
+    let of = |name: &&str| {
+        let has = |word: &Word| word.sources().iter().any(|point| profile.model_index(*point).is_some());
+        let word = || Word::of(name).filter(has).map(Wanted::Word);
+        let shown = |index: &usize| profile.points.get(*index).is_some_and(|point| !point.hidden);
+        let point = profile.point_index(name).filter(shown).map(Wanted::Point);
+        point
+            .or_else(word)
+            .ok_or_else(|| format!("profile `{}` has no point `{name}`", profile.name))
+    };
+    names.iter().map(of).collect()
+}
+
+/// A point that is not polled: the drive is asked for it.
+async fn forwarded(drive: &DriveHandle, point: &Point, raw: &Raw, origin: Origin, deadline: Instant) -> PointValue {
+    let pdu = RequestPdu::Read {
+        table: raw.table,
+        start: raw.address,
+        count: raw.form.items(),
+    };
+    let now = Instant::now();
+    let expiry = deadline.saturating_duration_since(now);
+    let mut placed = drive.place(Order::Read(pdu), origin, Authority::ReadOnly, expiry, now);
+    let outcome = placed.answered().await.outcome;
+    let words: Option<Vec<u16>> = match &outcome {
+        command::Outcome::Acknowledged(Reply::Registers(words)) => Some(words.clone()),
+        command::Outcome::Acknowledged(Reply::Bits(bits)) => Some(bits.iter().map(|b| u16::from(*b)).collect()),
+        _ => None,
+    };
+    let was_read = words.is_some();
+    let value = words.and_then(|words| raw.decode(&words, point.kind()));
+    let sample = Sample {
+        value,
+        quality: if value.is_some() { Quality::Good } else { Quality::Bad },
+        at: None,
+    };
+    PointValue::new(point, &sample, || match was_read {
+        true => NO_NUMBER.to_string(),
+        false => outcome.to_string(),
+    })
+}
+
+const NO_NUMBER: &str = "the register does not hold a number";
+
+/// Why a polled or derived point has no good value.
+fn why_not_good(drive: &DriveHandle, reading: &Reading<'_>, index: usize) -> String {
+    if !drive.bus_up() {
+        let reason = drive.bus.image.health().reason;
+        return reason.map_or("the bus is down".to_string(), |why| format!("the bus is down: {why}"));
+    }
+    match reading.snapshot.link {
+        Link::Untried => return "the drive has not been polled yet".to_string(),
+        Link::Offline(_) => return "the drive does not answer".to_string(),
+        Link::Online(_) => {}
+    }
+    let profile = &reading.spec.profile;
+    let point = profile.points.get(index);
+    let rests_on = match point.map(|point| &point.source) {
+        Some(Source::Derived(derived)) => derived.rests_on(),
+        _ => vec![index],
+    };
+    let sources = rests_on.into_iter().filter_map(|source| profile.points.get(source));
+    let because = sources.filter_map(|source| {
+        let why = why_no_words(reading, source.raw()?)?;
+        let is_itself = point.is_some_and(|point| point.name == source.name);
+        Some(if is_itself {
+            why
+        } else {
+            format!("`{}`: {why}", source.name)
+        })
+    });
+    because
+        .into_iter()
+        .next()
+        .unwrap_or_else(|| match point.map(|point| &point.source) {
+            Some(Source::Derived(_)) => "it cannot be derived: its range is not known".to_string(),
+            _ => NO_NUMBER.to_string(),
+        })
+}
+
+/// Why the words of a register are not good, if they are not.
+fn why_no_words(reading: &Reading<'_>, raw: &Raw) -> Option<String> {
+    match reading.words(raw.table, raw.address, raw.form.items()).err()? {
+        Unavailable::Refused(code) => Some(format!("the drive refused it with {code}")),
+        Unavailable::NotPolled => Some("it is not polled".to_string()),
+        Unavailable::Stale => Some(match reading.snapshot.read_at(raw.table, raw.address) {
+            Some(at) => {
+                let age = reading.now.saturating_duration_since(at).as_secs_f64();
+                format!("last read {age:.1} s ago")
+            }
+            None => "it has not been read yet".to_string(),
+        }),
+    }
+}

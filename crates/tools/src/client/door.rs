@@ -1,0 +1,158 @@
+//! One way to a gateway, and the connection to it.
+
+use std::fmt;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use rustls_pki_types::ServerName;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpStream, UnixStream};
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
+
+use super::{ClientError, Url};
+use crate::north::http::{InProcess, basic_authorization};
+use crate::north::{GATEWAY, client_tls, explain};
+
+/// What to do about a handshake that says nothing of its own.
+const NO_TLS: &str = "pass the CA of the gateway's certificate with --ca, or use http://";
+
+/// One way to a gateway.
+#[derive(Debug, Clone)]
+pub(crate) enum Door {
+    /// Its HTTP server.
+    Network(Network),
+    /// Its local socket.
+    Socket(PathBuf),
+    /// The parts of one in this process.
+    InProcess(Arc<InProcess>),
+}
+
+/// An HTTP server, and who asks it.
+#[derive(Debug, Clone)]
+pub(crate) struct Network {
+    pub(crate) url: Url,
+    /// `None`: those of the system.
+    pub(crate) ca: Option<PathBuf>,
+    pub(crate) token_file: Option<PathBuf>,
+}
+
+/// A connection, with TLS or without.
+pub(crate) trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
+
+impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
+
+/// Why there is no connection.
+#[derive(Debug)]
+pub(super) enum NotConnected {
+    /// No gateway listens there.
+    Nobody,
+    /// There may be one.
+    Because(String),
+    /// No other way is to be tried.
+    Final(ClientError),
+}
+
+impl fmt::Display for Door {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Door::Network(network) => network.url.fmt(f),
+            Door::Socket(path) => path.display().fmt(f),
+            Door::InProcess(_) => f.write_str("its bus"),
+        }
+    }
+}
+
+impl Door {
+    pub(super) fn is_network(&self) -> bool {
+        matches!(self, Door::Network(_))
+    }
+
+    /// What the path of a request begins with, and the host.
+    pub(super) fn base(&self) -> (&str, &str) {
+        match self {
+            Door::Network(network) => (&network.url.path, &network.url.authority),
+            Door::Socket(_) | Door::InProcess(_) => ("", "gateway"),
+        }
+    }
+
+    /// What to send as `Authorization`.
+    ///
+    /// # Errors
+    /// Its file cannot be read.
+    pub(super) fn authorization(&self) -> Result<Option<String>, ClientError> {
+        match self {
+            Door::Network(network) => network.token_file.as_deref().map(authorization).transpose(),
+            Door::Socket(_) | Door::InProcess(_) => Ok(None),
+        }
+    }
+
+    /// Connects.
+    ///
+    /// # Errors
+    /// Nobody listens, or the TLS handshake fails.
+    pub(super) async fn connect(&self) -> Result<Box<dyn Stream>, NotConnected> {
+        match self {
+            Door::Network(network) => network.connect().await,
+            Door::Socket(path) => match UnixStream::connect(path).await {
+                Ok(stream) => Ok(Box::new(stream)),
+                Err(error) if is_nobody(&error) => Err(NotConnected::Nobody),
+                Err(error) => Err(NotConnected::Because(format!(
+                    "cannot connect to {}: {error}",
+                    path.display()
+                ))),
+            },
+            Door::InProcess(door) => match door.connect() {
+                Some(stream) => Ok(Box::new(stream)),
+                None => Err(NotConnected::Because("too many requests at once".to_string())),
+            },
+        }
+    }
+}
+
+/// Whether no gateway listens there.
+fn is_nobody(error: &io::Error) -> bool {
+    use io::ErrorKind::{ConnectionRefused, NotADirectory, NotFound};
+    matches!(error.kind(), ConnectionRefused | NotFound | NotADirectory)
+}
+
+/// A token, or user and password, as the header has it.
+fn authorization(file: &Path) -> Result<String, ClientError> {
+    let text = std::fs::read_to_string(file).map_err(|error| {
+        let shown = file.display();
+        ClientError::File(format!(
+            "cannot read the token: {error}; {shown}; check the path and its permissions"
+        ))
+    })?;
+    let text = text.trim();
+    Ok(match text.contains(':') {
+        true => basic_authorization(text),
+        false => format!("Bearer {text}"),
+    })
+}
+
+impl Network {
+    async fn connect(&self) -> Result<Box<dyn Stream>, NotConnected> {
+        let socket = TcpStream::connect((self.url.host.as_str(), self.url.port))
+            .await
+            .map_err(|error| NotConnected::Because(error.to_string()))?;
+        Ok(match self.url.tls {
+            false => Box::new(socket),
+            true => Box::new(self.with_tls(socket).await.map_err(NotConnected::Final)?),
+        })
+    }
+
+    async fn with_tls(&self, socket: TcpStream) -> Result<TlsStream<TcpStream>, ClientError> {
+        let config = client_tls(self.ca.as_deref()).map_err(ClientError::File)?;
+        let failed = |why: String| {
+            let (what, remedy) = why.split_once("; ").unwrap_or((&why, NO_TLS));
+            ClientError::Tls(format!("{what}; {}; {remedy}", self.url))
+        };
+        let name = ServerName::try_from(self.url.host.clone()).map_err(|error| failed(error.to_string()))?;
+        let handshake = TlsConnector::from(config).connect(name, socket);
+        handshake
+            .await
+            .map_err(|error| failed(explain(&error, GATEWAY).unwrap_or_else(|| error.to_string())))
+    }
+}

@@ -1,0 +1,81 @@
+//! Several requests about one drive, all by the same way.
+
+use super::direct::{Direct, Needs};
+use super::{Target, Way};
+use crate::client::{Asked, Client, ClientError, Reply};
+use crate::config::{LogFormat, LogSettings};
+
+/// Requests about one drive, to the gateway or to the bus of this process.
+pub(super) struct Conversation {
+    client: Client,
+    direct: Option<Direct>,
+}
+
+impl Conversation {
+    /// Asks the gateway or, where there is none, opens the port; the first reply.
+    ///
+    /// # Errors
+    /// Why there is none, as a message.
+    pub(super) async fn begin(
+        target: &Target,
+        asked: &Asked,
+        needs: Needs<'_>,
+    ) -> Result<(Conversation, Reply), String> {
+        let client = target.client.clone();
+        let missed = match client.ask(asked).await {
+            Ok(reply) => return Ok((Conversation { client, direct: None }, reply)),
+            Err(ClientError::NotFound(missed)) => missed,
+            Err(error) => return Err(error.to_string()),
+        };
+        let Some(configured) = &target.configured else {
+            return Err(ClientError::NotFound(missed).to_string());
+        };
+        let not_found = configured.not_found(&missed, client.doors())?;
+        log_audit_only();
+        let direct = Direct::start(configured, needs, &not_found).await?;
+        let conversation = Conversation {
+            client: direct.client(),
+            direct: Some(direct),
+        };
+        match conversation.ask(asked).await {
+            Ok(reply) => Ok((conversation, reply)),
+            Err(why) => {
+                conversation.end().await;
+                Err(why)
+            }
+        }
+    }
+
+    /// A further request.
+    ///
+    /// # Errors
+    /// Why there is no reply, as a message.
+    pub(super) async fn ask(&self, asked: &Asked) -> Result<Reply, String> {
+        self.client.ask(asked).await.map_err(|error| match error {
+            ClientError::NotFound(_) => "the gateway is gone; the local socket; start it and try again".to_string(),
+            error => error.to_string(),
+        })
+    }
+
+    pub(super) fn way(&self) -> Way {
+        match self.direct {
+            None => Way::Gateway,
+            Some(_) => Way::Direct,
+        }
+    }
+
+    /// Closes the port, if it is open.
+    pub(super) async fn end(self) {
+        if let Some(direct) = self.direct {
+            direct.stop().await;
+        }
+    }
+}
+
+/// The command reports what happens itself; of the log only the audit is left.
+fn log_audit_only() {
+    crate::log::start_in_order(&LogSettings {
+        level: "off,audit=info".to_string(),
+        format: LogFormat::Auto,
+    });
+}

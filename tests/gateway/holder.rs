@@ -1,0 +1,177 @@
+//! Who sees and may what of a drive that one client holds: mbpoll, mosquitto, curl.
+
+use serde_json::{Value as Json, json};
+
+use crate::support::process::{Running, mbpoll_read, mbpoll_write, until, write_registers};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled};
+use crate::support::tools::{feed, run, tool};
+
+const PASSWORD: &str = "correct horse battery";
+const AUTHORITY: &str = r#"
+[authority]
+mode = "exclusive"
+lease = "30s"
+[[authority.principal]]
+name = "plc"
+rank = "automation"
+modbus_tcp = ["127.0.0.1/32"]
+[[authority.principal]]
+name = "alice"
+rank = "operator"
+http_user = "alice"
+[[authority.principal]]
+name = "cloud"
+rank = "remote"
+mqtt = "cloud"
+"#;
+
+struct Plant {
+    site: Site,
+    _others: [Running; 3],
+}
+
+fn plant() -> Plant {
+    let drives = controlled("pump-1", 1, "");
+    let http = format!("{HTTP}commands = true\nusers_file = \"users\"\n");
+    let site = Site::of(&[LINE1, &drives, MODBUS_TCP, MQTT, &http, AUTHORITY]);
+    let file = site.path("users");
+    let program = std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"));
+    let arguments = ["user", "add", "--file", &file, "alice"];
+    let added = feed(program, &arguments, &format!("{PASSWORD}\n"));
+    assert!(added.status.success(), "{added:?}");
+    let simulator = site.simulate(&["--addresses", "1", "--baud", "38400"]);
+    let broker = site.broker();
+    let gateway = site.run_ready();
+    site.until_connected(true);
+    site.until_state("pump-1", "ready");
+    Plant {
+        site,
+        _others: [simulator, broker, gateway],
+    }
+}
+
+impl Plant {
+    fn curl(&self, what: &str, body: &str) -> (u16, Json) {
+        let url = format!("http://127.0.0.1:{}/api/v1/drives/pump-1/{what}", self.site.http);
+        let user = format!("alice:{PASSWORD}");
+        let arguments = ["-s", "-u", &user, "-d", body, "-w", "\n%{http_code}", &url];
+        let output = run(&tool("curl"), &arguments);
+        let text = String::from_utf8(output.stdout).unwrap();
+        let (body, status) = text.rsplit_once('\n').unwrap();
+        (status.parse().unwrap(), serde_json::from_str(body).unwrap())
+    }
+
+    fn mosquitto(&self, topic: &str, payload: &str) -> Json {
+        let port = self.site.mqtt.to_string();
+        let topic = format!("drivegate/test/drive/pump-1/{topic}");
+        let client = ["-h", "127.0.0.1", "-p", &port, "-V", "5", "-q", "1", "-W", "60"];
+        let request = ["-t", &topic, "-e", "answers/1", "-m", payload];
+        let output = run(&tool("mosquitto_rr"), &[&client[..], &request].concat());
+        serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {output:?}"))
+    }
+
+    /// 0x8013 and 0x8104 as the PLC reads them, and the state over HTTP.
+    fn seen(&self) -> (u16, u16, Json, Json) {
+        let read = |address| until("registers", || mbpoll_read(self.site.modbus, 1, address, 1).ok())[0];
+        let (holder, own) = (read(0x8013), read(0x8104));
+        let url = format!("http://127.0.0.1:{}/api/v1/drives/pump-1", self.site.http);
+        let output = run(&tool("curl"), &["-s", &url]);
+        let drive: Json = serde_json::from_slice(&output.stdout).unwrap();
+        (holder, own, drive["hold"].clone(), drive["holder"].clone())
+    }
+
+    fn write(&self, address: u16, values: &[u16]) -> Result<(), String> {
+        mbpoll_write(self.site.modbus, 1, address, values).map(|_| ())
+    }
+}
+
+fn busy(written: Result<(), String>) {
+    let error = written.unwrap_err();
+    assert!(error.to_lowercase().contains("busy"), "{error}");
+}
+
+#[test]
+fn who_sees_and_may_what() {
+    let plant = plant();
+    assert_eq!(plant.seen(), (0, 0, json!("free"), json!(null)));
+    // The first command takes the drive, and everybody sees that.
+    write_registers(plant.site.modbus, 1, 0x8100, &[1, 5000]);
+    plant.site.until_point("pump-1", "output_frequency", 25.0);
+    assert_eq!(plant.seen(), (1, 1, json!("held"), json!("plc")));
+    let left = until("the time", || mbpoll_read(plant.site.modbus, 1, 0x8014, 1).ok())[0];
+    assert!((1..=30).contains(&left), "{left}");
+    // Nobody else commands it, whatever rank; each refusal names the holder.
+    let (status, answer) = plant.curl("commands", r#"{"run": true, "speed_reference": 10}"#);
+    assert_eq!((status, &answer["result"]), (409, &json!("held_by_other")), "{answer}");
+    assert_eq!(
+        (&answer["holder"], &answer["holder_rank"]),
+        (&json!("plc"), &json!("automation"))
+    );
+    let answer = plant.mosquitto("as/cloud/set", r#"{"speed_reference": 10}"#);
+    assert_eq!(
+        (&answer["result"], &answer["holder"]),
+        (&json!("held_by_other"), &json!("plc")),
+        "{answer}"
+    );
+    // Nobody is nobody, also with a drive's name right.
+    for topic in ["set", "as/stranger/set"] {
+        let answer = plant.mosquitto(topic, r#"{"speed_reference": 10}"#);
+        assert_eq!(answer["result"], "not_allowed", "{answer}");
+    }
+    assert_eq!(plant.mosquitto("as/cloud/hold", "break")["result"], "held_by_other");
+    assert_eq!(plant.mosquitto("hold", "take")["result"], "not_allowed");
+    assert_eq!(plant.site.point("pump-1", "output_frequency"), 25.0);
+    // A higher rank takes it over: the motor runs on.
+    assert_eq!(plant.curl("hold", r#"{"action": "take"}"#).0, 409);
+    let (status, answer) = plant.curl("hold", r#"{"action": "break"}"#);
+    assert_eq!(
+        (status, &answer["holder"], &answer["own"]),
+        (200, &json!("alice"), &json!(true)),
+        "{answer}"
+    );
+    assert_eq!(plant.seen(), (2, 0, json!("held"), json!("alice")));
+    assert_eq!(plant.site.point("pump-1", "running"), true);
+    busy(plant.write(0x8100, &[1, 4000]));
+    busy(plant.write(0x8104, &[1]));
+    busy(plant.write(0x8104, &[2]));
+    let refused = plant.write(0x8104, &[3]).unwrap_err();
+    assert!(refused.contains("Illegal data value"), "{refused}");
+    plant.write(0x8104, &[0]).unwrap();
+    plant.write(0x8103, &[1]).unwrap();
+    assert_eq!(
+        plant.seen(),
+        (2, 0, json!("held"), json!("alice")),
+        "a release by another has no effect"
+    );
+    // A stop of anybody passes and ends the hold; that of nobody reserves nothing.
+    let answer = plant.mosquitto("set", r#"{"run": false}"#);
+    assert_eq!(answer["result"], "confirmed", "{answer}");
+    assert_eq!(plant.seen(), (0, 0, json!("free"), json!(null)));
+    // Behind the stop of the operator the PLC does not start the motor by going on.
+    plant.write(0x8100, &[1, 5000]).unwrap();
+    plant.site.until_point("pump-1", "running", true);
+    let (status, answer) = plant.curl("commands", r#"{"run": false}"#);
+    assert_eq!(status, 200, "{answer}");
+    assert_eq!(plant.seen(), (4, 0, json!("reserved"), json!("alice")));
+    busy(plant.write(0x8100, &[1, 5000]));
+    let answer = plant.mosquitto("as/cloud/set", r#"{"run": true}"#);
+    assert_eq!(
+        (&answer["result"], &answer["holder"]),
+        (&json!("held_by_other"), &json!("alice")),
+        "{answer}"
+    );
+    assert_eq!(plant.curl("hold", r#"{"action": "release"}"#).1["hold"], "free");
+    let (_, answer) = plant.curl("hold", r#"{"action": "renew"}"#);
+    assert_eq!(answer["result"], "needs_take", "{answer}");
+    plant.write(0x8103, &[1, 1]).unwrap();
+    assert_eq!(plant.seen(), (1, 1, json!("held"), json!("plc")));
+    plant.write(0x8100, &[1, 5000]).unwrap();
+    plant.site.until_point("pump-1", "running", true);
+    plant.write(0x8104, &[0]).unwrap();
+    assert_eq!(plant.seen(), (0, 0, json!("free"), json!(null)));
+    assert_eq!(
+        plant.site.point("pump-1", "running"),
+        true,
+        "the motor runs on when a hold ends"
+    );
+}

@@ -1,0 +1,309 @@
+//! Six clients and the holder of a drive, on a line that loses and damages frames, with reloads and kills: no run or reference of one
+//! who does not hold the drive is on the wire, and every stop is carried out.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use drivegate::codec::{Protocol, Table};
+use drivegate::command::{
+    Authority, DEFAULT_EXPIRY, HoldState, Mode, Order, Origin, Outcome, Principal, Proof, Refusal, Rules, SourceKind,
+    Verb, written,
+};
+use drivegate::plant::Placed;
+use drivegate::sim::faults::FaultPlan;
+use drivegate::sim::random::Random;
+
+use super::bus::{Parts, Seen};
+use super::rig::{PATIENCE, Rig, line};
+use super::scenario::Line;
+
+const SECOND: Duration = Duration::from_secs(1);
+const LEASE: Duration = Duration::from_secs(3);
+const DRIVES: u8 = 2;
+/// Each client on a north side of its own. The reference that it sets tells whose a frame is: 10 % and as many more as its place.
+const CLIENTS: [&str; 6] = ["plc", "op", "cloud", "socket:7", "host", "nobody"];
+
+fn works() -> Line {
+    Line {
+        cycle: Duration::from_millis(100),
+        ..line("vacon-nx", Protocol::ModbusRtu, 19_200, DRIVES)
+    }
+}
+
+fn rules() -> Arc<Rules> {
+    let principals = vec![
+        Principal {
+            modbus_tcp: vec!["10.0.0.5/32".parse().unwrap()],
+            ..Principal::new("plc", 2)
+        },
+        Principal {
+            http_user: Some("op".to_string()),
+            ..Principal::new("op", 1)
+        },
+        Principal {
+            mqtt: Some("cloud".to_string()),
+            ..Principal::new("cloud", 3)
+        },
+        Principal {
+            sparkplug: true,
+            ..Principal::new("host", 2)
+        },
+    ];
+    Arc::new(Rules {
+        mode: Mode::Exclusive,
+        ranks: ["site", "operator", "automation", "remote"].map(Into::into).to_vec(),
+        lease: LEASE,
+        stop_at_local: true,
+        principals,
+    })
+}
+
+fn origin(client: usize) -> Origin {
+    let (kind, proof) = match client {
+        0 => (SourceKind::ModbusTcp, Proof::Address("10.0.0.5".parse().unwrap())),
+        1 => (SourceKind::Http, Proof::User("op".into())),
+        2 => (SourceKind::Mqtt, Proof::Topic("cloud".into())),
+        3 => (SourceKind::LocalSocket, Proof::Uid(7)),
+        4 => (SourceKind::Sparkplug, Proof::Sparkplug),
+        _ => (SourceKind::Mqtt, Proof::Nothing),
+    };
+    Origin::new(kind, CLIENTS[client]).proven(proof)
+}
+
+struct Play {
+    rig: Rig,
+    dice: Random,
+    rules: Arc<Rules>,
+    began: Instant,
+    stops: Vec<(usize, Placed)>,
+    /// Orders that run, by drive and client.
+    runs: Vec<(usize, usize, Placed)>,
+    /// The last holder of each drive.
+    last: BTreeMap<usize, String>,
+    results: BTreeMap<&'static str, u32>,
+    frames: u32,
+    faulty: bool,
+}
+
+impl Play {
+    fn new(seed: u64) -> Play {
+        let rig = Rig::new(&works(), Parts::of(0, &works(), seed));
+        let rules = rules();
+        rig.bus.handle.queue.set_authority(Some(rules.clone()));
+        Play {
+            began: rig.now,
+            rig,
+            dice: Random::new(seed ^ 0x401D),
+            rules,
+            stops: Vec::new(),
+            runs: Vec::new(),
+            last: BTreeMap::new(),
+            results: BTreeMap::new(),
+            frames: 0,
+            faulty: false,
+        }
+    }
+
+    fn time(&self) -> SystemTime {
+        SystemTime::UNIX_EPOCH + Duration::from_secs(1_800_000_000) + (self.rig.now - self.began)
+    }
+
+    fn holder(&self, drive: usize) -> (HoldState, String) {
+        let queue = self.rig.bus.handle.queue.lock();
+        let (view, _) = queue.hold_view(drive, None, self.rig.now).unwrap();
+        (
+            view.state,
+            view.holder.map(|holder| holder.to_string()).unwrap_or_default(),
+        )
+    }
+
+    fn run(&mut self, time: Duration) {
+        let until = self.rig.now + time;
+        loop {
+            for drive in 0..usize::from(DRIVES) {
+                if let (HoldState::Held, holder) = self.holder(drive) {
+                    self.last.insert(drive, holder);
+                }
+            }
+            match self.rig.step(until) {
+                Some(seen) => seen.into_iter().for_each(|seen| self.note(seen)),
+                None => return,
+            }
+        }
+    }
+
+    /// Whose frame may be on the wire: that of the holder, or of the last one while nobody else came.
+    fn note(&mut self, seen: Seen) {
+        let Seen::Sent(asked) = seen else { return };
+        let Some((Table::Holding, items)) = written(&asked.pdu) else {
+            return;
+        };
+        let profile = self.rig.bus.profile.clone();
+        let reference = profile.points[profile.point_index("speed_reference").unwrap()]
+            .raw()
+            .unwrap()
+            .address;
+        for (address, word) in items {
+            let runs = profile.runs_by(Table::Holding, address, word) == Some(true);
+            if !runs && address != reference {
+                continue;
+            }
+            self.frames += 1;
+            let (state, holder) = self.holder(asked.drive);
+            let whose = match state {
+                HoldState::Held => holder,
+                HoldState::Free => self.last.get(&asked.drive).cloned().unwrap_or_default(),
+                HoldState::Reserved | HoldState::Local => panic!("{:?} while {state:?} for {holder}", asked.pdu),
+            };
+            let place = CLIENTS.iter().position(|client| *client == whose);
+            let place = place.unwrap_or_else(|| panic!("{:?} while nobody ever held the drive", asked.pdu));
+            if address == reference {
+                assert_eq!(
+                    usize::from(word),
+                    1000 + 100 * place,
+                    "the reference of another than {whose}"
+                );
+            } else {
+                let waits = |(drive, client, _): &(usize, usize, Placed)| (*drive, *client) == (asked.drive, place);
+                assert!(self.runs.iter().any(waits), "a run that {whose} did not order");
+            }
+        }
+    }
+
+    fn place(&mut self, client: usize, drive: usize, points: &[(&str, f64)]) -> Placed {
+        let order: Order = self.rig.points(drive as u8 + 1, points);
+        let handle = self.rig.drive(drive as u8 + 1);
+        let placed = handle.place(order, origin(client), Authority::Write, DEFAULT_EXPIRY, self.rig.now);
+        self.rig.bus.command_came(self.rig.now);
+        placed
+    }
+
+    fn act(&mut self) {
+        let client = self.dice.within(0..=5) as usize;
+        let drive = self.dice.within(0..=u64::from(DRIVES) - 1) as usize;
+        let reference = 10.0 + client as f64;
+        match self.dice.within(0..=11) {
+            0..=2 => {
+                let placed = self.place(client, drive, &[("run", 1.0), ("speed_reference", reference)]);
+                self.runs.push((drive, client, placed));
+            }
+            3..=4 => drop(self.place(client, drive, &[("speed_reference", reference)])),
+            5..=6 => {
+                let placed = self.place(client, drive, &[("run", 0.0)]);
+                self.stops.push((client, placed));
+            }
+            7 => self.rig.drive(drive as u8 + 1).heartbeat(&origin(client), self.rig.now),
+            place => {
+                let verb = Verb::ALL[place as usize - 8];
+                let handle = self.rig.drive(drive as u8 + 1);
+                let acted = handle.hold(verb, &origin(client), Authority::Write, self.rig.now);
+                self.rig.bus.command_came(self.rig.now);
+                let code = acted.as_ref().map_or_else(Refusal::code, |_| verb.name());
+                *self.results.entry(code).or_default() += 1;
+            }
+        }
+    }
+
+    fn look(&mut self) {
+        let results = &mut self.results;
+        let faulty = self.faulty;
+        self.stops.retain_mut(|(client, placed)| {
+            let Some(answer) = placed.answer() else { return true };
+            let refused = matches!(answer.outcome, Outcome::Refused(_) | Outcome::QueueFull);
+            assert!(!refused, "the stop of {}: {}", CLIENTS[*client], answer.outcome);
+            assert!(
+                faulty || answer.outcome.is_ok(),
+                "the stop of {}: {}",
+                CLIENTS[*client],
+                answer.outcome
+            );
+            *results.entry("stopped").or_default() += 1;
+            false
+        });
+        self.runs.retain_mut(|(_, client, placed)| {
+            let Some(answer) = placed.answer() else { return true };
+            if *client == 5 {
+                assert_eq!(answer.outcome.code(), "not_allowed");
+            }
+            *results.entry(answer.outcome.code()).or_default() += 1;
+            false
+        });
+    }
+
+    /// A reload of the bus keeps holds; after a kill only the reservations are left.
+    fn restart(&mut self, killed: bool) {
+        let kept = self.rig.plant.reservations(self.rig.now, self.time());
+        let kept: Vec<_> = kept.into_iter().map(|(_, one)| one).collect();
+        let before: Vec<_> = (0..usize::from(DRIVES)).map(|drive| self.holder(drive)).collect();
+        self.rig.restart_now();
+        let queue = self.rig.bus.handle.queue.clone();
+        queue.set_authority(Some(self.rules.clone()));
+        if killed {
+            queue.set_authority(None);
+            queue.set_authority(Some(self.rules.clone()));
+            self.rig.plant.restore_reservations(&kept, self.rig.now, self.time());
+            self.last.clear();
+        }
+        for (drive, before) in before.into_iter().enumerate() {
+            let expected = match before.0 {
+                HoldState::Held if killed => (HoldState::Free, String::new()),
+                _ => before,
+            };
+            assert_eq!(self.holder(drive), expected, "killed: {killed}");
+        }
+    }
+}
+
+#[test]
+fn only_the_holder_is_on_the_wire_and_every_stop() {
+    let mut all = BTreeMap::new();
+    let mut frames = 0;
+    for seed in 0..12 {
+        let mut play = Play::new(seed);
+        play.rig.until("online", PATIENCE, |rig| rig.is_whole());
+        play.faulty = seed % 3 == 2;
+        if play.faulty {
+            let faults = "drop=0.15,corrupt=0.1,late:60ms=0.1,busy=0.1";
+            play.rig.set_faults(FaultPlan::new(faults.parse().unwrap(), seed));
+        }
+        for round in 0..400 {
+            let pause = play.dice.within(1..=180);
+            play.run(Duration::from_millis(pause));
+            let many = play.dice.within(1..=4);
+            for _ in 0..many {
+                play.act();
+            }
+            if round % 67 == 66 && !play.faulty {
+                // What is on its way when a bus starts anew may end in any way.
+                play.run(DEFAULT_EXPIRY + SECOND);
+                play.look();
+                let killed = play.dice.chance(0.5);
+                play.restart(killed);
+            }
+            play.look();
+        }
+        play.run(10 * SECOND);
+        play.look();
+        assert!(play.stops.is_empty(), "a stop that nobody answers");
+        play.rig.plant.tell_holds(play.rig.now, play.time());
+        frames += play.frames;
+        for (code, count) in play.results {
+            *all.entry(code).or_insert(0) += count;
+        }
+    }
+    // Every kind of thing happened.
+    for code in [
+        "acknowledged",
+        "held_by_other",
+        "needs_take",
+        "not_allowed",
+        "stopped",
+        "take",
+        "break",
+        "release",
+    ] {
+        assert!(all.get(code).is_some_and(|count| *count > 5), "{code}: {all:?}");
+    }
+    assert!(frames > 500, "{frames} frames; {all:?}");
+}
