@@ -565,6 +565,7 @@ mod tests {
             quality: Quality::Good,
             blocked_by: Vec::new(),
             hold: None,
+            stop_waits: None,
             points: Vec::new(),
         };
         let object = StateObject {
@@ -597,7 +598,7 @@ mod tests {
         });
         let running = cx.point_index("running").unwrap();
         let ready = cx.point_index("ready").unwrap();
-        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter(), Vec::new());
+        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter(), Vec::new(), None);
         let object = StateObject {
             shown: &shown,
             names: &["running".to_string(), "ready".to_string()],
@@ -621,7 +622,7 @@ mod tests {
         assert_eq!(object["point_quality"], serde_json::json!({"ready": "good"}));
         assert_eq!(PointPayload::state(shown.state), PointPayload::Nothing);
         image.update(|s| s.store(Table::DiscreteInput, 2, &[0], now));
-        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter(), Vec::new());
+        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter(), Vec::new(), None);
         assert_eq!((shown.state, shown.quality), (Some(State::Ready), Quality::Good));
     }
 
