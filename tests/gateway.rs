@@ -26,6 +26,7 @@ mod gateway {
     mod living;
     mod local_socket;
     mod messages;
+    mod openapi;
     mod operators;
     mod parameters;
     mod recordings;

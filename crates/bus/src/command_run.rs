@@ -278,10 +278,7 @@ impl CommandRun {
 
     /// Whether only supervision wants it.
     pub fn is_of_supervision(&self) -> bool {
-        let kind = |ticket: &Ticket| ticket.origin().kind;
-        self.tickets
-            .iter()
-            .all(|ticket| kind(ticket) == SourceKind::Supervision)
+        self.tickets.iter().all(|ticket| ticket.origin().is_lease())
     }
 
     /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is

@@ -46,8 +46,8 @@ pub(super) struct DriveState {
     /// Whether `[authority]` is on: then those are kept whose orders were carried out.
     pub(super) guarded: bool,
     pub(super) carried_out: Vec<Origin>,
-    /// Its local control place has it, as far as was told.
-    pub(super) local: bool,
+    /// Whether its local control place has it; none while that is not known.
+    pub(super) local: Option<bool>,
 }
 
 /// What the begun commands of a drive want.
@@ -83,7 +83,7 @@ impl DriveState {
             acknowledged: None,
             guarded: false,
             carried_out: Vec::new(),
-            local: false,
+            local: None,
         }
     }
 

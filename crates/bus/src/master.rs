@@ -325,7 +325,7 @@ impl Master {
                 news.extend(late.into_iter().map(|late| News::NotConfirmed(index, late)));
             }
             if drive.guarded || guarded {
-                look_at_hold(bus, index, image, drive, guarded, now);
+                look_at_hold(bus, index, image, drive, (guarded, writes), now);
             }
             if image.spec.supervision.is_some() {
                 supervise(bus, index, image, drive, writes, now, news);
@@ -479,7 +479,7 @@ pub(super) fn supervise(
             drive.supervision.withdrawn(now);
         }
         Demand::Write(point, value) => {
-            let origin = Origin::new(SourceKind::Supervision, "supervision");
+            let origin = Origin::new(SourceKind::Supervision, Origin::LEASE);
             let ordered = bus.own_order(index, &reading, (point, value), origin.clone(), DEFAULT_EXPIRY, writes);
             if let Some(refusal) = supervision.ordered(ordered, now) {
                 let what = format!("{}={value}", point.name());

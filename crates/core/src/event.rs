@@ -202,17 +202,20 @@ impl EventKind {
 }
 
 /// One event.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct Event {
     /// Running number within a run of the process, from 1.
     pub id: u64,
     /// The run.
+    #[schema(value_type = String)]
     pub boot: Boot,
     /// When it happened.
     #[serde(serialize_with = "rfc3339")]
+    #[schema(value_type = String)]
     pub time: SystemTime,
     /// What happened.
     #[serde(rename = "event")]
+    #[schema(value_type = String)]
     pub kind: EventKind,
     /// The bus; empty if the whole gateway is meant.
     #[serde(skip_serializing_if = "String::is_empty")]
@@ -237,11 +240,12 @@ pub struct Event {
 }
 
 /// A recording that was made.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct RecordingMade {
     /// Its id.
     pub id: String,
     /// What made it.
+    #[schema(value_type = String)]
     pub trigger: Cow<'static, str>,
     /// What it shows, for people.
     pub summary: String,

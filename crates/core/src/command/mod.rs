@@ -154,6 +154,9 @@ pub struct Origin {
 }
 
 impl Origin {
+    /// Who acts when a lease runs out.
+    pub const LEASE: &str = "supervision";
+
     /// One that is a client by itself.
     pub fn new(kind: SourceKind, who: impl Into<String>) -> Origin {
         let who = who.into();
@@ -201,6 +204,11 @@ impl Origin {
     /// The login, if the client has one.
     pub fn login(&self) -> Option<&Arc<str>> {
         self.login.as_ref()
+    }
+
+    /// Whether it is the lease of a drive, and no other stop of the gateway's own.
+    pub fn is_lease(&self) -> bool {
+        self.kind == SourceKind::Supervision && self.who == Origin::LEASE
     }
 
     /// The client, whatever connection or topic it uses.

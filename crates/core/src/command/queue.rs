@@ -477,7 +477,7 @@ impl Pending {
     /// Takes away what supervision wants of a drive and has not begun: a client commands the drive again.
     pub fn withdraw_supervision(&mut self, drive: usize, now: Instant) {
         self.remove(now, &Outcome::Withdrawn, |c| {
-            c.drive == drive && c.joined.is_empty() && c.ticket.origin().kind == SourceKind::Supervision
+            c.drive == drive && c.joined.is_empty() && c.ticket.origin().is_lease()
         });
     }
 

@@ -65,6 +65,12 @@ bbmd = "bbmd.example.com"
 vendor = 999
 dcc_password_file = ""
 buses = []
+[authority]
+mode = "exclusive"
+[[authority.principal]]
+name = "plc-1"
+rank = "automation"
+modbus_tcp = ["127.0.0.1/32"]
 [audit]
 [params]
 [log]

@@ -22,7 +22,7 @@ const LOCAL_CONTROL: &str = "local_control";
 const INTERLOCKED: &str = "interlocked";
 
 /// One reason why a motor does not run.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Cause {
     /// The reason in one word, for programs.
     pub cause: String,
@@ -35,7 +35,7 @@ pub struct Cause {
 }
 
 /// Whether a motor runs, and why not.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Explanation {
     /// Whether it runs; `None` while that is not known.
     pub runs: Option<bool>,

@@ -9,8 +9,9 @@ use crate::command::{Answer, CONFIRMED, Outcome, Refusal, milliseconds, millisec
 use crate::plant::Shown;
 
 /// The one result of a command: `confirmed` if a read showed the effect in time, else the answer of the bus.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub(crate) struct CommandResult<'r> {
+    #[schema(value_type = serde_json::Value)]
     id: Option<&'r Id>,
     drive: &'r str,
     ok: bool,
@@ -24,8 +25,10 @@ pub(crate) struct CommandResult<'r> {
     #[serde(skip_serializing_if = "Option::is_none")]
     retry_after_ms: Option<u64>,
     #[serde(flatten)]
+    #[schema(value_type = KeptBy)]
     kept_by: Option<KeptBy>,
     #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
+    #[schema(value_type = f64)]
     latency: Duration,
     /// From acceptance to the read that showed the effect.
     #[serde(
@@ -33,24 +36,28 @@ pub(crate) struct CommandResult<'r> {
         serialize_with = "milliseconds_or_null",
         skip_serializing_if = "Option::is_none"
     )]
+    #[schema(value_type = Option<f64>)]
     confirmed: Option<Duration>,
     /// Why no read can show the effect of an acknowledged command.
     #[serde(skip_serializing_if = "Option::is_none")]
     note: Option<String>,
     #[serde(serialize_with = "crate::event::rfc3339")]
+    #[schema(value_type = String)]
     time: SystemTime,
 }
 
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub(super) struct ErrorObject {
     pub(super) code: &'static str,
     pub(super) message: String,
 }
 
 /// Who keeps the client from the drive.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 struct KeptBy {
+    #[schema(required = false)]
     holder: String,
+    #[schema(required = false)]
     holder_rank: String,
     hold_left_s: Option<u64>,
 }

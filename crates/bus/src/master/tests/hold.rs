@@ -82,6 +82,7 @@ fn only_the_holder_is_on_the_wire_and_every_stop() {
             (ModelPoint::FaultReset, Value::Bool(true)),
         ];
         for (point, value) in points {
+            drive(&plant, 0).heartbeat(&who("plc"), rig.now);
             let mut refused = place(&rig, &plant, name, point, value);
             rig.run(Time::from_millis(60));
             let expected = if name == "stranger" {
@@ -197,8 +198,10 @@ fn under_local_control_nobody_commands() {
         Value::Number(20.0),
     ));
     rig.run(Time::from_millis(300));
+    let from = rig.wire.len();
     rig.drives[0].holding.insert(FIELDBUS.0, 0);
     rig.run(Time::from_millis(1500));
+    assert_eq!(writes(&rig, from), 0, "no run command stood");
     let view = |now| drive(&plant, 0).hold_view(None, now).unwrap().0.state.name();
     assert_eq!(view(rig.now), "local");
     let mut refused = place(&rig, &plant, "plc", ModelPoint::SpeedReference, Value::Number(10.0));
@@ -209,4 +212,35 @@ fn under_local_control_nobody_commands() {
     rig.drives[0].holding.insert(FIELDBUS.0, FIELDBUS.1);
     rig.run(Time::from_millis(1500));
     assert_eq!(view(rig.now), "free");
+}
+
+#[test]
+fn nothing_starts_when_local_control_ends() {
+    let (mut rig, plant) = guarded(1, Mode::Exclusive);
+    drop(place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true)));
+    rig.run(Time::from_millis(200));
+    assert!(rig.runs(0));
+    rig.drives[0].holding.insert(FIELDBUS.0, 0);
+    rig.run(Time::from_millis(300));
+    assert!(!rig.runs(0), "one stop is written");
+    let view = drive(&plant, 0).hold_view(None, rig.now).unwrap().0;
+    assert_eq!(view.state.name(), "local");
+    let from = rig.wire.len();
+    rig.drives[0].holding.insert(FIELDBUS.0, FIELDBUS.1);
+    rig.run(Time::from_millis(300));
+    assert_eq!(writes(&rig, from), 0, "and nothing at its end");
+    let view = drive(&plant, 0).hold_view(None, rig.now).unwrap().0;
+    assert_eq!(
+        view.state.name(),
+        "free",
+        "a stop of the gateway's own reserves nothing"
+    );
+    // Found so at a start of the gateway: nothing is written.
+    let mut rig = Rig::new(1);
+    rig.drives[0].holding.insert(2000, 1);
+    let rules = plant.buses[0].queue.lock().rules().cloned();
+    rig.bus.queue.set_authority(rules);
+    let from = rig.wire.len();
+    rig.run(Time::from_millis(300));
+    assert_eq!(writes(&rig, from), 0);
 }

@@ -6,8 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::{CommandQueue, Pending};
 use crate::command::{
-    Asks, Claim, Command, Denial, HoldView, Holding, Mode, Origin, Outcome, Refusal, Rules, SourceKind, Told, Urgency,
-    Verb,
+    Asks, Claim, Command, Denial, HoldView, Holding, Mode, Origin, Outcome, Refusal, Rules, Told, Urgency, Verb,
 };
 
 /// What is told of holds waits for the gateway, which asks several times a second; beyond that the oldest is dropped.
@@ -138,7 +137,7 @@ impl Pending {
         for drive in command.reach() {
             let asks = Asks::of(command, *drive);
             if !origin.kind.is_client() {
-                let supervision = origin.kind == SourceKind::Supervision;
+                let supervision = origin.is_lease();
                 if asks == Asks::Stop {
                     self.holds.with(*drive, |holding, rules, told| {
                         holding.stopped_by_gateway(supervision, rules, now, told);
