@@ -11,8 +11,10 @@ use crate::process_image::{Access, BusSpec, DriveImage, DriveSpec, Link};
 
 const SECOND: Duration = Duration::from_secs(1);
 const RUN: Effect = Effect {
+    run: Some(true),
+    reverse: None,
     reference: false,
-    ..Effect::UNKNOWN
+    word: false,
 };
 
 /// Drives `d1` to `d3` of a family on one bus; `d1` and `d2` have the guard.

@@ -11,7 +11,8 @@ export const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", wa
 // All that the gateway knows; it refuses to search for others.
 const KINDS = [
   "fault", "fault_end", "warning", "warning_end", "online", "offline", "started", "stopped", "control_place", "supervision", "supervision_failed", "unsupervised",
-  "refused_command", "guarded", "interlock", "not_confirmed", "restarted", "unlike_profile", "selection_differs", "foreign_command", "parameters_changed", "restore_unfinished", "recording", "held", "released", "hold_broken", "bus_up",
+  "refused_command", "guarded", "interlock", "not_confirmed", "restarted", "unlike_profile", "selection_differs", "foreign_command", "parameters_changed", "restore_unfinished", "recording",
+  "held", "released", "hold_broken", "bus_up",
   "bus_down", "diagnosis", "reload_refused",
 ];
 const PAGE = 100;
