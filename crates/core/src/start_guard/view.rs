@@ -208,7 +208,7 @@ impl BusGuards {
     /// Whether that drive is not to be started together with another of these.
     fn is_together(&self, of: &Guarding, started: &[&Guarding]) -> bool {
         let other = |other: &&Guarding| other.machine != of.machine && other.group == of.group;
-        !of.guard.stagger.is_zero() && started.iter().any(|one| other(&one))
+        !of.guard.stagger.is_zero() && started.iter().any(other)
     }
 
     /// Counts what is not counted yet, and looks whether that is on disk.
