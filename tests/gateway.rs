@@ -26,6 +26,7 @@ mod gateway {
     mod living;
     mod local_socket;
     mod messages;
+    mod openapi;
     mod operators;
     mod parameters;
     mod recordings;
@@ -34,6 +35,7 @@ mod gateway {
     mod restart;
     mod restoring;
     mod slow_log;
+    mod start_guard;
     mod stop_all;
     mod trace;
     mod trying;

@@ -163,10 +163,11 @@ fn from_every_side() {
     let alice = ["--token-file", &login];
     let (code, text) = ran(&["write", "pump-1", "speed_reference=30"], &alice);
     assert!(code == 0 && text.contains("through the gateway"), "{text}");
-    let (code, text) = ran(&["read", "pump-1", "running", "slot_fault_response"], &alice);
-    assert!(code == 0 && text.matches("good").count() == 2, "{text}");
-    let (code, text) = ran(&["read", "pump-1", "running", "slot_fault_response"], &[]);
+    // A point that is not polled is read for those who may command.
+    let (code, text) = ran(&["read", "pump-1", "running", "process_data_in_8"], &[]);
     assert!(code == 1 && text.contains("it is not polled"), "{text}");
+    let (_, text) = ran(&["read", "pump-1", "running", "process_data_in_8"], &alice);
+    assert!(text.contains("good") && !text.contains("it is not polled"), "{text}");
     let (code, text) = ran(&["why", "pump-1"], &[]);
     assert_eq!((code, text.as_str()), (0, "pump-1 runs\n"));
     for refused in [

@@ -41,6 +41,8 @@ pub(super) struct DriveState {
     pub(super) was_read: bool,
     /// When its reference, and an end of its frequency range, were written last, whether or not it took that.
     pub(super) written: LastWritten,
+    /// A start (true) or a stop was acknowledged, and the guards have not taken note of it.
+    pub(super) acknowledged: Option<bool>,
     /// Whether `[authority]` is on: then those are kept whose orders were carried out.
     pub(super) guarded: bool,
     pub(super) carried_out: Vec<Origin>,
@@ -78,6 +80,7 @@ impl DriveState {
             answers_within: Duration::ZERO,
             was_read: false,
             written: LastWritten::default(),
+            acknowledged: None,
             guarded: false,
             carried_out: Vec::new(),
             local: None,
@@ -201,6 +204,11 @@ impl DriveState {
             overtaken.overtaken();
         }
         if outcome.is_ok() {
+            match urgency {
+                Urgency::Stop => self.acknowledged = Some(false),
+                Urgency::Command if run.start.is_some() => self.acknowledged = Some(true),
+                Urgency::Command | Urgency::Read => {}
+            }
             let was_read_back = run.was_read_back();
             let (effects, receipts) = run.acknowledge(outcome, now);
             if was_read_back {

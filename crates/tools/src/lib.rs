@@ -40,6 +40,7 @@ mod token;
 mod trace;
 mod trial;
 mod user;
+mod verify;
 mod watch;
 mod why;
 mod write;
@@ -140,6 +141,7 @@ commands! {
     Replay => replay,
     Simulate => simulate,
     Profiles => profiles,
+    Verify => verify,
     Map => map,
     Inventory => inventory,
     Audit => audit,

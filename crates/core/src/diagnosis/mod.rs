@@ -149,14 +149,16 @@ pub struct Finding {
 }
 
 /// A cause with its evidence, as it is shown.
-#[derive(Debug, Clone, PartialEq, Serialize, serde::Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct Verdict {
     /// The cause.
+    #[schema(value_type = String)]
     pub verdict: Cause,
     /// The drive, where it is about one.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub drive: Option<String>,
     /// How far the evidence goes.
+    #[schema(value_type = String)]
     pub certainty: Certainty,
     /// What it means, in a few words.
     pub meaning: String,
@@ -185,7 +187,7 @@ pub struct Diagnosis {
 }
 
 /// What was counted of one drive in the last minute.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, serde::Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct Counted {
     /// Its name.
     pub drive: String,
@@ -211,7 +213,7 @@ pub struct Counted {
 }
 
 /// What a drive counted since its counters were cleared (function 08, subfunctions 0B to 0F); they wrap at 65536.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, serde::Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct CountedByDrive {
     /// Sound messages on the line, to whatever address.
     pub messages: u16,

@@ -20,7 +20,7 @@ const MOST_HEADER: u64 = 1 << 20;
 const MOST_BYTES: u64 = 1 << 30;
 
 /// A recording in short.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct Entry {
     /// Its id.
     pub id: String,
@@ -31,6 +31,7 @@ pub struct Entry {
     /// Its bus.
     pub bus: String,
     /// What made it.
+    #[schema(value_type = String)]
     pub trigger: TriggerKind,
     /// What it shows.
     pub summary: String,

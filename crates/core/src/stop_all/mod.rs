@@ -38,7 +38,7 @@ const BROADCAST: Duration = Duration::from_millis(500);
 const MOST_ORDERS: usize = 256;
 
 /// What became of a drive.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Stopped {
     /// It acknowledged its stop, and a read since shows that the motor stands.
@@ -50,7 +50,7 @@ pub enum Stopped {
 }
 
 /// One drive in the answer.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct StoppedDrive {
     /// Its name.
     pub drive: String,
@@ -62,7 +62,7 @@ pub struct StoppedDrive {
 }
 
 /// The one answer to an order.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct StopReport {
     /// Every drive stands.
     pub ok: bool,

@@ -6,7 +6,7 @@ use super::result::ErrorObject;
 use crate::command::{HoldView, Refusal};
 
 /// Who holds a drive, and what became of an act upon that.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub(crate) struct HoldReply<'r> {
     drive: &'r str,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -23,7 +23,7 @@ pub(crate) struct HoldReply<'r> {
 }
 
 /// The fields of the hold wherever a drive is told. They are equal whatever time is left, which changes by itself.
-#[derive(Debug, Clone, Default, Serialize)]
+#[derive(Debug, Clone, Default, Serialize, utoipa::ToSchema)]
 pub(crate) struct HoldFields {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) hold: Option<&'static str>,

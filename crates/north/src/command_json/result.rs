@@ -5,12 +5,13 @@ use std::time::{Duration, SystemTime};
 use serde::Serialize;
 
 use super::Id;
-use crate::command::{Answer, CONFIRMED, Outcome, milliseconds, milliseconds_or_null};
+use crate::command::{Answer, CONFIRMED, Outcome, Refusal, milliseconds, milliseconds_or_null};
 use crate::plant::Shown;
 
 /// The one result of a command: `confirmed` if a read showed the effect in time, else the answer of the bus.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub(crate) struct CommandResult<'r> {
+    #[schema(value_type = serde_json::Value)]
     id: Option<&'r Id>,
     drive: &'r str,
     ok: bool,
@@ -20,9 +21,14 @@ pub(crate) struct CommandResult<'r> {
     /// Of a command whose stop alone was carried out: the code of the rest.
     #[serde(skip_serializing_if = "Option::is_none")]
     rest: Option<&'static str>,
+    /// Of a start that must wait: after which it may be tried again.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    retry_after_ms: Option<u64>,
     #[serde(flatten)]
+    #[schema(value_type = KeptBy)]
     kept_by: Option<KeptBy>,
     #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
+    #[schema(value_type = f64)]
     latency: Duration,
     /// From acceptance to the read that showed the effect.
     #[serde(
@@ -30,24 +36,28 @@ pub(crate) struct CommandResult<'r> {
         serialize_with = "milliseconds_or_null",
         skip_serializing_if = "Option::is_none"
     )]
+    #[schema(value_type = Option<f64>)]
     confirmed: Option<Duration>,
     /// Why no read can show the effect of an acknowledged command.
     #[serde(skip_serializing_if = "Option::is_none")]
     note: Option<String>,
     #[serde(serialize_with = "crate::event::rfc3339")]
+    #[schema(value_type = String)]
     time: SystemTime,
 }
 
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub(super) struct ErrorObject {
     pub(super) code: &'static str,
     pub(super) message: String,
 }
 
 /// Who keeps the client from the drive.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 struct KeptBy {
+    #[schema(required = false)]
     holder: String,
+    #[schema(required = false)]
     holder_rank: String,
     hold_left_s: Option<u64>,
 }
@@ -87,6 +97,10 @@ impl<'r> CommandResult<'r> {
             error: error.map(|message| ErrorObject { code, message }),
             rest: match &answer.outcome {
                 Outcome::StopOnly(rest) => Some(rest.code()),
+                _ => None,
+            },
+            retry_after_ms: match &answer.outcome {
+                Outcome::Refused(Refusal::Guarded(guarded)) => Some(guarded.retry_after_ms()),
                 _ => None,
             },
             kept_by: kept_by(&answer.outcome),

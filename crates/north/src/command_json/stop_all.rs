@@ -7,9 +7,9 @@ use serde::Deserialize;
 use super::excerpt;
 use crate::stop_all::{LONGEST_WAIT, Scope, WAIT};
 
-#[derive(Debug, Default, Deserialize)]
+#[derive(Debug, Default, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
-struct Body {
+pub(crate) struct StopBody {
     #[serde(default)]
     bus: Option<String>,
     #[serde(default)]
@@ -30,9 +30,11 @@ pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), String> {
         )
     };
     let body = match payload.trim_ascii() {
-        [] => Body::default(),
+        [] => StopBody::default(),
         // A list would be taken for an object without keys.
-        object @ [b'{', ..] => serde_json::from_slice(object).map_err(|error| unclear(error.to_string()))?,
+        object @ [b'{', ..] => {
+            serde_json::from_slice::<StopBody>(object).map_err(|error| unclear(error.to_string()))?
+        }
         _ => return Err(unclear("it is not a JSON object".to_string())),
     };
     let scope = match (body.bus, body.group) {

@@ -40,7 +40,7 @@ impl Clock {
 struct Time(#[serde(serialize_with = "crate::event::rfc3339")] SystemTime);
 
 /// One drive with all its points.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct Drive<'d> {
     name: &'d str,
     bus: &'d str,
@@ -52,10 +52,13 @@ pub(super) struct Drive<'d> {
     profile_verified: bool,
     access: &'static str,
     /// `null` while it is not known.
+    #[schema(value_type = Option<String>)]
     state: Option<State>,
+    #[schema(value_type = String)]
     quality: Quality,
     online: bool,
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
     since: Option<Time>,
     age_ms: Option<u64>,
     fault_text: String,
@@ -66,8 +69,12 @@ pub(super) struct Drive<'d> {
     /// Why it takes no commands but stops.
     #[serde(skip_serializing_if = "Option::is_none")]
     held: Option<String>,
+    /// For how long an ordinary stop still waits.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    stop_waits_ms: Option<u64>,
     /// Who holds it, where `[authority]` is on.
     #[serde(flatten)]
+    #[schema(value_type = HoldFields)]
     hold: Option<HoldFields>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
@@ -76,6 +83,7 @@ pub(super) struct Drive<'d> {
     running_seconds: Option<f64>,
     /// `null` where the drive does not count it.
     energy_kwh: Option<f64>,
+    #[schema(value_type = std::collections::HashMap<String, Point<'d>>)]
     points: Points<'d>,
 }
 
@@ -111,6 +119,7 @@ impl<'d> Drive<'d> {
             blocked_by: why.words(),
             why: why.causes,
             held: image.hold.why().map(|why| why.to_string()),
+            stop_waits_ms: drive.stop_waits(clock.now).map(millis),
             hold: drive.hold_view(None, clock.now).map(|(view, _)| view.into()),
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
@@ -133,7 +142,7 @@ impl<'d> Drive<'d> {
 }
 
 /// Exchanges by their outcome.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Outcomes {
     ok: u64,
     exception: u64,
@@ -176,15 +185,17 @@ impl Serialize for Points<'_> {
     }
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Point<'p> {
     value: serde_json::Value,
     /// The text of an enumeration's value.
     #[serde(skip_serializing_if = "Option::is_none")]
     text: Option<&'p str>,
+    #[schema(value_type = String)]
     quality: Quality,
     unit: &'p str,
     age_ms: Option<u64>,
+    #[schema(value_type = Option<String>)]
     time: Option<Time>,
     /// A newer state says otherwise.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
@@ -211,7 +222,7 @@ impl Points<'_> {
 }
 
 /// One bus with its statistics.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct Bus<'b> {
     name: &'b str,
     port: &'b str,
@@ -221,6 +232,7 @@ pub(super) struct Bus<'b> {
     state: &'static str,
     tried: bool,
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
     since: Option<Time>,
     #[serde(skip_serializing_if = "Option::is_none")]
     reason: Option<String>,
@@ -243,7 +255,7 @@ pub(super) struct Bus<'b> {
 }
 
 /// Cadence of a poll class.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Cycle {
     /// As configured.
     aim_ms: f64,
@@ -296,10 +308,11 @@ impl<'b> Bus<'b> {
 }
 
 /// What is wrong with the line of a bus.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct Diagnosis<'d> {
     bus: &'d str,
     /// `null` before the first five seconds are over.
+    #[schema(value_type = Option<String>)]
     time: Option<Time>,
     verdicts: &'d [Verdict],
     /// Sound replies of addresses that were not asked, in the last minute.

@@ -70,8 +70,8 @@ pub(super) async fn log(State(app): State<Arc<AppState>>, RawQuery(query): RawQu
 }
 
 /// An event, with the recording that shows it.
-#[derive(Debug, Serialize)]
-struct Shown<'e> {
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub(super) struct Shown<'e> {
     #[serde(flatten)]
     event: &'e Event,
     /// Absent in events that have it themselves.

@@ -33,8 +33,8 @@ pub(super) async fn bus(State(app): State<Arc<AppState>>, Path(name): Path<Strin
     Json(Line::new(handle, hour)).into_response()
 }
 
-#[derive(Debug, Serialize)]
-struct Line<'b> {
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub(super) struct Line<'b> {
     #[serde(flatten)]
     bus: api::Bus<'b>,
     turnaround: Turnarounds,
@@ -43,16 +43,17 @@ struct Line<'b> {
 }
 
 /// Load and cycle of the last hour; each step is least, greatest and last value, `null` where there was none.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Hour {
     #[serde(serialize_with = "crate::event::rfc3339")]
+    #[schema(value_type = String)]
     from: SystemTime,
     step_s: u64,
     load_ratio: Vec<Option<[f64; 3]>>,
     fast_cycle_ms: Vec<Option<[f64; 3]>>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct DriveLine<'b> {
     drive: &'b str,
     address: u8,
@@ -65,7 +66,7 @@ struct DriveLine<'b> {
 }
 
 /// How often the drive took how long until its reply began.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Turnarounds {
     /// Upper bound of each count; the last has none.
     le_ms: Vec<Option<f64>>,

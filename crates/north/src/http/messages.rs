@@ -11,7 +11,7 @@ use crate::parameters::{Plan, RestoreStage, RestoreStatus, Status};
 use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 
 /// An error reply.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ErrorReply {
     /// What is wrong, and what to do.
     pub error: String,
@@ -84,7 +84,7 @@ pub fn port_of(bus: &BusSpec) -> String {
 }
 
 /// Why a drive does not run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Why {
     /// Whether it runs, and why not.
     #[serde(flatten)]
@@ -96,7 +96,7 @@ pub struct Why {
 }
 
 /// How the parameters of a drive are to be read.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ReadParameters {
     /// The drive is asked for every address, whatever earlier readings found.
@@ -106,7 +106,7 @@ pub struct ReadParameters {
 }
 
 /// What is to be done with a restore.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum RestoreAct {
     /// The drive is read, and what would be written is found out.
@@ -134,7 +134,7 @@ pub enum RestoreAct {
 }
 
 /// The configuration was read again; it applies unless there are errors.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ReloadOutcome {
     /// What must be corrected; the gateway runs as before.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -148,7 +148,7 @@ pub struct ReloadOutcome {
 }
 
 /// Whether the gateway is ready.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Health {
     /// As `/readyz` says.
     pub ready: bool,
@@ -157,7 +157,7 @@ pub struct Health {
 }
 
 /// A recording that goes on.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Recorded {
     /// Its id.
     pub id: String,
@@ -166,7 +166,7 @@ pub struct Recorded {
 }
 
 /// A reading of parameters.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ParameterReading {
     /// Its number.
     pub number: u64,
@@ -208,7 +208,7 @@ impl ParameterReading {
 }
 
 /// A restore of parameters.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Restore {
     /// Its number.
     pub number: u64,
@@ -236,7 +236,7 @@ pub struct Restore {
 }
 
 /// What a restore is at.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Stage {
     /// The drive is read.
@@ -296,7 +296,7 @@ impl Restore {
 }
 
 /// A point with what is known of it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct PointValue {
     /// Name.
     pub point: String,

@@ -13,6 +13,7 @@ mod in_use;
 mod line;
 pub mod messages;
 mod offline;
+mod openapi;
 mod operating;
 mod page;
 mod params;

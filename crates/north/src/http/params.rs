@@ -6,7 +6,7 @@ use super::messages::Restore;
 use crate::parameters::{ParameterFile, RestoreStatus, Status};
 
 /// The parameters of a drive.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct Parameters<'a> {
     drive: &'a str,
     /// The last reading; `null` where there is none.
@@ -20,7 +20,7 @@ pub(super) struct Parameters<'a> {
     restore: Option<Restore>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct LastReading<'a> {
     family: &'a str,
     identification: &'a str,
@@ -34,7 +34,7 @@ struct LastReading<'a> {
     parameters: Vec<ParameterRow<'a>>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct ParameterRow<'a> {
     id: &'a str,
     /// As the drive gives it; `null` where it was not read.
@@ -45,7 +45,7 @@ struct ParameterRow<'a> {
     why: Option<&'a str>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct RunningReading<'a> {
     done: usize,
     total: usize,

@@ -11,14 +11,16 @@ use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
 use axum::http::{Method, StatusCode, Uri};
 use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
-use axum::routing::{get, post};
 use axum::{Json, response};
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
 use super::access::{Access, AccessError};
 use super::hosts::Hosts;
-use super::messages::{self, Health, Why};
+use super::messages::{
+    self, Health, ParameterReading, PointValue, ReadParameters, Recorded, ReloadOutcome, Restore, RestoreAct, Why,
+};
+use super::openapi::{Api, Doc};
 use super::operating::{self, Cookies, Operating};
 use super::params::Parameters;
 use super::{
@@ -26,11 +28,14 @@ use super::{
     streams, trend,
 };
 use crate::command::{Proof, SourceKind};
+use crate::command_json::{CommandResult, HoldReply, StopBody};
 use crate::connection_limit::{ConnectionLimit, Limits, Place};
+use crate::history::Entry;
 use crate::local::control::{self, Control};
 use crate::log_throttle::LogThrottle;
 use crate::parameters::ParameterFile;
 use crate::plant::{Plant, SharedPlant};
+use crate::stop_all::StopReport;
 use crate::{NorthStats, metrics, readiness};
 
 /// What all handlers share.
@@ -136,54 +141,189 @@ pub(super) fn router(
         files: Semaphore::new(1),
         operating,
     });
-    Router::new()
-        .route("/", get(status_page))
-        .route("/assets/{name}", get(asset))
-        .route("/metrics", get(exposition))
-        .route("/healthz", get(|| async { "ok\n" }))
-        .route("/readyz", get(ready))
-        .route("/api/v1/health", get(health))
-        .route(RELOAD, post(reload))
-        .route("/api/v1/drives", get(drives))
-        .route("/api/v1/drives/{name}", get(drive))
-        .route("/api/v1/drives/{name}/points", get(points::points))
-        .route("/api/v1/drives/{name}/why", get(why))
-        .route("/api/v1/drives/{name}/recordings", post(operating::record))
-        .route("/api/v1/drives/{name}/params", get(params))
-        .route(
-            "/api/v1/drives/{name}/params/reading",
-            get(operating::parameters::progress).post(operating::parameters::read),
-        )
-        .route(
-            "/api/v1/drives/{name}/params/restore",
-            get(operating::parameters::look).post(operating::parameters::restore),
-        )
-        .route("/api/v1/drives/{name}/trend", get(trend::trend))
-        .route("/api/v1/buses", get(buses))
-        .route("/api/v1/buses/{name}", get(line::bus))
-        .route("/api/v1/buses/{name}/diagnosis", get(diagnosis))
-        .route("/api/v1/audit", get(audit))
-        .route("/api/v1/recordings", get(recordings::list))
-        .route("/api/v1/recordings/{id}", get(recordings::one))
-        .route("/api/v1/events", get(streams::events))
-        .route("/api/v1/events/log", get(event_log::log))
-        .route("/api/v1/trace", get(streams::trace))
-        .route("/api/v1/login", post(operating::log_in))
-        .route("/api/v1/logout", post(operating::log_out))
-        .route("/api/v1/session", get(operating::session))
-        .route(
-            "/api/v1/drives/{name}/commands",
-            get(operating::commands_of).post(operating::command),
-        )
-        .route("/api/v1/drives/{name}/heartbeat", post(operating::heartbeat))
-        .route(
-            "/api/v1/drives/{name}/hold",
-            get(operating::hold_of).post(operating::hold),
-        )
-        .route("/api/v1/stop", post(operating::stop))
+    described()
+        .finished()
         .fallback(unknown)
         .with_state(app.clone())
         .layer(middleware::from_fn_with_state(app, guard))
+}
+
+/// What is served, with its description.
+fn described() -> Api {
+    const TEXT: &str = "text/plain";
+    const EVENTS: &str = "text/event-stream";
+    const POINT: &str = "names, separated by commas";
+    const TIME: &str = "RFC 3339, seconds since 1970, or an age such as 10min";
+    Api::new()
+        .get("/", Doc::text("Status page", "text/html"), status_page)
+        .get("/assets/{name}", Doc::text("A file of the status page", "*/*"), asset)
+        .get("/metrics", Doc::text("Metrics for Prometheus", TEXT), exposition)
+        .get(
+            "/healthz",
+            Doc::text("Whether the process is healthy", TEXT),
+            || async { "ok\n" },
+        )
+        .get(
+            "/readyz",
+            Doc::text("Whether the gateway is ready, else 503", TEXT),
+            ready,
+        )
+        .get(
+            "/api/v1/health",
+            Doc::object::<Health>("Whether the gateway is ready, and why not"),
+            health,
+        )
+        .post(
+            RELOAD,
+            Doc::object::<ReloadOutcome>("Reads the configuration again; at the local socket only"),
+            reload,
+        )
+        .get(
+            "/api/v1/drives",
+            Doc::list::<api::Drive<'_>>("All drives").query(&[("points", POINT)]),
+            drives,
+        )
+        .get("/api/v1/drives/{name}", Doc::object::<api::Drive<'_>>("A drive"), drive)
+        .get(
+            "/api/v1/drives/{name}/points",
+            Doc::list::<PointValue>("Points of a drive").query(&[("names", POINT)]),
+            points::points,
+        )
+        .get(
+            "/api/v1/drives/{name}/why",
+            Doc::object::<Why>("Why a drive does not run"),
+            why,
+        )
+        .get(
+            "/api/v1/drives/{name}/trend",
+            Doc::any("What values were; without `point` which are kept").query(&[
+                ("point", POINT),
+                ("from", TIME),
+                ("to", TIME),
+                ("format", "json or csv"),
+            ]),
+            trend::trend,
+        )
+        .post(
+            "/api/v1/drives/{name}/recordings",
+            Doc::object::<Recorded>("Records a drive"),
+            operating::record,
+        )
+        .get(
+            "/api/v1/drives/{name}/params",
+            Doc::object::<Parameters<'_>>("The last reading of the parameters, and what goes on"),
+            params,
+        )
+        .get(
+            "/api/v1/drives/{name}/params/reading",
+            Doc::object::<ParameterReading>("How far the reading of parameters is"),
+            operating::parameters::progress,
+        )
+        .post(
+            "/api/v1/drives/{name}/params/reading",
+            Doc::object::<ParameterReading>("Starts to read parameters").body::<ReadParameters>(),
+            operating::parameters::read,
+        )
+        .get(
+            "/api/v1/drives/{name}/params/restore",
+            Doc::object::<Restore>("How far the restore of parameters is"),
+            operating::parameters::look,
+        )
+        .post(
+            "/api/v1/drives/{name}/params/restore",
+            Doc::object::<Restore>("Prepares a restore of parameters, or goes on with it").body::<RestoreAct>(),
+            operating::parameters::restore,
+        )
+        .get(
+            "/api/v1/drives/{name}/commands",
+            Doc::object::<operating::Commandable<'_>>("What can be commanded"),
+            operating::commands_of,
+        )
+        .post(
+            "/api/v1/drives/{name}/commands",
+            Doc::object::<CommandResult<'_>>("Commands a drive: points and their values, `id`, `expires_ms`")
+                .any_body(),
+            operating::command,
+        )
+        .post(
+            "/api/v1/drives/{name}/heartbeat",
+            Doc::text("Renews the lease of a drive; 204", TEXT),
+            operating::heartbeat,
+        )
+        .get(
+            "/api/v1/drives/{name}/hold",
+            Doc::object::<HoldReply<'_>>("Who holds a drive"),
+            operating::hold_of,
+        )
+        .post(
+            "/api/v1/drives/{name}/hold",
+            Doc::object::<HoldReply<'_>>("Takes, renews, releases or breaks the hold").body::<operating::HoldAct>(),
+            operating::hold,
+        )
+        .get("/api/v1/buses", Doc::list::<api::Bus<'_>>("All buses"), buses)
+        .get(
+            "/api/v1/buses/{name}",
+            Doc::object::<line::Line<'_>>("A bus, with the last hour of its line"),
+            line::bus,
+        )
+        .get(
+            "/api/v1/buses/{name}/diagnosis",
+            Doc::object::<api::Diagnosis<'_>>("What is wrong with the line of a bus"),
+            diagnosis,
+        )
+        .get(
+            "/api/v1/audit",
+            Doc::any("The last commands").query(&[("drive", "only those to this drive")]),
+            audit,
+        )
+        .get("/api/v1/recordings", Doc::list::<Entry>("Recordings"), recordings::list)
+        .get(
+            "/api/v1/recordings/{id}",
+            Doc::any("A recording").query(&[("format", "json, csv or pcap")]),
+            recordings::one,
+        )
+        .get(
+            "/api/v1/events",
+            Doc::object::<streams::RecentEvents<'_>>("Events; as a stream unless only JSON is accepted"),
+            streams::events,
+        )
+        .get(
+            "/api/v1/events/log",
+            Doc::list::<event_log::Shown<'_>>("Events of earlier runs, too, newest first").query(&[
+                ("kind", POINT),
+                ("drive", "only of this drive"),
+                ("bus", "only of this bus"),
+                ("text", "only those that contain it"),
+                ("before", "time, or number of an event"),
+                ("limit", "1 to 1000"),
+            ]),
+            event_log::log,
+        )
+        .get(
+            "/api/v1/trace",
+            Doc::text("The frames on a bus", EVENTS).query(&[("bus", "only of this bus")]),
+            streams::trace,
+        )
+        .post(
+            "/api/v1/login",
+            Doc::object::<operating::SessionReply<'_>>("Starts a session").body::<operating::Credentials>(),
+            operating::log_in,
+        )
+        .post(
+            "/api/v1/logout",
+            Doc::text("Ends the session; 204", TEXT),
+            operating::log_out,
+        )
+        .get(
+            "/api/v1/session",
+            Doc::object::<operating::SessionReply<'_>>("The session"),
+            operating::session,
+        )
+        .post(
+            "/api/v1/stop",
+            Doc::object::<StopReport>("Stops all drives; 504 if one is not proven to stand").body::<StopBody>(),
+            operating::stop,
+        )
 }
 
 /// Refuses requests that are meant for another host or lack a token, and all methods that could change something, commands

@@ -189,10 +189,11 @@ fn event_id(number: u64) -> String {
 }
 
 /// The recent events, for a client that polls.
-#[derive(Debug, Serialize)]
-struct RecentEvents<'e> {
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub(super) struct RecentEvents<'e> {
     /// For `Last-Event-ID` of the next request.
     last: String,
+    #[schema(value_type = Vec<Event>)]
     events: Vec<&'e RawValue>,
 }
 

@@ -176,6 +176,8 @@ pub(super) struct StateContent {
     pub(super) quality: Quality,
     /// Why the motor does not run, in one word each.
     pub(super) blocked_by: Vec<String>,
+    /// For how long an ordinary stop still waits, in whole seconds.
+    pub(super) stop_waits: Option<u64>,
     /// Who holds it; none where `[authority]` is off.
     pub(super) hold: Option<HoldFields>,
     /// Value (only if good) and quality of each published point.
@@ -193,6 +195,7 @@ impl StateContent {
         reading: &Reading<'_>,
         points: impl Iterator<Item = usize>,
         blocked_by: Vec<String>,
+        stop_waits: Option<Duration>,
     ) -> StateContent {
         let shown = |index| {
             let sample = reading.sample(index);
@@ -202,6 +205,7 @@ impl StateContent {
             state: reading.state(),
             quality: reading.overall(),
             blocked_by,
+            stop_waits: stop_waits.map(|time| u64::try_from(time.as_millis().div_ceil(1000)).unwrap_or(u64::MAX)),
             hold: None,
             points: points.map(shown).collect(),
         }
@@ -245,6 +249,9 @@ impl Serialize for StateObject<'_> {
         map.serialize_entry("age_ms", &self.age.map(|a| a.as_millis() as u64))?;
         map.serialize_entry("fault_text", &self.fault_text)?;
         map.serialize_entry("blocked_by", &self.shown.blocked_by)?;
+        if let Some(seconds) = self.shown.stop_waits {
+            map.serialize_entry("stop_waits_ms", &seconds.saturating_mul(1000))?;
+        }
         if !self.profile.verified {
             map.serialize_entry("profile_verified", &false)?;
         }
@@ -526,6 +533,7 @@ mod tests {
                 state: Some(State::NotReady),
                 quality: Quality::Good,
                 blocked_by: Vec::new(),
+                stop_waits: None,
                 points: vec![(value.map(Value::Integer), Quality::Good)],
             };
             let object = StateObject {

@@ -8,6 +8,7 @@ use axum::body::Body;
 use axum::extract::{Extension, Path, Request, State};
 use axum::http::{StatusCode, header, request};
 use axum::response::{IntoResponse, Response};
+use serde::Serialize;
 use serde_json::{Value as Json_, json};
 use tokio::sync::{OwnedSemaphorePermit, watch};
 
@@ -20,7 +21,7 @@ use crate::command_json::{
     self, CommandResult, Id, MAX_PAYLOAD, Repetition, SharedMemory, Taken, excerpt, find_id, unknown_drive,
 };
 use crate::drive::model::Kind;
-use crate::drive::{ModelPoint, Profile, RESTART_COMMUNICATION, Value};
+use crate::drive::{ModelPoint, Point, Profile, RESTART_COMMUNICATION, Value};
 use crate::plant::{DriveHandle, Placed, Plant, Shown};
 use crate::process_image::Access;
 
@@ -80,7 +81,9 @@ fn status(outcome: &Outcome) -> StatusCode {
         Outcome::Acknowledged(_) => StatusCode::OK,
         Outcome::Refused(Refusal::NotAllowed(_)) => StatusCode::FORBIDDEN,
         Outcome::Refused(Refusal::UnknownDrive(_)) => StatusCode::NOT_FOUND,
-        Outcome::Refused(Refusal::HeldByOther(_) | Refusal::NeedsTake(_)) => StatusCode::CONFLICT,
+        Outcome::Refused(
+            Refusal::HeldByOther(_) | Refusal::NeedsTake(_) | Refusal::Guarded(_) | Refusal::Interlocked(_),
+        ) => StatusCode::CONFLICT,
         Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
         Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::NotStopped => StatusCode::CONFLICT,
         // Of what was not carried out.
@@ -246,7 +249,10 @@ impl Operating {
         }
         let (client, expiry) = (Authority::Write, asked.expiry);
         let placed = match (refused, stop) {
-            (None, _) => drive.place_asked(order, origin, client, expiry, asked_at, now),
+            (None, _) => {
+                let drive = drive.clone().waiting(asked.wait);
+                drive.place_asked(order, origin, client, expiry, asked_at, now)
+            }
             (Some(refusal), Some(stop)) => {
                 let rest = (excerpt(payload), refusal);
                 drive.place_stop(Order::Points(stop), (&rest.0, rest.1), origin, client, expiry, now)
@@ -333,7 +339,32 @@ pub(in crate::http) async fn commands_of(
     }
 }
 
-fn description(drive: &DriveHandle, operator: &Operator) -> Json_ {
+/// What can be commanded of a drive.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub(in crate::http) struct Commandable<'d> {
+    drive: &'d str,
+    points: Vec<CommandablePoint<'d>>,
+    /// `null` without `supervision`.
+    lease_ms: Option<u64>,
+    /// This login commanded the drive last.
+    commanded_last: bool,
+    /// Name of the client in `[authority]`.
+    principal: Option<String>,
+    /// The ranks below its own.
+    outranks: Option<Vec<String>>,
+}
+
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct CommandablePoint<'d> {
+    name: &'d str,
+    /// `bool` or `number`.
+    kind: &'static str,
+    unit: &'d str,
+    minimum: Option<f64>,
+    maximum: Option<f64>,
+}
+
+fn description<'d>(drive: &'d DriveHandle, operator: &Operator) -> Commandable<'d> {
     let spec = &drive.image.spec;
     let controlled = spec.access == Access::Control;
     let writable = spec
@@ -342,27 +373,27 @@ fn description(drive: &DriveHandle, operator: &Operator) -> Json_ {
         .iter()
         .enumerate()
         .filter(|(_, point)| controlled && point.write);
-    let points: Vec<Json_> = writable
-        .map(|(index, point)| {
-            let limits = spec.limits_of(index).map(std::ops::RangeInclusive::into_inner);
-            json!({
-                "name": point.name,
-                "kind": if point.kind() == Kind::Bool { "bool" } else { "number" },
-                "unit": point.unit,
-                "minimum": limits.map(|(low, _)| low).filter(|low| low.is_finite()),
-                "maximum": limits.map(|(_, high)| high).filter(|high| high.is_finite()),
-            })
-        })
-        .collect();
+    let point = |(index, point): (usize, &'d Point)| {
+        let limits = spec.limits_of(index).map(std::ops::RangeInclusive::into_inner);
+        CommandablePoint {
+            name: &point.name,
+            kind: if point.kind() == Kind::Bool { "bool" } else { "number" },
+            unit: &point.unit,
+            minimum: limits.map(|(low, _)| low).filter(|low| low.is_finite()),
+            maximum: limits.map(|(_, high)| high).filter(|high| high.is_finite()),
+        }
+    };
+    let lease = spec.supervision.as_ref().map(|lease| lease.timeout.as_millis());
     let rank = drive.rank_of(&operator.origin());
-    json!({
-        "drive": spec.name,
-        "points": points,
-        "lease_ms": spec.supervision.as_ref().map(|lease| u64::try_from(lease.timeout.as_millis()).unwrap_or(u64::MAX)),
-        "commanded_last": drive.commander().as_ref() == Some(&operator.login),
-        "principal": rank.as_ref().map(|(name, _)| name),
-        "outranks": rank.map(|(_, below)| below),
-    })
+    let (principal, outranks) = rank.unzip();
+    Commandable {
+        drive: &spec.name,
+        points: writable.map(point).collect(),
+        lease_ms: lease.map(|lease| u64::try_from(lease).unwrap_or(u64::MAX)),
+        commanded_last: drive.commander().as_ref() == Some(&operator.login),
+        principal,
+        outranks,
+    }
 }
 
 /// `POST /api/v1/drives/{name}/heartbeat`: renews the lease of a drive that this login commanded last.

@@ -15,9 +15,10 @@ use crate::command::{Authority, Verb};
 use crate::command_json::{HoldReply, MAX_PAYLOAD};
 use crate::http::messages::ErrorReply;
 
-#[derive(Deserialize)]
+#[derive(Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
-struct Wanted {
+pub(in crate::http) struct HoldAct {
+    /// `take`, `renew`, `release` or `break`.
     action: String,
 }
 
@@ -61,7 +62,7 @@ pub(in crate::http) async fn hold(
         Ok(payload) => payload,
         Err(response) => return response,
     };
-    let wanted = serde_json::from_slice::<Wanted>(&payload).ok();
+    let wanted = serde_json::from_slice::<HoldAct>(&payload).ok();
     let Some(verb) = wanted.and_then(|wanted| Verb::of(&wanted.action)) else {
         let text = "the body is {\"action\": …} with \"take\", \"renew\", \"release\" or \"break\"";
         return error(StatusCode::UNPROCESSABLE_ENTITY, text);
@@ -84,9 +85,5 @@ pub(in crate::http) async fn hold(
 }
 
 fn error(status: StatusCode, text: &str) -> Response {
-    let error = ErrorReply {
-        error: text.to_string(),
-        known: Vec::new(),
-    };
-    (status, Json(error)).into_response()
+    (status, Json(ErrorReply::new(text))).into_response()
 }

@@ -25,8 +25,8 @@ use super::{Credentials, Denied, Operating, is_own_origin};
 const MAX_LOGIN: usize = 4096;
 
 /// A session, for the page.
-#[derive(Debug, Serialize)]
-struct SessionReply<'s> {
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub(in crate::http) struct SessionReply<'s> {
     user: &'s str,
     /// For the header X-CSRF-Token.
     csrf: &'s str,

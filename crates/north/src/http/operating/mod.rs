@@ -42,9 +42,9 @@ use crate::command::{Authority, Proof, SourceKind};
 use crate::log_throttle::LogThrottle;
 
 pub(crate) use self::commands::PostedCommands;
-pub(super) use self::commands::{command, commands_of, heartbeat};
-pub(super) use self::hold::{hold, hold_of};
-pub(super) use self::login::{log_in, log_out, session};
+pub(super) use self::commands::{Commandable, command, commands_of, heartbeat};
+pub(super) use self::hold::{HoldAct, hold, hold_of};
+pub(super) use self::login::{SessionReply, log_in, log_out, session};
 pub(super) use self::record::record;
 pub(super) use self::stop_all::stop;
 
@@ -151,9 +151,9 @@ impl Denied {
 }
 
 /// A user and a password, as a client sent them.
-#[derive(Clone, serde::Deserialize)]
+#[derive(Clone, serde::Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
-struct Credentials {
+pub(super) struct Credentials {
     user: String,
     password: String,
 }

@@ -1,0 +1,76 @@
+//! The description of the API, by the validators that npm has.
+
+use std::process::Command;
+
+use serde_json::{Value, json};
+
+use super::parameters::few;
+use crate::support::process::{drivegate, get, until};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
+use crate::support::tools::{root, tool};
+
+#[test]
+fn every_answer_is_as_the_description_says() {
+    let site = Site::new();
+    site.write("few.toml", &few());
+    let keys = format!(
+        "[gateway]\nstate_dir = \"state\"\nsocket = \"{}\"\n",
+        site.path("socket")
+    );
+    let gateway = LINE1.replace("[gateway]\n", &keys);
+    let pump = "[[bus.drive]]\nname = \"pump-1\"\naddress = 1\nprofile = \"few\"\naccess = \"control\"\n";
+    let recordings = "[recordings]\nbefore = \"1s\"\nafter = \"1s\"\n";
+    site.configure(&[&gateway, pump, HTTP, MODBUS_TCP, recordings]);
+    let _line = site.line(&[1]);
+    let _gateway = site.run_ready();
+    let done = |arguments: &[&str]| {
+        let config = site.config();
+        let output = drivegate(&[arguments, &["--config", &config]].concat())
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{arguments:?}: {output:?}");
+        String::from_utf8(output.stdout).unwrap().trim().to_string()
+    };
+    // Something of each kind.
+    done(&["write", "pump-1", "run=true", "speed_reference=40"]);
+    done(&["params", "read", "pump-1", "--brisk"]);
+    let recording = done(&["record", "pump-1"]);
+    until("the recording", || {
+        let (_, listed) = get(site.http, "/api/v1/recordings")?;
+        listed.contains(&recording).then_some(())
+    });
+    let names = json!({"drives": "pump-1", "buses": "line1", "recordings": recording, "assets": "x"});
+    let checked = Command::new(tool("node"))
+        .arg("tests/tools/node/check_openapi.js")
+        .args([site.path("socket"), names.to_string()])
+        .current_dir(root())
+        .env("NODE_PATH", root().join(".tools/node/node_modules"))
+        .output()
+        .unwrap();
+    assert!(checked.status.success(), "{}", String::from_utf8_lossy(&checked.stderr));
+    let checked: Value = serde_json::from_slice(&checked.stdout).unwrap();
+    let answered = checked["answered"].as_object().unwrap();
+    let others: Vec<_> = answered.iter().filter(|(_, status)| **status != 200).collect();
+    // No restore was made, and nobody logs in at the socket.
+    let expected = [("/api/v1/drives/{name}/params/restore", 409), ("/api/v1/session", 404)];
+    assert_eq!(json!(others), json!(expected));
+    assert!(answered.len() > 15, "{answered:?}");
+    let described: Vec<&str> = checked["described"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .filter_map(Value::as_str)
+        .collect();
+    for path in [
+        "/",
+        "/metrics",
+        "/api/v1/stop",
+        "/api/v1/reload",
+        "/api/v1/drives/{name}/commands",
+    ] {
+        assert!(described.contains(&path), "{path}: {described:?}");
+    }
+    // Whoever may read may read that, too.
+    let (status, text) = get(site.http, "/api/v1/openapi.json").unwrap();
+    assert!(status == 200 && text.contains("\"openapi\":\"3.1"), "{text}");
+}
