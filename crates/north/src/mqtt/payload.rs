@@ -598,7 +598,12 @@ mod tests {
         });
         let running = cx.point_index("running").unwrap();
         let ready = cx.point_index("ready").unwrap();
-        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter(), Vec::new(), None);
+        let shown = StateContent::of(
+            &image.reading(now, second),
+            [running, ready].into_iter(),
+            Vec::new(),
+            None,
+        );
         let object = StateObject {
             shown: &shown,
             names: &["running".to_string(), "ready".to_string()],
@@ -622,7 +627,12 @@ mod tests {
         assert_eq!(object["point_quality"], serde_json::json!({"ready": "good"}));
         assert_eq!(PointPayload::state(shown.state), PointPayload::Nothing);
         image.update(|s| s.store(Table::DiscreteInput, 2, &[0], now));
-        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter(), Vec::new(), None);
+        let shown = StateContent::of(
+            &image.reading(now, second),
+            [running, ready].into_iter(),
+            Vec::new(),
+            None,
+        );
         assert_eq!((shown.state, shown.quality), (Some(State::Ready), Quality::Good));
     }
 
