@@ -18,8 +18,10 @@ const UNREAD: Duration = Duration::from_secs(2);
 /// What a reading shows of a motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Seen {
-    /// It runs by its run command.
+    /// It runs, and has no fault.
     pub running: bool,
+    /// Its run command as the drive has it, and when that was read.
+    pub commanded: Option<(bool, Instant)>,
     /// It stands.
     pub stands: bool,
     /// When it was read.
@@ -60,6 +62,8 @@ pub(super) struct Motor {
     running: Option<(bool, Instant)>,
     /// The same when it was known last.
     ran: Option<bool>,
+    /// Its run command as the drive had it last, and when that was read.
+    commanded: Option<(bool, Instant)>,
     stands_since: Option<Instant>,
     stop_written: Option<Instant>,
     started: Option<Started>,
@@ -78,9 +82,19 @@ impl Motor {
         self.starts.iter().copied().chain(reserved)
     }
 
-    /// Whether an order to run, written now, starts it: it does not run for certain.
+    /// Whether an order to run, written now, starts it: it does not run for certain. One that slows down after a stop may stand
+    /// by the time the order reaches it.
     pub(super) fn is_started_by_run(&self) -> bool {
-        let runs = |(running, at): (bool, Instant)| running && self.stop_written.is_none_or(|stop| at > stop);
+        let since_stop = |at: Instant| self.stop_written.is_none_or(|stop| at > stop);
+        let written = self.written.map(|(_, written)| written);
+        let stopped_last = self
+            .stop_written
+            .is_some_and(|stop| written.is_none_or(|start| stop > start));
+        let told_on = self.commanded.is_some_and(|(on, at)| on && since_stop(at));
+        // It was taken away since, here or elsewhere.
+        let is_off = |(on, at): (bool, Instant)| !on && written.is_none_or(|start| at > start);
+        let slows_down = (stopped_last && !told_on) || self.commanded.is_some_and(is_off);
+        let runs = |(running, at): (bool, Instant)| running && since_stop(at) && !slows_down;
         !self.running.is_some_and(runs)
     }
 
@@ -196,8 +210,14 @@ impl Motor {
 
     /// It was read. Whether a start was seen that nobody ordered here.
     pub(super) fn seen(&mut self, seen: Seen) -> bool {
-        let Seen { running, stands, at } = seen;
+        let Seen {
+            running,
+            commanded,
+            stands,
+            at,
+        } = seen;
         let written = self.written.map(|(_, written)| written);
+        self.commanded = commanded.or(self.commanded);
         if [written, self.stop_written]
             .into_iter()
             .flatten()

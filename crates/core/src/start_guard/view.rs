@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::ledger::{Guards, Kept, Ledger};
 use super::{Guard, Guarded, Interlock, Reason, Seen, Unmet, shown};
 use crate::command::{Command, Effect, Refusal};
-use crate::drive::{ModelPoint, Plan};
+use crate::drive::{ModelPoint, Plan, Value};
 use crate::process_image::{BusSpec, DriveSpec, Link, Machine, Reading};
 use crate::stop_all::Standstill;
 
@@ -372,9 +372,11 @@ fn seen(reading: &Reading<'_>) -> Option<Seen> {
     let running = sample.good()?.as_bool();
     // What a faulted drive says of its motor may be from before the fault; it does not run by its run command.
     let runs = running && !reading.is_set(ModelPoint::Fault);
+    let commanded = reading.model(ModelPoint::Run);
     let turns = || matches!(reading.standstill(None), Standstill::Turns(_));
     Some(Seen {
         running: runs,
+        commanded: commanded.good().map(Value::as_bool).zip(commanded.at),
         stands: !running && !turns(),
         at: sample.at?,
     })
