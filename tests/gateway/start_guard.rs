@@ -112,7 +112,7 @@ fn starts_are_refused_and_wait_and_stops_pass() {
     assert_eq!((status, &answer["result"]), (200, &json!("confirmed")), "{answer}");
     assert!(answer["latency_ms"].as_f64().unwrap() > 100.0, "{answer}");
     assert!(metric(&site, "min_off") >= Some(3) && metric(&site, "interlock") >= Some(3));
-    let (_, events) = get(site.http, "/api/v1/events").unwrap();
+    let (_, events) = get(site.http, "/api/v1/events/log?limit=100").unwrap();
     assert!(
         events.contains("\"guarded\"") && events.contains("\"interlock\""),
         "{events}"
