@@ -108,7 +108,12 @@ impl BusGuards {
     pub fn hindrance(&self, drive: usize, now: Instant) -> Option<Guarded> {
         let of = self.of_drive(drive)?;
         let interlocked = self.interlocked(of, now);
-        interlocked.or_else(|| self.shared.lock().hindered(&of.machine, &of.guard, now))
+        interlocked.or_else(|| {
+            let ledger = self.shared.lock();
+            // One that runs by its order, with a reference of zero, is not kept from a start.
+            let starts = ledger.motor(&of.machine).is_none_or(|motor| motor.is_started_by_run());
+            starts.then(|| ledger.hindered(&of.machine, &of.guard, now)).flatten()
+        })
     }
 
     /// The interlocks that do not hold, or of them those that stop the motor.
