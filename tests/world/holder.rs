@@ -11,8 +11,10 @@ use drivegate::command::{
     Verb, written,
 };
 use drivegate::plant::Placed;
+use drivegate::process_image::DriveSpec;
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::random::Random;
+use drivegate::start_guard::Guard;
 
 use super::bus::{Parts, Seen};
 use super::rig::{PATIENCE, Rig, line};
@@ -23,10 +25,26 @@ const LEASE: Duration = Duration::from_secs(3);
 const DRIVES: u8 = 2;
 /// Each client on a north side of its own. The reference that it sets tells whose a frame is: 10 % and as many more as its place.
 const CLIENTS: [&str; 6] = ["plc", "op", "cloud", "socket:7", "host", "nobody"];
+/// Their ranks; the last one has none.
+const RANKS: [usize; 6] = [2, 1, 3, 0, 2, usize::MAX];
 
-fn works() -> Line {
+/// The drives of every second world are guarded as well: that changes who is refused with what, and nothing of who holds.
+fn works(guarded: bool) -> Line {
+    let spec: fn(&mut DriveSpec) = match guarded {
+        true => |spec| {
+            spec.guard = Some(Guard {
+                starts_per_hour: Some(60),
+                min_off: SECOND,
+                min_run: SECOND,
+                stagger: Duration::from_millis(500),
+            });
+            spec.staggers = true;
+        },
+        false => |_| {},
+    };
     Line {
         cycle: Duration::from_millis(100),
+        spec,
         ..line("vacon-nx", Protocol::ModbusRtu, 19_200, DRIVES)
     }
 }
@@ -86,7 +104,8 @@ struct Play {
 
 impl Play {
     fn new(seed: u64) -> Play {
-        let rig = Rig::new(&works(), Parts::of(0, &works(), seed));
+        let works = works(seed % 2 == 1);
+        let rig = Rig::new(&works, Parts::of(0, &works, seed));
         let rules = rules();
         rig.bus.handle.queue.set_authority(Some(rules.clone()));
         Play {
@@ -117,8 +136,16 @@ impl Play {
 
     fn run(&mut self, time: Duration) {
         let until = self.rig.now + time;
-        while let Some(seen) = self.rig.step(until) {
-            seen.into_iter().for_each(|seen| self.note(seen));
+        while self.rig.now < until {
+            let next = until.min(self.rig.now + Duration::from_millis(10));
+            while let Some(seen) = self.rig.step(next) {
+                seen.into_iter().for_each(|seen| self.note(seen));
+            }
+            // A disk that takes what it gets.
+            let guards = self.rig.bus.guards.clone();
+            if let Some((generation, _)) = guards.to_write(self.rig.now, self.time()) {
+                guards.wrote(generation, Ok(()));
+            }
         }
     }
 
@@ -166,23 +193,46 @@ impl Play {
         placed
     }
 
+    /// An order that needs the drive: whoever has to be refused is refused at once.
+    fn steer(&mut self, client: usize, drive: usize, points: &[(&str, f64)]) {
+        let (state, holder) = self.holder(drive);
+        let other = CLIENTS
+            .iter()
+            .position(|name| *name == holder)
+            .filter(|other| *other != client);
+        let refused = match (state, other) {
+            (HoldState::Held, Some(_)) => true,
+            (HoldState::Reserved, Some(stopper)) => RANKS[stopper] < RANKS[client],
+            _ => client == 5,
+        };
+        let mut placed = self.place(client, drive, points);
+        if !refused {
+            self.orders.push((drive, client, placed));
+            return;
+        }
+        let code = placed.answer().map(|answer| answer.outcome.code());
+        let expected = if client == 5 { "not_allowed" } else { "held_by_other" };
+        assert_eq!(code, Some(expected), "{} while {state:?} for {holder}", CLIENTS[client]);
+        *self.results.entry(expected).or_default() += 1;
+    }
+
+    /// A stop ends the hold of another client.
+    fn stop(&mut self, client: usize, drive: usize) {
+        let placed = self.place(client, drive, &[("run", 0.0)]);
+        self.stops.push((client, placed));
+        let (state, holder) = self.holder(drive);
+        let ends = state != HoldState::Held || holder == CLIENTS[client];
+        assert!(ends, "{holder} holds it after a stop of {}", CLIENTS[client]);
+    }
+
     fn act(&mut self) {
         let client = self.dice.within(0..=5) as usize;
         let drive = self.dice.within(0..=u64::from(DRIVES) - 1) as usize;
         let reference = 10.0 + client as f64;
         match self.dice.within(0..=11) {
-            0..=2 => {
-                let placed = self.place(client, drive, &[("run", 1.0), ("speed_reference", reference)]);
-                self.orders.push((drive, client, placed));
-            }
-            3..=4 => {
-                let placed = self.place(client, drive, &[("speed_reference", reference)]);
-                self.orders.push((drive, client, placed));
-            }
-            5..=6 => {
-                let placed = self.place(client, drive, &[("run", 0.0)]);
-                self.stops.push((client, placed));
-            }
+            0..=2 => self.steer(client, drive, &[("run", 1.0), ("speed_reference", reference)]),
+            3..=4 => self.steer(client, drive, &[("speed_reference", reference)]),
+            5..=6 => self.stop(client, drive),
             7 => self.rig.drive(drive as u8 + 1).heartbeat(&origin(client), self.rig.now),
             place => {
                 let verb = Verb::ALL[place as usize - 8];
@@ -211,11 +261,8 @@ impl Play {
             *results.entry("stopped").or_default() += 1;
             false
         });
-        self.orders.retain_mut(|(_, client, placed)| {
+        self.orders.retain_mut(|(_, _, placed)| {
             let Some(answer) = placed.answer() else { return true };
-            if *client == 5 {
-                assert_eq!(answer.outcome.code(), "not_allowed");
-            }
             *results.entry(answer.outcome.code()).or_default() += 1;
             false
         });
@@ -275,6 +322,9 @@ fn only_the_holder_is_on_the_wire_and_every_stop() {
         play.run(10 * SECOND);
         play.look();
         assert!(play.stops.is_empty(), "a stop that nobody answers");
+        for drive in 0..usize::from(DRIVES) {
+            assert_eq!(play.holder(drive).0, HoldState::Free, "its lease has ended");
+        }
         play.rig.plant.tell_holds(play.rig.now, play.time());
         frames += play.frames;
         for (code, count) in play.results {
@@ -286,6 +336,7 @@ fn only_the_holder_is_on_the_wire_and_every_stop() {
         "acknowledged",
         "held_by_other",
         "needs_take",
+        "guarded",
         "not_allowed",
         "stopped",
         "take",

@@ -3,10 +3,13 @@
 //! without guards.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate::codec::{Protocol, RequestPdu, Table};
-use drivegate::command::{Authority, Order, Origin, Outcome, Refusal, SourceKind, written};
+use drivegate::command::{
+    Authority, Mode, Order, Origin, Outcome, Principal, Proof, Refusal, Rules, SourceKind, written,
+};
 use drivegate::drive::{ModelPoint, State, Value};
 use drivegate::plant::Placed;
 use drivegate::process_image::DriveSpec;
@@ -467,4 +470,61 @@ fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
     rig.run(20 * SECOND);
     assert!(!turns(&mut rig) && rig.answered(&mut waiting).is_ok());
     rig.until("it stands", PATIENCE, |rig| rig.state(1) == State::Ready);
+}
+
+/// A cyclic client writes its stop again and again: none of them is a second stop. One of another client is.
+#[test]
+fn repeated_stops_of_a_cyclic_client_wait_for_min_run() {
+    let of = Line {
+        spec: |spec| {
+            spec.guard = Some(Guard {
+                min_run: Duration::from_secs(20),
+                ..Guard::default()
+            });
+        },
+        ..line("vacon-nx", Protocol::ModbusRtu, 19_200, 2)
+    };
+    for cyclic in [true, false] {
+        let mut rig = Rig::of(&of);
+        let principals = vec![Principal {
+            cyclic,
+            mqtt: Some("plc".to_string()),
+            ..Principal::new("plc", 1)
+        }];
+        let rules = Rules {
+            mode: Mode::Exclusive,
+            ranks: ["site", "automation"].map(Into::into).to_vec(),
+            lease: Duration::from_secs(30),
+            stop_at_local: true,
+            principals,
+        };
+        rig.bus.handle.queue.set_authority(Some(Arc::new(rules)));
+        rig.until_state(1, State::Ready);
+        let turns = |rig: &mut Rig| rig.with_drive(1, |drive, _| drive.state().running);
+        let give = |rig: &mut Rig, points: &[(&str, f64)], proof: Proof| {
+            let order = rig.points(1, points);
+            let origin = Origin::new(SourceKind::Mqtt, "plc").proven(proof);
+            let placed = rig.drive(1).place(order, origin, Authority::Write, SECOND, rig.now);
+            rig.bus.command_came(rig.now);
+            placed
+        };
+        let plc = || Proof::Topic("plc".into());
+        let mut run = give(&mut rig, &[("run", 1.0), ("speed_reference", 50.0)], plc());
+        assert!(rig.answered(&mut run).is_ok());
+        rig.until_state(1, State::Running);
+        let mut stops = Vec::new();
+        for _ in 0..8 {
+            stops.push(give(&mut rig, &[("run", 0.0)], plc()));
+            rig.run(SECOND);
+        }
+        assert_eq!(turns(&mut rig), cyclic, "cyclic: {cyclic}");
+        if cyclic {
+            assert!(stops.iter_mut().all(|stop| stop.answer().is_none()));
+            assert!(rig.drive(1).stop_waits(rig.now).is_some());
+            stops.push(give(&mut rig, &[("run", 0.0)], Proof::Nothing));
+            rig.run(8 * SECOND);
+            assert!(!turns(&mut rig), "the stop of another client");
+        }
+        assert!(stops.iter_mut().all(|stop| rig.answered(stop).is_ok()));
+    }
 }

@@ -35,7 +35,7 @@ pub use parameter::ParameterOrder;
 pub use priorities::{
     Commanded, Effect, Entry, Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, SlotWrite,
 };
-pub use queue::{CAPACITY, Chosen, CommandQueue, NotStopped, Pending, Stopping};
+pub use queue::{CAPACITY, Chosen, CommandQueue, NotStopped, Pending, Stopping, Unheld};
 pub use standing::{LastWritten, is_reference, limits_passed, still_keeps_limits};
 pub use ticket::{Receipt, Ticket, WriteStats};
 pub use touched::Touched;

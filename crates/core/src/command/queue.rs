@@ -4,6 +4,8 @@ mod handover;
 mod holds;
 mod passed_on;
 
+pub use holds::Unheld;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -204,7 +206,16 @@ impl Pending {
         let last = self.stopped_at.get(&stop.drive).copied();
         let delayed = delayed && stop.urgency == Urgency::Stop && !stop.is_urgent;
         let guards = self.guards.as_ref().filter(|_| delayed);
-        guards.is_some_and(|guards| guards.is_ordinary_stop(stop.drive, origin.client(), last))
+        guards.is_some_and(|guards| guards.is_ordinary_stop(stop.drive, origin.client(), last)) || self.repeats(stop)
+    }
+
+    /// Whether a cyclic client gives its waiting ordinary stop again: that is no second stop.
+    fn repeats(&self, stop: &Command) -> bool {
+        let origin = stop.ticket.origin();
+        let waits = |c: &Command| c.is_ordinary && c.drive == stop.drive && c.order == stop.order;
+        let own = |c: &Command| c.ticket.origin().client() == origin.client();
+        let delayed = stop.urgency == Urgency::Stop && !stop.is_urgent;
+        delayed && self.waiting.iter().any(|c| waits(c) && own(c)) && self.is_cyclic(origin)
     }
 
     /// Until when the stop that waits for that drive does so by `min_run`.
@@ -312,11 +323,11 @@ impl Pending {
             self.stopped.push(drive);
         }
         // A second stop waits for nothing, nor does the first one any more.
-        let others = self
-            .waiting
-            .iter_mut()
-            .filter(|c| c.drive == drive && c.urgency == Urgency::Stop);
-        others.for_each(|c| c.is_ordinary = false);
+        if !stop.is_ordinary {
+            let of_drive = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop;
+            let others = self.waiting.iter_mut().filter(of_drive);
+            others.for_each(|c| c.is_ordinary = false);
+        }
         let bare = stop.is_bare_stop();
         let alike = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop && c.is_bare_stop() == bare;
         match self.waiting.iter_mut().find(alike) {

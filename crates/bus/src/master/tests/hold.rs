@@ -115,6 +115,28 @@ fn advisory_sends_all_and_counts() {
         assert_eq!(code(&mut reference), "acknowledged", "{name}");
     }
     assert_eq!(rig.bus.queue.lock().unheld(0), 2);
+    let clients = |rig: &Rig| {
+        let unheld = rig.bus.queue.lock().take_unheld();
+        let clients = unheld.iter().map(|(_, unheld)| unheld.client.to_string());
+        clients.collect::<Vec<_>>()
+    };
+    assert_eq!(clients(&rig), ["op", "cloud"]);
+    // Once a client and minute.
+    for (wait, expected) in [(1, vec![]), (60, vec!["op", "cloud"])] {
+        rig.run(Time::from_secs(wait));
+        for name in ["plc", "op", "cloud", "op", "cloud"] {
+            let mut reference = place(&rig, &plant, name, ModelPoint::SpeedReference, Value::Number(10.0));
+            rig.run(Time::from_millis(200));
+            assert_eq!(code(&mut reference), "acknowledged", "{name}");
+        }
+        assert_eq!(
+            clients(&rig)
+                .iter()
+                .filter(|client| *client != "plc")
+                .collect::<Vec<_>>(),
+            expected
+        );
+    }
 }
 
 #[test]
@@ -170,6 +192,21 @@ fn the_turn_is_judged_again() {
     let from = rig.wire.len();
     rig.run(Time::from_millis(300));
     assert_eq!((code(&mut waits), writes(&rig, from)), ("not_allowed", 0));
+}
+
+/// Its client gives the drive back while the order still waits.
+#[test]
+fn an_order_whose_drive_is_free_at_its_turn_takes_it() {
+    let (mut rig, plant) = guarded(1, Mode::Exclusive);
+    let mut waits = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
+    let released = drive(&plant, 0).hold(Verb::Release, &who("plc"), Authority::Write, rig.now);
+    assert_eq!(released.unwrap().holder, None);
+    rig.run(Time::from_millis(300));
+    assert_eq!((code(&mut waits), rig.runs(0)), ("acknowledged", true));
+    let (view, own) = drive(&plant, 0).hold_view(Some(&who("plc")), rig.now).unwrap();
+    assert!(own, "{view:?}");
+    let mut refused = place(&rig, &plant, "cloud", ModelPoint::SpeedReference, Value::Number(10.0));
+    assert_eq!(code(&mut refused), "held_by_other");
 }
 
 #[test]
