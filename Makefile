@@ -15,7 +15,7 @@ IN_OWN_TMP := tests/tools/in_own_tmp.sh
 
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
-.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak fleet fleet-rollout fleet-cluster interop book clean
+.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak fleet fleet-rollout fleet-cluster fleet-thousand interop book clean
 .PHONY: package-tools deb image release test-package test-static test-image
 
 help: ## Show this list
@@ -95,6 +95,10 @@ BROKERS ?= mosquitto rmqttd ejabberd
 fleet-cluster: tools build ## Run gateways with brokers that are clusters, and harm their nodes; builds rmqttd, which takes many minutes. BROKERS=ejabberd runs that one
 	tests/fleet/install.sh $(BROKERS)
 	.tools/venv/bin/python tests/fleet/cluster.py $(addprefix --broker ,$(BROKERS))
+
+fleet-thousand: tools build ## Run 100 gateways and 900 more sessions at one broker with TLS: start, rebirths at once, broker back
+	cargo bench --locked --no-run --bench sessions
+	.tools/venv/bin/python tests/fleet/thousand.py --sessions-binary "$$(ls -t target/release/deps/sessions-* | grep -v '[.]d$$' | head -n 1)"
 
 CHECKS ?=
 interop: ## Run the gateway with Home Assistant, pysparkplug and Node-RED; installs them, which takes minutes. CHECKS=name runs one

@@ -105,6 +105,7 @@ impl Gateway {
             response_topics: Vec::new(),
             buffer: None,
             home_assistant: None,
+            principals: None,
             sparkplug: None,
         };
         let stats = Arc::<NorthStats>::default();

@@ -108,6 +108,7 @@ fn options(name: &str) -> Result<Options, Box<dyn Error>> {
         response_topics: Vec::new(),
         buffer: None,
         home_assistant: None,
+        principals: None,
         sparkplug: Some(sparkplug::Options {
             group: "fleet".to_string(),
             node: name.to_string(),

@@ -35,6 +35,7 @@ mod gateway {
     mod restart;
     mod restoring;
     mod slow_log;
+    mod start_guard;
     mod stop_all;
     mod trace;
     mod trying;

@@ -347,26 +347,40 @@ def lost_events(site, host):
 
 
 def fault(site, host, name, harm, heal, wait):
-    """Harms the first node and heals it after `wait`; what that costs."""
-    node = site.broker.nodes[0]
+    """Harms the first node and heals it after `wait`; what that costs, and what its return costs."""
+    node, mended = site.broker.nodes[0], []
     began, before = time.monotonic(), len(host.client.seen(lambda topic: topic.endswith("/state")))
-    worker = threading.Thread(target=lambda: (harm(node), time.sleep(wait), heal(node)), daemon=True)
+    worker = threading.Thread(target=lambda: (harm(node), time.sleep(wait), mended.append(time.monotonic()), heal(node)), daemon=True)
     worker.start()
-    away, back, now = set(), began, set()
+    phases, now = [Phase(began), Phase(began + wait)], set()
     while time.monotonic() < began + wait + AFTER:
+        phase = phases[bool(mended)]
         now = {gateway.name for gateway in site.gateways if not gateway.is_connected()}
-        away |= now
-        back = time.monotonic() if now else back
+        phase.see(now, time.monotonic())
         time.sleep(0.05)
     worker.join()
     took = time.monotonic() - began
     states = len(host.client.seen(lambda topic: topic.endswith("/state"))) - before
-    commands = [number for number, (at, _) in host.sent.items() if began <= at < began + took - 3]
+    commands = [number for number, (at, _) in list(host.sent.items()) if began <= at < began + took - 3]
     results = host.results()
     silent = [number for number in commands if number not in results]
-    print(f"  {name}: {len(away)} gateways were away, the last was back {back - began:.1f} s after the fault; "
+    print(f"  {name}: {phases[0]}; at its return {phases[1]}; "
           f"commands {len(commands)}, without a result {len(silent)}; states {states / took:.0f}/s", flush=True)
     return not now
+
+
+class Phase:
+    """Who was away in a part of the trial, and until when."""
+
+    def __init__(self, began):
+        self.began, self.until, self.away = began, began, set()
+
+    def see(self, away, at):
+        self.away |= away
+        self.until = at if away else self.until
+
+    def __str__(self):
+        return f"{len(self.away)} gateways away, until {self.until - self.began:.1f} s"
 
 
 def wrong_statuses(site):
@@ -403,6 +417,8 @@ def one(kind, tools, options, directory):
             "restarted": (lambda node: node.end(signal.SIGTERM), lambda node: node.start(), 0),
         }
         for name, (harm, heal, wait) in faults.items():
+            if options.fault and name not in options.fault:
+                continue
             mark = time.monotonic()
             raised, lost, twice = lost_events(site, host)
             is_well &= fault(site, host, name, harm, heal, wait)
@@ -428,6 +444,8 @@ def main():
     parser.add_argument("--binary", type=pathlib.Path, default=ROOT / "target/release/drivegate")
     parser.add_argument("--tools", type=pathlib.Path, default=ROOT / ".tools/brokers")
     parser.add_argument("--only-faults", action="store_true")
+    parser.add_argument("--fault", action="append", default=[], help="killed, stopped or restarted; without it all")
+    parser.add_argument("--keep", action="store_true", help="keep the logs")
     options = parser.parse_args()
     directory = pathlib.Path(tempfile.mkdtemp(prefix="drivegate-cluster-"))
     print(f"cluster: logs in {directory}", flush=True)
@@ -435,7 +453,7 @@ def main():
     is_well = True
     for kind in options.broker or BROKERS:
         is_well &= one(kind, options.tools.resolve(), options, directory)
-    if is_well:
+    if is_well and not options.keep:
         shutil.rmtree(directory)
     sys.exit(0 if is_well else 1)
 

@@ -7,6 +7,7 @@ import http.client
 import json
 import os
 import pathlib
+import random
 import shutil
 import socket
 import subprocess
@@ -48,13 +49,19 @@ def ask(path, target, body=None):
         connection.close()
 
 
+TAKEN = set()
+
+
 def free_ports(count):
-    probes = [socket.socket() for _ in range(count)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    ports = [probe.getsockname()[1] for probe in probes]
-    for probe in probes:
-        probe.close()
+    """Below those that the system gives to connections: nobody takes one before its listener is there."""
+    ports = []
+    while len(ports) < count:
+        port = random.randrange(20000, 32000)
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if port not in TAKEN and probe.connect_ex(("127.0.0.1", port)) != 0:
+                TAKEN.add(port)
+                ports.append(port)
     return ports
 
 
@@ -229,11 +236,14 @@ password_file {passwords}
             (gateway.directory / "state").mkdir()
             gateway.start()
         for gateway in self.gateways:
-            until(f"the start of {gateway.name}", lambda: gateway.socket.exists() and self.is_whole(gateway), 60)
+            until(f"the start of {gateway.name}", lambda: gateway.socket.exists() and self.is_whole(gateway), 120)
 
     def is_whole(self, gateway):
-        drives = gateway.drive_states()
-        return all(each["online"] for each in drives.values()) and gateway.metric("drivegate_mqtt_connected") == 1
+        try:
+            drives = gateway.drive_states()
+            return all(each["online"] for each in drives.values()) and gateway.metric("drivegate_mqtt_connected") == 1
+        except OSError:
+            return False
 
     def run_motors(self):
         """Each drive runs, and its lease is renewed from now on."""

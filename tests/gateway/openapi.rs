@@ -51,8 +51,12 @@ fn every_answer_is_as_the_description_says() {
     let checked: Value = serde_json::from_slice(&checked.stdout).unwrap();
     let answered = checked["answered"].as_object().unwrap();
     let others: Vec<_> = answered.iter().filter(|(_, status)| **status != 200).collect();
-    // No restore was made, and nobody logs in at the socket.
-    let expected = [("/api/v1/drives/{name}/params/restore", 409), ("/api/v1/session", 404)];
+    // `[authority]` is off, no restore was made, and nobody logs in at the socket.
+    let expected = [
+        ("/api/v1/drives/{name}/hold", 409),
+        ("/api/v1/drives/{name}/params/restore", 409),
+        ("/api/v1/session", 404),
+    ];
     assert_eq!(json!(others), json!(expected));
     assert!(answered.len() > 15, "{answered:?}");
     let described: Vec<&str> = checked["described"]

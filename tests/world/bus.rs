@@ -22,6 +22,7 @@ use drivegate::sim::random::Random;
 use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
 use drivegate::sim::slave::Slaves;
 use drivegate::sim::statistics::Transcript;
+use drivegate::start_guard::{BusGuards, Guards};
 
 use super::scenario::Line;
 
@@ -60,6 +61,8 @@ pub struct WorldBus {
     pub core: BusCore,
     pub wire: HalfDuplex,
     pub options: BusOptions,
+    /// The starts of its drives, as long as the process lives.
+    pub guards: Arc<Guards>,
     pub profile: Arc<Profile>,
     pub open: bool,
     /// It was asked to stop its drives: its polls cease.
@@ -145,7 +148,8 @@ impl WorldBus {
             line: LineOptions::default(),
             mode: Default::default(),
         };
-        let handle = handle(index, line, &profile, format);
+        let guards = Arc::new(Guards::default());
+        let handle = handle(index, line, &profile, format, &guards);
         let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();
         let predicted = predict(&handle.image.spec, parts.silence, &specs);
         let (round, slow_round) = (predicted.fast_cycle, predicted.slow_cycle);
@@ -179,6 +183,7 @@ impl WorldBus {
             core,
             wire,
             options,
+            guards,
             profile,
             open: true,
             ending: false,
@@ -202,10 +207,28 @@ impl WorldBus {
         self.handle.queue.begin_handover(now);
         let before = self.core.ended(now);
         let format = self.handle.image.spec.format;
-        let stopped = std::mem::replace(&mut self.handle, handle(index, &self.line, &self.profile, format));
+        let stopped = std::mem::replace(
+            &mut self.handle,
+            handle(index, &self.line, &self.profile, format, &self.guards),
+        );
         self.handle.take_over(std::slice::from_ref(&stopped), now);
         stopped.queue.close(drivegate::command::Outcome::ShuttingDown, now);
         let (bus, options) = (self.handle.clone(), &self.options);
+        self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
+        if self.open {
+            self.core.opened(now);
+        }
+        (self.asked, self.ended) = (None, None);
+        (self.until, self.commands) = (now, true);
+    }
+
+    /// The process is killed and started again: of all that it knew, `guards` has what is left.
+    pub fn kill(&mut self, guards: Guards, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
+        self.wire.cut();
+        self.guards = Arc::new(guards);
+        let format = self.handle.image.spec.format;
+        self.handle = handle(self.index, &self.line, &self.profile, format, &self.guards);
+        let (bus, options, before) = (self.handle.clone(), &self.options, Handover::default());
         self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
         if self.open {
             self.core.opened(now);
@@ -411,7 +434,13 @@ impl WorldBus {
     }
 }
 
-pub fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat) -> BusHandle {
+pub fn handle(
+    index: usize,
+    line: &Line,
+    profile: &Arc<Profile>,
+    format: LineFormat,
+    guards: &Arc<Guards>,
+) -> BusHandle {
     let name = format!("line{index}");
     let spec = BusSpec {
         name: name.clone(),
@@ -434,8 +463,11 @@ pub fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFor
         (line.spec)(&mut spec);
         Arc::new(DriveImage::new(spec, line.slow_cycle))
     };
+    let drives: Vec<Arc<DriveImage>> = (1..=line.drives).map(drive).collect();
+    let guarded = BusGuards::of(guards, &spec, drives.iter().map(|drive| &drive.spec));
+    guards.watch(drives.iter().cloned(), Duration::from_secs(1));
     BusHandle {
-        image: Arc::new(BusImage::new(spec, (1..=line.drives).map(drive).collect())),
-        queue: Arc::new(CommandQueue::new().unwrap()),
+        image: Arc::new(BusImage::new(spec, drives)),
+        queue: Arc::new(CommandQueue::new().unwrap().guarded(guarded)),
     }
 }

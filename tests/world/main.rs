@@ -42,6 +42,7 @@ mod scenario;
 mod selection;
 mod situations;
 mod slot;
+mod start_guard;
 mod stop_all;
 mod world;
 

@@ -19,6 +19,7 @@ use self::functions::other;
 use self::parameter::ParameterRun;
 use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_of, unsendable, write_on_change};
 use super::confirm::{self, Effect};
+use super::start_gate::Start;
 use crate::codec::{Exception, Reply, Table};
 use crate::command::{
     Command, Interruption, Order, Origin, Outcome, Receipt, Refusal, SourceKind, Ticket, Touched, Urgency,
@@ -109,6 +110,8 @@ pub struct CommandRun {
     started: bool,
     /// A stop as it was ordered, for a bus that takes the place of this one.
     stop: Option<Order>,
+    /// The order by which it starts a motor whose starts count.
+    pub(super) start: Option<Start>,
     /// The silence of whoever gave it is the one that counts for supervision.
     pub renews: bool,
 }
@@ -193,6 +196,7 @@ impl CommandRun {
             reads_back,
             started: false,
             stop,
+            start: None,
             renews: true,
         }
     }
@@ -228,6 +232,9 @@ impl CommandRun {
             // They are noted.
             effects: Vec::new(),
             slot: None,
+            waits: false,
+            is_ordinary: false,
+            is_urgent: true,
         })
     }
 
@@ -248,9 +255,8 @@ impl CommandRun {
 
     /// Whether a client gave it: no order of the gateway's own.
     pub fn is_of_client(&self) -> bool {
-        let own = [SourceKind::Supervision, SourceKind::Shutdown];
         let kind = |ticket: &Ticket| ticket.origin().kind;
-        self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| !own.contains(&kind(ticket)))
+        self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| kind(ticket).is_client())
     }
 
     /// Whether it renews the lease of its drive: a client gave it whose silence counts.
@@ -272,10 +278,7 @@ impl CommandRun {
 
     /// Whether only supervision wants it.
     pub fn is_of_supervision(&self) -> bool {
-        let kind = |ticket: &Ticket| ticket.origin().kind;
-        self.tickets
-            .iter()
-            .all(|ticket| kind(ticket) == SourceKind::Supervision)
+        self.tickets.iter().all(|ticket| ticket.origin().is_lease())
     }
 
     /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
@@ -401,6 +404,18 @@ impl CommandRun {
         if std::mem::take(&mut self.started) {
             self.actions.push_back(Action::Word(Word::Stop(None)));
         }
+    }
+
+    /// Whether it may write more than the end of a pulse.
+    pub fn may_write_on(&self) -> bool {
+        !self.only_ends
+    }
+
+    /// It goes no further, but for the end of a pulse. Who gave it, and what it was.
+    pub fn refuse(&mut self, refusal: Refusal) -> Option<(Origin, String)> {
+        self.cut_off(Outcome::Refused(refusal));
+        let ticket = self.tickets.first()?;
+        Some((ticket.origin().clone(), ticket.what().to_string()))
     }
 
     /// Whether it is still owed: nothing of it was on the wire, or the drive said each time that it was too busy.

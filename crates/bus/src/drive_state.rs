@@ -41,11 +41,13 @@ pub(super) struct DriveState {
     pub(super) was_read: bool,
     /// When its reference, and an end of its frequency range, were written last, whether or not it took that.
     pub(super) written: LastWritten,
+    /// A start (true) or a stop was acknowledged, and the guards have not taken note of it.
+    pub(super) acknowledged: Option<bool>,
     /// Whether `[authority]` is on: then those are kept whose orders were carried out.
     pub(super) guarded: bool,
     pub(super) carried_out: Vec<Origin>,
-    /// Its local control place has it, as far as was told.
-    pub(super) local: bool,
+    /// Whether its local control place has it; none while that is not known.
+    pub(super) local: Option<bool>,
 }
 
 /// What the begun commands of a drive want.
@@ -78,9 +80,10 @@ impl DriveState {
             answers_within: Duration::ZERO,
             was_read: false,
             written: LastWritten::default(),
+            acknowledged: None,
             guarded: false,
             carried_out: Vec::new(),
-            local: false,
+            local: None,
         }
     }
 
@@ -201,6 +204,11 @@ impl DriveState {
             overtaken.overtaken();
         }
         if outcome.is_ok() {
+            match urgency {
+                Urgency::Stop => self.acknowledged = Some(false),
+                Urgency::Command if run.start.is_some() => self.acknowledged = Some(true),
+                Urgency::Command | Urgency::Read => {}
+            }
             let was_read_back = run.was_read_back();
             let (effects, receipts) = run.acknowledge(outcome, now);
             if was_read_back {

@@ -8,6 +8,7 @@
 //! - `drive_state`: what is known of one drive beside its samples, polls and N2 session: its begun commands
 //!   ([`command_run`]), what they still have to show ([`confirm`]), its lease ([`supervision`]), the replies that it may
 //!   still send ([`late_replies`]).
+//! - `start_gate`: which commands to guarded drives may start them, and the stops of interlocks.
 //! - [`n2_session`] and [`n2_late_replies`]: what N2 needs beyond that, for the whole line.
 //! - [`listener`]: the bus without its thread on a line that another master owns: it decodes and never sends.
 //! - `line_diagnosis`: feeds [`crate::diagnosis`] and shows what comes of it.
@@ -37,6 +38,7 @@ pub mod proof;
 mod report;
 pub mod schedule;
 mod selection;
+mod start_gate;
 pub mod supervision;
 mod tap;
 pub mod transaction;
@@ -47,6 +49,7 @@ use drivegate_core::diagnosis;
 use drivegate_core::event;
 use drivegate_core::plant;
 use drivegate_core::process_image;
+use drivegate_core::start_guard;
 pub use drivegate_core::stop_all::stop_of_line;
 use drivegate_line as line;
 use drivegate_model::document;

@@ -30,6 +30,7 @@ use super::n2_late_replies::{N2LateReplies, n2_look_alike};
 use super::n2_session::N2Sessions;
 use super::news::News;
 use super::schedule::{Cadence, Poll, Schedule};
+use super::start_gate::StartGate;
 use super::supervision::{Demand, Lease, Orders};
 use super::transaction::Ended;
 use crate::codec::n2::Session;
@@ -169,6 +170,8 @@ pub struct Master {
     probes: Vec<u32>,
     /// A reply may have come late since before the exchange that is on the line.
     late_before: bool,
+    /// Which starts may be written; none where nothing is guarded.
+    starts: Option<StartGate>,
 }
 
 impl Master {
@@ -225,6 +228,7 @@ impl Master {
             successor: before.quiet_until.is_some(),
             writes,
             late_before: false,
+            starts: StartGate::of(&bus, now),
             bus,
         }
     }
@@ -262,6 +266,9 @@ impl Master {
             }
         }
         drop(queue);
+        if let Some(starts) = &mut self.starts {
+            starts.settle(|_| false);
+        }
         let close = |drive: &mut DriveState| {
             drive.close(&Outcome::ShuttingDown, Interruption::ShuttingDown, now);
             drive.supervision.lease()
@@ -297,6 +304,9 @@ impl Master {
         if let Some(round) = self.schedule.take_round() {
             news.push(News::FastRound(round.cycle));
         }
+        if let Some(starts) = &mut self.starts {
+            news.append(&mut starts.take_told());
+        }
         next.map_err(|until| until.min(now + LOOK_ROUND))
     }
 
@@ -315,16 +325,46 @@ impl Master {
                 news.extend(late.into_iter().map(|late| News::NotConfirmed(index, late)));
             }
             if drive.guarded || guarded {
-                look_at_hold(bus, index, image, drive, guarded, now);
+                look_at_hold(bus, index, image, drive, (guarded, writes), now);
             }
             if image.spec.supervision.is_some() {
                 supervise(bus, index, image, drive, writes, now, news);
             }
         }
+        self.look_at_starts(now);
         for drive in self.sessions.neglected(now).collect::<Vec<_>>() {
             self.schedule.ask(drive, now);
         }
         self.look_at_shutdown(now);
+    }
+
+    /// Tells the guards of starts what is known of their drives.
+    fn look_at_starts(&mut self, now: Instant) {
+        let Master {
+            bus,
+            drives,
+            starts,
+            writes,
+            background,
+            ..
+        } = self;
+        let Some(starts) = starts else { return };
+        for (index, (drive, image)) in drives.iter_mut().zip(&bus.image.drives).enumerate() {
+            if starts.guards(index) {
+                let reading = image.reading(now, drive.fresh);
+                starts.look(index, drive, &reading);
+                starts.look_at_interlocks(bus, (index, image), &drive.words, &reading, writes);
+            }
+        }
+        if starts.has_cleared() {
+            let pending = bus.queue.lock();
+            let passed_on = background.as_ref().map(Begun::number);
+            let begun = drives
+                .iter_mut()
+                .filter_map(|drive| drive.run(Urgency::Command)?.start.as_ref());
+            let begun: Vec<u64> = begun.map(|start| start.number).chain(passed_on).collect();
+            starts.settle(|number| pending.has(number) || begun.contains(&number));
+        }
     }
 
     /// The turn goes onto the line at `now`.
@@ -337,6 +377,12 @@ impl Master {
                 pdu: turn.pdu.clone(),
             };
             drive.sent(*slot, &step, now);
+            let start = drive.run(*slot).and_then(|run| run.start.clone());
+            if let Some(starts) = self.starts.as_ref().filter(|_| step.pdu.is_write())
+                && let Some(image) = self.bus.image.drives.get(turn.drive)
+            {
+                starts.written(turn.drive, &image.spec.profile, &step.pdu, start.as_ref(), now);
+            }
         }
         let is_command = matches!(
             turn.purpose,
@@ -433,7 +479,7 @@ pub(super) fn supervise(
             drive.supervision.withdrawn(now);
         }
         Demand::Write(point, value) => {
-            let origin = Origin::new(SourceKind::Supervision, "supervision");
+            let origin = Origin::new(SourceKind::Supervision, Origin::LEASE);
             let ordered = bus.own_order(index, &reading, (point, value), origin.clone(), DEFAULT_EXPIRY, writes);
             if let Some(refusal) = supervision.ordered(ordered, now) {
                 let what = format!("{}={value}", point.name());

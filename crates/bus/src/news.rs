@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::confirm::Unconfirmed;
 use crate::codec::Exception;
-use crate::command::Refusal;
+use crate::command::{Origin, Refusal};
 use crate::drive::PlannedRead;
 
 /// One piece of news. Drives are named by their place on the bus.
@@ -64,6 +64,24 @@ pub enum News {
     },
     /// A drive whose lease ran out does not say whether it runs.
     RunningUnknown(usize),
+    /// A command that waited, or was begun, is refused: it may not start its motor.
+    StartRefused {
+        /// Which drive.
+        drive: usize,
+        /// Who gave it.
+        origin: Origin,
+        /// The command in one line.
+        what: String,
+        /// Why not.
+        refusal: Refusal,
+    },
+    /// An interlock does not hold, and the motor is stopped by that.
+    Tripped {
+        /// Which drive.
+        drive: usize,
+        /// Which interlock, and why it does not hold.
+        why: String,
+    },
     /// A supervised drive runs, and no client is known to have commanded it; whether its lease starts by that.
     RunsUnsupervised(usize, Adopted),
 }

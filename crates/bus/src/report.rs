@@ -17,9 +17,9 @@ use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
 use super::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::{Exception, Reply, Request, Table};
-use crate::command::WriteStats;
+use crate::command::{Origin, Refusal, WriteStats};
 use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
-use crate::event::{Event, EventKind, Events};
+use crate::event::{Event, EventKind, Events, RefusedCommand};
 use crate::plant::explain;
 use crate::process_image::{
     Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Verdict,
@@ -144,6 +144,15 @@ impl Report {
                 });
             }
             News::RunsUnsupervised(drive, adopted) => self.runs_unsupervised(*drive, *adopted),
+            News::StartRefused {
+                drive,
+                origin,
+                what,
+                refusal,
+            } => self.start_refused(*drive, origin, what, refusal, now),
+            News::Tripped { drive, why } => self.drive_event(*drive, EventKind::Interlock, None, |name| {
+                format!("an interlock of {name} does not hold: {why}; the drive is being stopped")
+            }),
         }
         let News::Read { drive, read, at, .. } = news else {
             return Wanted::default();
@@ -191,6 +200,21 @@ impl Report {
             bus: self.image.spec.name.clone(),
             ..event
         });
+    }
+
+    /// A command was refused at its turn, as others are when they come.
+    fn start_refused(&self, index: usize, origin: &Origin, what: &str, refusal: &Refusal, now: Instant) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        let refused = RefusedCommand {
+            client: origin.client(),
+            reason: refusal.code(),
+            bus: &drive.spec.bus,
+            drive: &drive.spec.name,
+            text: format!("refused {what} from {} {}: {refusal}", origin.kind.name(), origin.who),
+        };
+        self.events.publish_refusal(refused, now);
     }
 
     fn read(&self, index: usize, read: &PlannedRead, words: &[u16], at: Instant) {

@@ -398,7 +398,7 @@ fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_va
 }
 
 /// The run command in the drive's word as it is known.
-fn written_run(reading: &Reading<'_>, words: &KnownWords) -> Option<bool> {
+pub(super) fn written_run(reading: &Reading<'_>, words: &KnownWords) -> Option<bool> {
     let profile = &reading.spec.profile;
     let place = profile.run_place()?;
     let word = words.get(place.table, place.address)?;

@@ -81,6 +81,10 @@ pub enum EventKind {
     RestoreUnfinished,
     /// A verdict about a line came, became firmer, or went.
     Diagnosis,
+    /// A start was refused, since it came too often or too soon.
+    Guarded,
+    /// A start was refused, or a motor stopped, since an interlock does not hold.
+    Interlock,
     /// A client took hold of a drive.
     Held,
     /// The hold of a client ended.
@@ -91,7 +95,7 @@ pub enum EventKind {
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 28] = [
+    pub const ALL: [EventKind; 30] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -117,6 +121,8 @@ impl EventKind {
         EventKind::ParametersChanged,
         EventKind::RestoreUnfinished,
         EventKind::Diagnosis,
+        EventKind::Guarded,
+        EventKind::Interlock,
         EventKind::Held,
         EventKind::Released,
         EventKind::HoldBroken,
@@ -137,6 +143,7 @@ impl EventKind {
             | EventKind::BusDown
             | EventKind::Diagnosis
             | EventKind::RestoreUnfinished
+            | EventKind::Interlock
             | EventKind::ReloadRefused => true,
             EventKind::Online
             | EventKind::FaultEnd
@@ -149,6 +156,7 @@ impl EventKind {
             | EventKind::BusUp
             | EventKind::Recording
             | EventKind::ForeignCommand
+            | EventKind::Guarded
             | EventKind::Held
             | EventKind::Released
             | EventKind::HoldBroken
@@ -184,6 +192,8 @@ impl EventKind {
             EventKind::ParametersChanged => "parameters_changed",
             EventKind::RestoreUnfinished => "restore_unfinished",
             EventKind::Diagnosis => "diagnosis",
+            EventKind::Guarded => "guarded",
+            EventKind::Interlock => "interlock",
             EventKind::Held => "held",
             EventKind::Released => "released",
             EventKind::HoldBroken => "hold_broken",
@@ -388,10 +398,15 @@ impl Events {
     /// Publishes that a command was refused: the first of a kind at once, then one event a second for each client, which
     /// stands for all of them.
     pub fn publish_refusal(&self, refused: RefusedCommand<'_>, now: Instant) {
+        let kind = match refused.reason {
+            "guarded" => EventKind::Guarded,
+            "interlocked" => EventKind::Interlock,
+            _ => EventKind::RefusedCommand,
+        };
         let event = Event {
             bus: refused.bus.to_string(),
             drive: Some(refused.drive.to_string()),
-            ..Event::new(EventKind::RefusedCommand, SystemTime::now(), refused.text)
+            ..Event::new(kind, SystemTime::now(), refused.text)
         };
         let mut store = self.store();
         let passed = store
@@ -498,7 +513,7 @@ mod tests {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised
                 | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
-                ParametersChanged | RestoreUnfinished | Diagnosis | Held | Released => false,
+                ParametersChanged | RestoreUnfinished | Diagnosis | Guarded | Interlock | Held | Released => false,
                 HoldBroken => true,
             };
             assert_eq!(kind as usize, place);

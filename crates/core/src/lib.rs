@@ -8,6 +8,7 @@ pub mod history;
 pub mod parameters;
 pub mod plant;
 pub mod process_image;
+pub mod start_guard;
 pub mod stop_all;
 pub mod version;
 

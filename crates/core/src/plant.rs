@@ -124,6 +124,19 @@ pub struct DriveHandle {
     stale_after: Duration,
     events: Events,
     writes: Arc<WriteStats>,
+    manner: Manner,
+}
+
+/// How orders are placed that guards of starts would refuse or delay.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+enum Manner {
+    /// A start that must wait is refused, an ordinary stop is delayed.
+    #[default]
+    Usual,
+    /// A start that must wait does so.
+    Waits,
+    /// No stop is delayed.
+    AtOnce,
 }
 
 /// What an order sets, with the values that are known before it.
@@ -274,11 +287,33 @@ impl Plant {
             stale_after: self.stale_after,
             events: self.events.clone(),
             writes: self.writes.clone(),
+            manner: Manner::default(),
         }
     }
 }
 
 impl DriveHandle {
+    /// The same, whose orders wait where a guard lets their start wait, within their expiry.
+    #[must_use]
+    pub fn waiting(mut self, waits: bool) -> DriveHandle {
+        self.manner = if waits { Manner::Waits } else { Manner::Usual };
+        self
+    }
+
+    /// The same, whose stops no guard delays.
+    #[must_use]
+    pub fn at_once(mut self) -> DriveHandle {
+        self.manner = Manner::AtOnce;
+        self
+    }
+
+    /// For how long the stop that waits for the drive still does so, by `min_run`.
+    pub fn stop_waits(&self, now: Instant) -> Option<Duration> {
+        self.bus.queue.guards()?;
+        let until = self.bus.queue.lock().stop_waits(self.index, now)?;
+        Some(until.saturating_duration_since(now))
+    }
+
     /// Which machine it is, whatever its name.
     pub fn machine(&self) -> Machine {
         self.bus.image.spec.machine(&self.image.spec)
@@ -302,7 +337,13 @@ impl DriveHandle {
 
     /// Whether the drive of `reading` runs, and why not.
     pub fn why(&self, reading: &Reading<'_>) -> Explanation {
-        self.with_reservation(explain(reading, &self.bus.image, &self.writes), reading.now)
+        let explanation = explain(reading, &self.bus.image, &self.writes);
+        let mut explanation = self.with_reservation(explanation, reading.now);
+        let guards = self.bus.queue.guards().filter(|_| explanation.runs == Some(false));
+        if let Some(hindrance) = guards.and_then(|guards| guards.hindrance(self.index, reading.now)) {
+            explanation.add(why::guarded(&hindrance));
+        }
+        explanation
     }
 
     /// Whether the bus is open.
@@ -398,12 +439,12 @@ impl DriveHandle {
         let what = self.describe(&order);
         let (mut ticket, answer) = self.ticket(&what, changes(&reading, &order), origin, write, now);
         let placed = Placed::new(now, answer, ticket.confirmation());
-        match self.judge(order, ticket.origin(), &reading, authority) {
+        match self.judge(order, ticket.origin(), &reading, authority, now + expiry) {
             Err(outcome) => self.turn_away(ticket, &what, outcome, write, now),
             Ok(admitted) => {
                 let command = Command::new(self.index, admitted, now + expiry, ticket).of_slot(write_to);
                 let command = command.asked_of(&self.image.spec.profile, asked);
-                self.bus.queue.submit(command, now);
+                self.bus.queue.submit(self.in_manner(command), now);
             }
         }
         placed
@@ -432,9 +473,10 @@ impl DriveHandle {
         sets.iter_mut().for_each(|change| change.run = None);
         let (mut rest_ticket, rest_answer) = self.ticket(what, sets, origin, true, now);
         let placed = placed.with_rest(rest_answer, rest_ticket.confirmation());
-        let stop = match self.judge(stop, ticket.origin(), &reading, authority) {
+        let stop = match self.judge(stop, ticket.origin(), &reading, authority, now + expiry) {
             Ok(admitted) => {
-                Command::new(self.index, admitted, now + expiry, ticket).asked_of(&self.image.spec.profile, now)
+                let stop = Command::new(self.index, admitted, now + expiry, ticket);
+                self.in_manner(stop.asked_of(&self.image.spec.profile, now))
             }
             Err(outcome) => {
                 self.turn_away(ticket, what, outcome, true, now);
@@ -443,7 +485,7 @@ impl DriveHandle {
             }
         };
         let judged = match rest {
-            Ok(order) => self.judge(order, rest_ticket.origin(), &reading, authority),
+            Ok(order) => self.judge(order, rest_ticket.origin(), &reading, authority, now + expiry),
             Err(refusal) => Err(Outcome::Refused(refusal)),
         };
         match judged {
@@ -458,6 +500,14 @@ impl DriveHandle {
             }
         }
         placed
+    }
+
+    fn in_manner(&self, command: Command) -> Command {
+        Command {
+            waits: self.manner == Manner::Waits,
+            is_urgent: self.manner == Manner::AtOnce,
+            ..command
+        }
     }
 
     fn ticket(
@@ -480,6 +530,7 @@ impl DriveHandle {
         origin: &Origin,
         reading: &Reading<'_>,
         authority: Authority,
+        expires: Instant,
     ) -> Result<Admitted, Outcome> {
         let online = reading.snapshot.link.is_online();
         let admitted = match command::admit(order, reading, authority) {
@@ -500,7 +551,10 @@ impl DriveHandle {
         }
         let held_back = || {
             let effect = Effect::of(&admitted.order, &self.image.spec.profile);
-            self.bus.queue.lock().held_back(self.index, origin, effect)
+            let until = (self.manner == Manner::Waits).then_some(expires);
+            let queue = self.bus.queue.lock();
+            let held_back = queue.held_back(self.index, origin, effect);
+            held_back.or_else(|| queue.guarded(self.index, effect, until, reading.now))
         };
         // Judged once more when it is accepted.
         match (admitted.urgency == Urgency::Command).then(held_back).flatten() {

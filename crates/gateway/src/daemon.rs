@@ -30,6 +30,7 @@ use crate::north::{NorthStats, ServerError, bacnet, http, local, modbus_tcp, mqt
 use crate::parameters::{Store, Vault};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
+use crate::start_guard::{self, BusGuards, Guards};
 use crate::stop_all::LOOK;
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
@@ -82,6 +83,10 @@ pub struct Daemon {
     recorder: Option<RecorderTask>,
     /// Keeps events and counters on disk.
     keeper: Option<Keeper>,
+    /// The starts of all drives.
+    guards: Arc<Guards>,
+    /// Keeps them on disk.
+    starts: Option<start_guard::Keeper>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
     stopper: tokio::task::JoinHandle<()>,
@@ -154,6 +159,8 @@ impl Daemon {
             history,
             recorder: None,
             keeper: None,
+            guards: Arc::default(),
+            starts: None,
             reporter: report_refusals(shared.clone()),
             stopper: stop_all(shared.clone()),
             reserver: reservations::keep(shared, reservations.clone()),
@@ -166,6 +173,8 @@ impl Daemon {
         daemon.apply_audit(&settings).await;
         // So that MQTT misses no event, though it comes after the buses: its first messages tell of them.
         drop(daemon.stats.mqtt.keep_unread(Some(daemon.events.subscribe())));
+        // Before the first start is counted.
+        daemon.apply_guards(&settings).await;
         let prepared = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings).await?;
         daemon.apply_params(&settings);
@@ -229,6 +238,7 @@ impl Daemon {
     /// before, without a recorder.
     pub async fn reload(&mut self, settings: Settings) -> Result<Vec<String>, StartError> {
         let settings = file_limit::fit(settings);
+        self.apply_guards(&settings).await;
         // Everything that can fail comes before anything that runs is stopped for good.
         let prepared = self.prepare_buses(&settings)?;
         let servers = self.prepare_servers(&settings).await?;
@@ -349,6 +359,10 @@ impl Daemon {
             parameters: self.vault.clone(),
             history: self.history.clone(),
         }));
+        let images = buses
+            .iter()
+            .flat_map(|(_, task)| task.handle().image.drives.iter().cloned());
+        self.guards.watch(images, settings.stale_after);
         if let Some(recorder) = &self.recorder {
             let images = buses.iter().map(|(_, task)| task.handle().image.clone());
             recorder.adopt(images.collect(), settings.stale_after);
@@ -367,7 +381,8 @@ impl Daemon {
         let image = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), slow_cycle).with_hold(hold(spec)));
         let drives = bus.drives.iter().map(image).collect();
         let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
-        let queue = Arc::new(CommandQueue::new().map_err(failed)?);
+        let guards = BusGuards::of(&self.guards, &bus.spec, &bus.drives);
+        let queue = Arc::new(CommandQueue::new().map_err(failed)?.guarded(guards));
         BusTask::prepare(
             BusHandle { image, queue },
             bus.options.clone(),
@@ -433,6 +448,30 @@ impl Daemon {
                     target: "drivegate::daemon", "cannot start the thread that keeps events and counters: {error}; free memory or threads"
                 );
             }
+        }
+    }
+
+    /// Keeps starts in the configured directory, where they are counted. Guarded drives are not started without that.
+    async fn apply_guards(&mut self, settings: &Settings) {
+        let same = |keeper: &start_guard::Keeper| keeper.dir() == settings.state_dir;
+        let mut drives = settings.buses.iter().flat_map(|bus| &bus.drives);
+        let none = !drives.any(|drive| drive.guard.is_some());
+        if none || !settings.keeps_history || self.starts.as_ref().is_some_and(same) {
+            return;
+        }
+        self.stop_starts().await;
+        match start_guard::Keeper::start(&settings.state_dir, self.guards.clone()) {
+            Ok(keeper) => self.starts = Some(keeper),
+            Err(error) => tracing::error!(
+                target: "drivegate::daemon",
+                "cannot start the thread that counts starts: {error}; drives with a guard are not started; free memory or threads"
+            ),
+        }
+    }
+
+    async fn stop_starts(&mut self) {
+        if let Some(keeper) = self.starts.take() {
+            within(STOP_AUDIT, "the file of starts", keeper.stop()).await;
         }
     }
 
@@ -583,6 +622,7 @@ impl Daemon {
         self.mqtt.stop().await;
         self.http.stop().await;
         self.stop_keeper().await;
+        self.stop_starts().await;
         let audit = self.writes.audit();
         if let Some(file) = audit.file() {
             within(STOP_AUDIT, "the audit file", file.stop()).await;

@@ -34,6 +34,7 @@ use drivegate_core::history;
 use drivegate_core::parameters;
 use drivegate_core::plant;
 use drivegate_core::process_image;
+use drivegate_core::start_guard;
 use drivegate_core::stop_all;
 use drivegate_core::version;
 use drivegate_line as line;

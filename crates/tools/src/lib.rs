@@ -15,6 +15,7 @@ mod demo;
 mod diagnose;
 mod drive_access;
 mod health;
+mod hold_command;
 mod inventory;
 mod listen;
 mod loading;
@@ -39,6 +40,7 @@ mod token;
 mod trace;
 mod trial;
 mod user;
+mod verify;
 mod watch;
 mod why;
 mod write;
@@ -128,6 +130,7 @@ commands! {
     Read => read,
     Write => write,
     StopAll => stop_all_command,
+    Hold => hold_command,
     Why => why,
     Diagnose => diagnose,
     Record => record,
@@ -138,6 +141,7 @@ commands! {
     Replay => replay,
     Simulate => simulate,
     Profiles => profiles,
+    Verify => verify,
     Map => map,
     Inventory => inventory,
     Audit => audit,

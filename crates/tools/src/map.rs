@@ -145,9 +145,11 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
     let bus = |bus: &BusSettings| {
         let drive = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), bus.spec.slow_cycle));
         let drives = bus.drives.iter().map(drive).collect();
+        let queue = CommandQueue::new()?;
+        queue.set_authority(settings.authority.clone());
         Ok(BusHandle {
             image: Arc::new(BusImage::new(bus.spec.clone(), drives)),
-            queue: Arc::new(CommandQueue::new()?),
+            queue: Arc::new(queue),
         })
     };
     Ok(Plant {

@@ -408,7 +408,7 @@ fn access(point: &Point) -> &'static str {
 }
 
 /// Address of a point, form of its raw value, and engineering value of one count.
-fn place(profile: &Profile, point: &Point) -> (String, String, String) {
+pub(super) fn place(profile: &Profile, point: &Point) -> (String, String, String) {
     match &point.source {
         Source::Raw(raw) => {
             let at = format!("{} {}", raw.table, raw.address);

@@ -50,7 +50,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     }
 }
 
-fn rows(target: &Target, points: &[String]) -> Result<Vec<PointValue>, String> {
+pub(super) fn rows(target: &Target, points: &[String]) -> Result<Vec<PointValue>, String> {
     let names = match points {
         [] => String::new(),
         names => format!("?names={}", encoded(&names.join(","))),

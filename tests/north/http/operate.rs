@@ -81,7 +81,14 @@ fn a_drive_is_operated_from_the_page_by_the_keyboard() {
     let commands: Vec<String> = audit.as_array().unwrap().iter().map(of).collect();
     assert_eq!(
         commands,
-        ["speed_reference=50", "run=true reverse=false", "run=false"],
+        [
+            "speed_reference=50",
+            "run=true reverse=false",
+            "run=false",
+            // Started once more, and stopped with all drives.
+            "run=true reverse=false",
+            "run=false"
+        ],
         "these, and no more"
     );
 }

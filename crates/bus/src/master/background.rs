@@ -8,8 +8,8 @@ use super::{Master, Purpose, Turn, TurnEnd};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{
-    BackgroundRequest, Chosen, Command, Interruption, NO_DRIVE, Order, Outcome, Pace, PassedOn, Pending, Refusal,
-    SourceKind, Touched, Urgency, written,
+    BackgroundRequest, Chosen, Command, Effect, Interruption, NO_DRIVE, Order, Outcome, Pace, PassedOn, Pending,
+    Refusal, SourceKind, Touched, Urgency, written,
 };
 use crate::drive::plan::WireTime;
 use crate::drive::{PlannedRead, PollClass};
@@ -20,6 +20,7 @@ use crate::n2_session::{N2Sessions, Progress};
 use crate::news::News;
 use crate::process_image::DriveImage;
 use crate::schedule::Admission;
+use crate::start_gate::{Start, StartGate};
 use crate::stop_of_line::BROADCAST_PAUSE;
 use crate::transaction::{CONNECTION_CLOSED, Ended};
 
@@ -36,9 +37,17 @@ pub(super) struct Begun {
     ordered: Option<Touched>,
     /// Its exchange is on the line, or was.
     sent: bool,
+    /// Its number among the orders, and what it means for each drive that it reaches.
+    number: u64,
+    effects: Vec<(usize, Effect)>,
 }
 
 impl Begun {
+    /// Its number among the orders to drives of the bus.
+    pub(super) fn number(&self) -> u64 {
+        self.number
+    }
+
     fn turn(&self) -> Turn {
         Turn {
             drive: self.request.drive,
@@ -65,6 +74,8 @@ pub(super) struct Late<'m> {
     pub(super) sessions: &'m mut N2Sessions,
     pub(super) n2_late: &'m N2LateReplies,
     pub(super) strangers: &'m mut BTreeMap<u8, LateReplies>,
+    /// Which starts may be written.
+    pub(super) starts: &'m mut Option<StartGate>,
 }
 
 impl Late<'_> {
@@ -159,7 +170,8 @@ impl Master {
         };
         match begun.ordered {
             Some(touched) => {
-                let command = begun.request.into_command(touched);
+                let mut command = begun.request.into_command(touched);
+                (command.number, command.effects) = (begun.number, begun.effects);
                 self.bus.queue.lock().put_back(command, now);
             }
             None => self.bus.queue.background().put_back(begun.request, now),
@@ -199,12 +211,14 @@ impl Master {
             sessions,
             n2_late,
             strangers,
+            starts,
             ..
         } = self;
         let mut late = Late {
             sessions,
             n2_late,
             strangers,
+            starts,
         };
         let chosen = pending.next_passed_on(now, |command| {
             let online = schedule.is_online(command.drive);
@@ -213,6 +227,9 @@ impl Master {
                 false
             })
         });
+        if let Some(starts) = starts {
+            starts.refuse(pending, now);
+        }
         (chosen, blocked)
     }
 
@@ -226,12 +243,14 @@ impl Master {
             sessions,
             n2_late,
             strangers,
+            starts,
             ..
         } = self;
         let mut late = Late {
             sessions,
             n2_late,
             strangers,
+            starts,
         };
         late.may_pass_on(pending.get(chosen)?, drives, now)
             .is_ok_and(|may| may)
@@ -263,13 +282,7 @@ impl Master {
     ) -> Option<Turn> {
         let held = command.passed_on.as_ref().and_then(|p| held(p, &self.bus.image.drives));
         let away = command.drive != NO_DRIVE && !self.schedule.is_online(command.drive);
-        let lost = || {
-            self.bus
-                .queue
-                .lock()
-                .hold_stops_turn(&command, now)
-                .map(Outcome::Refused)
-        };
+        let lost = || self.bus.queue.lock().hold_at_turn(&command, now).map(Outcome::Refused);
         let in_vain = held.or(away.then_some(Outcome::Offline)).or_else(lost);
         if let Some(outcome) = in_vain {
             command.answer(&outcome, now);
@@ -282,6 +295,8 @@ impl Master {
             ticket,
             touched,
             passed_on,
+            number,
+            effects,
             ..
         } = command
         else {
@@ -301,6 +316,8 @@ impl Master {
             admission,
             ordered: Some(touched),
             sent: false,
+            number,
+            effects,
         });
         Some(begun.turn())
     }
@@ -331,12 +348,14 @@ impl Master {
             sessions,
             n2_late,
             strangers,
+            starts,
             ..
         } = self;
         let mut late = Late {
             sessions,
             n2_late,
             strangers,
+            starts,
         };
         let may = |request: &BackgroundRequest| {
             let until = late.blocks((request.drive, &request.pdu), request.passed_on.as_ref(), drives, now);
@@ -362,6 +381,8 @@ impl Master {
             admission: Some(admission),
             ordered: None,
             sent: false,
+            number: 0,
+            effects: Vec::new(),
         });
         Ok(begun.turn())
     }
@@ -386,6 +407,9 @@ impl Master {
             let pending = self.bus.queue.lock();
             // A stop that came in while the line fell silent.
             !started.any(|drive| pending.was_stopped(*drive))
+        }) && self.starts.as_ref().is_none_or(|starts| {
+            let mut started = begun.effects.iter().filter(|(_, effect)| effect.run == Some(true));
+            started.all(|(drive, _)| starts.may_still_write(*drive, begun.number, now))
         })
     }
 
@@ -400,6 +424,19 @@ impl Master {
             if let Some(drive) = self.drives.get_mut(*index) {
                 drive.heard_order(renews, now);
             }
+        }
+        let Some(starts) = self.starts.as_ref().filter(|_| orders.is_some()) else {
+            return;
+        };
+        for (drive, effect) in &begun.effects {
+            let Some(image) = self.bus.image.drives.get(*drive) else {
+                continue;
+            };
+            let start = (effect.run == Some(true)).then(|| Start {
+                number: begun.number,
+                client: begun.request.ticket.origin().client().clone(),
+            });
+            starts.written(*drive, &image.spec.profile, &begun.request.pdu, start.as_ref(), now);
         }
     }
 
@@ -602,11 +639,17 @@ pub(super) fn may_go(
     drives: &mut [DriveState],
     now: Instant,
 ) -> Result<bool, Instant> {
-    match &command.passed_on {
-        Some(_) => late.may_pass_on(command, drives, now),
+    let may = match &command.passed_on {
+        Some(_) => late.may_pass_on(command, drives, now)?,
         None => match drives.get_mut(command.drive) {
-            Some(drive) => super::choose::may_begin(drive, command, online, now),
-            None => Ok(true),
+            Some(drive) => super::choose::may_begin(drive, command, online, now)?,
+            None => true,
         },
+    };
+    // What goes to a drive that is away is answered, and starts nothing.
+    let goes = may && (online || command.passed_on.is_some());
+    match late.starts.as_mut().filter(|_| goes) {
+        Some(starts) => starts.may_go(command, now),
+        None => Ok(may),
     }
 }

@@ -208,13 +208,20 @@ impl Master {
             bus,
             n2_late,
             sessions,
+            starts,
             ..
         } = self;
         for (index, (drive, image)) in drives.iter_mut().zip(&bus.image.drives).enumerate() {
             if !drive.has_runs() {
                 continue;
             }
-            match drive.wanted(image, n2_late, now) {
+            let mut wanted = drive.wanted(image, n2_late, now);
+            while let Some(starts) = starts
+                && starts.forbids(index, drive, &wanted, now)
+            {
+                wanted = drive.wanted(image, n2_late, now);
+            }
+            match wanted {
                 Wanted::Step(slot, step) => {
                     // What N2 needs said before is blocked by late replies as the step itself is.
                     let before = sessions.before(index, Some(slot), now).map(RequestPdu::N2);
@@ -257,6 +264,7 @@ impl Master {
             sessions,
             n2_late,
             strangers,
+            starts,
             ..
         } = self;
         drop_in_vain(&mut pending, &bus.image.drives, now);
@@ -264,6 +272,7 @@ impl Master {
             sessions,
             n2_late,
             strangers,
+            starts,
         };
         let stands: Vec<bool> = drives
             .iter()
@@ -291,6 +300,12 @@ impl Master {
             if let Some(until) = until {
                 commands.wait(until);
             }
+        }
+        if let Some(starts) = starts
+            && starts.refuse(&mut pending, now)
+        {
+            // Others may go instead.
+            commands.wait(now);
         }
     }
 
@@ -360,8 +375,9 @@ impl Master {
             // It waited for its turn: its time begins now.
             command.expires = command.expires.max(now + DEFAULT_EXPIRY);
         }
+        let start = self.starts.as_ref().and_then(|starts| starts.start_of(&command, index));
         let mut run = CommandRun::new(command, &image.spec.profile);
-        (run.rank, run.renews) = (rank, renews);
+        (run.rank, run.renews, run.start) = (rank, renews, start);
         drive.begin(run);
     }
 
@@ -424,6 +440,13 @@ impl Master {
             return self.background_is_due(now);
         }
         let Some(slot) = turn.slot() else { return true };
+        if let Some(starts) = self.starts.as_ref().filter(|_| slot == Urgency::Command)
+            && let Some(drive) = self.drives.get_mut(turn.drive)
+            && starts.may_not_write(turn.drive, drive, turn.pdu(), now).is_some()
+        {
+            // It is refused when it is chosen anew.
+            return false;
+        }
         let run = self.drives.get_mut(turn.drive).and_then(|drive| drive.run(slot));
         let Some(run) = run.filter(|run| !run.is_late(now)) else {
             return false;

@@ -3,10 +3,12 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use crate::drive::ModelPoint;
+use crate::command::{DEFAULT_EXPIRY, Origin, SourceKind, WriteStats};
+use crate::drive::{ModelPoint, Value};
 use crate::drive_state::DriveState;
 use crate::plant::BusHandle;
-use crate::process_image::DriveImage;
+use crate::process_image::{DriveImage, Reading};
+use crate::supervision::written_run;
 
 /// Tells the queue whose orders were carried out, and whether the drive's local control place has it.
 pub(super) fn look_at_hold(
@@ -14,23 +16,46 @@ pub(super) fn look_at_hold(
     index: usize,
     image: &Arc<DriveImage>,
     drive: &mut DriveState,
-    guarded: bool,
+    (guarded, writes): (bool, &Arc<WriteStats>),
     now: Instant,
 ) {
     drive.guarded = guarded;
     let carried_out = std::mem::take(&mut drive.carried_out);
-    let remote = image.reading(now, drive.fresh).model(ModelPoint::Remote).good();
-    // What is not known is not local.
-    let local = guarded && remote.is_some_and(|remote| !remote.as_bool());
+    let reading = image.reading(now, drive.fresh);
+    let remote = reading.model(ModelPoint::Remote).good().filter(|_| guarded);
+    let local = remote.map(|remote| !remote.as_bool());
     if local == drive.local && carried_out.is_empty() {
         return;
     }
+    let before = std::mem::replace(&mut drive.local, local);
     let mut queue = bus.queue.lock();
     for origin in &carried_out {
         queue.hold_renewed(index, origin, now);
     }
-    if local != drive.local {
-        queue.set_local(index, local);
+    if local != before {
+        // What is not known is not local.
+        queue.set_local(index, local == Some(true));
     }
-    drive.local = local;
+    let stops = queue.rules().is_some_and(|rules| rules.stop_at_local);
+    drop(queue);
+    if stops && before == Some(false) && local == Some(true) {
+        stop_at_local(bus, index, drive, &reading, writes);
+    }
+}
+
+/// The run command that stands is taken away, so that nothing starts when the local control place gives the drive back. Whether that
+/// was so at a start of the gateway is not known: then nothing is written.
+fn stop_at_local(bus: &BusHandle, index: usize, drive: &DriveState, reading: &Reading<'_>, writes: &Arc<WriteStats>) {
+    let run = reading.model(ModelPoint::Run).good().map(|run| run.as_bool());
+    if !run.or_else(|| written_run(reading, &drive.words)).unwrap_or(false) {
+        return;
+    }
+    let origin = Origin::new(SourceKind::Supervision, "local control place");
+    let stop = (ModelPoint::Run, Value::Bool(false));
+    if let Err(refusal) = bus.own_order(index, reading, stop, origin, DEFAULT_EXPIRY, writes) {
+        tracing::error!(
+            target: "drivegate::bus::master", drive = %reading.spec.name,
+            "its run command stands while the local control place has it, and no stop can be sent: {refusal}"
+        );
+    }
 }

@@ -110,6 +110,7 @@ fn cause(who: &str) -> String {
     match who.split_once(' ') {
         Some(("supervision", _)) => ": supervision timed out".to_string(),
         Some(("shutdown", _)) => ": the gateway shuts down".to_string(),
+        Some(("interlock", _)) => ": an interlock does not hold".to_string(),
         _ => format!(": ordered by {who}"),
     }
 }

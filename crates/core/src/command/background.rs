@@ -112,6 +112,9 @@ impl BackgroundRequest {
             was_begun: false,
             effects: effects.unwrap_or_default(),
             slot: None,
+            waits: false,
+            is_ordinary: false,
+            is_urgent: false,
         }
     }
 

@@ -35,7 +35,7 @@ pub use parameter::ParameterOrder;
 pub use priorities::{
     Commanded, Effect, Entry, Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, SlotWrite,
 };
-pub use queue::{CAPACITY, Chosen, CommandQueue, NotStopped, Pending, Stopping};
+pub use queue::{CAPACITY, Chosen, CommandQueue, NotStopped, Pending, Stopping, Unheld};
 pub use standing::{LastWritten, is_reference, limits_passed, still_keeps_limits};
 pub use ticket::{Receipt, Ticket, WriteStats};
 pub use touched::Touched;
@@ -46,6 +46,7 @@ use std::time::{Duration, Instant};
 
 use crate::codec::{Exception, Reply, RequestPdu};
 use crate::drive::{Profile, Value};
+use crate::start_guard::Guarded;
 
 /// Time after which a command is not sent any more, unless it says otherwise.
 pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);
@@ -80,11 +81,13 @@ pub enum SourceKind {
     Slot,
     /// BACnet client.
     Bacnet,
+    /// Interlock that does not hold.
+    Interlock,
 }
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 12] = [
+    pub const ALL: [SourceKind; 13] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
         SourceKind::Sparkplug,
@@ -97,6 +100,7 @@ impl SourceKind {
         SourceKind::Schedule,
         SourceKind::Slot,
         SourceKind::Bacnet,
+        SourceKind::Interlock,
     ];
 
     /// The label of metrics and audit lines.
@@ -114,6 +118,7 @@ impl SourceKind {
             SourceKind::Schedule => "schedule",
             SourceKind::Slot => "slot",
             SourceKind::Bacnet => "bacnet",
+            SourceKind::Interlock => "interlock",
         }
     }
 
@@ -121,7 +126,7 @@ impl SourceKind {
     pub fn is_client(self) -> bool {
         !matches!(
             self,
-            SourceKind::Supervision | SourceKind::Shutdown | SourceKind::Schedule
+            SourceKind::Supervision | SourceKind::Shutdown | SourceKind::Schedule | SourceKind::Interlock
         )
     }
 }
@@ -149,6 +154,9 @@ pub struct Origin {
 }
 
 impl Origin {
+    /// Who acts when a lease runs out.
+    pub const LEASE: &str = "supervision";
+
     /// One that is a client by itself.
     pub fn new(kind: SourceKind, who: impl Into<String>) -> Origin {
         let who = who.into();
@@ -196,6 +204,11 @@ impl Origin {
     /// The login, if the client has one.
     pub fn login(&self) -> Option<&Arc<str>> {
         self.login.as_ref()
+    }
+
+    /// Whether it is the lease of a drive, and no other stop of the gateway's own.
+    pub fn is_lease(&self) -> bool {
+        self.kind == SourceKind::Supervision && self.who == Origin::LEASE
     }
 
     /// The client, whatever connection or topic it uses.
@@ -265,6 +278,12 @@ pub struct Command {
     pub effects: Vec<(usize, Effect)>,
     /// The write to a slot from which it follows.
     pub slot: Option<SlotWrite>,
+    /// A start that must wait does so, as long as it lives.
+    pub waits: bool,
+    /// An ordinary stop: it waits until the motor has run for a time.
+    pub is_ordinary: bool,
+    /// A stop that is never an ordinary one.
+    pub is_urgent: bool,
 }
 
 impl Command {
@@ -288,6 +307,9 @@ impl Command {
             was_begun: false,
             effects: Vec::new(),
             slot: None,
+            waits: false,
+            is_ordinary: false,
+            is_urgent: false,
         }
     }
 
@@ -575,6 +597,12 @@ pub enum Refusal {
     /// Somebody else has a right to the drive that goes before that of the client.
     #[error("{0}")]
     HeldByOther(Box<Holder>),
+    /// The motor may not be started yet.
+    #[error("{0}; it was not sent")]
+    Guarded(Box<Guarded>),
+    /// What must hold before the motor is started does not.
+    #[error("{0}; it was not sent")]
+    Interlocked(String),
     /// A client that was refused behind a stop goes on with run, or renews what it does not hold.
     #[error("{0}")]
     NeedsTake(Box<Holder>),
@@ -619,6 +647,8 @@ impl Refusal {
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => "not_writable",
             Refusal::BadValue(_) => "bad_value",
             Refusal::HeldByOther(_) => "held_by_other",
+            Refusal::Guarded(_) => "guarded",
+            Refusal::Interlocked(_) => "interlocked",
             Refusal::NeedsTake(_) => "needs_take",
             Refusal::UnknownDrive(_) => Refusal::UNKNOWN_DRIVE,
         }
@@ -638,7 +668,9 @@ impl Refusal {
             Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => Exception::FUNCTION,
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => Exception::ADDRESS,
             Refusal::BadValue(_) => Exception::VALUE,
-            Refusal::HeldByOther(_) | Refusal::NeedsTake(_) => Exception::BUSY,
+            Refusal::HeldByOther(_) | Refusal::NeedsTake(_) | Refusal::Guarded(_) | Refusal::Interlocked(_) => {
+                Exception::BUSY
+            }
             Refusal::UnknownDrive(_) => Exception::GATEWAY_PATH,
         }
     }
@@ -670,6 +702,7 @@ mod tests {
         let held = [Refusal::HeldByOther(Box::default()), Refusal::NeedsTake(Box::default())];
         outcomes.extend(held.map(Outcome::Refused));
         outcomes.extend([
+            Outcome::Refused(Refusal::Interlocked(String::new())),
             Outcome::Acknowledged(Reply::Written),
             Outcome::TimedOut,
             Outcome::Garbled,
@@ -692,6 +725,7 @@ mod tests {
             let row = format!("| `{}` | {exception} |", outcome.code());
             assert!(page.contains(&row), "docs/commands.md lacks {row}");
         }
+        assert!(page.contains("| `guarded` | 06 | 409 |"));
         for with_code in [Outcome::Exception, Outcome::Unknown] {
             assert!(page.contains(&format!("| `{}` |", with_code(Exception::BUSY).code())));
         }

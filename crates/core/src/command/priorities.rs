@@ -137,7 +137,7 @@ pub enum Follows {
     /// Nothing: it does not govern, or the drive stays as it is.
     Nothing,
     /// This value of a point becomes an order of whoever wrote it.
-    Order(Commanded, Entry),
+    Order(Commanded, Box<Entry>),
     /// The last value of `run` is given back: a stop.
     Stop,
 }
@@ -324,10 +324,12 @@ impl Priorities {
         after.ask(write);
         let own = (write.what, write.priority);
         match (&write.entry, after.counting(write.what)) {
-            (Some(entry), Some((what, priority, _))) if (what, priority) == own => Follows::Order(what, entry.clone()),
+            (Some(entry), Some((what, priority, _))) if (what, priority) == own => {
+                Follows::Order(what, Box::new(entry.clone()))
+            }
             (Some(_), _) => Follows::Nothing,
             (None, _) if was_empty || before != Some(own) => Follows::Nothing,
-            (None, Some((what, _, next))) => Follows::Order(what, next.clone()),
+            (None, Some((what, _, next))) => Follows::Order(what, Box::new(next.clone())),
             (None, None) if write.what == Commanded::Run => Follows::Stop,
             (None, None) => Follows::Nothing,
         }

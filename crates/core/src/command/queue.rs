@@ -4,6 +4,8 @@ mod handover;
 mod holds;
 mod passed_on;
 
+pub use holds::Unheld;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -17,6 +19,7 @@ use tokio::sync::oneshot;
 use self::holds::Holds;
 use super::background::{Background, BackgroundRequest};
 use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal, SourceKind, Urgency};
+use crate::start_guard::BusGuards;
 
 /// Commands and forwarded reads that may wait on one bus, besides two stops for each drive.
 pub const CAPACITY: usize = 64;
@@ -58,6 +61,8 @@ pub struct Pending {
     holds: Holds,
     /// The stops that the gateway wants before it ends, until the bus takes note of it.
     stopping: Option<Stopping>,
+    /// What keeps motors from being started.
+    guards: Option<Arc<BusGuards>>,
 }
 
 /// The wish of the gateway, which is about to end, that a bus stops its drives.
@@ -128,6 +133,7 @@ impl Pending {
             command.answer(&Outcome::ShuttingDown, now);
             return;
         }
+        command.is_ordinary = self.is_ordinary(&command);
         if let Some(refusal) = self.hold_refuses_command(&command, now) {
             command.answer(&Outcome::Refused(refusal), now);
             return;
@@ -137,7 +143,7 @@ impl Pending {
             self.push_stop(command, now);
             return;
         }
-        if let Some(refusal) = self.refuses(&command) {
+        if let Some(refusal) = self.refuses(&command, now) {
             command.answer(&Outcome::Refused(refusal), now);
             return;
         }
@@ -174,12 +180,66 @@ impl Pending {
     }
 
     /// Who keeps a command from being accepted, where it starts the motor or sets a reference.
-    fn refuses(&self, command: &Command) -> Option<Refusal> {
+    fn refuses(&self, command: &Command, now: Instant) -> Option<Refusal> {
         let (origin, reach) = (command.ticket.origin(), command.reach());
         let waits = |drive: &usize| self.held_back(*drive, origin, command.effect(*drive));
+        let until = command.waits.then_some(command.expires);
+        let guarded = |drive: &usize| self.guarded(*drive, command.effect(*drive), until, now);
         (command.urgency == Urgency::Command)
-            .then(|| reach.iter().find_map(waits))
+            .then(|| reach.iter().find_map(waits).or_else(|| reach.iter().find_map(guarded)))
             .flatten()
+    }
+
+    /// Why an order with that effect is not accepted, where it starts a motor that may not be started yet; it waits until
+    /// `until` where it says so.
+    pub fn guarded(&self, drive: usize, effect: Effect, until: Option<Instant>, now: Instant) -> Option<Refusal> {
+        self.guards.as_ref()?.refuses(drive, effect, until, now)
+    }
+
+    /// Whether a stop waits until its motor has run for a time.
+    fn is_ordinary(&self, stop: &Command) -> bool {
+        let origin = stop.ticket.origin();
+        let delayed = matches!(
+            origin.kind,
+            SourceKind::ModbusTcp | SourceKind::Mqtt | SourceKind::Sparkplug | SourceKind::Bacnet | SourceKind::Slot
+        );
+        let last = self.stopped_at.get(&stop.drive).copied();
+        let delayed = delayed && stop.urgency == Urgency::Stop && !stop.is_urgent;
+        let guards = self.guards.as_ref().filter(|_| delayed);
+        guards.is_some_and(|guards| guards.is_ordinary_stop(stop.drive, origin.client(), last)) || self.repeats(stop)
+    }
+
+    /// Whether a cyclic client gives its waiting ordinary stop again: that is no second stop.
+    fn repeats(&self, stop: &Command) -> bool {
+        let origin = stop.ticket.origin();
+        let waits = |c: &Command| c.is_ordinary && c.drive == stop.drive && c.order == stop.order;
+        let own = |c: &Command| c.ticket.origin().client() == origin.client();
+        let delayed = stop.urgency == Urgency::Stop && !stop.is_urgent;
+        delayed && self.waiting.iter().any(|c| waits(c) && own(c)) && self.is_cyclic(origin)
+    }
+
+    /// Until when the stop that waits for that drive does so by `min_run`.
+    pub fn stop_waits(&self, drive: usize, now: Instant) -> Option<Instant> {
+        let guards = self.guards.as_ref()?;
+        let ordinary = |c: &Command| c.is_ordinary && c.drive == drive;
+        self.waiting
+            .iter()
+            .any(ordinary)
+            .then(|| guards.stop_waits(drive, now))?
+    }
+
+    /// Whether that command waits.
+    pub fn has(&self, number: u64) -> bool {
+        self.waiting.iter().any(|c| c.number == number)
+    }
+
+    /// Refuses a command that waits; who gave it, and what it was.
+    pub fn refuse(&mut self, number: u64, refusal: &Refusal, now: Instant) -> Option<(Origin, String)> {
+        let index = self.waiting.iter().position(|c| c.number == number)?;
+        let command = self.waiting.remove(index)?;
+        let told = (command.ticket.origin().clone(), command.ticket.what().to_string());
+        command.answer(&Outcome::Refused(refusal.clone()), now);
+        Some(told)
     }
 
     /// Why an order of that client with that effect is not accepted, where a slot of another one keeps it.
@@ -261,6 +321,12 @@ impl Pending {
         });
         if !self.stopped.contains(&drive) {
             self.stopped.push(drive);
+        }
+        // A second stop waits for nothing, nor does the first one any more.
+        if !stop.is_ordinary {
+            let of_drive = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop;
+            let others = self.waiting.iter_mut().filter(of_drive);
+            others.for_each(|c| c.is_ordinary = false);
         }
         let bare = stop.is_bare_stop();
         let alike = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop && c.is_bare_stop() == bare;
@@ -422,7 +488,7 @@ impl Pending {
     /// Takes away what supervision wants of a drive and has not begun: a client commands the drive again.
     pub fn withdraw_supervision(&mut self, drive: usize, now: Instant) {
         self.remove(now, &Outcome::Withdrawn, |c| {
-            c.drive == drive && c.joined.is_empty() && c.ticket.origin().kind == SourceKind::Supervision
+            c.drive == drive && c.joined.is_empty() && c.ticket.origin().is_lease()
         });
     }
 
@@ -484,10 +550,9 @@ impl Command {
 
     /// Until when a client waits for it; none where it is the gateway's own.
     fn client_waits_until(&self) -> Option<Instant> {
-        let own = [SourceKind::Supervision, SourceKind::Shutdown];
         let joined = self.joined.iter().map(|(ticket, expires)| (ticket, *expires));
         let tickets = std::iter::once((&self.ticket, self.expires)).chain(joined);
-        let of_clients = tickets.filter(|(ticket, _)| !own.contains(&ticket.origin().kind));
+        let of_clients = tickets.filter(|(ticket, _)| ticket.origin().kind.is_client());
         of_clients.map(|(_, expires)| expires).max()
     }
 }
@@ -509,6 +574,7 @@ pub struct CommandQueue {
     /// Whether `[authority]` is on.
     guarded: AtomicBool,
     wake: OwnedFd,
+    guards: Option<Arc<BusGuards>>,
 }
 
 impl CommandQueue {
@@ -523,7 +589,21 @@ impl CommandQueue {
             background: Mutex::default(),
             guarded: AtomicBool::new(false),
             wake,
+            guards: None,
         })
+    }
+
+    /// The same with what keeps the motors of its drives from being started.
+    #[must_use]
+    pub fn guarded(mut self, guards: Option<Arc<BusGuards>>) -> CommandQueue {
+        self.lock().guards.clone_from(&guards);
+        self.guards = guards;
+        self
+    }
+
+    /// What keeps the motors of its drives from being started; none where nothing does.
+    pub fn guards(&self) -> Option<&Arc<BusGuards>> {
+        self.guards.as_ref()
     }
 
     /// Takes a command in and wakes the bus.
@@ -582,6 +662,7 @@ impl CommandQueue {
         self.background().close(&Outcome::ShuttingDown, now);
         let mut pending = self.lock();
         pending.remove(now, &Outcome::ShuttingDown, |c| c.urgency != Urgency::Stop);
+        pending.waiting.iter_mut().for_each(|c| c.is_ordinary = false);
         pending.stops_only = true;
         pending.stopping = Some(Stopping { deadline, report });
         drop(pending);

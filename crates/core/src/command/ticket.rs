@@ -129,6 +129,11 @@ impl Ticket {
         &self.origin
     }
 
+    /// What was ordered, for people.
+    pub fn what(&self) -> &str {
+        &self.what
+    }
+
     /// The client, as shares are reckoned: see [`Origin::client`].
     pub fn client(&self) -> &str {
         self.origin.client()

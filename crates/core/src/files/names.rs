@@ -4,6 +4,8 @@
 pub const EVENTS: &str = "events.jsonl";
 /// Run hours and starts.
 pub const COUNTERS: &str = "counters.json";
+/// Starts of the last hour of drives with a guard.
+pub const STARTS: &str = "starts.json";
 /// First part of the names of buffered MQTT events.
 pub const MQTT_EVENTS: &str = "mqtt-events";
 /// First part of the names of buffered MQTT history.
@@ -20,9 +22,10 @@ pub const RECORDINGS: &str = "recordings";
 pub const PARAMS: &str = "params";
 
 /// What the names begin with, before a `.` or `-` or their end; counters are written and set aside under other endings.
-const OWN: [&str; 9] = [
+const OWN: [&str; 10] = [
     EVENTS,
     "counters",
+    "starts",
     MQTT_EVENTS,
     MQTT_HISTORY,
     MQTT_TOPICS,
@@ -49,6 +52,7 @@ mod tests {
         for own in [
             EVENTS,
             COUNTERS,
+            STARTS,
             MQTT_EVENTS,
             MQTT_HISTORY,
             MQTT_TOPICS,

@@ -5,7 +5,7 @@ use std::time::{Instant, SystemTime};
 use super::{BusHandle, DriveHandle, Plant};
 use crate::command::{
     self, Admitted, Asks, Authority, Command, Effect, HoldState, HoldView, KeptReservation, Origin, Refusal, Rules,
-    Told, Urgency, Verb, What,
+    Told, Unheld, Urgency, Verb, What,
 };
 use crate::drive::why::{Cause, Explanation};
 use crate::event::{Event, EventKind, Events};
@@ -24,9 +24,17 @@ impl BusHandle {
         }
         let mut queue = self.queue.lock();
         let told = queue.take_told(now);
+        let unheld = queue.take_unheld();
         let rules = queue.rules().cloned();
         drop(queue);
         let Some(rules) = rules else { return };
+        let name_of = |drive: usize| self.image.drives.get(drive).map(|image| image.spec.name.as_str());
+        for (drive, Unheld { client, refusal }) in unheld {
+            tracing::warn!(
+                target: "drivegate::command", drive = name_of(drive),
+                "carried out an order of {client}, which `mode = \"exclusive\"` would have refused: {refusal}; logged once a client and minute"
+            );
+        }
         for (drive, told) in told {
             let Some(image) = self.image.drives.get(drive) else {
                 continue;
@@ -66,10 +74,10 @@ impl BusHandle {
         if !self.queue.is_guarded() {
             return (None, true);
         }
-        let queue = self.queue.lock();
+        let mut queue = self.queue.lock();
         let mut origins = std::iter::once(&command.ticket).chain(command.joined.iter().map(|(ticket, _)| ticket));
         let renews = origins.any(|ticket| queue.hold_renews(command.drive, ticket.origin()));
-        (queue.hold_stops_turn(command, now), renews)
+        (queue.hold_at_turn(command, now), renews)
     }
 }
 

@@ -3,8 +3,9 @@
 use std::time::Duration;
 
 use crate::command::{AuditRecord, CONFIRMED, SourceKind, WriteStats};
-use crate::drive::why::{self, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
+use crate::drive::why::{self, Cause, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
 use crate::process_image::{Access, BusImage, Hold, Link, Reading};
+use crate::start_guard::{Guarded, Reason};
 
 /// Whether the drive of `reading`, on that bus, runs, and why not.
 pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {
@@ -24,6 +25,20 @@ pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Ex
     why::explain(&spec.profile, &|point| reading.sample(point), &situation)
 }
 
+/// Why the motor may not be started, as a cause.
+pub(super) fn guarded(hindrance: &Guarded) -> Cause {
+    let (cause, remedy) = match hindrance.reason {
+        Reason::Interlock => ("interlocked", "see to what the interlock asks for, then send run again"),
+        _ => ("guarded", "send run again at that time, or with `\"wait\": true`"),
+    };
+    Cause {
+        cause: cause.to_string(),
+        evidence: hindrance.why.clone(),
+        age_ms: None,
+        remedy: remedy.to_string(),
+    }
+}
+
 fn contact(reading: &Reading<'_>, bus: &BusImage) -> Contact {
     match reading.snapshot.link {
         _ if !bus.is_up() => Contact::BusDown(bus.health().reason),
@@ -38,6 +53,7 @@ fn run_order(record: &AuditRecord, age: Duration) -> Option<RunOrder> {
     let by = match record.source {
         source if source == SourceKind::Supervision.name() => Giver::Supervision,
         source if source == SourceKind::Shutdown.name() => Giver::Shutdown,
+        source if source == SourceKind::Interlock.name() => Giver::Interlock,
         _ => Giver::Client,
     };
     Some(RunOrder {

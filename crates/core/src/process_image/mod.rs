@@ -29,6 +29,7 @@ use self::health::TURNAROUNDS;
 use crate::codec::{LineFormat, Protocol};
 use crate::diagnosis::Diagnosis;
 use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, RawWrites, Value};
+use crate::start_guard::{Guard, Interlock};
 
 /// Whether a drive may be commanded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -97,8 +98,14 @@ pub struct DriveSpec {
     pub unit: u8,
     /// Its family.
     pub profile: Arc<Profile>,
-    /// Group of drives that are stopped together.
+    /// Group of drives that are stopped together, and started one after the other.
     pub group: Option<String>,
+    /// How often and how soon it may be started.
+    pub guard: Option<Guard>,
+    /// What must hold before it is started.
+    pub interlocks: Vec<Interlock>,
+    /// A drive of its group starts at a distance from the others, so that its own starts count.
+    pub staggers: bool,
     /// Whether it may be commanded.
     pub access: Access,
     /// Limits of commands in engineering units, by point name.
@@ -503,6 +510,9 @@ impl DriveSpec {
             turnaround: profile.turnaround,
             profile,
             group: None,
+            guard: None,
+            interlocks: Vec::new(),
+            staggers: false,
             access: Access::Monitor,
             limits: BTreeMap::new(),
             supervision: None,
@@ -511,6 +521,19 @@ impl DriveSpec {
             triggers: Vec::new(),
             raw_writes: RawWrites::Points,
             params: ParamsAccess::Read,
+        }
+    }
+
+    /// Whether its starts count: for itself or for others.
+    pub fn is_guarded(&self) -> bool {
+        self.guard.is_some() || self.staggers || !self.interlocks.is_empty()
+    }
+
+    /// The drives with which it shares `stagger`, for people: those of its group, else those of its bus.
+    pub fn starts_with(&self) -> Arc<str> {
+        match &self.group {
+            Some(group) => format!("group `{group}`").into(),
+            None => format!("bus `{}`", self.bus).into(),
         }
     }
 

@@ -58,6 +58,7 @@ impl OneStop {
         self.step = match profile.model_index(ModelPoint::Run) {
             Some(run) => {
                 let order = Order::Points(vec![(run, Value::Bool(false))]);
+                let drive = drive.clone().at_once();
                 Step::Placed(drive.place(order, self.origin.clone(), MAY_WRITE, DEFAULT_EXPIRY, now))
             }
             None => {

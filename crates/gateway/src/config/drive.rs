@@ -6,7 +6,8 @@ use std::sync::Arc;
 
 use super::key::{Key, Number};
 use super::keys::{ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, SUPERVISION, TRIGGER};
-use super::raw_writes;
+use super::start_guard::Guards;
+use super::{raw_writes, start_guard};
 use crate::codec::Protocol;
 use crate::document::{Finding, Place, Raw as Node, Reader, nearest};
 use crate::drive::model::Kind;
@@ -33,6 +34,7 @@ pub(super) struct Found {
     pub(super) limits: Place,
     pub(super) lease: Option<Place>,
     pub(super) shutdown_stop: Option<Place>,
+    pub(super) guards: Guards,
     pub(super) spec: Option<DriveSpec>,
 }
 
@@ -55,6 +57,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let profile = read_profile(reader, around, address);
     let group = DRIVE.group.read(reader);
     let access = DRIVE.access.get(reader);
+    let guards = start_guard::read(reader, access, profile.as_deref());
     let frequency_range = read_frequencies(reader);
     let limits = read_limits(reader, profile.as_deref(), frequency_range.as_ref());
     let supervision = read_supervision(reader, profile.as_deref(), &limits);
@@ -73,6 +76,13 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             turnaround: turnaround.unwrap_or(profile.turnaround),
             profile,
             group,
+            guard: guards.guard,
+            interlocks: guards
+                .interlocks
+                .iter()
+                .map(|(interlock, ..)| interlock.clone())
+                .collect(),
+            staggers: false,
             access,
             limits,
             supervision,
@@ -95,6 +105,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             .has(DRIVE.supervision.name)
             .then(|| DRIVE.supervision.place(reader)),
         shutdown_stop: (on_shutdown == OnShutdown::Stop).then(|| DRIVE.on_shutdown.place(reader)),
+        guards,
         spec,
     }
 }

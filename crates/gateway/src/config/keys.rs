@@ -25,6 +25,7 @@ use crate::north::modbus_tcp::{Role, Uncached};
 use crate::north::mqtt::History;
 use crate::north::slot::SlotAccess;
 use crate::process_image::{Access, LeaseAction, OnShutdown, ParamsAccess};
+use crate::start_guard::MOST_STARTS;
 
 /// Declares tables: for each a type with its keys as fields, a constant of it, its schema and its documentation.
 macro_rules! keys {
@@ -306,7 +307,7 @@ keys! {
         profile: String = Text("^[a-z][a-z0-9-]*$", "the name of a profile"), required;
         /// Modbus TCP unit id, unique on each listener of `[modbus_tcp]`. 255 is the gateway itself.
         unit: u8 = Number(1..=254, Some((255, "unit 255 is the gateway itself"))), or "the address";
-        /// Drives that [stop all](commands.md#stop-all) can stop together.
+        /// Drives that [stop all](commands.md#stop-all) can stop together, and that share a [`stagger`](commands.md#guards).
         group: String = Name("-_"), or "none";
         /// `"monitor"`: every write is refused. `"control"`: writes by authorised clients are passed on.
         access: Access = Words(&[("monitor", Access::Monitor), ("control", Access::Control)]), default "monitor";
@@ -318,6 +319,10 @@ keys! {
         }, or "none";
         /// Lease of the drive. Not a safety function.
         supervision: Present = Own { schema: Supervision::schema, range: "[bus.drive.supervision]" }, or "none";
+        /// How often and how soon the motor may be [started](commands.md#guards).
+        guard: Present = Own { schema: GuardTable::schema, range: "[bus.drive.guard]" }, or "none";
+        /// What must hold before the motor is [started](commands.md#interlocks).
+        interlocks: Present = Own { schema: || each(InterlockTable::schema()), range: "[[bus.drive.interlocks]]" }, or "none";
         /// What is written at [shutdown](commands.md#shutdown): nothing, or a stop. Nothing is ever written to a
         /// monitored drive.
         on_shutdown: OnShutdown = Words(&[("hold", OnShutdown::Hold), ("stop", OnShutdown::Stop)]), default "hold";
@@ -373,6 +378,30 @@ keys! {
         /// Whether the [lease](commands.md#leases) of a drive that is running when the gateway starts begins
         /// immediately; nothing is written.
         adopt: bool = Flag, default false;
+    }
+
+    /// Guard of the motor: starts that come too often or too soon are refused.
+    GUARD: GuardTable {
+        /// Starts within any hour.
+        starts_per_hour: u32 = Number(1..=MOST_STARTS as i64, None), or "any number";
+        /// Time that the motor stands before a start.
+        min_off: Duration = Time(Duration::ZERO..=HOUR), default "0s";
+        /// Time that the motor runs before an [ordinary stop](commands.md#guards).
+        min_run: Duration = Time(Duration::ZERO..=HOUR), default "0s";
+        /// Time between two starts of drives of the same `group`; without `group`, of the same bus.
+        stagger: Duration = Time(Duration::ZERO..=HOUR), default "0s";
+    }
+
+    /// Interlock of the motor: a point of another drive that must hold before a start.
+    INTERLOCK: InterlockTable {
+        /// Name of the other drive.
+        drive: String = Name("-_"), required;
+        /// A point of it that is true or false and polled. One that is not good does not hold.
+        point: String = Text("^[a-z][a-z0-9_]*$", "the name of a point"), required;
+        /// What the point must be.
+        is: bool = Flag, default true;
+        /// Whether the running motor is stopped when the point does not hold any more.
+        trip: bool = Flag, default false;
     }
 
     /// Speed reference to write.

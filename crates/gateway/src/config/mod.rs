@@ -23,6 +23,7 @@ mod raw_writes;
 mod recordings;
 mod shutdown;
 mod slot;
+mod start_guard;
 mod unique;
 mod values;
 
@@ -322,6 +323,8 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
 
     let slots = buses.iter().flat_map(|bus| &bus.slots).map(|slot| slot.slot.clone());
     let slots: Vec<slot_server::Slot> = slots.collect::<Option<_>>()?;
+    let mut settings: Vec<BusSettings> = buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?;
+    start_guard::note_staggers(&mut settings);
     Some(Settings {
         gateway: name?,
         socket,
@@ -336,7 +339,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
             None => MODBUS_TCP.stale_after.read_default()?,
         },
         stale_after_written: modbus_tcp.as_ref().is_some_and(|m| m.stale_written),
-        buses: buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?,
+        buses: settings,
         slots: (!slots.is_empty()).then_some(slot_server::Options { slots }),
         modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
@@ -365,6 +368,7 @@ fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients<'_>) {
         bacnet,
     } = *clients;
     unique::check(reader.document(), buses);
+    start_guard::check(reader.document(), buses);
     // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
     if let Some(modbus_tcp) = modbus_tcp {
         unique::check_units(reader.document(), buses, &modbus_tcp.selections);

@@ -26,6 +26,7 @@ name = "b"
 port = "/dev/null"
 [[bus.drive]]
 name = "d"
+access = "control"
 address = 1
 profile = "vacon-nx"
 limits = { speed_reference = [0.0, 100.0] }
@@ -64,12 +65,27 @@ bbmd = "bbmd.example.com"
 vendor = 999
 dcc_password_file = ""
 buses = []
+[authority]
+mode = "exclusive"
+[[authority.principal]]
+name = "plc-1"
+rank = "automation"
+modbus_tcp = ["127.0.0.1/32"]
 [audit]
 [params]
 [log]
+[bus.drive.guard]
+starts_per_hour = 12
+[[bus.drive.interlocks]]
+drive = "valve"
+point = "at_reference"
 [[bus.drive.trigger]]
 point = "motor_current"
 above = 120.0
+[[bus.drive]]
+name = "valve"
+address = 99
+profile = "vacon-nx"
 [[bus.slot]]
 listen = "127.0.0.1:4001"
 "#;
@@ -449,4 +465,68 @@ fn what_mqtt_publishes_and_accepts() {
         "{:?}",
         mqtt(&pair("other"))
     );
+}
+
+#[test]
+fn guards_and_interlocks_of_a_drive() {
+    let drive = |name: &str, address: u8, more: &str| {
+        format!("[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\n{more}\n")
+    };
+    let of = |pump: &str, valve: &str| {
+        let (pump, valve) = (drive("pump", 1, pump), drive("valve", 2, valve));
+        format!("[gateway]\nname = \"g\"\n[[bus]]\nname = \"b\"\nport = \"/dev/ttyS1\"\nbaud = 19200\n{pump}{valve}")
+    };
+    let control = "access = \"control\"\n";
+    let all = settings(&of(
+        &format!(
+            "{control}group = \"wet\"\nguard = {{ starts_per_hour = 12, min_off = \"30s\", stagger = \"5s\" }}\n\
+             interlocks = [{{ drive = \"valve\", point = \"at_reference\", trip = true }}]"
+        ),
+        "group = \"wet\"",
+    ));
+    let [pump, valve] = &all.buses[0].drives[..] else {
+        unreachable!()
+    };
+    let guard = pump.guard.unwrap();
+    assert_eq!(
+        (guard.starts_per_hour, guard.min_off.as_secs(), guard.stagger.as_secs()),
+        (Some(12), 30, 5)
+    );
+    assert!(guard.min_run.is_zero() && pump.interlocks[0].is && pump.interlocks[0].trip);
+    assert!(
+        pump.staggers && valve.staggers,
+        "the valve is of the group whose starts are apart"
+    );
+    let alone = settings(&of(
+        &format!("{control}group = \"wet\"\nguard = {{ stagger = \"5s\" }}"),
+        "",
+    ));
+    assert!(!alone.buses[0].drives[1].is_guarded());
+    for (pump, says) in [
+        ("guard = { min_off = \"1s\" }", "the drive is only monitored"),
+        (
+            "access = \"control\"\nguard = { starts_per_hour = 0 }",
+            "0 is out of range",
+        ),
+        (
+            "access = \"control\"\ninterlocks = [{ drive = \"pump\", point = \"ready\" }]",
+            "`pump` is an interlock on itself",
+        ),
+        (
+            "access = \"control\"\ninterlocks = [{ drive = \"valv\", point = \"ready\" }]",
+            "there is no drive `valv`",
+        ),
+        (
+            "access = \"control\"\ninterlocks = [{ drive = \"valve\", point = \"motor_current\" }]",
+            "has no point `motor_current` that is true or false and polled",
+        ),
+        (
+            "access = \"control\"\ninterlocks = [{ drive = \"valve\" }]",
+            "`point` is missing",
+        ),
+    ] {
+        let errors = load(&of(pump, "")).0.errors;
+        let first = errors.first().map(ToString::to_string).unwrap_or_default();
+        assert!(first.contains(says), "{pump}: {first}");
+    }
 }

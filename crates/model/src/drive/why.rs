@@ -14,6 +14,8 @@ use super::profile::{Point, Profile};
 /// A DC link below this, in V, is not charged: the least supply of these families is 200 V, rectified 280 V.
 const UNCHARGED: f64 = 50.0;
 
+/// No cause is known.
+const NOT_KNOWN: &str = "not_known";
 /// Control place, as `blocks` of a point names it.
 const LOCAL_CONTROL: &str = "local_control";
 /// Interlock, likewise.
@@ -52,6 +54,12 @@ impl Explanation {
         };
         let causes: Vec<String> = self.causes.iter().map(cause).collect();
         (!causes.is_empty()).then(|| causes.join(", "))
+    }
+
+    /// Adds a cause that is not the drive's; it takes the place of none that is known.
+    pub fn add(&mut self, cause: Cause) {
+        self.causes.retain(|cause| cause.cause != NOT_KNOWN);
+        self.causes.push(cause);
     }
 
     /// The causes in one word each, in their order, each once.
@@ -131,6 +139,8 @@ pub enum Giver {
     Supervision,
     /// The gateway, when it stopped.
     Shutdown,
+    /// An interlock that does not hold.
+    Interlock,
 }
 
 /// What is known beside the points.
@@ -440,6 +450,11 @@ impl Look<'_> {
                 format!("the gateway ended, and {}", stopped(order.fate, text)),
                 "send run again",
             ),
+            (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Interlock) => (
+                "stopped_by_interlock",
+                format!("an interlock did not hold, and {}", stopped(order.fate, text)),
+                "send run again once it holds",
+            ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Client) => (
                 "stopped_by_order",
                 match order.fate {
@@ -500,7 +515,7 @@ impl Look<'_> {
         let (_, at) = self.bit(ModelPoint::Running).unzip();
         let evidence = "nothing that the drive reports keeps it from running".to_string();
         let remedy = "look at its display; check what it does not tell";
-        self.cause("not_known", evidence, at.flatten(), remedy)
+        self.cause(NOT_KNOWN, evidence, at.flatten(), remedy)
     }
 
     fn not_told(&self) -> Vec<String> {

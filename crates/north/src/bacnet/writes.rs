@@ -229,6 +229,8 @@ fn of_refusal(refusal: &Refusal) -> Error {
         | Refusal::MotorRuns(_)
         | Refusal::OtherValue(_)
         | Refusal::HeldByOther(_)
-        | Refusal::NeedsTake(_) => Error::SERVICE_REQUEST_DENIED,
+        | Refusal::NeedsTake(_)
+        | Refusal::Guarded(_)
+        | Refusal::Interlocked(_) => Error::SERVICE_REQUEST_DENIED,
     }
 }

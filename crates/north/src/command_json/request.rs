@@ -85,6 +85,8 @@ pub(crate) struct Asked {
     pub(crate) expiry: Duration,
     /// Why all else is refused; `points` are those of its stop then.
     pub(crate) refused: Option<Refusal>,
+    /// A start that must wait does so.
+    pub(crate) wait: bool,
 }
 
 impl Asked {
@@ -106,6 +108,7 @@ impl Asked {
             points,
             expiry,
             refused,
+            wait: false,
         })
     }
 }
@@ -134,6 +137,7 @@ pub(crate) fn check_size(size: usize) -> Result<(), Refusal> {
 fn points_of(fields: Fields, profile: &Profile) -> Result<Asked, Refusal> {
     let mut expiry = DEFAULT_EXPIRY;
     let mut points = Vec::new();
+    let mut wait = false;
     let twice = |name: String| sets_twice(excerpt(name.as_bytes()).trim_matches('`'));
     let mut refused = fields.twice.map(twice);
     for (name, value) in fields.all {
@@ -143,11 +147,18 @@ fn points_of(fields: Fields, profile: &Profile) -> Result<Asked, Refusal> {
                 "`id` is a number or a string of at most {MAX_ID} bytes"
             ))),
             "expires_ms" => request_expiry(&value).map(|time| expiry = time),
+            "wait" => request_wait(&value).map(|waits| wait = waits),
             name => resolve(profile, name, &value).map(|point| points.push(point)),
         };
         refused = refused.or(understood.err());
     }
-    Asked::new(points, expiry, refused, profile)
+    let asked = Asked::new(points, expiry, refused, profile)?;
+    Ok(Asked { wait, ..asked })
+}
+
+fn request_wait(value: &Json) -> Result<bool, Refusal> {
+    let what = || Refusal::BadValue(format!("`wait` = {} is not true or false", brief(value)));
+    value.as_bool().ok_or_else(what)
 }
 
 fn is_id(value: &Json) -> bool {

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 use serde::Serialize;
 
 use super::Id;
-use crate::command::{Answer, CONFIRMED, Outcome, milliseconds, milliseconds_or_null};
+use crate::command::{Answer, CONFIRMED, Outcome, Refusal, milliseconds, milliseconds_or_null};
 use crate::plant::Shown;
 
 /// The one result of a command: `confirmed` if a read showed the effect in time, else the answer of the bus.
@@ -21,6 +21,9 @@ pub(crate) struct CommandResult<'r> {
     /// Of a command whose stop alone was carried out: the code of the rest.
     #[serde(skip_serializing_if = "Option::is_none")]
     rest: Option<&'static str>,
+    /// Of a start that must wait: after which it may be tried again.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    retry_after_ms: Option<u64>,
     #[serde(flatten)]
     #[schema(value_type = KeptBy)]
     kept_by: Option<KeptBy>,
@@ -94,6 +97,10 @@ impl<'r> CommandResult<'r> {
             error: error.map(|message| ErrorObject { code, message }),
             rest: match &answer.outcome {
                 Outcome::StopOnly(rest) => Some(rest.code()),
+                _ => None,
+            },
+            retry_after_ms: match &answer.outcome {
+                Outcome::Refused(Refusal::Guarded(guarded)) => Some(guarded.retry_after_ms()),
                 _ => None,
             },
             kept_by: kept_by(&answer.outcome),

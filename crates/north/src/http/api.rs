@@ -69,6 +69,9 @@ pub(super) struct Drive<'d> {
     /// Why it takes no commands but stops.
     #[serde(skip_serializing_if = "Option::is_none")]
     held: Option<String>,
+    /// For how long an ordinary stop still waits.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    stop_waits_ms: Option<u64>,
     /// Who holds it, where `[authority]` is on.
     #[serde(flatten)]
     #[schema(value_type = HoldFields)]
@@ -116,6 +119,7 @@ impl<'d> Drive<'d> {
             blocked_by: why.words(),
             why: why.causes,
             held: image.hold.why().map(|why| why.to_string()),
+            stop_waits_ms: drive.stop_waits(clock.now).map(millis),
             hold: drive.hold_view(None, clock.now).map(|(view, _)| view.into()),
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),

@@ -16,6 +16,7 @@ use crate::drive::{ModelPoint, PollClass, State, Value};
 use crate::history::TriggerKind;
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
+use crate::start_guard::Reason;
 use crate::version::{self, VERSION};
 use crate::{NorthStats, ServerKind};
 
@@ -189,6 +190,11 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
         "drivegate_drive_turnaround_seconds",
         "Time from the end of the last request to the beginning of the drive's answer.",
     );
+    let refused = all.family(
+        Kind::Counter,
+        "drivegate_starts_refused_total",
+        "Starts of a guarded drive that were refused, by reason.",
+    );
     let supervision = all.family(
         Kind::Counter,
         "drivegate_supervision_actions_total",
@@ -223,6 +229,13 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
         all.add(failed, labels.clone(), SeriesValue::Count(failures));
         if image.spec.supervision.is_some() {
             all.add(unsupervised, labels.clone(), flag(image.is_unsupervised()));
+        }
+        let guards = drive.bus.queue.guards().filter(|guards| guards.guards(drive.index));
+        if let Some(counted) = guards.map(|guards| guards.refused(drive.index)) {
+            for reason in Reason::ALL {
+                let count = counted.get(&reason).copied().unwrap_or_default();
+                all.add(refused, labels.with("reason", reason.name()), SeriesValue::Count(count));
+            }
         }
         if let Some((view, _)) = drive.hold_view(None, now) {
             if let (HoldState::Held, Some(rank)) = (view.state, &view.rank) {

@@ -37,7 +37,7 @@ enum Decision {
     /// Refused at once.
     Exception(Exception),
     /// Forwarded to the drive, or refused on the way.
-    Drive(ForwardedRequest, BusWork),
+    Drive(Box<(ForwardedRequest, BusWork)>),
     /// The stops of all drives are in the queues of their buses.
     StopAll(RequestPdu, oneshot::Receiver<bool>),
 }
@@ -117,7 +117,8 @@ impl ClientSession {
                 self.put_exception(frame.header, frame.function, Exception::DEVICE_FAILURE, out);
             }
             Decision::Exception(code) => self.put_exception(frame.header, frame.function, code, out),
-            Decision::Drive(forwarded, work) => {
+            Decision::Drive(forwarded) => {
+                let (forwarded, work) = *forwarded;
                 let step = forwarded.send(work, &self.client, asked, now);
                 return self.follow(step, now, out);
             }
@@ -444,12 +445,12 @@ impl ClientSession {
             }
             Err(refusal) => BusWork::Refused(refusal),
         };
-        Decision::Drive(forwarded, work)
+        Decision::Drive(Box::new((forwarded, work)))
     }
 }
 
 fn forwarded(header: Header, drive: &DriveHandle, request: RequestPdu, work: BusWork) -> Decision {
-    Decision::Drive(ForwardedRequest::new(header, drive, request), work)
+    Decision::Drive(Box::new((ForwardedRequest::new(header, drive, request), work)))
 }
 
 /// Whether the family has the table that a function code accesses. No family supports 22 and 23.

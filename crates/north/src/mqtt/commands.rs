@@ -204,7 +204,10 @@ impl Commands {
         }
         let (client, expiry) = (Authority::Write, asked.expiry);
         let placed = match (refused, stop) {
-            (None, _) => drive.place_asked(order, origin, client, expiry, incoming.asked.unwrap_or(now), now),
+            (None, _) => {
+                let drive = drive.clone().waiting(asked.wait);
+                drive.place_asked(order, origin, client, expiry, incoming.asked.unwrap_or(now), now)
+            }
             (Some(refusal), Some(stop)) => {
                 drive.place_stop(Order::Points(stop), (&what(), refusal), origin, client, expiry, now)
             }

@@ -176,6 +176,8 @@ pub(super) struct StateContent {
     pub(super) quality: Quality,
     /// Why the motor does not run, in one word each.
     pub(super) blocked_by: Vec<String>,
+    /// For how long an ordinary stop still waits, in whole seconds.
+    pub(super) stop_waits: Option<u64>,
     /// Who holds it; none where `[authority]` is off.
     pub(super) hold: Option<HoldFields>,
     /// Value (only if good) and quality of each published point.
@@ -193,6 +195,7 @@ impl StateContent {
         reading: &Reading<'_>,
         points: impl Iterator<Item = usize>,
         blocked_by: Vec<String>,
+        stop_waits: Option<Duration>,
     ) -> StateContent {
         let shown = |index| {
             let sample = reading.sample(index);
@@ -202,6 +205,7 @@ impl StateContent {
             state: reading.state(),
             quality: reading.overall(),
             blocked_by,
+            stop_waits: stop_waits.map(|time| u64::try_from(time.as_millis().div_ceil(1000)).unwrap_or(u64::MAX)),
             hold: None,
             points: points.map(shown).collect(),
         }
@@ -245,6 +249,9 @@ impl Serialize for StateObject<'_> {
         map.serialize_entry("age_ms", &self.age.map(|a| a.as_millis() as u64))?;
         map.serialize_entry("fault_text", &self.fault_text)?;
         map.serialize_entry("blocked_by", &self.shown.blocked_by)?;
+        if let Some(seconds) = self.shown.stop_waits {
+            map.serialize_entry("stop_waits_ms", &seconds.saturating_mul(1000))?;
+        }
         if !self.profile.verified {
             map.serialize_entry("profile_verified", &false)?;
         }
@@ -526,6 +533,7 @@ mod tests {
                 state: Some(State::NotReady),
                 quality: Quality::Good,
                 blocked_by: Vec::new(),
+                stop_waits: None,
                 points: vec![(value.map(Value::Integer), Quality::Good)],
             };
             let object = StateObject {
@@ -557,6 +565,7 @@ mod tests {
             quality: Quality::Good,
             blocked_by: Vec::new(),
             hold: None,
+            stop_waits: None,
             points: Vec::new(),
         };
         let object = StateObject {
@@ -589,7 +598,12 @@ mod tests {
         });
         let running = cx.point_index("running").unwrap();
         let ready = cx.point_index("ready").unwrap();
-        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter(), Vec::new());
+        let shown = StateContent::of(
+            &image.reading(now, second),
+            [running, ready].into_iter(),
+            Vec::new(),
+            None,
+        );
         let object = StateObject {
             shown: &shown,
             names: &["running".to_string(), "ready".to_string()],
@@ -613,7 +627,12 @@ mod tests {
         assert_eq!(object["point_quality"], serde_json::json!({"ready": "good"}));
         assert_eq!(PointPayload::state(shown.state), PointPayload::Nothing);
         image.update(|s| s.store(Table::DiscreteInput, 2, &[0], now));
-        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter(), Vec::new());
+        let shown = StateContent::of(
+            &image.reading(now, second),
+            [running, ready].into_iter(),
+            Vec::new(),
+            None,
+        );
         assert_eq!((shown.state, shown.quality), (Some(State::Ready), Quality::Good));
     }
 

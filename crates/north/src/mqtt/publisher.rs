@@ -254,7 +254,8 @@ impl Publisher {
             let reading = drive.drive.reading(now);
             let hold = drive.drive.hold_view(None, now).map(|(view, _)| view);
             let words = drive.drive.why(&reading).words();
-            let shown = StateContent::of(&reading, indices.iter().copied(), words).with_hold(hold);
+            let shown =
+                StateContent::of(&reading, indices.iter().copied(), words, drive.drive.stop_waits(now)).with_hold(hold);
             let render = |shown: &StateContent| {
                 let fits = drive.fits;
                 render((names, indices, fits), &reading, shown, wall, true)
@@ -381,7 +382,13 @@ impl DriveTopics {
         let reading = drive.reading(now);
         let hold = self.drive.hold_view(None, now).map(|(view, _)| view);
         let words = self.drive.why(&reading).words();
-        let shown = StateContent::of(&reading, self.indices.iter().copied(), words).with_hold(hold);
+        let shown = StateContent::of(
+            &reading,
+            self.indices.iter().copied(),
+            words,
+            self.drive.stop_waits(now),
+        )
+        .with_hold(hold);
         let mut look_at = now + LOOK.min(pace.max);
         for point in &mut self.points {
             let payload = match point.source {

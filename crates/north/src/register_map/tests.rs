@@ -143,24 +143,24 @@ fn a_stale_drive_has_status_and_age_but_no_values() {
         }
     };
     // The link still stands, so the drive is online, but its values are stale.
-    nothing(&read(&image, late, 0x8000, 19).unwrap(), ONLINE | STALE, 1001);
+    nothing(&read(&image, late, 0x8000, 21).unwrap(), ONLINE | STALE, 1001);
     assert_eq!(read(&image, late, 0x8100, 4), Ok(vec![0xFFFF, 0x8000, 0xFFFF, 0]));
     let floats = read(&image, late, 0x8200, 26).unwrap();
     assert!(floats.chunks(2).all(|w| w == [0x7FC0, 0]), "{floats:04X?}");
 
     let reading = image.reading(now, STALE_AFTER);
     nothing(
-        &DriveView::new(&reading, BusState::Down).registers(0x8000, 19).unwrap(),
+        &DriveView::new(&reading, BusState::Down).registers(0x8000, 21).unwrap(),
         STALE,
         0,
     );
 
     image.update(|s| s.link = Link::Offline(SystemTime::now()));
-    nothing(&read(&image, now, 0x8000, 19).unwrap(), STALE, 0);
+    nothing(&read(&image, now, 0x8000, 21).unwrap(), STALE, 0);
     let days = now + Duration::from_secs(200_000);
-    nothing(&read(&image, days, 0x8000, 19).unwrap(), STALE, 65_534);
+    nothing(&read(&image, days, 0x8000, 21).unwrap(), STALE, 65_534);
     nothing(
-        &read(&super::tests::image(nx()), now, 0x8000, 19).unwrap(),
+        &read(&super::tests::image(nx()), now, 0x8000, 21).unwrap(),
         STALE,
         0xFFFF,
     );

@@ -16,7 +16,7 @@ fn rows(map: &Map<'_>) -> Vec<(u8, String, Row)> {
     let mut all = Vec::new();
     for drive in &map.drives {
         let spec = &drive.image.spec;
-        let rows = drive_rows(&spec.profile, &drive.image.plan, spec.access, &spec.raw_writes);
+        let rows = drive_rows(drive, spec.access);
         all.extend(rows.into_iter().map(|row| (spec.unit, spec.name.clone(), row)));
     }
     all.extend(map.gateway.iter().map(|row| (GATEWAY_UNIT, String::new(), row.clone())));

@@ -4,7 +4,7 @@ use crate::codec::Table;
 use crate::drive::profile::{Form as RawForm, Raw};
 use crate::drive::{ModelPoint, Plan, Point, Profile, RawWrites};
 use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry, FIRST};
-use crate::plant::{BusHandle, Plant};
+use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::Access;
 
 /// One line of the map.
@@ -69,10 +69,14 @@ impl Row {
 }
 
 /// The registers of one unit: the blocks of the common model, then the drive's own.
-pub(super) fn drive_rows(profile: &Profile, plan: &Plan, access: Access, raw_writes: &RawWrites) -> Vec<Row> {
+pub(super) fn drive_rows(drive: &DriveHandle, access: Access) -> Vec<Row> {
+    let spec = &drive.image.spec;
+    let (profile, plan, raw_writes) = (&spec.profile, &drive.image.plan, &spec.raw_writes);
     let entries = BLOCKS
         .into_iter()
         .flatten()
+        // Without [authority] nothing is there.
+        .filter(|entry| entry.content != Content::Hold || drive.is_guarded())
         .map(|entry| entry_row(profile, plan, entry, access));
     let mut raw: Vec<(&Point, &Raw)> = profile
         .points

@@ -45,12 +45,7 @@ pub(super) fn render(map: &Map<'_>) -> String {
             units.join(", ")
         );
         // What a unit of this profile can have; the table above shows which units can be written.
-        out += &rows(&drive_rows(
-            profile,
-            &drive.image.plan,
-            Access::Control,
-            &spec.raw_writes,
-        ));
+        out += &rows(&drive_rows(drive, Access::Control));
         let _ = write!(out, "\nAddresses of the drive itself, profile {}\n", profile.name);
         out += &ranges(spec);
     }

@@ -249,7 +249,9 @@ async function pageSpeaksTheLanguageOfTheBrowser(gateway, first, browser) {
   gateway.drives = [drive("pump-1", { state: "running", points: { actual_speed: point(62.5, { unit: "%" }), motor_speed: point(1290, { unit: "rpm" }), reversed: point(true) } })];
   gateway.events = [{ id: 2, boot: 1, time: "2026-03-02T07:40:12.118Z", event: "fault_end", bus: "line1", drive: "pump-1", text: "the fault of drive pump-1 is gone" }];
   await page.open(`${gateway.url}#/`);
-  await page.until(() => document.querySelector(".rows .row"));
+  // The text of a row is there when it was drawn: `content-visibility`.
+  const drawn = () => document.querySelector(".rows .row")?.innerText.includes("62,5");
+  await page.until(drawn);
   const text = await page.eval("document.body.innerText");
   for (const wanted of [/Umrichter\nLeitungen\nEreignisse\nAufzeichnungen/, /▶ in Betrieb/, /62,5 %/, /1290 1\/min/, /← rückwärts/, /Störung behoben\nthe fault is gone/]) assert.match(text, wanted);
   assert.equal(await page.eval("document.documentElement.lang"), "de");
@@ -258,7 +260,7 @@ async function pageSpeaksTheLanguageOfTheBrowser(gateway, first, browser) {
   // A language that there is not: English, with the decimals of its country.
   const other = await browser.page({ language: "fr-FR" });
   await other.open(`${gateway.url}#/`);
-  await other.until(() => document.querySelector(".rows .row"));
+  await other.until(drawn);
   assert.match(await other.eval("document.body.innerText"), /▶ running[^]*62,5 %/);
   assert.equal(await other.eval("document.documentElement.lang"), "en");
   await other.close();

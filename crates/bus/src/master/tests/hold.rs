@@ -82,6 +82,7 @@ fn only_the_holder_is_on_the_wire_and_every_stop() {
             (ModelPoint::FaultReset, Value::Bool(true)),
         ];
         for (point, value) in points {
+            drive(&plant, 0).heartbeat(&who("plc"), rig.now);
             let mut refused = place(&rig, &plant, name, point, value);
             rig.run(Time::from_millis(60));
             let expected = if name == "stranger" {
@@ -114,6 +115,28 @@ fn advisory_sends_all_and_counts() {
         assert_eq!(code(&mut reference), "acknowledged", "{name}");
     }
     assert_eq!(rig.bus.queue.lock().unheld(0), 2);
+    let clients = |rig: &Rig| {
+        let unheld = rig.bus.queue.lock().take_unheld();
+        let clients = unheld.iter().map(|(_, unheld)| unheld.client.to_string());
+        clients.collect::<Vec<_>>()
+    };
+    assert_eq!(clients(&rig), ["op", "cloud"]);
+    // Once a client and minute.
+    for (wait, expected) in [(1, vec![]), (60, vec!["op", "cloud"])] {
+        rig.run(Time::from_secs(wait));
+        for name in ["plc", "op", "cloud", "op", "cloud"] {
+            let mut reference = place(&rig, &plant, name, ModelPoint::SpeedReference, Value::Number(10.0));
+            rig.run(Time::from_millis(200));
+            assert_eq!(code(&mut reference), "acknowledged", "{name}");
+        }
+        assert_eq!(
+            clients(&rig)
+                .iter()
+                .filter(|client| *client != "plc")
+                .collect::<Vec<_>>(),
+            expected
+        );
+    }
 }
 
 #[test]
@@ -171,6 +194,21 @@ fn the_turn_is_judged_again() {
     assert_eq!((code(&mut waits), writes(&rig, from)), ("not_allowed", 0));
 }
 
+/// Its client gives the drive back while the order still waits.
+#[test]
+fn an_order_whose_drive_is_free_at_its_turn_takes_it() {
+    let (mut rig, plant) = guarded(1, Mode::Exclusive);
+    let mut waits = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
+    let released = drive(&plant, 0).hold(Verb::Release, &who("plc"), Authority::Write, rig.now);
+    assert_eq!(released.unwrap().holder, None);
+    rig.run(Time::from_millis(300));
+    assert_eq!((code(&mut waits), rig.runs(0)), ("acknowledged", true));
+    let (view, own) = drive(&plant, 0).hold_view(Some(&who("plc")), rig.now).unwrap();
+    assert!(own, "{view:?}");
+    let mut refused = place(&rig, &plant, "cloud", ModelPoint::SpeedReference, Value::Number(10.0));
+    assert_eq!(code(&mut refused), "held_by_other");
+}
+
 #[test]
 fn the_silence_of_the_holder_is_the_one_that_counts() {
     for (name, stops) in [("op", true), ("plc", false)] {
@@ -197,8 +235,10 @@ fn under_local_control_nobody_commands() {
         Value::Number(20.0),
     ));
     rig.run(Time::from_millis(300));
+    let from = rig.wire.len();
     rig.drives[0].holding.insert(FIELDBUS.0, 0);
     rig.run(Time::from_millis(1500));
+    assert_eq!(writes(&rig, from), 0, "no run command stood");
     let view = |now| drive(&plant, 0).hold_view(None, now).unwrap().0.state.name();
     assert_eq!(view(rig.now), "local");
     let mut refused = place(&rig, &plant, "plc", ModelPoint::SpeedReference, Value::Number(10.0));
@@ -209,4 +249,35 @@ fn under_local_control_nobody_commands() {
     rig.drives[0].holding.insert(FIELDBUS.0, FIELDBUS.1);
     rig.run(Time::from_millis(1500));
     assert_eq!(view(rig.now), "free");
+}
+
+#[test]
+fn nothing_starts_when_local_control_ends() {
+    let (mut rig, plant) = guarded(1, Mode::Exclusive);
+    drop(place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true)));
+    rig.run(Time::from_millis(200));
+    assert!(rig.runs(0));
+    rig.drives[0].holding.insert(FIELDBUS.0, 0);
+    rig.run(Time::from_millis(300));
+    assert!(!rig.runs(0), "one stop is written");
+    let view = drive(&plant, 0).hold_view(None, rig.now).unwrap().0;
+    assert_eq!(view.state.name(), "local");
+    let from = rig.wire.len();
+    rig.drives[0].holding.insert(FIELDBUS.0, FIELDBUS.1);
+    rig.run(Time::from_millis(300));
+    assert_eq!(writes(&rig, from), 0, "and nothing at its end");
+    let view = drive(&plant, 0).hold_view(None, rig.now).unwrap().0;
+    assert_eq!(
+        view.state.name(),
+        "free",
+        "a stop of the gateway's own reserves nothing"
+    );
+    // Found so at a start of the gateway: nothing is written.
+    let mut rig = Rig::new(1);
+    rig.drives[0].holding.insert(2000, 1);
+    let rules = plant.buses[0].queue.lock().rules().cloned();
+    rig.bus.queue.set_authority(rules);
+    let from = rig.wire.len();
+    rig.run(Time::from_millis(300));
+    assert_eq!(writes(&rig, from), 0);
 }

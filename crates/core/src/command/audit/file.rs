@@ -2,12 +2,11 @@
 //! for it: while the disk is slow, full or gone, records wait, and those beyond the queues are counted as lost. A reload
 //! that configures another file starts another thread behind the same queues, so that no record is lost in between.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
 use tokio::sync::watch;
@@ -53,7 +52,6 @@ pub struct AuditFile {
     options: AuditFileOptions,
     shared: Arc<Shared>,
     /// Until a successor waits for it.
-    thread: Mutex<Option<JoinHandle<()>>>,
     ended: watch::Receiver<()>,
 }
 
@@ -61,6 +59,9 @@ pub struct AuditFile {
 struct Shared {
     queues: Mutex<Queues>,
     wake: Condvar,
+    /// Held by the thread that writes the file at that path, to its end: a reload may name a file again that an earlier thread
+    /// still writes.
+    files: Mutex<HashMap<PathBuf, Arc<Mutex<()>>>>,
 }
 
 #[derive(Debug, Default)]
@@ -79,6 +80,12 @@ struct Queues {
 impl Shared {
     fn queues(&self) -> MutexGuard<'_, Queues> {
         self.queues.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn file(&self, path: &Path) -> Arc<Mutex<()>> {
+        let mut files = self.files.lock().unwrap_or_else(PoisonError::into_inner);
+        files.retain(|_, file| Arc::strong_count(file) > 1);
+        files.entry(path.to_path_buf()).or_default().clone()
     }
 
     /// The record that is written next; those of commands that were sent first.
@@ -116,44 +123,35 @@ impl AuditFile {
     /// # Errors
     /// The system does not provide a thread.
     pub fn start(options: AuditFileOptions) -> io::Result<AuditFile> {
-        AuditFile::behind(Arc::default(), options, None)
+        AuditFile::behind(Arc::default(), options)
     }
 
-    /// Starts the thread that writes in its place from now on, with what waits and what was lost. In the same file it begins
-    /// when this one has ended.
+    /// Starts the thread that writes in its place from now on, with what waits and what was lost. In a file that an
+    /// earlier one still writes it begins when that one has ended.
     ///
     /// # Errors
     /// The system does not provide a thread. This one goes on.
     pub fn succeed(&self, options: AuditFileOptions) -> io::Result<AuditFile> {
-        let same = options.path == self.options.path;
-        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
-        let before = same.then(|| thread.take()).flatten();
-        AuditFile::behind(self.shared.clone(), options, before)
+        AuditFile::behind(self.shared.clone(), options)
     }
 
-    fn behind(shared: Arc<Shared>, options: AuditFileOptions, before: Option<JoinHandle<()>>) -> io::Result<AuditFile> {
+    fn behind(shared: Arc<Shared>, options: AuditFileOptions) -> io::Result<AuditFile> {
         let (end, ended) = watch::channel(());
         let file = options.rotated();
+        let own = shared.file(file.path());
         let mut queues = shared.queues();
         let number = queues.threads + 1;
         let writer = Writer::new(file, shared.clone(), number);
-        let thread = std::thread::Builder::new().name("audit".to_string()).spawn(move || {
-            if let Some(before) = before {
-                // A panic of it was logged.
-                let _ = before.join();
-            }
+        std::thread::Builder::new().name("audit".to_string()).spawn(move || {
+            // A panic of the thread before was logged.
+            let _own = own.lock().unwrap_or_else(PoisonError::into_inner);
             writer.run();
             drop(end);
         })?;
         queues.threads = number;
         drop(queues);
         shared.wake.notify_all();
-        Ok(AuditFile {
-            options,
-            shared,
-            thread: Mutex::new(Some(thread)),
-            ended,
-        })
+        Ok(AuditFile { options, shared, ended })
     }
 
     /// Where it writes.

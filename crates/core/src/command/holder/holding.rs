@@ -316,6 +316,14 @@ impl Holding {
         self.state = State::Held(who.clone(), now + rules.lease);
     }
 
+    /// The turn of an accepted order came, and it passes: it holds the drive again if the hold has ended since.
+    pub fn turn_came(&mut self, who: &Claim, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+        self.settle(rules, now, told);
+        if asks.takes() && rules.mode == Mode::Exclusive && !self.is_held_by(who, now) {
+            self.taken(who, rules, now, told);
+        }
+    }
+
     /// An order of that client was carried out, or its heartbeat came: its hold runs anew. A lease is never shortened.
     pub fn renew(&mut self, who: &Claim, rules: &Rules, now: Instant) {
         if let State::Held(by, until) = &mut self.state

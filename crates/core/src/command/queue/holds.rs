@@ -6,12 +6,13 @@ use std::time::{Duration, Instant};
 
 use super::{CommandQueue, Pending};
 use crate::command::{
-    Asks, Claim, Command, Denial, HoldView, Holding, Mode, Origin, Outcome, Refusal, Rules, SourceKind, Told, Urgency,
-    Verb,
+    Asks, Claim, Command, Denial, HoldView, Holding, Mode, Origin, Outcome, Refusal, Rules, Told, Urgency, Verb,
 };
 
 /// What is told of holds waits for the gateway, which asks several times a second; beyond that the oldest is dropped.
 const MOST_TOLD: usize = 256;
+/// An order of a client that does not hold its drive is logged once in this time.
+const UNHELD_LOGGED: Duration = Duration::from_secs(60);
 
 /// The holds of the drives of a bus.
 #[derive(Debug, Default)]
@@ -23,6 +24,19 @@ pub(super) struct Holds {
     taken: Vec<usize>,
     /// Orders that were carried out, or would have been refused, though another client held the drive.
     unheld: BTreeMap<usize, u64>,
+    /// The same, to be logged.
+    unheld_told: Vec<(usize, Unheld)>,
+    /// When it was last logged of a client.
+    unheld_logged: BTreeMap<Arc<str>, Instant>,
+}
+
+/// An order that advisory mode carried out.
+#[derive(Debug, Clone)]
+pub struct Unheld {
+    /// Who gave it.
+    pub client: Arc<str>,
+    /// What exclusive mode would have answered.
+    pub refusal: Refusal,
 }
 
 impl Holds {
@@ -41,6 +55,22 @@ impl Holds {
         let beyond = self.told.len().saturating_sub(MOST_TOLD);
         self.told.drain(..beyond);
         Some(changed)
+    }
+
+    /// Counts an order that exclusive mode would have refused, and logs it once a client and minute.
+    fn count_unheld(&mut self, drive: usize, origin: &Origin, denial: &Denial, now: Instant) {
+        *self.unheld.entry(drive).or_default() += 1;
+        let Some(rules) = &self.rules else { return };
+        let client = rules
+            .claim_of(origin)
+            .map_or_else(|| origin.client().clone(), |who| who.name);
+        self.unheld_logged.retain(|_, at| now < *at + UNHELD_LOGGED);
+        if self.unheld_logged.contains_key(&client) || self.unheld_told.len() >= MOST_TOLD {
+            return;
+        }
+        self.unheld_logged.insert(client.clone(), now);
+        let refusal = denial.refusal(rules);
+        self.unheld_told.push((drive, Unheld { client, refusal }));
     }
 
     fn claim(&self, origin: &Origin) -> Option<Claim> {
@@ -106,8 +136,24 @@ impl Pending {
             .find_map(|(drive, asks)| self.holds.refuses(drive, origin, asks, now))
     }
 
-    /// Why a command that was accepted is not sent at its turn: its client has lost the drive since.
-    pub fn hold_stops_turn(&self, command: &Command, now: Instant) -> Option<Refusal> {
+    /// The turn of a command that was accepted: why it is not sent, if its client has lost the drive since. A drive that is free
+    /// by now, since its client released it or the lease ended, is taken as by any order.
+    pub fn hold_at_turn(&mut self, command: &Command, now: Instant) -> Option<Refusal> {
+        let refusal = self.hold_stops_turn(command, now);
+        let origin = command.ticket.origin();
+        let who = self.holds.claim(origin).filter(|_| origin.kind.is_client());
+        if let (None, Some(who)) = (&refusal, who) {
+            for drive in command.reach() {
+                let asks = Asks::of(command, *drive);
+                self.holds.with(*drive, |holding, rules, told| {
+                    holding.turn_came(&who, asks, rules, now, told)
+                });
+            }
+        }
+        refusal
+    }
+
+    fn hold_stops_turn(&self, command: &Command, now: Instant) -> Option<Refusal> {
         let rules = self.holds.rules.as_ref()?;
         let origin = command.ticket.origin();
         if rules.mode == Mode::Advisory || !origin.kind.is_client() {
@@ -138,7 +184,7 @@ impl Pending {
         for drive in command.reach() {
             let asks = Asks::of(command, *drive);
             if !origin.kind.is_client() {
-                let supervision = origin.kind == SourceKind::Supervision;
+                let supervision = origin.is_lease();
                 if asks == Asks::Stop {
                     self.holds.with(*drive, |holding, rules, told| {
                         holding.stopped_by_gateway(supervision, rules, now, told);
@@ -147,12 +193,12 @@ impl Pending {
                 continue;
             }
             let unheld = self.holds.with(*drive, |holding, rules, told| {
-                let unheld = holding.judge(who.as_ref(), asks, rules, now).is_err();
+                let unheld = holding.judge(who.as_ref(), asks, rules, now).err();
                 holding.accepted(who.as_ref(), asks, rules, now, told);
                 unheld
             });
-            if unheld == Some(true) {
-                *self.holds.unheld.entry(*drive).or_default() += 1;
+            if let Some(denial) = unheld.flatten() {
+                self.holds.count_unheld(*drive, origin, &denial, now);
             }
         }
     }
@@ -239,6 +285,16 @@ impl Pending {
                 .with(drive, |holding, rules, told| holding.settle(rules, now, told));
         }
         std::mem::take(&mut self.holds.told)
+    }
+
+    /// Orders of clients that did not hold their drive, to be logged.
+    pub fn take_unheld(&mut self) -> Vec<(usize, Unheld)> {
+        std::mem::take(&mut self.holds.unheld_told)
+    }
+
+    /// Whether that client writes its command word all the time, so that its repeated stop is no new one.
+    pub(super) fn is_cyclic(&self, origin: &Origin) -> bool {
+        self.holds.claim(origin).is_some_and(|who| who.cyclic)
     }
 
     /// What is told of the hold of a drive, and whether that client holds it.

@@ -171,18 +171,18 @@ fn errors_of_certificates_name_file_and_key() {
         (
             "gateway.crt",
             file("nowhere.crt"),
-            "nowhere.crt: No such file or directory (os error 2); /etc/drivegate/t.toml:18, \
+            "nowhere.crt: No such file or directory (os error 2); /etc/drivegate/t.toml:19, \
           modbus_tcp.tls.certificate; check the path and its permissions",
         ),
         (
             "gateway.crt",
             file("gateway.key"),
-            "gateway.key contains no certificate, but a private key; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; specify the certificate: are certificate and key swapped?",
+            "gateway.key contains no certificate, but a private key; /etc/drivegate/t.toml:19, modbus_tcp.tls.certificate; specify the certificate: are certificate and key swapped?",
         ),
         (
             "gateway.crt",
             file("other.crt"),
-            "the key does not match the certificate; /etc/drivegate/t.toml:19, \
+            "the key does not match the certificate; /etc/drivegate/t.toml:20, \
           modbus_tcp.tls.key; specify the key of the certificate",
         ),
         (

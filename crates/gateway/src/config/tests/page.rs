@@ -9,6 +9,8 @@ fn with_tables(page: &str) -> String {
         ("[[bus]]", "Bus"),
         ("[[bus.drive]]", "Drive"),
         ("[bus.drive.supervision]", "Supervision"),
+        ("[bus.drive.guard]", "GuardTable"),
+        ("[[bus.drive.interlocks]]", "InterlockTable"),
         ("[[bus.drive.trigger]]", "Trigger"),
         ("[[bus.slot]]", "SlotTable"),
         ("[modbus_tcp]", "ModbusTcp"),

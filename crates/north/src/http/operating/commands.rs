@@ -81,7 +81,9 @@ fn status(outcome: &Outcome) -> StatusCode {
         Outcome::Acknowledged(_) => StatusCode::OK,
         Outcome::Refused(Refusal::NotAllowed(_)) => StatusCode::FORBIDDEN,
         Outcome::Refused(Refusal::UnknownDrive(_)) => StatusCode::NOT_FOUND,
-        Outcome::Refused(Refusal::HeldByOther(_) | Refusal::NeedsTake(_)) => StatusCode::CONFLICT,
+        Outcome::Refused(
+            Refusal::HeldByOther(_) | Refusal::NeedsTake(_) | Refusal::Guarded(_) | Refusal::Interlocked(_),
+        ) => StatusCode::CONFLICT,
         Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
         Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::NotStopped => StatusCode::CONFLICT,
         // Of what was not carried out.
@@ -247,7 +249,10 @@ impl Operating {
         }
         let (client, expiry) = (Authority::Write, asked.expiry);
         let placed = match (refused, stop) {
-            (None, _) => drive.place_asked(order, origin, client, expiry, asked_at, now),
+            (None, _) => {
+                let drive = drive.clone().waiting(asked.wait);
+                drive.place_asked(order, origin, client, expiry, asked_at, now)
+            }
             (Some(refusal), Some(stop)) => {
                 let rest = (excerpt(payload), refusal);
                 drive.place_stop(Order::Points(stop), (&rest.0, rest.1), origin, client, expiry, now)

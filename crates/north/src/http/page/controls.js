@@ -172,7 +172,7 @@ export function build(panel, name, actions) {
   buildReference(panel, name, actions);
   panel.result = make("span", "operate-result");
   panel.result.setAttribute("role", "status");
-  panel.holder = make("span", "operate-lease");
+  panel.holder = make("span", "operate-holder");
   panel.lease = make("span", "operate-lease");
   panel.place.setAttribute("role", "group");
   panel.place.setAttribute("aria-label", t("Commands of {drive}", { drive: name }));

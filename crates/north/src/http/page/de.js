@@ -297,12 +297,12 @@ const words = {
   supervision: "Überwachung", supervision_failed: "Überwachung fehlgeschlagen", unsupervised: "nicht überwacht", refused_command: "Befehl abgelehnt",
   not_confirmed: "nicht bestätigt", restarted: "neu gestartet", unlike_profile: "anders als Profil", selection_differs: "Prozessdaten anders als Profil", foreign_command: "fremder Befehl",
   parameters_changed: "Parameter geändert", restore_unfinished: "Rückspielen unvollendet", recording: "Aufzeichnung", bus_up: "Leitung verbunden",
-  bus_down: "Leitung unterbrochen", diagnosis: "Diagnose", reload_refused: "Neuladen abgelehnt", lost: "verloren", refused_stop: "Stopp abgelehnt",
+  bus_down: "Leitung unterbrochen", diagnosis: "Diagnose", guarded: "Start zu früh", interlock: "Verriegelung", reload_refused: "Neuladen abgelehnt", lost: "verloren", refused_stop: "Stopp abgelehnt",
   released: "freigegeben", hold_broken: "übernommen", line_errors: "Leitungsfehler", point: "Grenzwert", command: "Befehl",
   // Why a drive does not run.
   no_dc_link: "kein Zwischenkreis", held: "belegt", reserved: "nach Stopp reserviert", order_refused: "Startbefehl abgelehnt", order_expired: "Startbefehl abgelaufen",
   order_unanswered: "Startbefehl unbeantwortet", stopped_by_order: "durch Befehl gestoppt", fault_was_reset: "Störung wurde quittiert",
-  stopped_by_gateway: "vom Gateway gestoppt", other_master: "anderer Master", no_run_order: "kein Startbefehl", reference_zero: "Sollwert null",
+  stopped_by_gateway: "vom Gateway gestoppt", stopped_by_interlock: "durch Verriegelung gestoppt", other_master: "anderer Master", no_run_order: "kein Startbefehl", reference_zero: "Sollwert null",
   direction_blocked: "Drehrichtung gesperrt", not_known: "nicht bekannt", local_control: "Vor-Ort-Steuerung", undervoltage: "Unterspannung", bypass: "Bypass",
   fire_mode: "Brandfallbetrieb", interlocked: "verriegelt", hand_off_auto: "Hand-Aus-Automatik", baseblock: "Impulssperre",
   // Results and sources of commands.

@@ -22,7 +22,6 @@ impl Writer {
         let file = AuditFile {
             options: options(Path::new("")),
             shared: self.shared.clone(),
-            thread: Mutex::new(None),
             ended: watch::channel(()).1,
         };
         records.for_each(|n| file.push(Arc::new(record("operator", n)), sent));
@@ -107,6 +106,36 @@ async fn a_reload_loses_no_record() {
         assert_eq!((after - before, file.lost()), (50 * 21, (0, 0)));
     }
     assert_eq!(faults(one.path()), Vec::<String>::new());
+}
+
+/// Reloads name A, B, A: the second writer of A begins when the first one, held up by its disk, has ended.
+#[test]
+fn a_reload_back_to_a_file_that_is_still_written_waits_for_it() {
+    let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+    let a = AuditFile::start(options(dirs[0].path())).unwrap();
+    let first_writer = a.shared.file(&a.options.path);
+    let busy = loop {
+        // It has its file.
+        match first_writer.try_lock() {
+            Ok(_) => std::thread::sleep(Duration::from_millis(1)),
+            Err(_) => break first_writer.clone(),
+        }
+    };
+    let b = a.succeed(options(dirs[1].path())).unwrap();
+    let first = busy.lock().unwrap();
+    let again = b.succeed(options(dirs[0].path())).unwrap();
+    while b.ended.has_changed().is_ok() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    again.push(Arc::new(record("operator", 1)), true);
+    for _ in 0..50 {
+        std::thread::sleep(Duration::from_millis(2));
+        assert_eq!(lines(dirs[0].path()).len(), 0, "two threads write one file");
+    }
+    drop(first);
+    tokio::runtime::Runtime::new().unwrap().block_on(again.stop());
+    assert_eq!(lines(dirs[0].path()).len(), 1);
+    assert_eq!(faults(dirs[0].path()), Vec::<String>::new());
 }
 
 #[test]

@@ -1,0 +1,103 @@
+//! The form of the file of starts. Pure.
+
+use std::time::{Duration, SystemTime};
+
+use serde::{Deserialize, Serialize};
+
+use super::MOST_STARTS;
+use crate::process_image::Machine;
+
+/// Form of the file.
+const VERSION: u32 = 1;
+/// Motors in a file at most; more are none of ours.
+const MOST_MOTORS: usize = 16_384;
+/// The year 9999, in which no clock is.
+const LATEST: Duration = Duration::from_secs(253_370_764_800);
+
+/// The starts of the last hour of all motors.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Saved {
+    drivegate_starts: u32,
+    motors: Vec<SavedMotor>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+struct SavedMotor {
+    port: String,
+    address: u8,
+    profile: String,
+    /// Milliseconds since 1970.
+    starts: Vec<u64>,
+}
+
+impl Default for Saved {
+    fn default() -> Saved {
+        Saved {
+            drivegate_starts: VERSION,
+            motors: Vec::new(),
+        }
+    }
+}
+
+impl Saved {
+    pub(super) fn new(motors: impl Iterator<Item = (Machine, Vec<SystemTime>)>) -> Saved {
+        let millis = |at: SystemTime| {
+            let since = at.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+            u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
+        };
+        let motor = |(machine, starts): (Machine, Vec<SystemTime>)| SavedMotor {
+            port: machine.port,
+            address: machine.address,
+            profile: machine.profile,
+            starts: starts.into_iter().map(millis).collect(),
+        };
+        Saved {
+            motors: motors.map(motor).collect(),
+            ..Saved::default()
+        }
+    }
+
+    /// Each motor with its starts.
+    pub(super) fn motors(&self) -> impl Iterator<Item = (Machine, impl Iterator<Item = SystemTime> + '_)> + '_ {
+        self.motors.iter().map(|motor| {
+            let machine = Machine {
+                port: motor.port.clone(),
+                address: motor.address,
+                profile: motor.profile.clone(),
+            };
+            let at = |millis: &u64| {
+                // As late as the form can say, where the clock cannot.
+                let at = SystemTime::UNIX_EPOCH.checked_add(Duration::from_millis(*millis));
+                at.unwrap_or(SystemTime::UNIX_EPOCH + LATEST)
+            };
+            (machine, motor.starts.iter().map(at))
+        })
+    }
+
+    /// As it is written.
+    pub fn to_json(&self) -> Vec<u8> {
+        // Numbers and strings can always be serialized.
+        serde_json::to_vec(self).unwrap_or_default()
+    }
+
+    /// What a file says.
+    ///
+    /// # Errors
+    /// It is none of these; why.
+    pub fn from_json(bytes: &[u8]) -> Result<Saved, String> {
+        let saved: Saved = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
+        let most = MOST_STARTS as usize + 1;
+        if saved.drivegate_starts != VERSION {
+            return Err(format!(
+                "it has version {}, this gateway knows {VERSION}",
+                saved.drivegate_starts
+            ));
+        }
+        if saved.motors.len() > MOST_MOTORS || saved.motors.iter().any(|motor| motor.starts.len() > most) {
+            return Err(format!(
+                "it has more than {MOST_MOTORS} motors, or {most} starts of one"
+            ));
+        }
+        Ok(saved)
+    }
+}

@@ -1,0 +1,75 @@
+//! Whether the points hold that a start needs. Pure.
+
+use std::fmt;
+use std::time::Instant;
+
+use super::Interlock;
+use super::ledger::Around;
+use crate::drive::{Quality, Value};
+
+/// An interlock that does not hold.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Unmet {
+    drive: String,
+    point: String,
+    is: bool,
+    /// What is known of the point instead.
+    but: String,
+    was_read: bool,
+}
+
+impl Unmet {
+    /// Whether the point was read since the gateway started.
+    pub fn was_read(&self) -> bool {
+        self.was_read
+    }
+}
+
+impl fmt::Display for Unmet {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Unmet {
+            drive, point, is, but, ..
+        } = self;
+        write!(f, "`{point}` of {drive} must be {is} and {but}")
+    }
+}
+
+impl Interlock {
+    /// Whether it does not hold. Only a good sample holds.
+    pub(super) fn unmet(&self, around: &Around, now: Instant) -> Option<Unmet> {
+        let (but, was_read) = self.differs(around, now)?;
+        Some(Unmet {
+            was_read,
+            drive: self.drive.clone(),
+            point: self.point.clone(),
+            is: self.is,
+            but,
+        })
+    }
+
+    /// What is known of the point where it does not hold, and whether it was ever read.
+    fn differs(&self, around: &Around, now: Instant) -> Option<(String, bool)> {
+        let Some(image) = around.images.get(&self.drive) else {
+            return Some(("there is no such drive".to_string(), true));
+        };
+        let Some(index) = image.spec.profile.point_index(&self.point) else {
+            return Some(("the drive has no such point".to_string(), true));
+        };
+        let reading = image.reading(now, around.stale_after);
+        let sample = reading.sample(index);
+        let age = || {
+            sample
+                .at
+                .map_or(0.0, |at| now.saturating_duration_since(at).as_secs_f64())
+        };
+        let but = match sample.good().map(Value::as_bool) {
+            Some(is) if is == self.is => return None,
+            Some(is) => format!("is {is}"),
+            None if !reading.snapshot.link.is_online() => "is not known: the drive is offline".to_string(),
+            None if sample.at.is_none() => "was never read".to_string(),
+            None if sample.quality == Quality::Stale => format!("is stale: read {:.1} s ago", age()),
+            None => "is not known: its value is bad".to_string(),
+        };
+        Some((but, sample.at.is_some()))
+    }
+}

@@ -1,0 +1,350 @@
+//! The motors of all buses, their groups, and what of them is on disk. Pure: time is an argument.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use arc_swap::ArcSwap;
+
+use super::file::Saved;
+use super::motor::{HOUR, Motor, Reserved};
+use super::{Guard, Guarded, Reason, shown};
+use crate::process_image::{DriveImage, Machine};
+
+/// Longest wait of a start for the disk.
+pub(super) const DISK: Duration = Duration::from_secs(1);
+
+/// The starts of the whole gateway: shared by its buses, whatever a reload does to them.
+#[derive(Debug, Default)]
+pub struct Guards {
+    ledger: Mutex<Ledger>,
+    changed: Condvar,
+    around: ArcSwap<Around>,
+}
+
+/// What interlocks look at.
+#[derive(Debug, Default)]
+pub(super) struct Around {
+    pub(super) images: BTreeMap<String, Arc<DriveImage>>,
+    pub(super) stale_after: Duration,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct Ledger {
+    motors: BTreeMap<Machine, Entry>,
+    groups: BTreeMap<Arc<str>, Group>,
+    /// Counts changes that belong on disk.
+    generation: u64,
+    disk: Disk,
+}
+
+/// One motor in its group.
+#[derive(Debug)]
+pub(super) struct Entry {
+    pub(super) motor: Motor,
+    group: Arc<str>,
+    /// Starts that were refused, by reason.
+    refused: BTreeMap<Reason, u64>,
+}
+
+/// Drives of which one is started after the other.
+#[derive(Debug, Default)]
+struct Group {
+    last: Option<Instant>,
+    /// Starts that are decided and not written.
+    reserved: usize,
+}
+
+/// Whether starts are kept.
+#[derive(Debug, Default)]
+enum Disk {
+    /// In memory only.
+    #[default]
+    None,
+    /// In a file.
+    File {
+        /// Newest generation that is in it.
+        written: u64,
+        /// Newest one that could not be written, and why.
+        failed: Option<(u64, String)>,
+    },
+}
+
+/// How far a start that is decided came.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Kept {
+    Yes,
+    NotYet,
+    Failed(String),
+}
+
+impl Guards {
+    pub(super) fn lock(&self) -> MutexGuard<'_, Ledger> {
+        self.ledger.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(super) fn around(&self) -> arc_swap::Guard<Arc<Around>> {
+        self.around.load()
+    }
+
+    /// From now on interlocks look at these drives.
+    pub fn watch(&self, drives: impl IntoIterator<Item = Arc<DriveImage>>, stale_after: Duration) {
+        let named = |image: Arc<DriveImage>| (image.spec.name.clone(), image);
+        self.around.store(Arc::new(Around {
+            images: drives.into_iter().map(named).collect(),
+            stale_after,
+        }));
+    }
+
+    /// Something changed that belongs on disk.
+    pub(super) fn tell_change(&self) {
+        self.changed.notify_one();
+    }
+
+    /// From now on starts are kept in a file: none is written to a drive before [`Guards::wrote`] says that it is there.
+    /// `saved` is what earlier runs left; of a clock that was set back nothing is taken to be older than it can be.
+    pub fn keep(&self, saved: &Saved, now: Instant, time: SystemTime) {
+        let mut ledger = self.lock();
+        for (machine, starts) in saved.motors() {
+            let at = |start: SystemTime| {
+                let age = time.duration_since(start).unwrap_or_default();
+                now.checked_sub(age).filter(|_| age < HOUR)
+            };
+            ledger.remember(machine, starts.filter_map(at), now);
+        }
+        ledger.generation += 1;
+        ledger.disk = Disk::File {
+            written: 0,
+            failed: None,
+        };
+        drop(ledger);
+        self.tell_change();
+    }
+
+    /// What belongs on disk, with its generation; none where that is there already, or failed.
+    pub fn to_write(&self, now: Instant, time: SystemTime) -> Option<(u64, Saved)> {
+        self.lock().to_write(now, time)
+    }
+
+    /// What belongs on disk, once there is something; none after `time`.
+    pub(super) fn wait_to_write(&self, most: Duration) -> Option<(u64, Saved)> {
+        let is_up_to_date = |ledger: &mut Ledger| !ledger.is_behind();
+        let waited = self.changed.wait_timeout_while(self.lock(), most, is_up_to_date);
+        let (ledger, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        ledger.to_write(Instant::now(), SystemTime::now())
+    }
+
+    /// What became of a write.
+    pub fn wrote(&self, generation: u64, done: Result<(), String>) {
+        let mut ledger = self.lock();
+        if let Disk::File { written, failed } = &mut ledger.disk {
+            match done {
+                Ok(()) => (*written, *failed) = (generation.max(*written), None),
+                Err(why) => *failed = Some((generation, why)),
+            }
+        }
+    }
+}
+
+impl Ledger {
+    /// A drive is configured; its starts count in that group.
+    pub(super) fn register(&mut self, machine: &Machine, group: &Arc<str>) {
+        let entry = self.motors.entry(machine.clone()).or_insert_with(|| Entry {
+            motor: Motor::default(),
+            group: group.clone(),
+            refused: BTreeMap::new(),
+        });
+        if entry.group != *group && entry.motor.reserved.is_some() {
+            entry.motor.settle();
+            let before = self.groups.entry(entry.group.clone()).or_default();
+            before.reserved = before.reserved.saturating_sub(1);
+        }
+        entry.group = group.clone();
+        let last = entry.motor.starts().max();
+        let group = self.groups.entry(group.clone()).or_default();
+        group.last = group.last.max(last);
+    }
+
+    fn remember(&mut self, machine: Machine, starts: impl Iterator<Item = Instant>, now: Instant) {
+        let entry = self.motors.entry(machine).or_insert_with(|| Entry {
+            motor: Motor::default(),
+            group: Arc::from(""),
+            refused: BTreeMap::new(),
+        });
+        entry.motor.remember(starts.map(|at| at.min(now)));
+        let last = entry.motor.starts().max();
+        let group = self.groups.entry(entry.group.clone()).or_default();
+        group.last = group.last.max(last);
+    }
+
+    pub(super) fn motor(&self, machine: &Machine) -> Option<&Motor> {
+        self.motors.get(machine).map(|entry| &entry.motor)
+    }
+
+    /// Does something with a motor that is no start.
+    pub(super) fn with<T>(&mut self, machine: &Machine, act: impl FnOnce(&mut Motor) -> T) -> Option<T> {
+        self.motors.get_mut(machine).map(|entry| act(&mut entry.motor))
+    }
+
+    /// Why a motor may not be started now.
+    pub(super) fn hindered(&self, machine: &Machine, guard: &Guard, now: Instant) -> Option<Guarded> {
+        let entry = self.motors.get(machine)?;
+        let stagger = self.too_close(&entry.group, guard, now);
+        entry
+            .motor
+            .hindered(guard, now)
+            .into_iter()
+            .chain(stagger)
+            .max_by_key(|wait| wait.retry_after)
+    }
+
+    fn too_close(&self, name: &Arc<str>, guard: &Guard, now: Instant) -> Option<Guarded> {
+        let group = self.groups.get(name).filter(|_| !guard.stagger.is_zero())?;
+        let last = group.last.filter(|_| group.reserved == 0);
+        let retry_after = match (group.reserved, last) {
+            // It may be written at any time.
+            (1.., _) => guard.stagger,
+            (0, last) => (last? + guard.stagger).saturating_duration_since(now),
+        };
+        (!retry_after.is_zero()).then(|| Guarded {
+            reason: Reason::Stagger,
+            why: format!(
+                "drives of {name} start {} apart (guard.stagger); it may start in {}",
+                shown(guard.stagger),
+                shown(retry_after)
+            ),
+            retry_after,
+        })
+    }
+
+    /// A start is decided: it counts from now on, and belongs on disk before it is written.
+    pub(super) fn reserve(&mut self, machine: &Machine, number: u64, until: Instant, now: Instant) {
+        self.settle(machine, None);
+        self.generation += 1;
+        let generation = self.generation;
+        let Some(entry) = self.motors.get_mut(machine) else {
+            return;
+        };
+        entry.motor.reserve(Reserved {
+            number,
+            at: now,
+            until,
+            generation,
+        });
+        self.groups.entry(entry.group.clone()).or_default().reserved += 1;
+    }
+
+    /// What is decided and will not be written any more counts as made; with a number, only that command's.
+    pub(super) fn settle(&mut self, machine: &Machine, number: Option<u64>) {
+        let Some(entry) = self.motors.get_mut(machine) else {
+            return;
+        };
+        let of = |reserved: &Reserved| number.is_none_or(|number| reserved.number == number);
+        let Some(reserved) = entry.motor.reserved.filter(of) else {
+            return;
+        };
+        entry.motor.settle();
+        let group = self.groups.entry(entry.group.clone()).or_default();
+        group.reserved = group.reserved.saturating_sub(1);
+        group.last = group.last.max(Some(reserved.at));
+    }
+
+    /// A start that could not be counted on disk is not made, and does not count.
+    pub(super) fn withdraw(&mut self, machine: &Machine) {
+        if let Some(entry) = self.motors.get_mut(machine)
+            && entry.motor.reserved.take().is_some()
+        {
+            let group = self.groups.entry(entry.group.clone()).or_default();
+            group.reserved = group.reserved.saturating_sub(1);
+            self.generation += 1;
+        }
+    }
+
+    /// Whether a start that is decided is on disk.
+    pub(super) fn kept(&self, reserved: &Reserved, now: Instant) -> Kept {
+        match &self.disk {
+            Disk::None => Kept::Yes,
+            Disk::File { written, .. } if *written >= reserved.generation => Kept::Yes,
+            Disk::File {
+                failed: Some((generation, why)),
+                ..
+            } if *generation >= reserved.generation => Kept::Failed(why.clone()),
+            Disk::File { .. } if now >= reserved.at + DISK => {
+                Kept::Failed(format!("the disk does not take them within {}", shown(DISK)))
+            }
+            Disk::File { .. } => Kept::NotYet,
+        }
+    }
+
+    /// A word that starts a motor goes onto the line.
+    pub(super) fn start_written(&mut self, machine: &Machine, number: u64, client: &Arc<str>, now: Instant) {
+        let Some(entry) = self.motors.get_mut(machine) else {
+            return;
+        };
+        let was_reserved = entry.motor.reserved.is_some();
+        if entry.motor.start_written(number, client, now) {
+            let group = self.groups.entry(entry.group.clone()).or_default();
+            if was_reserved && entry.motor.reserved.is_none() {
+                group.reserved = group.reserved.saturating_sub(1);
+            }
+            group.last = group.last.max(Some(now));
+            self.generation += 1;
+        }
+    }
+
+    /// A motor was read. Whether that changed what belongs on disk.
+    pub(super) fn seen(&mut self, machine: &Machine, seen: super::Seen) -> bool {
+        let Some(entry) = self.motors.get_mut(machine) else {
+            return false;
+        };
+        let started = entry.motor.seen(seen);
+        if started {
+            let group = self.groups.entry(entry.group.clone()).or_default();
+            group.last = group.last.max(Some(seen.at));
+            self.generation += 1;
+        }
+        started
+    }
+
+    /// A start was refused.
+    pub(super) fn count_refused(&mut self, machine: &Machine, reason: Reason) {
+        if let Some(entry) = self.motors.get_mut(machine) {
+            *entry.refused.entry(reason).or_default() += 1;
+        }
+    }
+
+    pub(super) fn refused(&self, machine: &Machine) -> BTreeMap<Reason, u64> {
+        self.motors
+            .get(machine)
+            .map(|entry| entry.refused.clone())
+            .unwrap_or_default()
+    }
+
+    fn is_behind(&self) -> bool {
+        match &self.disk {
+            Disk::None => false,
+            Disk::File { written, failed } => {
+                let tried = failed.as_ref().map_or(0, |(generation, _)| *generation);
+                self.generation > tried.max(*written)
+            }
+        }
+    }
+
+    fn to_write(&self, now: Instant, time: SystemTime) -> Option<(u64, Saved)> {
+        if !self.is_behind() {
+            return None;
+        }
+        let at = |at: Instant| match at.checked_duration_since(now) {
+            Some(later) => time + later,
+            None => time
+                .checked_sub(now.saturating_duration_since(at))
+                .unwrap_or(SystemTime::UNIX_EPOCH),
+        };
+        let known = self.motors.iter().filter(|(_, entry)| !entry.motor.is_forgotten(now));
+        let motors = known.map(|(machine, entry)| {
+            let starts = entry.motor.starts_to_keep().filter(|start| *start + HOUR > now);
+            (machine.clone(), starts.map(at).collect())
+        });
+        Some((self.generation, Saved::new(motors)))
+    }
+}

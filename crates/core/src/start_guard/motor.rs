@@ -1,0 +1,302 @@
+//! What is known of one motor, and when it may be started. Pure: time is an argument.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::{Guard, Guarded, MOST_STARTS, Reason, shown};
+
+/// The window of `starts_per_hour`.
+pub(super) const HOUR: Duration = Duration::from_secs(3600);
+/// A motor that is seen to start so soon after an order that starts it was started by that.
+const STARTS_WITHIN: Duration = Duration::from_secs(30);
+/// For so long after the word that starts it a motor may still read as standing.
+const SETTLES: Duration = Duration::from_secs(1);
+/// For so long after its start a motor counts as running though it was not read since.
+const UNREAD: Duration = Duration::from_secs(2);
+
+/// What a reading shows of a motor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Seen {
+    /// It runs, and has no fault.
+    pub running: bool,
+    /// Its run command as the drive has it, and when that was read.
+    pub commanded: Option<(bool, Instant)>,
+    /// It stands.
+    pub stands: bool,
+    /// When it was read.
+    pub at: Instant,
+}
+
+/// A start that is decided and not written yet.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Reserved {
+    /// The command, by its number in the queue.
+    pub(super) number: u64,
+    pub(super) at: Instant,
+    /// It is not written later.
+    pub(super) until: Instant,
+    /// What must be on disk before.
+    pub(super) generation: u64,
+}
+
+/// The last start of the motor, until it is seen to stand.
+#[derive(Debug, Clone)]
+struct Started {
+    at: Instant,
+    /// The client whose order it was.
+    by: Option<Arc<str>>,
+}
+
+/// One motor.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Motor {
+    /// The last starts, oldest first.
+    starts: VecDeque<Instant>,
+    pub(super) reserved: Option<Reserved>,
+    /// The command whose start was the last one that was written, and when; a motor that is seen to start soon after it was
+    /// started by it.
+    written: Option<(u64, Instant)>,
+    is_awaited: bool,
+    /// Whether it runs, and when that was read; none while it is not known.
+    running: Option<(bool, Instant)>,
+    /// The same when it was known last.
+    ran: Option<bool>,
+    /// Its run command as the drive had it last, and when that was read.
+    commanded: Option<(bool, Instant)>,
+    stands_since: Option<Instant>,
+    stop_written: Option<Instant>,
+    started: Option<Started>,
+}
+
+impl Motor {
+    /// Starts of the last hour, one that is decided included.
+    pub(super) fn starts(&self) -> impl Iterator<Item = Instant> + '_ {
+        let reserved = self.reserved.map(|reserved| reserved.at);
+        self.starts.iter().copied().chain(reserved)
+    }
+
+    /// The same for the file: one that is decided may be written as late as its command lives.
+    pub(super) fn starts_to_keep(&self) -> impl Iterator<Item = Instant> + '_ {
+        let reserved = self.reserved.map(|reserved| reserved.until);
+        self.starts.iter().copied().chain(reserved)
+    }
+
+    /// Whether an order to run, written now, starts it: it does not run for certain. One that slows down after a stop may stand
+    /// by the time the order reaches it.
+    pub(super) fn is_started_by_run(&self) -> bool {
+        let since_stop = |at: Instant| self.stop_written.is_none_or(|stop| at > stop);
+        let written = self.written.map(|(_, written)| written);
+        let stopped_last = self
+            .stop_written
+            .is_some_and(|stop| written.is_none_or(|start| stop > start));
+        let told_on = self.commanded.is_some_and(|(on, at)| on && since_stop(at));
+        // It was taken away since, here or elsewhere.
+        let is_off = |(on, at): (bool, Instant)| !on && written.is_none_or(|start| at > start);
+        let slows_down = (stopped_last && !told_on) || self.commanded.is_some_and(is_off);
+        let runs = |(running, at): (bool, Instant)| running && since_stop(at) && !slows_down;
+        !self.running.is_some_and(runs)
+    }
+
+    /// Whether the start of that command is decided, or written.
+    pub(super) fn is_cleared(&self, number: u64) -> bool {
+        let reserved = self.reserved.is_some_and(|reserved| reserved.number == number);
+        reserved || self.written.is_some_and(|(of, _)| of == number)
+    }
+
+    /// Why it may not be started now, beside its group.
+    pub(super) fn hindered(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
+        self.too_often(guard, now)
+            .into_iter()
+            .chain(self.too_soon(guard, now))
+            .max_by_key(|wait| wait.retry_after)
+    }
+
+    fn too_often(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
+        let most = usize::try_from(guard.starts_per_hour?).ok()?;
+        let within: Vec<Instant> = self.starts().filter(|at| *at + HOUR > now).collect();
+        // The oldest of the last so many leaves the window first.
+        let oldest = within.len().checked_sub(most).and_then(|place| within.get(place))?;
+        let retry_after = (*oldest + HOUR).saturating_duration_since(now);
+        Some(Guarded {
+            reason: Reason::StartsPerHour,
+            why: format!(
+                "{} starts within the last hour, and {most} are allowed (guard.starts_per_hour); it may start in {}",
+                within.len(),
+                shown(retry_after)
+            ),
+            retry_after,
+        })
+    }
+
+    fn too_soon(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
+        if guard.min_off.is_zero() {
+            return None;
+        }
+        let (since, retry_after) = match self.stands_since {
+            Some(since) => ("", (since + guard.min_off).saturating_duration_since(now)),
+            None => (", and was not seen to stand yet", guard.min_off),
+        };
+        (!retry_after.is_zero()).then(|| Guarded {
+            reason: Reason::MinOff,
+            why: format!(
+                "the motor must stand for {} before a start (guard.min_off){since}; it may start in {}",
+                shown(guard.min_off),
+                shown(retry_after)
+            ),
+            retry_after,
+        })
+    }
+
+    fn count(&mut self, at: Instant) {
+        if self.starts.len() >= MOST_STARTS as usize {
+            self.starts.pop_front();
+        }
+        self.starts.push_back(at);
+    }
+
+    /// A start is decided.
+    pub(super) fn reserve(&mut self, reserved: Reserved) {
+        self.settle();
+        self.reserved = Some(reserved);
+    }
+
+    /// What is decided counts as made, whatever became of it.
+    pub(super) fn settle(&mut self) {
+        if let Some(reserved) = self.reserved.take() {
+            self.count(reserved.at);
+        }
+    }
+
+    /// A word of a command that starts the motor goes onto the line. Whether a start was made by it.
+    pub(super) fn start_written(&mut self, number: u64, client: &Arc<str>, now: Instant) -> bool {
+        if self.reserved.is_some_and(|reserved| reserved.number == number) {
+            self.reserved = None;
+            self.count(now);
+        } else if self.written.is_some_and(|(of, _)| of == number) {
+            // One more word of the same start, or the same word once more.
+            if let Some(last) = self.starts.back_mut() {
+                *last = now;
+            }
+        } else {
+            return false;
+        }
+        self.written = Some((number, now));
+        self.is_awaited = true;
+        // It is to be seen to stand anew, also where it was never seen to run.
+        self.stands_since = None;
+        self.started = Some(Started {
+            at: now,
+            by: Some(client.clone()),
+        });
+        true
+    }
+
+    /// The drive acknowledged a start; of one that does not say whether it runs that is all that shows it.
+    pub(super) fn start_acknowledged(&mut self, now: Instant) {
+        (self.running, self.ran, self.stands_since) = (Some((true, now)), Some(true), None);
+    }
+
+    /// A stop goes onto the line.
+    pub(super) fn stop_written(&mut self, now: Instant) {
+        self.stop_written = Some(now);
+    }
+
+    /// The drive acknowledged it, likewise.
+    pub(super) fn stop_acknowledged(&mut self, now: Instant) {
+        (self.running, self.ran, self.started) = (Some((false, now)), Some(false), None);
+        self.stands_since.get_or_insert(now);
+    }
+
+    /// It was read. Whether a start was seen that nobody ordered here.
+    pub(super) fn seen(&mut self, seen: Seen) -> bool {
+        let Seen {
+            running,
+            commanded,
+            stands,
+            at,
+        } = seen;
+        let written = self.written.map(|(_, written)| written);
+        self.commanded = commanded.or(self.commanded);
+        if [written, self.stop_written]
+            .into_iter()
+            .flatten()
+            .any(|write| at <= write)
+        {
+            // From before what was written last.
+            return false;
+        }
+        let came = running && self.ran == Some(false);
+        (self.running, self.ran) = (Some((running, at)), Some(running));
+        if running {
+            self.stands_since = None;
+        } else {
+            if stands && written.is_none_or(|written| at >= written + SETTLES) {
+                self.stands_since.get_or_insert(at);
+            }
+            if self.started.as_ref().is_some_and(|started| at > started.at + UNREAD) {
+                self.started = None;
+            }
+        }
+        if !came {
+            return false;
+        }
+        let awaited = std::mem::take(&mut self.is_awaited);
+        let ordered = |(_, written): (u64, Instant)| at.saturating_duration_since(written) <= STARTS_WITHIN;
+        if awaited && self.written.is_some_and(ordered) {
+            return false;
+        }
+        self.count(at);
+        self.started = Some(Started { at, by: None });
+        true
+    }
+
+    /// It cannot be read: what it does meanwhile is not known.
+    pub(super) fn unseen(&mut self) {
+        self.running = None;
+    }
+
+    /// The drive is away: it may run and stand again unseen.
+    pub(super) fn away(&mut self) {
+        (self.running, self.stands_since) = (None, None);
+    }
+
+    /// Nothing shows whether it runs; it is taken to stand from now on.
+    pub(super) fn begin_untold(&mut self, now: Instant) {
+        if self.running.is_none() {
+            self.stands_since.get_or_insert(now);
+        }
+    }
+
+    /// Whether a stop of that client is an ordinary one: the first since its own order started the motor.
+    pub(super) fn is_ordinary_stop(&self, client: &str, last_stop: Option<Instant>) -> bool {
+        let own = |started: &Started| started.by.as_deref() == Some(client);
+        let first = |started: &Started| last_stop.is_none_or(|stop| stop < started.at);
+        self.started
+            .as_ref()
+            .is_some_and(|started| own(started) && first(started))
+    }
+
+    /// Until when an ordinary stop waits; none where the motor does not run for certain.
+    pub(super) fn stop_waits(&self, guard: &Guard, now: Instant) -> Option<Instant> {
+        let started = self.started.as_ref()?;
+        let runs = match self.running {
+            Some((running, at)) if at > started.at => running,
+            _ => now < started.at + UNREAD,
+        };
+        Some(started.at + guard.min_run).filter(|until| runs && *until > now)
+    }
+
+    /// Takes in starts of an earlier run.
+    pub(super) fn remember(&mut self, earlier: impl Iterator<Item = Instant>) {
+        let mut all: Vec<Instant> = earlier.chain(self.starts.iter().copied()).collect();
+        all.sort();
+        let spare = all.len().saturating_sub(MOST_STARTS as usize);
+        self.starts = all.into_iter().skip(spare).collect();
+    }
+
+    /// Whether nothing of the last hour is known of it.
+    pub(super) fn is_forgotten(&self, now: Instant) -> bool {
+        self.starts().all(|at| at + HOUR <= now)
+    }
+}

@@ -1,0 +1,515 @@
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use super::*;
+use crate::codec::{LineFormat, Protocol, RequestPdu, Table};
+use crate::command::{
+    BackgroundRequest, Effect, NO_DRIVE, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind, Ticket, Touched,
+};
+use crate::drive::profile::Profiles;
+use crate::process_image::{Access, BusSpec, DriveImage, DriveSpec, Link};
+
+const SECOND: Duration = Duration::from_secs(1);
+const RUN: Effect = Effect {
+    run: Some(true),
+    reverse: None,
+    reference: false,
+    word: false,
+};
+
+/// Drives `d1` to `d3` of a family on one bus; `d1` and `d2` have the guard.
+struct Bench {
+    shared: Arc<Guards>,
+    bus: BusSpec,
+    images: Vec<Arc<DriveImage>>,
+    guards: Arc<BusGuards>,
+    start: Instant,
+}
+
+impl Bench {
+    fn of(guard: Guard, interlocks: Vec<Interlock>) -> Bench {
+        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+        let bus = BusSpec {
+            name: "b".to_string(),
+            port: "/dev/b".to_string(),
+            protocol: Protocol::ModbusRtu,
+            format: LineFormat::new(38_400, "8N1").unwrap(),
+            cycle: Duration::from_millis(10),
+            slow_cycle: SECOND,
+        };
+        let drive = |address: u8| {
+            let spec = DriveSpec {
+                access: Access::Control,
+                guard: (address < 3).then_some(guard),
+                interlocks: if address == 1 { interlocks.clone() } else { Vec::new() },
+                staggers: !guard.stagger.is_zero(),
+                ..DriveSpec::new(&format!("d{address}"), "b", address, profile.clone())
+            };
+            Arc::new(DriveImage::new(spec, SECOND))
+        };
+        let images: Vec<Arc<DriveImage>> = (1..=3).map(drive).collect();
+        let shared = Arc::new(Guards::default());
+        let guards = BusGuards::of(&shared, &bus, images.iter().map(|image| &image.spec)).unwrap();
+        shared.watch(images.iter().cloned(), SECOND);
+        Bench {
+            shared,
+            bus,
+            images,
+            guards,
+            start: Instant::now(),
+        }
+    }
+
+    fn at(&self, seconds: f64) -> Instant {
+        self.start + Duration::from_secs_f64(seconds)
+    }
+
+    /// The drive is read: it runs, or stands.
+    fn read(&self, drive: usize, running: bool, seconds: f64) {
+        let (image, at) = (&self.images[drive], self.at(seconds));
+        image.update(|snapshot| {
+            snapshot.link = Link::Online(SystemTime::now());
+            snapshot.fast_at = Some(at);
+            // The status word: running, or at zero speed; then the output frequency.
+            let words = if running { [0x03, 0, 0, 2500] } else { [0x41, 0, 0, 0] };
+            snapshot.store(Table::Holding, 2100, &words, at);
+        });
+        self.guards.look(drive, &image.reading(at, SECOND));
+    }
+
+    fn refused(&self, drive: usize, seconds: f64) -> Option<&'static str> {
+        let refusal = self.guards.refuses(drive, RUN, None, self.at(seconds))?;
+        Some(match refusal {
+            Refusal::Guarded(guarded) => guarded.reason.name(),
+            Refusal::Interlocked(_) => "interlock",
+            other => unreachable!("{other}"),
+        })
+    }
+
+    /// A command that starts these drives has its turn.
+    fn clear(&self, drives: &[usize], number: u64, seconds: f64) -> Clearance {
+        self.clear_waiting(drives, number, false, seconds)
+    }
+
+    fn clear_waiting(&self, drives: &[usize], number: u64, waits: bool, seconds: f64) -> Clearance {
+        let now = self.at(seconds);
+        let origin = Origin::new(SourceKind::Mqtt, "c");
+        let (ticket, _) = Ticket::new(origin, "d", String::new(), true, now, Arc::default());
+        let request = BackgroundRequest {
+            drive: NO_DRIVE,
+            pdu: RequestPdu::WriteRegister {
+                address: 2000,
+                value: 1,
+            },
+            pace: Pace::Brisk,
+            expires: now + 2 * SECOND,
+            ticket,
+            passed_on: Some(PassedOn {
+                address: 0,
+                may_write: true,
+                reach: drives.to_vec(),
+                stops: Vec::new(),
+                effects: drives.iter().map(|drive| (*drive, RUN)).collect(),
+                first: false,
+                frame: tokio::sync::oneshot::channel().0,
+            }),
+        };
+        let mut command = request.into_command(Touched::Anything);
+        (command.number, command.waits) = (number, waits);
+        self.guards.clear(&command, now)
+    }
+
+    /// Starts a drive and sees it run, then stops it and sees it stand a second later.
+    fn start_and_stop(&self, drive: usize, number: u64, seconds: f64) {
+        assert_eq!(self.clear(&[drive], number, seconds), Clearance::Go, "at {seconds} s");
+        self.guards
+            .start_written(drive, number, &Arc::from("c"), self.at(seconds));
+        self.read(drive, true, seconds + 0.1);
+        self.guards.stop_written(drive, self.at(seconds + 0.5));
+        self.read(drive, false, seconds + 1.0);
+    }
+}
+
+fn reason(clearance: Clearance) -> &'static str {
+    match clearance {
+        Clearance::Refused(Refusal::Guarded(guarded)) => guarded.reason.name(),
+        Clearance::Refused(Refusal::Interlocked(_)) => "interlock",
+        Clearance::Refused(other) => unreachable!("{other}"),
+        Clearance::Go => "go",
+        Clearance::Wait(_) => "wait",
+    }
+}
+
+fn per_hour(most: u32) -> Guard {
+    Guard {
+        starts_per_hour: Some(most),
+        ..Guard::default()
+    }
+}
+
+#[test]
+fn the_window_of_an_hour_slides() {
+    let bench = Bench::of(per_hour(3), Vec::new());
+    bench.read(0, false, 0.0);
+    for (number, seconds) in [(1, 10.0), (2, 600.0), (3, 1200.0)] {
+        bench.start_and_stop(0, number, seconds);
+    }
+    assert_eq!(bench.refused(0, 1300.0), Some("starts_per_hour"));
+    assert_eq!(bench.refused(1, 1300.0), None, "each drive for itself");
+    let Some(Refusal::Guarded(wait)) = bench.guards.refuses(0, RUN, None, bench.at(1300.0)) else {
+        unreachable!()
+    };
+    assert_eq!(
+        wait.retry_after,
+        Duration::from_secs(2310),
+        "when the first one is an hour old"
+    );
+    assert_eq!(wait.retry_after_ms(), 2_310_000);
+    assert!(
+        wait.why.contains("3 starts within the last hour") && wait.why.contains("39 min"),
+        "{wait}"
+    );
+    assert_eq!(bench.refused(0, 3609.9), Some("starts_per_hour"));
+    assert_eq!(bench.refused(0, 3610.0), None);
+    bench.start_and_stop(0, 4, 3610.0);
+    assert_eq!(
+        bench.refused(0, 4199.0),
+        Some("starts_per_hour"),
+        "the second one counts until 4200 s"
+    );
+    assert_eq!(bench.refused(0, 4200.0), None);
+    let counted = bench.guards.refused(0);
+    assert_eq!(counted.get(&Reason::StartsPerHour), Some(&4), "{counted:?}");
+}
+
+#[test]
+fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
+    let bench = Bench::of(per_hour(1), Vec::new());
+    bench.read(0, false, 0.0);
+    assert_eq!(bench.clear(&[0], 1, 1.0), Clearance::Go);
+    bench.guards.start_written(0, 1, &Arc::from("c"), bench.at(1.0));
+    assert_eq!(bench.refused(0, 1.05), Some("starts_per_hour"), "not seen to run yet");
+    bench.read(0, true, 1.1);
+    assert_eq!(bench.refused(0, 1.2), None, "it runs");
+    assert_eq!(bench.clear(&[0], 2, 1.2), Clearance::Go);
+    bench.guards.start_written(0, 2, &Arc::from("c"), bench.at(1.2));
+    bench.guards.stop_written(0, bench.at(2.0));
+    assert_eq!(
+        bench.refused(0, 2.01),
+        Some("starts_per_hour"),
+        "what was read before the stop says nothing"
+    );
+    // It coasts down: it may stand by the time that the order reaches it.
+    bench.read(0, true, 2.1);
+    assert_eq!(bench.refused(0, 2.2), Some("starts_per_hour"));
+    // The drive did not take the stop, or somebody else started it again.
+    bench.images[0].update(|snapshot| snapshot.store(Table::Holding, 2000, &[1, 0, 0], bench.at(2.3)));
+    bench.read(0, true, 2.4);
+    assert_eq!(bench.refused(0, 2.5), None);
+    bench.read(0, false, 3.0);
+    assert_eq!(bench.refused(0, 3.1), Some("starts_per_hour"));
+    // A run that was cleared while the motor ran does not start it when it has stopped since.
+    assert!(bench.guards.may_write(0, 2, bench.at(3.1)).is_err());
+    assert!(bench.guards.may_write(0, 1, bench.at(3.1)).is_ok());
+}
+
+#[test]
+fn starts_at_the_panel_count_and_those_of_orders_count_once() {
+    let bench = Bench::of(per_hour(2), Vec::new());
+    bench.read(0, false, 0.0);
+    bench.start_and_stop(0, 1, 1.0);
+    assert_eq!(bench.refused(0, 5.0), None, "one of two");
+    bench.read(0, true, 6.0);
+    bench.read(0, false, 7.0);
+    assert_eq!(bench.refused(0, 8.0), Some("starts_per_hour"), "the panel started it");
+    // One that runs when it is first read was not seen to start.
+    bench.read(1, true, 0.0);
+    bench.read(1, false, 1.0);
+    bench.start_and_stop(1, 2, 2.0);
+    assert_eq!(bench.refused(1, 5.0), None);
+}
+
+#[test]
+fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
+    let guard = Guard {
+        min_off: 30 * SECOND,
+        ..Guard::default()
+    };
+    let bench = Bench::of(guard, Vec::new());
+    assert_eq!(bench.refused(0, 0.0), Some("min_off"), "never read");
+    bench.read(0, false, 1.0);
+    bench.read(0, false, 20.0);
+    assert_eq!(
+        (bench.refused(0, 30.9), bench.refused(0, 31.0)),
+        (Some("min_off"), None)
+    );
+    bench.start_and_stop(0, 1, 40.0);
+    assert_eq!(
+        (bench.refused(0, 70.9), bench.refused(0, 71.0)),
+        (Some("min_off"), None)
+    );
+    // A start and a stop between two reads: it is to be seen to stand anew.
+    assert_eq!(bench.clear(&[0], 2, 71.0), Clearance::Go);
+    bench.guards.start_written(0, 2, &Arc::from("c"), bench.at(71.0));
+    bench.read(0, false, 71.0);
+    bench.guards.stop_written(0, bench.at(71.1));
+    bench.read(0, false, 71.2);
+    bench.read(0, false, 72.5);
+    assert_eq!(
+        (bench.refused(0, 102.4), bench.refused(0, 102.5)),
+        (Some("min_off"), None)
+    );
+    // Stops to a motor that stands change nothing.
+    bench.guards.stop_written(0, bench.at(102.6));
+    bench.read(0, false, 102.7);
+    assert_eq!(bench.refused(0, 102.8), None);
+    // Away, it may have run meanwhile.
+    bench.images[0].update(|snapshot| snapshot.link = Link::Offline(SystemTime::now()));
+    bench.guards.look(0, &bench.images[0].reading(bench.at(180.0), SECOND));
+    assert_eq!(bench.refused(0, 180.0), Some("min_off"));
+    bench.read(0, false, 190.0);
+    assert_eq!(
+        (bench.refused(0, 219.0), bench.refused(0, 220.0)),
+        (Some("min_off"), None)
+    );
+    // One that waits is taken in if it can go in time.
+    bench.read(1, false, 200.0);
+    let until = |seconds| Some(bench.at(seconds));
+    assert!(bench.guards.refuses(1, RUN, until(229.0), bench.at(220.0)).is_some());
+    assert_eq!(bench.guards.refuses(1, RUN, until(231.0), bench.at(220.0)), None);
+    assert_eq!(
+        bench.clear_waiting(&[1], 9, true, 229.0),
+        Clearance::Wait(bench.at(230.0)),
+        "it goes at its time"
+    );
+    assert_eq!(bench.clear_waiting(&[1], 9, true, 230.0), Clearance::Go);
+}
+
+#[test]
+fn drives_of_a_group_start_one_after_the_other() {
+    let guard = Guard {
+        stagger: 5 * SECOND,
+        ..Guard::default()
+    };
+    let bench = Bench::of(guard, Vec::new());
+    (0..3).for_each(|drive| bench.read(drive, false, 0.0));
+    assert_eq!(
+        reason(bench.clear(&[0, 1], 1, 1.0)),
+        "stagger",
+        "never two by one order"
+    );
+    assert_eq!(bench.clear(&[0], 2, 2.0), Clearance::Go);
+    // Cleared and not written: it may be at any time.
+    assert_eq!(reason(bench.clear(&[1], 3, 7.5)), "stagger");
+    bench.guards.start_written(0, 2, &Arc::from("c"), bench.at(8.0));
+    assert_eq!(
+        (reason(bench.clear(&[1], 3, 12.9)), bench.clear(&[1], 3, 13.0)),
+        ("stagger", Clearance::Go)
+    );
+    // What was cleared and not written counts from when it was.
+    bench.guards.settle(1, 3);
+    assert_eq!(
+        (bench.refused(0, 17.9), bench.refused(0, 18.0)),
+        (Some("stagger"), None)
+    );
+    // A drive without a guard is not held back, and its starts count for the others.
+    assert_eq!(bench.clear(&[2], 4, 18.0), Clearance::Go);
+    bench.guards.start_written(2, 4, &Arc::from("c"), bench.at(18.0));
+    assert_eq!(
+        (bench.refused(0, 22.9), bench.refused(0, 23.0)),
+        (Some("stagger"), None)
+    );
+}
+
+#[test]
+fn only_a_good_point_holds_an_interlock() {
+    let interlock = |drive: &str, is| Interlock {
+        drive: drive.to_string(),
+        point: "running".to_string(),
+        is,
+        trip: false,
+    };
+    let bench = Bench::of(Guard::default(), vec![interlock("d3", true)]);
+    bench.read(0, false, 0.0);
+    let text = |seconds| match bench.guards.refuses(0, RUN, None, bench.at(seconds)) {
+        Some(refusal @ Refusal::Interlocked(_)) => refusal.to_string(),
+        other => format!("{other:?}"),
+    };
+    assert!(
+        text(0.0).contains("`running` of d3 must be true and is not known: the drive is offline"),
+        "{}",
+        text(0.0)
+    );
+    bench.read(2, false, 1.0);
+    assert!(text(1.0).contains("must be true and is false"), "{}", text(1.0));
+    bench.read(2, true, 2.0);
+    assert_eq!(bench.refused(0, 2.5), None);
+    assert!(text(3.5).contains("is stale: read 1.5 s ago"), "{}", text(3.5));
+    bench.read(2, true, 4.0);
+    assert_eq!(bench.clear(&[0], 1, 4.5), Clearance::Go);
+    // It does not hold any more when the word is to be written.
+    assert!(bench.guards.may_write(0, 1, bench.at(4.9)).is_ok());
+    assert!(bench.guards.may_write(0, 1, bench.at(5.5)).is_err());
+    assert_eq!(bench.guards.unmet(0, true, bench.at(5.5)), [], "it stops no motor");
+    let bench = Bench::of(Guard::default(), vec![interlock("d9", true)]);
+    bench.read(0, false, 0.0);
+    assert_eq!(bench.refused(0, 0.0), Some("interlock"), "no such drive");
+    let bench = Bench::of(Guard::default(), vec![interlock("d3", false)]);
+    bench.read(0, false, 0.0);
+    assert_eq!(bench.refused(0, 0.0), Some("interlock"), "not known is not false");
+    bench.read(2, false, 1.0);
+    assert_eq!(bench.refused(0, 1.0), None);
+}
+
+#[test]
+fn a_start_waits_until_it_is_on_disk() {
+    let bench = Bench::of(per_hour(3), Vec::new());
+    let time = SystemTime::now();
+    bench.shared.keep(&Saved::default(), bench.start, time);
+    bench.read(0, false, 0.0);
+    assert_eq!(reason(bench.clear(&[0], 1, 1.0)), "wait");
+    let (generation, saved) = bench.shared.to_write(bench.at(1.0), time).unwrap();
+    assert_eq!(reason(bench.clear(&[0], 1, 1.1)), "wait");
+    bench.shared.wrote(generation, Ok(()));
+    assert_eq!(bench.clear(&[0], 1, 1.2), Clearance::Go);
+    assert_eq!(bench.shared.to_write(bench.at(1.2), time), None);
+    // Killed before it wrote anything, the next run knows of it.
+    let next = Bench::of(per_hour(1), Vec::new());
+    let saved = Saved::from_json(&saved.to_json()).unwrap();
+    next.shared.keep(&saved, next.start, time + 60 * SECOND);
+    next.read(0, false, 0.0);
+    assert_eq!(
+        (next.refused(0, 3500.0), next.refused(0, 3603.0)),
+        (Some("starts_per_hour"), None)
+    );
+    // A clock that was set back makes nothing older.
+    let next = Bench::of(per_hour(1), Vec::new());
+    next.shared.keep(&saved, next.start, time - 7200 * SECOND);
+    next.read(0, false, 0.0);
+    assert_eq!(
+        (next.refused(0, 3599.0), next.refused(0, 3600.0)),
+        (Some("starts_per_hour"), None)
+    );
+}
+
+#[test]
+fn a_start_that_cannot_be_counted_is_refused_and_is_none() {
+    let bench = Bench::of(per_hour(1), Vec::new());
+    let time = SystemTime::now();
+    bench.shared.keep(&Saved::default(), bench.start, time);
+    bench.read(0, false, 0.0);
+    assert_eq!(reason(bench.clear(&[0], 1, 1.0)), "wait");
+    let (generation, _) = bench.shared.to_write(bench.at(1.0), time).unwrap();
+    bench.shared.wrote(generation, Err("starts.json: no space".to_string()));
+    let refused = bench.clear(&[0], 1, 1.1);
+    let Clearance::Refused(refusal) = &refused else {
+        unreachable!("{refused:?}")
+    };
+    assert!(refusal.to_string().contains("starts.json: no space"), "{refusal}");
+    // A disk that hangs is not waited for.
+    assert_eq!(reason(bench.clear(&[0], 2, 2.0)), "wait");
+    assert_eq!(reason(bench.clear(&[0], 2, 2.9)), "wait");
+    assert_eq!(reason(bench.clear(&[0], 2, 3.0)), "state_file");
+    // It works again.
+    let (generation, _) = bench.shared.to_write(bench.at(4.0), time).unwrap();
+    bench.shared.wrote(generation, Ok(()));
+    assert_eq!(reason(bench.clear(&[0], 3, 5.0)), "wait");
+    let (generation, _) = bench.shared.to_write(bench.at(5.0), time).unwrap();
+    bench.shared.wrote(generation, Ok(()));
+    assert_eq!(bench.clear(&[0], 3, 5.1), Clearance::Go);
+}
+
+#[test]
+fn counters_belong_to_the_machine_over_a_reload() {
+    let bench = Bench::of(per_hour(1), Vec::new());
+    bench.read(0, false, 0.0);
+    bench.start_and_stop(0, 1, 1.0);
+    // Renamed, and at another place of the bus.
+    let mut specs: Vec<DriveSpec> = bench.images.iter().map(|image| image.spec.clone()).collect();
+    specs[0].name = "other".to_string();
+    specs.reverse();
+    let after = BusGuards::of(&bench.shared, &bench.bus, &specs).unwrap();
+    assert!(after.refuses(2, RUN, None, bench.at(10.0)).is_some());
+    assert!(after.refuses(1, RUN, None, bench.at(10.0)).is_none());
+    // Another machine at its address has none.
+    specs[2].profile = Profiles::built_in().get("vacon-cx").unwrap().clone();
+    let after = BusGuards::of(&bench.shared, &bench.bus, &specs).unwrap();
+    assert!(after.refuses(2, RUN, None, bench.at(10.0)).is_none());
+    specs
+        .iter_mut()
+        .for_each(|spec| (spec.guard, spec.staggers) = (None, false));
+    assert!(
+        BusGuards::of(&bench.shared, &bench.bus, &specs).is_none(),
+        "nothing to look after"
+    );
+}
+
+#[test]
+fn min_run_delays_the_first_stop_of_the_client_that_started_the_motor() {
+    let guard = Guard {
+        min_run: 20 * SECOND,
+        ..Guard::default()
+    };
+    let bench = Bench::of(guard, Vec::new());
+    bench.read(0, false, 0.0);
+    assert!(!bench.guards.is_ordinary_stop(0, "c", None), "it stands");
+    assert_eq!(bench.clear(&[0], 1, 1.0), Clearance::Go);
+    bench.guards.start_written(0, 1, &Arc::from("c"), bench.at(1.0));
+    let waits = |seconds| bench.guards.stop_waits(0, bench.at(seconds));
+    assert_eq!(waits(1.5), Some(bench.at(21.0)), "not read since");
+    bench.read(0, true, 2.0);
+    assert!(bench.guards.is_ordinary_stop(0, "c", None));
+    assert!(
+        bench.guards.is_ordinary_stop(0, "c", Some(bench.at(0.5))),
+        "a stop before the start"
+    );
+    assert!(
+        !bench.guards.is_ordinary_stop(0, "c", Some(bench.at(2.0))),
+        "a second stop"
+    );
+    assert!(!bench.guards.is_ordinary_stop(0, "another", None));
+    assert_eq!((waits(10.0), waits(21.0)), (Some(bench.at(21.0)), None));
+    // It is seen to stand, or not seen at all: nothing is waited for.
+    bench.read(0, false, 12.0);
+    assert_eq!(waits(12.1), None);
+    bench.read(1, false, 0.0);
+    bench.read(1, true, 5.0);
+    assert!(!bench.guards.is_ordinary_stop(1, "c", None), "the panel started it");
+}
+
+#[test]
+fn files_of_others_are_refused_with_a_reason() {
+    for (text, why) in [
+        ("{", "EOF"),
+        ("{\"drivegate_starts\": 2, \"motors\": []}", "version 2"),
+        ("[]", "invalid length"),
+    ] {
+        let error = Saved::from_json(text.as_bytes()).unwrap_err();
+        assert!(error.contains(why), "{text}: {error}");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("starts.json");
+    std::fs::write(&path, "{").unwrap();
+    let keeper = Keeper::start(folder.path(), Arc::new(Guards::default())).unwrap();
+    assert!(folder.path().join("starts.damaged").exists(), "it is kept aside");
+    drop(keeper);
+}
+
+#[test]
+fn times_for_people_are_never_0() {
+    for (millis, text) in [
+        (1, "0.1 s"),
+        (950, "1.0 s"),
+        (9_900, "9.9 s"),
+        (12_345, "13 s"),
+        (200_000, "4 min"),
+    ] {
+        assert_eq!(shown(Duration::from_millis(millis)), text);
+    }
+}
+
+#[test]
+fn outcomes_of_guards_are_busy_to_modbus() {
+    let refused = Outcome::Refused(Refusal::Interlocked("x".to_string()));
+    assert_eq!(refused.exception().map(|exception| exception.0), Some(6));
+}

@@ -1,0 +1,117 @@
+//! `drivegate hold`: who holds a drive, and taking, renewing, releasing and breaking that.
+
+use std::process::ExitCode;
+
+use serde::Deserialize;
+use serde_json::json;
+
+use super::client::{Asked, Gateway, encoded};
+use super::{EXIT_FAILED, printable, report};
+
+/// Prints who holds a drive: holder, rank and seconds left; or takes, renews, releases or breaks that.
+///
+/// Through the local socket it acts as its user, who has the first rank unless a principal names that user.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  drivegate hold --config drivegate.toml pump-1
+  drivegate hold --config drivegate.toml pump-1 take")]
+pub(super) struct Args {
+    #[command(flatten)]
+    gateway: Gateway,
+    /// Name of the drive.
+    drive: String,
+    /// What to do; without it, who holds the drive is printed.
+    #[arg(value_parser = ["take", "renew", "release", "break"])]
+    action: Option<String>,
+}
+
+/// What the gateway says.
+#[derive(Debug, Deserialize)]
+struct Hold {
+    #[serde(default)]
+    error: Option<Reason>,
+    hold: String,
+    holder: Option<String>,
+    holder_rank: Option<String>,
+    hold_left_s: Option<u64>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Reason {
+    message: String,
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    super::block_on(async {
+        match hold(args).await {
+            Ok(hold) => {
+                report::print(&line(&hold));
+                match hold.error {
+                    None => ExitCode::SUCCESS,
+                    Some(reason) => failed(&reason.message),
+                }
+            }
+            Err(why) => failed(&why),
+        }
+    })
+}
+
+fn failed(why: &str) -> ExitCode {
+    report::error(why);
+    ExitCode::from(EXIT_FAILED)
+}
+
+async fn hold(args: &Args) -> Result<Hold, String> {
+    let path = format!("/api/v1/drives/{}/hold", encoded(&args.drive));
+    let asked = match &args.action {
+        None => Asked::get(path),
+        Some(action) => {
+            let lost = "whether the hold changed is not known: ask again without an action";
+            Asked::post(path, &json!({ "action": action })).if_lost(lost)
+        }
+    };
+    let reply = args.gateway.client()?.ask(&asked).await?;
+    match reply.parsed() {
+        // Of either status.
+        Some(hold) => Ok(hold),
+        None => Err(reply.refusal(&asked).to_string()),
+    }
+}
+
+/// Holder, rank and seconds left.
+fn line(hold: &Hold) -> String {
+    let Hold {
+        hold,
+        holder,
+        holder_rank,
+        hold_left_s,
+        ..
+    } = hold;
+    let (Some(holder), Some(rank)) = (holder, holder_rank) else {
+        return format!("{}\n", printable::line(hold));
+    };
+    let (holder, rank) = (printable::line(holder), printable::line(rank));
+    match (hold.as_str(), hold_left_s) {
+        ("reserved", Some(left)) => format!("{holder} ({rank}) stopped it, reserved for {left} s\n"),
+        (_, Some(left)) => format!("{holder} ({rank}), {left} s left\n"),
+        (_, None) => format!("{holder}\n"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_line() {
+        let said = |json: &str| line(&serde_json::from_str(json).unwrap());
+        let held = r#"{"drive": "p", "hold": "held", "holder": "plc", "holder_rank": "automation", "hold_left_s": 24}"#;
+        assert_eq!(said(held), "plc (automation), 24 s left\n");
+        let stopped = held.replace("held\"", "reserved\"");
+        assert_eq!(said(&stopped), "plc (automation) stopped it, reserved for 24 s\n");
+        let free = r#"{"hold": "free", "holder": null, "holder_rank": null, "hold_left_s": 0}"#;
+        assert_eq!(said(free), "free\n");
+        let local = r#"{"hold": "local", "holder": "local", "holder_rank": "local", "hold_left_s": null}"#;
+        assert_eq!(said(local), "local\n");
+    }
+}

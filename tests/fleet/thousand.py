@@ -1,0 +1,232 @@
+#!/usr/bin/env python3
+"""A thousand nodes at one broker with TLS: PROCESSES gateways of `drivegate run`, and SESSIONS of the same MQTT and Sparkplug code in one
+process (benches/sessions.rs), with DRIVES drives each.
+
+All start at once; the broker is away for a while; then a host asks all nodes for their births at once. Prints how long it takes until every
+birth is there, and what that costs. Ends with 1 if it takes longer than BOUND, if data had an alias that the host does not know, or if an event was lost.
+"""
+
+import argparse
+import collections
+import json
+import os
+import pathlib
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+import paho.mqtt.client as paho
+
+from fleet import listens, memory, processor_seconds
+from plant import ROOT, Certificates, ask, free_ports, to_toml, until
+from sparkplug_host import Host, rebirth
+
+BOUND = 30.0
+GROUP = "fleet"
+
+
+class Fleet:
+    def __init__(self, directory, options):
+        self.directory, self.options = directory, options
+        self.certificates = Certificates(directory / "certificates")
+        self.port = free_ports(1)[0]
+        self.plain = free_ports(1)[0]
+        self.all, self.gateways = [], []
+        self.host = Host(options.drives)
+        self.online = {}
+
+    def start(self, name, command, stdin=subprocess.DEVNULL, **environment):
+        with open(self.directory / f"{name}.log", "ab") as log:
+            process = subprocess.Popen([str(each) for each in command], stdin=stdin, stdout=log, stderr=log, env=os.environ | environment)
+        self.all.append(process)
+        return process
+
+    def start_broker(self):
+        certificates, config = self.certificates, self.directory / "mosquitto.conf"
+        config.write_text(f"""listener {self.port} 127.0.0.1
+cafile {certificates.path("authority.crt")}
+certfile {certificates.path("broker.crt")}
+keyfile {certificates.path("broker.key")}
+listener {self.plain} 127.0.0.1
+allow_anonymous true
+persistence false
+max_queued_messages 1000000
+max_connections -1
+user root
+""")
+        self.broker = self.start("mosquitto", [shutil.which("mosquitto") or "/usr/sbin/mosquitto", "-c", config])
+        until("the broker", lambda: listens(self.plain), 20)
+
+    def watch(self):
+        """The host, by the listener without TLS: its own decryption is not part of what is measured."""
+        client = paho.Client(paho.CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+        client.reconnect_delay_set(0.1, 0.1)
+        client.on_connect = lambda client, *_: client.subscribe([(f"spBv1.0/{GROUP}/#", 0), ("drivegate/+/status", 1)])
+        client.on_message = self.received
+        client.connect("127.0.0.1", self.plain)
+        client.loop_start()
+        self.client = client
+
+    def received(self, _client, _data, message):
+        if message.topic.startswith("spBv1.0/"):
+            self.host.received(message.topic, message.payload)
+        elif message.payload == b"online":
+            self.online[message.topic.split("/")[1]] = time.monotonic()
+
+    def names(self):
+        options = self.options
+        return [f"site-{n:04}" for n in (*range(options.processes), *range(1000, 1000 + options.sessions))]
+
+    def configuration(self, number):
+        options, name = self.options, f"site-{number:04}"
+        drives = [{"name": f"d{n}", "address": n, "profile": "vacon-nx"} for n in range(1, options.drives + 1)]
+        bus = {"name": "line", "port": str(self.directory / f"line{number}"), "baud": 115200, "cycle": options.cycle, "slow_cycle": "30s",
+               "response_timeout": "500ms", "retries": 3, "drive": drives}
+        return {
+            "gateway": {"name": name, "socket": str(self.directory / f"{name}.socket"), "state_dir": str(self.directory / name)},
+            "bus": [bus],
+            "mqtt": {"url": f"mqtts://localhost:{self.port}", "ca": self.certificates.path("authority.crt"), "topics": ["state"],
+                     "sparkplug": {"group": GROUP}},
+            "recordings": {"max_count": 0},
+        }
+
+    def run(self):
+        options = self.options
+        buses = []
+        for number in range(options.processes):
+            bus = self.configuration(number)["bus"][0]
+            for at, drive in enumerate(bus["drive"]):
+                drive |= {"name": f"d{number}-{at}"}
+            buses.append(bus | {"name": f"line{number}"})
+        began = time.monotonic()
+        if buses:
+            lines = self.directory / "lines.toml"
+            lines.write_text(to_toml({"gateway": {"name": "lines"}, "bus": buses}))
+            self.lines = self.start("lines", [options.binary, "simulate", "--config", lines, "--speed", "max", "--autopilot"])
+            until("the lines", lambda: all(os.path.exists(bus["port"]) for bus in buses), 60)
+        command = [options.sessions_binary, "--port", self.port, "--sessions", options.sessions, "--drives", options.drives,
+                   "--ca", self.certificates.path("authority.crt"), "--dir", self.directory / "sessions",
+                   "--cycle", options.cycle.removesuffix("s")]
+        self.sessions = self.start("sessions", command, stdin=subprocess.PIPE)
+        for number in range(options.processes):
+            name = f"site-{number:04}"
+            (self.directory / name).mkdir()
+            config = self.directory / f"{name}.toml"
+            config.write_text(to_toml(self.configuration(number)))
+            self.gateways.append(self.start(name, [options.binary, "run", "--config", config]))
+        return began
+
+    def births(self, what, began, seconds=120):
+        """Waits until every birth is there; whether that was in time."""
+        names = set(self.names())
+        end = began + seconds
+        while time.monotonic() < end and not names <= self.host.whole_at.keys():
+            time.sleep(0.05)
+        times = sorted(at - began for at in self.host.whole_at.values())
+        peak = max(collections.Counter(int(at * 10) for at in times).values(), default=0)
+        missing = len(names - self.host.whole_at.keys())
+        half = times[len(times) // 2] if times else float("nan")
+        last = times[-1] if times else float("nan")
+        print(f"{what}: births of {len(times)} of {len(names)} nodes, half after {half:.1f} s, the last after {last:.1f} s, "
+              f"at most {peak} in 0.1 s", flush=True)
+        return missing == 0 and last <= BOUND
+
+    def costs(self, what, seconds):
+        watched = {"broker": [self.broker], "sessions": [self.sessions], "gateways": self.gateways}
+        before = {name: sum(processor_seconds(p.pid) for p in group) for name, group in watched.items()}
+        data = self.host.data
+        began = time.monotonic()
+        time.sleep(seconds)
+        took = time.monotonic() - began
+        used = {name: (sum(processor_seconds(p.pid) for p in group) - before[name]) / took for name, group in watched.items()}
+        print(f"{what}: DDATA {(self.host.data - data) / took:.0f}/s; broker {100 * used['broker']:.0f} % of a core, "
+              f"{memory(self.broker.pid)[0]:.0f} MiB; {self.options.sessions} sessions {100 * used['sessions']:.0f} %, "
+              f"{memory(self.sessions.pid)[0]:.0f} MiB; {len(self.gateways)} gateways {100 * used['gateways']:.0f} %", flush=True)
+
+    def lost(self):
+        """Messages that gateways and sessions gave up."""
+        self.sessions.stdin.close()
+        self.sessions.wait(60)
+        said = (self.directory / "sessions.log").read_text()
+        count = int(said.rpartition("lost: ")[2].split()[0])
+        for number in range(self.options.processes):
+            lines = ask(self.directory / f"site-{number:04}.socket", "/metrics")[1].splitlines()
+            count += sum(int(line.rsplit(" ", 1)[1]) for line in lines if line.startswith("drivegate_mqtt_lost_total"))
+        return count
+
+    def end(self):
+        for process in self.all:
+            if process.poll() is None:
+                process.terminate()
+        for process in self.all:
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def tried(fleet):
+    options = fleet.options
+    fleet.start_broker()
+    fleet.watch()
+    is_well = fleet.births("start, all at once", fleet.run())
+    time.sleep(5)
+    fleet.costs("quiet", options.seconds)
+
+    used = processor_seconds(fleet.broker.pid)
+    fleet.host.forget()
+    began = time.monotonic()
+    for name in fleet.names():
+        fleet.client.publish(f"spBv1.0/{GROUP}/NCMD/{name}", rebirth(), 0)
+    is_well &= fleet.births("rebirths of all, asked for at once", began)
+    print(f"  the broker took {processor_seconds(fleet.broker.pid) - used:.1f} s of a core", flush=True)
+
+    fleet.broker.kill()
+    fleet.broker.wait()
+    fleet.host.forget()
+    fleet.online.clear()
+    time.sleep(options.outage)
+    fleet.start_broker()
+    began = time.monotonic()
+    is_well &= fleet.births(f"the broker back after {options.outage:.0f} s", began)
+    print(f"  the broker took {processor_seconds(fleet.broker.pid):.1f} s of a core", flush=True)
+    time.sleep(10)
+    is_well &= len(fleet.online) == len(fleet.names())
+    print(f"status online: {len(fleet.online)}; data with an unknown alias since then: {sum(fleet.host.unknown.values())}", flush=True)
+    is_well &= not fleet.host.unknown
+    ended = [process.poll() for process in fleet.gateways if process.poll() is not None]
+    lost = fleet.lost()
+    print(f"lost: {lost}; gateways that ended: {len(ended)}", flush=True)
+    return is_well and not lost and not ended
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--processes", type=int, default=100)
+    parser.add_argument("--sessions", type=int, default=900)
+    parser.add_argument("--drives", type=int, default=10)
+    parser.add_argument("--cycle", default="10s", help="each drive has new values so often")
+    parser.add_argument("--seconds", type=float, default=30)
+    parser.add_argument("--outage", type=float, default=10)
+    parser.add_argument("--binary", type=pathlib.Path, default=ROOT / "target/release/drivegate")
+    parser.add_argument("--sessions-binary", type=pathlib.Path, required=True, help="benches/sessions.rs, built")
+    options = parser.parse_args()
+    directory = pathlib.Path(tempfile.mkdtemp(prefix="drivegate-thousand-"))
+    print(f"thousand: {json.dumps(vars(options), default=str)}; logs in {directory}", flush=True)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    fleet, is_well = Fleet(directory, options), False
+    try:
+        is_well = tried(fleet)
+    finally:
+        fleet.end()
+    if is_well:
+        shutil.rmtree(directory)
+    sys.exit(0 if is_well else 1)
+
+
+if __name__ == "__main__":
+    main()

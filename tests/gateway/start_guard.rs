@@ -1,0 +1,178 @@
+//! Guards and interlocks from every side, over a kill and a reload, and with a disk that takes nothing.
+
+use serde_json::{Value as Json, json};
+
+use crate::support::process::{Running, api, get, mbpoll_write, until, until_ready, write_registers};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled};
+use crate::support::tools::{feed, run, tool};
+
+/// The password of `alice`.
+const PASSWORD: &str = "correct horse battery";
+const COMMAND: u16 = 0x8100;
+
+/// `pump-1` is guarded, and needs `fan-2` to run.
+fn site(guard: &str) -> Site {
+    let line = LINE1.replace("profile_dirs", "state_dir = \"state\"\nprofile_dirs");
+    let guarded = format!("guard = {guard}\ninterlocks = [{{ drive = \"fan-2\", point = \"running\" }}]");
+    let drives = controlled("pump-1", 1, &guarded) + &controlled("fan-2", 2, "");
+    let http = format!("{HTTP}commands = true\nusers_file = \"users\"\n");
+    let site = Site::of(&[&line, &drives, MODBUS_TCP, MQTT, &http]);
+    let program = std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"));
+    let added = feed(
+        program,
+        &["user", "add", "--file", &site.path("users"), "alice"],
+        &format!("{PASSWORD}\n"),
+    );
+    assert!(added.status.success(), "{added:?}");
+    site
+}
+
+fn curl(site: &Site, drive: &str, body: &str) -> (u16, Json) {
+    let url = format!("http://127.0.0.1:{}/api/v1/drives/{drive}/commands", site.http);
+    let user = format!("alice:{PASSWORD}");
+    let arguments = ["-s", "-u", &user, "-d", body, "-w", "\n%{http_code}", &url];
+    let output = run(&tool("curl"), &arguments);
+    let text = String::from_utf8(output.stdout).unwrap();
+    let (body, status) = text.rsplit_once('\n').unwrap();
+    (status.parse().unwrap(), serde_json::from_str(body).unwrap())
+}
+
+/// Stops `pump-1` and waits until it stands.
+fn stop(site: &Site) {
+    write_registers(site.modbus, 1, COMMAND, &[0]);
+    site.until_point("pump-1", "running", false);
+}
+
+fn starts(site: &Site, drive: &str) {
+    let (status, answer) = until("a start", || {
+        Some(curl(site, drive, "{\"run\": true}")).filter(|(status, _)| *status != 409)
+    });
+    assert_eq!((status, &answer["result"]), (200, &json!("confirmed")), "{answer}");
+}
+
+fn metric(site: &Site, reason: &str) -> Option<u64> {
+    let (_, text) = get(site.http, "/metrics")?;
+    let is_it = |line: &&str| {
+        line.starts_with("drivegate_starts_refused_total{") && line.contains("pump-1") && line.contains(reason)
+    };
+    text.lines().find(is_it)?.rsplit(' ').next()?.parse().ok()
+}
+
+#[test]
+fn starts_are_refused_and_wait_and_stops_pass() {
+    let site = site("{ starts_per_hour = 3, min_off = \"4s\" }");
+    let _simulator = site.simulate(&["--addresses", "1-2", "--baud", "38400"]);
+    let _broker = site.broker();
+    let mut gateway = site.run_ready();
+    site.until_connected(true);
+    site.until_state("pump-1", "ready");
+    site.until_state("fan-2", "ready");
+
+    // The interlock, to each side in its own words.
+    let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
+    assert_eq!((status, &answer["result"]), (409, &json!("interlocked")), "{answer}");
+    let message = answer["error"]["message"].as_str().unwrap();
+    assert!(
+        message.contains("`running` of fan-2 must be true and is false"),
+        "{message}"
+    );
+    let refused = mbpoll_write(site.modbus, 1, COMMAND, &[1]).unwrap_err();
+    assert!(refused.to_lowercase().contains("busy"), "{refused}");
+    let answer = site.ask("pump-1/set", "{\"run\": true}");
+    assert_eq!(answer["result"], "interlocked", "{answer}");
+    let shown = api(site.http, "pump-1");
+    let words = shown["blocked_by"].as_array().unwrap();
+    assert!(words.contains(&json!("interlocked")), "{shown}");
+
+    starts(&site, "fan-2");
+    site.until_point("fan-2", "running", true);
+    starts(&site, "pump-1");
+    stop(&site);
+
+    // Too soon: refused with the time, or it waits for it.
+    let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
+    assert_eq!((status, &answer["result"]), (409, &json!("guarded")), "{answer}");
+    let retry = answer["retry_after_ms"].as_u64().unwrap();
+    assert!((1..=4000).contains(&retry), "{answer}");
+    let answer = site.ask("pump-1/set", "{\"run\": true}");
+    assert!(
+        answer["result"] == "guarded" && answer["retry_after_ms"].is_u64(),
+        "{answer}"
+    );
+    let refused = mbpoll_write(site.modbus, 1, COMMAND, &[1]).unwrap_err();
+    assert!(refused.to_lowercase().contains("busy"), "{refused}");
+    let shown = api(site.http, "pump-1");
+    let words = shown["blocked_by"].as_array().unwrap();
+    assert!(words.contains(&json!("guarded")), "{shown}");
+    let (status, answer) = curl(
+        &site,
+        "pump-1",
+        "{\"run\": true, \"wait\": true, \"expires_ms\": 20000}",
+    );
+    assert_eq!((status, &answer["result"]), (200, &json!("confirmed")), "{answer}");
+    assert!(answer["latency_ms"].as_f64().unwrap() > 100.0, "{answer}");
+    assert!(metric(&site, "min_off") >= Some(3) && metric(&site, "interlock") >= Some(3));
+    let (_, events) = get(site.http, "/api/v1/events/log?limit=100").unwrap();
+    assert!(
+        events.contains("\"guarded\"") && events.contains("\"interlock\""),
+        "{events}"
+    );
+
+    // Killed and started anew, it has not forgotten the starts.
+    stop(&site);
+    gateway.signal("KILL");
+    gateway.ended();
+    assert!(site.file("state/starts.json").exists());
+    let gateway = site.run();
+    until_ready(site.http);
+    site.until_state("pump-1", "ready");
+    site.until_point("fan-2", "running", true);
+    starts(&site, "pump-1");
+    stop(&site);
+    let (status, answer) = until("the hour", || {
+        let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
+        Some((status, answer)).filter(|(_, answer)| answer["retry_after_ms"].as_u64() > Some(60_000))
+    });
+    assert_eq!((status, &answer["result"]), (409, &json!("guarded")), "{answer}");
+    // Under another name it is the same motor.
+    site.change("name = \"pump-1\"", "name = \"pump-9\"");
+    gateway.signal("HUP");
+    until("the new name", || {
+        get(site.http, "/api/v1/drives/pump-9").filter(|(status, _)| *status == 200)
+    });
+    site.until_state("pump-9", "ready");
+    let (status, answer) = curl(&site, "pump-9", "{\"run\": true}");
+    assert!(
+        status == 409 && answer["retry_after_ms"].as_u64() > Some(60_000),
+        "{answer}"
+    );
+    drop::<Running>(gateway);
+}
+
+#[test]
+fn a_disk_that_takes_nothing_refuses_starts_and_no_stops() {
+    let site = site("{ starts_per_hour = 3 }");
+    let _simulator = site.simulate(&["--addresses", "1-2", "--baud", "38400"]);
+    let _broker = site.broker();
+    let _gateway = site.run_ready();
+    site.until_state("pump-1", "ready");
+    site.until_state("fan-2", "ready");
+    starts(&site, "fan-2");
+    site.until_point("fan-2", "running", true);
+    starts(&site, "pump-1");
+    // Nothing can be written in its place any more.
+    std::fs::create_dir(site.file("state/starts.partial")).unwrap();
+    stop(&site);
+    let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
+    assert_eq!((status, &answer["result"]), (409, &json!("guarded")), "{answer}");
+    let message = answer["error"]["message"].as_str().unwrap();
+    assert!(
+        message.contains("its start cannot be counted") && message.contains("starts.json"),
+        "{message}"
+    );
+    // What was refused did not count.
+    std::fs::remove_dir(site.file("state/starts.partial")).unwrap();
+    starts(&site, "pump-1");
+    stop(&site);
+    starts(&site, "pump-1");
+}

@@ -1,0 +1,530 @@
+//! Guards of starts with clients that know nothing of them, on a line that loses and damages frames, with drives that go away,
+//! reloads, and a process that is killed at any moment: no start of an order on the wire breaks a rule, and stops come as soon as
+//! without guards.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use drivegate::codec::{Protocol, RequestPdu, Table};
+use drivegate::command::{
+    Authority, Mode, Order, Origin, Outcome, Principal, Proof, Refusal, Rules, SourceKind, written,
+};
+use drivegate::drive::{ModelPoint, State, Value};
+use drivegate::plant::Placed;
+use drivegate::process_image::DriveSpec;
+use drivegate::sim::faults::FaultPlan;
+use drivegate::sim::random::Random;
+use drivegate::start_guard::{Guard, Guards, Interlock, Saved};
+
+use super::bus::Seen;
+use super::rig::{PATIENCE, Rig, line, write};
+use super::scenario::Line;
+
+const SECOND: Duration = Duration::from_secs(1);
+const HOUR: Duration = Duration::from_secs(3600);
+const GUARD: Guard = Guard {
+    starts_per_hour: Some(5),
+    min_off: Duration::from_secs(4),
+    min_run: Duration::ZERO,
+    stagger: Duration::from_secs(2),
+};
+/// Between the word of a start and the drive that acts upon it.
+const WIRE: Duration = Duration::from_millis(100);
+
+/// Drives 1 to 3 are guarded, the first also by the fourth.
+fn works(family: &'static str) -> Line {
+    fn guarded(spec: &mut DriveSpec) {
+        spec.staggers = true;
+        spec.guard = (spec.address < 4).then_some(GUARD);
+        if spec.address == 1 {
+            spec.interlocks = vec![Interlock {
+                drive: "d0-4".to_string(),
+                point: "running".to_string(),
+                is: true,
+                trip: true,
+            }];
+        }
+    }
+    Line {
+        cycle: Duration::from_millis(250),
+        spec: guarded,
+        ..line(family, Protocol::ModbusRtu, 19_200, 4)
+    }
+}
+
+/// The file of starts on a disk that takes its time, and fails at times.
+struct Disk {
+    holds: Saved,
+    writing: Option<(u64, Saved, Instant)>,
+    fails: bool,
+}
+
+/// What the drives themselves did.
+#[derive(Default)]
+struct Truth {
+    running: BTreeMap<u8, bool>,
+    stood: BTreeMap<u8, Instant>,
+    /// The last word that starts, when the drive acted upon it.
+    acted: BTreeMap<u8, Instant>,
+    /// Starts by orders.
+    starts: BTreeMap<u8, Vec<Instant>>,
+}
+
+struct Play {
+    rig: Rig,
+    dice: Random,
+    disk: Disk,
+    truth: Truth,
+    began: Instant,
+    stops: Vec<(Placed, Instant)>,
+    orders: Vec<Placed>,
+    results: BTreeMap<&'static str, u32>,
+    longest_stop: Duration,
+}
+
+impl Play {
+    fn new(family: &'static str, seed: u64) -> Play {
+        let rig = Rig::new(&works(family), super::bus::Parts::of(0, &works(family), seed));
+        let play = Play {
+            began: rig.now,
+            rig,
+            dice: Random::new(seed ^ 0x57A7),
+            disk: Disk {
+                holds: Saved::default(),
+                writing: None,
+                fails: false,
+            },
+            truth: Truth::default(),
+            stops: Vec::new(),
+            orders: Vec::new(),
+            results: BTreeMap::new(),
+            longest_stop: Duration::ZERO,
+        };
+        let (now, time) = (play.rig.now, play.time());
+        play.rig.bus.guards.keep(&play.disk.holds, now, time);
+        play
+    }
+
+    fn time(&self) -> SystemTime {
+        SystemTime::UNIX_EPOCH + Duration::from_secs(1_800_000_000) + (self.rig.now - self.began)
+    }
+
+    fn run(&mut self, time: Duration) {
+        let until = self.rig.now + time;
+        while self.rig.now < until {
+            let next = until.min(self.rig.now + Duration::from_millis(10));
+            while let Some(seen) = self.rig.step(next) {
+                seen.into_iter().for_each(|seen| self.note(seen));
+            }
+            self.look();
+            self.work_the_disk();
+        }
+    }
+
+    /// A word that starts goes out only where the interlock holds, as far as the gateway knows.
+    fn note(&mut self, seen: Seen) {
+        let (asked, acted) = match seen {
+            Seen::Sent(asked) => (asked, false),
+            Seen::Acted(asked) => (asked, true),
+            Seen::Over(_) | Seen::Heard(_) => return,
+        };
+        let Some((table, items)) = written(&asked.pdu) else {
+            return;
+        };
+        let profile = self.rig.bus.profile.clone();
+        let starts = |(address, word): &(u16, u16)| profile.runs_by(table, *address, *word) == Some(true);
+        if !items.iter().any(starts) {
+            return;
+        }
+        let address = asked.drive as u8 + 1;
+        if acted {
+            self.truth.acted.insert(address, self.rig.now);
+            return;
+        }
+        let known = |address| self.rig.good(address, ModelPoint::Running).map(Value::as_bool);
+        if address == 1 && known(1) == Some(false) && !self.rig.drive(1).image.spec.interlocks.is_empty() {
+            assert_eq!(known(4), Some(true), "a start on the wire without its interlock");
+        }
+    }
+
+    fn look(&mut self) {
+        let now = self.rig.now;
+        for address in 1..=4 {
+            let running = self.rig.with_drive(address, |drive, _| drive.state().running);
+            let ran = self.truth.running.insert(address, running);
+            if ran == Some(true) && !running {
+                self.truth.stood.insert(address, now);
+            }
+            let acted = self.truth.acted.get(&address).copied();
+            if ran == Some(false) && running && acted.is_some_and(|at| now - at < SECOND) {
+                self.started(address, now);
+            }
+        }
+        let mut results = Vec::new();
+        self.orders.retain_mut(|placed| match placed.answer() {
+            Some(answer) => {
+                results.push(answer.outcome.code());
+                false
+            }
+            None => true,
+        });
+        for result in results {
+            *self.results.entry(result).or_default() += 1;
+        }
+        let longest = &mut self.longest_stop;
+        self.stops.retain_mut(|(placed, at)| match placed.answer() {
+            Some(answer) => {
+                if answer.outcome.is_ok() {
+                    *longest = (*longest).max(now - *at);
+                }
+                false
+            }
+            None => true,
+        });
+    }
+
+    fn started(&mut self, address: u8, now: Instant) {
+        let guarded = self.rig.drive(address).image.spec.guard.is_some();
+        if guarded {
+            let own = self.truth.starts.get(&address).map_or(&[][..], Vec::as_slice);
+            let within = own.iter().filter(|at| now - **at < HOUR - WIRE).count();
+            assert!(
+                within < 5,
+                "drive {address} was started {} times within an hour",
+                within + 1
+            );
+            if let Some(stood) = self.truth.stood.get(&address) {
+                let stood = now - *stood;
+                assert!(
+                    stood + WIRE >= GUARD.min_off,
+                    "drive {address} stood for {stood:?} only"
+                );
+            }
+            for (other, starts) in &self.truth.starts {
+                let apart = starts.last().map(|last| now - *last);
+                assert!(
+                    apart.is_none_or(|apart| apart + WIRE >= GUARD.stagger),
+                    "drives {address} and {other} were started {apart:?} apart"
+                );
+            }
+        }
+        self.truth.starts.entry(address).or_default().push(now);
+    }
+
+    fn work_the_disk(&mut self) {
+        let (now, time) = (self.rig.now, self.time());
+        let guards = self.rig.bus.guards.clone();
+        match self.disk.writing.take_if(|(.., due)| *due <= now) {
+            Some((generation, _, _)) if self.disk.fails => guards.wrote(generation, Err("no space".to_string())),
+            Some((generation, saved, _)) => {
+                self.disk.holds = saved;
+                guards.wrote(generation, Ok(()));
+            }
+            None => {}
+        }
+        if self.disk.writing.is_none()
+            && let Some((generation, saved)) = guards.to_write(now, time)
+        {
+            let takes = Duration::from_millis(self.dice.within(0..=60));
+            self.disk.writing = Some((generation, saved, now + takes));
+        }
+    }
+
+    /// The process is killed. What was being written may be on disk, or not.
+    fn kill(&mut self) {
+        if let Some((_, saved, _)) = self.disk.writing.take()
+            && self.dice.chance(0.5)
+        {
+            self.disk.holds = saved;
+        }
+        let (guards, now, time) = (Guards::default(), self.rig.now, self.time());
+        guards.keep(&self.disk.holds, now, time);
+        let (events, writes) = (self.rig.plant.events.clone(), self.rig.plant.writes.clone());
+        self.rig.bus.kill(guards, &events, &writes, now);
+        self.rig.plant.buses = vec![self.rig.bus.handle.clone()];
+        (self.stops, self.orders) = (Vec::new(), Vec::new());
+    }
+
+    fn order(&mut self) {
+        let address = self.dice.within(1..=4) as u8;
+        let stop = self.dice.chance(0.4);
+        let profile = self.rig.bus.profile.clone();
+        let place = profile.run_place().unwrap();
+        let run = if stop { 0.0 } else { 1.0 };
+        let order = match self.dice.within(0..=3) {
+            0 if place.table == Table::Holding => write(place.address, run as u16),
+            0 => Order::Write(RequestPdu::WriteCoil {
+                address: place.address,
+                on: !stop,
+            }),
+            1 if !stop => self.rig.points(address, &[("run", run), ("frequency_reference", 20.0)]),
+            _ => self.rig.points(address, &[("run", run)]),
+        };
+        let kind = [SourceKind::Mqtt, SourceKind::ModbusTcp, SourceKind::Http][self.dice.within(0..=2) as usize];
+        let (waits, expiry) = (self.dice.chance(0.3), SECOND * self.dice.within(1..=8) as u32);
+        let drive = self.rig.drive(address).waiting(waits);
+        let placed = drive.place(order, Origin::new(kind, "c"), Authority::Write, expiry, self.rig.now);
+        self.rig.bus.command_came(self.rig.now);
+        match stop {
+            true => self.stops.push((placed, self.rig.now)),
+            false => self.orders.push(placed),
+        }
+    }
+
+    fn incident(&mut self) {
+        match self.dice.within(0..=9) {
+            0 | 1 => self.kill(),
+            2 | 3 => {
+                self.rig.restart_now();
+            }
+            4 => self.disk.fails = !self.disk.fails,
+            5 | 6 => {
+                let address = self.dice.within(1..=4) as u8;
+                self.rig.set_alive(address, false);
+                self.run(8 * SECOND);
+                self.rig.set_alive(address, true);
+            }
+            7 => {
+                self.rig.bus.set_open(false, self.rig.now);
+                self.run(3 * SECOND);
+                self.rig.bus.set_open(true, self.rig.now);
+            }
+            _ => {
+                let faults = if self.dice.chance(0.5) {
+                    "drop=0.1,corrupt=0.1,busy=0.05"
+                } else {
+                    ""
+                };
+                let plan = match faults {
+                    "" => FaultPlan::default(),
+                    faults => FaultPlan::new(faults.parse().unwrap(), self.dice.within(1..=1_000_000)),
+                };
+                self.rig.set_faults(plan);
+            }
+        }
+    }
+}
+
+#[test]
+fn no_start_of_an_order_breaks_a_guard() {
+    let mut results: BTreeMap<&str, u32> = BTreeMap::new();
+    let mut starts = 0;
+    for seed in 0..8 {
+        let family = ["vacon-nx", "vacon-cx", "schneider-altivar", "eaton-hvx"][seed as usize % 4];
+        let mut play = Play::new(family, seed);
+        play.run(5 * SECOND);
+        for _ in 0..300 {
+            play.order();
+            let pause = Duration::from_millis(play.dice.within(1..=4_000));
+            play.run(pause);
+            if play.dice.chance(0.1) {
+                play.incident();
+            }
+        }
+        starts += play.truth.starts.values().map(Vec::len).sum::<usize>();
+        for (result, count) in play.results {
+            *results.entry(result).or_default() += count;
+        }
+    }
+    let count = |result: &str| results.get(result).copied().unwrap_or_default();
+    assert!(starts > 80, "{starts} starts: {results:?}");
+    assert!(count("guarded") > 200 && count("interlocked") > 20, "{results:?}");
+}
+
+/// The same clients, line and time, with guards and without: the longest way of a stop is the same.
+#[test]
+fn stops_come_as_soon_as_without_guards() {
+    let longest = |guarded: bool| {
+        let mut play = Play::new("vacon-nx", 77);
+        if !guarded {
+            let unguarded = Line {
+                spec: |_| {},
+                ..works("vacon-nx")
+            };
+            play.rig = Rig::new(&unguarded, super::bus::Parts::of(0, &unguarded, 77));
+            play.began = play.rig.now;
+        }
+        // The disk hangs for good: it holds up starts only.
+        play.disk.writing = Some((0, Saved::default(), play.rig.now + HOUR));
+        play.run(5 * SECOND);
+        for _ in 0..300 {
+            play.order();
+            play.run(Duration::from_millis(200));
+        }
+        play.longest_stop
+    };
+    let (with, without) = (longest(true), longest(false));
+    assert!(without > Duration::ZERO);
+    assert!(
+        with.as_secs_f64() <= 1.05 * without.as_secs_f64() + 0.011,
+        "{with:?}, without guards {without:?}"
+    );
+}
+
+#[test]
+fn an_interlock_that_fails_stops_the_motor_and_keeps_it_from_starting() {
+    let mut play = Play::new("vacon-nx", 3);
+    play.run(5 * SECOND);
+    let mut events = play.rig.plant.events.subscribe();
+    let refused = play.rig.set(1, &[("run", 1.0)]);
+    assert!(
+        matches!(&refused, Outcome::Refused(Refusal::Interlocked(_))),
+        "{refused}"
+    );
+    let start = |play: &mut Play, address| {
+        let order = play.rig.points(address, &[("run", 1.0), ("frequency_reference", 20.0)]);
+        let placed = play.rig.place(address, order);
+        play.orders.push(placed);
+        play.run(3 * SECOND);
+        assert_eq!(play.rig.state(address), State::Running, "{:?}", play.results);
+    };
+    start(&mut play, 4);
+    start(&mut play, 1);
+    // The other drive goes away: its last reading is old by and by.
+    play.rig.set_alive(4, false);
+    play.run(6 * SECOND);
+    assert_eq!(play.rig.state(1), State::Ready);
+    let told: Vec<_> = std::iter::from_fn(|| events.try_recv().ok()).collect();
+    let tripped = told.iter().find(|event| event.text.contains("is being stopped"));
+    let tripped = tripped.unwrap_or_else(|| unreachable!("{told:?}"));
+    assert!(
+        tripped
+            .text
+            .contains("an interlock of d0-1 does not hold: `running` of d0-4"),
+        "{}",
+        tripped.text
+    );
+    let stopped = told.iter().find(|event| event.text.contains("d0-1 has stopped"));
+    assert!(stopped.unwrap().text.contains("an interlock does not hold"), "{told:?}");
+    let why = play.rig.drive(1).why(&play.rig.drive(1).reading(play.rig.now)).words();
+    assert!(why.contains(&"interlocked".to_string()), "{why:?}");
+}
+
+#[test]
+fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
+    let of = Line {
+        spec: |spec| {
+            spec.guard = Some(Guard {
+                min_run: Duration::from_secs(20),
+                ..Guard::default()
+            });
+        },
+        ..line("vacon-nx", Protocol::ModbusRtu, 19_200, 2)
+    };
+    let mut rig = Rig::of(&of);
+    rig.until_state(1, State::Ready);
+    let turns = |rig: &mut Rig| rig.with_drive(1, |drive, _| drive.state().running);
+    let start = |rig: &mut Rig| {
+        let outcome = rig.set(1, &[("run", 1.0), ("speed_reference", 50.0)]);
+        assert!(outcome.is_ok(), "{outcome}");
+        rig.until_state(1, State::Running);
+    };
+    start(&mut rig);
+    let stop = rig.points(1, &[("run", 0.0)]);
+    // The client that started it, by MQTT.
+    let mut first = rig.place(1, stop.clone());
+    rig.run(10 * SECOND);
+    let waits = rig.drive(1).stop_waits(rig.now).unwrap();
+    assert!(waits > 5 * SECOND && waits < 11 * SECOND, "{waits:?}");
+    assert!(turns(&mut rig) && first.answer().is_none());
+    rig.run(12 * SECOND);
+    assert!(first.answer().unwrap().outcome.is_ok() && !turns(&mut rig));
+    assert_eq!(rig.drive(1).stop_waits(rig.now), None);
+    // A second stop, that of another client, and one of HTTP are sent at once.
+    for (kind, who) in [
+        (SourceKind::Mqtt, "test"),
+        (SourceKind::Mqtt, "other"),
+        (SourceKind::Http, "test"),
+    ] {
+        rig.until_state(1, State::Ready);
+        start(&mut rig);
+        let mut first = (who == "test" && kind == SourceKind::Mqtt).then(|| rig.place(1, stop.clone()));
+        rig.run(SECOND);
+        let waits = rig.drive(1).stop_waits(rig.now);
+        assert!(
+            turns(&mut rig),
+            "{kind:?} {who}: {waits:?} {:?}",
+            first.as_mut().and_then(|placed| placed.answer())
+        );
+        let origin = Origin::new(kind, who);
+        let mut second = rig
+            .drive(1)
+            .place(stop.clone(), origin, Authority::Write, SECOND, rig.now);
+        rig.bus.command_came(rig.now);
+        assert!(rig.answered(&mut second).is_ok(), "{who}");
+        if let Some(first) = &mut first {
+            assert!(rig.answered(first).is_ok(), "it joins");
+        }
+        // Its ramp takes a while.
+        rig.run(8 * SECOND);
+        assert!(!turns(&mut rig), "{who}");
+    }
+    // Over a reload, after which it is not known for a moment whether the motor runs, it is sent.
+    rig.until_state(1, State::Ready);
+    start(&mut rig);
+    let mut waiting = rig.place(1, stop);
+    rig.run(5 * SECOND);
+    assert!(turns(&mut rig) && waiting.answer().is_none());
+    rig.restart();
+    rig.run(20 * SECOND);
+    assert!(!turns(&mut rig) && rig.answered(&mut waiting).is_ok());
+    rig.until("it stands", PATIENCE, |rig| rig.state(1) == State::Ready);
+}
+
+/// A cyclic client writes its stop again and again: none of them is a second stop. One of another client is.
+#[test]
+fn repeated_stops_of_a_cyclic_client_wait_for_min_run() {
+    let of = Line {
+        spec: |spec| {
+            spec.guard = Some(Guard {
+                min_run: Duration::from_secs(20),
+                ..Guard::default()
+            });
+        },
+        ..line("vacon-nx", Protocol::ModbusRtu, 19_200, 2)
+    };
+    for cyclic in [true, false] {
+        let mut rig = Rig::of(&of);
+        let principals = vec![Principal {
+            cyclic,
+            mqtt: Some("plc".to_string()),
+            ..Principal::new("plc", 1)
+        }];
+        let rules = Rules {
+            mode: Mode::Exclusive,
+            ranks: ["site", "automation"].map(Into::into).to_vec(),
+            lease: Duration::from_secs(30),
+            stop_at_local: true,
+            principals,
+        };
+        rig.bus.handle.queue.set_authority(Some(Arc::new(rules)));
+        rig.until_state(1, State::Ready);
+        let turns = |rig: &mut Rig| rig.with_drive(1, |drive, _| drive.state().running);
+        let give = |rig: &mut Rig, points: &[(&str, f64)], proof: Proof| {
+            let order = rig.points(1, points);
+            let origin = Origin::new(SourceKind::Mqtt, "plc").proven(proof);
+            let placed = rig.drive(1).place(order, origin, Authority::Write, SECOND, rig.now);
+            rig.bus.command_came(rig.now);
+            placed
+        };
+        let plc = || Proof::Topic("plc".into());
+        let mut run = give(&mut rig, &[("run", 1.0), ("speed_reference", 50.0)], plc());
+        assert!(rig.answered(&mut run).is_ok());
+        rig.until_state(1, State::Running);
+        let mut stops = Vec::new();
+        for _ in 0..8 {
+            stops.push(give(&mut rig, &[("run", 0.0)], plc()));
+            rig.run(SECOND);
+        }
+        assert_eq!(turns(&mut rig), cyclic, "cyclic: {cyclic}");
+        if cyclic {
+            assert!(stops.iter_mut().all(|stop| stop.answer().is_none()));
+            assert!(rig.drive(1).stop_waits(rig.now).is_some());
+            stops.push(give(&mut rig, &[("run", 0.0)], Proof::Nothing));
+            rig.run(8 * SECOND);
+            assert!(!turns(&mut rig), "the stop of another client");
+        }
+        assert!(stops.iter_mut().all(|stop| rig.answered(stop).is_ok()));
+    }
+}
