@@ -6,6 +6,8 @@ use crate::support::process::{Running, mbpoll_read, mbpoll_write, until, write_r
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled};
 use crate::support::tools::{feed, run, tool};
 
+mod clients;
+
 const PASSWORD: &str = "correct horse battery";
 const AUTHORITY: &str = r#"
 [authority]

@@ -117,7 +117,7 @@ fn lines(buses: &Value) -> String {
 }
 
 fn table(drives: &Value) -> String {
-    let mut table = report::table([
+    let mut heads = vec![
         "drive",
         "unit",
         "profile",
@@ -129,7 +129,17 @@ fn table(drives: &Value) -> String {
         "reference %",
         "turnaround ms",
         "fault",
-    ]);
+    ];
+    // Only where `[authority]` is on.
+    let held = drives
+        .as_array()
+        .into_iter()
+        .flatten()
+        .any(|drive| at(drive, "/hold").is_string());
+    if held {
+        heads.push("held by");
+    }
+    let mut table = report::table(heads);
     for drive in drives.as_array().into_iter().flatten() {
         let good = |name: &str, digits: usize| {
             let point = at(drive, &format!("/points/{name}"));
@@ -140,7 +150,7 @@ fn table(drives: &Value) -> String {
                 String::new()
             }
         };
-        table.add_row([
+        let mut row = vec![
             text(at(drive, "/name")),
             text(at(drive, "/unit")),
             text(at(drive, "/profile")),
@@ -152,9 +162,25 @@ fn table(drives: &Value) -> String {
             good("speed_reference", 2),
             fixed(at(drive, "/turnaround_ms"), 2),
             text(at(drive, "/fault_text")),
-        ]);
+        ];
+        if held {
+            row.push(holder(drive));
+        }
+        table.add_row(row);
     }
     report::lines(&table)
+}
+
+/// Who has the drive, and for how long.
+fn holder(drive: &Value) -> String {
+    let who = || format!("{} ({})", text(at(drive, "/holder")), text(at(drive, "/holder_rank")));
+    let left = || at(drive, "/hold_left_s").as_u64().unwrap_or_default();
+    match at(drive, "/hold").as_str() {
+        Some("held") => format!("{}, {} s", who(), left()),
+        Some("reserved") => format!("reserved for {}, {} s", who(), left()),
+        Some("local") => "local control place".to_string(),
+        _ => String::new(),
+    }
 }
 
 /// The state, with the warning that the drive reports beside it.
@@ -190,6 +216,22 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+
+    #[test]
+    fn the_holder_is_shown_where_drives_are_held() {
+        let drive = |hold: Value, holder: Value, rank: Value, left: Value| json!([{"name": "p", "hold": hold, "holder": holder, "holder_rank": rank, "hold_left_s": left}]);
+        let shown = table(&drive(json!("held"), json!("plc-1"), json!("automation"), json!(24)));
+        assert!(
+            shown.contains("held by") && shown.contains("plc-1 (automation), 24 s"),
+            "{shown}"
+        );
+        let shown = table(&drive(json!("reserved"), json!("alice"), json!("operator"), json!(9)));
+        assert!(shown.contains("reserved for alice (operator), 9 s"), "{shown}");
+        let shown = table(&drive(json!("local"), json!("local"), json!("local"), Value::Null));
+        assert!(shown.contains("local control place"), "{shown}");
+        assert!(table(&drive(json!("free"), Value::Null, Value::Null, json!(0))).contains("held by"));
+        assert!(!table(&json!([{"name": "p"}])).contains("held by"));
+    }
 
     #[test]
     fn what_is_not_good_is_no_figure() {

@@ -241,7 +241,7 @@ fn described() -> Api {
         )
         .post(
             "/api/v1/drives/{name}/commands",
-            Doc::object::<CommandResult<'_>>("Commands a drive: points and their values, `id`, `expires_ms`")
+            Doc::object::<CommandResult<'_>>("Commands a drive: points and their values, `id`, `expires_ms`, `wait`")
                 .any_body(),
             operating::command,
         )
