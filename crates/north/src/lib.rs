@@ -44,6 +44,7 @@ use drivegate_proto as codec;
 
 use std::io;
 use std::net::SocketAddr;
+use std::path::PathBuf;
 
 pub use identity::client_tls;
 pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
@@ -75,8 +76,13 @@ pub enum ServerError {
     #[error("cannot start the Modbus TCP thread: {0}; free memory, threads or file descriptors")]
     Thread(io::Error),
     /// The local socket cannot be opened.
-    #[error("{0}")]
-    Local(io::Error),
+    #[error("cannot listen on {}: {cause}", .path.display())]
+    Local {
+        /// The first path that it could have.
+        path: PathBuf,
+        /// What the system reports.
+        cause: io::Error,
+    },
     /// The certificates of a server, named first, cannot be used.
     #[error("TLS of {0}: {1}")]
     Tls(&'static str, IdentityFault),

@@ -10,7 +10,7 @@ use std::time::SystemTime;
 
 use super::archive::{Content, FORMAT, Hashed, LeftOut, Manifest, Member, Root, write};
 use super::restore::UNPACKED;
-use super::{ConfigFile, EXIT_CONFIG, EXIT_FAILED, report};
+use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::config::{FileKind, NamedFile, Settings, environment, named_files};
 use crate::history::store;
 
@@ -47,10 +47,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     });
     match made {
         Ok(manifest) => report::print(&summary(&args.file, &manifest)),
-        Err(why) => {
-            report::error(&format!("{why}; {}; no backup was made", args.file.display()));
-            ExitCode::from(EXIT_FAILED)
-        }
+        Err(why) => report::failed(&format!("{why}; {}; no backup was made", args.file.display())),
     }
 }
 

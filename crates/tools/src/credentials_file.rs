@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use crate::north::http::{Credential, Credentials};
+
 /// How long somebody else may take to change the file.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// How often that is looked for.
@@ -27,17 +29,60 @@ impl CredentialsFile<'_> {
     ///
     /// # Errors
     /// What is wrong with it, for the user.
-    pub(super) fn read(&self) -> Result<String, String> {
+    fn read(&self) -> Result<String, String> {
         let (what, shown) = (self.what, self.path.display());
         read_to_string(self.path)
             .map_err(|error| format!("cannot read the {what} file: {error}; {shown}; check the path"))
+    }
+
+    /// What it holds.
+    ///
+    /// # Errors
+    /// What is wrong with it, for the user.
+    pub(super) fn list<C: Credential>(&self) -> Result<Credentials<C>, String> {
+        parsed(self.path, &self.read()?)
+    }
+
+    /// Adds one, and says whether it took the place of that of the same name, if it may.
+    ///
+    /// # Errors
+    /// It may not, or what is wrong with the file.
+    pub(super) fn put<C: Credential>(&self, new: &C, may_replace: bool) -> Result<bool, String> {
+        let (mut is_known, line) = (false, new.to_string());
+        self.change(|text| {
+            is_known = parsed::<C>(self.path, text)?.named(new.name()).is_some();
+            let text = match is_known && may_replace {
+                true => replaced(text, new.name(), Some(&line)),
+                false => with_line(text, &line),
+            };
+            let remedy = if is_known { "choose another name" } else { "remove one" };
+            match Credentials::<C>::parse(&text) {
+                Ok(_) => Ok(text),
+                Err((_, error)) => Err(format!("{error}; {}; {remedy}", self.path.display())),
+            }
+        })?;
+        Ok(is_known)
+    }
+
+    /// Removes that of a name.
+    ///
+    /// # Errors
+    /// There is none, or what is wrong with the file.
+    pub(super) fn remove<C: Credential>(&self, name: &str) -> Result<(), String> {
+        let (shown, kind) = (self.path.display(), C::KIND);
+        self.change(|text| match parsed::<C>(self.path, text)?.named(name) {
+            Some(_) => Ok(replaced(text, name, None)),
+            None => Err(format!(
+                "there is no {kind} `{name}`; {shown}; `drivegate {kind} list` shows them"
+            )),
+        })
     }
 
     /// Changes its text; a file that there is not yet has none. Others who change it wait meanwhile, so that no change is lost.
     ///
     /// # Errors
     /// That of `change`, or what the system reports; the file is as it was.
-    pub(super) fn change(&self, change: impl FnOnce(&str) -> Result<String, String>) -> Result<(), String> {
+    fn change(&self, change: impl FnOnce(&str) -> Result<String, String>) -> Result<(), String> {
         // A link stays one.
         let file = self.path.canonicalize().unwrap_or_else(|_| self.path.to_path_buf());
         let _lock = self.lock(&file)?;
@@ -122,20 +167,28 @@ fn like(file: &File, old: &Metadata) -> io::Result<()> {
     file.set_permissions(Permissions::from_mode(old.mode() & 0o777))
 }
 
+/// What stands in the text of a file.
+fn parsed<C: Credential>(path: &Path, text: &str) -> Result<Credentials<C>, String> {
+    Credentials::parse(text).map_err(|(line, error)| format!("{error}; {}:{line}; remove the line", path.display()))
+}
+
 /// A text with another line.
-pub(super) fn with_line(text: &str, line: &str) -> String {
-    let separator = if text.is_empty() || text.ends_with('\n') {
+fn with_line(text: &str, line: &str) -> String {
+    let end = if text.is_empty() || text.ends_with('\n') {
         ""
     } else {
         "\n"
     };
-    format!("{text}{separator}{line}\n")
+    format!("{text}{end}{line}\n")
 }
 
-/// A text without the lines of that name.
-pub(super) fn without(text: &str, name: &str) -> String {
-    let others = text.lines().filter(|line| line.split_whitespace().next() != Some(name));
-    others.map(|line| format!("{line}\n")).collect()
+/// A text in which another line, or none, takes the place of that of a name.
+fn replaced(text: &str, name: &str, by: Option<&str>) -> String {
+    let line = |line| match str::split_whitespace(line).next() == Some(name) {
+        true => by,
+        false => Some(line),
+    };
+    text.lines().filter_map(line).flat_map(|line| [line, "\n"]).collect()
 }
 
 #[cfg(test)]
@@ -167,7 +220,7 @@ mod tests {
         });
         let text = file(&path).read().unwrap();
         assert_eq!(text.lines().count(), 16, "{text}");
-        file(&path).change(|text| Ok(without(text, "n7"))).unwrap();
+        file(&path).change(|text| Ok(replaced(text, "n7", None))).unwrap();
         assert_eq!(file(&path).read().unwrap().lines().count(), 15);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }

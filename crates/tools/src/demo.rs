@@ -10,7 +10,7 @@ use std::process::ExitCode;
 use tokio_util::sync::CancellationToken;
 
 use self::written::Written;
-use super::{EXIT_FAILED, report};
+use super::report;
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{LogFormat, LogSettings, Settings};
 use crate::daemon::Daemon;
@@ -126,10 +126,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     super::block_on(async {
         match demo(args).await {
             Ok(()) => ExitCode::SUCCESS,
-            Err(error) => {
-                report::error(&error.to_string());
-                ExitCode::from(EXIT_FAILED)
-            }
+            Err(error) => report::failed(&error.to_string()),
         }
     })
 }

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use serde::Deserialize;
 
 use super::client::{Gateway, encoded};
-use super::{EXIT_FAILED, printable, report};
+use super::{printable, report};
 use crate::diagnosis::{Counted, Verdict};
 
 /// Says what is wrong with a line: each verdict with its evidence, how sure it is, and what to do.
@@ -38,15 +38,7 @@ struct Diagnosis {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    super::block_on(async {
-        match diagnose(args).await {
-            Ok(text) => report::print(&text),
-            Err(message) => {
-                report::error(&message);
-                ExitCode::from(EXIT_FAILED)
-            }
-        }
-    })
+    super::block_on(async { report::outcome(diagnose(args).await) })
 }
 
 async fn diagnose(args: &Args) -> Result<String, String> {

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use self::conversation::Conversation;
 pub(super) use self::direct::Needs;
 use super::client::{Asked, Client, ClientError, Door, Gateway, NotFound, Reply, encoded};
-use super::{EXIT_CONFIG, EXIT_USAGE, report};
+use super::{EXIT_CONFIG, report};
 use crate::config::{BusSettings, Settings, environment};
 use crate::document::{candidates, nearest};
 use crate::drive::Profile;
@@ -71,14 +71,13 @@ pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, ExitCode>
         let drives = || settings.buses.iter().flat_map(|bus| &bus.drives);
         let names = || drives().map(|spec| spec.name.as_str());
         let file = config.display();
-        report::error(&match nearest(drive, names()) {
+        return Err(report::misused(&match nearest(drive, names()) {
             Some(near) => format!("there is no drive `{drive}`; {file}; did you mean `{near}`?"),
             None => {
                 let names = names().collect::<Vec<_>>().join(", ");
                 format!("there is no drive `{drive}`; {file}; known drives: {names}")
             }
-        });
-        return Err(ExitCode::from(EXIT_USAGE));
+        }));
     };
     let expected = ExpectedDrive::new(&settings.gateway, &bus.spec, &spec);
     Ok(Target {

@@ -6,7 +6,7 @@ use serde::Deserialize;
 use serde_json::json;
 
 use super::client::{Asked, Gateway, encoded};
-use super::{EXIT_FAILED, printable, report};
+use super::{printable, report};
 
 /// Prints who holds a drive: holder, rank and seconds left; or takes, renews, releases or breaks that.
 ///
@@ -57,8 +57,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 fn failed(why: &str) -> ExitCode {
-    report::error(why);
-    ExitCode::from(EXIT_FAILED)
+    report::failed(why)
 }
 
 async fn hold(args: &Args) -> Result<Hold, String> {

@@ -200,11 +200,8 @@ fn runtime() -> Result<tokio::runtime::Runtime, String> {
 pub fn block_on(command: impl Future<Output = ExitCode>) -> ExitCode {
     match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime.block_on(command),
-        Err(why) => {
-            report::error(&format!(
-                "cannot start: {why}; free memory, threads or file descriptors"
-            ));
-            ExitCode::from(EXIT_FAILED)
-        }
+        Err(why) => report::failed(&format!(
+            "cannot start: {why}; free memory, threads or file descriptors"
+        )),
     }
 }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use super::adapters::persistent_name;
 use super::scan::{self, Found, Setting, Snippet, absolute};
-use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use super::{EXIT_CONFIG, EXIT_FAILED, report};
 use crate::bus::Mode;
 use crate::bus::listener::guess::Guess;
 use crate::bus::listener::n2_survey::N2Survey;
@@ -68,10 +68,7 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args) -> ExitCode {
     let (protocols, formats) = match settings(args) {
         Ok(settings) => settings,
-        Err(message) => {
-            report::error(&message);
-            return ExitCode::from(EXIT_USAGE);
-        }
+        Err(message) => return report::misused(&message),
     };
     let mut profiles = Profiles::built_in();
     let problems: Vec<_> = args.profile_dir.iter().flat_map(|dir| profiles.load(dir)).collect();
@@ -84,10 +81,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     let ear = Ear { args, stop };
     match ear.listen(&protocols, &formats, &profiles) {
         Ok(code) => code,
-        Err(message) => {
-            report::error(&message);
-            ExitCode::from(EXIT_FAILED)
-        }
+        Err(message) => report::failed(&message),
     }
 }
 

@@ -12,7 +12,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use self::rows::{Row, gateway_rows};
-use super::{DEFAULT_CONFIG, EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use super::{DEFAULT_CONFIG, EXIT_CONFIG, report};
 use crate::command::CommandQueue;
 use crate::config::{BusSettings, Settings, environment};
 use crate::north::modbus_tcp::Role;
@@ -79,10 +79,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     };
     match plant(&settings) {
         Ok(plant) => report::print(&render(&plant, &listeners, shown.as_deref(), format)),
-        Err(why) => {
-            report::error(&format!("cannot build the map: {why}; map; free file descriptors"));
-            ExitCode::from(EXIT_FAILED)
-        }
+        Err(why) => report::failed(&format!("cannot build the map: {why}; map; free file descriptors")),
     }
 }
 
@@ -96,8 +93,7 @@ fn unknown_listener(address: SocketAddr, listeners: &[Listener]) -> ExitCode {
         [] => "add [modbus_tcp] to the configuration".to_string(),
         known => format!("write one of {}", known.join(", ")),
     };
-    report::error(&format!("nothing listens on {address}; --listener; {remedy}"));
-    ExitCode::from(EXIT_USAGE)
+    report::misused(&format!("nothing listens on {address}; --listener; {remedy}"))
 }
 
 /// A listener of the Modbus TCP server.

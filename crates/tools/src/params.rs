@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use super::client::Gateway;
 use super::drive_access::target;
-use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use super::{EXIT_CONFIG, EXIT_FAILED, report};
 use crate::config::{Settings, environment};
 use crate::drive::parameters::RawValue;
 use crate::files;
@@ -124,8 +124,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 fn failed(message: &str) -> ExitCode {
-    report::error(message);
-    ExitCode::from(EXIT_FAILED)
+    report::failed(message)
 }
 
 fn read_drive(gateway: &Gateway, args: &ReadArgs) -> Result<ExitCode, ExitCode> {
@@ -269,11 +268,10 @@ fn file_or_drive(gateway: &Gateway, of: &str) -> Result<ParameterFile, ExitCode>
 fn diff(gateway: &Gateway, before: &str, after: &str) -> Result<ExitCode, ExitCode> {
     let (before, after) = (file_or_drive(gateway, before)?, file_or_drive(gateway, after)?);
     if before.family != after.family {
-        report::error(&format!(
+        return Err(report::misused(&format!(
             "`{}` is of family {}, `{}` of {}; command line; compare drives of one family",
             before.drive, before.family, after.drive, after.family
-        ));
-        return Err(ExitCode::from(EXIT_USAGE));
+        )));
     }
     let found = differences(&before, &after);
     let text: String = found.iter().map(|difference| difference.line() + "\n").collect();

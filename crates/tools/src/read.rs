@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use super::client::{Asked, Gateway, encoded};
 use super::drive_access::{Needs, Target, point, target};
-use super::{EXIT_FAILED, EXIT_USAGE, report};
+use super::{EXIT_FAILED, report};
 use crate::north::http::messages::{PointValue, Word};
 
 /// Reads points of a drive once, through the running gateway or directly.
@@ -38,15 +38,11 @@ pub(super) fn run(args: &Args) -> ExitCode {
         unknown.filter(|_| Word::of(name).is_none())
     };
     if let Some(message) = args.points.iter().find_map(unknown) {
-        report::error(&message);
-        return ExitCode::from(EXIT_USAGE);
+        return report::misused(&message);
     }
     match rows(&target, &args.points) {
         Ok(rows) => print(args, &rows),
-        Err(message) => {
-            report::error(&message);
-            ExitCode::from(EXIT_FAILED)
-        }
+        Err(message) => report::failed(&message),
     }
 }
 
@@ -64,8 +60,7 @@ fn print(args: &Args, rows: &[PointValue]) -> ExitCode {
     let all = rows.iter().all(PointValue::is_good);
     let none = !rows.iter().any(PointValue::is_good);
     if let Some(why) = only_reason(rows).filter(|_| !args.json) {
-        report::error(&format!("no point of `{}` has a value: {why}", args.drive));
-        return ExitCode::from(EXIT_FAILED);
+        return report::failed(&format!("no point of `{}` has a value: {why}", args.drive));
     }
     let printed = report::print(&if args.json { json(rows) } else { table(rows) });
     // Points requested by name must have a value.

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use super::client::{Asked, Gateway};
 use super::drive_access::target;
-use super::{EXIT_FAILED, report};
+use super::report;
 use crate::north::http::messages::Recorded;
 
 /// Makes the running gateway record a drive: the time before now, and the time after.
@@ -34,9 +34,6 @@ pub(super) fn run(args: &Args) -> ExitCode {
             report::note(&format!("it is complete in {:.0} s", record.after_s));
             report::print(&format!("{}\n", record.id))
         }
-        Err(message) => {
-            report::error(&message);
-            ExitCode::from(EXIT_FAILED)
-        }
+        Err(message) => report::failed(&message),
     }
 }

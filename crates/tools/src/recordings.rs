@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use super::{DEFAULT_CONFIG, EXIT_CONFIG, EXIT_FAILED, report};
+use super::{DEFAULT_CONFIG, EXIT_CONFIG, report};
 use crate::config::{Settings, environment};
 use crate::document::nearest;
 use crate::history::{Entry, Recording, export, pcapng, store};
@@ -81,8 +81,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 fn failed(message: &str) -> ExitCode {
-    report::error(message);
-    ExitCode::from(EXIT_FAILED)
+    report::failed(message)
 }
 
 /// The directory of the recordings.

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use hyper::StatusCode;
 
 use super::client::{Asked, Client};
-use super::{ConfigFile, EXIT_CONFIG, EXIT_FAILED, report};
+use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::config::{Settings, environment};
 use crate::north::http::messages::ReloadOutcome;
 use crate::north::local::SocketPath;
@@ -26,10 +26,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     super::block_on(async {
         match reload(&args.config.path).await {
             Ok(outcome) => reported(&outcome),
-            Err(why) => {
-                report::error(&why);
-                ExitCode::from(EXIT_FAILED)
-            }
+            Err(why) => report::failed(&why),
         }
     })
 }

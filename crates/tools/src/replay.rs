@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::broadcast;
 
-use super::{ConfigFile, EXIT_CONFIG, EXIT_DATA, EXIT_FAILED, EXIT_USAGE, report};
+use super::{ConfigFile, EXIT_CONFIG, EXIT_DATA, report};
 use crate::bus::listener::ListenCore;
 use crate::command::{CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings, environment};
@@ -53,17 +53,11 @@ pub(super) fn run(args: &Args) -> ExitCode {
     };
     let bus = match chosen(settings, args.bus.as_deref()) {
         Ok(bus) => bus,
-        Err(message) => {
-            report::error(&message);
-            return ExitCode::from(EXIT_USAGE);
-        }
+        Err(message) => return report::misused(&message),
     };
     let file = match read(&args.capture) {
         Ok(file) => file,
-        Err(message) => {
-            report::error(&message);
-            return ExitCode::from(EXIT_FAILED);
-        }
+        Err(message) => return report::failed(&message),
     };
     let packets = match capture::read(&file) {
         Ok(capture) => {
@@ -83,13 +77,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
             return ExitCode::from(EXIT_DATA);
         }
     };
-    match play(bus, &packets, settings.stale_after) {
-        Ok(text) => report::print(&text),
-        Err(message) => {
-            report::error(&message);
-            ExitCode::from(EXIT_FAILED)
-        }
-    }
+    report::outcome(play(bus, &packets, settings.stale_after))
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, String> {

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use comfy_table::{CellAlignment, ContentArrangement, Table, TableComponent, presets};
 
-use super::{EXIT_FAILED, log, printable};
+use super::{EXIT_FAILED, EXIT_USAGE, log, printable};
 use crate::config::Loaded;
 use crate::document::{Finding, Problem, parse_duration};
 
@@ -21,12 +21,9 @@ pub(super) fn print_bytes(bytes: &[u8]) -> ExitCode {
     match stdout.write_all(bytes).and_then(|()| stdout.flush()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
-        Err(why) => {
-            error(&format!(
-                "cannot write the output: {why}; stdout; free space, or redirect it"
-            ));
-            ExitCode::from(EXIT_FAILED)
-        }
+        Err(why) => failed(&format!(
+            "cannot write the output: {why}; stdout; free space, or redirect it"
+        )),
     }
 }
 
@@ -38,6 +35,26 @@ pub(super) fn duration(text: &str) -> Result<Duration, Finding> {
 /// Prints `error: what; where; what to do` to stderr.
 pub(super) fn error(message: &str) {
     line("error", message);
+}
+
+/// Reports a failure.
+pub(super) fn failed(message: &str) -> ExitCode {
+    error(message);
+    ExitCode::from(EXIT_FAILED)
+}
+
+/// Reports a wrong command line.
+pub(super) fn misused(message: &str) -> ExitCode {
+    error(message);
+    ExitCode::from(EXIT_USAGE)
+}
+
+/// Prints a text, or reports why there is none.
+pub(super) fn outcome(text: Result<String, String>) -> ExitCode {
+    match text {
+        Ok(text) => print(&text),
+        Err(message) => failed(&message),
+    }
 }
 
 /// Prints a warning to stderr.

@@ -12,7 +12,7 @@ use std::process::ExitCode;
 use self::staging::Staging;
 use super::archive::{self, Manifest, Root};
 use super::client::{Asked, Client};
-use super::{ConfigFile, EXIT_CONFIG, EXIT_FAILED, report};
+use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::config::{Loaded, Settings, environment};
 
 /// Sets a gateway up again from a file that `backup` wrote.
@@ -61,10 +61,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
             report::note("nothing was restored");
             ExitCode::from(EXIT_CONFIG)
         }
-        Err(Refused::Because(why)) => {
-            report::error(&format!("{why}; {}", args.file.display()));
-            ExitCode::from(EXIT_FAILED)
-        }
+        Err(Refused::Because(why)) => report::failed(&format!("{why}; {}", args.file.display())),
     }
 }
 

@@ -15,7 +15,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::loading::Loading;
 use super::log::LogHandle;
-use super::{EXIT_CONFIG, EXIT_FAILED, VERSION, report};
+use super::{EXIT_CONFIG, VERSION, report};
 use crate::config::{Loaded, Settings};
 use crate::daemon::Daemon;
 use crate::north::local::Control;
@@ -31,10 +31,9 @@ pub(super) struct Args {
 /// Runs the daemon until SIGTERM or SIGINT.
 pub(super) fn run(args: &Args) -> ExitCode {
     run_from(args.config.path()).unwrap_or_else(|why| {
-        report::error(&format!(
+        report::failed(&format!(
             "cannot start: {why}; free memory, threads or file descriptors"
-        ));
-        ExitCode::from(EXIT_FAILED)
+        ))
     })
 }
 
@@ -85,10 +84,7 @@ async fn serve(settings: Settings, path: &Path, log: &LogHandle, signals: Signal
     let (control, orders) = Control::new(path);
     let daemon = match Daemon::start_with(settings, Some(control)).await {
         Ok(daemon) => daemon,
-        Err(error) => {
-            report::error(&error.to_string());
-            return ExitCode::from(EXIT_FAILED);
-        }
+        Err(error) => return report::failed(&error.to_string()),
     };
     tracing::info!(target: "drivegate::cli::run", gateway, buses, "drivegate runs");
     notify(&[NotifyState::Ready]);

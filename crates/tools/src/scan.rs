@@ -17,7 +17,7 @@ pub(super) use self::search::{Extent, Heard, Search};
 pub(super) use self::settings::{Options, Setting, parse_port, protocols};
 pub(super) use self::snippet::{Snippet, absolute};
 use super::adapters::persistent_name;
-use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use super::{EXIT_CONFIG, EXIT_FAILED, report};
 use crate::bus::Mode;
 use crate::drive::profile::Profiles;
 
@@ -60,10 +60,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
 
 /// The settings to try and all profiles, or an exit code; what is wrong was reported.
 pub(super) fn prepare(options: &Options, port: &str) -> Result<(Vec<Setting>, Profiles), ExitCode> {
-    let settings = settings::settings(options, port).map_err(|message| {
-        report::error(&message);
-        ExitCode::from(EXIT_USAGE)
-    })?;
+    let settings = settings::settings(options, port).map_err(|message| report::misused(&message))?;
     let mut profiles = Profiles::built_in();
     let problems: Vec<_> = options.profile_dir.iter().flat_map(|dir| profiles.load(dir)).collect();
     if !problems.is_empty() {
@@ -105,8 +102,7 @@ fn finish(args: &Args, tried: &[Setting], search: &Search<'_>, outcome: Result<(
         report::print(&configuration(&args.port, &args.options, search))
     };
     if let Err(message) = outcome {
-        report::error(&message);
-        return ExitCode::from(EXIT_FAILED);
+        return report::failed(&message);
     }
     if search.found.is_empty() {
         report::error(&verdict::nobody_answers(&search.heard, &args.port));

@@ -3,7 +3,7 @@
 mod watch;
 
 use super::addresses::{Addresses, parse_addresses};
-use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use super::{EXIT_CONFIG, report};
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{self, BusSettings, Settings, default_format};
 use crate::document::{self, Problem, nearest};
@@ -227,7 +227,10 @@ fn configured(file: &Path) -> Result<Vec<SimulatedBusOptions>, ExitCode> {
     report::problems(&loaded);
     let settings = loaded.settings.ok_or(ExitCode::from(EXIT_CONFIG))?;
     let lines: Result<Vec<SimulatedBusOptions>, String> = settings.buses.iter().map(line_of).collect();
-    lines.map_err(|message| failed(EXIT_CONFIG, &message))
+    lines.map_err(|message| {
+        report::error(&message);
+        ExitCode::from(EXIT_CONFIG)
+    })
 }
 
 fn line_of(bus: &BusSettings) -> Result<SimulatedBusOptions, String> {
@@ -254,7 +257,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
         },
         None => match args.line() {
             Ok(line) => vec![line],
-            Err(message) => return failed(EXIT_USAGE, &message),
+            Err(message) => return report::misused(&message),
         },
     };
     let start = |line: SimulatedBusOptions| {
@@ -271,13 +274,8 @@ pub(super) fn run(args: &Args) -> ExitCode {
     let served = started.and_then(|lines| watch::serve(&lines).map_err(|error| format!("cannot simulate: {error}")));
     match served {
         Ok(()) => ExitCode::SUCCESS,
-        Err(message) => failed(EXIT_FAILED, &message),
+        Err(message) => report::failed(&message),
     }
-}
-
-fn failed(code: u8, message: &str) -> ExitCode {
-    report::error(message);
-    ExitCode::from(code)
 }
 
 impl Args {

@@ -37,10 +37,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
                     false => ExitCode::from(EXIT_FAILED),
                 }
             }
-            Err(why) => {
-                report::error(&why);
-                ExitCode::from(EXIT_FAILED)
-            }
+            Err(why) => report::failed(&why),
         }
     })
 }

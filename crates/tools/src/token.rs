@@ -1,11 +1,11 @@
 //! `drivegate token`: the access tokens of the HTTP server.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
-use super::credentials_file::{CredentialsFile, with_line, without};
-use super::{EXIT_FAILED, report};
-use crate::north::http::{Scope, Token, Tokens};
+use super::credentials_file::CredentialsFile;
+use super::report;
+use crate::north::http::{Scope, Token};
 
 /// Adds, lists and removes access tokens of the HTTP server
 ///
@@ -59,63 +59,35 @@ struct TokenFile {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let done = match &args.action {
-        Action::Add { file, scopes, name } => add(&file.path, name, scopes),
-        Action::List { file } => list(&file.path),
-        Action::Remove { file, name } => remove(&file.path, name),
-    };
-    match done {
-        Ok(text) => report::print(&text),
-        Err(message) => {
-            report::error(&message);
-            ExitCode::from(EXIT_FAILED)
+    report::outcome(match &args.action {
+        Action::Add { file, scopes, name } => add(file, name, scopes),
+        Action::List { file } => list(file),
+        Action::Remove { file, name } => file.open().remove::<Token>(name).map(|()| String::new()),
+    })
+}
+
+impl TokenFile {
+    fn open(&self) -> CredentialsFile<'_> {
+        CredentialsFile {
+            what: "token",
+            path: &self.path,
+            mode: 0o640,
         }
     }
 }
 
-fn file(path: &Path) -> CredentialsFile<'_> {
-    CredentialsFile {
-        what: "token",
-        path,
-        mode: 0o640,
-    }
-}
-
-fn add(path: &Path, name: &str, scopes: &[Scope]) -> Result<String, String> {
-    let shown = path.display();
-    let (token, secret) =
-        Token::generate(name, scopes.to_vec()).map_err(|error| format!("{error}; {shown}; choose another name"))?;
-    file(path).change(|text| {
-        let text = with_line(text, &token.to_string());
-        Tokens::parse(&text).map_err(|(_, error)| format!("{error}; {shown}; choose another name"))?;
-        Ok(text)
-    })?;
+fn add(file: &TokenFile, name: &str, scopes: &[Scope]) -> Result<String, String> {
+    let (token, secret) = Token::generate(name, scopes.to_vec())
+        .map_err(|error| format!("{error}; {}; choose another name", file.path.display()))?;
+    file.open().put(&token, false)?;
     Ok(format!("{secret}\n"))
 }
 
-fn list(path: &Path) -> Result<String, String> {
-    let tokens = tokens(path, &file(path).read()?)?;
+fn list(file: &TokenFile) -> Result<String, String> {
     let mut table = report::table(["name", "scopes"]);
-    for token in tokens.list() {
+    for token in file.open().list::<Token>()?.list() {
         let scopes: Vec<&str> = token.scopes.iter().map(|scope| scope.name()).collect();
         table.add_row([token.name.clone(), scopes.join(", ")]);
     }
     Ok(report::lines(&table))
-}
-
-fn remove(path: &Path, name: &str) -> Result<String, String> {
-    file(path).change(|text| {
-        if tokens(path, text)?.list().iter().any(|token| token.name == name) {
-            return Ok(without(text, name));
-        }
-        Err(format!(
-            "there is no token `{name}`; {}; `drivegate token list` shows them",
-            path.display()
-        ))
-    })?;
-    Ok(String::new())
-}
-
-fn tokens(path: &Path, text: &str) -> Result<Tokens, String> {
-    Tokens::parse(text).map_err(|(line, error)| format!("{error}; {}:{line}; remove the line", path.display()))
 }

@@ -13,7 +13,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use self::pcap::Capture;
 use super::client::{EventStream, Gateway, encoded};
-use super::{EXIT_FAILED, printable, report};
+use super::{printable, report};
 use crate::process_image::Direction;
 
 /// Interval at which the capture is flushed.
@@ -47,10 +47,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     super::block_on(async {
         match trace(args).await {
             Ok(()) => ExitCode::SUCCESS,
-            Err(message) => {
-                report::error(&message);
-                ExitCode::from(EXIT_FAILED)
-            }
+            Err(message) => report::failed(&message),
         }
     })
 }

@@ -14,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 
 use self::dialog::{check_new, choose_port};
 use super::scan::{self, Extent, Options, Search, parse_port, verdict};
-use super::{EXIT_FAILED, EXIT_USAGE, report};
+use super::{EXIT_FAILED, report};
 
 /// How long the line is listened to before anything is sent.
 const LISTEN: Duration = Duration::from_secs(1);
@@ -78,13 +78,8 @@ impl Stop {
 pub(super) fn run(args: &Args) -> ExitCode {
     match Stop::on_signals() {
         Ok(stop) => attempt(args, &stop).unwrap_or_else(|code| code),
-        Err(message) => failed(EXIT_FAILED, &message),
+        Err(message) => report::failed(&message),
     }
-}
-
-fn failed(code: u8, message: &str) -> ExitCode {
-    report::error(message);
-    ExitCode::from(code)
 }
 
 /// The end before anything was found.
@@ -95,7 +90,7 @@ fn stopped() -> ExitCode {
 
 fn attempt(args: &Args, stop: &Stop) -> Result<ExitCode, ExitCode> {
     if let Some(file) = &args.write {
-        check_new(file).map_err(|message| failed(EXIT_USAGE, &message))?;
+        check_new(file).map_err(|message| report::misused(&message))?;
     }
     let port = match &args.port {
         Some(port) => port.clone(),
@@ -115,12 +110,12 @@ fn attempt(args: &Args, stop: &Stop) -> Result<ExitCode, ExitCode> {
         None if stop.is_wanted() => Ok(()),
         None => search.run(&settings, Extent::OneSetting),
     });
-    outcome.map_err(|message| failed(EXIT_FAILED, &message))?;
+    outcome.map_err(|message| report::failed(&message))?;
     if stop.is_wanted() {
         return Err(stopped());
     }
     if search.found.is_empty() {
-        let code = failed(EXIT_FAILED, &verdict::nobody_answers(&search.heard, &port));
+        let code = report::failed(&verdict::nobody_answers(&search.heard, &port));
         report::lines_to_stderr(&verdict::at_silent_drives(&search.heard, &settings, &search.profiles));
         return Err(code);
     }

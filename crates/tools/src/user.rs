@@ -1,14 +1,14 @@
 //! `drivegate user`: the users who may command over HTTP.
 
 use std::io::{self, BufRead, IsTerminal, Read, Write};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
 
-use super::credentials_file::{CredentialsFile, with_line, without};
-use super::{EXIT_FAILED, report};
-use crate::north::http::{MAX_PASSWORD, User, Users};
+use super::credentials_file::CredentialsFile;
+use super::report;
+use crate::north::http::{MAX_PASSWORD, User};
 
 /// Adds, lists and removes the users who may command over HTTP
 ///
@@ -59,82 +59,42 @@ struct UsersFile {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let done = match &args.action {
-        Action::Add { file, name } => add(&file.path, name),
-        Action::List { file } => list(&file.path),
-        Action::Remove { file, name } => remove(&file.path, name),
-    };
-    match done {
-        Ok(text) => report::print(&text),
-        Err(message) => {
-            report::error(&message);
-            ExitCode::from(EXIT_FAILED)
+    report::outcome(match &args.action {
+        Action::Add { file, name } => add(file, name),
+        Action::List { file } => list(file),
+        Action::Remove { file, name } => {
+            let removed = file.open().remove::<User>(name);
+            removed.map(|()| format!("{name} was removed; reload the gateway\n"))
+        }
+    })
+}
+
+impl UsersFile {
+    fn open(&self) -> CredentialsFile<'_> {
+        CredentialsFile {
+            what: "users",
+            path: &self.path,
+            mode: 0o600,
         }
     }
 }
 
-fn file(path: &Path) -> CredentialsFile<'_> {
-    CredentialsFile {
-        what: "users",
-        path,
-        mode: 0o600,
-    }
-}
-
-fn add(path: &Path, name: &str) -> Result<String, String> {
-    let shown = path.display();
-    if path.exists() {
+fn add(file: &UsersFile, name: &str) -> Result<String, String> {
+    if file.path.exists() {
         // Before a password is asked for.
-        users(path, &file(path).read()?)?;
+        file.open().list::<User>()?;
     }
-    let password = password()?;
-    let user = User::new(name, &password).map_err(|error| format!("{error}; {shown}; choose another"))?;
-    let line = user.to_string();
-    let mut is_known = false;
-    file(path).change(|text| {
-        is_known = has(&users(path, text)?, name);
-        let replaced = |old: &str| match old.split_whitespace().next() == Some(name) {
-            true => format!("{line}\n"),
-            false => format!("{old}\n"),
-        };
-        let text = match is_known {
-            false => with_line(text, &line),
-            true => text.lines().map(replaced).collect(),
-        };
-        Users::parse(&text).map_err(|(_, error)| format!("{error}; {shown}; remove one"))?;
-        Ok(text)
-    })?;
-    Ok(match is_known {
+    let user =
+        User::new(name, &password()?).map_err(|error| format!("{error}; {}; choose another", file.path.display()))?;
+    Ok(match file.open().put(&user, true)? {
         true => format!("{name} has another password; reload the gateway\n"),
         false => format!("{name} was added; reload the gateway\n"),
     })
 }
 
-fn list(path: &Path) -> Result<String, String> {
-    let names = users(path, &file(path).read()?)?;
-    let lines = names.list().iter().map(|user| format!("{}\n", user.name));
-    Ok(lines.collect())
-}
-
-fn remove(path: &Path, name: &str) -> Result<String, String> {
-    file(path).change(|text| {
-        if has(&users(path, text)?, name) {
-            return Ok(without(text, name));
-        }
-        Err(format!(
-            "there is no user `{name}`; {}; `drivegate user list` shows them",
-            path.display()
-        ))
-    })?;
-    Ok(format!("{name} was removed; reload the gateway\n"))
-}
-
-fn has(users: &Users, name: &str) -> bool {
-    users.list().iter().any(|user| user.name == name)
-}
-
-fn users(path: &Path, text: &str) -> Result<Users, String> {
-    Users::parse(text).map_err(|(line, error)| format!("{error}; {}:{line}; remove the line", path.display()))
+fn list(file: &UsersFile) -> Result<String, String> {
+    let users = file.open().list::<User>()?;
+    Ok(users.list().iter().map(|user| format!("{}\n", user.name)).collect())
 }
 
 /// The password: typed twice without echo on a terminal, else the first line of standard input.

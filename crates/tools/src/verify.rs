@@ -6,7 +6,7 @@ use std::time::SystemTime;
 
 use super::client::Gateway;
 use super::drive_access::{Target, target};
-use super::{EXIT_FAILED, printable, profiles, read, report};
+use super::{printable, profiles, read, report};
 use crate::drive::{ModelPoint, Profile};
 use crate::north::http::messages::PointValue;
 
@@ -29,13 +29,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Ok(target) => target,
         Err(code) => return code,
     };
-    match form(&target) {
-        Ok(text) => report::print(&text),
-        Err(message) => {
-            report::error(&message);
-            ExitCode::from(EXIT_FAILED)
-        }
-    }
+    report::outcome(form(&target))
 }
 
 fn form(target: &Target) -> Result<String, String> {

@@ -8,7 +8,7 @@ use serde_json::Value;
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::client::{Client, Gateway};
-use super::{EXIT_FAILED, printable, report};
+use super::{printable, report};
 
 /// Refresh interval.
 const PAUSE: Duration = Duration::from_millis(500);
@@ -33,10 +33,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     super::block_on(async {
         match watch(args).await {
             Ok(code) => code,
-            Err(message) => {
-                report::error(&message);
-                ExitCode::from(EXIT_FAILED)
-            }
+            Err(message) => report::failed(&message),
         }
     })
 }

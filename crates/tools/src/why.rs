@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::client::{Asked, Gateway};
 use super::drive_access::{Needs, Target, target};
-use super::{EXIT_FAILED, printable, report};
+use super::{printable, report};
 use crate::north::http::messages::Why;
 
 /// Says why a drive does not run: each cause with its evidence, its age and what to do.
@@ -35,10 +35,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     match why(&target) {
         Ok(why) if args.json => report::print(&(serde_json::to_string_pretty(&why).unwrap_or_default() + "\n")),
         Ok(why) => report::print(&text(&args.drive, &why)),
-        Err(message) => {
-            report::error(&message);
-            ExitCode::from(EXIT_FAILED)
-        }
+        Err(message) => report::failed(&message),
     }
 }
 

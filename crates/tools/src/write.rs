@@ -7,7 +7,7 @@ use serde_json::Value as Json;
 
 use super::client::{Asked, Gateway};
 use super::drive_access::{Needs, Target, Way, point, target};
-use super::{EXIT_FAILED, EXIT_USAGE, printable, report};
+use super::{printable, report};
 use crate::drive::model::Kind;
 use crate::drive::{Point, Profile, RESTART_COMMUNICATION, Value};
 use crate::process_image::value_or_null;
@@ -74,18 +74,9 @@ pub(super) fn run(args: &Args) -> ExitCode {
     let settings: Result<Vec<Setting>, String> = args.values.iter().map(setting).collect();
     let settings = match settings {
         Ok(settings) => settings,
-        Err(message) => {
-            report::error(&message);
-            return ExitCode::from(EXIT_USAGE);
-        }
+        Err(message) => return report::misused(&message),
     };
-    match command(&target, &settings) {
-        Ok(text) => report::print(&text),
-        Err(message) => {
-            report::error(&message);
-            ExitCode::from(EXIT_FAILED)
-        }
-    }
+    report::outcome(command(&target, &settings))
 }
 
 /// `speed_reference=50`, `run=true`, `mode=auto`.

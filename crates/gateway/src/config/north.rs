@@ -7,7 +7,7 @@ use std::time::SystemTime;
 use super::keys::HTTP;
 use super::{files, values};
 use crate::document::{Finding, Place, Reader};
-use crate::north::http::{self, Tokens, Users};
+use crate::north::http::{self, Credential, Credentials, Tokens, Users};
 use crate::north::{ServerIdentity, TlsFile};
 
 /// An address that a server listens on, and its place.
@@ -67,45 +67,42 @@ pub(super) fn parse_host(text: &str) -> Result<String, Finding> {
 fn read_tokens(reader: &Reader<'_>, base: &Path) -> Option<Tokens> {
     let key = &HTTP.tokens_file;
     let path = values::resolved(base, key.read(reader)?);
-    let text = std::fs::read_to_string(&path).map_err(|error| files::cannot_read(&path, &error));
-    let text = reader.accept(key.name, text)?;
-    match Tokens::parse(&text) {
-        Ok(tokens) => {
-            if tokens.list().is_empty() {
-                let what = format!("{} contains no token, so every request is refused", path.display());
-                reader.warning(key.name, what, "add one with `drivegate token add`");
-            }
-            Some(tokens)
-        }
-        Err((line, error)) => {
-            let remedy = "remove the line, and make another with `drivegate token add`";
-            reader.problem(key.name, format!("{}:{line}: {error}", path.display()), remedy);
-            None
-        }
-    }
+    credentials(reader, key.name, &path, "every request is refused")
 }
 
 fn read_users(reader: &Reader<'_>, base: &Path) -> Option<Users> {
     let key = &HTTP.users_file;
     let path = values::resolved(base, key.read(reader)?);
     files::warn_of_readers(reader, key.name, &path);
-    let text = std::fs::read_to_string(&path).map_err(|error| files::cannot_read(&path, &error));
-    let text = reader.accept(key.name, text)?;
-    match Users::parse(&text) {
-        Ok(users) => {
-            if users.list().is_empty() {
-                let what = format!("{} contains no user, so nobody can log in", path.display());
-                reader.warning(key.name, what, "add one with `drivegate user add`");
+    let users = credentials(reader, key.name, &path, "nobody can log in")?;
+    if !HTTP.commands.get(reader) {
+        let what = "the users are not used while `commands` is off";
+        reader.warning(key.name, what, "set commands = true, or remove users_file");
+    }
+    Some(users)
+}
+
+/// What a file of tokens or users says; `without` it, something is so.
+fn credentials<C: Credential>(
+    reader: &Reader<'_>,
+    key: &'static str,
+    path: &Path,
+    without: &str,
+) -> Option<Credentials<C>> {
+    let text = std::fs::read_to_string(path).map_err(|error| files::cannot_read(path, &error));
+    let text = reader.accept(key, text)?;
+    let (path, kind) = (path.display(), C::KIND);
+    match Credentials::parse(&text) {
+        Ok(all) => {
+            if all.list().is_empty() {
+                let what = format!("{path} contains no {kind}, so {without}");
+                reader.warning(key, what, format!("add one with `drivegate {kind} add`"));
             }
-            if !HTTP.commands.get(reader) {
-                let what = "the users are not used while `commands` is off";
-                reader.warning(key.name, what, "set commands = true, or remove users_file");
-            }
-            Some(users)
+            Some(all)
         }
         Err((line, error)) => {
-            let remedy = "remove the line, and make another with `drivegate user add`";
-            reader.problem(key.name, format!("{}:{line}: {error}", path.display()), remedy);
+            let remedy = format!("remove the line, and make another with `drivegate {kind} add`");
+            reader.problem(key, format!("{path}:{line}: {error}"), remedy);
             None
         }
     }

@@ -147,11 +147,6 @@ impl Server {
     pub fn address(&self) -> SocketAddr {
         self.address
     }
-
-    /// Waits until it has ended, after the cancellation.
-    pub async fn stopped(&self) {
-        self.tasks.wait().await;
-    }
 }
 
 impl server::Server for Server {
@@ -188,7 +183,7 @@ impl server::Server for Server {
     }
 
     async fn stopped(self) {
-        Server::stopped(&self).await;
+        self.tasks.wait().await;
     }
 }
 

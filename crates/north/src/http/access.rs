@@ -2,13 +2,12 @@
 
 use std::net::IpAddr;
 
-use axum::Json;
 use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
 use axum::http::{StatusCode, Uri};
 use axum::response::{IntoResponse, Response};
 
 use super::hosts::{Host, Hosts};
-use super::messages::ErrorReply;
+use super::replies::refused;
 use super::tokens::{Scope, Tokens};
 
 /// Who is answered.
@@ -124,8 +123,7 @@ impl IntoResponse for AccessError {
                 Some("Bearer realm=\"drivegate\", error=\"insufficient_scope\""),
             ),
         };
-        let error = ErrorReply::new(self.to_string());
-        let mut response = (status, Json(error)).into_response();
+        let mut response = refused(status, self.to_string()).into_response();
         const CHALLENGE: HeaderName = header::WWW_AUTHENTICATE;
         response
             .headers_mut()

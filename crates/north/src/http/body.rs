@@ -2,23 +2,35 @@
 
 use std::time::{Duration, Instant};
 
-use axum::Json;
 use axum::body::{Body, Bytes, to_bytes};
+use axum::extract::{FromRequest, Request};
 use axum::http::StatusCode;
-use axum::response::{IntoResponse, Response};
 use tokio::time::timeout;
 
-use super::messages::ErrorReply;
+use super::replies::{Refused, Replied, refused};
 use super::routes::Reached;
+use crate::command_json::MAX_PAYLOAD;
 
 /// Time limit for the body of a request, from its head on.
 const TIMEOUT: Duration = Duration::from_secs(5);
+
+/// A body of at most so many bytes, as an argument of a handler.
+pub(super) struct Payload<const MOST: usize = MAX_PAYLOAD>(pub(super) Bytes);
+
+impl<S: Sync, const MOST: usize> FromRequest<S> for Payload<MOST> {
+    type Rejection = Refused;
+
+    async fn from_request(request: Request, _: &S) -> Replied<Payload<MOST>> {
+        let (parts, body) = request.into_parts();
+        Ok(Payload(read(body, &Reached::of(&parts)?, MOST).await?))
+    }
+}
 
 /// The body of at most `most` bytes. Until it is complete the connection is not in use: it yields to others.
 ///
 /// # Errors
 /// The reply to a body that is too long, incomplete or too slow.
-pub(super) async fn read(body: Body, reached: &Reached, most: usize) -> Result<Bytes, Response> {
+pub(super) async fn read(body: Body, reached: &Reached, most: usize) -> Replied<Bytes> {
     let in_use = |in_use| {
         if let Some(place) = &reached.place {
             place.use_at(Instant::now(), in_use);
@@ -38,6 +50,5 @@ pub(super) async fn read(body: Body, reached: &Reached, most: usize) -> Result<B
             format!("the body did not arrive within {} s", TIMEOUT.as_secs()),
         ),
     };
-    let error = ErrorReply::new(error);
-    Err((status, Json(error)).into_response())
+    Err(refused(status, error))
 }

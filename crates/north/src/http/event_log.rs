@@ -5,11 +5,11 @@ use std::time::{Duration, SystemTime};
 
 use axum::Json;
 use axum::extract::{RawQuery, State};
-use axum::http::StatusCode;
-use axum::response::{IntoResponse, Response};
+use axum::response::IntoResponse;
 use serde::Serialize;
 
 use super::query::{self, QueryError};
+use super::replies::Replied;
 use super::routes::AppState;
 use crate::event::{Before, Event, EventKind, RecordingMade, Search};
 use crate::history::{Entry, Recordings};
@@ -56,17 +56,14 @@ fn search(query: Option<&str>, now: SystemTime) -> Result<Search, QueryError> {
 }
 
 /// The events that match, newest first.
-pub(super) async fn log(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
-    let search = match search(query.as_deref(), SystemTime::now()) {
-        Ok(search) => search,
-        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
-    };
+pub(super) async fn log(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Replied {
+    let search = search(query.as_deref(), SystemTime::now())?;
     let _turn = app.turn().await;
     let plant = app.plant.load();
     let found = plant.events.search(&search);
     let recorded = Recorded::new(&plant.recordings);
     let shown: Vec<Shown<'_>> = found.iter().map(|event| recorded.show(event)).collect();
-    Json(shown).into_response()
+    Ok(Json(shown).into_response())
 }
 
 /// An event, with the recording that shows it.

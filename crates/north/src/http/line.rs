@@ -5,23 +5,21 @@ use std::time::SystemTime;
 
 use axum::Json;
 use axum::extract::{Path, State};
-use axum::response::{IntoResponse, Response};
+use axum::response::IntoResponse;
 use serde::Serialize;
 
 use super::api::{self, fine_millis, rounded};
-use super::routes::{AppState, not_found};
+use super::replies::{Replied, find_bus};
+use super::routes::AppState;
 use crate::history::Clock;
 use crate::history::line::{Exchanges, Figures, LastHour, LineHistory, STEP};
 use crate::plant::BusHandle;
 use crate::process_image::HistogramSnapshot;
 
 /// One bus, its statistics, and what they were minute by minute.
-pub(super) async fn bus(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
+pub(super) async fn bus(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Replied {
     let plant = app.plant.load();
-    let Some(handle) = plant.buses.iter().find(|bus| bus.image.spec.name == name) else {
-        let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
-        return not_found(format!("there is no bus `{name}`"), known.collect());
-    };
+    let handle = find_bus(&plant, &name)?;
     let _turn = app.turn().await;
     let clock = Clock::read();
     let line = plant.history.line(&name);
@@ -30,7 +28,7 @@ pub(super) async fn bus(State(app): State<Arc<AppState>>, Path(name): Path<Strin
         // It is being started.
         None => LineHistory::new(&handle.image, clock).last_hour(clock),
     };
-    Json(Line::new(handle, hour)).into_response()
+    Ok(Json(Line::new(handle, hour)).into_response())
 }
 
 #[derive(Debug, Serialize, utoipa::ToSchema)]

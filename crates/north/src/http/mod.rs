@@ -6,6 +6,7 @@
 mod access;
 mod api;
 mod body;
+mod credentials;
 mod event_log;
 mod expect;
 mod hosts;
@@ -20,6 +21,7 @@ mod params;
 mod points;
 mod query;
 mod recordings;
+mod replies;
 mod routes;
 mod socket_door;
 mod streams;
@@ -27,6 +29,7 @@ mod terms;
 mod tokens;
 mod trend;
 mod users;
+mod views;
 
 use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;
@@ -66,9 +69,10 @@ use crate::history::History;
 use crate::plant::{DriveHandle, SharedPlant};
 use crate::server::{self, Reconfigure};
 
+pub use self::credentials::{Credential, CredentialError, Credentials};
 pub use self::offline::Offline;
-pub use self::tokens::{Scope, Token, TokenError, Tokens};
-pub use self::users::{MAX_PASSWORD, MIN_PASSWORD, User, UserError, Users};
+pub use self::tokens::{Scope, Token, Tokens};
+pub use self::users::{MAX_PASSWORD, MIN_PASSWORD, User, Users};
 
 /// Maximum number of open connections. A connection whose request is incomplete, and one between two requests, yields to
 /// a newer one.
@@ -186,11 +190,6 @@ impl Http {
         let [plain, tls] = [false, true].map(|tls| self.listeners.addresses(tls));
         plain.into_iter().chain(tls).next()
     }
-
-    /// Waits until the server has stopped: at most half a second after the token was cancelled.
-    pub async fn stopped(self) {
-        self.tasks.wait().await;
-    }
 }
 
 impl server::Server for Http {
@@ -225,8 +224,9 @@ impl server::Server for Http {
         Ok(http)
     }
 
+    /// Takes at most half a second.
     async fn stopped(self) {
-        self.stopped().await;
+        self.tasks.wait().await;
     }
 }
 

@@ -4,13 +4,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::Json;
-use axum::extract::{Extension, Path, RawQuery, State};
-use axum::http::{HeaderMap, StatusCode};
-use axum::response::{IntoResponse, Response};
+use axum::extract::{Path, RawQuery, State};
 
 use super::messages::{PointValue, Word};
+use super::operating::Viewer;
 use super::query;
-use super::routes::{AppState, Reached, no_drive, not_found};
+use super::replies::{Replied, not_found};
+use super::routes::AppState;
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{self, Authority, Order, Origin};
 use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source};
@@ -26,28 +26,17 @@ const FORWARDED: Duration = Duration::from_secs(10);
 /// command it.
 pub(super) async fn points(
     State(app): State<Arc<AppState>>,
-    Extension(reached): Extension<Reached>,
     Path(name): Path<String>,
     RawQuery(query): RawQuery,
-    headers: HeaderMap,
-) -> Response {
-    let names = match query::parameters(query.as_deref(), &["names"]) {
-        Ok([names]) => names.unwrap_or_default(),
-        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
-    };
+    viewer: Replied<Viewer>,
+) -> Replied<Json<Vec<PointValue>>> {
+    let [names] = query::parameters(query.as_deref(), &["names"])?;
+    let names = names.unwrap_or_default();
     let names: Vec<&str> = names.split(',').filter(|name| !name.is_empty()).collect();
-    let plant = app.plant.load_full();
-    let Some(drive) = plant.drive(&name) else {
-        return no_drive(&plant, &name);
-    };
-    let wanted = match wanted(&drive.image.spec.profile, &names) {
-        Ok(wanted) => wanted,
-        Err(why) => return not_found(why, Vec::new()),
-    };
-    let cookies = app.cookies(&reached);
-    let operator = app.operating.operator(&headers, &cookies, &reached).await.ok();
-    let origin = operator.map(|operator| operator.origin());
-    Json(read(&drive, wanted, origin).await).into_response()
+    let drive = app.drive(&name)?;
+    let wanted = wanted(&drive.image.spec.profile, &names).map_err(|why| not_found(why, Vec::new()))?;
+    let origin = viewer.ok().map(|Viewer(operator)| operator.origin());
+    Ok(Json(read(&drive, wanted, origin).await))
 }
 
 /// What is known of the points; those that are not polled are read as `origin`.

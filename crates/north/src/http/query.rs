@@ -3,9 +3,13 @@
 use std::collections::HashSet;
 use std::time::{Duration, SystemTime};
 
+use axum::Json;
+use axum::http::StatusCode;
+use axum::response::IntoResponse;
 use percent_encoding::percent_decode_str;
 
 use super::messages::ErrorReply;
+use super::replies::Refused;
 use crate::document::parse_duration;
 
 /// Why a query is not understood.
@@ -23,17 +27,15 @@ pub(super) enum QueryError {
     },
 }
 
-impl QueryError {
-    /// As a reply with status 400.
-    pub(super) fn reply(&self) -> ErrorReply {
-        let known = match self {
+impl From<QueryError> for Refused {
+    fn from(error: QueryError) -> Refused {
+        let known = match &error {
             QueryError::Unknown(_, known) => known.iter().map(|name| (*name).to_string()).collect(),
             _ => Vec::new(),
         };
-        ErrorReply {
-            error: self.to_string(),
-            known,
-        }
+        let error = error.to_string();
+        let reply = (StatusCode::BAD_REQUEST, Json(ErrorReply { error, known }));
+        reply.into_response().into()
     }
 }
 
@@ -108,8 +110,9 @@ mod tests {
         assert!(of("bus=%ff").is_ok(), "not a name, but valid");
         assert_eq!(of("bus=a&bus=b"), Err(QueryError::Twice("bus")));
         let unknown = of("line=1").unwrap_err();
-        assert_eq!(unknown.reply().known, ["bus", "from"]);
         assert_eq!(unknown.to_string(), "unknown parameter `line`");
+        let reply = Refused::from(unknown).into_response();
+        assert_eq!(reply.status(), StatusCode::BAD_REQUEST);
     }
 
     #[test]

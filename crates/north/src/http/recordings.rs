@@ -7,9 +7,9 @@ use axum::extract::{Path, RawQuery, State};
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 
-use super::messages::ErrorReply;
 use super::query::{self, QueryError};
-use super::routes::{AppState, not_found};
+use super::replies::{Replied, not_found, refused};
+use super::routes::AppState;
 use crate::history::{Recording, export, pcapng};
 
 /// The forms of a recording.
@@ -66,15 +66,12 @@ pub(super) async fn one(
     State(app): State<Arc<AppState>>,
     Path(id): Path<String>,
     RawQuery(query): RawQuery,
-) -> Response {
-    let form = match form(query.as_deref()) {
-        Ok(form) => form,
-        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
-    };
+) -> Replied {
+    let form = form(query.as_deref())?;
     let recordings = app.plant.load().recordings.clone();
     // Files are read and converted away from the tasks of other clients, one at a time.
     let Ok(_permit) = app.files.acquire().await else {
-        return StatusCode::SERVICE_UNAVAILABLE.into_response();
+        return Err(StatusCode::SERVICE_UNAVAILABLE.into());
     };
     let wanted = id.clone();
     let read = tokio::task::spawn_blocking(move || {
@@ -90,13 +87,10 @@ pub(super) async fn one(
             if let (Ok(named), true) = (named, form != Form::Json) {
                 response.headers_mut().insert(header::CONTENT_DISPOSITION, named);
             }
-            response
+            Ok(response)
         }
-        Ok(Some(Err(error))) => {
-            let error = ErrorReply::new(error.to_string());
-            (StatusCode::INTERNAL_SERVER_ERROR, Json(error)).into_response()
-        }
-        Ok(None) => not_found(format!("there is no recording `{id}`"), Vec::new()),
-        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+        Ok(Some(Err(error))) => Err(refused(StatusCode::INTERNAL_SERVER_ERROR, error.to_string())),
+        Ok(None) => Err(not_found(format!("there is no recording `{id}`"), Vec::new())),
+        Err(_) => Err(StatusCode::INTERNAL_SERVER_ERROR.into()),
     }
 }

@@ -1,42 +1,40 @@
 //! The routes of the HTTP server.
 
-use std::fmt::Write as _;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
-use std::time::{Instant, SystemTime};
+use std::time::Instant;
 
 use axum::Router;
-use axum::extract::{Extension, Path, RawQuery, Request, State};
+use axum::extract::{Extension, Request, State};
 use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
-use axum::http::{Method, StatusCode, Uri};
+use axum::http::{Method, StatusCode, Uri, request};
 use axum::middleware::{self, Next};
-use axum::response::{Html, IntoResponse, Response};
-use axum::{Json, response};
+use axum::response::{IntoResponse, Response};
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
 use super::access::{Access, AccessError};
 use super::hosts::Hosts;
 use super::messages::{
-    self, Health, ParameterReading, PointValue, ReadParameters, Recorded, ReloadOutcome, Restore, RestoreAct, Why,
+    Health, ParameterReading, PointValue, ReadParameters, Recorded, ReloadOutcome, Restore, RestoreAct, Why,
 };
 use super::openapi::{Api, Doc};
 use super::operating::{self, Cookies, Operating};
 use super::params::Parameters;
+use super::replies::Replied;
 use super::{
-    Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, expect, line, page, points, query, recordings,
-    streams, trend,
+    Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, expect, line, page, points, recordings,
+    replies, streams, trend, views,
 };
+use crate::NorthStats;
 use crate::command::{Proof, SourceKind};
 use crate::command_json::{CommandResult, HoldReply, StopBody};
 use crate::connection_limit::{ConnectionLimit, Limits, Place};
 use crate::history::Entry;
-use crate::local::control::{self, Control};
+use crate::local::control::Control;
 use crate::log_throttle::LogThrottle;
-use crate::parameters::ParameterFile;
-use crate::plant::{Plant, SharedPlant};
+use crate::plant::SharedPlant;
 use crate::stop_all::StopReport;
-use crate::{NorthStats, metrics, readiness};
 
 /// What all handlers share.
 #[derive(Debug)]
@@ -107,6 +105,15 @@ pub(super) struct Reached {
 const RELOAD: &str = "/api/v1/reload";
 
 impl Reached {
+    /// How the request with this head came.
+    ///
+    /// # Errors
+    /// No server has said so.
+    pub(super) fn of(head: &request::Parts) -> Replied<Reached> {
+        let reached = head.extensions.get().cloned();
+        reached.ok_or(StatusCode::INTERNAL_SERVER_ERROR.into())
+    }
+
     /// A request of this machine that came over no network: through the local socket, or from a test of the interface.
     pub(super) fn within(local: Option<LocalUser>, place: Option<Arc<Place>>) -> Reached {
         let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
@@ -143,7 +150,7 @@ pub(super) fn router(
     });
     described()
         .finished()
-        .fallback(unknown)
+        .fallback(views::unknown)
         .with_state(app.clone())
         .layer(middleware::from_fn_with_state(app, guard))
 }
@@ -155,9 +162,13 @@ fn described() -> Api {
     const POINT: &str = "names, separated by commas";
     const TIME: &str = "RFC 3339, seconds since 1970, or an age such as 10min";
     Api::new()
-        .get("/", Doc::text("Status page", "text/html"), status_page)
-        .get("/assets/{name}", Doc::text("A file of the status page", "*/*"), asset)
-        .get("/metrics", Doc::text("Metrics for Prometheus", TEXT), exposition)
+        .get("/", Doc::text("Status page", "text/html"), views::status_page)
+        .get(
+            "/assets/{name}",
+            Doc::text("A file of the status page", "*/*"),
+            views::asset,
+        )
+        .get("/metrics", Doc::text("Metrics for Prometheus", TEXT), views::exposition)
         .get(
             "/healthz",
             Doc::text("Whether the process is healthy", TEXT),
@@ -166,24 +177,28 @@ fn described() -> Api {
         .get(
             "/readyz",
             Doc::text("Whether the gateway is ready, else 503", TEXT),
-            ready,
+            views::ready,
         )
         .get(
             "/api/v1/health",
             Doc::object::<Health>("Whether the gateway is ready, and why not"),
-            health,
+            views::health,
         )
         .post(
             RELOAD,
             Doc::object::<ReloadOutcome>("Reads the configuration again; at the local socket only"),
-            reload,
+            views::reload,
         )
         .get(
             "/api/v1/drives",
             Doc::list::<api::Drive<'_>>("All drives").query(&[("points", POINT)]),
-            drives,
+            views::drives,
         )
-        .get("/api/v1/drives/{name}", Doc::object::<api::Drive<'_>>("A drive"), drive)
+        .get(
+            "/api/v1/drives/{name}",
+            Doc::object::<api::Drive<'_>>("A drive"),
+            views::drive,
+        )
         .get(
             "/api/v1/drives/{name}/points",
             Doc::list::<PointValue>("Points of a drive").query(&[("names", POINT)]),
@@ -192,7 +207,7 @@ fn described() -> Api {
         .get(
             "/api/v1/drives/{name}/why",
             Doc::object::<Why>("Why a drive does not run"),
-            why,
+            views::why,
         )
         .get(
             "/api/v1/drives/{name}/trend",
@@ -212,7 +227,7 @@ fn described() -> Api {
         .get(
             "/api/v1/drives/{name}/params",
             Doc::object::<Parameters<'_>>("The last reading of the parameters, and what goes on"),
-            params,
+            views::params,
         )
         .get(
             "/api/v1/drives/{name}/params/reading",
@@ -260,7 +275,7 @@ fn described() -> Api {
             Doc::object::<HoldReply<'_>>("Takes, renews, releases or breaks the hold").body::<operating::HoldAct>(),
             operating::hold,
         )
-        .get("/api/v1/buses", Doc::list::<api::Bus<'_>>("All buses"), buses)
+        .get("/api/v1/buses", Doc::list::<api::Bus<'_>>("All buses"), views::buses)
         .get(
             "/api/v1/buses/{name}",
             Doc::object::<line::Line<'_>>("A bus, with the last hour of its line"),
@@ -269,12 +284,12 @@ fn described() -> Api {
         .get(
             "/api/v1/buses/{name}/diagnosis",
             Doc::object::<api::Diagnosis<'_>>("What is wrong with the line of a bus"),
-            diagnosis,
+            views::diagnosis,
         )
         .get(
             "/api/v1/audit",
             Doc::any("The last commands").query(&[("drive", "only those to this drive")]),
-            audit,
+            views::audit,
         )
         .get("/api/v1/recordings", Doc::list::<Entry>("Recordings"), recordings::list)
         .get(
@@ -355,7 +370,7 @@ async fn guard(
         let text = "too many connections are open; close some and try again\n";
         (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "5")], text).into_response()
     } else if let Err((status, why)) = expect::check(request.headers(), &app.plant.load(), &reached) {
-        (status, Json(messages::ErrorReply::new(why))).into_response()
+        replies::refused(status, why).into_response()
     } else if (is_on && operating::may_change(method, path)) || (is_local && path == RELOAD) {
         next.run(request).await
     } else if !matches!(*method, Method::GET | Method::HEAD) {
@@ -366,7 +381,7 @@ async fn guard(
         let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
         (StatusCode::METHOD_NOT_ALLOWED, allow, text).into_response()
     } else if !is_on && operating::is_operating(path) {
-        unknown(request.uri().clone()).await
+        views::unknown(request.uri().clone()).await
     } else {
         next.run(request).await
     };
@@ -400,7 +415,7 @@ async fn refused(
             return None;
         }
         if path == "/" {
-            return Some(document(page::render_login(&app.plant.load())));
+            return Some(views::document(page::render_login(&app.plant.load())));
         }
     }
     if let Some(suppressed) = reached.refusals.permit(Instant::now()) {
@@ -408,212 +423,4 @@ async fn refused(
         tracing::warn!(target: "drivegate::http", %peer, suppressed, "HTTP: request refused: {refusal}");
     }
     Some(refusal.into_response())
-}
-
-async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
-    let _turn = app.turn().await;
-    document(page::render(&app.plant.load(), app.operating.is_on(), Instant::now()))
-}
-
-fn document(html: String) -> Response {
-    let policy = [(header::CONTENT_SECURITY_POLICY, page::SECURITY_POLICY)];
-    (policy, Html(html)).into_response()
-}
-
-async fn asset(Path(name): Path<String>, uri: Uri) -> Response {
-    match page::ASSETS.iter().find(|asset| asset.name == name) {
-        Some(asset) => ([(header::CONTENT_TYPE, asset.content_type)], asset.body).into_response(),
-        None => unknown(uri).await,
-    }
-}
-
-async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
-    let _turn = app.turn().await;
-    let accept: Vec<&str> = headers
-        .get_all(header::ACCEPT)
-        .iter()
-        .filter_map(|value| value.to_str().ok())
-        .collect();
-    let (format, content_type) = metrics::Format::accepted(&accept.join(","));
-    match metrics::encode(&app.plant.load(), &app.stats, Instant::now(), format) {
-        Ok(text) => {
-            let headers = [(header::CONTENT_TYPE, content_type), (header::VARY, "accept")];
-            (headers, text).into_response()
-        }
-        Err(error) => {
-            tracing::error!(target: "drivegate::http", "cannot encode the metrics: {error}; report this");
-            StatusCode::INTERNAL_SERVER_ERROR.into_response()
-        }
-    }
-}
-
-async fn ready(State(app): State<Arc<AppState>>) -> Response {
-    let reasons = readiness::reasons(&app.plant.load(), &app.stats);
-    if reasons.is_empty() {
-        return "ready\n".into_response();
-    }
-    let mut text = "not ready\n".to_string();
-    for reason in reasons {
-        // Writing to a string cannot fail.
-        let _ = writeln!(text, "{reason}");
-    }
-    (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
-}
-
-/// Whether the gateway is ready, and why not: 200 in both cases.
-async fn health(State(app): State<Arc<AppState>>) -> Response {
-    let reasons = readiness::reasons(&app.plant.load(), &app.stats);
-    let ready = reasons.is_empty();
-    Json(Health { ready, reasons }).into_response()
-}
-
-/// The gateway reads its configuration again: 200 with what changed, 422 with the errors, and it goes on as before.
-async fn reload(Extension(reached): Extension<Reached>, uri: Uri, request: Request) -> Response {
-    let Some(local) = reached.local else {
-        return unknown(uri).await;
-    };
-    if !matches!(*request.method(), Method::POST) {
-        return StatusCode::METHOD_NOT_ALLOWED.into_response();
-    }
-    match control::reload(local.control.as_ref(), local.who.to_string()).await {
-        Ok(outcome) if outcome.errors.is_empty() => Json(outcome).into_response(),
-        Ok(outcome) => (StatusCode::UNPROCESSABLE_ENTITY, Json(outcome)).into_response(),
-        Err(why) => (StatusCode::SERVICE_UNAVAILABLE, Json(messages::ErrorReply::new(why))).into_response(),
-    }
-}
-
-/// All drives; with `points=` only these points of each.
-async fn drives(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
-    let shown = query::names(query.as_deref(), "points");
-    let _turn = app.turn().await;
-    let plant = app.plant.load();
-    let clock = api::Clock::new(Instant::now(), SystemTime::now());
-    let all: Vec<_> = plant.drives().collect();
-    let all: Vec<_> = all
-        .iter()
-        .map(|drive| api::Drive::new(drive, &plant.history, clock).only(shown.as_ref()))
-        .collect();
-    Json(all).into_response()
-}
-
-async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
-    let plant = app.plant.load();
-    match plant.drive(&name) {
-        Some(drive) => {
-            let clock = api::Clock::new(Instant::now(), SystemTime::now());
-            Json(api::Drive::new(&drive, &plant.history, clock)).into_response()
-        }
-        None => no_drive(&plant, &name),
-    }
-}
-
-/// Why a drive does not run.
-async fn why(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
-    let plant = app.plant.load();
-    let Some(drive) = plant.drive(&name) else {
-        return no_drive(&plant, &name);
-    };
-    let profile = &drive.image.spec.profile;
-    Json(Why {
-        explanation: drive.why(&drive.reading(Instant::now())),
-        profile: profile.name.clone(),
-        profile_verified: profile.verified,
-    })
-    .into_response()
-}
-
-/// The last reading of the parameters of a drive, and the one that goes on.
-async fn params(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
-    let plant = app.plant.load_full();
-    let Some(machine) = plant.drive(&name).map(|drive| drive.machine()) else {
-        return no_drive(&plant, &name);
-    };
-    let status = plant.parameters.status(&machine);
-    let last = match plant.parameters.last(&machine) {
-        Some(file) => Some(file),
-        None => match stored_params(&app, &plant, &name).await {
-            Ok(file) => file.map(Arc::new),
-            Err(response) => return response,
-        },
-    };
-    let restore = plant.parameters.restore(&machine);
-    Json(Parameters::new(
-        &name,
-        last.as_deref(),
-        status.as_ref(),
-        restore.as_ref(),
-    ))
-    .into_response()
-}
-
-/// The last reading on disk.
-async fn stored_params(app: &AppState, plant: &Plant, name: &str) -> Result<Option<ParameterFile>, Response> {
-    let Some(store) = plant.parameters.store() else {
-        return Ok(None);
-    };
-    let unavailable = || StatusCode::SERVICE_UNAVAILABLE.into_response();
-    let _permit = app.files.acquire().await.map_err(|_| unavailable())?;
-    let name = name.to_string();
-    let read = tokio::task::spawn_blocking(move || store.latest(&name)).await;
-    read.map_err(|_| unavailable())?.map_err(|error| {
-        let known = Vec::new();
-        (
-            StatusCode::INTERNAL_SERVER_ERROR,
-            Json(messages::ErrorReply { error, known }),
-        )
-            .into_response()
-    })
-}
-
-async fn buses(State(app): State<Arc<AppState>>) -> Response {
-    let plant = app.plant.load();
-    let all: Vec<_> = plant.buses.iter().map(api::Bus::new).collect();
-    Json(all).into_response()
-}
-
-/// What is wrong with the line of a bus.
-async fn diagnosis(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
-    let plant = app.plant.load();
-    match plant.buses.iter().find(|bus| bus.image.spec.name == name) {
-        Some(bus) => Json(api::Diagnosis::new(&name, &bus.image.diagnosis.load())).into_response(),
-        None => {
-            let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
-            not_found(format!("there is no bus `{name}`"), known.collect())
-        }
-    }
-}
-
-/// The last commands, newest last; with `drive` those to one drive.
-async fn audit(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
-    let [drive] = match query::parameters(query.as_deref(), &["drive"]) {
-        Ok(wanted) => wanted,
-        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
-    };
-    let plant = app.plant.load();
-    if let Some(drive) = drive.as_ref().filter(|drive| plant.drive(drive).is_none()) {
-        return no_drive(&plant, drive);
-    }
-    let _turn = app.turn().await;
-    let records = plant.writes.audit().recent(drive.as_deref());
-    let list = format!("[{}]", records.join(","));
-    ([(header::CONTENT_TYPE, "application/json")], list).into_response()
-}
-
-async fn unknown(uri: Uri) -> Response {
-    if uri.path().starts_with("/api/") {
-        return not_found(format!("there is nothing at {}", uri.path()), Vec::new());
-    }
-    let text = "there is nothing here; the status page is at /\n";
-    (StatusCode::NOT_FOUND, text).into_response()
-}
-
-/// The reply where there is no such drive.
-pub(super) fn no_drive(plant: &Plant, name: &str) -> Response {
-    let known = plant.drives().map(|drive| drive.image.spec.name.clone());
-    not_found(format!("there is no drive `{name}`"), known.collect())
-}
-
-/// A 404 reply that lists the known names.
-pub(super) fn not_found(error: String, known: Vec<String>) -> response::Response {
-    (StatusCode::NOT_FOUND, Json(messages::ErrorReply { error, known })).into_response()
 }

@@ -20,7 +20,8 @@ use tokio::sync::broadcast;
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
 
-use super::routes::{AppState, Client, not_found};
+use super::replies::{Replied, no_bus};
+use super::routes::{AppState, Client};
 use super::{messages, query};
 use crate::codec::{Protocol, describe};
 use crate::command::Authority;
@@ -79,11 +80,8 @@ pub(super) async fn trace(
     State(app): State<Arc<AppState>>,
     Extension(client): Extension<Client>,
     RawQuery(query): RawQuery,
-) -> Response {
-    let wanted = match query::parameters(query.as_deref(), &["bus"]) {
-        Ok([bus]) => bus,
-        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
-    };
+) -> Replied {
+    let [wanted] = query::parameters(query.as_deref(), &["bus"])?;
     let plant = app.plant.load();
     let buses = plant.buses.iter().map(|bus| &bus.image);
     let streams: Vec<_> = buses
@@ -98,13 +96,10 @@ pub(super) async fn trace(
         })
         .collect();
     if let (Some(name), true) = (wanted, streams.is_empty()) {
-        let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
-        return not_found(format!("there is no bus `{name}`"), known.collect());
+        return Err(no_bus(&plant, &name));
     }
-    match stream_permit(&app, client) {
-        Ok(permit) => respond(stream::select_all(streams), permit),
-        Err(refused) => full(&refused),
-    }
+    let permit = stream_permit(&app, client).map_err(|why| full(&why))?;
+    Ok(respond(stream::select_all(streams), permit))
 }
 
 /// A place for an event stream, or why there is none. The address with the most streams gives one up to an address

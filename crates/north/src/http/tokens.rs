@@ -10,12 +10,15 @@ use ring::digest::{SHA256, digest};
 use ring::rand::{SecureRandom, SystemRandom};
 use subtle::ConstantTimeEq;
 
+use super::credentials::{Credential, CredentialError, Credentials, checked_name};
+
 /// Bytes of a token and of its hash.
 const BYTES: usize = 32;
 /// Prefix of a hash in the file.
 const ALGORITHM: &str = "sha256:";
-/// Most tokens of a file.
-const MOST: usize = 1000;
+/// The words of a line.
+const FORM: CredentialError = CredentialError::Form("name scopes hash");
+const NOT_A_HASH: CredentialError = CredentialError::Hash("`sha256:` and 64 hexadecimal digits");
 
 /// What a token permits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,11 +46,11 @@ impl Scope {
 }
 
 impl FromStr for Scope {
-    type Err = TokenError;
+    type Err = CredentialError;
 
-    fn from_str(text: &str) -> Result<Scope, TokenError> {
+    fn from_str(text: &str) -> Result<Scope, CredentialError> {
         let known = Scope::ALL.into_iter().find(|scope| scope.name() == text);
-        known.ok_or_else(|| TokenError::Scope(text.to_string()))
+        known.ok_or_else(|| CredentialError::Scope(text.to_string()))
     }
 }
 
@@ -61,40 +64,19 @@ pub struct Token {
     hash: [u8; BYTES],
 }
 
-/// Why a line is not a token.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum TokenError {
-    /// Not three words.
-    #[error("not `name scopes hash`")]
-    Form,
-    /// A name of other characters, or a long one.
-    #[error("`{0}` is not a name of at most 64 letters, digits, `-`, `_` and `.`")]
-    Name(String),
-    /// A name that another line has.
-    #[error("there are two tokens named `{0}`")]
-    Repeated(String),
-    /// An unknown scope.
-    #[error("`{0}` is not a scope; there are read, metrics and control")]
-    Scope(String),
-    /// Not `sha256:` and 64 hexadecimal digits.
-    #[error("the hash is not `sha256:` and 64 hexadecimal digits")]
-    Hash,
-    /// More lines than any plant needs.
-    #[error("there are more than {MOST} tokens")]
-    Many,
-}
-
 impl Token {
     /// A new token, and the secret that its bearer sends: 64 hexadecimal digits, stored nowhere.
     ///
     /// # Errors
     /// The name is not one, or the system has no random numbers.
-    pub fn generate(name: &str, scopes: Vec<Scope>) -> Result<(Token, String), TokenError> {
+    pub fn generate(name: &str, scopes: Vec<Scope>) -> Result<(Token, String), CredentialError> {
         let mut bytes = [0; BYTES];
-        SystemRandom::new().fill(&mut bytes).map_err(|_| TokenError::Hash)?;
+        SystemRandom::new()
+            .fill(&mut bytes)
+            .map_err(|_| CredentialError::Random)?;
         let secret = hex(&bytes);
         let token = Token {
-            name: check_name(name)?,
+            name: checked_name(name)?,
             scopes,
             hash: hash(&secret),
         };
@@ -110,51 +92,35 @@ impl fmt::Display for Token {
 }
 
 impl FromStr for Token {
-    type Err = TokenError;
+    type Err = CredentialError;
 
-    fn from_str(line: &str) -> Result<Token, TokenError> {
+    fn from_str(line: &str) -> Result<Token, CredentialError> {
         let mut words = line.split_whitespace();
         let (Some(name), Some(scopes), Some(hash), None) = (words.next(), words.next(), words.next(), words.next())
         else {
-            return Err(TokenError::Form);
+            return Err(FORM);
         };
         Ok(Token {
-            name: check_name(name)?,
+            name: checked_name(name)?,
             scopes: scopes.split(',').map(str::parse).collect::<Result<_, _>>()?,
-            hash: hash.strip_prefix(ALGORITHM).and_then(unhex).ok_or(TokenError::Hash)?,
+            hash: hash.strip_prefix(ALGORITHM).and_then(unhex).ok_or(NOT_A_HASH)?,
         })
     }
 }
 
+impl Credential for Token {
+    const KIND: &'static str = "token";
+    const MOST: usize = 1000;
+
+    fn name(&self) -> &str {
+        &self.name
+    }
+}
+
 /// The tokens of a file.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Tokens(Vec<Token>);
+pub type Tokens = Credentials<Token>;
 
 impl Tokens {
-    /// Reads the text of a file: a token a line; empty lines and lines that begin with `#` are ignored.
-    ///
-    /// # Errors
-    /// The first bad line, counted from 1, and why.
-    pub fn parse(text: &str) -> Result<Tokens, (usize, TokenError)> {
-        let mut tokens: Vec<Token> = Vec::new();
-        for (line, text) in entries(text) {
-            let token: Token = text.parse().map_err(|error| (line, error))?;
-            if tokens.iter().any(|other| other.name == token.name) {
-                return Err((line, TokenError::Repeated(token.name)));
-            }
-            if tokens.len() >= MOST {
-                return Err((line, TokenError::Many));
-            }
-            tokens.push(token);
-        }
-        Ok(Tokens(tokens))
-    }
-
-    /// All of them, in the order of the file.
-    pub fn list(&self) -> &[Token] {
-        &self.0
-    }
-
     /// The token whose secret this is. The time that this takes depends on the number of tokens only.
     pub(super) fn find(&self, secret: &str) -> Option<&Token> {
         let hash = hash(secret);
@@ -165,25 +131,6 @@ impl Tokens {
             }
         }
         found
-    }
-}
-
-/// The lines of a file of tokens or users, counted from 1, without empty ones and those that begin with `#`.
-pub(super) fn entries(text: &str) -> impl Iterator<Item = (usize, &str)> {
-    let lines = (1..).zip(text.lines().map(str::trim));
-    lines.filter(|(_, text)| !text.is_empty() && !text.starts_with('#'))
-}
-
-/// Whether a token or a user can have that name.
-pub(super) fn is_name(name: &str) -> bool {
-    let sound = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
-    !name.is_empty() && name.len() <= 64 && name.chars().all(sound)
-}
-
-fn check_name(name: &str) -> Result<String, TokenError> {
-    match is_name(name) {
-        true => Ok(name.to_string()),
-        false => Err(TokenError::Name(name.chars().take(64).collect())),
     }
 }
 
@@ -244,25 +191,37 @@ mod tests {
     fn bad_lines() {
         let hash = format!("sha256:{}", "0".repeat(64));
         for (text, line, error) in [
-            ("a read".to_string(), 1, TokenError::Form),
-            (format!("a read {hash} x"), 1, TokenError::Form),
-            (format!("a read write {hash}"), 1, TokenError::Form),
-            (format!("#\na/b read {hash}"), 2, TokenError::Name("a/b".to_string())),
-            (format!("a write {hash}"), 1, TokenError::Scope("write".to_string())),
-            (format!("a read, {hash}"), 1, TokenError::Scope(String::new())),
-            (format!("a read {}", &hash[7..]), 1, TokenError::Hash),
-            (format!("a read {hash}0"), 1, TokenError::Hash),
-            (format!("a read sha256:{}", "ä".repeat(32)), 1, TokenError::Hash),
+            ("a read".to_string(), 1, FORM),
+            (format!("a read {hash} x"), 1, FORM),
+            (format!("a read write {hash}"), 1, FORM),
+            (
+                format!("#\na/b read {hash}"),
+                2,
+                CredentialError::Name("a/b".to_string()),
+            ),
+            (
+                format!("a write {hash}"),
+                1,
+                CredentialError::Scope("write".to_string()),
+            ),
+            (format!("a read, {hash}"), 1, CredentialError::Scope(String::new())),
+            (format!("a read {}", &hash[7..]), 1, NOT_A_HASH),
+            (format!("a read {hash}0"), 1, NOT_A_HASH),
+            (format!("a read sha256:{}", "ä".repeat(32)), 1, NOT_A_HASH),
             (
                 format!("a read {hash}\na metrics {hash}"),
                 2,
-                TokenError::Repeated("a".to_string()),
+                CredentialError::Repeated("token", "a".to_string()),
             ),
         ] {
             assert_eq!(Tokens::parse(&text), Err((line, error)), "{text}");
         }
+        const MOST: usize = Token::MOST;
         let many: String = (0..=MOST).map(|i| format!("t{i} read {hash}\n")).collect();
-        assert_eq!(Tokens::parse(&many), Err((MOST + 1, TokenError::Many)));
+        assert_eq!(
+            Tokens::parse(&many),
+            Err((MOST + 1, CredentialError::Many("token", MOST)))
+        );
     }
 
     proptest! {

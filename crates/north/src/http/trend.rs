@@ -6,12 +6,13 @@ use std::time::{Duration, SystemTime};
 
 use axum::Json;
 use axum::extract::{Path, RawQuery, State};
-use axum::http::{StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::http::header;
+use axum::response::IntoResponse;
 use serde::{Serialize, Serializer};
 
 use super::query::{self, QueryError};
-use super::routes::{AppState, no_drive, not_found};
+use super::replies::{Replied, no_drive, not_found};
+use super::routes::AppState;
 use crate::drive::ModelPoint;
 use crate::history::trend::{DriveTrend, POINTS, Part, RANGES, Range, Reach, Step};
 use crate::history::{Clock, DriveHistory};
@@ -75,16 +76,11 @@ pub(super) async fn trend(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
     RawQuery(query): RawQuery,
-) -> Response {
+) -> Replied {
     let plant = app.plant.load();
-    let Some(drive) = plant.drive(&name) else {
-        return no_drive(&plant, &name);
-    };
+    let drive = plant.drive(&name).ok_or_else(|| no_drive(&plant, &name))?;
     let clock = Clock::read();
-    let wanted = match Wanted::of(query.as_deref(), clock.wall) {
-        Ok(wanted) => wanted,
-        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
-    };
+    let wanted = Wanted::of(query.as_deref(), clock.wall)?;
     let _turn = app.turn().await;
     let history = plant.history.drive(&name);
     let profile = &drive.image.spec.profile;
@@ -95,7 +91,8 @@ pub(super) async fn trend(
         let Some(point) = known.iter().find(|point| point.name() == name) else {
             let known = known.iter().map(|point| point.name().to_string()).collect();
             let drive = &drive.image.spec.name;
-            return not_found(format!("no trend of `{name}` is kept of drive `{drive}`"), known);
+            let why = format!("no trend of `{name}` is kept of drive `{drive}`");
+            return Err(not_found(why, known));
         };
         points.push(*point);
     }
@@ -116,16 +113,16 @@ pub(super) async fn trend(
     };
     if wanted.csv {
         let csv = [(header::CONTENT_TYPE, "text/csv; charset=utf-8")];
-        return (csv, text(&parts)).into_response();
+        return Ok((csv, text(&parts)).into_response());
     }
-    match (&parts[..], &wanted.points[..]) {
+    Ok(match (&parts[..], &wanted.points[..]) {
         (_, []) => Json(Kept::new(&name, history.as_deref(), &known)).into_response(),
         ([part], [_]) => Json(Trend { drive: &name, part }).into_response(),
         _ => {
             let all: Vec<_> = parts.iter().map(|part| Trend { drive: &name, part }).collect();
             Json(all).into_response()
         }
-    }
+    })
 }
 
 /// Which trends there are.

@@ -9,7 +9,7 @@ use argon2::password_hash::{PasswordHash, PasswordHasher, PasswordVerifier, Salt
 use argon2::{Algorithm, Argon2, Params, Version};
 use ring::rand::{SecureRandom, SystemRandom};
 
-use super::tokens::{entries, is_name};
+use super::credentials::{Credential, CredentialError, Credentials, checked_name};
 
 /// Memory of a hash, KiB: 12 MiB are there on a small board too, once at a time.
 const MEMORY: u32 = 12 * 1024;
@@ -27,8 +27,9 @@ const NOBODY: &str = "bm9ib2R5bm9ib2R5bm9ibw$00000000000000000000000000000000000
 pub const MIN_PASSWORD: usize = 10;
 /// Most bytes of a password.
 pub const MAX_PASSWORD: usize = 256;
-/// Most users of a file.
-const MOST: usize = 100;
+/// The words of a line.
+const FORM: CredentialError = CredentialError::Form("name hash");
+const NOT_A_HASH: CredentialError = CredentialError::Hash("one of Argon2id with at most 64 MiB, 16 passes and 4 lanes");
 
 /// A line of the file. Displayed as that line.
 #[derive(Clone, PartialEq, Eq)]
@@ -39,53 +40,27 @@ pub struct User {
     hash: String,
 }
 
-/// Why a line is not a user, or a password cannot be one.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum UserError {
-    /// Not two words.
-    #[error("not `name hash`")]
-    Form,
-    /// A name of other characters, or a long one.
-    #[error("`{0}` is not a name of at most 64 letters, digits, `-`, `_` and `.`")]
-    Name(String),
-    /// A name that another line has.
-    #[error("there are two users named `{0}`")]
-    Repeated(String),
-    /// Not a hash of Argon2id, or one that is too expensive.
-    #[error("the hash is not one of Argon2id with at most 64 MiB, 16 passes and 4 lanes")]
-    Hash,
-    /// More lines than any plant needs.
-    #[error("there are more than {MOST} users")]
-    Many,
-    /// A password that is easily guessed, or no text.
-    #[error(
-        "a password has at least {MIN_PASSWORD} characters, at most {MAX_PASSWORD} bytes and no control characters"
-    )]
-    Password,
-    /// The system does not provide them.
-    #[error("the system has no random numbers")]
-    Random,
-}
-
 impl User {
     /// A user with that password, whose hash has a new salt.
     ///
     /// # Errors
     /// The name is not one, the password is too short or too long, or the system has no random numbers.
-    pub fn new(name: &str, password: &str) -> Result<User, UserError> {
+    pub fn new(name: &str, password: &str) -> Result<User, CredentialError> {
         let long_enough = password.chars().count() >= MIN_PASSWORD && password.len() <= MAX_PASSWORD;
         if !long_enough || password.chars().any(char::is_control) {
-            return Err(UserError::Password);
+            return Err(CredentialError::Password);
         }
         let mut salt = [0; SALT];
-        SystemRandom::new().fill(&mut salt).map_err(|_| UserError::Random)?;
-        let salt = SaltString::encode_b64(&salt).map_err(|_| UserError::Hash)?;
-        let params = Params::new(MEMORY, PASSES, 1, None).map_err(|_| UserError::Hash)?;
+        SystemRandom::new()
+            .fill(&mut salt)
+            .map_err(|_| CredentialError::Random)?;
+        let salt = SaltString::encode_b64(&salt).map_err(|_| NOT_A_HASH)?;
+        let params = Params::new(MEMORY, PASSES, 1, None).map_err(|_| NOT_A_HASH)?;
         let argon2 = Argon2::new(Algorithm::Argon2id, Version::V0x13, params);
         let hash = argon2.hash_password(password.as_bytes(), &salt);
         Ok(User {
             name: checked_name(name)?,
-            hash: hash.map_err(|_| UserError::Hash)?.to_string(),
+            hash: hash.map_err(|_| NOT_A_HASH)?.to_string(),
         })
     }
 
@@ -133,64 +108,41 @@ impl fmt::Display for User {
 }
 
 impl FromStr for User {
-    type Err = UserError;
+    type Err = CredentialError;
 
-    fn from_str(line: &str) -> Result<User, UserError> {
+    fn from_str(line: &str) -> Result<User, CredentialError> {
         let mut words = line.split_whitespace();
         let (Some(name), Some(hash), None) = (words.next(), words.next(), words.next()) else {
-            return Err(UserError::Form);
+            return Err(FORM);
         };
         match is_affordable(hash) {
             true => Ok(User {
                 name: checked_name(name)?,
                 hash: hash.to_string(),
             }),
-            false => Err(UserError::Hash),
+            false => Err(NOT_A_HASH),
         }
     }
 }
 
-fn checked_name(name: &str) -> Result<String, UserError> {
-    match is_name(name) {
-        true => Ok(name.to_string()),
-        false => Err(UserError::Name(name.chars().take(64).collect())),
+impl Credential for User {
+    const KIND: &'static str = "user";
+    const MOST: usize = 100;
+
+    fn name(&self) -> &str {
+        &self.name
     }
 }
 
 /// The users of a file.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Users(Vec<User>);
+pub type Users = Credentials<User>;
 
 impl Users {
-    /// Reads the text of a file: a user a line; empty lines and lines that begin with `#` are ignored.
-    ///
-    /// # Errors
-    /// The first bad line, counted from 1, and why.
-    pub fn parse(text: &str) -> Result<Users, (usize, UserError)> {
-        let mut users: Vec<User> = Vec::new();
-        for (line, text) in entries(text) {
-            let user: User = text.parse().map_err(|error| (line, error))?;
-            if users.iter().any(|other| other.name == user.name) {
-                return Err((line, UserError::Repeated(user.name)));
-            }
-            if users.len() >= MOST {
-                return Err((line, UserError::Many));
-            }
-            users.push(user);
-        }
-        Ok(Users(users))
-    }
-
-    /// All of them, in the order of the file.
-    pub fn list(&self) -> &[User] {
-        &self.0
-    }
-
     /// The hash behind which the password of that name has to be, if there is such a user, and hashes whose password nobody knows:
     /// all together there is one of each cost that the file has. So the comparison takes as long for every name, known or not,
     /// whatever the hashes of the file cost.
     pub(super) fn hashes(&self, name: &str) -> (Option<&str>, Vec<String>) {
-        let own = self.find(name).map(User::hash);
+        let own = self.named(name).map(User::hash);
         let mut costs: Vec<&str> = self.0.iter().map(|user| cost(user.hash())).collect();
         if costs.is_empty() {
             costs.push(COST);
@@ -199,11 +151,6 @@ impl Users {
         costs.dedup();
         costs.retain(|other| own.is_none_or(|own| cost(own) != *other));
         (own, costs.into_iter().map(|cost| format!("{cost}{NOBODY}")).collect())
-    }
-
-    /// The user of that name.
-    pub(super) fn find(&self, name: &str) -> Option<&User> {
-        self.0.iter().find(|user| user.name == name)
     }
 }
 
@@ -218,7 +165,7 @@ mod tests {
     #[test]
     fn the_hash_is_that_of_other_programs() {
         let users = Users::parse(&format!("# users\n\nalice {FOREIGN}\r\n")).unwrap();
-        let alice = users.find("alice").unwrap();
+        let alice = users.named("alice").unwrap();
         assert!(is_password(alice.hash(), "password"));
         assert!(!is_password(alice.hash(), "Password") && !is_password(alice.hash(), ""));
     }
@@ -232,14 +179,14 @@ mod tests {
         assert!(!text.contains("horse") && text.contains("$argon2id$v=19$m=12288,t=3,p=1$"));
         assert!(!format!("{one:?}").contains("argon2"), "hashes do not get into logs");
         let users = Users::parse(&text).unwrap();
-        assert!(is_password(users.find("bob").unwrap().hash(), "correct horse"));
-        assert!(!is_password(users.find("bob").unwrap().hash(), "correct horse "));
-        assert!(users.find("carol").is_none());
+        assert!(is_password(users.named("bob").unwrap().hash(), "correct horse"));
+        assert!(!is_password(users.named("bob").unwrap().hash(), "correct horse "));
+        assert!(users.named("carol").is_none());
         for (name, password, error) in [
-            ("alice", "too short", UserError::Password),
-            ("alice", "ten\ncharacters", UserError::Password),
-            ("alice", &*"x".repeat(MAX_PASSWORD + 1), UserError::Password),
-            ("a b", "correct horse", UserError::Name("a b".to_string())),
+            ("alice", "too short", CredentialError::Password),
+            ("alice", "ten\ncharacters", CredentialError::Password),
+            ("alice", &*"x".repeat(MAX_PASSWORD + 1), CredentialError::Password),
+            ("a b", "correct horse", CredentialError::Name("a b".to_string())),
         ] {
             assert_eq!(User::new(name, password), Err(error), "{name} {password}");
         }
@@ -284,35 +231,35 @@ mod tests {
     fn bad_lines() {
         let with = |parameters: &str| FOREIGN.replace("m=65536,t=2,p=1", parameters);
         for (text, line, error) in [
-            ("alice".to_string(), 1, UserError::Form),
-            (format!("alice {FOREIGN} x"), 1, UserError::Form),
-            (format!("#\na/b {FOREIGN}"), 2, UserError::Name("a/b".to_string())),
-            (format!("alice {}", &FOREIGN[1..]), 1, UserError::Hash),
+            ("alice".to_string(), 1, FORM),
+            (format!("alice {FOREIGN} x"), 1, FORM),
+            (format!("#\na/b {FOREIGN}"), 2, CredentialError::Name("a/b".to_string())),
+            (format!("alice {}", &FOREIGN[1..]), 1, NOT_A_HASH),
             (
                 format!("alice {}", FOREIGN.replace("argon2id", "argon2i")),
                 1,
-                UserError::Hash,
+                NOT_A_HASH,
             ),
-            (
-                format!("alice {}", FOREIGN.rsplit_once('$').unwrap().0),
-                1,
-                UserError::Hash,
-            ),
-            (format!("alice {}", with("m=65537,t=2,p=1")), 1, UserError::Hash),
-            (format!("alice {}", with("m=4294967295,t=2,p=1")), 1, UserError::Hash),
-            (format!("alice {}", with("m=64,t=17,p=1")), 1, UserError::Hash),
-            (format!("alice {}", with("m=64,t=1,p=5")), 1, UserError::Hash),
-            ("alice password".to_string(), 1, UserError::Hash),
+            (format!("alice {}", FOREIGN.rsplit_once('$').unwrap().0), 1, NOT_A_HASH),
+            (format!("alice {}", with("m=65537,t=2,p=1")), 1, NOT_A_HASH),
+            (format!("alice {}", with("m=4294967295,t=2,p=1")), 1, NOT_A_HASH),
+            (format!("alice {}", with("m=64,t=17,p=1")), 1, NOT_A_HASH),
+            (format!("alice {}", with("m=64,t=1,p=5")), 1, NOT_A_HASH),
+            ("alice password".to_string(), 1, NOT_A_HASH),
             (
                 format!("alice {FOREIGN}\nalice {FOREIGN}"),
                 2,
-                UserError::Repeated("alice".to_string()),
+                CredentialError::Repeated("user", "alice".to_string()),
             ),
         ] {
             assert_eq!(Users::parse(&text), Err((line, error)), "{text}");
         }
+        const MOST: usize = User::MOST;
         let many: String = (0..=MOST).map(|i| format!("u{i} {FOREIGN}\n")).collect();
-        assert_eq!(Users::parse(&many), Err((MOST + 1, UserError::Many)));
+        assert_eq!(
+            Users::parse(&many),
+            Err((MOST + 1, CredentialError::Many("user", MOST)))
+        );
     }
 
     proptest! {

@@ -8,7 +8,6 @@
 pub(crate) mod control;
 mod path;
 
-use std::io;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -68,14 +67,6 @@ impl Local {
     pub fn path(&self) -> &Path {
         &self.path
     }
-
-    /// Waits until it takes no more clients and its file is removed. A request that is being carried out gets its
-    /// response from the bus.
-    pub async fn stopped(self) {
-        if let Err(error) = self.task.await {
-            tracing::error!(target: "drivegate::local", "the local socket ended by itself: {error}; report this");
-        }
-    }
 }
 
 impl server::Server for Local {
@@ -93,11 +84,10 @@ impl server::Server for Local {
         cancel: CancellationToken,
     ) -> Result<Local, ServerError> {
         let paths = options.socket.of_gateway(&RuntimeDirectories::of_this_process());
-        let first = paths.first().map(|path| path.display().to_string()).unwrap_or_default();
+        let first = paths.first().cloned().unwrap_or_default();
         let bound = path::bind_first(&paths)
             .await
-            .map_err(|error| io::Error::new(error.kind(), format!("cannot listen on {first}: {error}")))
-            .map_err(ServerError::Local)?;
+            .map_err(|cause| ServerError::Local { path: first, cause })?;
         let path = bound.path.clone();
         let door = Arc::new(Door {
             http: SocketDoor::new(&plant, &stats, cancel.clone()),
@@ -108,8 +98,11 @@ impl server::Server for Local {
         Ok(Local { path, task })
     }
 
+    /// Its file is removed; a request that is being carried out gets its response from the bus.
     async fn stopped(self) {
-        self.stopped().await;
+        if let Err(error) = self.task.await {
+            tracing::error!(target: "drivegate::local", "the local socket ended by itself: {error}; report this");
+        }
     }
 }
 

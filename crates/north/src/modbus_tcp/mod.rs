@@ -188,11 +188,6 @@ impl Server {
     pub fn tls_addresses(&self) -> Vec<SocketAddr> {
         self.listeners.addresses(true)
     }
-
-    /// Waits until all listeners and connections have ended, after the cancellation.
-    pub async fn stopped(&self) {
-        self.tasks.wait().await;
-    }
 }
 
 impl server::Server for Server {
@@ -236,7 +231,7 @@ impl server::Server for Server {
     }
 
     async fn stopped(self) {
-        Server::stopped(&self).await;
+        self.tasks.wait().await;
     }
 }
 

@@ -193,11 +193,6 @@ impl Server {
             });
         }
     }
-
-    /// Waits until all listeners, connections and pseudo-terminals have ended, after the cancellation.
-    pub async fn stopped(&self) {
-        self.tasks.wait().await;
-    }
 }
 
 impl server::Server for Server {
@@ -241,7 +236,7 @@ impl server::Server for Server {
     }
 
     async fn stopped(self) {
-        Server::stopped(&self).await;
+        self.tasks.wait().await;
     }
 }
 

@@ -10,7 +10,7 @@ use crate::files;
 use crate::north::bacnet::ede::{self, Ede};
 use crate::north::bacnet::listing::{self, COLUMNS, Line};
 use crate::north::bacnet::objects::Shown;
-use crate::{EXIT_FAILED, EXIT_USAGE, report};
+use crate::report;
 
 /// The devices that the configuration shows; none without `[bacnet]`.
 pub(crate) fn devices(settings: &Settings) -> Option<Vec<Shown>> {
@@ -22,14 +22,12 @@ pub(crate) fn devices(settings: &Settings) -> Option<Vec<Shown>> {
 /// Prints the objects, and writes the tables where they are wanted.
 pub(super) fn run(settings: &Settings, csv: bool, ede: Option<&Path>) -> ExitCode {
     let Some(devices) = devices(settings) else {
-        report::error("no BACnet objects; --bacnet; add [bacnet] to the configuration");
-        return ExitCode::from(EXIT_USAGE);
+        return report::misused("no BACnet objects; --bacnet; add [bacnet] to the configuration");
     };
     if let Some(path) = ede
         && let Err(why) = write(path, &ede::tables(&settings.gateway, &devices))
     {
-        report::error(&why);
-        return ExitCode::from(EXIT_FAILED);
+        return report::failed(&why);
     }
     let lines = listing::lines(&devices);
     report::print(&if csv { as_csv(&lines) } else { as_text(&lines) })

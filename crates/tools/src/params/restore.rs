@@ -75,8 +75,8 @@ pub(super) fn restore(gateway: &Gateway, args: &RestoreArgs) -> Result<ExitCode,
 /// Reads one drive and restores that to another.
 pub(super) fn clone(gateway: &Gateway, from: &str, to: &str, how: &How) -> Result<ExitCode, ExitCode> {
     if from == to {
-        report::error("a drive is not cloned to itself; command line; name two drives");
-        return Err(ExitCode::from(EXIT_USAGE));
+        let why = "a drive is not cloned to itself; command line; name two drives";
+        return Err(report::misused(why));
     }
     let brisk = ReadParameters {
         brisk: true,

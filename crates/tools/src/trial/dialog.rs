@@ -6,9 +6,9 @@ use std::process::ExitCode;
 use std::sync::mpsc;
 use std::time::Duration;
 
-use super::{Stop, failed};
+use super::Stop;
 use crate::adapters::{Adapter, adapters};
-use crate::{EXIT_FAILED, EXIT_USAGE, printable};
+use crate::{printable, report};
 
 /// Whether there is somebody to ask.
 pub(super) fn is_terminal() -> bool {
@@ -45,21 +45,17 @@ pub(super) fn ask(question: &str, stop: &Stop) -> Option<String> {
 pub(super) fn choose_port(stop: &Stop) -> Result<Option<String>, ExitCode> {
     let found = adapters();
     if found.is_empty() {
-        return Err(failed(
-            EXIT_FAILED,
+        return Err(report::failed(
             "no serial adapter is plugged in; /dev/serial/by-id and /sys/class/tty; plug one in, or write \
              --port tcp://host:port for a device server",
         ));
     }
     let _ = write!(io::stderr().lock(), "{}", list(&found));
     if !is_terminal() {
-        return Err(failed(
-            EXIT_USAGE,
-            &format!(
-                "no adapter is named, and there is no terminal to ask on; command line; write --port {}",
-                found.first().map_or("PORT", |adapter| adapter.port.as_str())
-            ),
-        ));
+        return Err(report::misused(&format!(
+            "no adapter is named, and there is no terminal to ask on; command line; write --port {}",
+            found.first().map_or("PORT", |adapter| adapter.port.as_str())
+        )));
     }
     loop {
         let Some(answer) = ask(&question(found.len()), stop) else {

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use super::dialog::{ask, is_terminal, write_new};
-use super::{Args, Stop, failed};
+use super::{Args, Stop};
 use crate::config::{LogFormat, LogSettings, Settings};
 use crate::daemon::Daemon;
 use crate::drive::{ModelPoint, Quality, State};
@@ -21,13 +21,12 @@ const FIRST_VALUES: Duration = Duration::from_secs(10);
 
 /// Reads the drives of the configuration `text` and serves the status page until a signal.
 pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Result<ExitCode, ExitCode> {
-    let fail = |message: &str| failed(EXIT_FAILED, message);
     let loaded = Settings::parse("drivegate.toml", text, std::iter::empty());
     report::errors(&loaded.errors);
     let mut settings = loaded.settings.ok_or(ExitCode::from(EXIT_FAILED))?;
     if settings.buses.iter().all(|bus| bus.drives.is_empty()) {
         report::print(text);
-        return Err(fail(
+        return Err(report::failed(
             "devices answer, but no profile matches any of them, so there is nothing to show; the configuration above; write a \
              profile (docs/profiles.md) and pass its directory with --profile-dir",
         ));
@@ -37,16 +36,16 @@ pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Result<ExitCode, Ex
     settings.recordings.max_count = 0;
     settings.keeps_history = false;
     settings.http = Some(http::Options::at(
-        demo::free_port("the status page", HTTP).map_err(|e| fail(&e))?,
+        demo::free_port("the status page", HTTP).map_err(|e| report::failed(&e))?,
     ));
     let _log = crate::log::start(&LogSettings {
         level: "error".to_string(),
         format: LogFormat::Auto,
     });
-    let runtime = crate::runtime().map_err(|message| fail(&message))?;
+    let runtime = crate::runtime().map_err(|message| report::failed(&message))?;
     let daemon = runtime
         .block_on(Daemon::start(settings))
-        .map_err(|error| fail(&error.to_string()))?;
+        .map_err(|error| report::failed(&error.to_string()))?;
     runtime.block_on(first_values(&daemon.plant(), stop));
     report::print(&values(&daemon.plant()));
     if let Some(address) = daemon.http_address() {
@@ -59,7 +58,7 @@ pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Result<ExitCode, Ex
             runtime.block_on(stop.token.cancelled());
             ExitCode::SUCCESS
         }
-        Err(message) => fail(&message),
+        Err(message) => report::failed(&message),
     };
     runtime.block_on(daemon.stop());
     Ok(code)

@@ -1,25 +1,23 @@
 //! Commands and heartbeats over HTTP. The body of a command is that of the MQTT set topics, and so is its result.
 
+use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use axum::Json;
-use axum::body::Body;
-use axum::extract::{Extension, Path, Request, State};
+use axum::extract::{FromRequestParts, Path, State};
 use axum::http::{StatusCode, header, request};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use serde_json::{Value as Json_, json};
 use tokio::sync::{OwnedSemaphorePermit, watch};
 
-use super::super::body;
-use super::super::messages::ErrorReply;
-use super::super::routes::{AppState, Reached, no_drive};
-use super::{Operating, Operator, restart};
+use super::super::body::Payload;
+use super::super::replies::{Replied, refused};
+use super::super::routes::AppState;
+use super::{Commander, Operating, Operator, Viewer, restart};
 use crate::command::{Answer, Authority, Order, Origin, Outcome, Parts, Refusal, SourceKind, stop_of};
-use crate::command_json::{
-    self, CommandResult, Id, MAX_PAYLOAD, Repetition, SharedMemory, Taken, excerpt, find_id, unknown_drive,
-};
+use crate::command_json::{self, CommandResult, Id, Repetition, SharedMemory, Taken, excerpt, find_id, unknown_drive};
 use crate::drive::model::Kind;
 use crate::drive::{ModelPoint, Point, Profile, RESTART_COMMUNICATION, Value};
 use crate::plant::{DriveHandle, Placed, Plant, Shown};
@@ -96,44 +94,34 @@ fn status(outcome: &Outcome) -> StatusCode {
     }
 }
 
-/// `POST /api/v1/drives/{name}/commands`
-pub(in crate::http) async fn command(
-    State(app): State<Arc<AppState>>,
-    Extension(reached): Extension<Reached>,
-    Path(name): Path<String>,
-    request: Request,
-) -> Response {
-    // Passwords are compared, and the body is waited for, behind that.
-    let asked = Instant::now();
-    let (parts, body) = request.into_parts();
-    match commanded(&app, &reached, &name, &parts, body, asked).await {
-        Ok(reply) => reply.into_response(),
-        Err(response) => response,
+/// When a request came, as the first argument of its handler: passwords are compared, and the body is waited for, behind that.
+pub(in crate::http) struct Asked(Instant);
+
+impl<S: Sync> FromRequestParts<S> for Asked {
+    type Rejection = Infallible;
+
+    async fn from_request_parts(_: &mut request::Parts, _: &S) -> Result<Asked, Infallible> {
+        Ok(Asked(Instant::now()))
     }
 }
 
-async fn commanded(
-    app: &AppState,
-    reached: &Reached,
-    name: &str,
-    parts: &request::Parts,
-    body: Body,
-    asked: Instant,
-) -> Result<CommandReply, Response> {
-    let (operating, cookies) = (&app.operating, app.cookies(reached));
-    let operator = operating.commander(&parts.headers, &cookies, reached).await;
-    let operator = operator.map_err(IntoResponse::into_response)?;
-    let payload = body::read(body, reached, MAX_PAYLOAD).await?;
+/// `POST /api/v1/drives/{name}/commands`
+pub(in crate::http) async fn command(
+    Asked(asked): Asked,
+    State(app): State<Arc<AppState>>,
+    Path(name): Path<String>,
+    Commander(operator): Commander,
+    Payload(payload): Payload,
+) -> Replied<CommandReply> {
     let plant = app.plant.load_full();
-    if let Some(drive) = restarts(&payload).then(|| plant.drive(name)).flatten()
+    if let Some(drive) = restarts(&payload).then(|| plant.drive(&name)).flatten()
         && drive.image.spec.profile.counts_messages
     {
         let (answer, shown) = restart::communication(&drive, operator.origin(), asked).await;
-        return Ok(CommandReply::new(None, name, &answer, shown, SystemTime::now()));
+        return Ok(CommandReply::new(None, &name, &answer, shown, SystemTime::now()));
     }
     let times = (asked, Instant::now(), SystemTime::now());
-    let progress = operating.take(&plant, &operator, name, &payload, times);
-    match progress {
+    match app.operating.take(&plant, &operator, &name, &payload, times) {
         Progress::Known(reply) => Ok(reply),
         Progress::Repeated(reply) => shared(reply).await,
         Progress::Placed(mut waiting) => match waiting.shared.take() {
@@ -153,14 +141,14 @@ async fn commanded(
 }
 
 /// Waits for a reply that several may wait for.
-async fn shared(mut reply: SharedReply) -> Result<CommandReply, Response> {
+async fn shared(mut reply: SharedReply) -> Replied<CommandReply> {
     let known = reply
         .wait_for(Option::is_some)
         .await
         .ok()
         .and_then(|reply| reply.clone());
     // Its task ends without a reply only when the process does.
-    known.ok_or_else(|| StatusCode::SERVICE_UNAVAILABLE.into_response())
+    known.ok_or(StatusCode::SERVICE_UNAVAILABLE.into())
 }
 
 impl Waiting {
@@ -324,19 +312,11 @@ enum Known {
 /// `GET /api/v1/drives/{name}/commands`: what can be commanded, and within which limits.
 pub(in crate::http) async fn commands_of(
     State(app): State<Arc<AppState>>,
-    Extension(reached): Extension<Reached>,
     Path(name): Path<String>,
-    headers: header::HeaderMap,
-) -> Response {
-    let cookies = app.cookies(&reached);
-    let operator = match app.operating.operator(&headers, &cookies, &reached).await {
-        Ok(operator) => operator,
-        Err(denied) => return denied.into_response(),
-    };
-    match app.plant.load().drive(&name) {
-        Some(drive) => Json(description(&drive, &operator)).into_response(),
-        None => no_drive(&app.plant.load(), &name),
-    }
+    Viewer(operator): Viewer,
+) -> Replied {
+    let drive = app.drive(&name)?;
+    Ok(Json(description(&drive, &operator)).into_response())
 }
 
 /// What can be commanded of a drive.
@@ -399,26 +379,12 @@ fn description<'d>(drive: &'d DriveHandle, operator: &Operator) -> Commandable<'
 /// `POST /api/v1/drives/{name}/heartbeat`: renews the lease of a drive that this login commanded last.
 pub(in crate::http) async fn heartbeat(
     State(app): State<Arc<AppState>>,
-    Extension(reached): Extension<Reached>,
     Path(name): Path<String>,
-    headers: header::HeaderMap,
-) -> Response {
-    let cookies = app.cookies(&reached);
-    let operator = match app.operating.commander(&headers, &cookies, &reached).await {
-        Ok(operator) => operator,
-        Err(denied) => return denied.into_response(),
-    };
-    let plant = app.plant.load();
-    let Some(drive) = plant.drive(&name) else {
-        return no_drive(&plant, &name);
-    };
-    match renew(&drive, &operator, Instant::now()) {
-        Ok(()) => StatusCode::NO_CONTENT.into_response(),
-        Err(why) => {
-            let error = ErrorReply::new(why.to_string());
-            (StatusCode::CONFLICT, Json(error)).into_response()
-        }
-    }
+    Commander(operator): Commander,
+) -> Replied<StatusCode> {
+    let drive = app.drive(&name)?;
+    renew(&drive, &operator, Instant::now()).map_err(|why| refused(StatusCode::CONFLICT, why))?;
+    Ok(StatusCode::NO_CONTENT)
 }
 
 /// Renews the lease of a drive, if the login commanded it last.

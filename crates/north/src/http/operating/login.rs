@@ -5,16 +5,15 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use axum::Json;
-use axum::body::Body;
 use axum::extract::{Extension, Request, State};
+use axum::http::StatusCode;
 use axum::http::header::{self, HeaderMap, HeaderValue};
-use axum::http::{StatusCode, request};
 use axum::response::{IntoResponse, Response};
 use ring::rand::{SecureRandom, SystemRandom};
 use serde::Serialize;
 
 use super::super::body;
-use super::super::messages::ErrorReply;
+use super::super::replies::{Refused, Replied, refused};
 use super::super::routes::{AppState, Reached};
 use super::cookies::{Cookies, known_as};
 use super::sessions::Session;
@@ -44,12 +43,11 @@ impl<'s> SessionReply<'s> {
     }
 }
 
-impl IntoResponse for Denied {
-    fn into_response(self) -> Response {
-        let error = ErrorReply::new(self.to_string());
-        let mut response = (self.status(), Json(error)).into_response();
+impl From<Denied> for Refused {
+    fn from(denied: Denied) -> Refused {
+        let mut response = refused(denied.status(), denied.to_string()).into_response();
         let headers = response.headers_mut();
-        match self {
+        match denied {
             // No Basic here: a browser would ask for a password and then send it by itself, whatever page makes a request.
             Denied::NotLoggedIn | Denied::SessionEnded | Denied::Wrong => {
                 headers.insert(
@@ -65,7 +63,7 @@ impl IntoResponse for Denied {
             }
             Denied::OtherOrigin | Denied::NoToken => {}
         }
-        response
+        response.into()
     }
 }
 
@@ -74,28 +72,17 @@ pub(in crate::http) async fn log_in(
     State(app): State<Arc<AppState>>,
     Extension(reached): Extension<Reached>,
     request: Request,
-) -> Response {
+) -> Replied {
     let (parts, body) = request.into_parts();
-    match logged_in(&app, &reached, &parts, body).await {
-        Ok(response) | Err(response) => response,
-    }
-}
-
-async fn logged_in(
-    app: &AppState,
-    reached: &Reached,
-    parts: &request::Parts,
-    body: Body,
-) -> Result<Response, Response> {
-    let (operating, cookies) = (&app.operating, app.cookies(reached));
-    is_own_origin(&parts.headers).map_err(Denied::into_response)?;
-    let body = body::read(body, reached, MAX_LOGIN).await?;
+    let (operating, cookies) = (&app.operating, app.cookies(&reached));
+    is_own_origin(&parts.headers)?;
+    let body = body::read(body, &reached, MAX_LOGIN).await?;
     let given = credentials(&parts.headers, &body).ok_or_else(|| {
-        let error = ErrorReply::new("send {\"user\": …, \"password\": …} as application/json".to_string());
-        (StatusCode::BAD_REQUEST, Json(error)).into_response()
+        let why = "send {\"user\": …, \"password\": …} as application/json";
+        refused(StatusCode::BAD_REQUEST, why)
     })?;
     let address = reached.peer.ip();
-    let source = operating.source(&given, &cookies, &parts.headers, reached);
+    let source = operating.source(&given, &cookies, &parts.headers, &reached);
     let user = match operating.verified(&given, address, source).await {
         Ok(user) => user,
         Err(denied) => {
@@ -103,11 +90,11 @@ async fn logged_in(
                 let user: String = given.user.chars().take(64).collect();
                 tracing::warn!(target: "drivegate::http", client = %address, user, suppressed, "HTTP: login refused: {denied}");
             }
-            return Err(denied.into_response());
+            return Err(denied.into());
         }
     };
     let now = Instant::now();
-    let unavailable = || StatusCode::INTERNAL_SERVER_ERROR.into_response();
+    let unavailable = || StatusCode::INTERNAL_SERVER_ERROR;
     let (session, cookie) = operating.begin(&user, address, now).ok_or_else(unavailable)?;
     tracing::info!(target: "drivegate::http", client = %address, user = %user, "HTTP: logged in");
     let mut response = Json(SessionReply::new(&session, now)).into_response();
@@ -134,7 +121,7 @@ impl Operating {
     fn source(&self, given: &Credentials, cookies: &Cookies, headers: &HeaderMap, reached: &Reached) -> Source {
         let known = cookies.known(headers).and_then(|mark| {
             let users = self.users.load_full()?;
-            let number = known_as(&mark, users.find(&given.user)?)?;
+            let number = known_as(&mark, users.named(&given.user)?)?;
             Some(Source::Known(self.hasher.hash_one(number)))
         });
         known.unwrap_or_else(|| Source::of(reached.peer.ip()))
@@ -144,7 +131,7 @@ impl Operating {
     fn mark_browser(&self, user: &str, cookies: &Cookies) -> Option<HeaderValue> {
         let mut number = [0; 16];
         SystemRandom::new().fill(&mut number).ok()?;
-        cookies.set_known(self.users.load_full()?.find(user)?, &number)
+        cookies.set_known(self.users.load_full()?.named(user)?, &number)
     }
 }
 
@@ -167,20 +154,18 @@ pub(in crate::http) async fn log_out(
     State(app): State<Arc<AppState>>,
     Extension(reached): Extension<Reached>,
     headers: HeaderMap,
-) -> Response {
+) -> Replied {
     let (operating, cookies) = (&app.operating, app.cookies(&reached));
-    if let Err(denied) = is_own_origin(&headers) {
-        return denied.into_response();
-    }
+    is_own_origin(&headers)?;
     if let Some(cookie) = cookies.session(&headers) {
         match operating.check_csrf(&headers, &cookie) {
             Ok(()) => operating.state().sessions.end(&cookie),
             Err(Denied::SessionEnded) => {}
-            Err(denied) => return denied.into_response(),
+            Err(denied) => return Err(denied.into()),
         }
     }
     let mut response = StatusCode::NO_CONTENT.into_response();
     let cleared = cookies.clear_session().map(|value| (header::SET_COOKIE, value));
     response.headers_mut().extend(cleared);
-    response
+    Ok(response)
 }

@@ -4,6 +4,7 @@
 //! changes something also has to come from this gateway's own page, or from no page at all: [`is_own_origin`], and a
 //! session's requests repeat its token ([`Operating::check_csrf`]). `sessions` and `throttle` are pure.
 
+mod asker;
 mod commands;
 mod cookies;
 mod hold;
@@ -41,6 +42,8 @@ use crate::NorthStats;
 use crate::command::{Authority, Proof, SourceKind};
 use crate::log_throttle::LogThrottle;
 
+use self::asker::Commander;
+pub(super) use self::asker::Viewer;
 pub(crate) use self::commands::PostedCommands;
 pub(super) use self::commands::{Commandable, command, commands_of, heartbeat};
 pub(super) use self::hold::{HoldAct, hold, hold_of};
@@ -182,7 +185,7 @@ impl Operating {
     pub(super) fn set_users(&self, users: Option<Users>) {
         let before = self.users.swap(users.map(Arc::new));
         let after = self.users.load_full();
-        let of = |users: &Option<Arc<Users>>, name: &str| users.as_ref().and_then(|users| users.find(name)).cloned();
+        let of = |users: &Option<Arc<Users>>, name: &str| users.as_ref().and_then(|users| users.named(name)).cloned();
         let stays = |name: &str| {
             let user: Option<User> = of(&after, name);
             user.is_some() && user == of(&before, name)
@@ -320,7 +323,7 @@ impl Operating {
         let failures = self.state().throttle.begin(source, name, Instant::now());
         let failures = failures.map_err(Denied::TooMany)?;
         // Whether the user exists must not show, neither by the answer nor by its time.
-        let user = users.find(&given.user);
+        let user = users.named(&given.user);
         let too_long = given.password.len() > MAX_PASSWORD;
         let password = if too_long { "" } else { given.password.as_str() };
         let hashes = users.hashes(&given.user);
@@ -346,7 +349,9 @@ impl Operating {
 
     fn has(&self, user: &User) -> bool {
         let users = self.users.load();
-        users.as_ref().is_some_and(|users| users.find(&user.name) == Some(user))
+        users
+            .as_ref()
+            .is_some_and(|users| users.named(&user.name) == Some(user))
     }
 
     /// What is kept of a user and a password that were right.

@@ -4,58 +4,38 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use axum::Json;
-use axum::extract::{Extension, Request, State};
+use axum::extract::State;
 use axum::http::StatusCode;
-use axum::response::{IntoResponse, Response};
+use axum::response::IntoResponse;
 
-use super::super::body;
-use super::super::messages::ErrorReply;
-use super::super::routes::{AppState, Reached};
-use crate::command_json::{MAX_PAYLOAD, stop_all};
+use super::super::body::Payload;
+use super::super::replies::{Replied, not_found, refused};
+use super::super::routes::AppState;
+use super::Commander;
+use crate::command_json::stop_all;
 use crate::stop_all::NothingToStop;
 
 /// 200 if every drive stands, 504 if one is not proven to.
 pub(in crate::http) async fn stop(
     State(app): State<Arc<AppState>>,
-    Extension(reached): Extension<Reached>,
-    request: Request,
-) -> Response {
-    let (parts, body) = request.into_parts();
-    let cookies = app.cookies(&reached);
-    let operator = app.operating.commander(&parts.headers, &cookies, &reached);
-    let operator = match operator.await {
-        Ok(operator) => operator,
-        Err(denied) => return denied.into_response(),
-    };
-    let payload = match body::read(body, &reached, MAX_PAYLOAD).await {
-        Ok(payload) => payload,
-        Err(response) => return response,
-    };
-    let (scope, wait) = match stop_all(&payload) {
-        Ok(wanted) => wanted,
-        Err(why) => return error(StatusCode::UNPROCESSABLE_ENTITY, why, Vec::new()),
-    };
+    Commander(operator): Commander,
+    Payload(payload): Payload,
+) -> Replied {
+    let (scope, wait) = stop_all(&payload).map_err(|why| refused(StatusCode::UNPROCESSABLE_ENTITY, why))?;
     let plant = app.plant.load_full();
     let order = plant
         .stop_all
         .order(&plant, &scope, &operator.origin(), wait, Instant::now());
-    match order {
-        Ok(order) => match order.report.await {
-            Ok(report) if report.ok => Json(report).into_response(),
-            Ok(report) => (StatusCode::GATEWAY_TIMEOUT, Json(report)).into_response(),
-            Err(_) => StatusCode::SERVICE_UNAVAILABLE.into_response(),
-        },
-        Err(why @ NothingToStop::NotControlled) => error(StatusCode::FORBIDDEN, why.to_string(), Vec::new()),
-        Err(why) => {
-            let text = why.to_string();
-            let NothingToStop::Unknown { known, .. } = why else {
-                return error(StatusCode::NOT_FOUND, text, Vec::new());
-            };
-            error(StatusCode::NOT_FOUND, text, known)
-        }
-    }
-}
-
-fn error(status: StatusCode, error: String, known: Vec<String>) -> Response {
-    (status, Json(ErrorReply { error, known })).into_response()
+    let order = order.map_err(|why| match (why.to_string(), why) {
+        (text, NothingToStop::NotControlled) => refused(StatusCode::FORBIDDEN, text),
+        (text, NothingToStop::Unknown { known, .. }) => not_found(text, known),
+    })?;
+    let report = order.report.await;
+    let report = report.map_err(|_| StatusCode::SERVICE_UNAVAILABLE)?;
+    let status = if report.ok {
+        StatusCode::OK
+    } else {
+        StatusCode::GATEWAY_TIMEOUT
+    };
+    Ok((status, Json(report)).into_response())
 }

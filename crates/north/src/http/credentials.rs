@@ -1,0 +1,98 @@
+//! What the files of tokens and users have in common: one of them a line, each with a name of its own.
+
+use std::str::FromStr;
+
+/// A token or a user. Displayed as its line of the file.
+pub trait Credential: FromStr<Err = CredentialError> + std::fmt::Display {
+    /// `token` or `user`.
+    const KIND: &'static str;
+    /// Most of a file: more than any plant needs.
+    const MOST: usize;
+
+    /// Unique in the file.
+    fn name(&self) -> &str;
+}
+
+/// Why a line is not a token or a user, or none can be made.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum CredentialError {
+    /// Other words than those of the form.
+    #[error("not `{0}`")]
+    Form(&'static str),
+    /// A name of other characters, or a long one.
+    #[error("`{0}` is not a name of at most 64 letters, digits, `-`, `_` and `.`")]
+    Name(String),
+    /// A name that another line has.
+    #[error("there are two {0}s named `{1}`")]
+    Repeated(&'static str, String),
+    /// An unknown scope.
+    #[error("`{0}` is not a scope; there are read, metrics and control")]
+    Scope(String),
+    /// Not a hash of the kind in the text.
+    #[error("the hash is not {0}")]
+    Hash(&'static str),
+    /// More lines than any plant needs.
+    #[error("there are more than {1} {0}s")]
+    Many(&'static str, usize),
+    /// A password that is easily guessed, or no text.
+    #[error(
+        "a password has at least {} characters, at most {} bytes and no control characters",
+        super::MIN_PASSWORD,
+        super::MAX_PASSWORD
+    )]
+    Password,
+    /// The system does not provide them.
+    #[error("the system has no random numbers")]
+    Random,
+}
+
+/// The tokens or users of a file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Credentials<C>(pub(super) Vec<C>);
+
+impl<C> Default for Credentials<C> {
+    fn default() -> Credentials<C> {
+        Credentials(Vec::new())
+    }
+}
+
+impl<C: Credential> Credentials<C> {
+    /// Reads the text of a file; empty lines and lines that begin with `#` are ignored.
+    ///
+    /// # Errors
+    /// The first bad line, counted from 1, and why.
+    pub fn parse(text: &str) -> Result<Credentials<C>, (usize, CredentialError)> {
+        let mut all = Credentials(Vec::new());
+        let lines = (1..).zip(text.lines().map(str::trim));
+        for (line, text) in lines.filter(|(_, text)| !text.is_empty() && !text.starts_with('#')) {
+            let one: C = text.parse().map_err(|error| (line, error))?;
+            if all.named(one.name()).is_some() {
+                return Err((line, CredentialError::Repeated(C::KIND, one.name().to_string())));
+            }
+            if all.0.len() >= C::MOST {
+                return Err((line, CredentialError::Many(C::KIND, C::MOST)));
+            }
+            all.0.push(one);
+        }
+        Ok(all)
+    }
+
+    /// All of them, in the order of the file.
+    pub fn list(&self) -> &[C] {
+        &self.0
+    }
+
+    /// The one of that name.
+    pub fn named(&self, name: &str) -> Option<&C> {
+        self.0.iter().find(|one| one.name() == name)
+    }
+}
+
+/// A name that a token or a user can have.
+pub(super) fn checked_name(name: &str) -> Result<String, CredentialError> {
+    let sound = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
+    match !name.is_empty() && name.len() <= 64 && name.chars().all(sound) {
+        true => Ok(name.to_string()),
+        false => Err(CredentialError::Name(name.chars().take(64).collect())),
+    }
+}

@@ -1,0 +1,77 @@
+//! Replies that refuse.
+
+use axum::Json;
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+
+use super::messages::ErrorReply;
+use super::routes::AppState;
+use crate::plant::{BusHandle, DriveHandle, Plant};
+
+/// A reply that says why not. Boxed: it goes through many results.
+#[derive(Debug)]
+pub(super) struct Refused(Box<Response>);
+
+/// What a handler replies.
+pub(super) type Replied<T = Response> = Result<T, Refused>;
+
+impl From<Response> for Refused {
+    fn from(reply: Response) -> Refused {
+        Refused(Box::new(reply))
+    }
+}
+
+impl From<StatusCode> for Refused {
+    fn from(status: StatusCode) -> Refused {
+        status.into_response().into()
+    }
+}
+
+impl IntoResponse for Refused {
+    fn into_response(self) -> Response {
+        *self.0
+    }
+}
+
+/// With that status.
+pub(super) fn refused(status: StatusCode, why: impl Into<String>) -> Refused {
+    (status, Json(ErrorReply::new(why))).into_response().into()
+}
+
+/// With status 404; lists the known names.
+pub(super) fn not_found(error: String, known: Vec<String>) -> Refused {
+    let error = Json(ErrorReply { error, known });
+    (StatusCode::NOT_FOUND, error).into_response().into()
+}
+
+/// Where there is no such drive.
+pub(super) fn no_drive(plant: &Plant, name: &str) -> Refused {
+    let known = plant.drives().map(|drive| drive.image.spec.name.clone());
+    not_found(format!("there is no drive `{name}`"), known.collect())
+}
+
+/// Where there is no such bus.
+pub(super) fn no_bus(plant: &Plant, name: &str) -> Refused {
+    let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
+    not_found(format!("there is no bus `{name}`"), known.collect())
+}
+
+/// The bus of that name.
+///
+/// # Errors
+/// The reply where there is none.
+pub(super) fn find_bus<'p>(plant: &'p Plant, name: &str) -> Replied<&'p BusHandle> {
+    let found = plant.buses.iter().find(|bus| bus.image.spec.name == name);
+    found.ok_or_else(|| no_bus(plant, name))
+}
+
+impl AppState {
+    /// The drive of that name.
+    ///
+    /// # Errors
+    /// The reply where there is none.
+    pub(super) fn drive(&self, name: &str) -> Replied<DriveHandle> {
+        let plant = self.plant.load();
+        plant.drive(name).ok_or_else(|| no_drive(&plant, name))
+    }
+}

@@ -1,0 +1,187 @@
+//! What the routes show that have no file of their own.
+
+use std::fmt::Write as _;
+use std::sync::Arc;
+use std::time::{Instant, SystemTime};
+
+use axum::Json;
+use axum::extract::{Extension, Path, RawQuery, Request, State};
+use axum::http::header::{self, HeaderMap};
+use axum::http::{Method, StatusCode, Uri};
+use axum::response::{Html, IntoResponse, Response};
+
+use super::messages::{Health, Why};
+use super::params::Parameters;
+use super::replies::{Replied, find_bus, no_drive, not_found, refused};
+use super::routes::{AppState, Reached};
+use super::{api, page, query};
+use crate::local::control;
+use crate::parameters::ParameterFile;
+use crate::plant::Plant;
+use crate::{metrics, readiness};
+
+pub(super) async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
+    let _turn = app.turn().await;
+    document(page::render(&app.plant.load(), app.operating.is_on(), Instant::now()))
+}
+
+pub(super) fn document(html: String) -> Response {
+    let policy = [(header::CONTENT_SECURITY_POLICY, page::SECURITY_POLICY)];
+    (policy, Html(html)).into_response()
+}
+
+pub(super) async fn asset(Path(name): Path<String>, uri: Uri) -> Response {
+    match page::ASSETS.iter().find(|asset| asset.name == name) {
+        Some(asset) => ([(header::CONTENT_TYPE, asset.content_type)], asset.body).into_response(),
+        None => unknown(uri).await,
+    }
+}
+
+pub(super) async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
+    let _turn = app.turn().await;
+    let accept: Vec<&str> = headers
+        .get_all(header::ACCEPT)
+        .iter()
+        .filter_map(|value| value.to_str().ok())
+        .collect();
+    let (format, content_type) = metrics::Format::accepted(&accept.join(","));
+    match metrics::encode(&app.plant.load(), &app.stats, Instant::now(), format) {
+        Ok(text) => {
+            let headers = [(header::CONTENT_TYPE, content_type), (header::VARY, "accept")];
+            (headers, text).into_response()
+        }
+        Err(error) => {
+            tracing::error!(target: "drivegate::http", "cannot encode the metrics: {error}; report this");
+            StatusCode::INTERNAL_SERVER_ERROR.into_response()
+        }
+    }
+}
+
+pub(super) async fn ready(State(app): State<Arc<AppState>>) -> Response {
+    let reasons = readiness::reasons(&app.plant.load(), &app.stats);
+    if reasons.is_empty() {
+        return "ready\n".into_response();
+    }
+    let mut text = "not ready\n".to_string();
+    for reason in reasons {
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "{reason}");
+    }
+    (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
+}
+
+/// Whether the gateway is ready, and why not: 200 in both cases.
+pub(super) async fn health(State(app): State<Arc<AppState>>) -> Response {
+    let reasons = readiness::reasons(&app.plant.load(), &app.stats);
+    let ready = reasons.is_empty();
+    Json(Health { ready, reasons }).into_response()
+}
+
+/// The gateway reads its configuration again: 200 with what changed, 422 with the errors, and it goes on as before.
+pub(super) async fn reload(Extension(reached): Extension<Reached>, uri: Uri, request: Request) -> Response {
+    let Some(local) = reached.local else {
+        return unknown(uri).await;
+    };
+    if !matches!(*request.method(), Method::POST) {
+        return StatusCode::METHOD_NOT_ALLOWED.into_response();
+    }
+    match control::reload(local.control.as_ref(), local.who.to_string()).await {
+        Ok(outcome) if outcome.errors.is_empty() => Json(outcome).into_response(),
+        Ok(outcome) => (StatusCode::UNPROCESSABLE_ENTITY, Json(outcome)).into_response(),
+        Err(why) => refused(StatusCode::SERVICE_UNAVAILABLE, why).into_response(),
+    }
+}
+
+/// All drives; with `points=` only these points of each.
+pub(super) async fn drives(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+    let shown = query::names(query.as_deref(), "points");
+    let _turn = app.turn().await;
+    let plant = app.plant.load();
+    let clock = api::Clock::new(Instant::now(), SystemTime::now());
+    let all: Vec<_> = plant.drives().collect();
+    let all: Vec<_> = all
+        .iter()
+        .map(|drive| api::Drive::new(drive, &plant.history, clock).only(shown.as_ref()))
+        .collect();
+    Json(all).into_response()
+}
+
+pub(super) async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Replied {
+    let plant = app.plant.load();
+    let drive = plant.drive(&name).ok_or_else(|| no_drive(&plant, &name))?;
+    let clock = api::Clock::new(Instant::now(), SystemTime::now());
+    Ok(Json(api::Drive::new(&drive, &plant.history, clock)).into_response())
+}
+
+/// Why a drive does not run.
+pub(super) async fn why(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Replied<Json<Why>> {
+    let drive = app.drive(&name)?;
+    let profile = &drive.image.spec.profile;
+    Ok(Json(Why {
+        explanation: drive.why(&drive.reading(Instant::now())),
+        profile: profile.name.clone(),
+        profile_verified: profile.verified,
+    }))
+}
+
+/// The last reading of the parameters of a drive, and the one that goes on.
+pub(super) async fn params(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Replied {
+    let plant = app.plant.load_full();
+    let drive = plant.drive(&name).ok_or_else(|| no_drive(&plant, &name))?;
+    let machine = drive.machine();
+    let status = plant.parameters.status(&machine);
+    let last = match plant.parameters.last(&machine) {
+        Some(file) => Some(file),
+        None => stored_params(&app, &plant, &name).await?.map(Arc::new),
+    };
+    let restore = plant.parameters.restore(&machine);
+    let parameters = Parameters::new(&name, last.as_deref(), status.as_ref(), restore.as_ref());
+    Ok(Json(parameters).into_response())
+}
+
+/// The last reading on disk.
+async fn stored_params(app: &AppState, plant: &Plant, name: &str) -> Replied<Option<ParameterFile>> {
+    let Some(store) = plant.parameters.store() else {
+        return Ok(None);
+    };
+    let unavailable = StatusCode::SERVICE_UNAVAILABLE;
+    let _permit = app.files.acquire().await.map_err(|_| unavailable)?;
+    let name = name.to_string();
+    let read = tokio::task::spawn_blocking(move || store.latest(&name)).await;
+    read.map_err(|_| unavailable)?
+        .map_err(|why| refused(StatusCode::INTERNAL_SERVER_ERROR, why))
+}
+
+pub(super) async fn buses(State(app): State<Arc<AppState>>) -> Response {
+    let plant = app.plant.load();
+    let all: Vec<_> = plant.buses.iter().map(api::Bus::new).collect();
+    Json(all).into_response()
+}
+
+/// What is wrong with the line of a bus.
+pub(super) async fn diagnosis(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Replied {
+    let plant = app.plant.load();
+    let diagnosis = find_bus(&plant, &name)?.image.diagnosis.load();
+    Ok(Json(api::Diagnosis::new(&name, &diagnosis)).into_response())
+}
+
+/// The last commands, newest last; with `drive` those to one drive.
+pub(super) async fn audit(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Replied {
+    let [drive] = query::parameters(query.as_deref(), &["drive"])?;
+    let plant = app.plant.load();
+    if let Some(drive) = drive.as_ref().filter(|drive| plant.drive(drive).is_none()) {
+        return Err(no_drive(&plant, drive));
+    }
+    let _turn = app.turn().await;
+    let records = plant.writes.audit().recent(drive.as_deref());
+    let list = format!("[{}]", records.join(","));
+    Ok(([(header::CONTENT_TYPE, "application/json")], list).into_response())
+}
+
+pub(super) async fn unknown(uri: Uri) -> Response {
+    if uri.path().starts_with("/api/") {
+        return not_found(format!("there is nothing at {}", uri.path()), Vec::new()).into_response();
+    }
+    let text = "there is nothing here; the status page is at /\n";
+    (StatusCode::NOT_FOUND, text).into_response()
+}
