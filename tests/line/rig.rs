@@ -114,15 +114,9 @@ impl Rig {
         };
         let bus = BusTask::start(handle.clone(), options, writes.clone(), events.clone()).unwrap();
         let plant = Plant {
-            gateway: "test".to_string(),
-            stale_after: PATIENCE,
-            buses: vec![handle],
             events: events.clone(),
             writes,
-            recordings: Default::default(),
-            stop_all: Arc::default(),
-            parameters: Default::default(),
-            history: Default::default(),
+            ..Plant::new("test", PATIENCE, vec![handle])
         };
         Rig {
             plant,

@@ -46,17 +46,7 @@ pub(crate) fn bus(name: &str, protocol: Protocol, drives: Vec<Arc<DriveImage>>) 
 
 /// Samples stay good for `stale_after`.
 pub(crate) fn plant(gateway: &str, stale_after: Duration, buses: Vec<BusHandle>) -> Plant {
-    Plant {
-        gateway: gateway.to_string(),
-        stale_after,
-        buses,
-        events: Events::default(),
-        writes: Arc::default(),
-        recordings: Default::default(),
-        stop_all: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
-    }
+    Plant::new(gateway, stale_after, buses)
 }
 
 /// Takes the command that has its turn, where every drive is free and no stop is redundant.

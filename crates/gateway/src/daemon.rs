@@ -23,7 +23,8 @@ use crate::bus::master::Handover;
 use crate::command::{AuditFile, CommandQueue, NotStopped, Outcome, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::{Event, EventKind, Events};
-use crate::history::{History, Keeper, RecorderTask, Recordings};
+use crate::files::Keeper;
+use crate::history::{self, History, RecorderTask, Recordings};
 use crate::north::local::Control;
 use crate::north::parameter_jobs::{hold_unfinished, keep_reading};
 use crate::north::{NorthStats, ServerError, bacnet, http, local, modbus_tcp, mqtt, slot};
@@ -86,7 +87,7 @@ pub struct Daemon {
     /// The starts of all drives.
     guards: Arc<Guards>,
     /// Keeps them on disk.
-    starts: Option<start_guard::Keeper>,
+    starts: Option<Keeper>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
     stopper: tokio::task::JoinHandle<()>,
@@ -127,15 +128,12 @@ impl Daemon {
         let vault = Arc::new(Vault::default());
         let history = Arc::new(History::default());
         let plant = Plant {
-            gateway: settings.gateway.clone(),
-            stale_after: settings.stale_after,
-            buses: Vec::new(),
             events: events.clone(),
             writes: writes.clone(),
             recordings: recordings.clone(),
-            stop_all: Arc::default(),
             parameters: vault.clone(),
             history: history.clone(),
+            ..Plant::new(&settings.gateway, settings.stale_after, Vec::new())
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let reservations = ReservationsFile::default();
@@ -441,7 +439,7 @@ impl Daemon {
         }
         let first = self.keeper.is_none();
         self.stop_keeper().await;
-        match Keeper::start(&settings.state_dir, first, self.history.clone(), &self.events) {
+        match history::keep(&settings.state_dir, first, self.history.clone(), &self.events) {
             Ok(keeper) => self.keeper = Some(keeper),
             Err(error) => {
                 tracing::error!(
@@ -453,14 +451,14 @@ impl Daemon {
 
     /// Keeps starts in the configured directory, where they are counted. Guarded drives are not started without that.
     async fn apply_guards(&mut self, settings: &Settings) {
-        let same = |keeper: &start_guard::Keeper| keeper.dir() == settings.state_dir;
+        let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
         let mut drives = settings.buses.iter().flat_map(|bus| &bus.drives);
         let none = !drives.any(|drive| drive.guard.is_some());
         if none || !settings.keeps_history || self.starts.as_ref().is_some_and(same) {
             return;
         }
         self.stop_starts().await;
-        match start_guard::Keeper::start(&settings.state_dir, self.guards.clone()) {
+        match start_guard::keep(&settings.state_dir, self.guards.clone()) {
             Ok(keeper) => self.starts = Some(keeper),
             Err(error) => tracing::error!(
                 target: "drivegate::daemon",

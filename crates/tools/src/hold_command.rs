@@ -48,16 +48,12 @@ pub(super) fn run(args: &Args) -> ExitCode {
                 report::print(&line(&hold));
                 match hold.error {
                     None => ExitCode::SUCCESS,
-                    Some(reason) => failed(&reason.message),
+                    Some(reason) => report::failed(&reason.message),
                 }
             }
-            Err(why) => failed(&why),
+            Err(why) => report::failed(&why),
         }
     })
-}
-
-fn failed(why: &str) -> ExitCode {
-    report::failed(why)
 }
 
 async fn hold(args: &Args) -> Result<Hold, String> {

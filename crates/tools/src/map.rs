@@ -148,17 +148,11 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
             queue: Arc::new(queue),
         })
     };
-    Ok(Plant {
-        gateway: settings.gateway.clone(),
-        stale_after: settings.stale_after,
-        buses: settings.buses.iter().map(bus).collect::<io::Result<_>>()?,
-        events: Default::default(),
-        writes: Default::default(),
-        recordings: Default::default(),
-        stop_all: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
-    })
+    Ok(Plant::new(
+        settings.gateway.clone(),
+        settings.stale_after,
+        settings.buses.iter().map(bus).collect::<io::Result<_>>()?,
+    ))
 }
 
 /// The map of the units on the buses that are `shown`, all without a choice.

@@ -123,10 +123,6 @@ pub(super) fn run(args: &Args) -> ExitCode {
     done.unwrap_or_else(|code| code)
 }
 
-fn failed(message: &str) -> ExitCode {
-    report::failed(message)
-}
-
 fn read_drive(gateway: &Gateway, args: &ReadArgs) -> Result<ExitCode, ExitCode> {
     let names = names(args.names.as_deref())?;
     let (file, profile) = read_from_drive(gateway, &args.drive, args.how())?;
@@ -144,7 +140,7 @@ fn read_drive(gateway: &Gateway, args: &ReadArgs) -> Result<ExitCode, ExitCode> 
         return Ok(report::print(&file.text()));
     };
     files::replace(output, file.text().as_bytes()).map_err(|error| {
-        failed(&format!(
+        report::failed(&format!(
             "cannot write the file: {error}; {}; name another place",
             output.display()
         ))
@@ -178,8 +174,9 @@ fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Resul
         }
     });
     line.end();
-    let file = text.map_err(|why| failed(&why)).and_then(|text| {
-        ParameterFile::parse(&text).map_err(|why| failed(&format!("the gateway's file is not understood: {why}")))
+    let file = text.map_err(|why| report::failed(&why)).and_then(|text| {
+        ParameterFile::parse(&text)
+            .map_err(|why| report::failed(&format!("the gateway's file is not understood: {why}")))
     })?;
     let profile = match target.profile() {
         Some(profile) => profile.clone(),
@@ -192,7 +189,7 @@ fn built_in(family: &str) -> Result<std::sync::Arc<crate::drive::Profile>, ExitC
     let profiles = crate::drive::profile::Profiles::built_in();
     let profile = profiles.get(family).cloned();
     profile.ok_or_else(|| {
-        failed(&format!(
+        report::failed(&format!(
             "profile `{family}` is not built in; --names; name the list in [params]"
         ))
     })
@@ -260,7 +257,8 @@ fn seconds_in_words(seconds: f64) -> String {
 /// A file where there is one, else the drive of that name, which is read.
 fn file_or_drive(gateway: &Gateway, of: &str) -> Result<ParameterFile, ExitCode> {
     match Path::new(of).is_file() {
-        true => read_file(Path::new(of)).map_err(|why| failed(&format!("{why}; name a file that `params read` wrote"))),
+        true => read_file(Path::new(of))
+            .map_err(|why| report::failed(&format!("{why}; name a file that `params read` wrote"))),
         false => Ok(read_from_drive(gateway, of, ReadParameters::default())?.0),
     }
 }
@@ -294,7 +292,7 @@ fn store(config: &Path) -> Result<Store, ExitCode> {
 fn list(config: &Path, drive: Option<&str>) -> Result<ExitCode, ExitCode> {
     let store = store(config)?;
     let kept = store.list().map_err(|error| {
-        failed(&format!(
+        report::failed(&format!(
             "cannot read the readings: {error}; {}; make it a directory that you may read, or use sudo",
             store.dir().display()
         ))
@@ -328,16 +326,15 @@ fn show(config: &Path, of: &str, names: Option<&Path>) -> Result<ExitCode, ExitC
     let names = self::names(names)?;
     let is_file = Path::new(of).is_file();
     let file = match is_file {
-        true => {
-            read_file(Path::new(of)).map_err(|why| failed(&format!("{why}; name a file that `params read` wrote")))?
-        }
+        true => read_file(Path::new(of))
+            .map_err(|why| report::failed(&format!("{why}; name a file that `params read` wrote")))?,
         false => {
             let store = store(config)?;
             let last = store
                 .latest(of)
-                .map_err(|why| failed(&format!("{why}; correct or remove it")))?;
+                .map_err(|why| report::failed(&format!("{why}; correct or remove it")))?;
             last.ok_or_else(|| {
-                failed(&format!(
+                report::failed(&format!(
                     "no reading of `{of}` is kept; {}; read it by `drivegate params read {of}`",
                     store.dir().display()
                 ))
@@ -382,8 +379,8 @@ fn names(path: Option<&Path>) -> Result<Option<Names>, ExitCode> {
     let Some(path) = path else { return Ok(None) };
     let shown = path.display();
     let text = std::fs::read_to_string(path)
-        .map_err(|error| failed(&format!("cannot read the names: {error}; {shown}; name a CSV file")))?;
+        .map_err(|error| report::failed(&format!("cannot read the names: {error}; {shown}; name a CSV file")))?;
     let names = Names::parse(&text)
-        .map_err(|why| failed(&format!("{why}; {shown}; write id, name, unit, scale in each row")))?;
+        .map_err(|why| report::failed(&format!("{why}; {shown}; write id, name, unit, scale in each row")))?;
     Ok(Some(names))
 }

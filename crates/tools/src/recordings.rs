@@ -80,10 +80,6 @@ pub(super) fn run(args: &Args) -> ExitCode {
     done.unwrap_or_else(|code| code)
 }
 
-fn failed(message: &str) -> ExitCode {
-    report::failed(message)
-}
-
 /// The directory of the recordings.
 fn directory(args: &Args) -> Result<PathBuf, ExitCode> {
     if let Some(dir) = &args.dir {
@@ -97,7 +93,7 @@ fn directory(args: &Args) -> Result<PathBuf, ExitCode> {
 
 fn entries(dir: &Path) -> Result<Vec<Entry>, ExitCode> {
     let unreadable = |error| {
-        failed(&format!(
+        report::failed(&format!(
             "cannot read the recordings: {error}; {}; use sudo",
             dir.display()
         ))
@@ -144,7 +140,7 @@ fn open(args: &Args, id: &str) -> Result<Recording, ExitCode> {
             path
         }
     };
-    let unreadable = |error| failed(&format!("{error}; name a recording of `drivegate recordings list`"));
+    let unreadable = |error| report::failed(&format!("{error}; name a recording of `drivegate recordings list`"));
     store::read(&path).map_err(unreadable)
 }
 
@@ -157,7 +153,7 @@ fn unknown(dir: &Path, id: &str) -> ExitCode {
         Some(near) => format!("did you mean `{near}`?"),
         None => "`drivegate recordings list` lists them".to_string(),
     };
-    failed(&format!("there is no recording `{id}`; {}; {remedy}", dir.display()))
+    report::failed(&format!("there is no recording `{id}`; {}; {remedy}", dir.display()))
 }
 
 fn export(form: &Export, recording: &Recording) -> Result<ExitCode, ExitCode> {
@@ -172,7 +168,7 @@ fn export(form: &Export, recording: &Recording) -> Result<ExitCode, ExitCode> {
             Ok(()) => Ok(ExitCode::SUCCESS),
             Err(error) => {
                 let path = path.display();
-                Err(failed(&format!(
+                Err(report::failed(&format!(
                     "cannot write the export: {error}; {path}; name another file"
                 )))
             }

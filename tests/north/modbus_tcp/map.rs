@@ -63,17 +63,7 @@ fn plant(settings: &Settings) -> Plant {
             queue: Arc::new(CommandQueue::new().unwrap()),
         }
     });
-    Plant {
-        gateway: settings.gateway.clone(),
-        stale_after: Duration::from_secs(3600),
-        buses: buses.collect(),
-        events: Default::default(),
-        writes: Default::default(),
-        recordings: Default::default(),
-        stop_all: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
-    }
+    Plant::new(settings.gateway.clone(), Duration::from_secs(3600), buses.collect())
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

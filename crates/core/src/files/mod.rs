@@ -1,9 +1,11 @@
 //! Files that the gateway writes while it runs: lines that are appended, and small files that are replaced.
 //!
 //! - [`rotated`]: a file of lines with older ones beside it, bounded together.
+//! - [`Keeper`]: the thread that writes some of them.
 //! - [`names`]: what the gateway calls its files.
 //! - [`replace`]: a new content in the place of the old one, never a half of either.
 
+mod keeper;
 pub mod names;
 pub mod rotated;
 
@@ -11,10 +13,19 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::Path;
 
+pub use keeper::Keeper;
 pub use rotated::Rotated;
 
 /// Ending of a file that is not written to its end.
 pub const PARTIAL: &str = "partial";
+
+/// Gives a file that cannot be used another name, and says so for the log.
+pub fn set_aside(path: &Path, aside: &Path) -> String {
+    match fs::rename(path, aside) {
+        Ok(()) => format!("it is kept as {}", aside.display()),
+        Err(error) => format!("it cannot be kept aside ({error})"),
+    }
+}
 
 /// Puts `bytes` in the place of a file: after a power failure it has the old content or the new one. Makes its directory.
 ///

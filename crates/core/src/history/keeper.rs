@@ -6,18 +6,18 @@ use std::fs;
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant, SystemTime};
 
 use serde::{Deserialize, Serialize};
+use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::TryRecvError;
-use tokio::sync::{broadcast, watch};
 
 use super::counters::Totals;
 use super::drives::History;
 use crate::event::{self, Event, Events};
 use crate::files::names::{COUNTERS, EVENTS};
-use crate::files::{self, Rotated};
+use crate::files::{self, Keeper, Rotated};
 
 /// Events reach the disk within that time; a disk that failed is tried again at this interval.
 const TICK: Duration = Duration::from_secs(1);
@@ -41,50 +41,17 @@ struct CounterFile {
     drives: BTreeMap<String, Totals>,
 }
 
-/// The thread, at work.
-#[derive(Debug)]
-pub struct Keeper {
-    dir: PathBuf,
-    end: Sender<()>,
-    ended: watch::Receiver<()>,
-}
-
-impl Keeper {
-    /// Keeps events and counters in that directory from now on. With `first`, the first of this run, events of earlier runs are
-    /// taken from there before it returns: to be called before anything happens.
-    ///
-    /// # Errors
-    /// The system gives no thread.
-    pub fn start(dir: &Path, first: bool, history: Arc<History>, events: &Events) -> io::Result<Keeper> {
-        let mut writer = Writer::new(dir, first, history, events.subscribe());
-        if first {
-            writer.remember(events);
-        }
-        let ((end, to_end), (running, ended)) = (channel(), watch::channel(()));
-        let thread = std::thread::Builder::new().name("history".to_string());
-        thread.spawn(move || {
-            writer.run(&to_end);
-            drop(running);
-        })?;
-        Ok(Keeper {
-            dir: dir.to_path_buf(),
-            end,
-            ended,
-        })
+/// Keeps events and counters in that directory from now on. With `first`, the first of this run, events of earlier runs are
+/// taken from there before it returns: to be called before anything happens.
+///
+/// # Errors
+/// The system gives no thread.
+pub fn keep(dir: &Path, first: bool, history: Arc<History>, events: &Events) -> io::Result<Keeper> {
+    let mut writer = Writer::new(dir, first, history, events.subscribe());
+    if first {
+        writer.remember(events);
     }
-
-    /// Where it keeps them.
-    pub fn dir(&self) -> &Path {
-        &self.dir
-    }
-
-    /// Writes what there is, as far as the disk takes it, and ends the thread. A disk that hangs holds it up for good: wait with
-    /// a limit.
-    pub async fn stop(self) {
-        let Keeper { end, mut ended, .. } = self;
-        drop(end);
-        while ended.changed().await.is_ok() {}
-    }
+    Keeper::start("history", dir, move |end| writer.run(end))
 }
 
 #[derive(Debug)]
@@ -229,11 +196,7 @@ impl Writer {
         match found {
             Ok(totals) => self.history.count_on(totals),
             Err(why) => {
-                let aside = kept_aside(path);
-                let kept = match fs::rename(path, &aside) {
-                    Ok(()) => format!("it is kept as {}", aside.display()),
-                    Err(error) => format!("it cannot be kept aside ({error})"),
-                };
+                let kept = files::set_aside(path, &kept_aside(path));
                 tracing::error!(
                     target: "drivegate::history",
                     "cannot use the run hours and starts in {}: {why}; {kept}, and counting begins at 0; to count on from it, stop the \

@@ -39,7 +39,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime};
 
 pub use drives::{DriveHistory, History};
-pub use keeper::Keeper;
+pub use keeper::keep;
 pub use recorder::{Capture, Recorder};
 pub use recording::{Recording, RecordingError};
 pub use store::{Entry, Store};

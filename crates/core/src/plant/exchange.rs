@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use super::{BusHandle, changes};
+use super::BusHandle;
+use super::orders::changes;
 use crate::codec::{Protocol, RequestPdu, describe};
 use crate::command::{
     Answer, BackgroundRequest, Effect, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Ticket, Touched, WriteStats,

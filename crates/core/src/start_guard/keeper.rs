@@ -2,75 +2,34 @@
 
 use std::fs;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant, SystemTime};
 
-use tokio::sync::watch;
-
 use super::{Guards, Saved};
-use crate::files;
 use crate::files::names::STARTS;
+use crate::files::{self, Keeper};
 
 /// Longest wait for a change: the thread ends within that time.
 const BEAT: Duration = Duration::from_millis(100);
 /// Longest file that is read.
 const LONGEST: u64 = 64 << 20;
 
-/// The thread, at work.
-#[derive(Debug)]
-pub struct Keeper {
-    dir: PathBuf,
-    end: Arc<AtomicBool>,
-    ended: watch::Receiver<()>,
+/// Keeps starts in that directory from now on; those of earlier runs are taken from there.
+///
+/// # Errors
+/// The system gives no thread.
+pub fn keep(dir: &Path, guards: Arc<Guards>) -> io::Result<Keeper> {
+    let path = dir.join(STARTS);
+    guards.keep(&load(&path), Instant::now(), SystemTime::now());
+    Keeper::start("starts", dir, move |end| run(&path, &guards, end))
 }
 
-impl Keeper {
-    /// Keeps starts in that directory from now on; those of earlier runs are taken from there.
-    ///
-    /// # Errors
-    /// The system gives no thread.
-    pub fn start(dir: &Path, guards: Arc<Guards>) -> io::Result<Keeper> {
-        let path = dir.join(STARTS);
-        guards.keep(&load(&path), Instant::now(), SystemTime::now());
-        let end = Arc::new(AtomicBool::new(false));
-        let (running, ended) = watch::channel(());
-        let to_end = end.clone();
-        std::thread::Builder::new().name("starts".to_string()).spawn(move || {
-            run(&path, &guards, &to_end);
-            drop(running);
-        })?;
-        Ok(Keeper {
-            dir: dir.to_path_buf(),
-            end,
-            ended,
-        })
-    }
-
-    /// Where it keeps them.
-    pub fn dir(&self) -> &Path {
-        &self.dir
-    }
-
-    /// Writes what there is, as far as the disk takes it, and ends the thread. A disk that hangs holds it up for good: wait with
-    /// a limit.
-    pub async fn stop(mut self) {
-        self.end.store(true, Ordering::Relaxed);
-        while self.ended.changed().await.is_ok() {}
-    }
-}
-
-impl Drop for Keeper {
-    fn drop(&mut self) {
-        self.end.store(true, Ordering::Relaxed);
-    }
-}
-
-fn run(path: &Path, guards: &Guards, end: &AtomicBool) {
+fn run(path: &Path, guards: &Guards, end: &Receiver<()>) {
     let mut failing = false;
     loop {
-        let ends = end.load(Ordering::Relaxed);
+        let ends = end.try_recv() != Err(TryRecvError::Empty);
         if let Some((generation, saved)) = guards.wait_to_write(if ends { Duration::ZERO } else { BEAT }) {
             let done = files::replace(path, &saved.to_json());
             report(path, &done, &mut failing);
@@ -114,11 +73,7 @@ fn load(path: &Path) -> Saved {
         Ok(bytes) => Saved::from_json(&bytes),
     };
     found.unwrap_or_else(|why| {
-        let aside = path.with_extension("damaged");
-        let kept = match fs::rename(path, &aside) {
-            Ok(()) => format!("it is kept as {}", aside.display()),
-            Err(error) => format!("it cannot be kept aside ({error})"),
-        };
+        let kept = files::set_aside(path, &path.with_extension("damaged"));
         tracing::error!(
             target: "drivegate::start_guard",
             "cannot use the starts in {}: {why}; {kept}, and starts before now are not counted", path.display()

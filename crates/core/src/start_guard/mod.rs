@@ -4,7 +4,7 @@
 //! since drives of several buses can belong to one group; every bus has its view of it, [`BusGuards`]. An order is judged when
 //! it is accepted ([`BusGuards::refuses`]), when its turn comes ([`BusGuards::clear`]), and before each of its writes
 //! ([`BusGuards::may_write`]). A start that is cleared counts from that moment, and is not written before it is on disk
-//! ([`Keeper`]). Stops ask nobody here, but for those that `min_run` delays.
+//! ([`keep`]). Stops ask nobody here, but for those that `min_run` delays.
 //!
 //! - `motor`: what is known of one motor, and the rules. `ledger`: all motors, groups, and what is to be written.
 //! - `interlock`: whether the points hold that a start needs. `view`: the judgement.
@@ -21,7 +21,7 @@ use std::time::Duration;
 
 pub use self::file::Saved;
 pub use self::interlock::Unmet;
-pub use self::keeper::Keeper;
+pub use self::keeper::keep;
 pub use self::ledger::Guards;
 pub use self::motor::Seen;
 pub use self::view::{BusGuards, Clearance};

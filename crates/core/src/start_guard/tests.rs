@@ -490,7 +490,7 @@ fn files_of_others_are_refused_with_a_reason() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("starts.json");
     std::fs::write(&path, "{").unwrap();
-    let keeper = Keeper::start(folder.path(), Arc::new(Guards::default())).unwrap();
+    let keeper = keep(folder.path(), Arc::new(Guards::default())).unwrap();
     assert!(folder.path().join("starts.damaged").exists(), "it is kept aside");
     drop(keeper);
 }

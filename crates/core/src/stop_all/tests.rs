@@ -37,17 +37,7 @@ fn plant() -> Plant {
         bus.image.update_health(|health| health.up = true);
         bus
     };
-    Plant {
-        gateway: "g".to_string(),
-        stale_after: Duration::from_secs(1),
-        buses: vec![bus("a"), bus("b")],
-        events: Default::default(),
-        writes: Default::default(),
-        recordings: Default::default(),
-        stop_all: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
-    }
+    Plant::new("g", Duration::from_secs(1), vec![bus("a"), bus("b")])
 }
 
 fn waiting(plant: &Plant) -> [usize; 2] {

@@ -252,17 +252,7 @@ mod tests {
     }
 
     fn world() -> (SharedPlant, Arc<NorthStats>) {
-        let plant = crate::plant::Plant {
-            gateway: "test".to_string(),
-            stale_after: Duration::from_secs(1),
-            buses: Vec::new(),
-            events: Default::default(),
-            writes: Default::default(),
-            recordings: Default::default(),
-            stop_all: Arc::default(),
-            parameters: Default::default(),
-            history: Default::default(),
-        };
+        let plant = crate::plant::Plant::new("test", Duration::from_secs(1), Vec::new());
         (Arc::new(arc_swap::ArcSwap::from_pointee(plant)), Arc::default())
     }
 

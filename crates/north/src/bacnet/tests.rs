@@ -80,17 +80,7 @@ impl Bench {
             image: bus,
             queue: Arc::new(CommandQueue::new().unwrap()),
         };
-        let plant = Plant {
-            gateway: "hall".to_string(),
-            stale_after: Duration::from_secs(1),
-            buses: vec![handle],
-            events: Default::default(),
-            writes: Default::default(),
-            recordings: Default::default(),
-            stop_all: Arc::default(),
-            parameters: Default::default(),
-            history: Default::default(),
-        };
+        let plant = Plant::new("hall", Duration::from_secs(1), vec![handle]);
         let bench = Bench {
             view: View::new(Arc::new(plant), Arc::new(options())),
             now: Instant::now(),

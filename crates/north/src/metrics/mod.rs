@@ -177,9 +177,8 @@ mod tests {
 
     use super::*;
     use crate::codec::{LineFormat, Protocol};
-    use crate::command::{CommandQueue, WriteStats};
+    use crate::command::CommandQueue;
     use crate::drive::profile::Profiles;
-    use crate::event::Events;
     use crate::plant::BusHandle;
     use crate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, LeaseAction, Supervision};
 
@@ -205,17 +204,7 @@ mod tests {
             image: Arc::new(BusImage::new(spec, drives)),
             queue: Arc::new(CommandQueue::new().unwrap()),
         };
-        Plant {
-            gateway: "pump-house".to_string(),
-            stale_after: Duration::from_secs(1),
-            buses: vec![bus],
-            events: Events::default(),
-            writes: Arc::new(WriteStats::default()),
-            recordings: Default::default(),
-            stop_all: Arc::default(),
-            parameters: Default::default(),
-            history: Default::default(),
-        }
+        Plant::new("pump-house", Duration::from_secs(1), vec![bus])
     }
 
     #[test]

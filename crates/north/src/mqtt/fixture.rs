@@ -33,17 +33,7 @@ pub(crate) fn plant(drives: &[&str]) -> Plant {
         queue: Arc::new(CommandQueue::new().unwrap()),
     };
     bus.image.update_health(|h| h.up = true);
-    Plant {
-        gateway: "hall".to_string(),
-        stale_after: Duration::from_secs(1),
-        buses: vec![bus],
-        events: Default::default(),
-        writes: Default::default(),
-        recordings: Default::default(),
-        stop_all: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
-    }
+    Plant::new("hall", Duration::from_secs(1), vec![bus])
 }
 
 /// The process data of an NX: status word and output frequency, 0.01 Hz, read at `now`.

@@ -27,17 +27,7 @@ fn plant() -> Plant {
     let drives = vec![drive("pump-1", 1, Access::Control), drive("pump-2", 2, Access::Monitor)];
     let image = Arc::new(BusImage::new(spec, drives));
     let queue = Arc::new(CommandQueue::new().unwrap());
-    Plant {
-        gateway: "pump-house".to_string(),
-        stale_after: Duration::from_secs(1),
-        buses: vec![BusHandle { image, queue }],
-        events: Default::default(),
-        writes: Default::default(),
-        recordings: Default::default(),
-        stop_all: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
-    }
+    Plant::new("pump-house", Duration::from_secs(1), vec![BusHandle { image, queue }])
 }
 
 #[test]

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use super::super::client::Gateway;
 use super::super::drive_access::target;
 use super::super::{EXIT_FAILED, EXIT_USAGE, report};
-use super::{StatusLine, failed, read_file, read_from_drive};
+use super::{StatusLine, read_file, read_from_drive};
 use crate::north::http::messages::{ReadParameters, Restore, RestoreAct, Stage};
 use crate::parameters::{Entry, Id, ParameterFile};
 
@@ -68,7 +68,8 @@ pub(super) fn restore(gateway: &Gateway, args: &RestoreArgs) -> Result<ExitCode,
     let (Some(file), Some(drive)) = (&args.file, &args.drive) else {
         return Err(ExitCode::from(EXIT_USAGE));
     };
-    let file = read_file(file).map_err(|why| failed(&format!("{why}; name a file that `params read` wrote")))?;
+    let file =
+        read_file(file).map_err(|why| report::failed(&format!("{why}; name a file that `params read` wrote")))?;
     write(gateway, &file, drive, &args.how)
 }
 
@@ -143,7 +144,7 @@ fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> 
     if let Some(code) = refused_to_write {
         return Ok(code);
     }
-    let ended = ended.map_err(|why| failed(&why))?;
+    let ended = ended.map_err(|why| report::failed(&why))?;
     let text = ended.text.clone().unwrap_or_default();
     match ended.stage {
         Stage::Done => {
@@ -163,7 +164,7 @@ fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> 
             report::note(&format!("a restore to `{drive}` is prepared, and nothing was written"));
             Ok(ExitCode::SUCCESS)
         }
-        _ => Err(failed(&text)),
+        _ => Err(report::failed(&text)),
     }
 }
 
@@ -190,7 +191,7 @@ fn agrees(drive: &str, how: &How) -> Result<(), ExitCode> {
     }
     let (stdin, mut stderr) = (std::io::stdin(), std::io::stderr());
     if !stdin.is_terminal() || !stderr.is_terminal() {
-        return Err(failed(
+        return Err(report::failed(
             "nothing was written: there is no terminal on which to ask; command line; add --yes to write that, or --dry-run",
         ));
     }

@@ -123,17 +123,7 @@ mod tests {
     fn a_refused_reload_stays_in_the_status() {
         let errors = ["`baud` is missing\nx", "b", "c"].map(str::to_string);
         assert_eq!(summary(&errors[1..2]), Some("b".to_string()));
-        let plant = Plant {
-            gateway: "test".to_string(),
-            stale_after: Duration::from_secs(1),
-            buses: Vec::new(),
-            events: Default::default(),
-            writes: Default::default(),
-            recordings: Default::default(),
-            stop_all: Arc::default(),
-            parameters: Default::default(),
-            history: Default::default(),
-        };
+        let plant = Plant::new("test", Duration::from_secs(1), Vec::new());
         assert_eq!(status(&plant, None), "0 of 0 buses up, 0 of 0 drives online");
         let refused = (SystemTime::UNIX_EPOCH, summary(&errors).unwrap());
         let text = status(&plant, Some(&refused));

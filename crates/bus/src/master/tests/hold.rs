@@ -31,15 +31,8 @@ fn guarded(drives: u8, mode: Mode) -> (Rig, Plant) {
     rig.run(Time::from_secs(2));
     rig.bus.image.update_health(|health| health.up = true);
     let plant = Plant {
-        gateway: "g".to_string(),
-        stale_after: Time::from_secs(1),
-        buses: vec![rig.bus.clone()],
-        events: Default::default(),
         writes: rig.stats.clone(),
-        recordings: Default::default(),
-        stop_all: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
+        ..Plant::new("g", Time::from_secs(1), vec![rig.bus.clone()])
     };
     (rig, plant)
 }

@@ -8,15 +8,8 @@ use drivegate_core::stop_all::{Scope, StopAll, StopOrder, StopReport, Stopped, W
 fn plant(rig: &Rig) -> Plant {
     rig.bus.image.update_health(|health| health.up = true);
     Plant {
-        gateway: "g".to_string(),
-        stale_after: Duration::from_secs(1),
-        buses: vec![rig.bus.clone()],
-        events: Default::default(),
         writes: rig.stats.clone(),
-        recordings: Default::default(),
-        stop_all: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
+        ..Plant::new("g", Duration::from_secs(1), vec![rig.bus.clone()])
     }
 }
 

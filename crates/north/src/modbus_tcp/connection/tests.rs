@@ -40,17 +40,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         idle_timeout: None,
         uncached: Uncached::Refuse,
     };
-    let plant = Plant {
-        gateway: "test".to_string(),
-        stale_after: Duration::from_secs(1),
-        buses: Vec::new(),
-        events: Default::default(),
-        writes: Default::default(),
-        recordings: Default::default(),
-        stop_all: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
-    };
+    let plant = Plant::new("test", Duration::from_secs(1), Vec::new());
     let stats = Arc::new(NorthStats::default());
     let state = ServerState::new(options, stats.clone(), CancellationToken::new());
     let view = PlantView::new(Arc::new(ArcSwap::from_pointee(plant)), None);

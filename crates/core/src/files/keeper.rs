@@ -1,0 +1,45 @@
+//! A thread that keeps something on disk, and its end.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, Sender, channel};
+
+use tokio::sync::watch;
+
+/// The thread, at work.
+#[derive(Debug)]
+pub struct Keeper {
+    dir: PathBuf,
+    /// Dropped when the thread is to end.
+    end: Sender<()>,
+    ended: watch::Receiver<()>,
+}
+
+impl Keeper {
+    /// Starts a thread that works for that directory until the other end of its channel is dropped.
+    ///
+    /// # Errors
+    /// The system gives no thread.
+    pub fn start(name: &str, dir: &Path, work: impl FnOnce(&Receiver<()>) + Send + 'static) -> io::Result<Keeper> {
+        let ((end, to_end), (running, ended)) = (channel(), watch::channel(()));
+        std::thread::Builder::new().name(name.to_string()).spawn(move || {
+            work(&to_end);
+            drop(running);
+        })?;
+        let dir = dir.to_path_buf();
+        Ok(Keeper { dir, end, ended })
+    }
+
+    /// Where it keeps what it keeps.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// Writes what there is, as far as the disk takes it, and ends the thread. A disk that hangs holds it up for good: wait with
+    /// a limit.
+    pub async fn stop(self) {
+        let Keeper { end, mut ended, .. } = self;
+        drop(end);
+        while ended.changed().await.is_ok() {}
+    }
+}
