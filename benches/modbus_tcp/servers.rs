@@ -12,6 +12,7 @@ use arc_swap::ArcSwap;
 use drivegate::codec::Table;
 use drivegate::command::CommandQueue;
 use drivegate::config::Settings;
+use drivegate::north::Server as _;
 use drivegate::north::modbus_tcp;
 use drivegate::plant::{BusHandle, Plant};
 use drivegate::process_image::{BusImage, DriveImage, Link};
@@ -173,7 +174,7 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
     };
     std::thread::spawn(poll);
     let options = settings.modbus_tcp.clone().ok_or("no server")?;
-    let server = modbus_tcp::start(
+    let server = modbus_tcp::Server::start(
         options,
         Arc::new(ArcSwap::from_pointee(plant)),
         Arc::default(),

@@ -20,6 +20,7 @@ mod pem;
 mod readiness;
 mod refusals;
 pub mod register_map;
+mod server;
 mod server_trust;
 pub mod slot;
 mod stats;
@@ -48,6 +49,7 @@ pub use identity::client_tls;
 pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
 pub use listener::ListenerStates;
 pub use pem::unreadable;
+pub use server::{Reconfigure, Server};
 pub use stats::{
     BacnetStats, ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats,
     ServerKind, SlotOutcome, SlotStats,

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::Exception;
+use drivegate::north::Server as _;
 use drivegate::north::http::{self, Options};
 use drivegate::process_image::Link;
 use serde_json::{Value, json};
@@ -433,7 +434,7 @@ async fn an_address_in_use_is_told() {
     let server = Server::of(plant::mixed()).await;
     let shared = Arc::new(ArcSwap::from_pointee(plant::mixed()));
     let options = Options::at(server.address);
-    let error = http::start(options, shared, plant::stats(), CancellationToken::new())
+    let error = http::Http::start(options, shared, plant::stats(), CancellationToken::new())
         .await
         .unwrap_err();
     let text = error.to_string();

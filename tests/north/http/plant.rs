@@ -16,6 +16,7 @@ use drivegate::drive::{ModelPoint, Profile};
 use drivegate::event::{Event, EventKind};
 use drivegate::north::http::{self, Http, Options};
 use drivegate::north::{NorthStats, SlotOutcome};
+use drivegate::north::{Reconfigure as _, Server as _};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{DriveImage, DriveSpec, LeaseAction, Link, Outcome, PollCycle, Supervision};
 use tokio_util::sync::CancellationToken;
@@ -237,7 +238,7 @@ impl Server {
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let cancel = CancellationToken::new();
         let stats = stats();
-        let http = http::start(options, shared.clone(), stats.clone(), cancel.clone())
+        let http = http::Http::start(options, shared.clone(), stats.clone(), cancel.clone())
             .await
             .expect("it starts");
         Server {

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use arc_swap::ArcSwap;
+use drivegate::north::Server as _;
 use drivegate::north::modbus_tcp::{self, Uncached};
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
@@ -121,7 +122,7 @@ async fn a_taken_address_is_told() {
     let mut options = options();
     options.listeners[0].listen = vec![address];
     let plant = Arc::new(ArcSwap::from_pointee(plant()));
-    let why = modbus_tcp::start(options, plant, Arc::default(), CancellationToken::new())
+    let why = modbus_tcp::Server::start(options, plant, Arc::default(), CancellationToken::new())
         .await
         .unwrap_err()
         .to_string();

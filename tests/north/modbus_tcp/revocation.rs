@@ -5,6 +5,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, SystemTime};
 
+use drivegate::north::Reconfigure as _;
 use drivegate::north::modbus_tcp::{Identity, Options, Role};
 use rustls::version::{TLS12, TLS13};
 

@@ -13,6 +13,7 @@ use drivegate::drive::RawWrites;
 use drivegate::drive::profile::{Profile, Profiles};
 use drivegate::north::modbus_tcp::{self, Listener, Options, Server, Uncached};
 use drivegate::north::{NorthStats, ServerError};
+use drivegate::north::{Reconfigure as _, Server as _};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{Access, DriveImage, DriveSpec, LeaseAction, Link, Supervision};
 use rustix::event::{PollFd, PollFlags, poll};
@@ -302,7 +303,7 @@ impl Rig {
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let stats = Arc::new(NorthStats::default());
         let cancel = CancellationToken::new();
-        let server = modbus_tcp::start(options, plant.clone(), stats.clone(), cancel.clone())
+        let server = modbus_tcp::Server::start(options, plant.clone(), stats.clone(), cancel.clone())
             .await
             .unwrap();
         Rig {

@@ -35,6 +35,7 @@ use self::task::{Task, ToTask};
 use super::{NorthStats, ServerError, ServerKind};
 use crate::listener::ListenerState;
 use crate::plant::SharedPlant;
+use crate::server::{self, Reconfigure};
 
 /// What a drive that is away does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -147,11 +148,58 @@ impl Server {
         self.address
     }
 
+    /// Waits until it has ended, after the cancellation.
+    pub async fn stopped(&self) {
+        self.tasks.wait().await;
+    }
+}
+
+impl server::Server for Server {
+    const NAME: &'static str = "BACnet/IP";
+    type Options = Options;
+
+    /// Binds the address and serves until `cancel`.
+    ///
+    /// # Errors
+    /// The address cannot be bound.
+    async fn start(
+        options: Options,
+        plant: SharedPlant,
+        stats: Arc<NorthStats>,
+        cancel: CancellationToken,
+    ) -> Result<Server, ServerError> {
+        let sockets = bind(options.listen).await?;
+        let address = SocketAddr::V4(sockets.address);
+        tracing::info!(target: "drivegate::bacnet", %address, network = options.network, device = options.device, "BACnet/IP: listening");
+        let (to_task, from_server) = mpsc::unbounded_channel();
+        let (busy, tasks) = (Arc::new(AtomicBool::new(false)), TaskTracker::new());
+        let task = Task::new(options.clone(), sockets, plant, stats.clone(), busy.clone());
+        tasks.spawn(task.run(from_server, cancel));
+        tasks.close();
+        Ok(Server {
+            options,
+            address,
+            to_task,
+            busy,
+            _state: stats.listeners.add(ServerKind::Bacnet, address),
+            stats,
+            tasks,
+        })
+    }
+
+    async fn stopped(self) {
+        Server::stopped(&self).await;
+    }
+}
+
+impl Reconfigure for Server {
+    type Change = Change;
+
     /// Prepares other options: binds a new address. Nothing changes for any client.
     ///
     /// # Errors
     /// The address cannot be bound; everything is as before.
-    pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+    async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
         let sockets = match options.listen == self.options.listen {
             true => None,
             false => Some(bind(options.listen).await?),
@@ -160,12 +208,12 @@ impl Server {
     }
 
     /// Forgets prepared options.
-    pub fn abort(&mut self, change: Change) {
+    fn abort(&mut self, change: Change) {
         drop(change);
     }
 
     /// Applies prepared options.
-    pub fn commit(&mut self, change: Change) {
+    fn commit(&mut self, change: Change) {
         let Change { options, sockets } = change;
         if let Some(sockets) = &sockets {
             self.address = SocketAddr::V4(sockets.address);
@@ -177,18 +225,13 @@ impl Server {
     }
 
     /// Takes no more from any client; what was begun is answered.
-    pub async fn retire(&mut self) {
+    async fn retire(&mut self) {
         let _ = self.to_task.send(ToTask::Retire);
     }
 
     /// Whether everybody was answered, after it retired.
-    pub fn is_drained(&self) -> bool {
+    fn is_drained(&self) -> bool {
         !self.busy.load(Ordering::Relaxed)
-    }
-
-    /// Waits until it has ended, after the cancellation.
-    pub async fn stopped(&self) {
-        self.tasks.wait().await;
     }
 }
 
@@ -198,34 +241,5 @@ async fn bind(listen: SocketAddrV4) -> Result<Sockets, ServerError> {
         address: SocketAddr::V4(listen),
         section: "[bacnet]".to_string(),
         cause,
-    })
-}
-
-/// Binds the address and serves until `cancel`.
-///
-/// # Errors
-/// The address cannot be bound.
-pub async fn start(
-    options: Options,
-    plant: SharedPlant,
-    stats: Arc<NorthStats>,
-    cancel: CancellationToken,
-) -> Result<Server, ServerError> {
-    let sockets = bind(options.listen).await?;
-    let address = SocketAddr::V4(sockets.address);
-    tracing::info!(target: "drivegate::bacnet", %address, network = options.network, device = options.device, "BACnet/IP: listening");
-    let (to_task, from_server) = mpsc::unbounded_channel();
-    let (busy, tasks) = (Arc::new(AtomicBool::new(false)), TaskTracker::new());
-    let task = Task::new(options.clone(), sockets, plant, stats.clone(), busy.clone());
-    tasks.spawn(task.run(from_server, cancel));
-    tasks.close();
-    Ok(Server {
-        options,
-        address,
-        to_task,
-        busy,
-        _state: stats.listeners.add(ServerKind::Bacnet, address),
-        stats,
-        tasks,
     })
 }

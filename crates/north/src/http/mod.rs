@@ -64,6 +64,7 @@ use super::refusals::Refusals;
 use super::{NorthStats, ServerError, ServerIdentity, ServerKind, tls_words};
 use crate::history::History;
 use crate::plant::{DriveHandle, SharedPlant};
+use crate::server::{self, Reconfigure};
 
 pub use self::offline::Offline;
 pub use self::tokens::{Scope, Token, TokenError, Tokens};
@@ -186,11 +187,57 @@ impl Http {
         plain.into_iter().chain(tls).next()
     }
 
+    /// Waits until the server has stopped: at most half a second after the token was cancelled.
+    pub async fn stopped(self) {
+        self.tasks.wait().await;
+    }
+}
+
+impl server::Server for Http {
+    const NAME: &'static str = "HTTP";
+    type Options = Options;
+
+    /// Starts the server. It runs until `cancel`.
+    ///
+    /// # Errors
+    /// The address cannot be bound, or the certificates cannot be used.
+    async fn start(
+        options: Options,
+        plant: SharedPlant,
+        stats: Arc<NorthStats>,
+        cancel: CancellationToken,
+    ) -> Result<Http, ServerError> {
+        let tasks = TaskTracker::new();
+        // A reload can replace the listener, so the server ends with the token and not with its last task.
+        tasks.spawn(cancel.clone().cancelled_owned());
+        tasks.close();
+        let mut http = Http {
+            listeners: Listeners::new(ServerKind::Http, stats.clone(), tasks.clone(), cancel.clone()),
+            stopping: cancel,
+            terms: Arc::new(ArcSwap::from_pointee(Terms::new(&options)?)),
+            plant,
+            operating: Arc::new(Operating::new(stats.clone())),
+            stats,
+            tasks,
+        };
+        let change = http.prepare(options).await?;
+        http.commit(change);
+        Ok(http)
+    }
+
+    async fn stopped(self) {
+        self.stopped().await;
+    }
+}
+
+impl Reconfigure for Http {
+    type Change = Change;
+
     /// Prepares other options: binds a new address and checks new certificates. Nothing changes for any client.
     ///
     /// # Errors
     /// The address cannot be bound, or the certificates cannot be used; everything is as before.
-    pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+    async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
         let terms = Terms::new(&options)?;
         let spec = ListenerSpec {
             address: options.listen,
@@ -205,13 +252,13 @@ impl Http {
     }
 
     /// Forgets prepared options.
-    pub fn abort(&mut self, change: Change) {
+    fn abort(&mut self, change: Change) {
         self.listeners.abort(change.sockets);
     }
 
     /// Applies prepared options. Connections and streams end if hosts or tokens change, or the listener is another, those with a
     /// command behind its reply; new certificates are for new connections.
-    pub fn commit(&mut self, change: Change) {
+    fn commit(&mut self, change: Change) {
         let Change {
             options,
             sockets,
@@ -235,47 +282,14 @@ impl Http {
     }
 
     /// Closes the listener and its connections, those with a command behind its reply.
-    pub async fn retire(&mut self) {
+    async fn retire(&mut self) {
         self.listeners.close().await;
     }
 
     /// Whether no connection is left after [`Http::retire`].
-    pub fn is_drained(&self) -> bool {
+    fn is_drained(&self) -> bool {
         self.tasks.len() <= 1
     }
-
-    /// Waits until the server has stopped: at most half a second after the token was cancelled.
-    pub async fn stopped(self) {
-        self.tasks.wait().await;
-    }
-}
-
-/// Starts the server. It runs until `cancel`.
-///
-/// # Errors
-/// The address cannot be bound, or the certificates cannot be used.
-pub async fn start(
-    options: Options,
-    plant: SharedPlant,
-    stats: Arc<NorthStats>,
-    cancel: CancellationToken,
-) -> Result<Http, ServerError> {
-    let tasks = TaskTracker::new();
-    // A reload can replace the listener, so the server ends with the token and not with its last task.
-    tasks.spawn(cancel.clone().cancelled_owned());
-    tasks.close();
-    let mut http = Http {
-        listeners: Listeners::new(ServerKind::Http, stats.clone(), tasks.clone(), cancel.clone()),
-        stopping: cancel,
-        terms: Arc::new(ArcSwap::from_pointee(Terms::new(&options)?)),
-        plant,
-        operating: Arc::new(Operating::new(stats.clone())),
-        stats,
-        tasks,
-    };
-    let change = http.prepare(options).await?;
-    http.commit(change);
-    Ok(http)
 }
 
 /// Serves the connections of a listener.

@@ -21,11 +21,12 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use self::path::Bound;
-use crate::NorthStats;
 use crate::command::{Authority, Proof, SourceKind};
 use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Limits, Newcomer};
 use crate::http::{LocalUser, SocketDoor};
 use crate::plant::SharedPlant;
+use crate::server;
+use crate::{NorthStats, ServerError};
 
 pub use control::{Control, ReloadOrder, absolute};
 pub use path::{RuntimeDirectories, SocketPath};
@@ -77,29 +78,39 @@ impl Local {
     }
 }
 
-/// Starts the server at the first path that it can have. It runs until `cancel`, whatever clients do.
-///
-/// # Errors
-/// When the socket cannot be bound: what and where.
-pub async fn start(
-    options: &Options,
-    plant: SharedPlant,
-    stats: Arc<NorthStats>,
-    cancel: CancellationToken,
-) -> io::Result<Local> {
-    let paths = options.socket.of_gateway(&RuntimeDirectories::of_this_process());
-    let first = paths.first().map(|path| path.display().to_string()).unwrap_or_default();
-    let bound = path::bind_first(&paths)
-        .await
-        .map_err(|error| io::Error::new(error.kind(), format!("cannot listen on {first}: {error}")))?;
-    let path = bound.path.clone();
-    let door = Arc::new(Door {
-        http: SocketDoor::new(&plant, &stats, cancel.clone()),
-        control: options.control.clone(),
-    });
-    tracing::info!(target: "drivegate::local", path = %path.display(), "local socket: listening");
-    let task = tokio::spawn(accept(bound, door, cancel));
-    Ok(Local { path, task })
+impl server::Server for Local {
+    const NAME: &'static str = "the local socket";
+    type Options = Options;
+
+    /// Starts the server at the first path that it can have. It runs until `cancel`, whatever clients do.
+    ///
+    /// # Errors
+    /// When the socket cannot be bound: what and where.
+    async fn start(
+        options: Options,
+        plant: SharedPlant,
+        stats: Arc<NorthStats>,
+        cancel: CancellationToken,
+    ) -> Result<Local, ServerError> {
+        let paths = options.socket.of_gateway(&RuntimeDirectories::of_this_process());
+        let first = paths.first().map(|path| path.display().to_string()).unwrap_or_default();
+        let bound = path::bind_first(&paths)
+            .await
+            .map_err(|error| io::Error::new(error.kind(), format!("cannot listen on {first}: {error}")))
+            .map_err(ServerError::Local)?;
+        let path = bound.path.clone();
+        let door = Arc::new(Door {
+            http: SocketDoor::new(&plant, &stats, cancel.clone()),
+            control: options.control,
+        });
+        tracing::info!(target: "drivegate::local", path = %path.display(), "local socket: listening");
+        let task = tokio::spawn(accept(bound, door, cancel));
+        Ok(Local { path, task })
+    }
+
+    async fn stopped(self) {
+        self.stopped().await;
+    }
 }
 
 async fn accept(bound: Bound, door: Arc<Door>, cancel: CancellationToken) {

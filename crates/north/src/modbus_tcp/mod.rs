@@ -39,6 +39,7 @@ use crate::listener::{ListenerSpec, Listeners, NewSockets};
 use crate::log_throttle::LogThrottle;
 use crate::plant::SharedPlant;
 use crate::refusals::Refusals;
+use crate::server::{self, Reconfigure};
 use crate::{NorthStats, ServerError, ServerKind, certificate};
 
 pub use self::offline::Offline;
@@ -188,11 +189,65 @@ impl Server {
         self.listeners.addresses(true)
     }
 
+    /// Waits until all listeners and connections have ended, after the cancellation.
+    pub async fn stopped(&self) {
+        self.tasks.wait().await;
+    }
+}
+
+impl server::Server for Server {
+    const NAME: &'static str = "Modbus TCP";
+    type Options = Options;
+
+    /// Opens the listeners and serves until `cancel`; then pending requests have half a second to be answered.
+    ///
+    /// # Errors
+    /// An address cannot be bound, the certificates cannot be used, or there is no thread. No socket stays open then.
+    async fn start(
+        options: Options,
+        plant: SharedPlant,
+        stats: Arc<NorthStats>,
+        cancel: CancellationToken,
+    ) -> Result<Server, ServerError> {
+        let (tasks, cancel) = (TaskTracker::new(), cancel.child_token());
+        // The tasks, and with them the thread, end with the token.
+        tasks.spawn(cancel.clone().cancelled_owned());
+        tasks.close();
+        let own = start_thread(&tasks)?;
+        let mut server = Server {
+            listeners: Listeners::new(ServerKind::ModbusTcp, stats.clone(), tasks.clone(), cancel.clone()),
+            authenticator: None,
+            state: Arc::new(ServerState::new(options.clone(), stats, cancel.clone())),
+            plant,
+            own,
+            opened: 0,
+            tasks,
+        };
+        match server.prepare(options).await {
+            Ok(change) => {
+                server.commit(change);
+                Ok(server)
+            }
+            Err(error) => {
+                cancel.cancel();
+                Err(error)
+            }
+        }
+    }
+
+    async fn stopped(self) {
+        Server::stopped(&self).await;
+    }
+}
+
+impl Reconfigure for Server {
+    type Change = Change;
+
     /// Prepares other options: binds new addresses and checks new certificates. Nothing changes for any client.
     ///
     /// # Errors
     /// An address cannot be bound, or the certificates cannot be used; everything is as before.
-    pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+    async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
         let before = self.state.options.load_full();
         let requirements = match (&options.tls, &before.tls) {
             (Some(tls), Some(before)) if self.authenticator.is_some() && tls.admits_like(before) => None,
@@ -210,14 +265,14 @@ impl Server {
     }
 
     /// Forgets prepared options.
-    pub fn abort(&mut self, change: Change) {
+    fn abort(&mut self, change: Change) {
         self.listeners.abort(change.sockets);
     }
 
     /// Applies prepared options. Listeners that stay keep their connections, as far as the options allow them; their
     /// rights are those of the new options from then on. TLS clients whose certificate is not admitted with the same
     /// rights are disconnected.
-    pub fn commit(&mut self, change: Change) {
+    fn commit(&mut self, change: Change) {
         let Change {
             options,
             sockets,
@@ -272,18 +327,13 @@ impl Server {
     }
 
     /// Closes all listeners and their connections; requests that wait for the bus are answered.
-    pub async fn retire(&mut self) {
+    async fn retire(&mut self) {
         self.listeners.close().await;
     }
 
     /// Whether no connection is left after [`Server::retire`].
-    pub fn is_drained(&self) -> bool {
+    fn is_drained(&self) -> bool {
         self.tasks.len() <= 1
-    }
-
-    /// Waits until all listeners and connections have ended, after the cancellation.
-    pub async fn stopped(&self) {
-        self.tasks.wait().await;
     }
 }
 
@@ -314,42 +364,6 @@ impl ServerState {
             options: ArcSwap::from_pointee(options),
             stats,
             command_words: CommandWords::default(),
-        }
-    }
-}
-
-/// Opens the listeners and serves until `cancel`; then pending requests have half a second to be answered.
-///
-/// # Errors
-/// An address cannot be bound, the certificates cannot be used, or there is no thread. No socket stays open then.
-pub async fn start(
-    options: Options,
-    plant: SharedPlant,
-    stats: Arc<NorthStats>,
-    cancel: CancellationToken,
-) -> Result<Server, ServerError> {
-    let (tasks, cancel) = (TaskTracker::new(), cancel.child_token());
-    // The tasks, and with them the thread, end with the token.
-    tasks.spawn(cancel.clone().cancelled_owned());
-    tasks.close();
-    let own = start_thread(&tasks)?;
-    let mut server = Server {
-        listeners: Listeners::new(ServerKind::ModbusTcp, stats.clone(), tasks.clone(), cancel.clone()),
-        authenticator: None,
-        state: Arc::new(ServerState::new(options.clone(), stats, cancel.clone())),
-        plant,
-        own,
-        opened: 0,
-        tasks,
-    };
-    match server.prepare(options).await {
-        Ok(change) => {
-            server.commit(change);
-            Ok(server)
-        }
-        Err(error) => {
-            cancel.cancel();
-            Err(error)
         }
     }
 }

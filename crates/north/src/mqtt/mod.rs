@@ -53,6 +53,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::NorthStats;
 use crate::plant::SharedPlant;
+use crate::{ServerError, server};
 
 pub(crate) use self::commands::OrdersLeft;
 pub use self::offline::{Offline, Published};
@@ -210,6 +211,26 @@ impl Mqtt {
                 tracing::error!(target: "drivegate::north::mqtt", "the MQTT client ended unexpectedly: {error}");
             }
         }
+    }
+}
+
+impl server::Server for Mqtt {
+    const NAME: &'static str = "MQTT";
+    // Orders that are under way come first: its successor would be another client at the broker.
+    const STOP_TIMEOUT: Duration = Duration::from_secs(6);
+    type Options = Options;
+
+    async fn start(
+        options: Options,
+        plant: SharedPlant,
+        stats: Arc<NorthStats>,
+        cancel: CancellationToken,
+    ) -> Result<Mqtt, ServerError> {
+        Ok(start(options, plant, stats, cancel))
+    }
+
+    async fn stopped(self) {
+        self.stopped().await;
     }
 }
 

@@ -31,6 +31,7 @@ use super::refusals::Refusals;
 use super::{NorthStats, ServerError, ServerKind};
 use crate::codec::{LineFormat, Protocol};
 use crate::plant::SharedPlant;
+use crate::server::{self, Reconfigure};
 
 pub use self::offline::Offline;
 
@@ -169,22 +170,100 @@ impl Server {
         self.listeners.addresses(false)
     }
 
+    fn commit_ptys(&mut self, all: &[Arc<Terms>]) {
+        let wanted = |slot: &Slot| all.iter().any(|terms| terms.slot == *slot);
+        self.ptys.retain(|pty| {
+            let stays = wanted(&pty.slot);
+            if !stays {
+                pty.cancel.cancel();
+            }
+            stays
+        });
+        for terms in all {
+            let Some(path) = terms.slot.pty.clone() else { continue };
+            if self.ptys.iter().any(|pty| pty.slot == terms.slot) {
+                continue;
+            }
+            let cancel = self.cancel.child_token();
+            self.tasks
+                .spawn(pty::serve(path, terms.clone(), cancel.clone(), self.cancel.clone()));
+            self.ptys.push(RunningPty {
+                slot: terms.slot.clone(),
+                cancel,
+            });
+        }
+    }
+
+    /// Waits until all listeners, connections and pseudo-terminals have ended, after the cancellation.
+    pub async fn stopped(&self) {
+        self.tasks.wait().await;
+    }
+}
+
+impl server::Server for Server {
+    const NAME: &'static str = "the tool slots";
+    type Options = Options;
+
+    /// Opens the slots and serves until `cancel`.
+    ///
+    /// # Errors
+    /// An address cannot be bound. No socket stays open then.
+    async fn start(
+        options: Options,
+        plant: SharedPlant,
+        stats: Arc<NorthStats>,
+        cancel: CancellationToken,
+    ) -> Result<Server, ServerError> {
+        let (tasks, cancel) = (TaskTracker::new(), cancel.child_token());
+        tasks.spawn(cancel.clone().cancelled_owned());
+        tasks.close();
+        let mut server = Server {
+            listeners: Listeners::new(ServerKind::Slot, stats.clone(), tasks.clone(), cancel.clone()),
+            ptys: Vec::new(),
+            plant,
+            paces: Arc::default(),
+            refusals: Arc::new(Refusals::new(ServerKind::Slot, stats.clone())),
+            stats,
+            opened: 0,
+            tasks,
+            cancel: cancel.clone(),
+        };
+        match server.prepare(options).await {
+            Ok(change) => {
+                server.commit(change);
+                Ok(server)
+            }
+            Err(error) => {
+                cancel.cancel();
+                Err(error)
+            }
+        }
+    }
+
+    async fn stopped(self) {
+        Server::stopped(&self).await;
+    }
+}
+
+impl Reconfigure for Server {
+    type Change = Change;
+
     /// Prepares other slots: binds new addresses. Nothing changes for any tool.
     ///
     /// # Errors
     /// An address cannot be bound; everything is as before.
-    pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+    async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
         let sockets = self.listeners.prepare(options.listener_specs()).await?;
         Ok(Change { options, sockets })
     }
 
     /// Forgets prepared slots.
-    pub fn abort(&mut self, change: Change) {
+    fn abort(&mut self, change: Change) {
         self.listeners.abort(change.sockets);
     }
 
     /// Applies prepared slots. Tools of a slot that serves as before stay connected.
-    pub fn commit(&mut self, change: Change) {
+    fn commit(&mut self, change: Change) {
         let Change { options, sockets } = change;
         let terms = |slot: &Slot| {
             Arc::new(Terms {
@@ -229,79 +308,14 @@ impl Server {
         self.commit_ptys(&all);
     }
 
-    fn commit_ptys(&mut self, all: &[Arc<Terms>]) {
-        let wanted = |slot: &Slot| all.iter().any(|terms| terms.slot == *slot);
-        self.ptys.retain(|pty| {
-            let stays = wanted(&pty.slot);
-            if !stays {
-                pty.cancel.cancel();
-            }
-            stays
-        });
-        for terms in all {
-            let Some(path) = terms.slot.pty.clone() else { continue };
-            if self.ptys.iter().any(|pty| pty.slot == terms.slot) {
-                continue;
-            }
-            let cancel = self.cancel.child_token();
-            self.tasks
-                .spawn(pty::serve(path, terms.clone(), cancel.clone(), self.cancel.clone()));
-            self.ptys.push(RunningPty {
-                slot: terms.slot.clone(),
-                cancel,
-            });
-        }
-    }
-
     /// Closes all slots; what tools have asked is answered.
-    pub async fn retire(&mut self) {
+    async fn retire(&mut self) {
         self.listeners.close().await;
         self.ptys.drain(..).for_each(|pty| pty.cancel.cancel());
     }
 
     /// Whether no tool is left after [`Server::retire`].
-    pub fn is_drained(&self) -> bool {
+    fn is_drained(&self) -> bool {
         self.tasks.len() <= 1
-    }
-
-    /// Waits until all listeners, connections and pseudo-terminals have ended, after the cancellation.
-    pub async fn stopped(&self) {
-        self.tasks.wait().await;
-    }
-}
-
-/// Opens the slots and serves until `cancel`.
-///
-/// # Errors
-/// An address cannot be bound. No socket stays open then.
-pub async fn start(
-    options: Options,
-    plant: SharedPlant,
-    stats: Arc<NorthStats>,
-    cancel: CancellationToken,
-) -> Result<Server, ServerError> {
-    let (tasks, cancel) = (TaskTracker::new(), cancel.child_token());
-    tasks.spawn(cancel.clone().cancelled_owned());
-    tasks.close();
-    let mut server = Server {
-        listeners: Listeners::new(ServerKind::Slot, stats.clone(), tasks.clone(), cancel.clone()),
-        ptys: Vec::new(),
-        plant,
-        paces: Arc::default(),
-        refusals: Arc::new(Refusals::new(ServerKind::Slot, stats.clone())),
-        stats,
-        opened: 0,
-        tasks,
-        cancel: cancel.clone(),
-    };
-    match server.prepare(options).await {
-        Ok(change) => {
-            server.commit(change);
-            Ok(server)
-        }
-        Err(error) => {
-            cancel.cancel();
-            Err(error)
-        }
     }
 }

@@ -1,0 +1,62 @@
+//! What all servers have in common: how they start, change and stop.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio_util::sync::CancellationToken;
+
+use super::{NorthStats, ServerError};
+use crate::plant::SharedPlant;
+
+/// Time limit for a server to stop.
+const STOP_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// A server that the daemon runs.
+#[allow(async_fn_in_trait, reason = "the daemon awaits it in its own task")]
+pub trait Server: Sized + std::fmt::Debug {
+    /// Name in messages.
+    const NAME: &'static str;
+    /// Time limit for it to stop.
+    const STOP_TIMEOUT: Duration = STOP_TIMEOUT;
+    /// What it is configured by.
+    type Options: Clone + PartialEq + std::fmt::Debug;
+
+    /// Starts it; it runs until `cancel`.
+    ///
+    /// # Errors
+    /// It cannot run so: an address, a certificate or a thread cannot be had.
+    async fn start(
+        options: Self::Options,
+        plant: SharedPlant,
+        stats: Arc<NorthStats>,
+        cancel: CancellationToken,
+    ) -> Result<Self, ServerError>;
+
+    /// Waits until it has stopped, after the cancellation.
+    async fn stopped(self);
+}
+
+/// A server that applies new options while it runs, in two steps.
+#[allow(async_fn_in_trait, reason = "the daemon awaits it in its own task")]
+pub trait Reconfigure: Server {
+    /// What the first step has prepared.
+    type Change;
+
+    /// Does all that can fail; nothing changes for any client.
+    ///
+    /// # Errors
+    /// It cannot run so: it runs as before.
+    async fn prepare(&mut self, options: Self::Options) -> Result<Self::Change, ServerError>;
+
+    /// Applies what was prepared.
+    fn commit(&mut self, change: Self::Change);
+
+    /// Forgets what was prepared.
+    fn abort(&mut self, change: Self::Change);
+
+    /// Takes no more from any client; what was begun is answered.
+    async fn retire(&mut self);
+
+    /// Whether everybody was answered and has gone, after it retired.
+    fn is_drained(&self) -> bool;
+}
