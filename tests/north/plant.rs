@@ -7,7 +7,6 @@ use drivegate::codec::{LineFormat, Protocol};
 use drivegate::command::{Command, CommandQueue, Urgency};
 use drivegate::drive::Profile;
 use drivegate::drive::profile::Profiles;
-use drivegate::event::Events;
 use drivegate::plant::{BusHandle, Plant};
 use drivegate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec};
 

@@ -151,15 +151,14 @@ impl Plant {
         let before = self.site.audit().len();
         self.site
             .publish(&["-t", "spBv1.0/plant/DCMD/test/pump-1", "-f", &self.site.path("payload")]);
-        let result = until("the result of a DCMD", || {
+        until("the result of a DCMD", || {
             let audit = self.site.audit();
             let last = audit
                 .get(before..)?
                 .iter()
                 .rfind(|entry| entry["source"] == "sparkplug")?;
             last["result"].as_str().map(String::from)
-        });
-        result
+        })
     }
 
     /// The client sets a point: the code of its result.

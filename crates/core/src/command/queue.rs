@@ -3,22 +3,19 @@
 mod handover;
 mod holds;
 mod passed_on;
+mod shared;
+mod stops;
 
 pub use holds::Unheld;
+pub use shared::CommandQueue;
+pub use stops::{NotStopped, Stopping};
 
 use std::collections::{BTreeMap, VecDeque};
-use std::io;
-use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::sync::atomic::AtomicBool;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::Instant;
 
-use rustix::event::{EventfdFlags, eventfd};
-use tokio::sync::oneshot;
-
 use self::holds::Holds;
-use super::background::{Background, BackgroundRequest};
-use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal, SourceKind, Urgency};
+use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal, Urgency};
 use crate::start_guard::BusGuards;
 
 /// Commands and forwarded reads that may wait on one bus, besides two stops for each drive.
@@ -63,41 +60,6 @@ pub struct Pending {
     stopping: Option<Stopping>,
     /// What keeps motors from being started.
     guards: Option<Arc<BusGuards>>,
-}
-
-/// The wish of the gateway, which is about to end, that a bus stops its drives.
-#[derive(Debug)]
-pub struct Stopping {
-    deadline: Instant,
-    report: oneshot::Sender<Vec<NotStopped>>,
-}
-
-/// A drive that did not get, or did not acknowledge, the stop that the gateway wanted before it ends.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct NotStopped {
-    /// Its name.
-    pub drive: String,
-    /// What became of the stop, in words.
-    pub why: String,
-}
-
-impl std::fmt::Display for NotStopped {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "`{}` {}", self.drive, self.why)
-    }
-}
-
-impl Stopping {
-    /// When the gateway ends all the same.
-    pub fn deadline(&self) -> Instant {
-        self.deadline
-    }
-
-    /// The bus has done what it can; `missing` are the drives that were not stopped.
-    pub fn report(self, missing: Vec<NotStopped>) {
-        // The gateway may have given up waiting.
-        let _ = self.report.send(missing);
-    }
 }
 
 /// The command that has its turn.
@@ -196,38 +158,6 @@ impl Pending {
         self.guards.as_ref()?.refuses(drive, effect, until, now)
     }
 
-    /// Whether a stop waits until its motor has run for a time.
-    fn is_ordinary(&self, stop: &Command) -> bool {
-        let origin = stop.ticket.origin();
-        let delayed = matches!(
-            origin.kind,
-            SourceKind::ModbusTcp | SourceKind::Mqtt | SourceKind::Sparkplug | SourceKind::Bacnet | SourceKind::Slot
-        );
-        let last = self.stopped_at.get(&stop.drive).copied();
-        let delayed = delayed && stop.urgency == Urgency::Stop && !stop.is_urgent;
-        let guards = self.guards.as_ref().filter(|_| delayed);
-        guards.is_some_and(|guards| guards.is_ordinary_stop(stop.drive, origin.client(), last)) || self.repeats(stop)
-    }
-
-    /// Whether a cyclic client gives its waiting ordinary stop again: that is no second stop.
-    fn repeats(&self, stop: &Command) -> bool {
-        let origin = stop.ticket.origin();
-        let waits = |c: &Command| c.is_ordinary && c.drive == stop.drive && c.order == stop.order;
-        let own = |c: &Command| c.ticket.origin().client() == origin.client();
-        let delayed = stop.urgency == Urgency::Stop && !stop.is_urgent;
-        delayed && self.waiting.iter().any(|c| waits(c) && own(c)) && self.is_cyclic(origin)
-    }
-
-    /// Until when the stop that waits for that drive does so by `min_run`.
-    pub fn stop_waits(&self, drive: usize, now: Instant) -> Option<Instant> {
-        let guards = self.guards.as_ref()?;
-        let ordinary = |c: &Command| c.is_ordinary && c.drive == drive;
-        self.waiting
-            .iter()
-            .any(ordinary)
-            .then(|| guards.stop_waits(drive, now))?
-    }
-
     /// Whether that command waits.
     pub fn has(&self, number: u64) -> bool {
         self.waiting.iter().any(|c| c.number == number)
@@ -276,21 +206,6 @@ impl Pending {
         }
     }
 
-    fn note_stop(&mut self, drive: usize, now: Instant) {
-        *self.stops.entry(drive).or_default() += 1;
-        let at = self.stopped_at.entry(drive).or_insert(now);
-        *at = now.max(*at);
-    }
-
-    /// Whether a stop came in since a command was asked for, which takes longer than to say so: its head came before.
-    fn is_behind_its_stop(&self, command: &Command) -> bool {
-        let stopped = |drive: &usize| {
-            let at = self.stopped_at.get(drive).zip(command.asked);
-            at.is_some_and(|(stopped, asked)| asked < *stopped) && !command.stops(*drive)
-        };
-        command.urgency == Urgency::Command && command.reach().iter().any(stopped)
-    }
-
     /// The login that commanded a drive last, unless another client did since.
     pub fn commander(&self, drive: usize) -> Option<&Arc<str>> {
         self.commanders.get(&drive)
@@ -309,39 +224,6 @@ impl Pending {
             Some(login) => self.commanders.insert(drive, login),
             None => self.commanders.remove(&drive),
         };
-    }
-
-    /// Of each drive one stop waits that does nothing else, and one that does. Later ones join theirs if they ask for the
-    /// same, and are answered with it; of two that do different things besides the newer one is sent.
-    fn push_stop(&mut self, stop: Command, now: Instant) {
-        let drive = stop.drive;
-        self.note_accepted(&stop, now);
-        self.remove(now, &Outcome::Purged, |c| {
-            c.reaches(drive) && c.urgency == Urgency::Command && !c.stops(drive)
-        });
-        if !self.stopped.contains(&drive) {
-            self.stopped.push(drive);
-        }
-        // A second stop waits for nothing, nor does the first one any more.
-        if !stop.is_ordinary {
-            let of_drive = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop;
-            let others = self.waiting.iter_mut().filter(of_drive);
-            others.for_each(|c| c.is_ordinary = false);
-        }
-        let bare = stop.is_bare_stop();
-        let alike = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop && c.is_bare_stop() == bare;
-        match self.waiting.iter_mut().find(alike) {
-            Some(waiting) if waiting.order == stop.order => {
-                waiting.joined.push((stop.ticket, stop.expires));
-                waiting.joined.extend(stop.joined);
-                return;
-            }
-            Some(_) => self.remove(now, &Outcome::Replaced, |c| {
-                c.drive == drive && c.urgency == Urgency::Stop && c.is_bare_stop() == bare
-            }),
-            None => {}
-        }
-        self.waiting.push_back(stop);
     }
 
     /// The queued reference whose place a newer one takes: the last of the same points, unless something behind it sets what
@@ -375,12 +257,6 @@ impl Pending {
         let counted = others().filter_map(|(index, c)| Some((held(&kind(c)?), index)));
         let (most, index) = counted.max()?;
         (most > held(&own) + 1).then_some(index)
-    }
-
-    /// Drives for which a stop came in since the last call: nothing that was begun for them goes on, whatever becomes of
-    /// the stop itself.
-    pub fn take_stopped(&mut self) -> Vec<usize> {
-        std::mem::take(&mut self.stopped)
     }
 
     /// The command of that rank that has its turn at `now`, expired ones answered and removed. `may` says whether a
@@ -485,13 +361,6 @@ impl Pending {
         commands.filter_map(Command::client_waits_until).max()
     }
 
-    /// Takes away what supervision wants of a drive and has not begun: a client commands the drive again.
-    pub fn withdraw_supervision(&mut self, drive: usize, now: Instant) {
-        self.remove(now, &Outcome::Withdrawn, |c| {
-            c.drive == drive && c.joined.is_empty() && c.ticket.origin().is_lease()
-        });
-    }
-
     /// Answers those whose time ran out. A stop that was taken in is sent, however long it waits.
     fn expire(&mut self, now: Instant) {
         self.remove(now, &Outcome::Expired, |c| {
@@ -513,16 +382,6 @@ impl Pending {
         }
     }
 
-    /// Stops of that drive that were taken in so far, also by the bus before a reload.
-    pub fn stops(&self, drive: usize) -> u64 {
-        self.stops.get(&drive).copied().unwrap_or_default()
-    }
-
-    /// The stops that the gateway wants before it ends, once.
-    pub fn take_stopping(&mut self) -> Option<Stopping> {
-        self.stopping.take()
-    }
-
     /// Commands that wait.
     pub fn len(&self) -> usize {
         self.waiting.len()
@@ -540,14 +399,6 @@ impl Pending {
 }
 
 impl Command {
-    /// A stop that does nothing but take the run command away.
-    fn is_bare_stop(&self) -> bool {
-        match &self.order {
-            Order::Points(values) => values.len() == 1,
-            Order::Write(_) | Order::Read(_) | Order::Parameter(_) => false,
-        }
-    }
-
     /// Until when a client waits for it; none where it is the gateway's own.
     fn client_waits_until(&self) -> Option<Instant> {
         let joined = self.joined.iter().map(|(ticket, expires)| (ticket, *expires));
@@ -563,141 +414,6 @@ fn same_points(older: &Order, newer: &Order) -> bool {
             a.len() == b.len() && a.iter().zip(b).all(|((left, _), (right, _))| left == right)
         }
         _ => false,
-    }
-}
-
-/// The queue between the north sides and one bus.
-#[derive(Debug)]
-pub struct CommandQueue {
-    pending: Mutex<Pending>,
-    background: Mutex<Background>,
-    /// Whether `[authority]` is on.
-    guarded: AtomicBool,
-    wake: OwnedFd,
-    guards: Option<Arc<BusGuards>>,
-}
-
-impl CommandQueue {
-    /// An empty queue.
-    ///
-    /// # Errors
-    /// When the system gives no event descriptor.
-    pub fn new() -> io::Result<CommandQueue> {
-        let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
-        Ok(CommandQueue {
-            pending: Mutex::default(),
-            background: Mutex::default(),
-            guarded: AtomicBool::new(false),
-            wake,
-            guards: None,
-        })
-    }
-
-    /// The same with what keeps the motors of its drives from being started.
-    #[must_use]
-    pub fn guarded(mut self, guards: Option<Arc<BusGuards>>) -> CommandQueue {
-        self.lock().guards.clone_from(&guards);
-        self.guards = guards;
-        self
-    }
-
-    /// What keeps the motors of its drives from being started; none where nothing does.
-    pub fn guards(&self) -> Option<&Arc<BusGuards>> {
-        self.guards.as_ref()
-    }
-
-    /// Takes a command in and wakes the bus.
-    pub fn submit(&self, command: Command, now: Instant) {
-        self.lock().push(command, now);
-        self.wake();
-    }
-
-    /// Takes the stop of an order and its rest in, with nothing between them, and wakes the bus.
-    pub fn submit_parts(&self, stop: Command, mut rest: Command, now: Instant) {
-        let mut pending = self.lock();
-        let outdated = pending.is_behind_its_stop(&rest);
-        pending.push(stop, now);
-        if outdated {
-            rest.answer(&Outcome::Purged, now);
-        } else {
-            // Its own stop is none that came in since.
-            rest.asked = None;
-            pending.push(rest, now);
-        }
-        drop(pending);
-        self.wake();
-    }
-
-    /// Takes a background request in and wakes the bus.
-    pub fn submit_background(&self, request: BackgroundRequest, now: Instant) {
-        self.background().push(request, now);
-        self.wake();
-    }
-
-    /// The waiting background requests, for the bus.
-    pub fn background(&self) -> MutexGuard<'_, Background> {
-        self.background.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// The waiting commands, for the bus.
-    pub fn lock(&self) -> MutexGuard<'_, Pending> {
-        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Answers everything that waits, and all that comes from now on, with `outcome`.
-    pub fn close(&self, outcome: Outcome, now: Instant) {
-        self.background().close(&outcome, now);
-        let mut pending = self.lock();
-        // That the port is gone does not matter to stops that another bus sends.
-        let keeps_stops = pending.ending && outcome == Outcome::BusDown;
-        pending.remove(now, &outcome, |c| !keeps_stops || c.urgency != Urgency::Stop);
-        pending.ending = keeps_stops;
-        pending.closed = Some(outcome);
-    }
-
-    /// The gateway is about to end: from now on only stops get in, since nothing may start a drive again. What waits
-    /// is answered, stops apart. The bus stops its drives until `deadline`, and reports those that were not stopped.
-    pub fn begin_shutdown(&self, deadline: Instant, now: Instant) -> oneshot::Receiver<Vec<NotStopped>> {
-        let (report, missing) = oneshot::channel();
-        self.background().close(&Outcome::ShuttingDown, now);
-        let mut pending = self.lock();
-        pending.remove(now, &Outcome::ShuttingDown, |c| c.urgency != Urgency::Stop);
-        pending.waiting.iter_mut().for_each(|c| c.is_ordinary = false);
-        pending.stops_only = true;
-        pending.stopping = Some(Stopping { deadline, report });
-        drop(pending);
-        self.wake();
-        missing
-    }
-
-    /// Takes commands again.
-    pub fn open(&self) {
-        let mut pending = self.lock();
-        if pending.ending {
-            return;
-        }
-        pending.closed = None;
-        if !pending.stops_only {
-            self.background().open();
-        }
-    }
-
-    /// Wakes the bus from its wait.
-    pub fn wake(&self) {
-        // A full counter means that the bus is being woken already.
-        let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
-    }
-
-    /// Readable when the bus is to look at the queue.
-    pub fn wake_fd(&self) -> BorrowedFd<'_> {
-        self.wake.as_fd()
-    }
-
-    /// Clears the wake-up.
-    pub fn clear_wake(&self) {
-        let mut count = [0u8; 8];
-        // Nothing to read means that nobody woke the bus.
-        let _ = rustix::io::read(&self.wake, &mut count);
     }
 }
 

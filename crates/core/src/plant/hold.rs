@@ -29,10 +29,10 @@ impl BusHandle {
         drop(queue);
         let Some(rules) = rules else { return };
         let name_of = |drive: usize| self.image.drives.get(drive).map(|image| image.spec.name.as_str());
-        for (drive, Unheld { client, refusal }) in unheld {
+        for (drive, Unheld { client, why }) in unheld {
             tracing::warn!(
                 target: "drivegate::command", drive = name_of(drive),
-                "carried out an order of {client}, which `mode = \"exclusive\"` would have refused: {refusal}; logged once a client and minute"
+                "carried out an order of {client}, which `mode = \"exclusive\"` would refuse: {why}; logged once a client and minute"
             );
         }
         for (drive, told) in told {

@@ -76,7 +76,30 @@ fn fate(result: &str) -> Fate {
     match result {
         "acknowledged" | CONFIRMED => Fate::Taken,
         "timeout" | "garbled" | "unknown" | "interrupted" => Fate::Unsure,
-        "not_allowed" | "not_writable" | "bad_value" | "refused_by_drive" => Fate::Refused,
+        "not_allowed" | "not_writable" | "bad_value" | "refused_by_drive" | "held_by_other" | "needs_take"
+        | "guarded" | "interlocked" => Fate::Refused,
         _ => Fate::NotSent,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::command::{Holder, Refusal};
+
+    #[test]
+    fn what_was_refused_did_not_expire() {
+        for refusal in [
+            Refusal::NotAllowed(String::new()),
+            Refusal::NotWritable(String::new()),
+            Refusal::BadValue(String::new()),
+            Refusal::Interlocked(String::new()),
+            Refusal::HeldByOther(Box::default()),
+            Refusal::NeedsTake(Box::<Holder>::default()),
+        ] {
+            assert_eq!(fate(refusal.code()), Fate::Refused, "{}", refusal.code());
+        }
+        assert_eq!(fate("guarded"), Fate::Refused);
+        assert_eq!(fate("expired"), Fate::NotSent);
     }
 }

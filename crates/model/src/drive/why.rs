@@ -422,7 +422,7 @@ impl Look<'_> {
             (RunWish::Run, Fate::Refused, _) => (
                 "order_refused",
                 format!("run of {who} was refused: {text}"),
-                "correct the command or the rights of the client",
+                "correct what it names, then send run again",
             ),
             (RunWish::Run, Fate::NotSent, _) => (
                 "order_expired",

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::{CommandQueue, Pending};
+use super::Pending;
 use crate::command::{
-    Asks, Claim, Command, Denial, HoldView, Holding, Mode, Origin, Outcome, Refusal, Rules, Told, Urgency, Verb,
+    Asks, Claim, Command, Denial, HoldView, Holder, Holding, Mode, Origin, Outcome, Refusal, Rules, Told, Urgency, Verb,
 };
 
 /// What is told of holds waits for the gateway, which asks several times a second; beyond that the oldest is dropped.
@@ -35,8 +35,8 @@ pub(super) struct Holds {
 pub struct Unheld {
     /// Who gave it.
     pub client: Arc<str>,
-    /// What exclusive mode would have answered.
-    pub refusal: Refusal,
+    /// Why exclusive mode would have refused it.
+    pub why: String,
 }
 
 impl Holds {
@@ -69,8 +69,11 @@ impl Holds {
             return;
         }
         self.unheld_logged.insert(client.clone(), now);
-        let refusal = denial.refusal(rules);
-        self.unheld_told.push((drive, Unheld { client, refusal }));
+        let why = match denial.refusal(rules).holder() {
+            Some(Holder { who, rank, keeps, .. }) => format!("{who} ({rank}) {keeps}"),
+            None => "it is not a principal of [authority]".to_string(),
+        };
+        self.unheld_told.push((drive, Unheld { client, why }));
     }
 
     fn claim(&self, origin: &Origin) -> Option<Claim> {
@@ -345,20 +348,5 @@ impl Pending {
         // The next reading says it anew.
         holding.set_local(false, &mut Vec::new());
         self.holds.drives.insert(drive, holding);
-    }
-}
-
-impl CommandQueue {
-    /// From now on these rules hold for the drives of the bus; none: `[authority]` is off.
-    pub fn set_authority(&self, rules: Option<Arc<Rules>>) {
-        let mut pending = self.lock();
-        self.guarded
-            .store(rules.is_some(), std::sync::atomic::Ordering::Release);
-        pending.set_rules(rules);
-    }
-
-    /// Whether `[authority]` is on: without it, nobody need ask.
-    pub fn is_guarded(&self) -> bool {
-        self.guarded.load(std::sync::atomic::Ordering::Acquire)
     }
 }

@@ -4,7 +4,7 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::super::ticket::tests::ticket;
-use super::super::{Admitted, Answer, Origin, Ticket, Touched, WriteStats};
+use super::super::{Admitted, Answer, Origin, SourceKind, Ticket, Touched, WriteStats};
 use super::*;
 use crate::codec::Table;
 use crate::drive::Value;

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::codec::RequestPdu;
-use crate::command::{Commanded, Effect, Entry, NO_DRIVE, Pace, PassedOn, Settled, SlotWrite};
+use crate::command::{BackgroundRequest, Commanded, Effect, Entry, NO_DRIVE, Pace, PassedOn, Settled, SlotWrite};
 
 fn effect(run: bool) -> Effect {
     Effect {

@@ -1,0 +1,162 @@
+//! The command queue of a bus as the north sides and the bus share it: behind a lock, with the descriptor that wakes the bus.
+
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use rustix::event::{EventfdFlags, eventfd};
+use tokio::sync::oneshot;
+
+use super::{NotStopped, Pending, Stopping};
+use crate::command::background::{Background, BackgroundRequest};
+use crate::command::{Command, Outcome, Rules, Urgency};
+use crate::start_guard::BusGuards;
+
+/// The queue between the north sides and one bus.
+#[derive(Debug)]
+pub struct CommandQueue {
+    pending: Mutex<Pending>,
+    background: Mutex<Background>,
+    /// Whether `[authority]` is on.
+    guarded: AtomicBool,
+    wake: OwnedFd,
+    guards: Option<Arc<BusGuards>>,
+}
+
+impl CommandQueue {
+    /// An empty queue.
+    ///
+    /// # Errors
+    /// When the system gives no event descriptor.
+    pub fn new() -> io::Result<CommandQueue> {
+        let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
+        Ok(CommandQueue {
+            pending: Mutex::default(),
+            background: Mutex::default(),
+            guarded: AtomicBool::new(false),
+            wake,
+            guards: None,
+        })
+    }
+
+    /// The same with what keeps the motors of its drives from being started.
+    #[must_use]
+    pub fn guarded(mut self, guards: Option<Arc<BusGuards>>) -> CommandQueue {
+        self.lock().guards.clone_from(&guards);
+        self.guards = guards;
+        self
+    }
+
+    /// What keeps the motors of its drives from being started; none where nothing does.
+    pub fn guards(&self) -> Option<&Arc<BusGuards>> {
+        self.guards.as_ref()
+    }
+
+    /// Takes a command in and wakes the bus.
+    pub fn submit(&self, command: Command, now: Instant) {
+        self.lock().push(command, now);
+        self.wake();
+    }
+
+    /// Takes the stop of an order and its rest in, with nothing between them, and wakes the bus.
+    pub fn submit_parts(&self, stop: Command, mut rest: Command, now: Instant) {
+        let mut pending = self.lock();
+        let outdated = pending.is_behind_its_stop(&rest);
+        pending.push(stop, now);
+        if outdated {
+            rest.answer(&Outcome::Purged, now);
+        } else {
+            // Its own stop is none that came in since.
+            rest.asked = None;
+            pending.push(rest, now);
+        }
+        drop(pending);
+        self.wake();
+    }
+
+    /// Takes a background request in and wakes the bus.
+    pub fn submit_background(&self, request: BackgroundRequest, now: Instant) {
+        self.background().push(request, now);
+        self.wake();
+    }
+
+    /// The waiting background requests, for the bus.
+    pub fn background(&self) -> MutexGuard<'_, Background> {
+        self.background.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The waiting commands, for the bus.
+    pub fn lock(&self) -> MutexGuard<'_, Pending> {
+        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Answers everything that waits, and all that comes from now on, with `outcome`.
+    pub fn close(&self, outcome: Outcome, now: Instant) {
+        self.background().close(&outcome, now);
+        let mut pending = self.lock();
+        // That the port is gone does not matter to stops that another bus sends.
+        let keeps_stops = pending.ending && outcome == Outcome::BusDown;
+        pending.remove(now, &outcome, |c| !keeps_stops || c.urgency != Urgency::Stop);
+        pending.ending = keeps_stops;
+        pending.closed = Some(outcome);
+    }
+
+    /// The gateway is about to end: from now on only stops get in, since nothing may start a drive again. What waits
+    /// is answered, stops apart. The bus stops its drives until `deadline`, and reports those that were not stopped.
+    pub fn begin_shutdown(&self, deadline: Instant, now: Instant) -> oneshot::Receiver<Vec<NotStopped>> {
+        let (report, missing) = oneshot::channel();
+        self.background().close(&Outcome::ShuttingDown, now);
+        let mut pending = self.lock();
+        pending.remove(now, &Outcome::ShuttingDown, |c| c.urgency != Urgency::Stop);
+        pending.waiting.iter_mut().for_each(|c| c.is_ordinary = false);
+        pending.stops_only = true;
+        pending.stopping = Some(Stopping { deadline, report });
+        drop(pending);
+        self.wake();
+        missing
+    }
+
+    /// Takes commands again.
+    pub fn open(&self) {
+        let mut pending = self.lock();
+        if pending.ending {
+            return;
+        }
+        pending.closed = None;
+        if !pending.stops_only {
+            self.background().open();
+        }
+    }
+
+    /// Wakes the bus from its wait.
+    pub fn wake(&self) {
+        // A full counter means that the bus is being woken already.
+        let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
+    }
+
+    /// Readable when the bus is to look at the queue.
+    pub fn wake_fd(&self) -> BorrowedFd<'_> {
+        self.wake.as_fd()
+    }
+
+    /// Clears the wake-up.
+    pub fn clear_wake(&self) {
+        let mut count = [0u8; 8];
+        // Nothing to read means that nobody woke the bus.
+        let _ = rustix::io::read(&self.wake, &mut count);
+    }
+
+    /// From now on these rules hold for the drives of the bus; none: `[authority]` is off.
+    pub fn set_authority(&self, rules: Option<Arc<Rules>>) {
+        let mut pending = self.lock();
+        self.guarded.store(rules.is_some(), Ordering::Release);
+        pending.set_rules(rules);
+    }
+
+    /// Whether `[authority]` is on: without it, nobody need ask.
+    pub fn is_guarded(&self) -> bool {
+        self.guarded.load(Ordering::Acquire)
+    }
+}
