@@ -87,7 +87,7 @@ fn what_a_tool_sends_to_all_is_refused_for_one_and_its_stop_withdraws() {
                 stops: if run { Vec::new() } else { vec![1, 2] },
                 effects: vec![(1, effect(run)), (2, effect(run))],
                 first: false,
-                frame: oneshot::channel().0,
+                frame: tokio::sync::oneshot::channel().0,
             }),
         };
         (request.into_command(Touched::Anything), answer)
