@@ -2,8 +2,9 @@
 
 use super::*;
 use crate::codec::{LineFormat, Protocol};
+use crate::confirm::Unconfirmed;
 use crate::drive::profile::Profiles;
-use crate::process_image::{BusSpec, DriveSpec};
+use crate::process_image::{BusSpec, DriveSpec, LeaseAction};
 
 fn image(drives: u8) -> Arc<BusImage> {
     let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();

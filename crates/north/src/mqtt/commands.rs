@@ -11,9 +11,9 @@ use std::time::{Instant, SystemTime};
 use tokio::sync::oneshot;
 
 use super::outbox::Message;
-use super::payload::{HoldTopic, Topics};
 use super::reply::{Reply, ResponseTopics};
 use super::request::{self, Incoming};
+use super::topics::{HoldTopic, Topics};
 use crate::command::{Answer, Authority, Order, Origin, Parts, Proof, Refusal, SourceKind, Verb, stop_of};
 use crate::command_json::{HoldReply, Id, Repetition, SharedMemory, excerpt, stop_all, unknown_drive};
 use crate::plant::{Placed, Plant, Shown};

@@ -13,8 +13,8 @@ use std::time::{Duration, Instant};
 
 use self::device::Device;
 use super::Telemetry;
-use super::payload::Topics;
 use super::publisher::Update;
+use super::topics::Topics;
 use crate::plant::{DriveHandle, Plant};
 
 /// Messages that wait for the broker at a time.

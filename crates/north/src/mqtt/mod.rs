@@ -42,6 +42,7 @@ pub mod sparkplug;
 mod store;
 mod takeover;
 mod tls;
+mod topics;
 
 use std::fmt;
 use std::path::PathBuf;

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::commands::{Commands, Rules};
 use super::outbox::Message;
-use super::payload::Topics;
 use super::reply::ResponseTopics;
 use super::request::Incoming;
+use super::topics::Topics;
 use crate::command_json::SharedMemory;
 use crate::plant::SharedPlant;
 

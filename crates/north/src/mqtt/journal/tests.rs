@@ -1,3 +1,5 @@
+use std::io::ErrorKind;
+
 use super::*;
 
 const BIG: u64 = 64 << 20;

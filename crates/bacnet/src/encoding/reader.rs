@@ -1,0 +1,321 @@
+//! Reads tagged values.
+
+use super::tag;
+use crate::types::{Data, ObjectId, PropertyId, Reject};
+
+/// A tag as read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Tag {
+    /// Of a primitive value by its type; for BOOLEAN the second is the value.
+    App(u8, usize),
+    /// Of a primitive value in a context.
+    Context(u8, usize),
+    /// Begins a constructed value.
+    Open(u8),
+    /// Ends it.
+    Close(u8),
+}
+
+/// What reading gives.
+pub type Read<T> = Result<T, Reject>;
+
+/// Reads tagged values; everything out of place is an error that says how the request is rejected.
+#[derive(Debug, Clone)]
+pub struct Reader<'a> {
+    bytes: &'a [u8],
+}
+
+impl<'a> Reader<'a> {
+    /// At the beginning of `bytes`.
+    pub fn new(bytes: &'a [u8]) -> Reader<'a> {
+        Reader { bytes }
+    }
+
+    /// Whether nothing is left.
+    pub fn is_empty(&self) -> bool {
+        self.bytes.is_empty()
+    }
+
+    /// An error unless nothing is left.
+    ///
+    /// # Errors
+    /// Something is left.
+    pub fn end(&self) -> Read<()> {
+        match self.is_empty() {
+            true => Ok(()),
+            false => Err(Reject::TooManyArguments),
+        }
+    }
+
+    /// So many octets.
+    ///
+    /// # Errors
+    /// There are fewer.
+    pub fn take(&mut self, len: usize) -> Read<&'a [u8]> {
+        let (head, rest) = self
+            .bytes
+            .split_at_checked(len)
+            .ok_or(Reject::MissingRequiredParameter)?;
+        self.bytes = rest;
+        Ok(head)
+    }
+
+    fn octet(&mut self) -> Read<u8> {
+        let (first, rest) = self.bytes.split_first().ok_or(Reject::MissingRequiredParameter)?;
+        self.bytes = rest;
+        Ok(*first)
+    }
+
+    /// The next tag, which stays.
+    ///
+    /// # Errors
+    /// There is none.
+    pub fn peek(&self) -> Read<Tag> {
+        self.clone().tag()
+    }
+
+    /// The next tag; its value comes next.
+    ///
+    /// # Errors
+    /// There is none, or none that is valid.
+    pub fn tag(&mut self) -> Read<Tag> {
+        let first = self.octet()?;
+        let number = match first >> 4 {
+            15 => self.octet()?,
+            number => number,
+        };
+        let context = first & 8 != 0;
+        let len = match first & 7 {
+            6 if context => return Ok(Tag::Open(number)),
+            7 if context => return Ok(Tag::Close(number)),
+            6 | 7 => return Err(Reject::InvalidTag),
+            5 => match self.octet()? {
+                254 => usize::from(u16::from_be_bytes(self.array()?)),
+                255 => usize::try_from(u32::from_be_bytes(self.array()?)).map_err(|_| Reject::BufferOverflow)?,
+                len => usize::from(len),
+            },
+            len => usize::from(len),
+        };
+        Ok(match context {
+            true => Tag::Context(number, len),
+            false => Tag::App(number, len),
+        })
+    }
+
+    fn array<const N: usize>(&mut self) -> Read<[u8; N]> {
+        self.take(N)?.try_into().map_err(|_| Reject::MissingRequiredParameter)
+    }
+
+    /// Whether the next tag is that context, primitive.
+    pub fn is_context(&self, number: u8) -> bool {
+        matches!(self.peek(), Ok(Tag::Context(next, _)) if next == number)
+    }
+
+    /// Whether the next tag opens that context.
+    pub fn is_open(&self, number: u8) -> bool {
+        self.peek() == Ok(Tag::Open(number))
+    }
+
+    /// Whether the next tag closes that context.
+    pub fn is_close(&self, number: u8) -> bool {
+        self.peek() == Ok(Tag::Close(number))
+    }
+
+    /// Opens a constructed value.
+    ///
+    /// # Errors
+    /// Another tag comes.
+    pub fn open(&mut self, number: u8) -> Read<()> {
+        self.exactly(Tag::Open(number))
+    }
+
+    /// Closes it.
+    ///
+    /// # Errors
+    /// Another tag comes.
+    pub fn close(&mut self, number: u8) -> Read<()> {
+        self.exactly(Tag::Close(number))
+    }
+
+    fn exactly(&mut self, wanted: Tag) -> Read<()> {
+        match self.tag()? {
+            tag if tag == wanted => Ok(()),
+            _ => Err(Reject::InvalidTag),
+        }
+    }
+
+    /// The octets of a primitive value in that context.
+    ///
+    /// # Errors
+    /// Another tag comes.
+    pub fn context(&mut self, number: u8) -> Read<&'a [u8]> {
+        if self.is_empty() {
+            return Err(Reject::MissingRequiredParameter);
+        }
+        match self.tag()? {
+            Tag::Context(next, len) if next == number => self.take(len),
+            Tag::Context(..) | Tag::Open(_) | Tag::Close(_) => Err(Reject::MissingRequiredParameter),
+            Tag::App(..) => Err(Reject::InvalidTag),
+        }
+    }
+
+    /// As [`Reader::context`], where that context comes next.
+    ///
+    /// # Errors
+    /// It is not valid.
+    pub fn optional(&mut self, number: u8) -> Read<Option<&'a [u8]>> {
+        match self.is_context(number) {
+            true => self.context(number).map(Some),
+            false => Ok(None),
+        }
+    }
+
+    /// Unsigned of at most 32 bits in a context.
+    ///
+    /// # Errors
+    /// Another tag or value comes.
+    pub fn context_u32(&mut self, number: u8) -> Read<u32> {
+        u32_of(self.context(number)?)
+    }
+
+    /// The same where it comes next.
+    ///
+    /// # Errors
+    /// It is not valid.
+    pub fn optional_u32(&mut self, number: u8) -> Read<Option<u32>> {
+        self.optional(number)?.map(u32_of).transpose()
+    }
+
+    /// BOOLEAN in a context, where it comes next.
+    ///
+    /// # Errors
+    /// It is not valid.
+    pub fn optional_bool(&mut self, number: u8) -> Read<Option<bool>> {
+        match self.optional(number)? {
+            None => Ok(None),
+            Some([0]) => Ok(Some(false)),
+            Some([1]) => Ok(Some(true)),
+            Some(_) => Err(Reject::InvalidParameterDataType),
+        }
+    }
+
+    /// BACnetObjectIdentifier in a context.
+    ///
+    /// # Errors
+    /// Another tag or length comes.
+    pub fn context_object(&mut self, number: u8) -> Read<ObjectId> {
+        let bytes: [u8; 4] = self
+            .context(number)?
+            .try_into()
+            .map_err(|_| Reject::InvalidParameterDataType)?;
+        Ok(ObjectId::from_bits(u32::from_be_bytes(bytes)))
+    }
+
+    /// Property identifier in a context.
+    ///
+    /// # Errors
+    /// Another tag or value comes.
+    pub fn context_property(&mut self, number: u8) -> Read<PropertyId> {
+        self.context_u32(number).map(PropertyId)
+    }
+
+    /// REAL in a context, where it comes next.
+    ///
+    /// # Errors
+    /// It is not valid.
+    pub fn optional_real(&mut self, number: u8) -> Read<Option<f32>> {
+        let Some(bytes) = self.optional(number)? else {
+            return Ok(None);
+        };
+        let bytes: [u8; 4] = bytes.try_into().map_err(|_| Reject::InvalidParameterDataType)?;
+        Ok(Some(f32::from_be_bytes(bytes)))
+    }
+
+    /// A primitive value with its application tag; `None` where a constructed one, or one of a context, comes.
+    ///
+    /// # Errors
+    /// It is not valid.
+    pub fn data(&mut self) -> Read<Option<Data>> {
+        let (number, len) = match self.tag()? {
+            Tag::App(number, len) => (number, len),
+            Tag::Context(_, len) => {
+                self.take(len)?;
+                return Ok(None);
+            }
+            Tag::Open(_) | Tag::Close(_) => return Ok(None),
+        };
+        if number == tag::BOOLEAN {
+            return match len {
+                0 | 1 => Ok(Some(Data::Bool(len == 1))),
+                _ => Err(Reject::InvalidTag),
+            };
+        }
+        let bytes = self.take(len)?;
+        primitive(number, bytes).map(Some)
+    }
+}
+
+fn primitive(number: u8, bytes: &[u8]) -> Read<Data> {
+    let wrong = Reject::InvalidParameterDataType;
+    Ok(match number {
+        tag::NULL if bytes.is_empty() => Data::Null,
+        tag::UNSIGNED => Data::Unsigned(u64_of(bytes)?),
+        tag::SIGNED => Data::Signed(i64_of(bytes)?),
+        tag::REAL => Data::Real(f32::from_be_bytes(bytes.try_into().map_err(|_| wrong)?)),
+        tag::DOUBLE => Data::Double(f64::from_be_bytes(bytes.try_into().map_err(|_| wrong)?)),
+        tag::TEXT => Data::Text(text_of(bytes)?),
+        tag::ENUMERATED => Data::Enumerated(u32_of(bytes)?),
+        tag::OBJECT => {
+            let bytes: [u8; 4] = bytes.try_into().map_err(|_| wrong)?;
+            Data::Object(ObjectId::from_bits(u32::from_be_bytes(bytes)))
+        }
+        tag::OCTETS | tag::BITS => Data::Other,
+        tag::DATE | tag::TIME if bytes.len() == 4 => Data::Other,
+        _ => return Err(wrong),
+    })
+}
+
+/// A CharacterString in one of the usual character sets.
+///
+/// # Errors
+/// It is not valid, or of another set.
+pub fn text_of(bytes: &[u8]) -> Read<String> {
+    let wrong = Reject::InvalidParameterDataType;
+    let (set, text) = bytes.split_first().ok_or(wrong)?;
+    match set {
+        0 => String::from_utf8(text.to_vec()).map_err(|_| wrong),
+        4 if text.len() % 2 == 0 => {
+            let units: Vec<u16> = text
+                .chunks(2)
+                .map(|pair| pair.iter().fold(0, |unit, byte| unit << 8 | u16::from(*byte)))
+                .collect();
+            String::from_utf16(&units).map_err(|_| wrong)
+        }
+        5 => Ok(text.iter().map(|byte| char::from(*byte)).collect()),
+        _ => Err(wrong),
+    }
+}
+
+fn u64_of(bytes: &[u8]) -> Read<u64> {
+    match bytes.len() {
+        1..=8 => Ok(bytes.iter().fold(0, |value, byte| value << 8 | u64::from(*byte))),
+        _ => Err(Reject::InvalidParameterDataType),
+    }
+}
+
+/// An Unsigned of at most 32 bits.
+///
+/// # Errors
+/// It is longer, or empty.
+pub fn u32_of(bytes: &[u8]) -> Read<u32> {
+    u32::try_from(u64_of(bytes)?).map_err(|_| Reject::ParameterOutOfRange)
+}
+
+fn i64_of(bytes: &[u8]) -> Read<i64> {
+    let first = *bytes
+        .first()
+        .filter(|_| bytes.len() <= 8)
+        .ok_or(Reject::InvalidParameterDataType)?;
+    let start = if first & 0x80 == 0 { 0 } else { -1 };
+    Ok(bytes.iter().fold(start, |value, byte| value << 8 | i64::from(*byte)))
+}

@@ -1,0 +1,171 @@
+//! Events of drives and of the bus.
+
+use std::time::{Instant, SystemTime};
+
+use super::{RECENT, Report, goes_offline};
+use crate::command::{Origin, Refusal};
+use crate::confirm::Unconfirmed;
+use crate::event::{Event, EventKind, RefusedCommand};
+use crate::news::Adopted;
+use crate::plant::explain;
+use crate::process_image::{LeaseAction, Snapshot};
+
+impl Report {
+    /// Reports an event of a drive; `text` makes the words from its name.
+    pub(crate) fn drive_event(
+        &self,
+        index: usize,
+        kind: EventKind,
+        fault_code: Option<i64>,
+        text: impl FnOnce(&str) -> String,
+    ) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        let name = drive.spec.name.clone();
+        let text = text(&name);
+        self.event(kind, Some(name), fault_code, text);
+    }
+
+    pub(super) fn event(&self, kind: EventKind, drive: Option<String>, fault_code: Option<i64>, text: String) {
+        self.publish(Event {
+            drive,
+            fault_code,
+            ..Event::new(kind, SystemTime::now(), text)
+        });
+    }
+
+    pub(super) fn publish(&self, event: Event) {
+        self.events.publish(Event {
+            bus: self.image.spec.name.clone(),
+            ..event
+        });
+    }
+
+    /// A command was refused at its turn, as others are when they come.
+    pub(super) fn start_refused(&self, index: usize, origin: &Origin, what: &str, refusal: &Refusal, now: Instant) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        let refused = RefusedCommand {
+            client: origin.client(),
+            reason: refusal.code(),
+            bus: &drive.spec.bus,
+            drive: &drive.spec.name,
+            text: format!("refused {what} from {} {}: {refusal}", origin.kind.name(), origin.who),
+        };
+        self.events.publish_refusal(refused, now);
+    }
+
+    /// An action of supervision failed: counted, and told where `text` has words for it.
+    pub(super) fn action_failed(&self, index: usize, text: impl FnOnce(&str) -> Option<String>) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        drive.count_supervision_failure();
+        if let Some(text) = text(&drive.spec.name) {
+            self.drive_event(index, EventKind::SupervisionFailed, None, |_| text);
+        }
+    }
+
+    /// The action of the lease of a drive, in words.
+    pub(super) fn action_of(&self, index: usize) -> &'static str {
+        let drive = self.image.drives.get(index);
+        match drive
+            .and_then(|drive| drive.spec.supervision.as_ref())
+            .map(|s| &s.action)
+        {
+            Some(LeaseAction::SpeedReference(_)) => "the speed reference",
+            _ => "the stop",
+        }
+    }
+
+    /// A motor that was to run and does not: with the causes that are known.
+    pub(super) fn not_confirmed(&self, index: usize, late: &Unconfirmed, now: Instant) {
+        if late.own {
+            self.action_failed(index, |name| {
+                Some(format!(
+                    "the action of the lease of {name} shows no effect: the drive {}",
+                    late.text
+                ))
+            });
+        }
+        let Some(drive) = self.image.drives.get(index).filter(|_| late.does_not_run) else {
+            return self.drive_event(index, EventKind::NotConfirmed, None, |name| {
+                format!("drive {name} {}", late.text)
+            });
+        };
+        let explanation = explain(&drive.reading(now, RECENT), &self.image, &self.writes);
+        let causes = explanation.blocked_by().map(|causes| format!("; blocked by {causes}"));
+        self.drive_event(index, EventKind::NotConfirmed, None, |name| {
+            format!("drive {name} {}{}", late.text, causes.unwrap_or_default())
+        });
+    }
+
+    pub(super) fn lease_ran_out(&self, index: usize) {
+        let Some(drive) = self.drive(index) else { return };
+        let Some(supervision) = &drive.spec.supervision else {
+            return;
+        };
+        drive.count_supervision();
+        let action = match supervision.action {
+            LeaseAction::Stop => "the drive is being stopped".to_string(),
+            LeaseAction::Hold => "nothing is written".to_string(),
+            LeaseAction::SpeedReference(percent) => format!("the speed reference is being set to {percent} %"),
+        };
+        let timeout = supervision.timeout;
+        self.drive_event(index, EventKind::Supervision, None, |name| {
+            format!("no commanding client of {name} for {timeout:?}: {action}")
+        });
+    }
+
+    pub(super) fn runs_unsupervised(&self, index: usize, adopted: Adopted) {
+        let then = match adopted {
+            Adopted::Yes => "its lease starts now (supervision.adopt)",
+            Adopted::No => {
+                "its lease starts with the first command or heartbeat of a client; set supervision.adopt = true to \
+                 start it \
+                 whenever the drive is found running"
+            }
+        };
+        self.drive_event(index, EventKind::Unsupervised, None, |name| {
+            format!("drive {name} runs, and its supervision knows of no client that has commanded it; {then}")
+        });
+    }
+
+    /// Shows a drive as offline for a reason of its own.
+    pub(crate) fn gone(&self, index: usize, why: &str) {
+        if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
+            self.drive_event(index, EventKind::Offline, None, |name| {
+                format!("drive {name} is offline: {why}")
+            });
+        }
+    }
+
+    pub(super) fn offline_event(&self, index: usize, why: &str) {
+        self.drive_event(index, EventKind::Offline, None, |name| {
+            format!("drive {name} is offline: {why}; retrying at least every 10 s")
+        });
+    }
+
+    pub(super) fn restarted(&self, index: usize) {
+        let Some(drive) = self.drive(index) else { return };
+        drive.update(Snapshot::outlive);
+        self.drive_event(index, EventKind::Restarted, None, |name| {
+            format!("drive {name} has restarted; it is read again, and takes only commands sent from now on")
+        });
+    }
+
+    /// A drive says that it is of another device type than its profile expects.
+    pub(super) fn unlike(&self, index: usize, device: u8) {
+        let Some(drive) = self.drive(index) else { return };
+        let profile = &drive.spec.profile;
+        self.drive_event(index, EventKind::UnlikeProfile, None, |name| {
+            format!(
+                "drive {name} says that it is a device of type {device:02X}h, its profile `{}` expects {:02X}h; check \
+                 address and profile, or set device_type in [n2] of the profile",
+                profile.name, profile.n2.device_type
+            )
+        });
+    }
+}

@@ -1,0 +1,137 @@
+//! Where the journal of a drive is kept.
+
+use std::fs::{self, File};
+use std::io::{self, Read as _};
+use std::path::{Path, PathBuf};
+
+use super::super::file::MOST_BYTES;
+use super::{NAME, Owner, RELEASED};
+use crate::files;
+
+/// Where the journal of one drive is kept.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct JournalFile {
+    dir: PathBuf,
+}
+
+impl JournalFile {
+    /// Below that directory of readings.
+    pub fn new(params: &Path, drive: &str) -> JournalFile {
+        JournalFile {
+            dir: params.join(drive),
+        }
+    }
+
+    /// All that are below that directory, in the order of their names.
+    ///
+    /// # Errors
+    /// The directory cannot be read.
+    pub fn all(params: &Path) -> io::Result<Vec<JournalFile>> {
+        let entries = match fs::read_dir(params) {
+            Err(error) if is_absent(&error) => return Ok(Vec::new()),
+            entries => entries?,
+        };
+        let mut all = Vec::new();
+        for entry in entries {
+            let file = JournalFile { dir: entry?.path() };
+            // What cannot be looked at may be one.
+            if file.path().try_exists().unwrap_or(true) && file.dir.is_dir() {
+                all.push(file);
+            }
+        }
+        all.sort_by(|a, b| a.dir.cmp(&b.dir));
+        Ok(all)
+    }
+
+    /// Name of its directory: that of the drive when the restore began.
+    pub fn drive(&self) -> String {
+        let name = self.dir.file_name().unwrap_or_default();
+        name.to_string_lossy().into_owned()
+    }
+
+    /// The journal that is there must not be that of another machine than `of`.
+    fn is_free(&self, of: &Owner) -> io::Result<()> {
+        let there = self.read()?.and_then(|text| Owner::parse(&text).ok());
+        let is_same = |there: &Owner| there.machine == of.machine;
+        match there.filter(|there| !is_same(there)) {
+            None => Ok(()),
+            Some(there) => Err(io::Error::other(format!(
+                "there is the journal of a restore of {}, which was interrupted; resume or undo it, or set it aside by \
+                 `drivegate params restore --release {}`",
+                there.place(),
+                self.drive()
+            ))),
+        }
+    }
+
+    /// Its path.
+    pub fn path(&self) -> PathBuf {
+        self.dir.join(NAME)
+    }
+
+    /// Puts a journal on disk: when this returns it is there after a power failure too, and one that was there before is either
+    /// whole or replaced. The journal of another machine is left.
+    ///
+    /// # Errors
+    /// It is not certain to be there.
+    pub fn write(&self, of: &Owner, text: &str) -> io::Result<()> {
+        self.is_free(of)?;
+        files::replace(&self.path(), text.as_bytes())?;
+        // The entry of the file, and those of directories that may be new.
+        self.dir.ancestors().take(3).try_for_each(sync)
+    }
+
+    /// The journal, if there is one.
+    ///
+    /// # Errors
+    /// Whether there is one is not known, or it cannot be read.
+    pub fn read(&self) -> io::Result<Option<String>> {
+        let mut bytes = Vec::new();
+        match File::open(self.path()) {
+            Ok(file) => file.take(MOST_BYTES).read_to_end(&mut bytes)?,
+            Err(error) if is_absent(&error) => return Ok(None),
+            Err(error) => return Err(error),
+        };
+        Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
+    }
+
+    /// The restore is over: there is no journal of it any more. That of another machine is left.
+    ///
+    /// # Errors
+    /// It may still be there.
+    pub fn remove(&self, of: &Owner) -> io::Result<()> {
+        if self.is_free(of).is_err() {
+            return Ok(());
+        }
+        match fs::remove_file(self.path()) {
+            Err(error) if is_absent(&error) => Ok(()),
+            Err(error) => Err(error),
+            Ok(()) => sync(&self.dir),
+        }
+    }
+
+    /// Sets the journal aside, with the former values in it; where.
+    ///
+    /// # Errors
+    /// It is still where it was.
+    pub fn release(&self) -> io::Result<PathBuf> {
+        let aside = self.dir.join(RELEASED);
+        fs::rename(self.path(), &aside)?;
+        sync(&self.dir)?;
+        Ok(aside)
+    }
+}
+
+fn sync(dir: &Path) -> io::Result<()> {
+    // A relative path of one part has the working directory above it.
+    let dir = if dir.as_os_str().is_empty() {
+        Path::new(".")
+    } else {
+        dir
+    };
+    File::open(dir)?.sync_all()
+}
+
+fn is_absent(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory)
+}
