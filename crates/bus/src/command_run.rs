@@ -36,7 +36,6 @@ pub enum Next {
     Send(Step),
     /// Nothing before then.
     Wait(Instant),
-    /// It is done.
     Done,
 }
 

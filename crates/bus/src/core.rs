@@ -337,7 +337,6 @@ impl BusCore {
         }
     }
 
-    /// An exchange is over.
     fn over(&mut self, mut exchanged: Exchanged, now: Instant) {
         let Some(turn) = self.asked.take() else { return };
         if matches!(exchanged.ended, Ended::Reply(_)) {

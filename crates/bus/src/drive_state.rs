@@ -16,7 +16,6 @@ use crate::process_image::{DriveImage, Reading};
 /// A status older than this, or than three rounds of the line, does not show whether the motor runs.
 pub(super) const FRESH: Duration = Duration::from_secs(2);
 
-/// One drive.
 #[derive(Debug)]
 pub(super) struct DriveState {
     /// A status older than that does not show whether the motor runs.
@@ -57,7 +56,6 @@ pub(super) enum Wanted {
     Step(Urgency, Step),
     /// Nothing before then.
     Wait(Instant),
-    /// Nothing.
     Nothing,
 }
 
@@ -108,7 +106,6 @@ impl DriveState {
         self.runs.iter().any(Option::is_some)
     }
 
-    /// Begins a command.
     pub(super) fn begin(&mut self, run: CommandRun) {
         if let Some(place) = self.runs.get_mut(slot(run.urgency())) {
             *place = Some(run);

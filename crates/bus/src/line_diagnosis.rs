@@ -14,7 +14,6 @@ use crate::diagnosis::{
 };
 use crate::process_image::BusImage;
 
-/// The diagnosis of one line.
 #[derive(Debug)]
 pub(super) struct LineDiagnosis {
     image: Arc<BusImage>,

@@ -103,7 +103,6 @@ impl BusTask {
         self.beats.clone()
     }
 
-    /// The bus.
     pub fn handle(&self) -> &BusHandle {
         &self.handle
     }

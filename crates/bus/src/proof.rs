@@ -40,7 +40,6 @@ pub struct Counterexample {
     pub what: String,
     /// The drive before.
     pub state: String,
-    /// The command.
     pub command: String,
     /// The requests, with their words in hex, and what became of them.
     pub frames: Vec<String>,
@@ -59,7 +58,6 @@ impl std::fmt::Display for Counterexample {
 }
 
 impl Counterexample {
-    /// On one line.
     pub fn line(&self) -> String {
         let frames = self.frames.join(", then ");
         let Counterexample {

@@ -113,7 +113,6 @@ pub struct RoundStart {
 /// Why a poll has its turn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Turn {
-    /// It is due.
     Due,
     /// A slow poll that goes before fast ones.
     OnCredit,

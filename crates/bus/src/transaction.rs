@@ -165,7 +165,6 @@ impl Transaction {
         &self.frame
     }
 
-    /// The request.
     pub fn request(&self) -> &Request {
         &self.request
     }

@@ -94,7 +94,6 @@ pub enum EventKind {
 }
 
 impl EventKind {
-    /// All kinds.
     pub const ALL: [EventKind; 30] = [
         EventKind::Online,
         EventKind::Offline,
@@ -285,7 +284,6 @@ impl Boot {
         self.0.is_none()
     }
 
-    /// Its name.
     pub fn name(&self) -> &str {
         self.0.as_deref().unwrap_or_else(|| boot())
     }
@@ -319,9 +317,7 @@ pub struct RefusedCommand<'r> {
     pub client: &'r Arc<str>,
     /// Code of the reason.
     pub reason: &'static str,
-    /// The bus.
     pub bus: &'r str,
-    /// The drive.
     pub drive: &'r str,
     /// For people.
     pub text: String,

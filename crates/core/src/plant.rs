@@ -110,7 +110,6 @@ pub struct Plant {
 /// One drive and the way to it.
 #[derive(Debug, Clone)]
 pub struct DriveHandle {
-    /// Its bus.
     pub bus: BusHandle,
     /// Index on the bus.
     pub index: usize,
@@ -174,7 +173,6 @@ impl Plant {
         })
     }
 
-    /// The drive of that name.
     pub fn drive(&self, name: &str) -> Option<DriveHandle> {
         self.buses.iter().find_map(|bus| {
             let index = bus.image.drives.iter().position(|drive| drive.spec.name == name)?;
@@ -182,7 +180,6 @@ impl Plant {
         })
     }
 
-    /// The drive that is that machine.
     pub fn drive_at(&self, machine: &Machine) -> Option<DriveHandle> {
         self.drives().find(|drive| drive.machine() == *machine)
     }

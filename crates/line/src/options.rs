@@ -66,7 +66,6 @@ pub struct LineOptions {
     pub termination: bool,
     /// Level of RTS; not together with RS-485 by the kernel, which switches it.
     pub rts: Level,
-    /// Level of DTR.
     pub dtr: Level,
     /// How precisely waits end.
     pub spin: Spin,

@@ -22,7 +22,6 @@ pub(super) struct Limits {
     pub(super) total: usize,
     /// How many of them only clients that may write can have.
     pub(super) reserved: usize,
-    /// For one address.
     pub(super) per_address: usize,
 }
 

@@ -44,7 +44,6 @@ pub enum TlsFile {
 #[derive(Debug, thiserror::Error)]
 #[error("{problem}")]
 pub struct IdentityFault {
-    /// The file.
     pub file: TlsFile,
     problem: FileProblem,
 }

@@ -65,7 +65,6 @@ pub enum ServerError {
     Listen {
         /// `Modbus TCP` or `HTTP`.
         protocol: &'static str,
-        /// The address.
         address: SocketAddr,
         /// Section of the configuration, in brackets.
         section: String,

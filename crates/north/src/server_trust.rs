@@ -20,7 +20,6 @@ use super::certificate;
 use super::certificate_kind::Kind;
 use super::identity::provider;
 
-/// The servers that are trusted.
 #[derive(Debug)]
 pub(super) struct ServerTrust {
     by_ca: Arc<WebPkiServerVerifier>,

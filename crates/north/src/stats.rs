@@ -76,7 +76,6 @@ const OTHER: &str = "other";
 pub enum ServerKind {
     /// Modbus TCP, with and without TLS.
     ModbusTcp,
-    /// HTTP.
     Http,
     /// The tool slots.
     Slot,
@@ -85,7 +84,6 @@ pub enum ServerKind {
 }
 
 impl ServerKind {
-    /// All servers.
     pub const ALL: [ServerKind; 4] = [
         ServerKind::ModbusTcp,
         ServerKind::Http,
@@ -282,7 +280,6 @@ pub enum SlotOutcome {
 }
 
 impl SlotOutcome {
-    /// All outcomes.
     pub const ALL: [SlotOutcome; 7] = [
         SlotOutcome::Answered,
         SlotOutcome::Exception,
@@ -373,7 +370,6 @@ pub(crate) enum LinkOf {
 /// What the MQTT client lost.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MqttLoss {
-    /// Events.
     Event,
     /// Results of commands.
     Result,

@@ -23,7 +23,6 @@ pub enum Peer {
     Client,
 }
 
-/// The broker.
 pub(super) const BROKER: Peer = Peer::Server {
     ca: "mqtt.ca",
     own: "mqtt.certificate and mqtt.key",

@@ -21,7 +21,6 @@ pub(crate) const AT_REFERENCE_BAND: f64 = 0.005;
 /// Run, direction and speed from whoever commands a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Command {
-    /// Run.
     pub run: bool,
     /// Counterclockwise.
     pub reverse: bool,

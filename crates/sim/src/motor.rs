@@ -17,7 +17,6 @@ pub struct Ratings {
     pub speed: f64,
     /// Nominal current, A.
     pub current: f64,
-    /// cos phi.
     pub cos_phi: f64,
 }
 

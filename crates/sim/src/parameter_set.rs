@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use super::random::Random;
 
-/// One parameter.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Parameter {
     /// Its ID or address.

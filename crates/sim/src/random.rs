@@ -40,7 +40,6 @@ impl Random {
         self.unit() < probability
     }
 
-    /// A byte.
     pub fn byte(&mut self) -> u8 {
         (self.bits() >> 56) as u8
     }

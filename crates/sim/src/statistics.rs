@@ -100,7 +100,6 @@ pub struct Recorded {
     pub start: SimTime,
     /// When its last character ended.
     pub end: SimTime,
-    /// Its bytes.
     pub bytes: Vec<u8>,
 }
 

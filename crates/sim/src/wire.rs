@@ -30,7 +30,6 @@ pub struct SimulatedBusOptions {
     /// How the line behaves. On a real serial port the wire keeps the time, whatever `wire` says, and silence is
     /// counted but not enforced: drivers and adapters hand bytes over late.
     pub rules: LineRules,
-    /// The drives on it.
     pub drives: Vec<DriveOptions>,
     /// Options of their boards, where they speak N2.
     pub boards: BoardOptions,

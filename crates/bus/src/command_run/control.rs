@@ -61,7 +61,6 @@ pub(super) enum Made {
 pub(super) struct AwaitedState {
     /// The register.
     raw: Raw,
-    /// Its name.
     name: String,
     mask: Mask,
     /// After which the sequence is given up.
@@ -309,7 +308,6 @@ fn runs(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Acti
     }
 }
 
-/// The write of a word to that place.
 fn write(place: Place, word: u16, profile: &Profile) -> RequestPdu {
     match place.table {
         Table::Coil | Table::DiscreteInput => profile.functions.write_coil(place.address, word != 0),

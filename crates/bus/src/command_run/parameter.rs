@@ -35,7 +35,6 @@ pub(super) enum Then {
     Go,
     /// The next step, after a pause.
     Pause,
-    /// It is over.
     Over(Outcome),
 }
 

@@ -84,7 +84,6 @@ impl Action {
         )
     }
 
-    /// Whether it ends one.
     pub(super) fn ends_reset(&self) -> bool {
         matches!(
             self,

@@ -42,7 +42,6 @@ pub enum Heard {
     Exchange(Box<Exchange>),
     /// Bytes that belong to no exchange.
     Stray {
-        /// The bytes.
         bytes: Vec<u8>,
         /// When they had come.
         at: Instant,

@@ -41,7 +41,6 @@ mod tests {
     use crate::drive::profile::Profiles;
     use crate::drive::{ModelPoint, PollClass};
 
-    /// The drives of a line with that cycle.
     fn line(cycle: u64, profiles: &[&str]) -> Option<Vec<DriveSpec>> {
         let spec = BusSpec {
             name: "line1".to_string(),

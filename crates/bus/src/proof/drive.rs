@@ -57,7 +57,6 @@ impl Start {
     }
 }
 
-/// The drive.
 #[derive(Debug, Clone)]
 pub(super) struct Drive<'p> {
     profile: &'p Profile,
@@ -152,7 +151,6 @@ impl<'p> Drive<'p> {
         self.word(setting.place.unwrap_or(self.control.at))
     }
 
-    /// Whether its reset stands.
     pub(super) fn reset_stands(&self) -> bool {
         let reset = self.control.fault_reset;
         reset.is_some_and(|reset| !reset.setting.once && reset.setting.holds(self.word_of(&reset.setting)))

@@ -38,7 +38,6 @@ impl Lead {
     }
 }
 
-/// The share of commands.
 #[derive(Debug, Default)]
 pub(super) struct CommandShare {
     /// Of everything that commands caused, over process data; reckoned since polls last had nothing to do.

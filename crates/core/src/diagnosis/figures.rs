@@ -39,14 +39,12 @@ pub enum End {
     Doubtful,
 }
 
-/// One exchange.
 #[derive(Debug, Clone, Copy)]
 pub struct Exchange<'e> {
     /// Place of the drive on the bus.
     pub drive: usize,
     /// What was asked.
     pub request: &'e Request,
-    /// Its frame.
     pub frame: &'e [u8],
     /// All that came until the end.
     pub seen: &'e [u8],
@@ -71,7 +69,6 @@ pub struct Exchange<'e> {
 /// How the line is set up.
 #[derive(Debug, Clone, Copy)]
 pub struct Line {
-    /// Protocol.
     pub protocol: Protocol,
     /// Baud rate and character format.
     pub format: LineFormat,
@@ -121,7 +118,6 @@ const SIGNS: usize = Sign::Echoed as usize + 1;
 /// What is counted of one drive.
 #[derive(Debug, Clone)]
 pub struct Drive {
-    /// Its address.
     pub address: u8,
     window: Window<SIGNS>,
     /// Slowest beginning of a reply in each step, tenths of a millisecond.
@@ -176,7 +172,6 @@ impl Drive {
 pub struct Figures {
     /// How the line is set up.
     pub line: Line,
-    /// Its drives.
     pub drives: Vec<Drive>,
     /// Sound replies by the millisecond of their arrival, modulo the latency timer; requests after a pause likewise.
     arrivals: Window<LATENCY>,

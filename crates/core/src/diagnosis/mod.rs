@@ -138,7 +138,6 @@ impl Certainty {
 /// What a rule found. Drives are named by their place on the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
-    /// The cause.
     pub cause: Cause,
     /// The drive, where it is about one.
     pub drive: Option<usize>,

@@ -9,7 +9,6 @@ use super::{Boot, Event, EventKind, RecordingMade};
 /// Where a search begins: with what comes before.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Before {
-    /// This time.
     Time(SystemTime),
     /// The event of that number of a run, which itself is left out.
     Event(Boot, u64),
@@ -20,9 +19,7 @@ pub enum Before {
 pub struct Search {
     /// Any of these kinds; none: all kinds.
     pub kinds: Vec<EventKind>,
-    /// Of this drive.
     pub drive: Option<String>,
-    /// Of this bus.
     pub bus: Option<String>,
     /// With these words in any of its texts, upper and lower case alike.
     pub text: Option<String>,

@@ -12,7 +12,6 @@ use super::summary;
 use crate::drive::{Profile, Source};
 use crate::process_image::{Reading, Snapshot, TapedRead, value_or_null};
 
-/// The recording of a capture.
 pub fn assemble(capture: &Capture) -> Recording {
     let spec = &capture.drive.spec;
     let profile = &spec.profile;

@@ -26,7 +26,6 @@ pub struct Packet {
     pub at: Duration,
     /// They were sent: `at` is when they were given to the port. Else it is when the last of them had come.
     pub sent: bool,
-    /// The bytes.
     pub bytes: Vec<u8>,
 }
 
@@ -36,7 +35,6 @@ pub struct Packet {
 pub struct CaptureError {
     /// Where, from the beginning of the file.
     pub offset: usize,
-    /// What.
     pub what: String,
 }
 

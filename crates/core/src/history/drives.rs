@@ -133,7 +133,6 @@ impl DriveHistory {
         (&self.bus, self.address, &self.profile) == (&spec.bus, spec.address, &spec.profile)
     }
 
-    /// Its trends.
     pub fn trend(&self) -> MutexGuard<'_, DriveTrend> {
         lock(&self.trend)
     }

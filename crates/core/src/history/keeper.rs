@@ -32,7 +32,6 @@ const MOST_DRIVES: usize = 16_384;
 /// Form of the file of counters.
 const VERSION: u32 = 1;
 
-/// The file of counters.
 #[derive(Debug, Serialize, Deserialize)]
 struct CounterFile {
     drivegate_counters: u32,

@@ -114,7 +114,6 @@ impl LineHistory {
         }
     }
 
-    /// The last hour.
     pub fn last_hour(&self, clock: Clock) -> LastHour {
         let now = number(clock.now.saturating_duration_since(self.epoch), STEP);
         let figures = |bucket: Bucket| (!bucket.is_empty()).then_some((bucket.min, bucket.max, bucket.last));

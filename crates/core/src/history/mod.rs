@@ -78,7 +78,6 @@ impl RecorderOptions {
 /// An instant and the time of day at it.
 #[derive(Debug, Clone, Copy)]
 pub struct Clock {
-    /// The instant.
     pub now: Instant,
     /// The time of day.
     pub wall: SystemTime,

@@ -39,7 +39,6 @@ pub enum NoteBody {
     Event {
         /// Kind of the event.
         kind: &'static str,
-        /// Its text.
         text: String,
     },
     /// A command that was answered.
@@ -103,13 +102,10 @@ pub(super) fn reading<'d>(spec: &'d DriveSpec, snapshot: &Arc<Snapshot>, at: Ins
 /// All that a recording is made of.
 #[derive(Debug, Clone)]
 pub struct Capture {
-    /// Its id.
     pub id: String,
     /// Time of day and instant that the times of the capture are reckoned by.
     pub clock: Clock,
-    /// The bus.
     pub bus: Arc<BusImage>,
-    /// The drive.
     pub drive: Arc<DriveImage>,
     /// Why it was made.
     pub trigger: Trigger,
@@ -240,7 +236,6 @@ impl Recorder {
         }
     }
 
-    /// The drive of that name and its bus.
     pub fn drive(&self, name: &str) -> Option<(Arc<BusImage>, Arc<DriveImage>)> {
         self.lines.iter().find_map(|line| {
             let ring = line.drives.iter().find(|ring| ring.image.spec.name == name)?;

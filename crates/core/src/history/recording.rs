@@ -36,9 +36,7 @@ pub struct Header {
     pub first: bool,
     /// What else happened meanwhile that would have made a recording.
     pub more: Vec<Further>,
-    /// The drive.
     pub drive: Drive,
-    /// Its bus.
     pub bus: Bus,
     /// Beginning and end.
     pub from: f64,
@@ -68,7 +66,6 @@ pub struct Further {
 /// The drive of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Drive {
-    /// Name.
     pub name: String,
     /// Address on the bus.
     pub address: u8,
@@ -79,9 +76,7 @@ pub struct Drive {
 /// The bus of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Bus {
-    /// Name.
     pub name: String,
-    /// Protocol.
     pub protocol: String,
     /// Baud rate and character format.
     pub format: String,
@@ -92,7 +87,6 @@ pub struct Bus {
 /// A point.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Column {
-    /// Name.
     pub name: String,
     /// Unit; empty for states and codes.
     pub unit: String,
@@ -101,7 +95,6 @@ pub struct Column {
 /// A read that samples are of.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Read {
-    /// Table.
     pub table: Table,
     /// First PDU address.
     pub start: u16,
@@ -122,7 +115,6 @@ pub struct Sample {
     values: Range<usize>,
 }
 
-/// An event.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EventNote {
     /// When.
@@ -210,7 +202,6 @@ struct End {
     check: String,
 }
 
-/// A recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recording {
     /// What it is of.

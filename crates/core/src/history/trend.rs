@@ -155,7 +155,6 @@ pub struct Step {
 pub struct Part {
     /// Name of the point.
     pub point: &'static str,
-    /// Its unit.
     pub unit: &'static str,
     /// Length of a step.
     pub step: Duration,
@@ -191,7 +190,6 @@ struct Kept {
     last: Option<(Duration, f32)>,
 }
 
-/// The trends of a drive.
 #[derive(Debug)]
 pub struct DriveTrend {
     /// Time that the numbers of the buckets are counted from.

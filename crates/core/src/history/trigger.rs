@@ -16,7 +16,6 @@ pub const BURST: usize = 10;
 /// Time in which errors on a line are counted.
 pub const BURST_IN: Duration = Duration::from_secs(10);
 
-/// Kinds of triggers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TriggerKind {
@@ -41,7 +40,6 @@ pub enum TriggerKind {
 }
 
 impl TriggerKind {
-    /// All kinds.
     pub const ALL: [TriggerKind; 9] = [
         TriggerKind::Fault,
         TriggerKind::Warning,
@@ -104,7 +102,6 @@ impl TriggerKind {
 /// A trigger at a time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Trigger {
-    /// Its kind.
     pub kind: TriggerKind,
     /// When.
     pub at: Instant,

@@ -35,12 +35,10 @@ pub(super) const CHECKSUM: usize = 16;
 pub struct Id(String);
 
 impl Id {
-    /// Of that name.
     pub fn new(name: &str) -> Id {
         Id(name.to_string())
     }
 
-    /// The name.
     pub fn name(&self) -> &str {
         &self.0
     }

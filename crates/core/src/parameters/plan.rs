@@ -12,7 +12,6 @@ use crate::drive::parameters::RawValue;
 use making::Making;
 pub use making::NOT_KNOWN;
 
-/// One parameter to write.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterWrite {
     /// Which.

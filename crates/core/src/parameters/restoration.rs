@@ -88,7 +88,6 @@ pub struct Restoration {
 }
 
 impl Restoration {
-    /// One that begins.
     pub fn begin(journal: Journal, now: Instant) -> Restoration {
         Restoration::of(journal, false, now)
     }

@@ -26,7 +26,6 @@ pub struct Placed {
     /// Of an order that stops and does more: of its stop.
     answer: Arriving<Answer>,
     confirmation: Arriving<Result<Duration, String>>,
-    /// Of its rest.
     rest: Option<Box<Rest>>,
 }
 

@@ -20,7 +20,6 @@ pub enum Outcome {
 }
 
 impl Outcome {
-    /// All outcomes.
     pub const ALL: [Outcome; 4] = [Outcome::Ok, Outcome::Exception, Outcome::Timeout, Outcome::Corrupt];
 
     /// The label of metrics.

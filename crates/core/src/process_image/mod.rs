@@ -46,7 +46,6 @@ pub enum Access {
 /// What may be done with the parameters of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ParamsAccess {
-    /// They are read.
     #[default]
     Read,
     /// They are restored, too.
@@ -131,7 +130,6 @@ pub struct DriveSpec {
 pub struct PointTrigger {
     /// Index of the point in the profile.
     pub point: usize,
-    /// The limit.
     pub limit: TriggerLimit,
     /// For how long without interruption.
     pub hold: Duration,
@@ -153,7 +151,6 @@ pub struct BusSpec {
     pub name: String,
     /// Path of the serial port, or `tcp://host:port` or `rfc2217://host:port`.
     pub port: String,
-    /// Protocol.
     pub protocol: Protocol,
     /// Baud rate and character format.
     pub format: LineFormat,
@@ -193,7 +190,6 @@ impl BusSpec {
     }
 }
 
-/// The image of one drive.
 #[derive(Debug)]
 pub struct DriveImage {
     /// As configured.

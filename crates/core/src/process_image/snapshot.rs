@@ -351,7 +351,6 @@ impl Reading<'_> {
         }
     }
 
-    /// The sample of a point.
     pub fn sample(&self, point: usize) -> Sample {
         self.selected(point).map_or(Sample::NONE, |point| self.sample_of(point))
     }

@@ -53,7 +53,6 @@ impl Verdict {
 pub struct TapedRead {
     /// When they were read.
     pub at: Instant,
-    /// Table.
     pub table: Table,
     /// First PDU address.
     pub start: u16,

@@ -12,11 +12,8 @@ use super::units;
 /// The three files.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Ede {
-    /// All objects.
     pub objects: String,
-    /// The texts of states.
     pub state_texts: String,
-    /// The units.
     pub units: String,
 }
 

@@ -18,7 +18,6 @@ pub(super) const FILE: &str = "bacnet-priorities.json";
 /// Longest file that is read.
 const LONGEST: u64 = 4 << 20;
 
-/// One slot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct KeptSlot {
     port: String,
@@ -39,7 +38,6 @@ impl KeptSlot {
     }
 }
 
-/// All slots of the plant that are kept.
 pub(super) fn of_plant(plant: &Plant) -> Vec<KeptSlot> {
     let mut all = Vec::new();
     for drive in plant

@@ -11,11 +11,9 @@ use crate::process_image::{BusSpec, DriveSpec};
 pub struct Line {
     /// Instance of its device.
     pub device: u32,
-    /// Name of its device.
     pub device_name: String,
     /// As it is usually written, such as `AI 2`.
     pub object: String,
-    /// Its name.
     pub name: String,
     /// What its values are.
     pub kind: String,

@@ -83,7 +83,6 @@ pub struct Options {
 pub struct Secret(String);
 
 impl Secret {
-    /// That text.
     pub fn new(text: String) -> Secret {
         Secret(text)
     }

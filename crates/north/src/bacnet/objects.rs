@@ -61,9 +61,7 @@ pub enum Meaning {
     Slot(Commanded, usize),
     /// A pulse, and its point.
     Reset(usize),
-    /// Whether that bus is up.
     BusUp(usize),
-    /// Load of that bus.
     BusLoad(usize),
 }
 

@@ -51,7 +51,6 @@ pub(super) enum ToTask {
 
 type Ending = Pin<Box<dyn Future<Output = Ended> + Send>>;
 
-/// The task.
 pub(super) struct Task {
     options: Arc<Options>,
     sockets: Sockets,

@@ -24,7 +24,6 @@ use crate::process_image::{Reading, Unavailable};
 /// The run command of every drive.
 const RUN: ObjectId = ObjectId::new(ObjectType::BINARY_VALUE, 1);
 
-/// A drive that is shown.
 #[derive(Debug)]
 pub(super) struct ShownDrive {
     pub(super) handle: DriveHandle,
@@ -73,7 +72,6 @@ impl View {
         [self.gateway.device.clone()].into_iter().chain(drives).collect()
     }
 
-    /// It is looked at now.
     pub(super) fn look(&self, now: Instant) {
         self.now.set((now, SystemTime::now()));
     }
@@ -157,7 +155,6 @@ impl View {
         }
     }
 
-    /// What the drive has of a command.
     fn drive_has(&self, reading: &Reading<'_>, what: Commanded, index: usize) -> Sample {
         self.point(reading, index, |value| match what {
             Commanded::Run | Commanded::Reverse => Datum::Bool(value.as_bool()),

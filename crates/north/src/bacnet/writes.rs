@@ -23,7 +23,6 @@ const LOWEST: u8 = 16;
 /// What becomes of a job.
 #[derive(Debug)]
 pub(super) enum Begun {
-    /// It is answered.
     Answered(Result<(), Error>),
     /// It waits for the drive.
     Waits(Box<Waiting>),

@@ -82,7 +82,6 @@ impl<C: Credential> Credentials<C> {
         &self.0
     }
 
-    /// The one of that name.
     pub fn named(&self, name: &str) -> Option<&C> {
         self.0.iter().find(|one| one.name() == name)
     }

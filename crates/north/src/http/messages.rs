@@ -325,14 +325,12 @@ pub enum Word {
 }
 
 impl Word {
-    /// The one of that name.
     pub fn of(name: &str) -> Option<Word> {
         [Word::State, Word::FaultText]
             .into_iter()
             .find(|word| word.name() == name)
     }
 
-    /// Its name.
     pub fn name(self) -> &'static str {
         match self {
             Word::State => "state",

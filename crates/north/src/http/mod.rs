@@ -206,22 +206,18 @@ impl server::Server for Http {
         stats: Arc<NorthStats>,
         cancel: CancellationToken,
     ) -> Result<Http, ServerError> {
-        let tasks = TaskTracker::new();
-        // A reload can replace the listener, so the server ends with the token and not with its last task.
-        tasks.spawn(cancel.clone().cancelled_owned());
-        tasks.close();
-        let mut http = Http {
+        let cancel = cancel.child_token();
+        let tasks = server::tasks_until(&cancel);
+        let http = Http {
             listeners: Listeners::new(ServerKind::Http, stats.clone(), tasks.clone(), cancel.clone()),
-            stopping: cancel,
+            stopping: cancel.clone(),
             terms: Arc::new(ArcSwap::from_pointee(Terms::new(&options)?)),
             plant,
             operating: Arc::new(Operating::new(stats.clone())),
             stats,
             tasks,
         };
-        let change = http.prepare(options).await?;
-        http.commit(change);
-        Ok(http)
+        server::begun(http, options, &cancel).await
     }
 
     /// Takes at most half a second.

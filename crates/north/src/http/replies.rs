@@ -33,7 +33,6 @@ impl IntoResponse for Refused {
     }
 }
 
-/// With that status.
 pub(super) fn refused(status: StatusCode, why: impl Into<String>) -> Refused {
     (status, Json(ErrorReply::new(why))).into_response().into()
 }

@@ -32,7 +32,6 @@ pub enum Scope {
 }
 
 impl Scope {
-    /// All scopes.
     pub const ALL: [Scope; 3] = [Scope::Read, Scope::Metrics, Scope::Control];
 
     /// Its name in the file.

@@ -12,7 +12,6 @@ const WAITING: usize = super::MAX_CLIENTS;
 /// Somebody wants the gateway to read its configuration again.
 #[derive(Debug)]
 pub struct ReloadOrder {
-    /// Who.
     pub who: String,
     /// Where the outcome goes.
     pub answer: oneshot::Sender<ReloadOutcome>,

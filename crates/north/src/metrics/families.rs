@@ -76,7 +76,6 @@ pub(super) enum Kind {
     Histogram,
 }
 
-/// Value of one series.
 #[derive(Debug)]
 pub(super) enum SeriesValue {
     /// Of a gauge.
@@ -85,7 +84,6 @@ pub(super) enum SeriesValue {
     Count(u64),
     /// Of a counter of seconds.
     Total(f64),
-    /// Of a histogram.
     Histogram(HistogramSnapshot),
 }
 

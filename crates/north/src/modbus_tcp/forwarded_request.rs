@@ -38,7 +38,6 @@ pub(super) enum BusWork {
     Parts(Vec<ReadPart>),
 }
 
-/// Part of a read.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum ReadPart {
     /// Words from the process image.
@@ -70,7 +69,6 @@ pub(super) enum Progress {
 /// A request whose command is in the queue; nothing is left to do but wait. What it was is `None` once it is answered.
 #[derive(Debug)]
 pub(super) enum PendingRequest {
-    /// One that is forwarded.
     Forwarded(Option<Box<ForwardedRequest>>, Placed),
     /// A stop of all drives.
     StopAll(Option<(Header, RequestPdu)>, oneshot::Receiver<bool>),
@@ -79,7 +77,6 @@ pub(super) enum PendingRequest {
 /// A request of which the bus has answered a command.
 #[derive(Debug)]
 pub(super) enum AnsweredRequest {
-    /// One that is forwarded.
     Forwarded(Box<ForwardedRequest>, Outcome),
     /// A stop of all drives, and whether every drive acknowledged it.
     StopAll(Header, RequestPdu, bool),

@@ -184,7 +184,6 @@ impl Server {
         self.listeners.addresses(false)
     }
 
-    /// The addresses with TLS.
     pub fn tls_addresses(&self) -> Vec<SocketAddr> {
         self.listeners.addresses(true)
     }
@@ -204,12 +203,11 @@ impl server::Server for Server {
         stats: Arc<NorthStats>,
         cancel: CancellationToken,
     ) -> Result<Server, ServerError> {
-        let (tasks, cancel) = (TaskTracker::new(), cancel.child_token());
-        // The tasks, and with them the thread, end with the token.
-        tasks.spawn(cancel.clone().cancelled_owned());
-        tasks.close();
+        let cancel = cancel.child_token();
+        // With its tasks the thread ends.
+        let tasks = server::tasks_until(&cancel);
         let own = start_thread(&tasks)?;
-        let mut server = Server {
+        let server = Server {
             listeners: Listeners::new(ServerKind::ModbusTcp, stats.clone(), tasks.clone(), cancel.clone()),
             authenticator: None,
             state: Arc::new(ServerState::new(options.clone(), stats, cancel.clone())),
@@ -218,16 +216,7 @@ impl server::Server for Server {
             opened: 0,
             tasks,
         };
-        match server.prepare(options).await {
-            Ok(change) => {
-                server.commit(change);
-                Ok(server)
-            }
-            Err(error) => {
-                cancel.cancel();
-                Err(error)
-            }
-        }
+        server::begun(server, options, &cancel).await
     }
 
     async fn stopped(self) {

@@ -89,7 +89,6 @@ impl Routes {
         self.drives.get(usize::from(index))
     }
 
-    /// All drives.
     pub(super) fn drives(&self) -> &[DriveHandle] {
         &self.drives
     }

@@ -83,7 +83,6 @@ struct PendingStop {
 /// What is finished.
 #[derive(Debug)]
 pub(super) enum Finished {
-    /// A command.
     Command(FinishedCommand),
     /// A stop of all drives.
     StopAll(Reply, StopReport),
@@ -436,7 +435,6 @@ impl PendingCommand {
     }
 }
 
-/// Limits of a queue.
 #[derive(Debug, Clone, Copy)]
 struct QueueLimit {
     most: usize,

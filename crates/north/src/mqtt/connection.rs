@@ -55,7 +55,6 @@ const SEND_BUFFER: u32 = 256 << 10;
 /// Time for the DISCONNECT of a connection that the gateway gives up.
 const LAST_PACKET: Duration = Duration::from_millis(500);
 
-/// An event of the connection.
 #[derive(Debug)]
 pub(super) enum ConnectionEvent {
     /// The broker accepted the connection.

@@ -77,7 +77,6 @@ impl fmt::Debug for Secret {
 pub struct Broker {
     /// Host; an IPv6 address with or without brackets.
     pub host: String,
-    /// Port.
     pub port: u16,
 }
 
@@ -104,11 +103,9 @@ pub struct Options {
     pub brokers: Vec<Broker>,
     /// TLS (`mqtts://`), of all of them.
     pub tls: bool,
-    /// Client id.
     pub client_id: String,
     /// User name, with password.
     pub username: Option<String>,
-    /// Password.
     pub password: Option<Secret>,
     /// CA certificates (PEM) for the broker; those of the system if absent.
     pub ca: Option<PathBuf>,

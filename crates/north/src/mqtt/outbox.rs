@@ -63,7 +63,6 @@ impl Message {
 pub(super) enum Kind {
     /// Results of commands.
     Result,
-    /// Events.
     Event,
     /// Values of an outage.
     History,

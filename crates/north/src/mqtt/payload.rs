@@ -149,7 +149,6 @@ fn tidy(value: Value) -> Value {
 pub(super) enum PointPayload {
     /// Nothing good is known: an empty payload, which clears the retained value.
     Nothing,
-    /// A value.
     Value(Value),
     /// The state of the drive.
     State(State),
@@ -208,7 +207,6 @@ pub(super) struct BusFigures {
     pub(super) queue: usize,
 }
 
-/// State and figures of a bus.
 pub(super) fn bus_now(bus: &BusHandle) -> (BusState, BusFigures) {
     let BusHealth {
         up,

@@ -12,7 +12,6 @@ use crate::drive::Profile;
 /// A message on a set topic.
 #[derive(Debug, Clone, Default)]
 pub struct Incoming {
-    /// Its topic.
     pub topic: String,
     /// A JSON object, or a bare value.
     pub payload: Vec<u8>,

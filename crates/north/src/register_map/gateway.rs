@@ -40,7 +40,6 @@ pub struct BusRegister {
     pub form: Form,
     /// Engineering value of one count.
     pub scale: &'static str,
-    /// Unit.
     pub unit: &'static str,
 }
 

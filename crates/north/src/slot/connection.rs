@@ -38,7 +38,6 @@ enum End {
     Lost(#[from] io::Error),
 }
 
-/// One connection.
 #[derive(Debug)]
 pub(super) struct Connection<S> {
     stream: S,

@@ -41,7 +41,6 @@ pub const MAX_TOOLS: usize = 4;
 /// What the tools of a slot may do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum SlotAccess {
-    /// Read.
     #[default]
     Read,
     /// Write what a client of Modbus TCP could write, too.
@@ -209,10 +208,9 @@ impl server::Server for Server {
         stats: Arc<NorthStats>,
         cancel: CancellationToken,
     ) -> Result<Server, ServerError> {
-        let (tasks, cancel) = (TaskTracker::new(), cancel.child_token());
-        tasks.spawn(cancel.clone().cancelled_owned());
-        tasks.close();
-        let mut server = Server {
+        let cancel = cancel.child_token();
+        let tasks = server::tasks_until(&cancel);
+        let server = Server {
             listeners: Listeners::new(ServerKind::Slot, stats.clone(), tasks.clone(), cancel.clone()),
             ptys: Vec::new(),
             plant,
@@ -223,16 +221,7 @@ impl server::Server for Server {
             tasks,
             cancel: cancel.clone(),
         };
-        match server.prepare(options).await {
-            Ok(change) => {
-                server.commit(change);
-                Ok(server)
-            }
-            Err(error) => {
-                cancel.cancel();
-                Err(error)
-            }
-        }
+        server::begun(server, options, &cancel).await
     }
 
     async fn stopped(self) {

@@ -22,7 +22,6 @@ const EXPIRY: Duration = super::dialogue::ANSWER_WITHIN;
 /// What becomes of a request.
 #[derive(Debug)]
 pub(super) enum Decision {
-    /// It is refused.
     Refuse(Refused),
     /// Nothing is sent and nothing answered.
     Silent,

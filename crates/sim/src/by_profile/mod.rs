@@ -49,7 +49,6 @@ pub struct ProfileOptions {
 pub enum Given {
     /// In the unit of the point; 1 is true.
     Number(f64),
-    /// A text.
     Text(String),
 }
 

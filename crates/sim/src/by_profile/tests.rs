@@ -105,7 +105,6 @@ struct Case {
     idle: &'static [Order],
     /// The status register while it runs forward: address, bits that count and what they are, from the manuals.
     runs: (u16, u16, u16),
-    /// With a fault.
     fault: (u16, u16, u16),
 }
 

@@ -10,7 +10,6 @@ pub(super) enum Does {
     Nothing,
     /// It has come so far in its start sequence; the motor is not fed.
     Prepares(usize),
-    /// It runs.
     Runs {
         /// In reverse, apart from the sign of the reference.
         reverse: bool,

@@ -10,7 +10,6 @@ use std::str::FromStr;
 pub struct Limits {
     /// Coils or discrete inputs.
     pub bits: u16,
-    /// Registers.
     pub registers: u16,
     /// The answer to more.
     pub beyond: Beyond,
@@ -30,9 +29,7 @@ impl Default for Limits {
 /// boards may have an offset of 1 (drives.md 9.6).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct AddressOffset {
-    /// Coils.
     pub coil: u16,
-    /// Discrete inputs.
     pub discrete_input: u16,
     /// Input registers.
     pub input: u16,

@@ -22,7 +22,6 @@ pub enum Place {
 pub struct Entry {
     /// Its type.
     pub region: Region,
-    /// Its number.
     pub number: u8,
     /// What stands behind it.
     pub place: Place,
@@ -35,7 +34,6 @@ pub struct Entry {
 pub enum Beyond {
     /// Acknowledges it and takes the limit, if the value fits the variable (Vacon, Eaton).
     Clamp,
-    /// Refuses it.
     Refuse,
 }
 

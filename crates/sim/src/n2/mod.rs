@@ -23,7 +23,6 @@ use crate::codec::{Exception, Reply, RequestPdu};
 /// Without a poll for that time a drive takes itself for alone (drives.md 6.5).
 pub(crate) const ALONE: Duration = Duration::from_secs(600);
 
-/// Options of a board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BoardOptions {
     /// A byte, the object's status, stands before the value of a read.

@@ -34,7 +34,6 @@ const PROCESS_DATA: usize = 11;
 
 /// Control word, ID 2001 (drives.md 3.4).
 pub mod control_word {
-    /// Run.
     pub const RUN: u16 = 1 << 0;
     /// Counterclockwise.
     pub const REVERSE: u16 = 1 << 1;
@@ -54,21 +53,17 @@ pub mod control_word {
 
 /// Status word, ID 2101 (drives.md 3.6).
 pub mod status_word {
-    /// Ready.
     pub const READY: u16 = 1 << 0;
     /// Running.
     pub const RUN: u16 = 1 << 1;
     /// Counterclockwise.
     pub const REVERSE: u16 = 1 << 2;
-    /// Faulted.
     pub const FAULT: u16 = 1 << 3;
-    /// Warning.
     pub const WARNING: u16 = 1 << 4;
     /// Reference reached.
     pub const AT_REFERENCE: u16 = 1 << 5;
     /// Motor at zero speed.
     pub const ZERO_SPEED: u16 = 1 << 6;
-    /// Flux ready.
     pub const FLUX_READY: u16 = 1 << 7;
     /// Torque control's speed limit is **not** active.
     pub const NO_SPEED_LIMIT: u16 = 1 << 8;
@@ -92,9 +87,7 @@ pub const FIELDBUS_FAULT: u16 = 53;
 pub enum ControlPlace {
     /// I/O terminals.
     Terminals,
-    /// Panel.
     Panel,
-    /// Fieldbus.
     Fieldbus,
 }
 

@@ -77,7 +77,6 @@ impl NxOptions {
     /// PDU address of the simulator's own trip register.
     pub const TRIP_ADDRESS: u16 = 1998;
 
-    /// Vacon NX.
     pub fn vacon() -> NxOptions {
         NxOptions {
             load: Load::default(),

@@ -24,11 +24,8 @@ use crate::codec::{Exception, Reply, RequestPdu};
 
 /// Bits of the operation signals, register 0001H (drives.md 5.3).
 pub(crate) mod operation {
-    /// Run.
     pub(crate) const RUN: u16 = 1 << 0;
-    /// Reverse.
     pub(crate) const REVERSE: u16 = 1 << 1;
-    /// External fault.
     pub(crate) const EXTERNAL_FAULT: u16 = 1 << 2;
     /// Fault reset.
     pub(crate) const RESET: u16 = 1 << 3;
@@ -40,17 +37,13 @@ pub(crate) mod operation {
 pub(crate) mod fault {
     /// Overcurrent or ground fault.
     pub(crate) const OVERCURRENT: u16 = 1 << 0;
-    /// Overvoltage.
     pub(crate) const OVERVOLTAGE: u16 = 1 << 1;
-    /// Inverter overload.
     pub(crate) const INVERTER_OVERLOAD: u16 = 1 << 2;
     /// Inverter overheat.
     pub(crate) const OVERHEAT: u16 = 1 << 3;
     /// External fault.
     pub(crate) const EXTERNAL: u16 = 1 << 7;
-    /// Control circuit.
     pub(crate) const CONTROL_CIRCUIT: u16 = 1 << 8;
-    /// Motor overload.
     pub(crate) const MOTOR_OVERLOAD: u16 = 1 << 9;
     /// Undervoltage or power loss.
     pub(crate) const POWER: u16 = 1 << 12;

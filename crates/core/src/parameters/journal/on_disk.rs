@@ -64,7 +64,6 @@ impl JournalFile {
         }
     }
 
-    /// Its path.
     pub fn path(&self) -> PathBuf {
         self.dir.join(NAME)
     }

@@ -26,7 +26,6 @@ use crate::process_image::Access;
 /// The commands that came over HTTP, also to the server that a reload starts in the place of one that ended.
 pub(crate) type PostedCommands = SharedMemory<SharedReply>;
 
-/// The reply to a command.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct CommandReply {
     status: StatusCode,

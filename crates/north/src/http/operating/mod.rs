@@ -248,7 +248,6 @@ impl Operating {
         })
     }
 
-    /// The session of a cookie.
     fn session(&self, cookie: &str, now: Instant) -> Option<Session> {
         self.is_on().then(|| self.state().sessions.find(cookie, now).cloned())?
     }

@@ -83,7 +83,6 @@ impl Sessions {
         }
     }
 
-    /// The session of a cookie.
     pub(super) fn find(&self, cookie: &str, now: Instant) -> Option<&Session> {
         self.open.get(&hash(cookie)).filter(|session| now < session.ends())
     }

@@ -44,7 +44,6 @@ enum Kind {
 }
 
 impl Device {
-    /// The gateway of this id.
     pub(super) fn gateway(id: &str, plant: &Plant) -> Device {
         let name = |bus: &crate::plant::BusHandle| bus.image.spec.name.clone();
         Device {

@@ -395,7 +395,6 @@ impl Session {
         }
     }
 
-    /// The metric of a device by its name or its alias.
     pub(super) fn metric(&self, device: usize, by_name: Option<&str>, alias: Option<u64>) -> Option<usize> {
         let device = self.devices.get(device)?;
         match (by_name, alias) {

@@ -32,9 +32,7 @@ impl Kind {
 pub(super) enum Received<'t> {
     /// The primary host is online or offline.
     State(StateForm),
-    /// A command for the node.
     NodeCommand,
-    /// A command for this device.
     DeviceCommand(&'t str),
 }
 

@@ -6,7 +6,6 @@
 
 use prost::Message as _;
 
-/// A payload.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct Payload {
     /// When it was sent, ms since 1970.
@@ -67,7 +66,6 @@ pub(super) struct PropertySet {
     pub(super) values: Vec<PropertyValue>,
 }
 
-/// The value of a property.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct PropertyValue {
     #[prost(uint32, optional, tag = "1")]

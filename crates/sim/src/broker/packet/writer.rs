@@ -75,7 +75,6 @@ pub(in super::super) fn acknowledge(version: Version, first: u8, pkid: u16, code
     }
 }
 
-/// PINGRESP.
 pub(in super::super) const PINGRESP: [u8; 2] = [0xD0, 0];
 
 /// DISCONNECT; 3.1.1 has none from the broker. The library of the gateway reads none without a property section.
