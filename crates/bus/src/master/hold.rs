@@ -50,7 +50,7 @@ fn stop_at_local(bus: &BusHandle, index: usize, drive: &DriveState, reading: &Re
     if !run.or_else(|| written_run(reading, &drive.words)).unwrap_or(false) {
         return;
     }
-    let origin = Origin::new(SourceKind::Supervision, "local control place");
+    let origin = Origin::new(SourceKind::Supervision, Origin::LOCAL);
     let stop = (ModelPoint::Run, Value::Bool(false));
     if let Err(refusal) = bus.own_order(index, reading, stop, origin, DEFAULT_EXPIRY, writes) {
         tracing::error!(

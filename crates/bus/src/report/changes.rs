@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant, SystemTime};
 
 use super::{RECENT, Report};
+use crate::command::Origin;
 use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, EventKind};
 
@@ -108,6 +109,7 @@ impl Watched {
 /// Why a motor started or stopped, by who gave the command.
 fn cause(who: &str) -> String {
     match who.split_once(' ') {
+        Some(("supervision", Origin::LOCAL)) => ": its local control place took it over".to_string(),
         Some(("supervision", _)) => ": supervision timed out".to_string(),
         Some(("shutdown", _)) => ": the gateway shuts down".to_string(),
         Some(("interlock", _)) => ": an interlock does not hold".to_string(),

@@ -156,6 +156,8 @@ pub struct Origin {
 impl Origin {
     /// Who acts when a lease runs out.
     pub const LEASE: &str = "supervision";
+    /// The client of the stop of a drive whose local control place took it while its run command stood.
+    pub const LOCAL: &str = "local control place";
 
     /// One that is a client by itself.
     pub fn new(kind: SourceKind, who: impl Into<String>) -> Origin {

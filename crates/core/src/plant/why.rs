@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::command::{AuditRecord, CONFIRMED, SourceKind, WriteStats};
+use crate::command::{AuditRecord, CONFIRMED, Origin, SourceKind, WriteStats};
 use crate::drive::why::{self, Cause, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
 use crate::process_image::{Access, BusImage, Hold, Link, Reading};
 use crate::start_guard::{Guarded, Reason};
@@ -51,7 +51,10 @@ fn contact(reading: &Reading<'_>, bus: &BusImage) -> Contact {
 
 fn run_order(record: &AuditRecord, age: Duration) -> Option<RunOrder> {
     let by = match record.source {
-        source if source == SourceKind::Supervision.name() => Giver::Supervision,
+        source if source == SourceKind::Supervision.name() => match &*record.client == Origin::LOCAL {
+            true => Giver::LocalControl,
+            false => Giver::Supervision,
+        },
         source if source == SourceKind::Shutdown.name() => Giver::Shutdown,
         source if source == SourceKind::Interlock.name() => Giver::Interlock,
         _ => Giver::Client,

@@ -141,6 +141,8 @@ pub enum Giver {
     Shutdown,
     /// An interlock that does not hold.
     Interlock,
+    /// The gateway, when the drive's local control place took it while its run command stood.
+    LocalControl,
 }
 
 /// What is known beside the points.
@@ -454,6 +456,14 @@ impl Look<'_> {
                 "stopped_by_interlock",
                 format!("an interlock did not hold, and {}", stopped(order.fate, text)),
                 "send run again once it holds",
+            ),
+            (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::LocalControl) => (
+                "stopped_by_gateway",
+                format!(
+                    "its local control place took it over, and {}",
+                    stopped(order.fate, text)
+                ),
+                "send run again",
             ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Client) => (
                 "stopped_by_order",

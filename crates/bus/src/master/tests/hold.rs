@@ -273,4 +273,9 @@ fn nothing_starts_when_local_control_ends() {
     let from = rig.wire.len();
     rig.run(Time::from_millis(300));
     assert_eq!(writes(&rig, from), 0);
+    let drive = drive(&plant, 0);
+    let why = drive.why(&drive.reading(rig.now));
+    let stopped = why.causes.iter().find(|cause| cause.cause == "stopped_by_gateway");
+    let evidence = stopped.map(|cause| cause.evidence.as_str()).unwrap_or_default();
+    assert!(evidence.contains("its local control place took it over"), "{why:?}");
 }

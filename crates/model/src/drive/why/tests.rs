@@ -225,6 +225,7 @@ fn what_became_of_the_last_order() {
         (RunWish::Stop, Fate::Unsure, Giver::Supervision, "supervision"),
         (RunWish::Stop, Fate::Taken, Giver::Supervision, "supervision"),
         (RunWish::Stop, Fate::Taken, Giver::Shutdown, "stopped_by_gateway"),
+        (RunWish::Stop, Fate::Taken, Giver::LocalControl, "stopped_by_gateway"),
         (RunWish::Stop, Fate::Refused, Giver::Client, "no_run_order"),
         (RunWish::Reset, Fate::Taken, Giver::Client, "fault_was_reset"),
     ] {
