@@ -279,11 +279,6 @@ impl Boot {
         Boot(Some(name).filter(|name| *name != boot()).map(Arc::from))
     }
 
-    /// Whether it is this one.
-    pub fn is_this(&self) -> bool {
-        self.0.is_none()
-    }
-
     pub fn name(&self) -> &str {
         self.0.as_deref().unwrap_or_else(|| boot())
     }

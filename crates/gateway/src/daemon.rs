@@ -204,16 +204,6 @@ impl Daemon {
         server.map(modbus_tcp::Server::addresses).unwrap_or_default()
     }
 
-    /// The addresses of the tool slots.
-    pub fn slot_addresses(&self) -> Vec<std::net::SocketAddr> {
-        self.slots.server().map(slot::Server::addresses).unwrap_or_default()
-    }
-
-    /// The address of the BACnet server.
-    pub fn bacnet_address(&self) -> Option<std::net::SocketAddr> {
-        self.bacnet.server().map(bacnet::Server::address)
-    }
-
     /// Path of the local socket, if it is open.
     pub fn socket(&self) -> Option<&std::path::Path> {
         self.local.server().map(local::Local::path)

@@ -7,7 +7,7 @@ use super::SimTime;
 use super::endpoint::{Endpoint, EndpointOptions};
 use super::faults::FaultPlan;
 use super::half_duplex::{HalfDuplex, LineRules, Wire};
-use super::n2::{Board, BoardOptions};
+use super::n2::BoardOptions;
 use super::simulated_drive::{DriveOptions, SimulatedDrive};
 use super::slave::Slaves;
 use super::statistics::{Recorded, Statistics, Transcript};
@@ -279,13 +279,6 @@ impl SimulatedBus {
             drive.advance(now);
             act(drive, now)
         })
-    }
-
-    /// Calls `act` with the N2 board of a drive; `None` when there is none with that address.
-    pub fn with_board<R>(&self, address: u8, act: impl FnOnce(&mut Board, SimTime) -> R) -> Option<R> {
-        let mut line = self.shared.line();
-        let now = self.shared.now();
-        line.slaves().board(address).map(|board| act(board, now))
     }
 
     /// Takes a drive off the line or puts it back; false when there is none with that address.

@@ -22,6 +22,23 @@ use crate::north::http::messages::{Expected, ExpectedDrive};
 use crate::north::local::SocketPath;
 use crate::process_image::DriveSpec;
 
+// The options by which a command is told its drive.
+#[derive(Debug, clap::Args)]
+pub(super) struct OneDrive {
+    #[command(flatten)]
+    gateway: Gateway,
+    /// Name of the drive.
+    #[arg(value_name = "DRIVE")]
+    pub(super) name: String,
+}
+
+impl OneDrive {
+    /// Runs a command about the drive; what is wrong with its name was reported otherwise.
+    pub(super) fn with(&self, run: impl FnOnce(&Target) -> ExitCode) -> ExitCode {
+        target(&self.gateway, &self.name).map_or_else(|code| code, |target| run(&target))
+    }
+}
+
 /// The drive that a command is about, and the gateway to ask.
 #[derive(Debug)]
 pub(super) struct Target {

@@ -2,8 +2,8 @@
 
 use std::process::ExitCode;
 
-use super::client::{Asked, Gateway, encoded};
-use super::drive_access::{Needs, Target, point, target};
+use super::client::{Asked, encoded};
+use super::drive_access::{Needs, OneDrive, Target, point};
 use super::{EXIT_FAILED, report};
 use crate::north::http::messages::{PointValue, Word};
 
@@ -18,9 +18,7 @@ Without points: all that are polled. state and fault_text are made of points. A 
 the port itself.")]
 pub(super) struct Args {
     #[command(flatten)]
-    gateway: Gateway,
-    /// Name of the drive.
-    drive: String,
+    drive: OneDrive,
     /// Names of points.
     points: Vec<String>,
     /// JSON instead of a table.
@@ -29,10 +27,10 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let target = match target(&args.gateway, &args.drive) {
-        Ok(target) => target,
-        Err(code) => return code,
-    };
+    args.drive.with(|target| read(args, target))
+}
+
+fn read(args: &Args, target: &Target) -> ExitCode {
     let unknown = |name: &String| {
         let unknown = point(target.profile()?, name).err();
         unknown.filter(|_| Word::of(name).is_none())
@@ -40,7 +38,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     if let Some(message) = args.points.iter().find_map(unknown) {
         return report::misused(&message);
     }
-    match rows(&target, &args.points) {
+    match rows(target, &args.points) {
         Ok(rows) => print(args, &rows),
         Err(message) => report::failed(&message),
     }
@@ -60,7 +58,7 @@ fn print(args: &Args, rows: &[PointValue]) -> ExitCode {
     let all = rows.iter().all(PointValue::is_good);
     let none = !rows.iter().any(PointValue::is_good);
     if let Some(why) = only_reason(rows).filter(|_| !args.json) {
-        return report::failed(&format!("no point of `{}` has a value: {why}", args.drive));
+        return report::failed(&format!("no point of `{}` has a value: {why}", args.drive.name));
     }
     let printed = report::print(&if args.json { json(rows) } else { table(rows) });
     // Points requested by name must have a value.

@@ -2,8 +2,8 @@
 
 use std::process::ExitCode;
 
-use super::client::{Asked, Gateway};
-use super::drive_access::target;
+use super::client::Asked;
+use super::drive_access::{OneDrive, Target};
 use super::report;
 use crate::north::http::messages::Recorded;
 
@@ -16,16 +16,14 @@ use crate::north::http::messages::Recorded;
   drivegate recordings --config drivegate.toml show 20260302T074012.118Z-pump-1")]
 pub(super) struct Args {
     #[command(flatten)]
-    gateway: Gateway,
-    /// Name of the drive.
-    drive: String,
+    drive: OneDrive,
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let target = match target(&args.gateway, &args.drive) {
-        Ok(target) => target,
-        Err(code) => return code,
-    };
+    args.drive.with(record)
+}
+
+fn record(target: &Target) -> ExitCode {
     let asked = Asked::post(target.path("recordings"), &serde_json::json!({}));
     let asked = asked.if_refused("set max_count of [recordings] above 0 and reload");
     let reply = target.ask_gateway(&asked);

@@ -4,8 +4,7 @@ use std::fmt::Write as _;
 use std::process::ExitCode;
 use std::time::SystemTime;
 
-use super::client::Gateway;
-use super::drive_access::{Target, target};
+use super::drive_access::{OneDrive, Target};
 use super::{printable, profiles, read, report};
 use crate::drive::{ModelPoint, Profile};
 use crate::north::http::messages::PointValue;
@@ -19,17 +18,11 @@ Fill it in at the drive and send it in, with the frames: drivegate trace --pcap.
 hand.")]
 pub(super) struct Args {
     #[command(flatten)]
-    gateway: Gateway,
-    /// Name of the drive.
-    drive: String,
+    drive: OneDrive,
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let target = match target(&args.gateway, &args.drive) {
-        Ok(target) => target,
-        Err(code) => return code,
-    };
-    report::outcome(form(&target))
+    args.drive.with(|target| report::outcome(form(target)))
 }
 
 fn form(target: &Target) -> Result<String, String> {

@@ -4,8 +4,8 @@ use std::fmt::Write;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use super::client::{Asked, Gateway};
-use super::drive_access::{Needs, Target, target};
+use super::client::Asked;
+use super::drive_access::{Needs, OneDrive, Target};
 use super::{printable, report};
 use crate::north::http::messages::Why;
 
@@ -19,24 +19,18 @@ A running gateway is asked through its local socket, and knows who commanded the
 opens the port itself and reads the drive.")]
 pub(super) struct Args {
     #[command(flatten)]
-    gateway: Gateway,
-    /// Name of the drive.
-    drive: String,
+    drive: OneDrive,
     /// JSON instead of text.
     #[arg(long)]
     json: bool,
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let target = match target(&args.gateway, &args.drive) {
-        Ok(target) => target,
-        Err(code) => return code,
+    let shown = |why: Why| match args.json {
+        true => serde_json::to_string_pretty(&why).unwrap_or_default() + "\n",
+        false => text(&args.drive.name, &why),
     };
-    match why(&target) {
-        Ok(why) if args.json => report::print(&(serde_json::to_string_pretty(&why).unwrap_or_default() + "\n")),
-        Ok(why) => report::print(&text(&args.drive, &why)),
-        Err(message) => report::failed(&message),
-    }
+    args.drive.with(|target| report::outcome(why(target).map(shown)))
 }
 
 fn why(target: &Target) -> Result<Why, String> {

@@ -5,8 +5,8 @@ use std::process::ExitCode;
 use serde::{Deserialize, Serialize, Serializer};
 use serde_json::Value as Json;
 
-use super::client::{Asked, Gateway};
-use super::drive_access::{Needs, Target, Way, point, target};
+use super::client::Asked;
+use super::drive_access::{Needs, OneDrive, Target, Way, point};
 use super::{printable, report};
 use crate::drive::model::Kind;
 use crate::drive::{Point, Profile, RESTART_COMMUNICATION, Value};
@@ -23,9 +23,7 @@ Several points are sent as one command, in a safe order. The drive must have acc
 Without a gateway nothing supervises a motor that the command has started.")]
 pub(super) struct Args {
     #[command(flatten)]
-    gateway: Gateway,
-    /// Name of the drive.
-    drive: String,
+    drive: OneDrive,
     /// What to set.
     #[arg(required = true, value_name = "POINT=VALUE")]
     values: Vec<String>,
@@ -66,17 +64,16 @@ struct WriteError {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let target = match target(&args.gateway, &args.drive) {
-        Ok(target) => target,
-        Err(code) => return code,
-    };
+    args.drive.with(|target| write(args, target))
+}
+
+fn write(args: &Args, target: &Target) -> ExitCode {
     let setting = |text: &String| parse(target.profile().map(|profile| &**profile), text);
     let settings: Result<Vec<Setting>, String> = args.values.iter().map(setting).collect();
-    let settings = match settings {
-        Ok(settings) => settings,
-        Err(message) => return report::misused(&message),
-    };
-    report::outcome(command(&target, &settings))
+    match settings {
+        Ok(settings) => report::outcome(command(target, &settings)),
+        Err(message) => report::misused(&message),
+    }
 }
 
 /// `speed_reference=50`, `run=true`, `mode=auto`.
