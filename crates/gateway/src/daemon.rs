@@ -2,10 +2,12 @@
 
 mod changes;
 mod file_limit;
+mod keepers;
 mod leases;
 mod pulse;
 mod reservations;
 mod server;
+mod servers;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -16,22 +18,21 @@ use arc_swap::ArcSwap;
 use self::leases::Parted;
 pub use self::pulse::Pulse;
 use self::reservations::ReservationsFile;
-use self::server::{Prepared, ServerSlot, within};
+use self::server::{ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::line_state::Learned;
 use crate::bus::master::Handover;
-use crate::command::{AuditFile, CommandQueue, NotStopped, Outcome, WriteStats};
+use crate::command::{CommandQueue, NotStopped, Outcome, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::{Event, EventKind, Events};
 use crate::files::Keeper;
-use crate::history::{self, History, RecorderTask, Recordings};
+use crate::history::{History, RecorderTask, Recordings};
 use crate::north::local::Control;
-use crate::north::parameter_jobs::{hold_unfinished, keep_reading};
 use crate::north::{NorthStats, ServerError, bacnet, http, local, modbus_tcp, mqtt, slot};
-use crate::parameters::{Store, Vault};
+use crate::parameters::Vault;
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
-use crate::start_guard::{self, BusGuards, Guards};
+use crate::start_guard::{BusGuards, Guards};
 use crate::stop_all::LOOK;
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
@@ -97,14 +98,6 @@ pub struct Daemon {
     pulse: Pulse,
     /// Who is asked to reload, and the file that the gateway runs with.
     control: Option<Control>,
-}
-
-/// The servers that listen on the network, prepared.
-struct PreparedServers {
-    modbus_tcp: Prepared<modbus_tcp::Server>,
-    slots: Prepared<slot::Server>,
-    bacnet: Prepared<bacnet::Server>,
-    http: Prepared<http::Http>,
 }
 
 impl Daemon {
@@ -378,205 +371,6 @@ impl Daemon {
             self.events.clone(),
         )
         .map_err(failed)
-    }
-
-    /// Starts the recorder, or another one where it is configured otherwise; what the one before recorded is on disk then.
-    async fn apply_recorder(&mut self, settings: &Settings) -> Result<(), StartError> {
-        if self.recorder.is_some() && self.settings.recordings == settings.recordings {
-            return Ok(());
-        }
-        if let Some(recorder) = self.recorder.take() {
-            // A thread of it that panicked has logged that.
-            let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
-        }
-        let (recordings, history) = (self.recordings.clone(), self.history.clone());
-        let options = settings.recordings.clone();
-        let started = RecorderTask::start(options, recordings, history, self.events.clone(), &self.writes);
-        self.recorder = Some(started.map_err(StartError::Recorder)?);
-        Ok(())
-    }
-
-    /// Reads parameters every so often, where that is configured.
-    fn apply_params(&mut self, settings: &Settings) {
-        let params = &settings.params;
-        self.vault
-            .configure(Some(Store::new(params.dir.clone())), params.names.clone());
-        self.vault.set_others(params.others.clone());
-        if self.reader.is_some() && self.settings.params.every == params.every {
-            return;
-        }
-        if let Some(reader) = self.reader.take() {
-            reader.abort();
-        }
-        let every = params.every;
-        self.reader = every.map(|every| tokio::spawn(keep_reading(self.plant.clone(), every)));
-    }
-
-    /// New drives whose parameters may be half restored take no commands but stops, before their bus starts.
-    async fn hold_unfinished(&self, settings: &Settings) {
-        let drives = settings
-            .buses
-            .iter()
-            .flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)));
-        hold_unfinished(&self.vault, &self.events, drives).await;
-    }
-
-    /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.
-    async fn apply_keeper(&mut self, settings: &Settings) {
-        let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
-        if !settings.keeps_history || self.keeper.as_ref().is_some_and(same) {
-            return;
-        }
-        let first = self.keeper.is_none();
-        self.stop_keeper().await;
-        match history::keep(&settings.state_dir, first, self.history.clone(), &self.events) {
-            Ok(keeper) => self.keeper = Some(keeper),
-            Err(error) => {
-                tracing::error!(
-                    target: "drivegate::daemon", "cannot start the thread that keeps events and counters: {error}; free memory or threads"
-                );
-            }
-        }
-    }
-
-    /// Keeps starts in the configured directory, where they are counted. Guarded drives are not started without that.
-    async fn apply_guards(&mut self, settings: &Settings) {
-        let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
-        let mut drives = settings.buses.iter().flat_map(|bus| &bus.drives);
-        let none = !drives.any(|drive| drive.guard.is_some());
-        if none || !settings.keeps_history || self.starts.as_ref().is_some_and(same) {
-            return;
-        }
-        self.stop_starts().await;
-        match start_guard::keep(&settings.state_dir, self.guards.clone()) {
-            Ok(keeper) => self.starts = Some(keeper),
-            Err(error) => tracing::error!(
-                target: "drivegate::daemon",
-                "cannot start the thread that counts starts: {error}; drives with a guard are not started; free memory or threads"
-            ),
-        }
-    }
-
-    async fn stop_starts(&mut self) {
-        if let Some(keeper) = self.starts.take() {
-            within(STOP_AUDIT, "the file of starts", keeper.stop()).await;
-        }
-    }
-
-    async fn stop_keeper(&mut self) {
-        if let Some(keeper) = self.keeper.take() {
-            within(STOP_AUDIT, "the history of events", keeper.stop()).await;
-        }
-    }
-
-    /// Prepares the servers that listen on the network: all of them or none.
-    async fn prepare_servers(&mut self, settings: &Settings) -> Result<PreparedServers, ServerError> {
-        let (plant, stats) = (&self.plant, &self.stats);
-        let options = settings.modbus_tcp.as_ref();
-        let modbus_tcp = self.modbus_tcp.prepare(options, plant, stats).await?;
-        let slots = match self.slots.prepare(settings.slots.as_ref(), plant, stats).await {
-            Ok(slots) => slots,
-            Err(error) => {
-                self.modbus_tcp.abort(modbus_tcp).await;
-                return Err(error);
-            }
-        };
-        let bacnet = match self.bacnet.prepare(settings.bacnet.as_ref(), plant, stats).await {
-            Ok(bacnet) => bacnet,
-            Err(error) => {
-                self.slots.abort(slots).await;
-                self.modbus_tcp.abort(modbus_tcp).await;
-                return Err(error);
-            }
-        };
-        match self.http.prepare(settings.http.as_ref(), plant, stats).await {
-            Ok(http) => Ok(PreparedServers {
-                modbus_tcp,
-                slots,
-                bacnet,
-                http,
-            }),
-            Err(error) => {
-                self.bacnet.abort(bacnet).await;
-                self.slots.abort(slots).await;
-                self.modbus_tcp.abort(modbus_tcp).await;
-                Err(error)
-            }
-        }
-    }
-
-    async fn abort_servers(&mut self, prepared: PreparedServers) {
-        self.modbus_tcp.abort(prepared.modbus_tcp).await;
-        self.slots.abort(prepared.slots).await;
-        self.bacnet.abort(prepared.bacnet).await;
-        self.http.abort(prepared.http).await;
-    }
-
-    async fn commit_servers(&mut self, prepared: PreparedServers) {
-        self.modbus_tcp.commit(prepared.modbus_tcp).await;
-        self.slots.commit(prepared.slots).await;
-        self.bacnet.commit(prepared.bacnet).await;
-        self.http.commit(prepared.http).await;
-    }
-
-    async fn apply_mqtt(&mut self, settings: &Settings) -> Result<(), ServerError> {
-        // The name of the gateway is part of all topics.
-        if settings.gateway != self.settings.gateway {
-            self.mqtt.stop().await;
-        }
-        let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.stats).await;
-        // Events that came while no client was configured are not published later.
-        self.stats.mqtt.forget_what_is_left();
-        applied
-    }
-
-    /// Keeps reservations where the gateway keeps its state.
-    fn apply_reservations(&self, settings: &Settings) {
-        let kept = settings.keeps_history && settings.authority.is_some();
-        let dir = kept.then_some(settings.state_dir.as_path());
-        reservations::keep_in(&self.reservations, dir);
-    }
-
-    /// Opens the local socket if one is configured. The gateway runs without it if it cannot be opened; a reload tries
-    /// again.
-    async fn apply_local(&mut self, settings: &Settings) {
-        let options = (settings.socket != local::SocketPath::Off).then(|| local::Options {
-            socket: settings.socket.clone(),
-            control: self.control.clone(),
-        });
-        if let Err(error) = self.local.apply(options.as_ref(), &self.plant, &self.stats).await {
-            tracing::warn!(
-                target: "drivegate::local",
-                "{error}; `drivegate read`, `write`, `reload` and `health` cannot reach this gateway; set `socket` of [gateway], or \
-                 socket = \"\" to do without"
-            );
-        }
-    }
-
-    /// Writes the audit to the configured file. The gateway runs on without it if there is no thread for it.
-    async fn apply_audit(&self, settings: &Settings) {
-        let audit = self.writes.audit();
-        let before = audit.file();
-        if before.as_ref().map(|file| file.options()) == settings.audit.as_ref() {
-            return;
-        }
-        let started = match (settings.audit.clone(), before) {
-            (Some(options), Some(before)) => before.succeed(options),
-            (Some(options), None) => AuditFile::start(options),
-            (None, before) => {
-                audit.write_to(None);
-                if let Some(before) = before {
-                    within(STOP_AUDIT, "the audit file", before.stop()).await;
-                }
-                return;
-            }
-        };
-        match started {
-            Ok(file) => audit.write_to(Some(Arc::new(file))),
-            Err(error) => tracing::error!(
-                target: "drivegate::daemon", "cannot start the thread of the audit file: {error}; the audit stays where it was; free memory or threads"
-            ),
-        }
     }
 
     /// Shuts down in order: no new commands of local clients, tools and Modbus TCP clients, the configured stop commands, the buses,

@@ -8,8 +8,9 @@ use ipnet::IpNet;
 
 pub(super) use crate::command::Mode;
 
+use super::bus;
 use super::keys::{AUTHORITY, PRINCIPAL};
-use super::{Clients, bus};
+use super::together::Clients;
 use crate::command::{Principal, Rules};
 use crate::document::{Finding, Reader, nearest};
 

@@ -24,6 +24,7 @@ mod recordings;
 mod shutdown;
 mod slot;
 mod start_guard;
+mod together;
 mod unique;
 mod values;
 
@@ -45,7 +46,7 @@ use crate::bus::predict::{self, Prediction};
 use crate::bus::proof;
 use crate::bus::{BusOptions, Mode};
 use crate::command::{AuditFileOptions, Rules};
-use crate::document::{self, Document, Finding, Place, Problem, Reader};
+use crate::document::{self, Document, Finding, Problem, Reader};
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
 use crate::history::RecorderOptions;
@@ -54,7 +55,8 @@ use crate::north::{
     bacnet as bacnet_server, http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client, slot as slot_server,
 };
 use crate::process_image::{Access, BusSpec, DriveSpec};
-use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
+use keys::{GATEWAY, MODBUS_TCP, ROOT};
+use together::{Clients, judge};
 
 /// Where the gateway keeps its state unless it is told otherwise.
 const STATE_DIR: &str = "/var/lib/drivegate";
@@ -351,78 +353,6 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     })
 }
 
-/// The sections by which clients reach the drives.
-struct Clients<'c> {
-    modbus_tcp: Option<&'c modbus_tcp::ModbusTcp>,
-    mqtt: Option<&'c Option<mqtt_client::Options>>,
-    http: Option<&'c north::Http>,
-    bacnet: Option<&'c bacnet::Bacnet>,
-}
-
-/// Reports what is wrong or doubtful about the sections together.
-fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients<'_>) {
-    let Clients {
-        modbus_tcp,
-        mqtt,
-        http,
-        bacnet,
-    } = *clients;
-    unique::check(reader.document(), buses);
-    start_guard::check(reader.document(), buses);
-    // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
-    if let Some(modbus_tcp) = modbus_tcp {
-        unique::check_units(reader.document(), buses, &modbus_tcp.selections);
-    }
-    if let Some(bacnet) = bacnet {
-        bacnet::check_instances(reader, buses, bacnet);
-    }
-    let http_listener = http.and_then(|http| http.listener.as_ref());
-    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http_listener);
-    let slots = || buses.iter().flat_map(|bus| &bus.slots);
-    let listeners = listeners.chain(slots().flat_map(|slot| &slot.listeners));
-    unique::check_listeners(reader.document(), listeners);
-    if mqtt.is_some_and(|m| m.as_ref().is_some_and(|m| m.commands && m.home_assistant.is_some())) {
-        check_numbers_of_home_assistant(reader, buses);
-    }
-    warn_of_emptiness(reader);
-    let commanded = modbus_tcp.is_some_and(|m| m.commands)
-        || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands))
-        || http.is_some_and(|http| http.commands)
-        || bacnet.is_some_and(|bacnet| bacnet.commands)
-        || slots().any(|slot| slot.writes);
-    if !commanded {
-        warn_of_idle_control(reader, buses);
-    }
-    if reader.document().is_sound() {
-        // Besides errors, a default may stand in for a wrong value, or an unknown key for the one that is missed; a warning
-        // about it would mislead.
-        if commanded {
-            warn_of_missing_leases(reader, buses);
-        }
-        warn_of_idle_stops(reader, buses);
-        warn_of_long_shutdowns(reader, buses);
-        let written = modbus_tcp.filter(|m| m.stale_written);
-        warn_of_cadence(reader, buses, written.map(|m| (m.stale_after, &m.stale_place)));
-    }
-}
-
-/// Home Assistant takes no number whose lowest value is its highest, and would refuse the whole drive.
-fn check_numbers_of_home_assistant(reader: &Reader<'_>, buses: &[bus::Found]) {
-    for drive in buses.iter().flat_map(|bus| &bus.drives) {
-        let Some(spec) = drive.spec.as_ref().filter(|_| drive.access.0 == Access::Control) else {
-            continue;
-        };
-        for (point, range) in spec.limits.iter().filter(|(_, range)| range.start() == range.end()) {
-            let only = range.start();
-            reader.document().problem(
-                &drive.limits,
-                format!("the limits of `{point}` leave only {only}, and Home Assistant takes no such number"),
-                "write a range, access = \"monitor\", or home_assistant = false",
-            );
-        }
-    }
-}
-
 /// An invalid section invalidates the whole; an absent one does not.
 fn flipped<T>(section: Option<Option<T>>) -> Option<Option<T>> {
     match section {
@@ -519,179 +449,6 @@ fn default_state_dir() -> PathBuf {
     match given.split(':').next() {
         Some(dir) if !dir.is_empty() => PathBuf::from(dir),
         _ => PathBuf::from(STATE_DIR),
-    }
-}
-
-fn warn_of_emptiness(reader: &Reader<'_>) {
-    let of_file = |key: &str| Place {
-        key: key.to_string(),
-        ..Place::default()
-    };
-    if !reader.has(ROOT.bus.name) {
-        reader.document().warning(
-            &of_file(ROOT.bus.name),
-            "the configuration has no bus, so nothing is read",
-            "write [[bus]] with its drives",
-        );
-    }
-    let servers = [ROOT.modbus_tcp.name, ROOT.mqtt.name, ROOT.http.name, ROOT.bacnet.name];
-    if !servers.iter().any(|server| reader.has(server)) {
-        reader.document().warning(
-            &of_file(""),
-            "no server is configured, so nobody can see the drives",
-            "write [modbus_tcp], [mqtt], [http] or [bacnet]",
-        );
-    }
-}
-
-/// Cadences that the line cannot carry, and a written `stale_after` that is shorter than a cycle.
-fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Option<(Duration, &Place)>) {
-    for found in buses {
-        let Some(settings) = &found.settings else { continue };
-        let prediction = settings.predict();
-        if let Some(shortage) = &prediction.shortage {
-            let (fast, slow) = &found.cadence;
-            let place = if shortage.fast.is_some() { fast } else { slow };
-            let Finding { what, remedy } = shortage.finding();
-            reader.document().warning(place, what, remedy);
-        }
-        warn_of_fault_time(reader, found, prediction.fast_cycle);
-        if let (Some(cycle), Some((limit, place))) = (prediction.fast_cycle, stale_after)
-            && cycle > limit
-        {
-            let [cycle, limit] = [cycle, limit].map(|time| time.as_secs_f64() * 1e3);
-            let bus = &settings.spec.name;
-            reader.document().warning(
-                place,
-                format!("process data of bus `{bus}` is read every {cycle:.0} ms and stale after {limit:.0} ms"),
-                "raise stale_after, leave it out, or reduce the load of the bus",
-            );
-        }
-    }
-}
-
-/// Polls so rare that a drive may take them for a silent master. The manual's example is 1 s [T 6.2]; what is set can be read from
-/// the drive only.
-const FAULT_TIME: Duration = Duration::from_secs(1);
-
-/// Drives that may trip because they are polled too seldom.
-fn warn_of_fault_time(reader: &Reader<'_>, found: &bus::Found, cycle: Option<Duration>) {
-    let fault_time = crate::drive::COMMUNICATION_FAULT_TIME;
-    let Some(cycle) = cycle.filter(|cycle| *cycle > FAULT_TIME / 2) else {
-        return;
-    };
-    let drives = found.drives.iter().filter_map(|drive| drive.spec.as_ref());
-    let Some(first) = drives
-        .into_iter()
-        .find(|spec| spec.profile.point_index(fault_time).is_some())
-    else {
-        return;
-    };
-    reader.document().warning(
-        &found.cadence.0,
-        format!(
-            "each drive is polled every {:.2} s, and drive `{}` may have a communication fault where that is near its \
-             {fault_time}",
-            cycle.as_secs_f64(),
-            first.name
-        ),
-        "set that parameter (Cn-31 of a TECO 7300PA, 1 s in the manual's example) well above the cycle, or raise the baud or \
-         lower the number of drives",
-    );
-}
-
-/// Stops at shutdown that take longer than the service manager waits.
-fn warn_of_long_shutdowns(reader: &Reader<'_>, buses: &[bus::Found]) {
-    for found in buses {
-        let stops = found.drives.iter().find_map(|drive| drive.shutdown_stop.as_ref());
-        let (Some(settings), Some(place)) = (&found.settings, stops) else {
-            continue;
-        };
-        if let Some(Finding { what, remedy }) = settings.shutdown_time().beyond_unit(&settings.spec.name) {
-            reader.document().warning(place, what, remedy);
-        }
-    }
-}
-
-/// Writes configured for drives that are only monitored.
-fn warn_of_idle_stops(reader: &Reader<'_>, buses: &[bus::Found]) {
-    for drive in buses.iter().flat_map(|bus| &bus.drives) {
-        let (Some((name, _)), Access::Monitor) = (&drive.name, drive.access.0) else {
-            continue;
-        };
-        let effects = [
-            (
-                &drive.lease,
-                "it has no lease that could run out",
-                DRIVE.supervision.name,
-            ),
-            (
-                &drive.shutdown_stop,
-                "it is not stopped with the gateway",
-                DRIVE.on_shutdown.name,
-            ),
-        ];
-        for (place, effect, key) in effects {
-            let Some(place) = place else { continue };
-            reader.document().warning(
-                place,
-                format!("drive `{name}` is only monitored, so nothing is ever written to it, and {effect}"),
-                format!("set access = \"control\", or leave {key} out"),
-            );
-        }
-    }
-}
-
-/// Drives that accept commands while no client may send any.
-fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
-    for drive in buses.iter().flat_map(|bus| &bus.drives) {
-        let (Some((name, _)), (Access::Control, place)) = (&drive.name, &drive.access) else {
-            continue;
-        };
-        reader.document().warning(
-            place,
-            format!("drive `{name}` accepts commands but no client may send any"),
-            "set `write` of [modbus_tcp], or `commands = true` of [mqtt], [http] or [bacnet]",
-        );
-    }
-}
-
-/// Commanded drives that nothing stops when the commanding client falls silent.
-fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
-    for drive in buses.iter().flat_map(|bus| &bus.drives) {
-        let (Some(spec), (Access::Control, place)) = (&drive.spec, &drive.access) else {
-            continue;
-        };
-        if spec.supervision.is_some() {
-            continue;
-        }
-        let known = [
-            crate::drive::FIELDBUS_FAULT_RESPONSE,
-            crate::drive::COMMUNICATION_TIMEOUT,
-            crate::drive::COMMUNICATION_ERROR_REACTION,
-        ];
-        let known: Vec<&str> = known
-            .into_iter()
-            .filter(|p| spec.profile.point_index(p).is_some())
-            .collect();
-        let own = match known.is_empty() {
-            true if spec.profile.may_stop_by_itself => {
-                "the drive may stop when its master falls silent, which cannot be read over this protocol".to_string()
-            }
-            true => "the profile has no parameter for the drive's own response to a silent master".to_string(),
-            false => format!(
-                "the drive's own response to a silent master ({}) may be off, and the gateway keeps polling",
-                known.join(" and ")
-            ),
-        };
-        reader.document().warning(
-            place,
-            format!(
-                "drive `{}` has no lease, so it runs on when its client falls silent",
-                spec.name
-            ),
-            format!("{own}; set supervision = {{ timeout = \"5s\", action = \"stop\" }}"),
-        );
     }
 }
 

@@ -12,8 +12,10 @@ use crate::plant::SharedPlant;
 /// is looked whether that is over.
 const RETIRE: (Duration, Duration) = (Duration::from_secs(60), Duration::from_millis(20));
 /// What [`ServerSlot::prepare`] has prepared.
+#[derive(Default)]
 pub(super) enum Prepared<S: Reconfigure> {
     /// The server stays as it is.
+    #[default]
     Same,
     /// It stops.
     Stop,

@@ -1,0 +1,137 @@
+//! What is kept on disk, and read for it.
+
+use std::sync::Arc;
+
+use super::server::within;
+use super::{Daemon, STOP_AUDIT, StartError, reservations};
+use crate::command::AuditFile;
+use crate::config::Settings;
+use crate::files::Keeper;
+use crate::history::{self, RecorderTask};
+use crate::north::parameter_jobs::{hold_unfinished, keep_reading};
+use crate::parameters::Store;
+use crate::start_guard;
+
+impl Daemon {
+    /// Starts the recorder, or another one where it is configured otherwise; what the one before recorded is on disk then.
+    pub(super) async fn apply_recorder(&mut self, settings: &Settings) -> Result<(), StartError> {
+        if self.recorder.is_some() && self.settings.recordings == settings.recordings {
+            return Ok(());
+        }
+        if let Some(recorder) = self.recorder.take() {
+            // A thread of it that panicked has logged that.
+            let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
+        }
+        let (recordings, history) = (self.recordings.clone(), self.history.clone());
+        let options = settings.recordings.clone();
+        let started = RecorderTask::start(options, recordings, history, self.events.clone(), &self.writes);
+        self.recorder = Some(started.map_err(StartError::Recorder)?);
+        Ok(())
+    }
+
+    /// Reads parameters every so often, where that is configured.
+    pub(super) fn apply_params(&mut self, settings: &Settings) {
+        let params = &settings.params;
+        self.vault
+            .configure(Some(Store::new(params.dir.clone())), params.names.clone());
+        self.vault.set_others(params.others.clone());
+        if self.reader.is_some() && self.settings.params.every == params.every {
+            return;
+        }
+        if let Some(reader) = self.reader.take() {
+            reader.abort();
+        }
+        let every = params.every;
+        self.reader = every.map(|every| tokio::spawn(keep_reading(self.plant.clone(), every)));
+    }
+
+    /// New drives whose parameters may be half restored take no commands but stops, before their bus starts.
+    pub(super) async fn hold_unfinished(&self, settings: &Settings) {
+        let drives = settings
+            .buses
+            .iter()
+            .flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)));
+        hold_unfinished(&self.vault, &self.events, drives).await;
+    }
+
+    /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.
+    pub(super) async fn apply_keeper(&mut self, settings: &Settings) {
+        let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
+        if !settings.keeps_history || self.keeper.as_ref().is_some_and(same) {
+            return;
+        }
+        let first = self.keeper.is_none();
+        self.stop_keeper().await;
+        match history::keep(&settings.state_dir, first, self.history.clone(), &self.events) {
+            Ok(keeper) => self.keeper = Some(keeper),
+            Err(error) => {
+                tracing::error!(
+                    target: "drivegate::daemon", "cannot start the thread that keeps events and counters: {error}; free memory or threads"
+                );
+            }
+        }
+    }
+
+    /// Keeps starts in the configured directory, where they are counted. Guarded drives are not started without that.
+    pub(super) async fn apply_guards(&mut self, settings: &Settings) {
+        let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
+        let mut drives = settings.buses.iter().flat_map(|bus| &bus.drives);
+        let none = !drives.any(|drive| drive.guard.is_some());
+        if none || !settings.keeps_history || self.starts.as_ref().is_some_and(same) {
+            return;
+        }
+        self.stop_starts().await;
+        match start_guard::keep(&settings.state_dir, self.guards.clone()) {
+            Ok(keeper) => self.starts = Some(keeper),
+            Err(error) => tracing::error!(
+                target: "drivegate::daemon",
+                "cannot start the thread that counts starts: {error}; drives with a guard are not started; free memory or threads"
+            ),
+        }
+    }
+
+    pub(super) async fn stop_starts(&mut self) {
+        if let Some(keeper) = self.starts.take() {
+            within(STOP_AUDIT, "the file of starts", keeper.stop()).await;
+        }
+    }
+
+    pub(super) async fn stop_keeper(&mut self) {
+        if let Some(keeper) = self.keeper.take() {
+            within(STOP_AUDIT, "the history of events", keeper.stop()).await;
+        }
+    }
+
+    /// Keeps reservations where the gateway keeps its state.
+    pub(super) fn apply_reservations(&self, settings: &Settings) {
+        let kept = settings.keeps_history && settings.authority.is_some();
+        let dir = kept.then_some(settings.state_dir.as_path());
+        reservations::keep_in(&self.reservations, dir);
+    }
+
+    /// Writes the audit to the configured file. The gateway runs on without it if there is no thread for it.
+    pub(super) async fn apply_audit(&self, settings: &Settings) {
+        let audit = self.writes.audit();
+        let before = audit.file();
+        if before.as_ref().map(|file| file.options()) == settings.audit.as_ref() {
+            return;
+        }
+        let started = match (settings.audit.clone(), before) {
+            (Some(options), Some(before)) => before.succeed(options),
+            (Some(options), None) => AuditFile::start(options),
+            (None, before) => {
+                audit.write_to(None);
+                if let Some(before) = before {
+                    within(STOP_AUDIT, "the audit file", before.stop()).await;
+                }
+                return;
+            }
+        };
+        match started {
+            Ok(file) => audit.write_to(Some(Arc::new(file))),
+            Err(error) => tracing::error!(
+                target: "drivegate::daemon", "cannot start the thread of the audit file: {error}; the audit stays where it was; free memory or threads"
+            ),
+        }
+    }
+}

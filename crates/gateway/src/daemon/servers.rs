@@ -1,0 +1,80 @@
+//! Which servers run.
+
+use super::Daemon;
+use super::server::Prepared;
+use crate::config::Settings;
+use crate::north::{ServerError, bacnet, http, local, modbus_tcp, slot};
+
+/// The servers that listen on the network, prepared.
+#[derive(Default)]
+pub(super) struct PreparedServers {
+    modbus_tcp: Prepared<modbus_tcp::Server>,
+    slots: Prepared<slot::Server>,
+    bacnet: Prepared<bacnet::Server>,
+    http: Prepared<http::Http>,
+}
+
+impl Daemon {
+    /// Prepares the servers that listen on the network: all of them or none.
+    pub(super) async fn prepare_servers(&mut self, settings: &Settings) -> Result<PreparedServers, ServerError> {
+        let mut prepared = PreparedServers::default();
+        match self.prepare_each(settings, &mut prepared).await {
+            Ok(()) => Ok(prepared),
+            Err(error) => {
+                self.abort_servers(prepared).await;
+                Err(error)
+            }
+        }
+    }
+
+    async fn prepare_each(&mut self, settings: &Settings, prepared: &mut PreparedServers) -> Result<(), ServerError> {
+        let (plant, stats) = (&self.plant, &self.stats);
+        let modbus_tcp = settings.modbus_tcp.as_ref();
+        prepared.modbus_tcp = self.modbus_tcp.prepare(modbus_tcp, plant, stats).await?;
+        prepared.slots = self.slots.prepare(settings.slots.as_ref(), plant, stats).await?;
+        prepared.bacnet = self.bacnet.prepare(settings.bacnet.as_ref(), plant, stats).await?;
+        prepared.http = self.http.prepare(settings.http.as_ref(), plant, stats).await?;
+        Ok(())
+    }
+
+    pub(super) async fn abort_servers(&mut self, prepared: PreparedServers) {
+        self.modbus_tcp.abort(prepared.modbus_tcp).await;
+        self.slots.abort(prepared.slots).await;
+        self.bacnet.abort(prepared.bacnet).await;
+        self.http.abort(prepared.http).await;
+    }
+
+    pub(super) async fn commit_servers(&mut self, prepared: PreparedServers) {
+        self.modbus_tcp.commit(prepared.modbus_tcp).await;
+        self.slots.commit(prepared.slots).await;
+        self.bacnet.commit(prepared.bacnet).await;
+        self.http.commit(prepared.http).await;
+    }
+
+    pub(super) async fn apply_mqtt(&mut self, settings: &Settings) -> Result<(), ServerError> {
+        // The name of the gateway is part of all topics.
+        if settings.gateway != self.settings.gateway {
+            self.mqtt.stop().await;
+        }
+        let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.stats).await;
+        // Events that came while no client was configured are not published later.
+        self.stats.mqtt.forget_what_is_left();
+        applied
+    }
+
+    /// Opens the local socket if one is configured. The gateway runs without it if it cannot be opened; a reload tries
+    /// again.
+    pub(super) async fn apply_local(&mut self, settings: &Settings) {
+        let options = (settings.socket != local::SocketPath::Off).then(|| local::Options {
+            socket: settings.socket.clone(),
+            control: self.control.clone(),
+        });
+        if let Err(error) = self.local.apply(options.as_ref(), &self.plant, &self.stats).await {
+            tracing::warn!(
+                target: "drivegate::local",
+                "{error}; `drivegate read`, `write`, `reload` and `health` cannot reach this gateway; set `socket` of [gateway], or \
+                 socket = \"\" to do without"
+            );
+        }
+    }
+}
