@@ -1,133 +1,20 @@
 //! Every metric with its name, help, labels and values. Those of the common drive model are listed in `model`; counters
 //! of the servers come from `NorthStats`.
 
-use std::borrow::Cow;
-use std::fmt;
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Instant, SystemTime};
 
-use prometheus_client::encoding::{EncodeLabel, EncodeLabelSet, LabelSetEncoder};
-
 use super::model::MODEL;
 use super::process;
+use super::series::{Families, FamilyId, Kind, Labels, SeriesValue};
 use crate::command::HoldState;
 use crate::drive::{ModelPoint, PollClass, State, Value};
 use crate::history::TriggerKind;
 use crate::plant::{BusHandle, Plant};
-use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
+use crate::process_image::{BusHealth, BusImage, DriveImage, Outcome, Reading, public_points};
 use crate::start_guard::Reason;
 use crate::version::{self, VERSION};
 use crate::{NorthStats, ServerKind};
-
-/// Label of a series: its name and value.
-type Label = (&'static str, Cow<'static, str>);
-
-/// Labels of a series. A plant has thousands of them, so that those of a drive share what they have in common.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Labels {
-    of: Option<Arc<[Label]>>,
-    own: [Option<Label>; 2],
-}
-
-impl Labels {
-    fn of<const N: usize>(labels: [(&'static str, &str); N]) -> Labels {
-        let owned = labels.map(|(name, value)| (name, Cow::Owned(value.to_string())));
-        Labels {
-            of: Some(Arc::new(owned)),
-            own: [None, None],
-        }
-    }
-
-    /// These with one of its own.
-    fn with(&self, name: &'static str, value: impl Into<Cow<'static, str>>) -> Labels {
-        Labels {
-            of: self.of.clone(),
-            own: [Some((name, value.into())), None],
-        }
-    }
-
-    /// These with two of its own.
-    fn with_both(&self, first: Label, second: Label) -> Labels {
-        Labels {
-            of: self.of.clone(),
-            own: [Some(first), Some(second)],
-        }
-    }
-
-    pub(super) fn is_empty(&self) -> bool {
-        self.of.is_none() && self.own.iter().all(Option::is_none)
-    }
-}
-
-impl EncodeLabelSet for Labels {
-    fn encode(&self, encoder: &mut LabelSetEncoder<'_>) -> fmt::Result {
-        let shared = self.of.iter().flat_map(|of| of.iter());
-        let mut all = shared.chain(self.own.iter().flatten());
-        all.try_for_each(|label| label.encode(encoder.encode_label()))
-    }
-}
-
-/// Kind of a family.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
-    Gauge,
-    Counter,
-    Histogram,
-}
-
-#[derive(Debug)]
-pub(super) enum SeriesValue {
-    /// Of a gauge.
-    Value(f64),
-    /// Of a counter of events.
-    Count(u64),
-    /// Of a counter of seconds.
-    Total(f64),
-    Histogram(HistogramSnapshot),
-}
-
-/// What the series of one name have in common.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Family {
-    pub(super) name: &'static str,
-    pub(super) help: &'static str,
-    pub(super) kind: Kind,
-}
-
-/// Place of a family.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct FamilyId(usize);
-
-/// All series of a scrape, in one list: a list for each family would leave its place in the heap behind, scrape by scrape.
-#[derive(Debug, Default)]
-pub(super) struct Families {
-    families: Vec<Family>,
-    series: Vec<(FamilyId, Labels, SeriesValue)>,
-}
-
-impl Families {
-    fn family(&mut self, kind: Kind, name: &'static str, help: &'static str) -> FamilyId {
-        self.families.push(Family { name, help, kind });
-        FamilyId(self.families.len() - 1)
-    }
-
-    fn add(&mut self, family: FamilyId, labels: Labels, figure: SeriesValue) {
-        self.series.push((family, labels, figure));
-    }
-
-    /// A family of one series without labels.
-    fn one(&mut self, kind: Kind, name: &'static str, help: &'static str, figure: SeriesValue) {
-        let family = self.family(kind, name, help);
-        self.add(family, Labels::default(), figure);
-    }
-
-    /// The families that have series, with these.
-    pub(super) fn iter(&self) -> impl Iterator<Item = (&Family, &[(FamilyId, Labels, SeriesValue)])> {
-        let chunks = self.series.chunk_by(|a, b| a.0 == b.0);
-        chunks.filter_map(|series| Some((self.families.get(series.first()?.0.0)?, series)))
-    }
-}
 
 /// All series, those of a family one after the other.
 pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Families {
@@ -142,79 +29,65 @@ pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Famili
     reload(stats, &mut all);
     build(plant, &mut all);
     process(&process::read(), &mut all);
-    all.series.sort_by_key(|(family, ..)| *family);
+    all.sort();
     all
 }
 
 fn drives(plant: &Plant, now: Instant, all: &mut Families) {
-    let up = all.family(
-        Kind::Gauge,
+    let up = all.gauge(
         "drivegate_drive_up",
         "Whether the drive answers: 1, else 0 (also before its first answer).",
     );
-    let state = all.family(
-        Kind::Gauge,
+    let state = all.gauge(
         "drivegate_drive_state",
         "State of the drive: 1 for the state it is in, 0 for the others; absent while it is not known.",
     );
-    let blocked = all.family(
-        Kind::Gauge,
+    let blocked = all.gauge(
         "drivegate_drive_blocked",
         "Why the motor does not run: 1 for each cause; absent while it runs.",
     );
-    let fault_info = all.family(
-        Kind::Gauge,
+    let fault_info = all.gauge(
         "drivegate_drive_fault_info",
         "Text of the active fault: 1; absent without a fault.",
     );
-    let age = all.family(
-        Kind::Gauge,
+    let age = all.gauge(
         "drivegate_drive_sample_age_seconds",
         "Age of the drive's process data; absent while it was never read.",
     );
-    let model = MODEL.map(|(_, name, help)| all.family(Kind::Gauge, name, help));
-    let point = all.family(
-        Kind::Gauge,
+    let model = MODEL.map(|(_, name, help)| all.gauge(name, help));
+    let point = all.gauge(
         "drivegate_point_value",
         "Points of a drive without a metric of their own, in their unit; true is 1.",
     );
-    let transactions = all.family(
-        Kind::Counter,
+    let transactions = all.counter(
         "drivegate_drive_transactions_total",
         "Transactions with the drive by outcome.",
     );
-    let turnaround = all.family(
-        Kind::Gauge,
+    let turnaround = all.gauge(
         "drivegate_drive_turnaround_seconds",
         "Time from the end of the last request to the beginning of the drive's answer.",
     );
-    let refused = all.family(
-        Kind::Counter,
+    let refused = all.counter(
         "drivegate_starts_refused_total",
         "Starts of a guarded drive that were refused, by reason.",
     );
-    let supervision = all.family(
-        Kind::Counter,
+    let supervision = all.counter(
         "drivegate_supervision_actions_total",
         "Leases that ran out while the drive ran or had its run command.",
     );
-    let failed = all.family(
-        Kind::Counter,
+    let failed = all.counter(
         "drivegate_supervision_failed_total",
         "Tries of the action of a lease, or of the stop of a shutdown, that failed.",
     );
-    let unsupervised = all.family(
-        Kind::Gauge,
+    let unsupervised = all.gauge(
         "drivegate_drive_unsupervised",
         "1 if a drive with supervision runs without a lease, else 0.",
     );
-    let held = all.family(
-        Kind::Gauge,
+    let held = all.gauge(
         "drivegate_drive_held",
         "1 for the rank of the client that holds the drive; no series while nobody does.",
     );
-    let unheld = all.family(
-        Kind::Counter,
+    let unheld = all.counter(
         "drivegate_orders_unheld_total",
         "Orders of clients that did not hold the drive, which advisory mode carried out.",
     );
@@ -222,63 +95,61 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
         let image = &drive.image;
         let labels = labels_of(image);
         let reading = drive.reading(now);
-        all.add(supervision, labels.clone(), SeriesValue::Count(image.supervisions()));
+        all.add(supervision, labels.clone(), image.supervisions());
         let failures = image.supervision_failures();
-        all.add(failed, labels.clone(), SeriesValue::Count(failures));
+        all.add(failed, labels.clone(), failures);
         if image.spec.supervision.is_some() {
-            all.add(unsupervised, labels.clone(), flag(image.is_unsupervised()));
+            all.add(unsupervised, labels.clone(), image.is_unsupervised());
         }
         let guards = drive.bus.queue.guards().filter(|guards| guards.guards(drive.index));
         if let Some(counted) = guards.map(|guards| guards.refused(drive.index)) {
             for reason in Reason::ALL {
                 let count = counted.get(&reason).copied().unwrap_or_default();
-                all.add(refused, labels.with("reason", reason.name()), SeriesValue::Count(count));
+                all.add(refused, labels.with("reason", reason.name()), count);
             }
         }
         if let Some((view, _)) = drive.hold_view(None, now) {
             if let (HoldState::Held, Some(rank)) = (view.state, &view.rank) {
-                all.add(held, labels.with("rank", rank.to_string()), SeriesValue::Value(1.0));
+                all.add(held, labels.with("rank", rank.to_string()), 1.0);
             }
             let count = drive.bus.queue.lock().unheld(drive.index);
-            all.add(unheld, labels.clone(), SeriesValue::Count(count));
+            all.add(unheld, labels.clone(), count);
         }
-        all.add(up, labels.clone(), flag(reading.snapshot.link.is_online()));
+        all.add(up, labels.clone(), reading.snapshot.link.is_online());
         if let Some(current) = reading.state() {
             for one in State::ALL {
-                all.add(state, labels.with("state", one.name()), flag(one == current));
+                all.add(state, labels.with("state", one.name()), one == current);
             }
         }
         for cause in drive.why(&reading).words() {
-            all.add(blocked, labels.with("reason", cause), SeriesValue::Value(1.0));
+            all.add(blocked, labels.with("reason", cause), 1.0);
         }
         let fault_text =
             Some(reading.fault_text()).filter(|text| reading.is_set(ModelPoint::Fault) && !text.is_empty());
         if let Some(text) = fault_text {
-            all.add(fault_info, labels.with("text", text), SeriesValue::Value(1.0));
+            all.add(fault_info, labels.with("text", text), 1.0);
         }
         if let Some(time) = reading.age() {
-            all.add(age, labels.clone(), SeriesValue::Value(time.as_secs_f64()));
+            all.add(age, labels.clone(), time.as_secs_f64());
         }
         points(&reading, &labels, (&model, point), all);
         for outcome in Outcome::ALL {
-            let count = SeriesValue::Count(image.counted(outcome));
+            let count = image.counted(outcome);
             all.add(transactions, labels.with("outcome", outcome.name()), count);
         }
         if let Some(time) = image.turnaround() {
-            all.add(turnaround, labels, SeriesValue::Value(time.as_secs_f64()));
+            all.add(turnaround, labels, time.as_secs_f64());
         }
     }
 }
 
 /// What was counted of the drives that say whether they run.
 fn runs(plant: &Plant, all: &mut Families) {
-    let starts = all.family(
-        Kind::Counter,
+    let starts = all.counter(
         "drivegate_drive_starts_total",
         "Starts of the motor that were seen; kept over restarts of the gateway.",
     );
-    let running = all.family(
-        Kind::Counter,
+    let running = all.counter(
         "drivegate_drive_running_seconds_total",
         "Time that the motor was seen running; kept over restarts of the gateway.",
     );
@@ -287,7 +158,7 @@ fn runs(plant: &Plant, all: &mut Families) {
         if spec.profile.model_index(ModelPoint::Running).is_some() {
             let totals = plant.history.totals(&spec.name);
             let labels = labels_of(&drive.image);
-            all.add(starts, labels.clone(), SeriesValue::Count(totals.starts));
+            all.add(starts, labels.clone(), totals.starts);
             all.add(running, labels, SeriesValue::Total(totals.running_seconds));
         }
     }
@@ -311,11 +182,11 @@ fn points(reading: &Reading<'_>, labels: &Labels, (model, other): (&[FamilyId], 
             model.get(place).copied()
         });
         match own {
-            Some(family) => all.add(family, labels.clone(), SeriesValue::Value(value)),
+            Some(family) => all.add(family, labels.clone(), value),
             None => {
                 let unit = point.map(|p| p.unit.clone()).unwrap_or_default();
                 let labels = labels.with_both(("point", name.to_string().into()), ("unit", unit.into()));
-                all.add(other, labels, SeriesValue::Value(value));
+                all.add(other, labels, value);
             }
         }
     }
@@ -340,114 +211,90 @@ fn buses(handles: &[BusHandle], all: &mut Families) {
         .map(|h| (Labels::of([("bus", &h.image.spec.name)]), h, h.image.health()))
         .collect();
     for (name, help, value) in gauges {
-        let family = all.family(Kind::Gauge, name, help);
+        let family = all.gauge(name, help);
         for (labels, handle, health) in &looks {
             if let Some(value) = value(&handle.image, health) {
-                all.add(family, labels.clone(), SeriesValue::Value(value));
+                all.add(family, labels.clone(), value);
             }
         }
     }
-    let cycles = all.family(
-        Kind::Histogram,
+    let cycles = all.histogram(
         "drivegate_bus_cycle_seconds",
         "Achieved cycle: time from the start of a poll round to the start of the next, by poll class.",
     );
-    let transactions = all.family(
-        Kind::Histogram,
+    let transactions = all.histogram(
         "drivegate_bus_transaction_seconds",
         "Duration of transactions on the bus.",
     );
-    let queue = all.family(
-        Kind::Gauge,
+    let queue = all.gauge(
         "drivegate_bus_queue_depth",
         "Commands and forwarded reads that wait for the bus.",
     );
-    let reconnects = all.family(
-        Kind::Counter,
+    let reconnects = all.counter(
         "drivegate_port_reconnects_total",
         "Times that a device server closed its connection after replies, and was connected to again at once.",
     );
-    let diagnosis = all.family(
-        Kind::Gauge,
+    let diagnosis = all.gauge(
         "drivegate_line_diagnosis",
         "What is wrong with the line: 1 for each verdict that holds; drive is empty where it is about the whole line.",
     );
     for (labels, handle, health) in looks {
         let image = &handle.image;
-        all.add(reconnects, labels.clone(), SeriesValue::Count(health.reconnects));
+        all.add(reconnects, labels.clone(), health.reconnects);
         for verdict in &image.diagnosis.load().verdicts {
             let drive = verdict.drive.clone().unwrap_or_default();
             let labels = labels.with_both(("drive", drive.into()), ("verdict", verdict.verdict.name().into()));
-            all.add(diagnosis, labels, SeriesValue::Value(1.0));
+            all.add(diagnosis, labels, 1.0);
         }
         for (class, times) in [
             (PollClass::Fast, &image.fast_cycles),
             (PollClass::Slow, &image.slow_cycles),
         ] {
-            all.add(
-                cycles,
-                labels.with("class", class.name()),
-                SeriesValue::Histogram(times.snapshot()),
-            );
+            all.add(cycles, labels.with("class", class.name()), times.snapshot());
         }
-        all.add(
-            transactions,
-            labels.clone(),
-            SeriesValue::Histogram(image.transactions.snapshot()),
-        );
-        all.add(queue, labels, SeriesValue::Value(handle.queue.lock().len() as f64));
+        all.add(transactions, labels.clone(), image.transactions.snapshot());
+        all.add(queue, labels, handle.queue.lock().len() as f64);
     }
 }
 
 fn writes(plant: &Plant, all: &mut Families) {
-    let results = all.family(
-        Kind::Counter,
-        "drivegate_writes_total",
-        "Commands answered, by source and result.",
-    );
+    let results = all.counter("drivegate_writes_total", "Commands answered, by source and result.");
     for ((source, result), count) in plant.writes.results() {
         let labels = Labels::default().with_both(("source", source.name().into()), ("result", result.into()));
-        all.add(results, labels, SeriesValue::Count(count));
+        all.add(results, labels, count);
     }
     all.one(
         Kind::Histogram,
         "drivegate_write_seconds",
         "Time from the acceptance of a command to its answer.",
-        SeriesValue::Histogram(plant.writes.seconds()),
+        plant.writes.seconds(),
     );
-    let lost = all.family(
-        Kind::Counter,
+    let lost = all.counter(
         "drivegate_audit_lost_total",
         "Records that the audit file lacks because the disk did not take them.",
     );
     if let Some(file) = plant.writes.audit().file() {
         let (sent, not_sent) = file.lost();
         for (kind, count) in [("sent", sent), ("not_sent", not_sent)] {
-            all.add(lost, Labels::default().with("kind", kind), SeriesValue::Count(count));
+            all.add(lost, Labels::default().with("kind", kind), count);
         }
     }
 }
 
 fn recordings(plant: &Plant, all: &mut Families) {
-    let made = all.family(
-        Kind::Counter,
+    let made = all.counter(
         "drivegate_recordings_total",
         "Recordings made since the start, by what made them.",
     );
     let counts = plant.recordings.made();
     for kind in TriggerKind::ALL {
         let count = counts.get(&kind).copied().unwrap_or_default();
-        all.add(
-            made,
-            Labels::default().with("trigger", kind.name()),
-            SeriesValue::Count(count),
-        );
+        all.add(made, Labels::default().with("trigger", kind.name()), count);
     }
 }
 
 fn parameters(plant: &Plant, all: &mut Families) {
-    let changed = all.family(
-        Kind::Counter,
+    let changed = all.counter(
         "drivegate_parameters_changed_total",
         "Parameters of the drive that changed from one reading to the next and that the gateway did not write.",
     );
@@ -455,24 +302,21 @@ fn parameters(plant: &Plant, all: &mut Families) {
     for drive in plant.drives() {
         let key = (drive.image.spec.bus.clone(), drive.image.spec.name.clone());
         let count = counts.get(&key).copied().unwrap_or_default();
-        all.add(changed, labels_of(&drive.image), SeriesValue::Count(count));
+        all.add(changed, labels_of(&drive.image), count);
     }
 }
 
 fn bacnet(stats: &NorthStats, all: &mut Families) {
     let Some(figures) = stats.bacnet.get() else { return };
     let counters = figures.counters;
-    let requests = all.family(
-        Kind::Counter,
+    let requests = all.counter(
         "drivegate_bacnet_requests_total",
         "BACnet requests that were answered, by outcome.",
     );
     for (outcome, count) in [("ok", counters.done), ("refused", counters.refused)] {
-        all.add(requests, Labels::of([("outcome", outcome)]), SeriesValue::Count(count));
+        all.add(requests, Labels::of([("outcome", outcome)]), count);
     }
-    let datagrams = all.family(
-        Kind::Counter,
-        "drivegate_bacnet_datagrams_total",
+    let datagrams = all.counter("drivegate_bacnet_datagrams_total",
         "BACnet datagrams: received, discarded (not understood, or not allowed), dropped (the address had its share of answers).",
     );
     let fates = [
@@ -481,26 +325,26 @@ fn bacnet(stats: &NorthStats, all: &mut Families) {
         ("dropped", counters.dropped),
     ];
     for (fate, count) in fates {
-        all.add(datagrams, Labels::of([("fate", fate)]), SeriesValue::Count(count));
+        all.add(datagrams, Labels::of([("fate", fate)]), count);
     }
     all.one(
         Kind::Counter,
         "drivegate_bacnet_notifications_total",
         "Changes of value sent to BACnet clients.",
-        SeriesValue::Count(counters.notifications),
+        counters.notifications,
     );
     all.one(
         Kind::Gauge,
         "drivegate_bacnet_subscriptions",
         "Subscriptions of BACnet clients now.",
-        SeriesValue::Value(counters.subscriptions as f64),
+        counters.subscriptions as f64,
     );
     if let Some((_, registration)) = figures.bbmd {
         all.one(
             Kind::Gauge,
             "drivegate_bacnet_bbmd_registered",
             "Whether the BBMD passes broadcasts on: 1, else 0.",
-            flag(registration == drivegate_bacnet::Registration::Registered),
+            registration == drivegate_bacnet::Registration::Registered,
         );
     }
 }
@@ -510,38 +354,34 @@ fn north(stats: &NorthStats, all: &mut Families) {
         Kind::Gauge,
         "drivegate_modbus_tcp_connections",
         "Modbus TCP clients connected now.",
-        SeriesValue::Value(stats.modbus_tcp.connections() as f64),
+        stats.modbus_tcp.connections() as f64,
     );
-    let requests = all.family(
-        Kind::Counter,
+    let requests = all.counter(
         "drivegate_modbus_tcp_requests_total",
         "Modbus TCP requests answered, by function code and outcome.",
     );
     for (function, outcome, count) in stats.modbus_tcp.requests() {
         let labels = Labels::default().with_both(("function", function.into()), ("outcome", outcome.into()));
-        all.add(requests, labels, SeriesValue::Count(count));
+        all.add(requests, labels, count);
     }
-    let tools = all.family(
-        Kind::Counter,
+    let tools = all.counter(
         "drivegate_slot_requests_total",
         "Requests of tools at the slots, by outcome.",
     );
     for (bus, outcome, count) in stats.slots.requests() {
         let labels = Labels::default().with_both(("bus", bus.into()), ("outcome", outcome.name().into()));
-        all.add(tools, labels, SeriesValue::Count(count));
+        all.add(tools, labels, count);
     }
     bacnet(stats, all);
-    let listener_up = all.family(
-        Kind::Gauge,
+    let listener_up = all.gauge(
         "drivegate_listener_up",
         "Whether all addresses of a server are listened on: 1; 0 while one of them is not, which /readyz names.",
     );
     for (server, up) in stats.listeners.up() {
         let labels = Labels::of([("server", server.name())]);
-        all.add(listener_up, labels, flag(up));
+        all.add(listener_up, labels, up);
     }
-    let refused = all.family(
-        Kind::Counter,
+    let refused = all.counter(
         "drivegate_connections_refused_total",
         "Connections refused, or closed in favour of others, by server and reason.",
     );
@@ -549,7 +389,7 @@ fn north(stats: &NorthStats, all: &mut Families) {
         for (reason, count) in stats.refused.of(server).filter(|(_, count)| *count > 0) {
             let labels =
                 Labels::default().with_both(("server", server.name().into()), ("reason", reason.name().into()));
-            all.add(refused, labels, SeriesValue::Count(count));
+            all.add(refused, labels, count);
         }
     }
     let mqtt = &stats.mqtt;
@@ -557,37 +397,32 @@ fn north(stats: &NorthStats, all: &mut Families) {
         Kind::Gauge,
         "drivegate_mqtt_configured",
         "Whether an MQTT broker is configured: 1, else 0.",
-        flag(mqtt.configured.load(Ordering::Relaxed)),
+        mqtt.configured.load(Ordering::Relaxed),
     );
     all.one(
         Kind::Gauge,
         "drivegate_mqtt_connected",
         "Whether the gateway is connected to its MQTT broker: 1, else 0 (also without one configured).",
-        flag(mqtt.connected.load(Ordering::Relaxed)),
+        mqtt.connected.load(Ordering::Relaxed),
     );
     all.one(
         Kind::Counter,
         "drivegate_mqtt_published_total",
         "Messages sent to the MQTT broker; with QoS 1 those that it acknowledged.",
-        SeriesValue::Count(mqtt.published.load(Ordering::Relaxed)),
+        mqtt.published.load(Ordering::Relaxed),
     );
     all.one(
         Kind::Gauge,
         "drivegate_mqtt_buffered_messages",
         "Messages that wait for the MQTT broker.",
-        SeriesValue::Value(mqtt.buffered.load(Ordering::Relaxed) as f64),
+        mqtt.buffered.load(Ordering::Relaxed) as f64,
     );
-    let lost = all.family(
-        Kind::Counter,
+    let lost = all.counter(
         "drivegate_mqtt_lost_total",
         "Messages that MQTT lost, by kind: the buffer was full or damaged, or the broker refused them.",
     );
     for (kind, count) in mqtt.losses() {
-        all.add(
-            lost,
-            Labels::default().with("kind", kind.name()),
-            SeriesValue::Count(count),
-        );
+        all.add(lost, Labels::default().with("kind", kind.name()), count);
     }
 }
 
@@ -598,13 +433,13 @@ fn reload(stats: &NorthStats, all: &mut Families) {
         Kind::Gauge,
         "drivegate_config_last_reload_successful",
         "Whether the last reload of the configuration was applied: 1; 0 if it was refused.",
-        flag(applied),
+        applied,
     );
     all.one(
         Kind::Gauge,
         "drivegate_config_last_reload_timestamp_seconds",
         "When the last reload of the configuration ended, applied or refused; the start counts as one.",
-        SeriesValue::Value((since_epoch.as_secs_f64() * 1e3).round() / 1e3),
+        (since_epoch.as_secs_f64() * 1e3).round() / 1e3,
     );
 }
 
@@ -614,12 +449,11 @@ fn build(plant: &Plant, all: &mut Families) {
         ("commit", version::commit().unwrap_or("unknown")),
         ("gateway", &plant.gateway),
     ]);
-    let family = all.family(
-        Kind::Gauge,
+    let family = all.gauge(
         "drivegate_build_info",
         "Always 1; version and commit of the build, and the name of the gateway.",
     );
-    all.add(family, labels, SeriesValue::Value(1.0));
+    all.add(family, labels, 1.0);
 }
 
 fn process(figures: &process::ProcessStats, all: &mut Families) {
@@ -661,15 +495,11 @@ fn process(figures: &process::ProcessStats, all: &mut Families) {
     ];
     for (name, help, value) in gauges {
         if let Some(value) = value {
-            all.one(Kind::Gauge, name, help, SeriesValue::Value(value));
+            all.one(Kind::Gauge, name, help, value);
         }
     }
 }
 
 fn labels_of(drive: &DriveImage) -> Labels {
     Labels::of([("bus", &drive.spec.bus), ("drive", &drive.spec.name)])
-}
-
-fn flag(it_is: bool) -> SeriesValue {
-    SeriesValue::Value(f64::from(u8::from(it_is)))
 }

@@ -6,6 +6,7 @@
 mod families;
 mod model;
 mod process;
+mod series;
 
 use std::fmt;
 use std::time::Instant;
@@ -15,7 +16,7 @@ use prometheus_client::encoding::{DescriptorEncoder, MetricEncoder};
 use prometheus_client::metrics::MetricType;
 use prometheus_client::registry::Registry;
 
-use self::families::{Families, Kind, SeriesValue};
+use self::series::{Families, Kind, SeriesValue};
 use super::NorthStats;
 use crate::plant::Plant;
 
