@@ -24,6 +24,8 @@ pub(super) struct OneStop {
     failed: Option<String>,
     /// Wait before the next try.
     pause: Duration,
+    /// A read since its acknowledgement showed that the motor stands, and none since that it turns.
+    stood: bool,
 }
 
 #[derive(Debug)]
@@ -48,6 +50,7 @@ impl OneStop {
             step: Step::Refused,
             failed: None,
             pause: AGAIN,
+            stood: false,
         };
         stop.try_at(drive, now);
         stop
@@ -111,13 +114,27 @@ impl OneStop {
                     self.step = Step::Refused;
                 }
             },
-            Step::Again(_) | Step::Acknowledged(_) | Step::Refused => {}
+            Step::Acknowledged(at) => {
+                let seen = plant
+                    .drive_at(&self.machine)
+                    .map(|drive| drive.reading(now).standstill(Some(*at)));
+                match seen {
+                    Some(Standstill::Stands) => self.stood = true,
+                    Some(Standstill::Turns(_)) => self.stood = false,
+                    // On a slow line a value is old before the next read of it.
+                    Some(Standstill::Unknown(_)) | None => {}
+                }
+            }
+            Step::Again(_) | Step::Refused => {}
         }
     }
 
     /// What is known of the drive.
     pub(super) fn outcome(&self, plant: &Plant, now: Instant) -> StoppedDrive {
         let (outcome, reason) = match (&self.step, plant.drive_at(&self.machine)) {
+            (Step::Acknowledged(_), Some(drive)) if self.stood && drive.reading(now).may_turn().is_none() => {
+                (Stopped::Standing, None)
+            }
             (Step::Acknowledged(at), Some(drive)) => match drive.reading(now).standstill(Some(*at)) {
                 Standstill::Stands => (Stopped::Standing, None),
                 Standstill::Turns(what) => (
