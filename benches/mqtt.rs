@@ -161,6 +161,7 @@ fn plant(drives: u16) -> Result<Plant, Box<dyn Error>> {
         writes: Default::default(),
         recordings: Default::default(),
         stop_all: Arc::default(),
+        drills: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     })

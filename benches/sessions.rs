@@ -147,6 +147,7 @@ fn plant(name: &str, drives: u16) -> Result<Plant, Box<dyn Error>> {
         writes: Default::default(),
         recordings: Default::default(),
         stop_all: Arc::default(),
+        drills: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     })

@@ -30,6 +30,7 @@ pub use drivegate_bacnet as bacnet;
 pub use drivegate_bus as bus;
 pub use drivegate_core::command;
 pub use drivegate_core::diagnosis;
+pub use drivegate_core::drill;
 pub use drivegate_core::event;
 pub use drivegate_core::files;
 pub use drivegate_core::history;

@@ -17,6 +17,7 @@ mod gateway {
     mod cli;
     mod commands;
     mod demo;
+    mod drill;
     mod drive_access;
     mod families;
     mod fleet;

@@ -158,6 +158,7 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
         writes: Default::default(),
         recordings: Default::default(),
         stop_all: Arc::default(),
+        drills: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     };

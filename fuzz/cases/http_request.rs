@@ -17,6 +17,7 @@ static SERVER: LazyLock<Offline> = LazyLock::new(|| {
         writes: Default::default(),
         recordings: Default::default(),
         stop_all: Default::default(),
+        drills: Default::default(),
         parameters: Default::default(),
         history: Default::default(),
     };

@@ -54,6 +54,7 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         writes: Default::default(),
         recordings: Default::default(),
         stop_all: Default::default(),
+        drills: Default::default(),
         parameters: Default::default(),
         history: Default::default(),
     }))

@@ -53,6 +53,7 @@ fn every_answer_is_as_the_description_says() {
     let others: Vec<_> = answered.iter().filter(|(_, status)| **status != 200).collect();
     // `[authority]` is off, no restore was made, and nobody logs in at the socket.
     let expected = [
+        ("/api/v1/drills/{id}", 404),
         ("/api/v1/drives/{name}/hold", 409),
         ("/api/v1/drives/{name}/params/restore", 409),
         ("/api/v1/session", 404),

@@ -539,6 +539,7 @@ fn whatever_clients_try_nothing_goes_out_for_an_hour() {
         writes: scene.writes.clone(),
         recordings: Default::default(),
         stop_all: Arc::default(),
+        drills: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     };

@@ -23,6 +23,7 @@ mod connection;
 mod control;
 mod cost;
 mod diagnosis;
+mod drill;
 mod drives;
 mod families;
 mod history;

@@ -102,6 +102,7 @@ impl Rig {
             writes,
             recordings: Default::default(),
             stop_all: Arc::default(),
+            drills: Arc::default(),
             parameters: Default::default(),
             history: Default::default(),
         };
@@ -181,6 +182,7 @@ impl Rig {
             writes: self.plant.writes.clone(),
             recordings: Default::default(),
             stop_all: Arc::default(),
+            drills: Arc::default(),
             parameters: Default::default(),
             history: Default::default(),
         }))

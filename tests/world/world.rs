@@ -263,6 +263,7 @@ fn plant_of(buses: &[WorldBus], events: &Events, writes: &Arc<WriteStats>) -> Pl
         writes: writes.clone(),
         recordings: Default::default(),
         stop_all: Arc::default(),
+        drills: Arc::default(),
         parameters: Default::default(),
         history: Default::default(),
     }

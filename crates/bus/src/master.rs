@@ -172,6 +172,8 @@ pub struct Master {
     late_before: bool,
     /// Which starts may be written; none where nothing is guarded.
     starts: Option<StartGate>,
+    /// A drive to which a drill sends nothing but stops, and until when.
+    quiet: Option<(usize, Instant)>,
 }
 
 impl Master {
@@ -229,6 +231,7 @@ impl Master {
             writes,
             late_before: false,
             starts: StartGate::of(&bus, now),
+            quiet: None,
             bus,
         }
     }

@@ -520,6 +520,17 @@ impl Schedule {
         self.share.polled(Duration::ZERO);
     }
 
+    /// That drive is not read until then, the others are read as ever; none: all are read.
+    pub fn keep_quiet(&mut self, quiet: Option<(usize, Instant)>) {
+        for (index, drive) in self.drives.iter_mut().enumerate() {
+            drive.quiet_until = quiet.filter(|(quiet, _)| *quiet == index).map(|(_, until)| until);
+        }
+        if let Some((quiet, _)) = quiet {
+            self.round.retain(|(drive, _)| *drive != quiet);
+            self.state_first.retain(|(drive, _)| *drive != quiet);
+        }
+    }
+
     /// Whether the drive answers.
     pub fn is_online(&self, drive: usize) -> bool {
         self.drives.get(drive).is_some_and(|d| d.presence == Presence::Online)

@@ -91,10 +91,12 @@ pub enum EventKind {
     Released,
     /// A client took a drive from its holder.
     HoldBroken,
+    /// A drill has ended.
+    Drill,
 }
 
 impl EventKind {
-    pub const ALL: [EventKind; 30] = [
+    pub const ALL: [EventKind; 31] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -125,6 +127,7 @@ impl EventKind {
         EventKind::Held,
         EventKind::Released,
         EventKind::HoldBroken,
+        EventKind::Drill,
     ];
 
     /// Whether somebody should look: the log has it as a warning.
@@ -159,6 +162,7 @@ impl EventKind {
             | EventKind::Held
             | EventKind::Released
             | EventKind::HoldBroken
+            | EventKind::Drill
             | EventKind::ParametersChanged => false,
         }
     }
@@ -196,6 +200,7 @@ impl EventKind {
             EventKind::Held => "held",
             EventKind::Released => "released",
             EventKind::HoldBroken => "hold_broken",
+            EventKind::Drill => "drill",
         }
     }
 }
@@ -504,8 +509,9 @@ mod tests {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised
                 | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
-                ParametersChanged | RestoreUnfinished | Diagnosis | Guarded | Interlock | Held | Released => false,
-                HoldBroken => true,
+                ParametersChanged | RestoreUnfinished | Diagnosis | Guarded | Interlock | Held | Released
+                | HoldBroken => false,
+                Drill => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

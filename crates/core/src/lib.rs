@@ -2,6 +2,7 @@
 
 pub mod command;
 pub mod diagnosis;
+pub mod drill;
 pub mod event;
 pub mod files;
 pub mod history;

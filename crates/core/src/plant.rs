@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 use arc_swap::ArcSwap;
 
 use crate::command::{Answer, CommandQueue, Origin, Outcome, Priorities, Refusal, WriteStats};
+use crate::drill::Drills;
 use crate::drive::why::Explanation;
 use crate::event::{Event, Events};
 use crate::history::{History, Recordings};
@@ -101,6 +102,8 @@ pub struct Plant {
     pub recordings: Arc<Recordings>,
     /// Orders that stop all drives.
     pub stop_all: Arc<StopAll>,
+    /// Drills.
+    pub drills: Arc<Drills>,
     /// Readings of parameters.
     pub parameters: Arc<Vault>,
     /// The past of the drives.
@@ -144,6 +147,7 @@ impl Plant {
             writes: Arc::default(),
             recordings: Arc::default(),
             stop_all: Arc::default(),
+            drills: Arc::default(),
             parameters: Arc::default(),
             history: Arc::default(),
         }
@@ -233,6 +237,11 @@ impl DriveHandle {
     /// changed its address.
     pub fn stops(&self) -> u64 {
         self.bus.queue.lock().stops(self.index)
+    }
+
+    /// Who gave the last stop that was taken in; none before the first one.
+    pub fn last_stop_by(&self) -> Option<Origin> {
+        self.bus.queue.lock().last_stop_by(self.index).cloned()
     }
 
     /// The login that commanded the drive last, unless another client did since.

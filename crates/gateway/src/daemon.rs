@@ -1,6 +1,7 @@
 //! The gateway as a whole: start, reload and the order of shutdown.
 
 mod changes;
+pub mod drills;
 mod file_limit;
 mod keepers;
 mod leases;
@@ -92,6 +93,8 @@ pub struct Daemon {
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
     stopper: tokio::task::JoinHandle<()>,
+    driller: tokio::task::JoinHandle<()>,
+    drills: drills::DrillsFile,
     reservations: ReservationsFile,
     /// Keeps reservations on disk.
     reserver: tokio::task::JoinHandle<()>,
@@ -130,6 +133,7 @@ impl Daemon {
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let reservations = ReservationsFile::default();
+        let drills_file = drills::DrillsFile::default();
         let mut daemon = Daemon {
             plant: shared.clone(),
             settings: settings.clone(),
@@ -154,6 +158,8 @@ impl Daemon {
             starts: None,
             reporter: report_refusals(shared.clone()),
             stopper: stop_all(shared.clone()),
+            driller: drills::watch(shared.clone(), drills_file.clone()),
+            drills: drills_file,
             reserver: reservations::keep(shared, reservations.clone()),
             reservations,
             pulse: Pulse::default(),
@@ -172,6 +178,7 @@ impl Daemon {
         daemon.hold_unfinished(&settings).await;
         daemon.replace_buses(&settings, prepared).await;
         daemon.apply_reservations(&settings);
+        daemon.apply_drills(&settings);
         reservations::restore(&daemon.reservations, &daemon.plant.load());
         daemon.apply_mqtt(&settings).await?;
         // The servers that report readiness come last.
@@ -230,8 +237,10 @@ impl Daemon {
         self.apply_params(&settings);
         self.hold_unfinished(&settings).await;
         self.commit_servers(servers).await;
+        self.end_drill_of_changed_bus(&settings).await;
         self.replace_buses(&settings, prepared).await;
         self.apply_reservations(&settings);
+        self.apply_drills(&settings);
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
         self.apply_audit(&settings).await;
@@ -337,6 +346,7 @@ impl Daemon {
             writes: self.writes.clone(),
             recordings: self.recordings.clone(),
             stop_all: self.plant.load().stop_all.clone(),
+            drills: self.plant.load().drills.clone(),
             parameters: self.vault.clone(),
             history: self.history.clone(),
         }));
@@ -380,6 +390,8 @@ impl Daemon {
         self.slots.stop().await;
         self.bacnet.stop().await;
         self.modbus_tcp.stop().await;
+        drills::end(&self.plant, &self.drills, "the end of the gateway", |_| true).await;
+        self.driller.abort();
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);
         let recorder = self.recorder.take();

@@ -5,6 +5,7 @@ pub mod daemon;
 
 use drivegate_bus as bus;
 use drivegate_core::command;
+use drivegate_core::drill;
 use drivegate_core::event;
 use drivegate_core::files;
 use drivegate_core::history;

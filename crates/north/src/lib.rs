@@ -28,6 +28,7 @@ mod tls_words;
 
 use drivegate_core::command;
 use drivegate_core::diagnosis;
+use drivegate_core::drill;
 use drivegate_core::event;
 use drivegate_core::files;
 use drivegate_core::history;

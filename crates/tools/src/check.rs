@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
 
@@ -15,8 +15,11 @@ use crate::bus::predict::{PredictedRequest, Prediction};
 use crate::bus::proof;
 use crate::config::memory::{BusMemory, Memory};
 use crate::config::{BusSettings, Loaded, Settings, environment};
+use crate::daemon::drills::load as kept_drills;
 use crate::document::{Finding, Problem};
+use crate::drill::{Kind, ways};
 use crate::drive::raw_writes;
+use crate::files::names::DRILLS;
 use crate::history::trend::Reach;
 use crate::north::parameter_jobs::orphans;
 use crate::north::slot::Slot;
@@ -98,6 +101,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     }
     if let Some(settings) = &loaded.settings {
         loaded.warnings.extend(orphaned_journals(settings));
+        loaded.warnings.extend(unproven_stops(settings));
     }
     let printed = if args.json {
         report::print(&json(&loaded))
@@ -126,6 +130,43 @@ fn orphaned_journals(settings: &Settings) -> Vec<Problem> {
         Problem::of_file(path.display().to_string(), "", Finding::new(what, remedy))
     };
     orphans.map(problem).collect()
+}
+
+/// Where drills are configured: the drives whose stops no drill has proven, or not lately.
+fn unproven_stops(settings: &Settings) -> Option<Problem> {
+    let options = settings.drill?;
+    let path = settings.state_dir.join(DRILLS);
+    let problem =
+        |what: String, remedy: String| Problem::of_file(path.display().to_string(), "", Finding::new(what, remedy));
+    let saved = match kept_drills(&path) {
+        Ok(saved) => saved.unwrap_or_default(),
+        Err(why) => {
+            return Some(problem(
+                format!("what drills have proven cannot be read: {why}"),
+                "run check as the gateway's user".to_string(),
+            ));
+        }
+    };
+    let drives = settings
+        .buses
+        .iter()
+        .flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)));
+    let unproven: Vec<String> = drives
+        .filter_map(|(bus, drive)| {
+            let missing = saved.unproven(&bus.machine(drive), &ways(drive), options.every, SystemTime::now());
+            let missing: Vec<&str> = missing.into_iter().map(Kind::name).collect();
+            (!missing.is_empty()).then(|| format!("{} ({})", drive.name, missing.join(", ")))
+        })
+        .collect();
+    let first = unproven.first()?.split(' ').next().unwrap_or_default().to_string();
+    let what = format!(
+        "stops that no drill has proven, or not within `every`: {}",
+        unproven.join(", ")
+    );
+    Some(problem(
+        what,
+        format!("run `drivegate drill {first}`, and so on, at the machine"),
+    ))
 }
 
 fn json(loaded: &Loaded) -> String {

@@ -13,6 +13,7 @@ mod client;
 mod credentials_file;
 mod demo;
 mod diagnose;
+mod drill_command;
 mod drive_access;
 mod health;
 mod hold_command;
@@ -48,6 +49,7 @@ mod write;
 use drivegate_bus as bus;
 use drivegate_core::command;
 use drivegate_core::diagnosis;
+use drivegate_core::drill;
 use drivegate_core::event;
 use drivegate_core::files;
 use drivegate_core::history;
@@ -131,6 +133,7 @@ commands! {
     Write => write,
     StopAll => stop_all_command,
     Hold => hold_command,
+    Drill => drill_command,
     Why => why,
     Diagnose => diagnose,
     Record => record,

@@ -76,6 +76,8 @@ pub(super) struct Late<'m> {
     pub(super) strangers: &'m mut BTreeMap<u8, LateReplies>,
     /// Which starts may be written.
     pub(super) starts: &'m mut Option<StartGate>,
+    /// A drive to which nothing but stops is sent, and until when.
+    pub(super) quiet: Option<(usize, Instant)>,
 }
 
 impl Late<'_> {
@@ -98,6 +100,13 @@ impl Late<'_> {
         };
         let late = late.and_then(|late| late.blocks(pdu, now));
         late.max(self.n2_late.blocks(pdu, now))
+    }
+
+    /// Until when a request has to wait, since it would reach a drive that a drill sends nothing.
+    fn quiet_until(&self, request: &BackgroundRequest) -> Option<Instant> {
+        let (quiet, until) = self.quiet?;
+        let reach = request.passed_on.as_ref().map_or(&[][..], |passed_on| &passed_on.reach);
+        (request.drive == quiet || reach.contains(&quiet)).then_some(until)
     }
 
     /// Whether what is passed on to drives of the bus can go: nothing is begun for any of them.
@@ -212,6 +221,7 @@ impl Master {
             n2_late,
             strangers,
             starts,
+            quiet,
             ..
         } = self;
         let mut late = Late {
@@ -219,6 +229,7 @@ impl Master {
             n2_late,
             strangers,
             starts,
+            quiet: *quiet,
         };
         let chosen = pending.next_passed_on(now, |command| {
             let online = schedule.is_online(command.drive);
@@ -244,6 +255,7 @@ impl Master {
             n2_late,
             strangers,
             starts,
+            quiet,
             ..
         } = self;
         let mut late = Late {
@@ -251,6 +263,7 @@ impl Master {
             n2_late,
             strangers,
             starts,
+            quiet: *quiet,
         };
         late.may_pass_on(pending.get(chosen)?, drives, now)
             .is_ok_and(|may| may)
@@ -349,6 +362,7 @@ impl Master {
             n2_late,
             strangers,
             starts,
+            quiet,
             ..
         } = self;
         let mut late = Late {
@@ -356,9 +370,11 @@ impl Master {
             n2_late,
             strangers,
             starts,
+            quiet: *quiet,
         };
         let may = |request: &BackgroundRequest| {
             let until = late.blocks((request.drive, &request.pdu), request.passed_on.as_ref(), drives, now);
+            let until = until.max(late.quiet_until(request));
             blocked = blocked.into_iter().chain(until).min();
             until.is_none()
         };
@@ -639,6 +655,12 @@ pub(super) fn may_go(
     drives: &mut [DriveState],
     now: Instant,
 ) -> Result<bool, Instant> {
+    if let Some((quiet, until)) = late.quiet
+        && command.reaches(quiet)
+        && !command.stops(quiet)
+    {
+        return Err(until);
+    }
     let may = match &command.passed_on {
         Some(_) => late.may_pass_on(command, drives, now)?,
         None => match drives.get_mut(command.drive) {

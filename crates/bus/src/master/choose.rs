@@ -101,6 +101,11 @@ impl Master {
     /// One decision; none where it changed what is to be decided on.
     fn decide(&mut self, now: Instant) -> Option<Result<Turn, Instant>> {
         self.purge(now);
+        let quiet = self.bus.queue.quiet(now);
+        if quiet != self.quiet {
+            self.quiet = quiet;
+            self.schedule.keep_quiet(quiet);
+        }
         if self.shutdown.is_none()
             && let Some(turn) = self.broadcast_stop(now)
         {
@@ -209,6 +214,7 @@ impl Master {
             n2_late,
             sessions,
             starts,
+            quiet,
             ..
         } = self;
         for (index, (drive, image)) in drives.iter_mut().zip(&bus.image.drives).enumerate() {
@@ -221,7 +227,11 @@ impl Master {
             {
                 wanted = drive.wanted(image, n2_late, now);
             }
+            let quiet = quiet.filter(|(quiet, _)| *quiet == index);
             match wanted {
+                Wanted::Step(slot, _) if quiet.is_some() && slot != Urgency::Stop => {
+                    quiet.into_iter().for_each(|(_, until)| commands.wait(until));
+                }
                 Wanted::Step(slot, step) => {
                     // What N2 needs said before is blocked by late replies as the step itself is.
                     let before = sessions.before(index, Some(slot), now).map(RequestPdu::N2);
@@ -265,6 +275,7 @@ impl Master {
             n2_late,
             strangers,
             starts,
+            quiet,
             ..
         } = self;
         drop_in_vain(&mut pending, &bus.image.drives, now);
@@ -273,6 +284,7 @@ impl Master {
             n2_late,
             strangers,
             starts,
+            quiet: *quiet,
         };
         let stands: Vec<bool> = drives
             .iter()

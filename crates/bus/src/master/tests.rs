@@ -18,6 +18,7 @@ use crate::process_image::{
 use crate::transaction::MAY_BE_LATE;
 
 mod background;
+mod drill;
 mod hold;
 mod stop_all;
 
@@ -65,7 +66,9 @@ impl Registers {
                 count,
             } => {
                 let run = self.holding.get(&2000).is_some_and(|word| word & 1 == 1);
-                self.holding.insert(2100, if run { 3 } else { 1 });
+                // With a fault (bit 3) the motor stands.
+                let fault = self.holding.get(&2100).map_or(0, |word| word & 8);
+                self.holding.insert(2100, if run && fault == 0 { 3 } else { 1 | fault });
                 let word = |address| self.holding.get(&address).copied().unwrap_or(0);
                 Reply::Registers((*start..start + count).map(word).collect())
             }

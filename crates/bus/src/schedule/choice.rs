@@ -34,7 +34,7 @@ impl Schedule {
             .drives
             .iter()
             .enumerate()
-            .filter(|(_, d)| d.presence == Presence::Online)
+            .filter(|(_, d)| d.presence == Presence::Online && !d.is_quiet(now))
         {
             let due = drive
                 .items
@@ -102,7 +102,7 @@ impl Schedule {
     /// The drive that is asked whether it answers: the one waiting longest.
     fn due_probe(&self, now: Instant) -> Option<Poll> {
         let due = |drive: &DriveSchedule| match drive.presence {
-            Presence::Away(at, _) if at <= now => Some(at),
+            Presence::Away(at, _) if at <= now && !drive.is_quiet(now) => Some(at),
             _ => None,
         };
         let mut waiting: Vec<(Instant, usize)> = self
@@ -125,7 +125,7 @@ impl Schedule {
     /// The read that a command asked for, waiting longest.
     pub(super) fn due_asked(&self, now: Instant) -> Option<Poll> {
         let online = self.drives.iter().enumerate();
-        let online = online.filter(|(_, d)| d.presence == Presence::Online && !d.doubted);
+        let online = online.filter(|(_, d)| d.presence == Presence::Online && !d.doubted && !d.is_quiet(now));
         let asked = online.flat_map(|(drive, d)| d.items.iter().map(move |item| (drive, item)));
         let due = asked.filter_map(|(drive, item)| Some((item.asked.filter(|since| *since <= now)?, drive, item.read)));
         let (_, drive, read) = due.min_by_key(|(since, _, _)| *since)?;
@@ -147,7 +147,7 @@ impl Schedule {
             .drives
             .iter()
             .enumerate()
-            .filter(|(_, d)| d.presence == Presence::Online && !d.waits_for_fast())
+            .filter(|(_, d)| d.presence == Presence::Online && !d.waits_for_fast() && !d.is_quiet(now))
         {
             let slow = drive.items.iter().filter(|item| item.is_slow());
             for (due, item) in slow.map(|item| (drive.due(item), item)).filter(|(due, _)| *due <= now) {
@@ -170,6 +170,7 @@ impl Schedule {
         let mut next = self.round_due;
         for drive in &self.drives {
             let due = match drive.presence {
+                _ if drive.is_quiet(now) => drive.quiet_until,
                 Presence::Away(_, _) if drive.items.is_empty() => None,
                 Presence::Away(at, _) => Some(at),
                 Presence::Online => {

@@ -65,6 +65,8 @@ pub(super) enum Presence {
 #[derive(Debug)]
 pub(super) struct DriveSchedule {
     pub(super) presence: Presence,
+    /// A drill sends it nothing until then.
+    pub(super) quiet_until: Option<Instant>,
     pub(super) early: EarlyProbes,
     pub(super) tried: bool,
     /// It answered a session step (Identify, poll of N2) since its last probe.
@@ -183,6 +185,11 @@ impl Item {
 }
 
 impl DriveSchedule {
+    /// Whether a drill sends it nothing now.
+    pub(super) fn is_quiet(&self, now: Instant) -> bool {
+        self.quiet_until.is_some_and(|until| now < until)
+    }
+
     /// A drive that was not asked yet.
     pub(super) fn new(
         items: Vec<Item>,
@@ -192,6 +199,7 @@ impl DriveSchedule {
     ) -> DriveSchedule {
         DriveSchedule {
             presence: Presence::Away(now, Duration::ZERO),
+            quiet_until: None,
             early: EarlyProbes::default(),
             tried: false,
             heard: false,

@@ -240,6 +240,31 @@ impl Audit {
             .for_each(|passed| self.keep_counted(&mut records, passed, now));
     }
 
+    /// Records what a client did with a drive that was no command: what, and its result.
+    pub fn note(
+        &self,
+        who: &super::Origin,
+        (drive, what): (&str, &str),
+        (result, text): (&'static str, &str),
+        now: Instant,
+    ) {
+        let record = AuditRecord {
+            time: SystemTime::now(),
+            source: who.kind.name(),
+            client: who.who.clone(),
+            drive: drive.to_string(),
+            command: what.to_string(),
+            points: Vec::new(),
+            result,
+            text: text.to_string(),
+            latency: Duration::ZERO,
+            confirmed: None,
+            count: 1,
+            share: who.client().clone(),
+        };
+        self.record(record, Reach::Sent, now);
+    }
+
     /// Records the refusals that waited long enough for their count.
     pub fn record_due(&self, now: Instant) {
         let mut records = self.records();

@@ -45,6 +45,10 @@ pub struct Pending {
     stops: BTreeMap<usize, u64>,
     /// When the last of them came in.
     stopped_at: BTreeMap<usize, Instant>,
+    /// Who gave the last of them.
+    stopped_by: BTreeMap<usize, Origin>,
+    /// A drive to which nothing but stops is sent until then.
+    quiet: Option<(usize, Instant)>,
     /// The bus ends and another one takes its place: stops wait for that one.
     ending: bool,
     /// The queues that took over the stops of drives, and their places there.
@@ -101,7 +105,7 @@ impl Pending {
             return;
         }
         if command.urgency == Urgency::Stop {
-            self.note_stop(command.drive, now);
+            self.note_stop(command.drive, command.ticket.origin().clone(), now);
             self.push_stop(command, now);
             return;
         }

@@ -16,13 +16,15 @@ pub const MQTT_TOPICS: &str = "mqtt-topics";
 pub const SPARKPLUG: &str = "sparkplug-bdseq";
 /// Reservations that stops left behind.
 pub const RESERVATIONS: &str = "reservations.json";
+/// Drills, and when each way was proven last.
+pub const DRILLS: &str = "drills.json";
 /// Directory of the recordings.
 pub const RECORDINGS: &str = "recordings";
 /// Directory of the parameters.
 pub const PARAMS: &str = "params";
 
 /// What the names begin with, before a `.` or `-` or their end; counters are written and set aside under other endings.
-const OWN: [&str; 10] = [
+const OWN: [&str; 11] = [
     EVENTS,
     "counters",
     "starts",
@@ -31,6 +33,7 @@ const OWN: [&str; 10] = [
     MQTT_TOPICS,
     SPARKPLUG,
     "reservations",
+    "drills",
     RECORDINGS,
     PARAMS,
 ];
@@ -58,6 +61,7 @@ mod tests {
             MQTT_TOPICS,
             SPARKPLUG,
             RESERVATIONS,
+            DRILLS,
             RECORDINGS,
             PARAMS,
         ] {

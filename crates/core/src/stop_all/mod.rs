@@ -20,7 +20,7 @@ use tokio::sync::{Notify, oneshot};
 pub use self::scope::{NothingToStop, Scope};
 pub use self::standstill::Standstill;
 
-use self::one_stop::OneStop;
+pub(crate) use self::one_stop::OneStop;
 use self::stop_of_line::stop_of_line;
 use crate::command::{Authority, Origin};
 use crate::plant::{BusHandle, DriveHandle, Exchange, Plant, Question};

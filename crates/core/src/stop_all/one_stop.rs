@@ -15,8 +15,8 @@ const LONGEST_AGAIN: Duration = Duration::from_secs(1);
 
 /// The stop of one drive.
 #[derive(Debug)]
-pub(super) struct OneStop {
-    pub(super) machine: Machine,
+pub(crate) struct OneStop {
+    pub(crate) machine: Machine,
     drive: String,
     origin: Origin,
     step: Step,
@@ -42,7 +42,7 @@ enum Step {
 
 impl OneStop {
     /// Places the stop.
-    pub(super) fn place(drive: &DriveHandle, machine: Machine, origin: &Origin, now: Instant) -> OneStop {
+    pub(crate) fn place(drive: &DriveHandle, machine: Machine, origin: &Origin, now: Instant) -> OneStop {
         let mut stop = OneStop {
             machine,
             drive: drive.image.spec.name.clone(),
@@ -72,21 +72,37 @@ impl OneStop {
     }
 
     /// Whether a drive that acknowledges it acknowledges one that is ordered now.
-    pub(super) fn waits_for_acknowledgement(&self) -> bool {
+    pub(crate) fn waits_for_acknowledgement(&self) -> bool {
         matches!(self.step, Step::Placed(_))
     }
 
-    pub(super) fn is_acknowledged(&self) -> bool {
+    pub(crate) fn is_acknowledged(&self) -> bool {
         matches!(self.step, Step::Acknowledged(_))
     }
 
+    /// Whether it cannot be given to the drive.
+    pub(crate) fn is_refused(&self) -> bool {
+        matches!(self.step, Step::Refused)
+    }
+
+    /// Why it is not acknowledged.
+    pub(crate) fn why_not(&self) -> String {
+        let why = self.failed.as_deref().unwrap_or("it was not answered");
+        format!("not acknowledged: {why}")
+    }
+
+    /// Whether a read since shows that the motor stands.
+    pub(crate) fn stands(&self, plant: &Plant, now: Instant) -> bool {
+        self.outcome(plant, now).outcome == Stopped::Standing
+    }
+
     /// Whether it failed at least once.
-    pub(super) fn has_failed(&self) -> bool {
+    pub(crate) fn has_failed(&self) -> bool {
         self.failed.is_some()
     }
 
     /// Looks what became of it, and places it again where it failed. A reload may have put the drive elsewhere.
-    pub(super) fn look(&mut self, plant: &Plant, now: Instant) {
+    pub(crate) fn look(&mut self, plant: &Plant, now: Instant) {
         match &mut self.step {
             Step::Placed(placed) => {
                 let accepted = placed.accepted();
@@ -130,7 +146,7 @@ impl OneStop {
     }
 
     /// What is known of the drive.
-    pub(super) fn outcome(&self, plant: &Plant, now: Instant) -> StoppedDrive {
+    pub(crate) fn outcome(&self, plant: &Plant, now: Instant) -> StoppedDrive {
         let (outcome, reason) = match (&self.step, plant.drive_at(&self.machine)) {
             (Step::Acknowledged(_), Some(drive)) if self.stood && drive.reading(now).may_turn().is_none() => {
                 (Stopped::Standing, None)

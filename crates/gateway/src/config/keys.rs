@@ -78,6 +78,8 @@ const fn key_name(field: &'static str) -> &'static str {
 
 const MILLISECOND: Duration = Duration::from_millis(1);
 const HOUR: Duration = Duration::from_secs(3600);
+/// Ten years.
+const LONGEST_EVERY: Duration = Duration::from_secs(10 * 8760 * 3600);
 /// Range of cadences and timeouts.
 const TIMES: Time = Time(MILLISECOND..=HOUR);
 /// `response_timeout`: an hour was allowed before. A master that waits so long for an absent drive serves nobody else.
@@ -181,6 +183,8 @@ keys! {
         bacnet: Present = Own { schema: Bacnet::schema, range: "[bacnet]" }, or "not started";
         /// Who holds a drive; off without this section.
         authority: Present = Own { schema: AuthorityTable::schema, range: "[authority]" }, or "off";
+        /// How stops are proven; not possible without this section.
+        drill: Present = Own { schema: DrillTable::schema, range: "[drill]" }, or "off";
         /// File of all commands; not written without this section.
         audit: Present = Own { schema: AuditTable::schema, range: "[audit]" }, or "not written";
         /// What the recorder keeps.
@@ -669,6 +673,16 @@ keys! {
         stop_at_local: bool = Flag, default true;
         /// Those who may hold drives.
         principal: Present = Own { schema: || each(PrincipalTable::schema()), range: "[[authority.principal]]" }, or "none";
+    }
+
+    /// [Drills](safety.md#drills): proving that motors stop.
+    DRILL: DrillTable {
+        /// Highest speed at which a drill stops a motor, % of its range, more than 0 to 100.
+        max_speed: f64 = Figure, default 20.0;
+        /// Time in which the motor has to stand: more than the timeout of its supervision, and than that of the drive's own.
+        limit: Duration = Time(Duration::from_secs(1)..=HOUR), default "10s";
+        /// Age from which `check`, page and metrics call a proof too old.
+        every: Duration = Time(HOUR..=LONGEST_EVERY), default "8760h";
     }
 
     /// One who may hold drives, whichever way in it uses. Rights stay what `allow`, `write`, roles and `commands` say.

@@ -7,6 +7,7 @@ mod authority;
 mod bacnet;
 mod bus;
 mod deprecated;
+mod drill;
 mod drive;
 mod files;
 mod key;
@@ -47,6 +48,7 @@ use crate::bus::proof;
 use crate::bus::{BusOptions, Mode};
 use crate::command::{AuditFileOptions, Rules};
 use crate::document::{self, Document, Finding, Problem, Reader};
+use crate::drill::DrillOptions;
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
 use crate::history::RecorderOptions;
@@ -100,6 +102,8 @@ pub struct Settings {
     pub bacnet: Option<bacnet_server::Options>,
     /// Who holds drives; absent: off.
     pub authority: Option<Arc<Rules>>,
+    /// How stops are proven; absent: off.
+    pub drill: Option<DrillOptions>,
     /// File of all commands; absent: not written.
     pub audit: Option<AuditFileOptions>,
     /// What is logged.
@@ -290,6 +294,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     let buffer = buffer.map(|buffer| buffer.dir.as_path());
     let authority = ROOT.authority.table(reader);
     let authority = authority.map(|table| (authority::read(&table), table));
+    let drill = ROOT.drill.table(reader).map(|table| drill::read(&table));
     let audit = ROOT.audit.table(reader);
     let audit = audit.map(|table| log::read_audit(&table, &state_dir, buffer));
     let recordings = ROOT.recordings.table(reader);
@@ -348,6 +353,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         http: flipped(http.map(|http| http.options))?,
         bacnet: flipped(bacnet.map(|bacnet| bacnet.options))?,
         authority,
+        drill: flipped(drill)?,
         audit,
         log: log?,
     })

@@ -71,6 +71,10 @@ mode = "exclusive"
 name = "plc-1"
 rank = "automation"
 modbus_tcp = ["127.0.0.1/32"]
+[drill]
+max_speed = 15.0
+limit = "12s"
+every = "720h"
 [audit]
 [params]
 [log]

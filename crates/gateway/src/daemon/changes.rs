@@ -20,6 +20,7 @@ pub(super) fn between(before: &Settings, after: &Settings) -> Vec<String> {
         section("HTTP", &before.http, &after.http),
         section("BACnet/IP", &before.bacnet, &after.bacnet),
         section("who holds drives", &before.authority, &after.authority),
+        section("drills", &before.drill, &after.drill),
         section("the audit file", &before.audit, &after.audit),
     ];
     changes.extend(sections.into_iter().flatten());

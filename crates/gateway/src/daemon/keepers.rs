@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::server::within;
-use super::{Daemon, STOP_AUDIT, StartError, reservations};
+use super::{Daemon, STOP_AUDIT, StartError, drills, reservations};
 use crate::command::AuditFile;
 use crate::config::Settings;
 use crate::files::Keeper;
@@ -107,6 +107,24 @@ impl Daemon {
         let kept = settings.keeps_history && settings.authority.is_some();
         let dir = kept.then_some(settings.state_dir.as_path());
         reservations::keep_in(&self.reservations, dir);
+    }
+
+    /// A bus that is replaced sends no stops to drives that are gone from it: a drill there ends before, and no other begins.
+    pub(super) async fn end_drill_of_changed_bus(&self, settings: &Settings) {
+        let changed = |name: &str| {
+            let mut before = self.buses.iter().map(|(bus, _)| bus);
+            before.any(|bus| bus.spec.name == name && !settings.buses.contains(bus))
+        };
+        self.plant.load().drills.set_options(None);
+        drills::end(&self.plant, &self.drills, "a reload of its bus", changed).await;
+    }
+
+    /// Drills as they are configured, kept where the gateway keeps its state.
+    pub(super) fn apply_drills(&self, settings: &Settings) {
+        let drills = self.plant.load().drills.clone();
+        let kept = settings.keeps_history && settings.drill.is_some();
+        drills::keep_in(&self.drills, kept.then_some(settings.state_dir.as_path()), &drills);
+        drills.set_options(settings.drill);
     }
 
     /// Writes the audit to the configured file. The gateway runs on without it if there is no thread for it.

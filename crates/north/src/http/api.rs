@@ -8,6 +8,7 @@ use serde::{Serialize, Serializer};
 
 use crate::command_json::HoldFields;
 use crate::diagnosis::{self, Counted, Verdict};
+use crate::drill::StopProof;
 use crate::drive::why::Cause;
 use crate::drive::{self, ModelPoint, Quality, State};
 use crate::history::History;
@@ -76,6 +77,9 @@ pub(super) struct Drive<'d> {
     #[serde(flatten)]
     #[schema(value_type = HoldFields)]
     hold: Option<HoldFields>,
+    /// What drills have proven of its stops, where `[drill]` is on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    stops: Option<Vec<StopProof>>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
     /// `null` where the drive does not say whether it runs.
@@ -121,6 +125,7 @@ impl<'d> Drive<'d> {
             held: image.hold.why().map(|why| why.to_string()),
             stop_waits_ms: drive.stop_waits(clock.now).map(millis),
             hold: drive.hold_view(None, clock.now).map(|(view, _)| view.into()),
+            stops: None,
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
             starts: tells_running.then_some(totals.starts),
@@ -132,6 +137,12 @@ impl<'d> Drive<'d> {
                 shown: None,
             },
         }
+    }
+
+    /// With what drills have proven.
+    pub(super) fn proven(mut self, stops: Option<Vec<StopProof>>) -> Drive<'d> {
+        self.stops = stops;
+        self
     }
 
     /// Only these of its points.

@@ -431,7 +431,8 @@ impl HttpConnections {
                 .set(self.operating.authority_at(peer.ip(), Instant::now()));
             request.extensions_mut().insert(client);
             request.extensions_mut().insert(reached.clone());
-            let command = (request.method() == hyper::Method::POST).then(|| commands.token());
+            let command =
+                matches!(*request.method(), hyper::Method::POST | hyper::Method::DELETE).then(|| commands.token());
             let reply = router.call(request);
             async move {
                 // Other clients have a turn between two pipelined requests.

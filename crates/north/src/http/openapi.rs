@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 use axum::Router;
 use axum::handler::Handler;
 use axum::http::header::CONTENT_TYPE;
-use axum::routing::{MethodRouter, get, post};
+use axum::routing::{MethodRouter, delete, get, post};
 use utoipa::ToSchema;
 use utoipa::openapi::path::{HttpMethod, OperationBuilder, ParameterBuilder, ParameterIn};
 use utoipa::openapi::request_body::RequestBodyBuilder;
@@ -131,6 +131,10 @@ impl Api {
 
     pub(super) fn post<H: Handler<T, Arc<AppState>>, T: 'static>(self, path: &str, doc: Doc, handler: H) -> Api {
         self.add(path, HttpMethod::Post, doc, post(handler))
+    }
+
+    pub(super) fn delete<H: Handler<T, Arc<AppState>>, T: 'static>(self, path: &str, doc: Doc, handler: H) -> Api {
+        self.add(path, HttpMethod::Delete, doc, delete(handler))
     }
 
     fn add(mut self, path: &str, method: HttpMethod, doc: Doc, route: MethodRouter<Arc<AppState>>) -> Api {

@@ -30,6 +30,7 @@ use crate::NorthStats;
 use crate::command::{Proof, SourceKind};
 use crate::command_json::{CommandResult, HoldReply, StopBody};
 use crate::connection_limit::{ConnectionLimit, Limits, Place};
+use crate::drill::DrillReport;
 use crate::history::Entry;
 use crate::local::control::Control;
 use crate::log_throttle::LogThrottle;
@@ -338,6 +339,31 @@ fn described() -> Api {
             "/api/v1/stop",
             Doc::object::<StopReport>("Stops all drives; 504 if one is not proven to stand").body::<StopBody>(),
             operating::stop,
+        )
+        .get(
+            "/api/v1/drills",
+            Doc::list::<DrillReport>("Drills, the newest first"),
+            operating::drills,
+        )
+        .post(
+            "/api/v1/drills",
+            Doc::object::<DrillReport>("Arms a drill; 201").body::<operating::DrillWish>(),
+            operating::arm_drill,
+        )
+        .get(
+            "/api/v1/drills/{id}",
+            Doc::object::<DrillReport>("A drill"),
+            operating::drill,
+        )
+        .delete(
+            "/api/v1/drills/{id}",
+            Doc::object::<DrillReport>("Ends a drill, which stops the motor"),
+            operating::end_drill,
+        )
+        .post(
+            "/api/v1/drills/{id}/start",
+            Doc::object::<DrillReport>("Starts an armed drill, by who armed it, within 60 s"),
+            operating::start_drill,
         )
 }
 

@@ -91,10 +91,22 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
         "drivegate_orders_unheld_total",
         "Orders of clients that did not hold the drive, which advisory mode carried out.",
     );
+    let drill_age = all.gauge(
+        "drivegate_drill_age_seconds",
+        "Time since the last drill of that way was tried to its end; no series where none was.",
+    );
+    let drill_passed = all.gauge("drivegate_drill_passed", "1 if the motor stood in time in that drill.");
+    let drills = plant.drills.options().is_some();
     for drive in plant.drives() {
         let image = &drive.image;
         let labels = labels_of(image);
         let reading = drive.reading(now);
+        let proofs = drills.then(|| plant.drills.proofs(&drive.machine()));
+        for proof in proofs.into_iter().flatten() {
+            let labels = labels.with("kind", proof.kind.name());
+            all.add(drill_age, labels.clone(), proof.age(SystemTime::now()).as_secs_f64());
+            all.add(drill_passed, labels, proof.passed);
+        }
         all.add(supervision, labels.clone(), image.supervisions());
         let failures = image.supervision_failures();
         all.add(failed, labels.clone(), failures);

@@ -69,6 +69,13 @@ impl Asked {
         }
     }
 
+    pub(crate) fn delete(path: impl Into<String>) -> Asked {
+        Asked {
+            method: Method::DELETE,
+            ..Asked::get(path)
+        }
+    }
+
     /// What to do where the reply is lost.
     pub(crate) fn if_lost(self, lost: &'static str) -> Asked {
         Asked { lost, ..self }

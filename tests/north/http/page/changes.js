@@ -99,9 +99,10 @@ async function agesAreTheException(gateway, page) {
 
 async function driveHasALinkOfItsOwn(gateway, page) {
   const odd = "pump 1/ä";
+  const stops = [{ kind: "order", passed: true, age_s: 90, due: false }, { kind: "client", passed: false, age_s: 7260, due: true }, { kind: "gateway", passed: null, age_s: null, due: true }];
   const cause = { cause: "interlocked", evidence: "interlocked is on", age_ms: 140, remedy: "close it" };
   const before = { hand_auto: point(false, { text: "hand" }), old_point: point(7), output_frequency: point(25, { unit: "Hz", age_ms: 40 }) };
-  gateway.drives = [drive(odd, { points: before, why: [cause], blocked_by: ["interlocked"] }), drive("pump-2")];
+  gateway.drives = [drive(odd, { points: before, why: [cause], blocked_by: ["interlocked"], stops }), drive("pump-2")];
   gateway.trends = { motor_current: { unit: "A", samples: [[1, 2, 1.5], [1, 3, 2], null, null, null, [4, 4, 4]] } };
   gateway.events = [{ id: 2, boot: 1, time: "2026-03-02T07:40:12.118Z", event: "fault", bus: "line1", drive: odd, text: NASTY, recording: { id: "x" } }];
   await page.open(`${gateway.url}#/`);
@@ -114,7 +115,8 @@ async function driveHasALinkOfItsOwn(gateway, page) {
   // The plot is drawn empty before its samples come.
   await page.until(() => document.querySelector('.points div') && document.querySelector(".curve")?.getAttribute("d"));
   const text = await page.eval("document.querySelector('.view').textContent");
-  for (const wanted of [/hand autohand(?!\d)/, /old point7/, /Interlocked|interlocked/, /interlocked is on \(140 ms ago\)close it/, /2 h 1 min/, /Starts3/, /not known/]) assert.match(text, wanted);
+  for (const wanted of [/hand autohand(?!\d)/, /old point7/, /Interlocked|interlocked/, /interlocked is on \(140 ms ago\)close it/, /2 h 1 min/, /Starts3/, /not known/,
+    /an order: stood in time, 1 min ago · a silent client: did not stand in time, 2 h 1 min ago, due · a silent gateway: never tried/]) assert.match(text, wanted);
   assert.deepEqual(await page.eval(() => [...document.querySelectorAll(".curve")].map((path) => path.getAttribute("d").split("M").length - 1)), [2], "a gap is a gap");
   assert.ok(await page.eval(() => document.querySelector('[data-operate]').dataset.operate === "pump 1/ä"));
 

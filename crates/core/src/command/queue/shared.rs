@@ -21,6 +21,8 @@ pub struct CommandQueue {
     background: Mutex<Background>,
     /// Whether `[authority]` is on.
     guarded: AtomicBool,
+    /// Whether a drive is to be sent nothing for a time.
+    has_quiet: AtomicBool,
     wake: OwnedFd,
     guards: Option<Arc<BusGuards>>,
 }
@@ -36,6 +38,7 @@ impl CommandQueue {
             pending: Mutex::default(),
             background: Mutex::default(),
             guarded: AtomicBool::new(false),
+            has_quiet: AtomicBool::new(false),
             wake,
             guards: None,
         })
@@ -158,5 +161,26 @@ impl CommandQueue {
     /// Whether `[authority]` is on: without it, nobody need ask.
     pub fn is_guarded(&self) -> bool {
         self.guarded.load(Ordering::Acquire)
+    }
+
+    /// Nothing but stops is sent to that drive until then, so that its own supervision of the fieldbus acts; none: all again.
+    pub fn keep_quiet(&self, drive: usize, until: Option<Instant>) {
+        let mut pending = self.lock();
+        pending.quiet = until.map(|until| (drive, until));
+        self.has_quiet.store(until.is_some(), Ordering::Release);
+        drop(pending);
+        self.wake();
+    }
+
+    /// The drive to which nothing but stops is sent, and until when.
+    pub fn quiet(&self, now: Instant) -> Option<(usize, Instant)> {
+        if !self.has_quiet.load(Ordering::Acquire) {
+            return None;
+        }
+        let mut pending = self.lock();
+        pending.quiet = pending.quiet.filter(|(_, until)| now < *until);
+        // Under the lock, so that one that begins now is not lost.
+        self.has_quiet.store(pending.quiet.is_some(), Ordering::Release);
+        pending.quiet
     }
 }

@@ -6,7 +6,7 @@ use std::time::Instant;
 use tokio::sync::oneshot;
 
 use super::Pending;
-use crate::command::{Command, Order, Outcome, SourceKind, Urgency};
+use crate::command::{Command, Order, Origin, Outcome, SourceKind, Urgency};
 
 /// The wish of the gateway, which is about to end, that a bus stops its drives.
 #[derive(Debug)]
@@ -76,7 +76,8 @@ impl Pending {
             .then(|| guards.stop_waits(drive, now))?
     }
 
-    pub(super) fn note_stop(&mut self, drive: usize, now: Instant) {
+    pub(super) fn note_stop(&mut self, drive: usize, by: Origin, now: Instant) {
+        self.stopped_by.insert(drive, by);
         *self.stops.entry(drive).or_default() += 1;
         let at = self.stopped_at.entry(drive).or_insert(now);
         *at = now.max(*at);
@@ -140,6 +141,11 @@ impl Pending {
     /// Stops of that drive that were taken in so far, also by the bus before a reload.
     pub fn stops(&self, drive: usize) -> u64 {
         self.stops.get(&drive).copied().unwrap_or_default()
+    }
+
+    /// Who gave the last stop of that drive that was taken in.
+    pub fn last_stop_by(&self, drive: usize) -> Option<&Origin> {
+        self.stopped_by.get(&drive)
     }
 
     /// The stops that the gateway wants before it ends, once.

@@ -25,6 +25,7 @@ fn with_tables(page: &str) -> String {
         ("[http]", "Http"),
         ("[bacnet]", "Bacnet"),
         ("[authority]", "AuthorityTable"),
+        ("[drill]", "DrillTable"),
         ("[[authority.principal]]", "PrincipalTable"),
         ("[audit]", "AuditTable"),
         ("[recordings]", "Recordings"),

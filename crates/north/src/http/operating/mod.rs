@@ -7,6 +7,7 @@
 mod asker;
 mod commands;
 mod cookies;
+mod drills;
 mod hold;
 mod login;
 pub(super) mod parameters;
@@ -46,6 +47,7 @@ use self::asker::Commander;
 pub(super) use self::asker::Viewer;
 pub(crate) use self::commands::PostedCommands;
 pub(super) use self::commands::{Commandable, command, commands_of, heartbeat};
+pub(super) use self::drills::{DrillWish, arm_drill, drill, drills, end_drill, start_drill};
 pub(super) use self::hold::{HoldAct, hold, hold_of};
 pub(super) use self::login::{SessionReply, log_in, log_out, session};
 pub(super) use self::record::record;
@@ -463,6 +465,7 @@ pub(super) fn is_operating(path: &str) -> bool {
     };
     is_session(path)
         || path == "/api/v1/stop"
+        || is_drill(path)
         || path.starts_with("/assets/operate.")
         || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive)
 }
@@ -479,12 +482,18 @@ pub(super) fn may_change(method: &Method, path: &str) -> bool {
             .is_some_and(|(_, what)| matches!(what, "recordings" | "params/reading" | "params/restore"))
     };
     let changes = is_operating(path) || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive);
-    *method == Method::POST && changes
+    let ends_a_drill = *method == Method::DELETE && is_drill(path);
+    ends_a_drill || (*method == Method::POST && changes)
+}
+
+/// Whether it is about drills.
+fn is_drill(path: &str) -> bool {
+    path == "/api/v1/drills" || path.starts_with("/api/v1/drills/")
 }
 
 /// Whether it is a command: that is served in whatever way the client got in.
 pub(super) fn is_command(method: &Method, path: &str) -> bool {
-    may_change(method, path) && (path.ends_with("/commands") || path == "/api/v1/stop")
+    may_change(method, path) && (path.ends_with("/commands") || path == "/api/v1/stop" || *method == Method::DELETE)
 }
 
 #[cfg(test)]

@@ -160,6 +160,18 @@ function showCounters(facts, drive) {
   facts.set("energy", isKnown(energy) ? `${figure(energy, "kWh")} kWh` : t("not known"));
 }
 
+/// What drills have proven of its stops.
+function showStops(element, stops) {
+  hide(element, !stops?.length);
+  const ways = { order: t("an order"), client: t("a silent client"), gateway: t("a silent gateway") };
+  const said = ({ kind, passed, age_s: seconds, due }) => {
+    if (passed === null) return `${ways[kind]}: ${t("never tried")}`;
+    const result = passed ? t("stood in time") : t("did not stand in time");
+    return `${ways[kind]}: ${result}, ${t("{age} ago", { age: hours(seconds) })}${due ? `, ${t("due")}` : ""}`;
+  };
+  text(element, `${t("Stops proven by drills")}: ${(stops ?? []).map(said).join(" · ")}`);
+}
+
 function showLine(facts, drive) {
   const { ok, exception, timeout, corrupt } = drive.transactions;
   const total = ok + exception + timeout + corrupt;
@@ -210,10 +222,10 @@ export function open(root, { name }) {
     line: factList({ online: t("Online"), exchanges: t("Exchanges"), invalid: t("Without a valid reply"), failures: t("Failures"), turnaround: t("Turnaround") }),
     commands: log("commands", t("Commands"), t("No command to this drive is known."), [t("Time"), t("Command"), t("By"), t("Client"), t("Result"), t("Took")], commandRow),
     recordings: log("recordings", t("Recordings"), t("There is no recording of this drive."), [t("Time"), t("Trigger"), t("Summary"), t("Size")], recordingRow),
-    events: eventList(false), strip: make("div", "strip-bars"),
+    events: eventList(false), strip: make("div", "strip-bars"), stops: make("p", "note"),
   };
   parts.operate.dataset.operate = name;
-  const counters = section("counters", t("Counted by the gateway"), parts.counters.element);
+  const counters = section("counters", t("Counted by the gateway"), parts.counters.element, parts.stops);
   const line = section("line", t("Line"), parts.line.element, make("p", "note", t("Errors by minute, the last hour")), parts.strip, minuteAxis());
   const events = section("drive-events", t("Events"), parts.events.element, make("p", "note", anchor(`#/events?drive=${encodeURIComponent(name)}`, "", t("All events of this drive"))));
   root.append(parts.top.element, parts.why.element, parts.operate, parts.figures.element, parts.trends.element,
@@ -245,6 +257,7 @@ export function open(root, { name }) {
       parts.why.show(drive.why);
       parts.points.show(drive.points);
       showCounters(parts.counters, drive);
+      showStops(parts.stops, drive.stops);
       showLine(parts.line, drive);
       window.Operate?.update(drive);
       if (performance.now() >= slow) await refreshSlow(load, drive);

@@ -12,7 +12,7 @@ export const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", wa
 const KINDS = [
   "fault", "fault_end", "warning", "warning_end", "online", "offline", "started", "stopped", "control_place", "supervision", "supervision_failed", "unsupervised",
   "refused_command", "guarded", "interlock", "not_confirmed", "restarted", "unlike_profile", "selection_differs", "foreign_command", "parameters_changed", "restore_unfinished", "recording",
-  "held", "released", "hold_broken", "bus_up",
+  "held", "released", "hold_broken", "drill", "bus_up",
   "bus_down", "diagnosis", "reload_refused",
 ];
 const PAGE = 100;

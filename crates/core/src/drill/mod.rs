@@ -1,0 +1,397 @@
+//! Drills: a motor is started at a low speed and stopped in each way by which it is to stop, and how long that took is kept.
+//!
+//! [`Drills::arm`] says what is to be tried, [`Drills::start`] begins it within [`ARMED`] and by the same client, and a task of the
+//! gateway calls [`Drills::look`] while one is under way. One at a time. However a drill ends, it ends with a stop. Pure: time is an
+//! argument.
+
+mod report;
+mod run;
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use tokio::sync::Notify;
+
+pub use self::report::{DrillReport, DrillState, DrillStep, Kind, Proof, SavedDrills, StopProof};
+use self::run::Run;
+use crate::command::Origin;
+use crate::drive::ModelPoint;
+use crate::plant::{DriveHandle, Plant};
+use crate::process_image::{Access, DriveSpec, Machine};
+
+/// Time within which a drill is started after it was armed.
+pub const ARMED: Duration = Duration::from_secs(60);
+/// Time between two looks at a drill that is under way.
+pub const LOOK: Duration = Duration::from_millis(20);
+/// Drills that are kept.
+const MOST_REPORTS: usize = 200;
+/// Machines and ways whose last proof is kept.
+const MOST_PROOFS: usize = 16_384;
+
+/// `[drill]` of the configuration.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DrillOptions {
+    /// Highest speed at which a motor is stopped, % of its range.
+    pub max_speed: f64,
+    /// Time from the cause in which the motor has to stand.
+    pub limit: Duration,
+    /// Age from which a proof is too old.
+    pub every: Duration,
+}
+
+/// Why a drill is not armed, started or ended.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DrillRefusal {
+    /// There is none of that name.
+    #[error("there is no drill `{0}`")]
+    Unknown(String),
+    /// It cannot be done.
+    #[error("{0}; nothing was started")]
+    NotPossible(String),
+    /// Not now, or not by this client.
+    #[error("{0}; nothing was started")]
+    NotNow(String),
+}
+
+/// The ways that can be tried on a drive: a silent client stops it where it has supervision.
+pub fn ways(spec: &DriveSpec) -> Vec<Kind> {
+    let starts = [ModelPoint::Run, ModelPoint::SpeedReference];
+    let can = spec.access == Access::Control && starts.iter().all(|point| spec.profile.model_index(*point).is_some());
+    let has = |kind: &&Kind| can && (**kind != Kind::Client || spec.supervision.is_some());
+    Kind::ALL.iter().filter(has).copied().collect()
+}
+
+fn not_possible(why: impl Into<String>) -> DrillRefusal {
+    DrillRefusal::NotPossible(why.into())
+}
+
+fn not_now(why: impl Into<String>) -> DrillRefusal {
+    DrillRefusal::NotNow(why.into())
+}
+
+/// The drills of the gateway.
+#[derive(Debug, Default)]
+pub struct Drills {
+    state: Mutex<State>,
+    begun: Notify,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    options: Option<DrillOptions>,
+    run: Option<Run>,
+    ended: VecDeque<DrillReport>,
+    proofs: Vec<Proof>,
+    /// Counts what is to be kept.
+    generation: u64,
+    kept: u64,
+}
+
+impl Drills {
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// From now on these options hold; none: no drill is armed.
+    pub fn set_options(&self, options: Option<DrillOptions>) {
+        self.state().options = options;
+    }
+
+    /// The options, where drills are possible.
+    pub fn options(&self) -> Option<DrillOptions> {
+        self.state().options
+    }
+
+    /// Arms a drill of these ways, at `speed` % or at `max_speed`.
+    ///
+    /// # Errors
+    /// Why it cannot be done; nothing was started.
+    pub fn arm(
+        &self,
+        drive: &DriveHandle,
+        (kinds, speed): (&[Kind], Option<f64>),
+        who: &Origin,
+        now: Instant,
+        time: SystemTime,
+    ) -> Result<DrillReport, DrillRefusal> {
+        let mut state = self.state();
+        let options = state
+            .options
+            .ok_or_else(|| not_possible("drills are off: the configuration has no [drill]"))?;
+        state.drop_armed(now, time);
+        if let Some(run) = &state.run {
+            let report = run.report();
+            return Err(not_now(format!(
+                "drill `{}` of drive `{}` is {}; one drill at a time",
+                report.id,
+                report.drive,
+                report.state.name()
+            )));
+        }
+        let speed = speed.unwrap_or(options.max_speed);
+        possible(drive, kinds, speed, options)?;
+        may(drive, who, now)?;
+        let run = Run::armed(drive, (kinds, speed), options, who, (now, time));
+        let report = run.report().clone();
+        state.run = Some(run);
+        Ok(report)
+    }
+
+    /// Starts an armed drill, by who armed it.
+    ///
+    /// # Errors
+    /// It is not armed, or not by this client; nothing was started.
+    pub fn start(
+        &self,
+        plant: &Plant,
+        id: &str,
+        who: &Origin,
+        now: Instant,
+        time: SystemTime,
+    ) -> Result<DrillReport, DrillRefusal> {
+        let mut state = self.state();
+        state.drop_armed(now, time);
+        let known = state.report(id).map(|report| report.state);
+        let run = state.run.as_mut().filter(|run| run.report().id == id);
+        let Some(run) = run else {
+            return Err(match known {
+                Some(state) => not_now(format!("drill `{id}` is {}", state.name())),
+                None => DrillRefusal::Unknown(id.to_string()),
+            });
+        };
+        if run.report().state != DrillState::Armed {
+            return Err(not_now(format!("drill `{id}` is {}", run.report().state.name())));
+        }
+        if !run.is_of(who) {
+            return Err(not_now(format!("drill `{id}` was armed by {}", run.report().who)));
+        }
+        may(run.drive(), who, now)?;
+        run.start(plant, now, time);
+        let report = run.report().clone();
+        drop(state);
+        self.begun.notify_one();
+        Ok(report)
+    }
+
+    /// Ends a drill, which stops the motor. One that is over stays as it is.
+    ///
+    /// # Errors
+    /// There is none of that name.
+    pub fn abort(&self, id: &str, who: &Origin, now: Instant, time: SystemTime) -> Result<DrillReport, DrillRefusal> {
+        let mut state = self.state();
+        if let Some(run) = state.run.as_mut().filter(|run| run.report().id == id) {
+            run.abort(&format!("{} ended it", run::named(who)), now, time);
+            let report = run.report().clone();
+            if report.state.is_over() {
+                state.end();
+            }
+            return Ok(report);
+        }
+        state.report(id).ok_or_else(|| DrillRefusal::Unknown(id.to_string()))
+    }
+
+    /// Waits until a drill is under way.
+    pub async fn begun(&self) {
+        self.begun.notified().await;
+    }
+
+    /// Looks at the drill that is under way, and drops one that was armed and not started. Whether one is under way.
+    pub fn look(&self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
+        let mut state = self.state();
+        state.drop_armed(now, time);
+        let Some(run) = &mut state.run else { return false };
+        if run.report().state == DrillState::Armed {
+            return false;
+        }
+        if run.look(plant, now, time) {
+            return true;
+        }
+        state.end();
+        false
+    }
+
+    /// All that are known, the newest first.
+    pub fn reports(&self) -> Vec<DrillReport> {
+        let state = self.state();
+        let current = state.run.iter().map(|run| run.report().clone());
+        current.chain(state.ended.iter().rev().cloned()).collect()
+    }
+
+    /// One of them.
+    pub fn report(&self, id: &str) -> Option<DrillReport> {
+        self.state().report(id)
+    }
+
+    /// The last proof of each way on that machine.
+    pub fn proofs(&self, machine: &Machine) -> Vec<Proof> {
+        let state = self.state();
+        state
+            .proofs
+            .iter()
+            .filter(|proof| proof.is_of(machine))
+            .cloned()
+            .collect()
+    }
+
+    /// What drills have proven of each way that can be tried on that drive at `time`; none where drills are off.
+    pub fn stops(&self, drive: &DriveHandle, time: SystemTime) -> Option<Vec<StopProof>> {
+        let state = self.state();
+        let every = state.options?.every;
+        let machine = drive.machine();
+        let of = |kind| {
+            let proof = state
+                .proofs
+                .iter()
+                .find(|proof| proof.kind == kind && proof.is_of(&machine));
+            let age = proof.map(|proof| proof.age(time));
+            let is_good = proof.is_some_and(|proof| proof.passed) && age.is_some_and(|age| age <= every);
+            StopProof {
+                kind,
+                passed: proof.map(|proof| proof.passed),
+                age_s: age.map(|age| age.as_secs()),
+                due: !is_good,
+            }
+        };
+        Some(ways(&drive.image.spec).into_iter().map(of).collect())
+    }
+
+    /// Takes in what was kept before the start of the process.
+    pub fn restore(&self, saved: SavedDrills) {
+        let mut state = self.state();
+        state.ended = saved
+            .reports
+            .into_iter()
+            .filter(|report| report.state.is_over())
+            .collect();
+        state.proofs = saved.proofs;
+        state.bound();
+    }
+
+    /// What is to be kept, if that changed since the last call.
+    pub fn to_keep(&self) -> Option<SavedDrills> {
+        let mut state = self.state();
+        if state.kept == state.generation {
+            return None;
+        }
+        state.kept = state.generation;
+        Some(SavedDrills::new(
+            state.ended.iter().cloned().collect(),
+            state.proofs.clone(),
+        ))
+    }
+}
+
+impl State {
+    fn report(&self, id: &str) -> Option<DrillReport> {
+        let current = self.run.iter().map(Run::report);
+        current.chain(&self.ended).find(|report| report.id == id).cloned()
+    }
+
+    /// An armed drill that nobody started is over.
+    fn drop_armed(&mut self, now: Instant, time: SystemTime) {
+        if let Some(run) = &mut self.run
+            && run.expires(now, time)
+        {
+            self.end();
+        }
+    }
+
+    fn end(&mut self) {
+        let Some(run) = self.run.take() else { return };
+        let (report, proofs) = run.over();
+        for proof in proofs {
+            let machine = report.machine();
+            self.proofs.retain(|old| old.kind != proof.kind || !old.is_of(&machine));
+            self.proofs.push(proof);
+        }
+        self.ended.push_back(report);
+        self.bound();
+        self.generation += 1;
+    }
+
+    fn bound(&mut self) {
+        let beyond = self.ended.len().saturating_sub(MOST_REPORTS);
+        self.ended.drain(..beyond);
+        let beyond = self.proofs.len().saturating_sub(MOST_PROOFS);
+        self.proofs.drain(..beyond);
+    }
+}
+
+/// Whether these ways can be tried on that drive.
+fn possible(drive: &DriveHandle, kinds: &[Kind], speed: f64, options: DrillOptions) -> Result<(), DrillRefusal> {
+    let spec = &drive.image.spec;
+    if kinds.is_empty() {
+        return Err(not_possible("no way is named: order, client, gateway"));
+    }
+    if !(speed > 0.0 && speed <= options.max_speed) {
+        let most = options.max_speed;
+        return Err(not_possible(format!(
+            "speed is {speed} %, allowed are more than 0 to {most} % (max_speed of [drill])"
+        )));
+    }
+    if spec.access != Access::Control {
+        return Err(not_possible(format!(
+            "drive `{}` has no access = \"control\"",
+            spec.name
+        )));
+    }
+    for point in [ModelPoint::Run, ModelPoint::SpeedReference] {
+        if spec.profile.model_index(point).is_none() {
+            let (profile, point) = (&spec.profile.name, point.name());
+            return Err(not_possible(format!("profile `{profile}` has no `{point}`")));
+        }
+    }
+    if kinds.contains(&Kind::Client) {
+        let Some(supervision) = &spec.supervision else {
+            return Err(not_possible(format!(
+                "drive `{}` has no supervision, so a client that falls silent stops nothing",
+                spec.name
+            )));
+        };
+        if supervision.timeout >= options.limit {
+            return Err(not_possible(format!(
+                "its supervision acts after {} s, and limit of [drill] is {} s; raise limit",
+                supervision.timeout.as_secs_f64(),
+                options.limit.as_secs_f64()
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// Whether that client may begin now.
+fn may(drive: &DriveHandle, who: &Origin, now: Instant) -> Result<(), DrillRefusal> {
+    if let Some((view, own)) = drive.hold_view(Some(who), now)
+        && !own
+    {
+        return Err(not_now(match view.holder {
+            Some(holder) => format!("{holder} holds the drive; a drill is its holder's"),
+            None => "nobody holds the drive; take it first".to_string(),
+        }));
+    }
+    let reading = drive.reading(now);
+    if !reading.snapshot.link.is_online() {
+        return Err(not_now("the drive is offline"));
+    }
+    if reading.is_set(ModelPoint::Fault) {
+        return Err(not_now("the drive has a fault"));
+    }
+    if reading
+        .model(ModelPoint::Remote)
+        .good()
+        .is_some_and(|remote| !remote.as_bool())
+    {
+        return Err(not_now("the drive is switched to its local control place"));
+    }
+    if reading.is_set(ModelPoint::Running) || reading.is_set(ModelPoint::Run) {
+        return Err(not_now("the motor runs; stop it first"));
+    }
+    if let Some(why) = drive.image.hold.why() {
+        return Err(not_now(why.to_string()));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

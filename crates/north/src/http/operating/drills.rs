@@ -1,0 +1,101 @@
+//! `/api/v1/drills`: arming, starting and ending a drill, and what drills have proven.
+
+use std::sync::Arc;
+use std::time::{Instant, SystemTime};
+
+use axum::Json;
+use axum::extract::{Path, State};
+use axum::http::StatusCode;
+use axum::response::IntoResponse;
+use serde::Deserialize;
+
+use super::super::body::Payload;
+use super::super::replies::{Refused, Replied, not_found, refused};
+use super::super::routes::AppState;
+use super::Commander;
+use crate::drill::{DrillRefusal, DrillReport, Kind};
+
+/// What is to be tried.
+#[derive(Debug, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct DrillWish {
+    /// The drive.
+    drive: String,
+    /// The ways; all where absent or empty.
+    #[serde(default)]
+    kinds: Vec<Kind>,
+    /// Speed at which the motor is stopped, %; `max_speed` of `[drill]` where absent.
+    #[serde(default)]
+    speed: Option<f64>,
+}
+
+/// All that are known, the newest first.
+pub(in crate::http) async fn drills(State(app): State<Arc<AppState>>) -> Json<Vec<DrillReport>> {
+    Json(app.plant.load().drills.reports())
+}
+
+/// One of them.
+pub(in crate::http) async fn drill(
+    State(app): State<Arc<AppState>>,
+    Path(id): Path<String>,
+) -> Replied<Json<DrillReport>> {
+    let report = app.plant.load().drills.report(&id);
+    report.map(Json).ok_or_else(|| why_not(&DrillRefusal::Unknown(id)))
+}
+
+/// Arms one; 201.
+pub(in crate::http) async fn arm_drill(
+    State(app): State<Arc<AppState>>,
+    Commander(operator): Commander,
+    Payload(payload): Payload,
+) -> Replied {
+    let wish: DrillWish = serde_json::from_slice(&payload).map_err(|error| {
+        let form = "{\"drive\": …, \"kinds\": [\"order\", \"client\", \"gateway\"], \"speed\": …}";
+        refused(StatusCode::UNPROCESSABLE_ENTITY, format!("the body is {form}: {error}"))
+    })?;
+    let drive = app.drive(&wish.drive)?;
+    let kinds = if wish.kinds.is_empty() {
+        &Kind::ALL[..]
+    } else {
+        &wish.kinds
+    };
+    let plant = app.plant.load();
+    let (now, time) = (Instant::now(), SystemTime::now());
+    let armed = plant
+        .drills
+        .arm(&drive, (kinds, wish.speed), &operator.origin(), now, time);
+    let report = armed.map_err(|refusal| why_not(&refusal))?;
+    Ok((StatusCode::CREATED, Json(report)).into_response())
+}
+
+/// Starts an armed one.
+pub(in crate::http) async fn start_drill(
+    State(app): State<Arc<AppState>>,
+    Path(id): Path<String>,
+    Commander(operator): Commander,
+) -> Replied<Json<DrillReport>> {
+    let plant = app.plant.load();
+    let (now, time) = (Instant::now(), SystemTime::now());
+    let started = plant.drills.start(&plant, &id, &operator.origin(), now, time);
+    started.map(Json).map_err(|refusal| why_not(&refusal))
+}
+
+/// Ends one, which stops the motor.
+pub(in crate::http) async fn end_drill(
+    State(app): State<Arc<AppState>>,
+    Path(id): Path<String>,
+    Commander(operator): Commander,
+) -> Replied<Json<DrillReport>> {
+    let drills = app.plant.load().drills.clone();
+    let ended = drills.abort(&id, &operator.origin(), Instant::now(), SystemTime::now());
+    ended.map(Json).map_err(|refusal| why_not(&refusal))
+}
+
+fn why_not(refusal: &DrillRefusal) -> Refused {
+    let text = refusal.to_string();
+    match refusal {
+        DrillRefusal::Unknown(_) => not_found(text, Vec::new()),
+        DrillRefusal::NotPossible(_) => refused(StatusCode::UNPROCESSABLE_ENTITY, text),
+        DrillRefusal::NotNow(_) => refused(StatusCode::CONFLICT, text),
+    }
+}

@@ -1,0 +1,229 @@
+//! `drivegate drill`: proves that a motor stops, and shows what was proven.
+
+mod page;
+
+use std::io::Write as _;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use serde_json::json;
+
+use super::client::{Asked, Client, Gateway, encoded};
+use super::{printable, report};
+use crate::drill::{DrillReport, DrillState, Kind};
+
+/// How often a drill that is under way is looked at.
+const LOOK: Duration = Duration::from_millis(500);
+
+/// Proves that a motor stops: by an order, when its client falls silent, when the gateway falls silent.
+///
+/// The motor is started at a low speed and stopped in each way, and the time until it stands is measured. The drive's name has to
+/// be typed before it starts; Ctrl-C ends the drill and stops the motor. Have a hand on the switch, and nobody at the machine.
+#[derive(Debug, clap::Args)]
+#[command(
+    args_conflicts_with_subcommands = true,
+    after_help = "Examples:
+  drivegate drill --config drivegate.toml pump-1 --order --client --speed 10
+  drivegate drill list --config drivegate.toml
+  drivegate drill report --config drivegate.toml 20261128T074744.695Z-pump-1 > report.html"
+)]
+pub(super) struct Args {
+    #[command(subcommand)]
+    shown: Option<Shown>,
+    #[command(flatten)]
+    wish: Wish,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Shown {
+    /// Lists the drills that are known, the newest first.
+    #[command(after_help = "Example:\n  drivegate drill list --config drivegate.toml")]
+    List {
+        #[command(flatten)]
+        gateway: Gateway,
+    },
+    /// Prints a drill as a page of HTML.
+    #[command(
+        after_help = "Example:\n  drivegate drill report --config drivegate.toml 20261128T074744.695Z-pump-1 > report.html"
+    )]
+    Report {
+        #[command(flatten)]
+        gateway: Gateway,
+        /// Its id, as `list` prints it.
+        id: String,
+    },
+}
+
+#[derive(Debug, clap::Args)]
+struct Wish {
+    #[command(flatten)]
+    gateway: Gateway,
+    /// Name of the drive.
+    drive: Option<String>,
+    /// By an order to stop.
+    #[arg(long)]
+    order: bool,
+    /// When its client falls silent.
+    #[arg(long)]
+    client: bool,
+    /// When the gateway falls silent: nothing is sent to the drive for `limit`.
+    #[arg(long = "gateway")]
+    silence: bool,
+    /// Speed at which the motor is stopped, %; without it `max_speed` of [drill].
+    #[arg(long, value_name = "PERCENT")]
+    speed: Option<f64>,
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    super::block_on(async {
+        match (&args.shown, &args.wish.drive) {
+            (Some(Shown::List { gateway }), _) => report::outcome(list(gateway).await),
+            (Some(Shown::Report { gateway, id }), _) => report::outcome(printed(gateway, id).await),
+            (None, Some(name)) => match drill(name, &args.wish).await {
+                Ok(DrillReport {
+                    state: DrillState::Passed,
+                    ..
+                }) => ExitCode::SUCCESS,
+                Ok(ended) => report::failed(&format!("{}: {}", said(ended.state), ended.text)),
+                Err(why) => report::failed(&why),
+            },
+            (None, None) => report::misused("name the drive, or use `list` or `report ID`"),
+        }
+    })
+}
+
+async fn list(gateway: &Gateway) -> Result<String, String> {
+    let drills: Vec<DrillReport> = asked(&gateway.client()?, &Asked::view("/api/v1/drills")).await?;
+    let mut table = report::table(["id", "drive", "result", "order", "client", "gateway", "by"]);
+    for drill in &drills {
+        let of = |kind: Kind| {
+            let step = drill.steps.iter().find(|step| step.kind == kind);
+            step.map_or_else(String::new, |step| match step.took_ms {
+                Some(took) => format!("{} {:.1} s", said(step.state), seconds(took)),
+                None => said(step.state),
+            })
+        };
+        table.add_row([
+            drill.id.clone(),
+            drill.drive.clone(),
+            said(drill.state),
+            of(Kind::Order),
+            of(Kind::Client),
+            of(Kind::Gateway),
+            drill.who.clone(),
+        ]);
+    }
+    Ok(printable::lines(&report::lines(&table)))
+}
+
+async fn printed(gateway: &Gateway, id: &str) -> Result<String, String> {
+    let drill = asked(&gateway.client()?, &Asked::view(path(id))).await?;
+    Ok(page::of(&drill))
+}
+
+fn path(id: &str) -> String {
+    format!("/api/v1/drills/{}", encoded(id))
+}
+
+async fn asked<T: serde::de::DeserializeOwned>(client: &Client, asked: &Asked) -> Result<T, String> {
+    let reply = client.ask(asked).await.map_err(|error| error.to_string())?;
+    reply.accepted(asked).map_err(|error| error.to_string())
+}
+
+async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
+    let client = wish.gateway.client()?;
+    let chosen = [
+        (Kind::Order, wish.order),
+        (Kind::Client, wish.client),
+        (Kind::Gateway, wish.silence),
+    ];
+    let kinds: Vec<Kind> = chosen
+        .into_iter()
+        .filter(|(_, wanted)| *wanted)
+        .map(|(kind, _)| kind)
+        .collect();
+    let body = json!({"drive": name, "kinds": kinds, "speed": wish.speed});
+    let armed: DrillReport = asked(&client, &Asked::post("/api/v1/drills", &body)).await?;
+    let ways: Vec<&str> = armed.steps.iter().map(|step| step.kind.name()).collect();
+    let warning = format!(
+        "Drive {} is started at {} % and stopped by: {}. Allowed are {} s each.\nType its name to start the motor: ",
+        armed.drive,
+        armed.speed,
+        ways.join(", "),
+        seconds(armed.limit_ms)
+    );
+    let typed = tokio::select! {
+        typed = line(&warning) => typed?,
+        () = interrupted() => String::new(),
+    };
+    if typed.trim() != armed.drive {
+        // It would end by itself after a minute.
+        let ended = asked::<DrillReport>(&client, &Asked::delete(path(&armed.id))).await;
+        ended.map_err(|why| format!("{why}; nothing was started"))?;
+        return Err("the name was not typed; nothing was started".to_string());
+    }
+    let lost = "whether it started is not known: look at the motor, and end it with Ctrl-C on the machine";
+    let start = Asked::post(format!("{}/start", path(&armed.id)), &json!({})).if_lost(lost);
+    let started: DrillReport = asked(&client, &start).await?;
+    watch(&client, started).await
+}
+
+/// Shows what the drill does until it is over. Ctrl-C ends it.
+async fn watch(client: &Client, started: DrillReport) -> Result<DrillReport, String> {
+    let mut told = String::new();
+    let mut now = started;
+    loop {
+        if now.text != told {
+            told.clone_from(&now.text);
+            report::note(&printable::line(&told));
+        }
+        if now.state.is_over() {
+            let last = now.last_stop.as_deref().unwrap_or_default();
+            report::note(&printable::line(&format!(
+                "last stop: {last}; report: drivegate drill report {}",
+                now.id
+            )));
+            return Ok(now);
+        }
+        let ends = tokio::select! {
+            () = tokio::time::sleep(LOOK) => false,
+            () = interrupted() => true,
+        };
+        let next = match ends {
+            true => Asked::delete(path(&now.id))
+                .if_lost("whether the drill ended is not known: stop the motor by its switch"),
+            false => Asked::view(path(&now.id)),
+        };
+        now = asked(client, &next).await?;
+    }
+}
+
+async fn interrupted() {
+    // Without a handler for it Ctrl-C ends the process.
+    if tokio::signal::ctrl_c().await.is_err() {
+        std::future::pending::<()>().await;
+    }
+}
+
+async fn line(prompt: &str) -> Result<String, String> {
+    let mut stderr = std::io::stderr();
+    // Whoever cannot see it types nothing.
+    let _ = write!(stderr, "{}", printable::lines(prompt)).and_then(|()| stderr.flush());
+    // A thread of its own: it is not waited for when the command ends.
+    let (sender, typed) = tokio::sync::oneshot::channel();
+    std::thread::spawn(move || {
+        let mut line = String::new();
+        // Nobody listens after Ctrl-C.
+        let _ = sender.send(std::io::stdin().read_line(&mut line).map(|_| line));
+    });
+    let read = typed.await.map_err(|error| error.to_string())?;
+    read.map_err(|error| format!("cannot read the name: {error}"))
+}
+
+fn seconds(millis: u64) -> f64 {
+    Duration::from_millis(millis).as_secs_f64()
+}
+
+fn said(state: DrillState) -> String {
+    state.name().replace('_', " ")
+}

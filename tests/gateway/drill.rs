@@ -1,0 +1,226 @@
+//! A drill on the real program: by the command line and by curl, on simulated drives in a process of their own.
+
+use serde_json::{Value as Json, json};
+
+use crate::support::process::{Running, get, until, write_registers};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled};
+use crate::support::tools::{feed, run, tool};
+
+const PASSWORD: &str = "correct horse battery";
+
+fn program() -> &'static std::path::Path {
+    std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"))
+}
+
+struct Plant {
+    site: Site,
+    _others: [Running; 2],
+}
+
+fn plant() -> Plant {
+    let supervised = "supervision = { timeout = \"2s\", action = \"stop\" }";
+    let drives = [controlled("pump-1", 1, supervised), controlled("pump-2", 2, "")].concat();
+    let http = format!("{HTTP}commands = true\nusers_file = \"users\"\n");
+    let drill = "[drill]\nmax_speed = 20.0\nlimit = \"8s\"\n";
+    let site = Site::of(&[LINE1, &drives, MODBUS_TCP, &http, drill]);
+    site.change(
+        "[gateway]\n",
+        &format!(
+            "[gateway]\nstate_dir = \"{}\"\nsocket = \"{}\"\n",
+            site.path("state"),
+            site.path("s")
+        ),
+    );
+    std::fs::create_dir(site.file("state")).unwrap();
+    for user in ["alice", "bob"] {
+        let added = feed(
+            program(),
+            &["user", "add", "--file", &site.path("users"), user],
+            &format!("{PASSWORD}\n"),
+        );
+        assert!(added.status.success(), "{added:?}");
+    }
+    let simulator = site.simulate(&["--addresses", "1-2", "--baud", "38400"]);
+    let gateway = site.run_ready();
+    site.until_state("pump-1", "ready");
+    Plant {
+        site,
+        _others: [simulator, gateway],
+    }
+}
+
+impl Plant {
+    fn curl(&self, user: &str, method: &str, path: &str, body: &Json) -> (u16, Json) {
+        let url = format!("http://127.0.0.1:{}/api/v1/drills{path}", self.site.http);
+        let (user, body) = (format!("{user}:{PASSWORD}"), body.to_string());
+        let mut arguments = vec!["-s", "-u", &user, "-X", method, "-w", "\n%{http_code}", &url];
+        if method == "POST" {
+            arguments.extend(["-d", &body]);
+        }
+        let output = run(&tool("curl"), &arguments);
+        let text = String::from_utf8(output.stdout).unwrap();
+        let (body, status) = text.rsplit_once('\n').unwrap();
+        (status.parse().unwrap(), serde_json::from_str(body).unwrap())
+    }
+
+    fn ended(&self, id: &str) -> Json {
+        until("the drill is over", || {
+            let (_, drill) = self.curl("alice", "GET", &format!("/{id}"), &Json::Null);
+            let state = drill["state"].as_str().unwrap().to_string();
+            (state != "armed" && state != "running").then_some(drill)
+        })
+    }
+
+    fn metrics(&self) -> String {
+        get(self.site.http, "/metrics").unwrap().1
+    }
+}
+
+#[test]
+fn a_drill_proves_stops_and_is_kept() {
+    let plant = plant();
+    let site = &plant.site;
+    let config = site.config();
+    let check = |wanted: &str| {
+        let output = run(program(), &["check", "--config", &config]);
+        let said = String::from_utf8(output.stderr).unwrap();
+        let line = said
+            .lines()
+            .find(|line| line.contains("no drill has proven"))
+            .unwrap_or_default();
+        assert!(line.contains(wanted), "{wanted}: {said}");
+    };
+    check("pump-1 (order, client, gateway), pump-2 (order, gateway)");
+    // The wrong name starts nothing.
+    let wrong = feed(program(), &["drill", "--config", &config, "pump-1"], "pump-2\n");
+    let said = String::from_utf8(wrong.stderr).unwrap();
+    assert!(
+        !wrong.status.success() && said.contains("the name was not typed; nothing was started"),
+        "{said}"
+    );
+    assert_eq!(site.point("pump-1", "running"), false);
+    let ran = feed(
+        program(),
+        &[
+            "drill", "--config", &config, "pump-1", "--order", "--client", "--speed", "10",
+        ],
+        "pump-1\n",
+    );
+    let said = String::from_utf8(ran.stderr.clone()).unwrap();
+    assert!(ran.status.success(), "{said}");
+    assert!(
+        said.contains("the client is silent") && said.contains("the motor stood in time in each way"),
+        "{said}"
+    );
+    check("pump-1 (gateway), pump-2 (order, gateway)");
+    let metrics = plant.metrics();
+    for kind in ["order", "client"] {
+        let passed = metrics
+            .lines()
+            .find(|line| line.starts_with("drivegate_drill_passed") && line.contains(kind));
+        assert!(
+            passed.is_some_and(|line| line.contains("pump-1") && line.ends_with(" 1")),
+            "{metrics}"
+        );
+        assert!(metrics.contains("drivegate_drill_age_seconds{"));
+    }
+    let (_, drills) = plant.curl("alice", "GET", "", &Json::Null);
+    let steps = drills[0]["steps"].as_array().unwrap();
+    assert_eq!((&drills[0]["state"], steps.len()), (&json!("passed"), 2), "{drills}");
+    let took = |step: usize| steps[step]["took_ms"].as_u64().unwrap();
+    assert!(took(0) < 8_000 && (2_000..8_000).contains(&took(1)), "{drills}");
+    let id = drills[0]["id"].as_str().unwrap();
+    let report = run(program(), &["drill", "report", "--config", &config, id]);
+    let page = String::from_utf8(report.stdout).unwrap();
+    assert!(
+        page.starts_with("<!doctype html>") && page.contains("Drill of drive pump-1"),
+        "{page}"
+    );
+    // A restart knows it still; the audit has it.
+    let of_drill = |record: &Json| {
+        record["command"]
+            .as_str()
+            .is_some_and(|command| command.starts_with("drill order, client"))
+    };
+    assert!(
+        site.audit()
+            .iter()
+            .any(|record| of_drill(record) && record["result"] == "passed")
+    );
+    drop(plant._others);
+    check("pump-1 (gateway), pump-2 (order, gateway)");
+}
+
+#[test]
+fn what_ends_a_drill_is_named_and_the_motor_is_stopped() {
+    let plant = plant();
+    let site = &plant.site;
+    let begin = |kinds: Json| {
+        let (status, armed) = plant.curl(
+            "alice",
+            "POST",
+            "",
+            &json!({"drive": "pump-1", "kinds": kinds, "speed": 10}),
+        );
+        assert_eq!((status, &armed["state"]), (201, &json!("armed")), "{armed}");
+        let id = armed["id"].as_str().unwrap().to_string();
+        // It is whose armed it.
+        let (status, refused) = plant.curl("bob", "POST", &format!("/{id}/start"), &json!({}));
+        assert_eq!(status, 409, "{refused}");
+        let (status, started) = plant.curl("alice", "POST", &format!("/{id}/start"), &json!({}));
+        assert_eq!(status, 200, "{started}");
+        site.until_point("pump-1", "running", true);
+        id
+    };
+    let stands = |id: &str, state: &str, text: &str| {
+        let drill = plant.ended(id);
+        assert_eq!(drill["state"], state, "{drill}");
+        assert!(drill["text"].as_str().unwrap().contains(text), "{text}: {drill}");
+        assert_eq!(drill["last_stop"], "acknowledged", "{drill}");
+        site.until_point("pump-1", "running", false);
+        site.until_state("pump-1", "ready");
+    };
+    // A PLC that stops it, and one that orders something else.
+    let id = begin(json!(["gateway"]));
+    write_registers(site.modbus, 1, 0x8100, &[0]);
+    stands(&id, "aborted", "modbus_tcp 127.0.0.1");
+    let id = begin(json!(["gateway"]));
+    let refused = crate::support::process::mbpoll_write(site.modbus, 1, 0x8101, &[1500]);
+    assert!(refused.is_err());
+    stands(&id, "aborted", "gave an order: speed_reference=15");
+    // Who may ends it.
+    let id = begin(json!(["order", "gateway"]));
+    assert_eq!(plant.curl("bob", "DELETE", &format!("/{id}"), &Json::Null).0, 200);
+    stands(&id, "aborted", "http bob 127.0.0.1 ended it");
+    // The simulated drive does nothing when its master is silent, as it comes from the factory: that is the finding.
+    let id = begin(json!(["gateway"]));
+    stands(&id, "failed", "after a silence of 8 s the motor still turns");
+    // A drive that cannot pass is refused before anything starts, and the gateway's end stops the motor.
+    for (body, text) in [
+        (json!({"drive": "pump-2", "kinds": ["client"]}), "has no supervision"),
+        (
+            json!({"drive": "pump-1", "speed": 21}),
+            "allowed are more than 0 to 20 %",
+        ),
+        (json!({"drive": "pump-1", "kinds": ["all"]}), "the body is"),
+    ] {
+        let (status, refused) = plant.curl("alice", "POST", "", &body);
+        assert_eq!(status, 422, "{refused}");
+        assert!(refused["error"].as_str().unwrap().contains(text), "{refused}");
+    }
+    // A reload that removes the drive stops its motor first.
+    let id = begin(json!(["gateway"]));
+    let supervised = "supervision = { timeout = \"2s\", action = \"stop\" }";
+    site.change(&controlled("pump-1", 1, supervised), "");
+    plant._others[1].signal("HUP");
+    let drill = plant.ended(&id);
+    assert_eq!(
+        (&drill["state"], &drill["last_stop"]),
+        (&json!("aborted"), &json!("acknowledged")),
+        "{drill}"
+    );
+    assert!(
+        drill["text"].as_str().unwrap().contains("a reload of its bus"),
+        "{drill}"
+    );
+}
