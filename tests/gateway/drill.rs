@@ -14,7 +14,7 @@ fn program() -> &'static std::path::Path {
 
 struct Plant {
     site: Site,
-    _others: [Running; 2],
+    others: [Running; 2],
 }
 
 fn plant() -> Plant {
@@ -45,7 +45,7 @@ fn plant() -> Plant {
     site.until_state("pump-1", "ready");
     Plant {
         site,
-        _others: [simulator, gateway],
+        others: [simulator, gateway],
     }
 }
 
@@ -147,7 +147,7 @@ fn a_drill_proves_stops_and_is_kept() {
             .iter()
             .any(|record| of_drill(record) && record["result"] == "passed")
     );
-    drop(plant._others);
+    drop(plant.others);
     check("pump-1 (gateway), pump-2 (order, gateway)");
 }
 
@@ -212,7 +212,7 @@ fn what_ends_a_drill_is_named_and_the_motor_is_stopped() {
     let id = begin(json!(["gateway"]));
     let supervised = "supervision = { timeout = \"2s\", action = \"stop\" }";
     site.change(&controlled("pump-1", 1, supervised), "");
-    plant._others[1].signal("HUP");
+    plant.others[1].signal("HUP");
     let drill = plant.ended(&id);
     assert_eq!(
         (&drill["state"], &drill["last_stop"]),
@@ -223,4 +223,36 @@ fn what_ends_a_drill_is_named_and_the_motor_is_stopped() {
         drill["text"].as_str().unwrap().contains("a reload of its bus"),
         "{drill}"
     );
+}
+
+#[test]
+fn a_gateway_killed_in_a_drill_stops_the_motor_when_it_is_back() {
+    let mut plant = plant();
+    let wish = json!({"drive": "pump-2", "kinds": ["gateway"], "speed": 10});
+    let (status, armed) = plant.curl("alice", "POST", "", &wish);
+    assert_eq!(status, 201, "{armed}");
+    let id = armed["id"].as_str().unwrap().to_string();
+    let (status, started) = plant.curl("alice", "POST", &format!("/{id}/start"), &json!({}));
+    assert_eq!(status, 200, "{started}");
+    plant.site.until_point("pump-2", "running", true);
+    plant.others[1].signal("KILL");
+    plant.others[1].ended();
+    plant.others[1] = plant.site.run_ready();
+    let drill = plant.ended(&id);
+    assert_eq!(
+        (&drill["state"], &drill["last_stop"]),
+        (&json!("aborted"), &json!("acknowledged")),
+        "{drill}"
+    );
+    let text = drill["text"].as_str().unwrap();
+    assert!(
+        text.contains("the gateway was killed or lost power during it"),
+        "{drill}"
+    );
+    plant.site.until_point("pump-2", "running", false);
+    // The next start finds nothing to stop.
+    plant.others[1].signal("KILL");
+    plant.others[1].ended();
+    plant.others[1] = plant.site.run_ready();
+    assert_eq!(plant.curl("alice", "GET", &format!("/{id}"), &Json::Null).1, drill);
 }

@@ -1,8 +1,9 @@
 //! Drills: a motor is started at a low speed and stopped in each way by which it is to stop, and how long that took is kept.
 //!
 //! [`Drills::arm`] says what is to be tried, [`Drills::start`] begins it within [`ARMED`] and by the same client, and a task of the
-//! gateway calls [`Drills::look`] while one is under way. One at a time. However a drill ends, it ends with a stop. Pure: time is an
-//! argument.
+//! gateway calls [`Drills::look`] while one is under way. One at a time. However a drill ends, it ends with a stop: where drills are
+//! kept on disk, the motor starts once that is written, and a gateway that was killed meanwhile stops it when it is back. Pure: time
+//! is an argument.
 
 mod report;
 mod run;
@@ -14,7 +15,7 @@ use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::Notify;
 
 pub use self::report::{DrillReport, DrillState, DrillStep, Kind, Proof, SavedDrills, StopProof};
-use self::run::Run;
+use self::run::{Ended, Run};
 use crate::command::Origin;
 use crate::drive::ModelPoint;
 use crate::plant::{DriveHandle, Plant};
@@ -83,6 +84,12 @@ struct State {
     run: Option<Run>,
     ended: VecDeque<DrillReport>,
     proofs: Vec<Proof>,
+    /// Drills during which the gateway was killed; their motors may still run.
+    cut_off: Vec<DrillReport>,
+    /// Drills that are over, before the audit and events have them.
+    unpublished: Vec<Ended>,
+    /// Whether a file keeps them.
+    keeps: bool,
     /// Counts what is to be kept.
     generation: u64,
     kept: u64,
@@ -129,6 +136,12 @@ impl Drills {
                 report.state.name()
             )));
         }
+        if let Some(report) = state.cut_off.last() {
+            let (id, drive) = (&report.id, &report.drive);
+            return Err(not_now(format!(
+                "drill `{id}` of drive `{drive}` was cut off and is still being ended"
+            )));
+        }
         let speed = speed.unwrap_or(options.max_speed);
         possible(drive, kinds, speed, options)?;
         may(drive, who, now)?;
@@ -150,8 +163,11 @@ impl Drills {
         now: Instant,
         time: SystemTime,
     ) -> Result<DrillReport, DrillRefusal> {
-        let mut state = self.state();
+        let mut guard = self.state();
+        let state = &mut *guard;
         state.drop_armed(now, time);
+        // Otherwise this drill would take the record of another one's end for an order.
+        state.publish(plant, now, time);
         let known = state.report(id).map(|report| report.state);
         let run = state.run.as_mut().filter(|run| run.report().id == id);
         let Some(run) = run else {
@@ -167,10 +183,12 @@ impl Drills {
             return Err(not_now(format!("drill `{id}` was armed by {}", run.report().who)));
         }
         may(run.drive(), who, now)?;
-        run.start(plant, now, time);
+        let keep = state.keeps.then_some(state.generation + 1);
+        run.start(plant, keep, now, time);
         let report = run.report().clone();
-        drop(state);
-        self.begun.notify_one();
+        state.generation += 1;
+        drop(guard);
+        self.wake();
         Ok(report)
     }
 
@@ -191,30 +209,28 @@ impl Drills {
         state.report(id).ok_or_else(|| DrillRefusal::Unknown(id.to_string()))
     }
 
-    /// Waits until a drill is under way.
+    /// Waits until there is something to look at or to keep.
     pub async fn begun(&self) {
         self.begun.notified().await;
+    }
+
+    /// Ends a wait for [`begun`](Drills::begun).
+    pub fn wake(&self) {
+        self.begun.notify_one();
     }
 
     /// Looks at the drill that is under way, and drops one that was armed and not started. Whether one is under way.
     pub fn look(&self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
         let mut state = self.state();
-        state.drop_armed(now, time);
-        let Some(run) = &mut state.run else { return false };
-        if run.report().state == DrillState::Armed {
-            return false;
-        }
-        if run.look(plant, now, time) {
-            return true;
-        }
-        state.end();
-        false
+        let goes_on = state.look(plant, now, time);
+        state.publish(plant, now, time);
+        goes_on
     }
 
     /// All that are known, the newest first.
     pub fn reports(&self) -> Vec<DrillReport> {
         let state = self.state();
-        let current = state.run.iter().map(|run| run.report().clone());
+        let current = state.run.iter().map(Run::report).chain(&state.cut_off).cloned();
         current.chain(state.ended.iter().rev().cloned()).collect()
     }
 
@@ -256,35 +272,102 @@ impl Drills {
         Some(ways(&drive.image.spec).into_iter().map(of).collect())
     }
 
-    /// Takes in what was kept before the start of the process.
+    /// Takes in what was kept before the start of the process. What was under way then is ended with a stop at the next looks.
     pub fn restore(&self, saved: SavedDrills) {
         let mut state = self.state();
-        state.ended = saved
-            .reports
-            .into_iter()
-            .filter(|report| report.state.is_over())
-            .collect();
+        let known = |state: &State, report: &DrillReport| state.report(&report.id).is_some();
+        let (over, open): (Vec<_>, Vec<_>) = saved.reports.into_iter().partition(|report| report.state.is_over());
+        let cut_off = open.into_iter().filter(|report| !known(&state, report)).collect();
+        state.cut_off = cut_off;
+        state.ended = over.into();
         state.proofs = saved.proofs;
         state.bound();
     }
 
-    /// What is to be kept, if that changed since the last call.
-    pub fn to_keep(&self) -> Option<SavedDrills> {
-        let mut state = self.state();
+    /// Whether a file keeps drills from now on: they start once it has them.
+    pub fn keep(&self, keeps: bool) {
+        self.state().keeps = keeps;
+    }
+
+    /// What is to be kept and its generation, as long as that is not [`kept`](Drills::kept).
+    pub fn to_keep(&self) -> Option<(u64, SavedDrills)> {
+        let state = self.state();
         if state.kept == state.generation {
             return None;
         }
-        state.kept = state.generation;
-        Some(SavedDrills::new(
-            state.ended.iter().cloned().collect(),
-            state.proofs.clone(),
-        ))
+        let running = state.run.iter().map(Run::report);
+        let open = state
+            .cut_off
+            .iter()
+            .chain(running.filter(|report| report.state == DrillState::Running));
+        let reports = state.ended.iter().chain(open).cloned().collect();
+        Some((state.generation, SavedDrills::new(reports, state.proofs.clone())))
+    }
+
+    /// Whether all that is to be kept is on disk.
+    pub fn is_kept(&self) -> bool {
+        let state = self.state();
+        state.kept == state.generation
+    }
+
+    /// That generation is on disk.
+    pub fn kept(&self, generation: u64, now: Instant) {
+        let mut state = self.state();
+        state.kept = state.kept.max(generation);
+        if let Some(run) = &mut state.run {
+            run.kept(generation, now);
+        }
+    }
+
+    /// What is to be kept cannot be written: a drill that waits for it does not start.
+    pub fn not_kept(&self, why: &str, time: SystemTime) {
+        let mut state = self.state();
+        if state.run.as_mut().is_some_and(|run| run.not_kept(why, time)) {
+            state.end();
+        }
     }
 }
 
 impl State {
+    fn look(&mut self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
+        self.drop_armed(now, time);
+        if self.run.is_none() {
+            self.stop_cut_off(plant, now, time);
+        }
+        let Some(run) = &mut self.run else { return false };
+        if run.report().state == DrillState::Armed {
+            return false;
+        }
+        if run.look(plant, now, time) {
+            return true;
+        }
+        self.end();
+        false
+    }
+
+    /// Adds what ended to the audit and the events.
+    fn publish(&mut self, plant: &Plant, now: Instant, time: SystemTime) {
+        for drill in self.unpublished.drain(..) {
+            drill.publish(plant, now, time);
+        }
+    }
+
+    /// Begins to stop the motor of the next drill that was cut off.
+    fn stop_cut_off(&mut self, plant: &Plant, now: Instant, time: SystemTime) {
+        let Some(report) = self.cut_off.pop() else { return };
+        let why = match plant.drive_at(&report.machine()) {
+            _ if !run::is_recent(&report, time) => "that is too long ago to stop the motor now",
+            None => "the drive is not configured any more, so it got no stop",
+            Some(drive) => {
+                self.run = Some(Run::cut_off(report, &drive, now));
+                return;
+            }
+        };
+        self.over(run::ended_without_stop(report, why, time));
+    }
+
     fn report(&self, id: &str) -> Option<DrillReport> {
-        let current = self.run.iter().map(Run::report);
+        let current = self.run.iter().map(Run::report).chain(&self.cut_off);
         current.chain(&self.ended).find(|report| report.id == id).cloned()
     }
 
@@ -299,13 +382,18 @@ impl State {
 
     fn end(&mut self) {
         let Some(run) = self.run.take() else { return };
-        let (report, proofs) = run.over();
+        let (ended, proofs) = run.over();
+        let machine = ended.report.machine();
         for proof in proofs {
-            let machine = report.machine();
             self.proofs.retain(|old| old.kind != proof.kind || !old.is_of(&machine));
             self.proofs.push(proof);
         }
-        self.ended.push_back(report);
+        self.over(ended);
+    }
+
+    fn over(&mut self, ended: Ended) {
+        self.ended.push_back(ended.report.clone());
+        self.unpublished.push(ended);
         self.bound();
         self.generation += 1;
     }

@@ -1,22 +1,26 @@
 //! A drill that is armed or under way, step by step.
 
+mod interruption;
+
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use tokio::sync::broadcast::Receiver;
-use tokio::sync::broadcast::error::TryRecvError;
 
+use self::interruption::{LOCAL, is_local};
 use super::{ARMED, DrillOptions, DrillReport, DrillState, DrillStep, Kind, Proof};
-use crate::command::{AuditRecord, Authority, Order, Origin, SourceKind};
+use crate::command::{AuditRecord, Authority, Order, Origin, Outcome, Refusal, SourceKind};
 use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, EventKind};
 use crate::plant::{DriveHandle, Placed, Plant};
 use crate::process_image::{Machine, Reading};
 use crate::stop_all::{OneStop, Standstill};
 
+/// Time in which the start of a drill has to be on disk. A motor that starts later starts when nobody expects it.
+const KEEP: Duration = Duration::from_secs(5);
 /// Time in which a start is sent: a guard may delay it.
 const START: Duration = Duration::from_secs(60);
-/// Time for which a start that was refused is given again, and the wait before that.
+/// Time for which a start is repeated that was refused since a value was not read yet, and the pause before each repetition.
 const START_AGAIN: Duration = Duration::from_secs(15);
 const AGAIN: Duration = Duration::from_millis(500);
 /// Time in which the motor has to turn at its speed.
@@ -27,12 +31,12 @@ const STEADY: Duration = Duration::from_secs(2);
 const AT_SPEED: f64 = 0.8;
 /// Where the drive does not tell its speed in percent, the motor turns at it so long after it began.
 const UNTOLD_SPEED: Duration = Duration::from_secs(10);
-/// Percent above `max_speed` at which a drill ends: the motor turns faster than it was told.
-const TOO_FAST: f64 = 5.0;
 /// Time after a silence in which a read has to come.
 const READ: Duration = Duration::from_secs(15);
 /// Time in which the last stop has to be acknowledged, and the motor to stand for the next way.
 const LAST_STOP: Duration = Duration::from_secs(60);
+/// Age up to which the motor of a drill that was cut off is stopped at the next start. Later somebody may have started it since.
+const CUT_OFF: Duration = Duration::from_secs(3600);
 
 /// A drill that is armed or under way.
 #[derive(Debug)]
@@ -61,7 +65,9 @@ pub(super) struct Run {
 #[derive(Debug)]
 enum Step {
     Armed,
-    /// The start was refused, and is given again.
+    /// That it starts is being written to disk, as that generation: so a motor that a killed gateway leaves running is known.
+    Keeping(u64),
+    /// The start was refused, and is repeated.
     Waiting,
     /// The start is on its way to the drive.
     Starting(Placed),
@@ -73,6 +79,8 @@ enum Step {
     Caused(Instant, Cause),
     /// The way was tried; the motor is stopped in any case.
     Clearing(OneStop),
+    /// The gateway was killed during it: the motor is stopped once the drive is online.
+    CutOff,
     /// The drill is over, and has ended so, but for its last stop.
     Ending(DrillState, OneStop),
     Over,
@@ -97,12 +105,31 @@ enum Seen {
     Ended(DrillState, String),
 }
 
-/// Why a drill ends at a drive that takes its orders from elsewhere.
-const LOCAL: &str = "the drive was switched to its local control place";
+/// What is said of a drill during which the gateway was killed.
+const CUT_OFF_TEXT: &str = "the gateway was killed or lost power during it";
 
-fn is_local(reading: &Reading<'_>) -> bool {
-    let remote = reading.model(ModelPoint::Remote);
-    remote.good().is_some_and(|remote| !remote.as_bool())
+/// Ends the report of a drill that was cut off without a stop, and says why there is none.
+pub(super) fn ended_without_stop(mut report: DrillReport, why: &str, time: SystemTime) -> Ended {
+    report.state = DrillState::Aborted;
+    report.text = format!("{CUT_OFF_TEXT}; {why}; look at the motor");
+    report.ended_at = Some(text_of(time));
+    for step in report.steps.iter_mut().filter(|step| !step.state.is_over()) {
+        step.state = DrillState::NotProven;
+        step.seen = CUT_OFF_TEXT.to_string();
+    }
+    Ended {
+        who: Origin::new(SourceKind::Shutdown, "drill cut off"),
+        report,
+    }
+}
+
+/// Whether a drill that was cut off is so young that its motor is stopped. A clock that was set back makes none old.
+pub(super) fn is_recent(report: &DrillReport, time: SystemTime) -> bool {
+    let started = report
+        .started_at
+        .as_deref()
+        .and_then(|at| humantime::parse_rfc3339(at).ok());
+    started.is_none_or(|started| time.duration_since(started).unwrap_or_default() <= CUT_OFF)
 }
 
 /// A client in words.
@@ -171,6 +198,31 @@ impl Run {
         }
     }
 
+    /// A drill during which the gateway was killed: its motor may still run.
+    pub(super) fn cut_off(report: DrillReport, drive: &DriveHandle, now: Instant) -> Run {
+        let own = Origin::new(SourceKind::Shutdown, "drill cut off");
+        let at = report.steps.iter().position(|step| step.state == DrillState::Running);
+        Run {
+            at: at.unwrap_or(report.steps.len()),
+            machine: report.machine(),
+            options: DrillOptions {
+                max_speed: report.max_speed,
+                limit: Duration::from_millis(report.limit_ms),
+                every: Duration::MAX,
+            },
+            report,
+            drive: drive.clone(),
+            who: own.clone(),
+            own,
+            records: None,
+            stops: 0,
+            step: Step::CutOff,
+            since: now,
+            began: now,
+            proofs: Vec::new(),
+        }
+    }
+
     pub(super) fn report(&self) -> &DrillReport {
         &self.report
     }
@@ -196,16 +248,44 @@ impl Run {
         expired
     }
 
-    pub(super) fn over(self) -> (DrillReport, Vec<Proof>) {
-        (self.report, self.proofs)
+    pub(super) fn over(self) -> (Ended, Vec<Proof>) {
+        let ended = Ended {
+            who: self.who,
+            report: self.report,
+        };
+        (ended, self.proofs)
     }
 
-    pub(super) fn start(&mut self, plant: &Plant, now: Instant, time: SystemTime) {
+    /// Starts it; where drills are kept, the motor starts once generation `keep` is on disk.
+    pub(super) fn start(&mut self, plant: &Plant, keep: Option<u64>, now: Instant, time: SystemTime) {
         self.records = Some(plant.writes.audit().subscribe());
         self.stops = self.drive.stops();
         self.report.state = DrillState::Running;
         self.report.started_at = Some(text_of(time));
-        self.begin_step(now);
+        match keep {
+            Some(generation) => {
+                self.report.text = "recording the start on disk".to_string();
+                self.go(Step::Keeping(generation), now);
+            }
+            None => self.begin_step(now),
+        }
+    }
+
+    /// What was started before generation `kept` was written may begin.
+    pub(super) fn kept(&mut self, kept: u64, now: Instant) {
+        if matches!(self.step, Step::Keeping(generation) if generation <= kept) {
+            self.begin_step(now);
+        }
+    }
+
+    /// Its start cannot be written: nothing is started. Whether it was waiting for that.
+    pub(super) fn not_kept(&mut self, why: &str, time: SystemTime) -> bool {
+        let waits = matches!(self.step, Step::Keeping(_));
+        if waits {
+            let why = format!("its start could not be recorded on disk ({why}); nothing was started");
+            self.finish(DrillState::Aborted, why, time);
+        }
+        waits
     }
 
     fn go(&mut self, step: Step, now: Instant) {
@@ -248,8 +328,9 @@ impl Run {
     /// Somebody ends it: the motor is stopped.
     pub(super) fn abort(&mut self, why: &str, now: Instant, time: SystemTime) {
         match self.step {
-            Step::Armed => self.finish(DrillState::Aborted, why.to_string(), time),
-            Step::Ending(..) | Step::Over => {}
+            Step::Armed | Step::Keeping(_) => self.finish(DrillState::Aborted, why.to_string(), time),
+            // Its stop comes in any case.
+            Step::CutOff | Step::Ending(..) | Step::Over => {}
             _ => self.end(DrillState::Aborted, why.to_string(), now),
         }
     }
@@ -293,15 +374,21 @@ impl Run {
 
     /// Looks what became of it. Whether it goes on.
     pub(super) fn look(&mut self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
-        if !matches!(self.step, Step::Ending(..) | Step::Over)
+        if !matches!(self.step, Step::CutOff | Step::Ending(..) | Step::Over)
             && let Some(why) = self.interruption(plant, now)
         {
-            self.end(DrillState::Aborted, why, now);
+            self.abort(&why, now, time);
         }
         let reading_drive = self.drive.clone();
         let reading = reading_drive.reading(now);
         match std::mem::replace(&mut self.step, Step::Over) {
             Step::Armed => self.step = Step::Armed,
+            Step::Keeping(_) if now.saturating_duration_since(self.since) > KEEP => {
+                let seconds = KEEP.as_secs();
+                let why = format!("its start was not recorded on disk within {seconds} s; nothing was started");
+                self.finish(DrillState::Aborted, why, time);
+            }
+            Step::Keeping(generation) => self.step = Step::Keeping(generation),
             Step::Waiting if now.saturating_duration_since(self.since) < AGAIN => self.step = Step::Waiting,
             Step::Waiting => self.give_start(now),
             Step::Starting(placed) => self.look_at_start(placed, now),
@@ -309,85 +396,11 @@ impl Run {
             Step::Steady => self.look_steady(now, time),
             Step::Caused(cause, how) => self.look_at_cause(cause, how, &reading, (now, time)),
             Step::Clearing(stop) => self.look_cleared(stop, plant, now),
+            Step::CutOff => self.look_cut_off(plant, now),
             Step::Ending(state, stop) => self.look_at_end(state, stop, plant, (now, time)),
             Step::Over => {}
         }
         !matches!(self.step, Step::Over)
-    }
-
-    /// Why it does not go on.
-    fn interruption(&mut self, plant: &Plant, now: Instant) -> Option<String> {
-        let there = plant.drive_at(&self.machine);
-        if !there.is_some_and(|there| Arc::ptr_eq(&there.image, &self.drive.image)) {
-            return Some("a reload changed the drive or its bus".to_string());
-        }
-        if let Some(why) = self.others() {
-            return Some(why);
-        }
-        let silent = matches!(self.step, Step::Caused(_, Cause::Gateway(_)));
-        let reading = self.drive.reading(now);
-        if silent {
-            return None;
-        }
-        if !reading.snapshot.link.is_online() {
-            return Some("the drive went offline".to_string());
-        }
-        // Its supervision of the fieldbus may have stopped it by a fault.
-        let may_have_fault = matches!(self.step, Step::Clearing(_)) && self.kind() == Some(Kind::Gateway);
-        if reading.is_set(ModelPoint::Fault) && !may_have_fault {
-            return Some("the drive has a fault".to_string());
-        }
-        if is_local(&reading) {
-            return Some(LOCAL.to_string());
-        }
-        let speed = reading
-            .model(ModelPoint::ActualSpeed)
-            .good()
-            .map(|speed| speed.as_f64().abs());
-        speed
-            .filter(|speed| *speed > self.options.max_speed + TOO_FAST)
-            .map(|speed| format!("the motor turns at {speed:.1} %, more than max_speed of [drill]"))
-    }
-
-    /// Who else gave the drive an order.
-    fn others(&mut self) -> Option<String> {
-        let stops = self.drive.stops();
-        if stops != self.stops {
-            self.stops = stops;
-            let by = self.drive.last_stop_by();
-            let expected = match &mut self.step {
-                Step::Caused(_, Cause::Client { stopped }) if by.as_ref().is_some_and(Origin::is_lease) => {
-                    *stopped = true;
-                    true
-                }
-                _ => false,
-            };
-            let own = by
-                .as_ref()
-                .is_some_and(|by| by.client() == self.own.client() && by.who == self.own.who);
-            if !expected && !own {
-                let by = by.map_or_else(|| "another client".to_string(), |by| named(&by));
-                return Some(format!("{by} stopped the drive"));
-            }
-        }
-        loop {
-            match self.records.as_mut()?.try_recv() {
-                Ok(record) if record.drive != self.report.drive => {}
-                Ok(record) if record.client == self.own.who => {}
-                Ok(record) if record.source == SourceKind::Supervision.name() => {}
-                Ok(record) => {
-                    let AuditRecord {
-                        source,
-                        client,
-                        command,
-                        ..
-                    } = &*record;
-                    return Some(format!("{source} {client} gave an order: {command}"));
-                }
-                Err(TryRecvError::Empty | TryRecvError::Closed) => return None,
-                Err(TryRecvError::Lagged(_)) => return Some("too many orders came to see who gave them".to_string()),
-            }
-        }
     }
 
     fn look_at_start(&mut self, mut placed: Placed, now: Instant) {
@@ -399,8 +412,13 @@ impl Run {
                 self.report.text = "waiting until the motor turns".to_string();
                 self.go(Step::SpeedingUp(None), now);
             }
-            // What the order rests on may have to be read first.
-            Some(_) if now.saturating_duration_since(self.began) < START_AGAIN => self.go(Step::Waiting, now),
+            // A value that the order needs was not read yet.
+            Some(answer)
+                if matches!(answer.outcome, Outcome::Refused(Refusal::NotKnown(_)))
+                    && now.saturating_duration_since(self.began) < START_AGAIN =>
+            {
+                self.go(Step::Waiting, now);
+            }
             Some(answer) => {
                 let why = format!("the motor was not started: {}", answer.outcome);
                 self.end(DrillState::NotProven, why, now);
@@ -608,6 +626,19 @@ impl Run {
         self.step = Step::Clearing(stop);
     }
 
+    /// Stops the motor once the drive is online; a stop to one that is not would fail.
+    fn look_cut_off(&mut self, plant: &Plant, now: Instant) {
+        if let Some(drive) = plant.drive_at(&self.machine) {
+            self.drive = drive;
+        }
+        let waited = now.saturating_duration_since(self.since);
+        if waited <= LAST_STOP && !self.drive.reading(now).snapshot.link.is_online() {
+            self.step = Step::CutOff;
+            return;
+        }
+        self.end(DrillState::Aborted, CUT_OFF_TEXT.to_string(), now);
+    }
+
     fn look_at_end(&mut self, state: DrillState, mut stop: OneStop, plant: &Plant, (now, time): (Instant, SystemTime)) {
         stop.look(plant, now);
         let over = stop.is_acknowledged() || stop.is_refused();
@@ -621,31 +652,34 @@ impl Run {
         });
         let text = std::mem::take(&mut self.report.text);
         self.finish(state, text, time);
-        self.tell(plant, now, time);
     }
+}
 
-    /// The audit and an event say how it ended.
-    fn tell(&self, plant: &Plant, now: Instant, time: SystemTime) {
+/// A drill that is over.
+#[derive(Debug)]
+pub(super) struct Ended {
+    who: Origin,
+    pub(super) report: DrillReport,
+}
+
+impl Ended {
+    /// Adds it to the audit and publishes its event.
+    pub(super) fn publish(&self, plant: &Plant, now: Instant, time: SystemTime) {
         let DrillReport { drive, bus, state, .. } = &self.report;
         let kinds: Vec<&str> = self.report.steps.iter().map(|step| step.kind.name()).collect();
         let what = format!("drill {} at {} %", kinds.join(", "), self.report.speed);
-        plant
-            .writes
-            .audit()
-            .note(&self.who, (drive, &what), (state.name(), &self.report.text), now);
+        let result = (state.name(), self.report.text.as_str());
+        plant.writes.audit().note(&self.who, (drive, &what), result, now);
+        let text = format!(
+            "{what} by {}: {}: {}",
+            self.report.who,
+            state.name().replace('_', " "),
+            self.report.text
+        );
         plant.events.publish(Event {
             bus: bus.clone(),
             drive: Some(drive.clone()),
-            ..Event::new(
-                EventKind::Drill,
-                time,
-                format!(
-                    "{what} by {}: {}: {}",
-                    self.report.who,
-                    state.name().replace('_', " "),
-                    self.report.text
-                ),
-            )
+            ..Event::new(EventKind::Drill, time, text)
         });
     }
 }

@@ -12,7 +12,9 @@ use crate::plant::SharedPlant;
 
 /// How often an armed drill is looked at.
 const IDLE: Duration = Duration::from_millis(500);
-/// Time for the last stop of a drill that the shutdown ends.
+/// Time between two tries to write the file.
+const AGAIN: Duration = Duration::from_secs(10);
+/// Time for the last stop of a drill that the shutdown ends, and for the file after it.
 const LAST_STOP: Duration = Duration::from_secs(3);
 /// A file that is longer is none of these.
 const LONGEST: u64 = 16 << 20;
@@ -27,6 +29,7 @@ fn path(file: &DrillsFile) -> Option<PathBuf> {
 /// From now on they are kept in that state directory. What another one has is taken in.
 pub(super) fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, drills: &Drills) {
     let new = state_dir.map(|dir| dir.join(DRILLS));
+    drills.keep(new.is_some());
     let before = std::mem::replace(&mut *file.lock().unwrap_or_else(PoisonError::into_inner), new.clone());
     let Some(path) = new.filter(|new| before.as_ref() != Some(new)) else {
         return;
@@ -36,7 +39,7 @@ pub(super) fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, drills: &Dril
         Ok(None) => {}
         Err(why) => tracing::error!(
             target: "drivegate::daemon",
-            "cannot read {}: {why}; what was proven before is not known, and the file is replaced after the next drill; move it away to keep it",
+            "cannot read {}: {why}; what was proven before is not known, and the next drill replaces the file; move it away to keep it",
             path.display()
         ),
     }
@@ -58,35 +61,77 @@ pub fn load(path: &Path) -> Result<Option<SavedDrills>, String> {
     SavedDrills::from_json(&bytes).map(Some)
 }
 
-/// Looks at drills as long as the gateway runs, and writes the file after each.
+/// Looks at drills as long as the gateway runs, and keeps the file of them up to date.
 pub(super) fn watch(plant: SharedPlant, file: DrillsFile) -> tokio::task::JoinHandle<()> {
     tokio::spawn(async move {
         let drills = plant.load().drills.clone();
+        let mut writer = Writer::default();
         loop {
             // Either is a reason to look.
             let _ = tokio::time::timeout(IDLE, drills.begun()).await;
-            while drills.look(&plant.load(), Instant::now(), SystemTime::now()) {
+            loop {
+                let goes_on = drills.look(&plant.load(), Instant::now(), SystemTime::now());
+                writer.look(&drills, &file).await;
+                if !goes_on && writer.writing.is_none() {
+                    break;
+                }
                 tokio::time::sleep(LOOK).await;
             }
-            write(&drills, &file).await;
         }
     })
 }
 
-async fn write(drills: &Drills, file: &DrillsFile) {
-    let Some((path, saved)) = path(file).and_then(|path| Some((path, drills.to_keep()?))) else {
-        return;
-    };
-    let written = tokio::task::spawn_blocking(move || {
+type Writing = tokio::task::JoinHandle<(u64, Result<(), String>)>;
+
+/// Writes the file beside the drill that is under way: a slow disk delays no stop.
+#[derive(Default)]
+struct Writer {
+    writing: Option<Writing>,
+    /// When a write that failed is tried again.
+    again: Option<Instant>,
+}
+
+impl Writer {
+    /// Takes the result of a write that is done, and begins the next one that is due.
+    async fn look(&mut self, drills: &Drills, file: &DrillsFile) {
+        if let Some(writing) = self.writing.take_if(|writing| writing.is_finished()) {
+            match writing.await {
+                Ok((generation, Ok(()))) => {
+                    if self.again.take().is_some() {
+                        tracing::info!(target: "drivegate::daemon", "the drills are on disk again");
+                    }
+                    drills.kept(generation, Instant::now());
+                }
+                Ok((_, Err(why))) => self.failed(drills, &why),
+                Err(error) => self.failed(drills, &error.to_string()),
+            }
+        }
+        let waits = self.again.is_some_and(|again| Instant::now() < again);
+        if self.writing.is_none() && !waits {
+            self.writing = begin_to_write(drills, file);
+        }
+    }
+
+    fn failed(&mut self, drills: &Drills, why: &str) {
+        if self.again.replace(Instant::now() + AGAIN).is_none() {
+            tracing::error!(
+                target: "drivegate::daemon",
+                "the drills cannot be written: {why}; no drill starts until they can; retrying every {} s; check the disk",
+                AGAIN.as_secs()
+            );
+        }
+        drills.not_kept(why, SystemTime::now());
+    }
+}
+
+fn begin_to_write(drills: &Drills, file: &DrillsFile) -> Option<Writing> {
+    let path = path(file)?;
+    let (generation, saved) = drills.to_keep()?;
+    let write = move || {
         let text = serde_json::to_vec_pretty(&saved).map_err(|error| error.to_string())?;
         files::replace(&path, &text).map_err(|error| format!("{}: {error}", path.display()))
-    });
-    if let Ok(Err(why)) = written.await {
-        tracing::error!(
-            target: "drivegate::daemon",
-            "the drills cannot be written: {why}; they are known until the process ends; check the disk"
-        );
-    }
+    };
+    Some(tokio::task::spawn_blocking(move || (generation, write())))
 }
 
 /// The gateway ends, or the bus of that drill does: so does the drill, with its stop.
@@ -112,5 +157,22 @@ pub(super) async fn end(plant: &SharedPlant, file: &DrillsFile, by: &str, of_bus
             "the stop with which a drill ends was not acknowledged in time ({by}); look at the motor"
         );
     }
-    write(&drills, file).await;
+    until_on_disk(&drills, file).await;
+}
+
+/// Waits until the task that looks at drills has written the file.
+async fn until_on_disk(drills: &Drills, file: &DrillsFile) {
+    let until = Instant::now() + LAST_STOP;
+    while path(file).is_some() && !drills.is_kept() {
+        if Instant::now() >= until {
+            tracing::error!(
+                target: "drivegate::daemon",
+                "the end of a drill is not on disk after {} s; the next start stops its motor once more; check the disk",
+                LAST_STOP.as_secs()
+            );
+            return;
+        }
+        drills.wake();
+        tokio::time::sleep(LOOK).await;
+    }
 }

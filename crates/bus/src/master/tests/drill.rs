@@ -1,10 +1,24 @@
 //! A drill on the line: what a drive is sent meanwhile, and what counts as proven.
 
 use super::*;
+use crate::event::EventKind;
 use crate::plant::Plant;
 use drivegate_core::drill::{DrillOptions, DrillReport, DrillState, Kind};
 
 const LIMIT: Duration = Duration::from_secs(2);
+
+fn plant(rig: &Rig) -> Plant {
+    let plant = Plant {
+        writes: rig.stats.clone(),
+        ..Plant::new("g", Duration::from_secs(1), vec![rig.bus.clone()])
+    };
+    plant.drills.set_options(Some(DrillOptions {
+        max_speed: 20.0,
+        limit: LIMIT,
+        every: Duration::from_secs(3600),
+    }));
+    plant
+}
 
 /// Drills the first of two drives; `meanwhile` is called with what is said of it.
 fn drill(kind: Kind, mut meanwhile: impl FnMut(&mut Rig, &DrillReport)) -> (Rig, DrillReport) {
@@ -13,16 +27,8 @@ fn drill(kind: Kind, mut meanwhile: impl FnMut(&mut Rig, &DrillReport)) -> (Rig,
     rig.drives[0].holding.extend([(2101, 1 << 13), (2102, 1000)]);
     rig.run(Duration::from_secs(2));
     rig.bus.image.update_health(|health| health.up = true);
-    let plant = Plant {
-        writes: rig.stats.clone(),
-        ..Plant::new("g", Duration::from_secs(1), vec![rig.bus.clone()])
-    };
+    let plant = plant(&rig);
     let drills = plant.drills.clone();
-    drills.set_options(Some(DrillOptions {
-        max_speed: 20.0,
-        limit: LIMIT,
-        every: Duration::from_secs(3600),
-    }));
     let (alice, time) = (Origin::new(SourceKind::Http, "alice"), SystemTime::now());
     let drive = plant.drives().next().unwrap();
     let armed = drills.arm(&drive, (&[kind], Some(10.0)), &alice, rig.now, time);
@@ -106,4 +112,114 @@ fn a_silent_client_stops_a_motor_by_its_lease_only() {
     });
     assert_eq!(report.state, DrillState::NotProven, "{report:#?}");
     assert!(says(&report, "before its supervision stopped it"), "{report:#?}");
+}
+
+/// A plant with drills that a file keeps, and a drill of its first drive that was started.
+fn started() -> (Rig, Plant, String) {
+    let mut rig = Rig::new(2);
+    rig.drives[0].holding.extend([(2101, 1 << 13), (2102, 1000)]);
+    rig.run(Duration::from_secs(2));
+    rig.bus.image.update_health(|health| health.up = true);
+    let plant = plant(&rig);
+    plant.drills.keep(true);
+    let (alice, time) = (Origin::new(SourceKind::Http, "alice"), time(0));
+    let drive = plant.drives().next().unwrap();
+    let armed = plant
+        .drills
+        .arm(&drive, (&[Kind::Order], Some(10.0)), &alice, rig.now, time);
+    let id = armed.unwrap().id;
+    plant.drills.start(&plant, &id, &alice, rig.now, time).unwrap();
+    (rig, plant, id)
+}
+
+fn time(seconds: u64) -> SystemTime {
+    SystemTime::UNIX_EPOCH + Duration::from_secs(1_800_000_000 + seconds)
+}
+
+/// Looks for that long; whether a drill is under way at its end.
+fn look(rig: &mut Rig, plant: &Plant, at: SystemTime, span: Duration) -> bool {
+    let until = rig.now + span;
+    let mut goes_on = true;
+    while rig.now < until {
+        rig.step();
+        goes_on = plant.drills.look(plant, rig.now, at);
+    }
+    goes_on
+}
+
+#[test]
+fn a_motor_starts_once_the_start_is_on_disk() {
+    let (mut rig, plant, id) = started();
+    let drills = plant.drills.clone();
+    assert!(look(&mut rig, &plant, time(1), Duration::from_secs(2)));
+    assert!(!rig.runs(0), "its start is not on disk");
+    let (generation, saved) = drills.to_keep().unwrap();
+    assert_eq!(saved.reports[0].state, DrillState::Running);
+    drills.kept(generation - 1, rig.now);
+    look(&mut rig, &plant, time(2), Duration::from_secs(1));
+    assert!(!rig.runs(0), "an older state is on disk");
+    drills.kept(generation, rig.now);
+    look(&mut rig, &plant, time(2), Duration::from_secs(1));
+    assert!(rig.runs(0), "{:?}", drills.report(&id));
+    look(&mut rig, &plant, time(3), Duration::from_secs(60));
+    assert_eq!(drills.report(&id).unwrap().state, DrillState::Passed);
+}
+
+#[test]
+fn a_start_that_cannot_be_recorded_starts_nothing() {
+    let (mut rig, plant, id) = started();
+    plant.drills.not_kept("no space left", time(1));
+    assert!(!look(&mut rig, &plant, time(1), Duration::from_secs(1)));
+    let report = plant.drills.report(&id).unwrap();
+    assert_eq!(report.state, DrillState::Aborted);
+    assert!(
+        says(&report, "could not be recorded on disk (no space left)"),
+        "{report:#?}"
+    );
+    let (mut rig, plant, id) = started();
+    assert!(!look(&mut rig, &plant, time(1), Duration::from_secs(6)));
+    // A disk that answers after that starts nothing any more.
+    plant.drills.kept(u64::MAX, rig.now);
+    look(&mut rig, &plant, time(1), Duration::from_secs(1));
+    assert!(!rig.runs(0));
+    let report = plant.drills.report(&id).unwrap();
+    assert!(says(&report, "not recorded on disk within 5 s"), "{report:#?}");
+}
+
+#[test]
+fn the_motor_of_a_drill_that_was_cut_off_is_stopped_at_the_next_start() {
+    for (age, stops) in [(30, true), (4_000, false)] {
+        let (mut rig, plant, id) = started();
+        let (generation, saved) = plant.drills.to_keep().unwrap();
+        plant.drills.kept(generation, rig.now);
+        look(&mut rig, &plant, time(1), Duration::from_secs(1));
+        assert!(rig.runs(0));
+        // The process that comes up after the one that was killed.
+        let plant = self::plant(&rig);
+        plant.drills.restore(saved);
+        let mut events = plant.events.subscribe();
+        // Its client is still there, so that no lease stops the motor.
+        let (alice, until) = (Origin::new(SourceKind::Http, "alice"), rig.now + Duration::from_secs(2));
+        while rig.now < until {
+            plant.drives().next().unwrap().heartbeat(&alice, rig.now);
+            look(&mut rig, &plant, time(age), Duration::from_millis(100));
+        }
+        assert_eq!(!rig.runs(0), stops, "{age} s");
+        let report = plant.drills.report(&id).unwrap();
+        assert_eq!(report.state, DrillState::Aborted, "{report:#?}");
+        assert!(says(&report, "killed or lost power"), "{report:#?}");
+        assert_eq!(report.last_stop.as_deref(), stops.then_some("acknowledged"));
+        let event = std::iter::from_fn(|| events.try_recv().ok()).find(|event| event.kind == EventKind::Drill);
+        assert!(event.is_some_and(|event| event.text.contains("killed or lost power")));
+        assert!(
+            !plant
+                .drills
+                .to_keep()
+                .unwrap()
+                .1
+                .reports
+                .iter()
+                .any(|report| !report.state.is_over())
+        );
+    }
 }
