@@ -1,11 +1,12 @@
 //! Drills of simulated drives: a drive that stops as it should always passes, each fault is named, every drill ends with a stop, and
 //! the other drives of the line are read as ever.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate::codec::Protocol;
 use drivegate::command::{Authority, DEFAULT_EXPIRY, Origin, Outcome, SourceKind};
-use drivegate::drill::{DrillOptions, DrillReport, DrillState, Kind, LOOK};
+use drivegate::drill::{DrillOptions, DrillReport, DrillState, Drills, Kind, LOOK, SavedDrills};
 use drivegate::drive::ModelPoint;
 use drivegate::process_image::{LeaseAction, Supervision};
 use drivegate::sim::faults::FaultPlan;
@@ -322,4 +323,90 @@ fn one_at_a_time_by_who_armed_it_and_within_a_minute() {
         play.rig.good(1, ModelPoint::Running).map(|value| value.as_bool()),
         Some(false)
     );
+}
+
+/// What a file keeps of drills, written `looks` looks after it was due: a disk that is slow.
+struct Disk {
+    on_disk: Option<SavedDrills>,
+    writing: Option<(u32, u64, SavedDrills)>,
+    looks: u32,
+}
+
+impl Disk {
+    fn look(&mut self, drills: &Drills, now: Instant) {
+        match self.writing.take() {
+            Some((0, generation, saved)) => {
+                // As it is read by the next process.
+                let bytes = serde_json::to_vec(&saved).unwrap();
+                self.on_disk = Some(SavedDrills::from_json(&bytes).unwrap());
+                drills.kept(generation, now);
+            }
+            Some((left, generation, saved)) => self.writing = Some((left - 1, generation, saved)),
+            None => {
+                let due = drills.to_keep();
+                self.writing = due.map(|(generation, saved)| (self.looks, generation, saved));
+            }
+        }
+    }
+
+    fn knows(&self, id: &str) -> bool {
+        let saved = self.on_disk.as_ref();
+        saved.is_some_and(|saved| saved.reports.iter().any(|report| report.id == id))
+    }
+}
+
+/// The gateway is killed at any moment of a drill and comes back: the motor stands. It never turned while nothing of it was on disk.
+#[test]
+fn a_kill_at_any_moment_leaves_no_motor_running() {
+    let mut stopped = 0;
+    for kill in 0..60_u32 {
+        let mut works = works("vacon-nx", Protocol::ModbusRtu);
+        // Nothing else is to stop it.
+        works.supervision = None;
+        let mut play = Play::of(&works, u64::from(kill));
+        play.rig.plant.drills.keep(true);
+        let mut disk = Disk {
+            on_disk: None,
+            writing: None,
+            looks: kill % 7,
+        };
+        let id = play.begin(&[Kind::Order, Kind::Gateway], 10.0);
+        for look in 0..=kill * 10 {
+            play.rig.run(LOOK);
+            disk.look(&play.rig.plant.drills, play.rig.now);
+            play.rig.plant.drills.look(&play.rig.plant, play.rig.now, play.time());
+            play.rig.bus.command_came(play.rig.now);
+            assert!(
+                !turns(&mut play.rig) || disk.knows(&id),
+                "the motor turns at look {look} and nothing of its drill is on disk"
+            );
+        }
+        let turned = turns(&mut play.rig);
+        // What the process that was killed knew is gone, but for its file.
+        let drive = play.rig.drive(1);
+        drive.bus.queue.keep_quiet(drive.index, None);
+        drive.image.hold.set(None);
+        play.rig.plant.drills = Arc::default();
+        play.rig.plant.drills.set_options(Some(OPTIONS));
+        if let Some(saved) = disk.on_disk {
+            play.rig.plant.drills.restore(saved);
+        }
+        for _ in 0..500 {
+            play.rig.run(LOOK);
+            play.rig.plant.drills.look(&play.rig.plant, play.rig.now, play.time());
+            play.rig.bus.command_came(play.rig.now);
+        }
+        play.healed();
+        let report = play.rig.plant.drills.report(&id);
+        assert!(
+            report.as_ref().is_none_or(|report| report.state.is_over()),
+            "{report:#?}"
+        );
+        if turned {
+            stopped += 1;
+            let report = report.unwrap();
+            assert_eq!(report.last_stop.as_deref(), Some("acknowledged"), "{report:#?}");
+        }
+    }
+    assert!(stopped >= 20, "{stopped} motors turned at the kill");
 }
