@@ -8,7 +8,7 @@ use std::time::Duration;
 use ipnet::IpNet;
 use serde_json::{Value, json};
 
-use super::deprecated::Capped;
+use super::capped::Capped;
 use super::key::{
     DURATION, Figure, Flag, Key, List, Name, Number, Own, Parsed, Present, Preset, SIZE, Text, Time, Words, table,
 };

@@ -6,7 +6,7 @@
 mod authority;
 mod bacnet;
 mod bus;
-mod deprecated;
+mod capped;
 mod drill;
 mod drive;
 mod files;
@@ -233,7 +233,6 @@ fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>)
         .filter(|(name, _)| name.starts_with(ENVIRONMENT))
         .partition(|(_, value)| !value.contains(char::REPLACEMENT_CHARACTER));
     document.overlay(ENVIRONMENT, variables);
-    deprecated::rename(&mut document, deprecated::RENAMED);
     let mut profile_errors = Vec::new();
     let base = path.parent().unwrap_or(Path::new(""));
     let settings = read(&document.reader(), base, &mut profile_errors);

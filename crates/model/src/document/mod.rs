@@ -180,13 +180,6 @@ impl Document {
         }
     }
 
-    /// Renames the key `old` in all tables that the keys of `path` lead to, unless they have `new` too; where that was.
-    pub fn rename(&mut self, path: &[&str], old: &str, new: &str) -> Vec<Place> {
-        let mut places = Vec::new();
-        tree::rename(&mut self.root, String::new(), path, (old, new), &mut places);
-        places
-    }
-
     /// The whole tree.
     pub(crate) fn root(&self) -> &Node {
         &self.root

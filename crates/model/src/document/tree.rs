@@ -221,37 +221,6 @@ impl OverrideError {
     }
 }
 
-/// Renames a key, from the first name to the second, in the tables that `path` leads to from `node`, which is at `here`.
-pub(super) fn rename(node: &mut Node, here: String, path: &[&str], names: (&str, &str), places: &mut Vec<Place>) {
-    let below = |key: &str| match here.as_str() {
-        "" => key.to_string(),
-        here => format!("{here}.{key}"),
-    };
-    match (&mut node.value, path.split_first()) {
-        (Raw::Array(items), _) => {
-            for (index, item) in items.iter_mut().enumerate() {
-                rename(item, format!("{here}[{index}]"), path, names, places);
-            }
-        }
-        (Raw::Table(entries), Some((next, rest))) => {
-            for (key, _, child) in entries.iter_mut().filter(|(key, ..)| key == next) {
-                rename(child, below(key), rest, names, places);
-            }
-        }
-        (Raw::Table(entries), None) if entries.iter().all(|(key, ..)| key != names.1) => {
-            for (key, line, child) in entries.iter_mut().filter(|(key, ..)| key == names.0) {
-                places.push(Place {
-                    line: line.or(child.line).filter(|_| child.env.is_none()),
-                    env: child.env.clone(),
-                    key: below(key),
-                });
-                *key = names.1.to_string();
-            }
-        }
-        _ => {}
-    }
-}
-
 /// Puts the `text` of the variable `name` at `path` below `root`, into a table that exists.
 ///
 /// # Errors

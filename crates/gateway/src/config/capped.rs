@@ -1,0 +1,67 @@
+//! A duration whose upper limit was lowered: for one minor version a longer one is accepted with a warning.
+
+use std::ops::RangeInclusive;
+use std::time::Duration;
+
+use serde_json::Value;
+
+use super::key::{Form, Time};
+use crate::document::{Reader, format_duration};
+
+/// A duration of the range; a longer one, up to what was allowed before, counts as the longest of the range.
+pub(super) struct Capped {
+    pub(super) range: RangeInclusive<Duration>,
+    /// What was allowed before.
+    pub(super) before: Duration,
+    /// Why no longer, after the value.
+    pub(super) why: &'static str,
+    /// The version that refuses it, such as `0.2`.
+    pub(super) until: &'static str,
+}
+
+impl Capped {
+    fn now(&self) -> Time {
+        Time(self.range.clone())
+    }
+}
+
+impl Form<Duration> for Capped {
+    fn read(&self, reader: &Reader<'_>, key: &str) -> Option<Duration> {
+        let value: Duration = reader.optional(key)?;
+        let most = *self.range.end();
+        if !(most..=self.before).contains(&value) || value == most {
+            return reader.accept(key, self.now().check(value));
+        }
+        let [shown, used] = [value, most].map(format_duration);
+        let what = format!("{shown} {}; {used} is used", self.why);
+        reader.warning(
+            key,
+            what,
+            format!("write at most \"{used}\"; version {} refuses it", self.until),
+        );
+        Some(most)
+    }
+
+    fn schema(&self) -> Value {
+        self.now().schema()
+    }
+
+    fn range(&self) -> String {
+        self.now().range()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::keys::RESPONSE_TIMEOUT;
+
+    #[test]
+    fn a_longer_duration_is_accepted_no_longer_than_was_promised() {
+        let number = |text: &str| -> (u32, u32) {
+            let mut parts = text.split('.').map(|part| part.parse().unwrap());
+            (parts.next().unwrap(), parts.next().unwrap())
+        };
+        let (this, until) = (number(env!("CARGO_PKG_VERSION")), number(RESPONSE_TIMEOUT.until));
+        assert!(this < until, "make RESPONSE_TIMEOUT of keys.rs a plain range");
+    }
+}
