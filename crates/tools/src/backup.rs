@@ -155,7 +155,7 @@ fn state(dir: &Path, below: &Path, decided: &[PathBuf], sources: &mut Sources) -
         if kind.is_dir() {
             state(dir, &below, decided, sources)?;
         } else if !kind.is_file() {
-            sources.leave_out(&path, "it is not a plain file");
+            sources.leave_out(&path, "it is not a regular file");
         } else if path.extension().is_some_and(|ending| ending == "tar") {
             // Else each backup would have those before it.
             sources.leave_out(&path, "it is an archive");
@@ -291,7 +291,7 @@ mod tests {
             why: why.to_string(),
         };
         let expected = [
-            left_out("params/pump-1", "it is not a plain file"),
+            left_out("params/pump-1", "it is not a regular file"),
             left_out("yesterday.tar", "it is an archive"),
         ];
         assert_eq!(sources.left_out, expected);

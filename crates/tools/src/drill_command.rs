@@ -146,7 +146,8 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
     let armed: DrillReport = asked(&client, &Asked::post("/api/v1/drills", &body)).await?;
     let ways: Vec<&str> = armed.steps.iter().map(|step| step.kind.name()).collect();
     let warning = format!(
-        "Drive {} is started at {} % and stopped by: {}. Allowed are {} s each.\nType its name to start the motor: ",
+        "Drive {} will be started at {} % and stopped by: {}. Time allowed: {} s each.\nType its name to start the \
+         motor: ",
         armed.drive,
         armed.speed,
         ways.join(", "),
@@ -162,7 +163,7 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
         ended.map_err(|why| format!("{why}; nothing was started"))?;
         return Err("the name was not typed; nothing was started".to_string());
     }
-    let lost = "whether it started is not known: look at the motor, and end it with Ctrl-C on the machine";
+    let lost = "it is unknown whether it started: check the motor, and stop it at the machine";
     let start = Asked::post(format!("{}/start", path(&armed.id)), &json!({})).if_lost(lost);
     let started: DrillReport = asked(&client, &start).await?;
     watch(&client, started).await
@@ -191,7 +192,7 @@ async fn watch(client: &Client, started: DrillReport) -> Result<DrillReport, Str
         };
         let next = match ends {
             true => Asked::delete(path(&now.id))
-                .if_lost("whether the drill ended is not known: stop the motor by its switch"),
+                .if_lost("it is unknown whether the drill ended: stop the motor at its switch"),
             false => Asked::view(path(&now.id)),
         };
         now = asked(client, &next).await?;

@@ -61,7 +61,7 @@ async fn hold(args: &Args) -> Result<Hold, String> {
     let asked = match &args.action {
         None => Asked::get(path),
         Some(action) => {
-            let lost = "whether the hold changed is not known: ask again without an action";
+            let lost = "it is unknown whether the hold changed: run it again without an action";
             Asked::post(path, &json!({ "action": action })).if_lost(lost)
         }
     };

@@ -65,7 +65,7 @@ fn of(name: &str, source: &str) -> Result<String, (String, Finding)> {
     }
     let configuration = Value::Table(configuration);
     if let Some((key, text)) = template(&configuration, "") {
-        let what = format!("Ansible would take `{text}` for a template");
+        let what = format!("Ansible would treat `{text}` as a template");
         return Err((key, Finding::new(what, "write it without {{, {% and {#")));
     }
     let nested = |key: &str, value| Value::Table([(key.to_string(), value)].into_iter().collect());

@@ -113,7 +113,8 @@ fn settings(args: &Args) -> Result<(Vec<Protocol>, Vec<LineFormat>), String> {
     }
     if formats.is_empty() {
         return Err(
-            "no protocol supports these bauds and formats; --baud, --format; N2 is always 9600 8N1, Modbus RTU has 8 data bits"
+            "no protocol supports these baud rates and formats; --baud, --format; N2 is always 9600 8N1, Modbus RTU \
+             has 8 data bits"
                 .to_string(),
         );
     }
@@ -142,7 +143,7 @@ impl Ear<'_> {
         report::lines_to_stderr(&words(&survey, profiles, protocol));
         if self.args.n2_report {
             report::lines_to_stderr(&format!(
-                "\nWhat is assumed of N2, and what was seen of it\n{}",
+                "\nAssumptions about N2, and what was seen of them\n{}",
                 n2.report()
             ));
         }
@@ -256,8 +257,7 @@ fn nothing(bytes: u64, port: &str) -> String {
         ),
         bytes => format!(
             "{bytes} bytes were received, but no valid request with any setting; {port}; check A and B, name --baud \
-             and --format, or the \
-             line has another protocol"
+             and --format, or the line uses another protocol"
         ),
     }
 }

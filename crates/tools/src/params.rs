@@ -175,8 +175,7 @@ fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Resul
     });
     line.end();
     let file = text.map_err(|why| report::failed(&why)).and_then(|text| {
-        ParameterFile::parse(&text)
-            .map_err(|why| report::failed(&format!("the gateway's file is not understood: {why}")))
+        ParameterFile::parse(&text).map_err(|why| report::failed(&format!("the gateway's file is invalid: {why}")))
     })?;
     let profile = match target.profile() {
         Some(profile) => profile.clone(),
@@ -335,7 +334,7 @@ fn show(config: &Path, of: &str, names: Option<&Path>) -> Result<ExitCode, ExitC
                 .map_err(|why| report::failed(&format!("{why}; correct or remove it")))?;
             last.ok_or_else(|| {
                 report::failed(&format!(
-                    "no reading of `{of}` is kept; {}; read it by `drivegate params read {of}`",
+                    "no reading of `{of}` is stored; {}; read it with `drivegate params read {of}`",
                     store.dir().display()
                 ))
             })?

@@ -361,7 +361,7 @@ fn remarks(profile: &Profile, point: &Point) -> String {
         parts.push(format!("commands go to {}", name_of(profile, target)));
     }
     if point.fast_if_carried {
-        parts.push("fast where the line carries it".to_string());
+        parts.push("fast if the line can carry it".to_string());
     }
     if point.on_change {
         parts.push("written on change only".to_string());
@@ -391,7 +391,7 @@ fn remarks(profile: &Profile, point: &Point) -> String {
 fn unverified(profile: &Profile) -> &'static str {
     match profile.verified {
         true => "",
-        false => "no: nobody has confirmed it on hardware yet; docs/verifying.md says how to",
+        false => "no: nobody has confirmed it on hardware yet; docs/verifying.md explains how",
     }
 }
 
@@ -465,7 +465,7 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
             )
         }
         Derived::Zero { within, .. } => format!("true up to {within}"),
-        Derived::Equal { within, .. } => format!("true while they differ by {within} at most"),
+        Derived::Equal { within, .. } => format!("true while they differ by at most {within}"),
         Derived::State { any } => {
             let one = |state: &Mask| format!("{:#06x} of {:#06x}", state.is, state.mask);
             any.iter().map(one).collect::<Vec<_>>().join(" or ")

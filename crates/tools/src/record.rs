@@ -29,7 +29,7 @@ fn record(target: &Target) -> ExitCode {
     let reply = target.ask_gateway(&asked);
     match reply.and_then(|reply| Ok(reply.accepted::<Recorded>(&asked)?)) {
         Ok(record) => {
-            report::note(&format!("it is complete in {:.0} s", record.after_s));
+            report::note(&format!("it will be complete in {:.0} s", record.after_s));
             report::print(&format!("{}\n", record.id))
         }
         Err(message) => report::failed(&message),

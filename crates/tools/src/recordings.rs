@@ -140,7 +140,7 @@ fn open(args: &Args, id: &str) -> Result<Recording, ExitCode> {
             path
         }
     };
-    let unreadable = |error| report::failed(&format!("{error}; name a recording of `drivegate recordings list`"));
+    let unreadable = |error| report::failed(&format!("{error}; choose a recording from `drivegate recordings list`"));
     store::read(&path).map_err(unreadable)
 }
 

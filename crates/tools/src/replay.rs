@@ -31,9 +31,11 @@ const STEP: Duration = Duration::from_millis(100);
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate replay line1.pcap --config drivegate.toml
-  drivegate replay trip.pcapng --config drivegate.toml --bus line1
+  drivegate replay \
+                        trip.pcapng --config drivegate.toml --bus line1
 
-Exit codes: 0 played, 1 failure, 2 wrong command line, 65 no sound capture, 78 invalid configuration.")]
+Exit codes: 0 played, 1 failure, 2 wrong \
+                        command line, 65 no valid capture, 78 invalid configuration.")]
 pub(super) struct Args {
     /// The capture.
     #[arg(value_name = "FILE")]
@@ -63,7 +65,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Ok(capture) => {
             if let Some(error) = capture.broken {
                 report::warning(&format!(
-                    "the capture is read up to a damaged part: {error}; {}; what follows is left out",
+                    "the capture is read up to a damaged part: {error}; {}; the rest is ignored",
                     args.capture.display()
                 ));
             }
@@ -217,7 +219,8 @@ impl Player {
         let _ = write!(self.text, "\n{}", report::lines(&table));
         let _ = writeln!(
             self.text,
-            "\n{:.3} s: {} answered, {} refused, {} unanswered, {} damaged or doubtful, {} pieces outside transactions",
+            "\n{:.3} s: {} answered, {} refused, {} unanswered, {} damaged or doubtful, {} fragments outside \
+             transactions",
             at.as_secs_f64(),
             counted(Outcome::Ok),
             counted(Outcome::Exception),

@@ -71,7 +71,7 @@ fn restore(args: &Args) -> Result<String, Refused> {
     let runtime = super::runtime()?;
     if runtime.block_on(is_running(config)) {
         return Err(Refused::Because(
-            "the gateway runs: stop it first (systemctl stop drivegate)".to_string(),
+            "the gateway is running: stop it first (systemctl stop drivegate)".to_string(),
         ));
     }
     let file = File::open(&args.file).map_err(|error| format!("cannot read the backup: {error}"))?;

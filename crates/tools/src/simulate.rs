@@ -28,16 +28,22 @@ use std::time::Duration;
 #[derive(Debug, clap::Args)]
 #[command(after_help = format!("Examples:
   drivegate simulate --addresses 1-10 --link /tmp/line1 --baud 38400
-  drivegate simulate --addresses 1,2 --link /tmp/line1 --fault drop=0.01,late:150ms=0.01 --seed 7
-  drivegate simulate --profile teco-7300pa --addresses 1-3 --link /tmp/line2
-  drivegate simulate --profile our-meter.toml --set voltage_l1=231.5 --link /tmp/line3
-  drivegate simulate --config drivegate.toml
+  \
+                                drivegate simulate --addresses 1,2 --link /tmp/line1 --fault \
+                                drop=0.01,late:150ms=0.01 --seed 7
+  drivegate simulate --profile teco-7300pa \
+                                --addresses 1-3 --link /tmp/line2
+  drivegate simulate --profile our-meter.toml --set \
+                                voltage_l1=231.5 --link /tmp/line3
+  drivegate simulate --config \
+                                drivegate.toml
 
 Faults: {NAMES}.
 
-A simulated drive obeys the bus. Writing a fault, as its registers show it, to a holding register that no real drive \
-has trips it; PDU address by the key `simulator` of the profile: {}; others 9998. So does the signal USR1 with all \
-drives of the process; USR2 gives them to their panels, or back to the bus.", trip_registers()))]
+A simulated drive obeys the bus. Writing a fault \
+                                code to a holding register that no real drive has trips it; PDU address by the key \
+                                `simulator` of the profile: {}; others 9998. The signal USR1 trips all drives of the \
+                                process; USR2 gives them to their panels, or back to the bus.", trip_registers()))]
 pub(super) struct Args {
     /// Simulate every bus of a gateway configuration, each under its own `port`
     #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "protocol", "baud", "format"])]

@@ -48,7 +48,7 @@ async fn stop_all(args: &Args) -> Result<StopReport, String> {
         (None, Some(group)) => json!({ "group": group }),
         (None, None) => json!({}),
     };
-    let asked = Asked::post("/api/v1/stop", &scope).if_lost("whether the drives stopped is not known: look at them");
+    let asked = Asked::post("/api/v1/stop", &scope).if_lost("it is unknown whether the drives stopped: check them");
     let reply = args.gateway.client()?.ask(&asked).await?;
     match reply.parsed() {
         // Of either status.
@@ -68,8 +68,8 @@ fn shown(stopped: &StopReport) -> String {
         let reason = drive.reason.as_deref().unwrap_or_default();
         match drive.outcome {
             Stopped::Standing => format!("{name}: standing\n"),
-            Stopped::Stopping => format!("{name}: NOT PROVEN TO STAND, stopping: {}\n", printable::line(reason)),
-            Stopped::Unproven => format!("{name}: NOT PROVEN TO STAND, unproven: {}\n", printable::line(reason)),
+            Stopped::Stopping => format!("{name}: NOT PROVEN STOPPED, stopping: {}\n", printable::line(reason)),
+            Stopped::Unproven => format!("{name}: NOT PROVEN STOPPED, unproven: {}\n", printable::line(reason)),
         }
     };
     others.iter().chain(&standing).map(line).collect()

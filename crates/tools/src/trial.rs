@@ -98,7 +98,7 @@ fn attempt(args: &Args, stop: &Stop) -> Result<ExitCode, ExitCode> {
     };
     let (settings, profiles) = scan::prepare(&args.options, &port)?;
     report::note(&format!(
-        "looking for drives on {port}; nothing is written to them, and Ctrl-C ends it"
+        "looking for drives on {port}; nothing is written to them; Ctrl-C to stop"
     ));
     let mut search = Search::new(&port, &args.options, profiles, stop.flag.clone());
     let outcome = match settings.first() {

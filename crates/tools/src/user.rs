@@ -87,7 +87,7 @@ fn add(file: &UsersFile, name: &str) -> Result<String, String> {
     let user =
         User::new(name, &password()?).map_err(|error| format!("{error}; {}; choose another", file.path.display()))?;
     Ok(match file.open().put(&user, true)? {
-        true => format!("{name} has another password; reload the gateway\n"),
+        true => format!("{name} has a new password; reload the gateway\n"),
         false => format!("{name} was added; reload the gateway\n"),
     })
 }

@@ -86,7 +86,7 @@ const TIMES: Time = Time(MILLISECOND..=HOUR);
 pub(super) const RESPONSE_TIMEOUT: Capped = Capped {
     range: MILLISECOND..=Duration::from_secs(5),
     before: HOUR,
-    why: "is longer than any drive takes to begin its reply",
+    why: "is longer than any drive takes to start its reply",
     until: "0.2",
 };
 /// Range of the delays of RS-485 by the kernel, in whole milliseconds.
@@ -190,7 +190,7 @@ keys! {
         /// What the recorder keeps.
         recordings: Present = Own { schema: Recordings::schema, range: "[recordings]" }, or "the defaults";
         /// When parameters are read by themselves, and what they are called.
-        params: Present = Own { schema: Params::schema, range: "[params]" }, or "only when asked";
+        params: Present = Own { schema: Params::schema, range: "[params]" }, or "only on request";
         /// What is logged.
         log: Present = Own { schema: Log::schema, range: "[log]" }, or "the defaults";
     }

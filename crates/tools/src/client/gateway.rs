@@ -117,7 +117,7 @@ fn http_of(config: &Path) -> Result<Url, String> {
     })?;
     if http.identity.is_some() {
         return Err(format!(
-            "the HTTP server has TLS, and the name in its certificate is not known here; {shown}; pass --url and --ca"
+            "the HTTP server has TLS, and the name in its certificate is unknown here; {shown}; pass --url and --ca"
         ));
     }
     format!("http://{}", from_here(http.listen)).parse()

@@ -76,7 +76,7 @@ pub(super) fn restore(gateway: &Gateway, args: &RestoreArgs) -> Result<ExitCode,
 /// Reads one drive and restores that to another.
 pub(super) fn clone(gateway: &Gateway, from: &str, to: &str, how: &How) -> Result<ExitCode, ExitCode> {
     if from == to {
-        let why = "a drive is not cloned to itself; command line; name two drives";
+        let why = "a drive cannot be cloned to itself; command line; name two drives";
         return Err(report::misused(why));
     }
     let brisk = ReadParameters {
@@ -192,7 +192,7 @@ fn agrees(drive: &str, how: &How) -> Result<(), ExitCode> {
     let (stdin, mut stderr) = (std::io::stdin(), std::io::stderr());
     if !stdin.is_terminal() || !stderr.is_terminal() {
         return Err(report::failed(
-            "nothing was written: there is no terminal on which to ask; command line; add --yes to write that, or --dry-run",
+            "nothing was written: there is no terminal to ask on; command line; add --yes to write, or --dry-run",
         ));
     }
     // A terminal that is gone gives no answer.

@@ -112,8 +112,8 @@ pub(super) fn settings(args: &Options, port: &str) -> Result<Vec<Setting>, Strin
     check_addresses(args, &settings)?;
     if settings.is_empty() {
         return Err(
-            "no protocol supports these bauds and formats; --baud, --format; N2 is always 9600 8N1, Modbus \
-                    RTU has 8 data bits"
+            "no protocol supports these baud rates and formats; --baud, --format; N2 is always 9600 8N1, Modbus RTU \
+             has 8 data bits"
                 .to_string(),
         );
     }
