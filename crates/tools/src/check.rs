@@ -27,8 +27,8 @@ use crate::process_image::{Access, DriveSpec};
 
 /// Checks a configuration and predicts wire times, cycles and load of each bus.
 ///
-/// Opens only the files that the configuration names, and the journals of restores in the state directory. Errors and warnings go to stderr, with --json to
-/// stdout with all the rest.
+/// Opens only the files that the configuration names, and the journals of restores in the state directory. Errors and
+/// warnings go to stderr, with --json to stdout with everything else.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  drivegate check --config /etc/drivegate/drivegate.toml\n  \

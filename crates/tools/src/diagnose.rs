@@ -9,7 +9,7 @@ use super::client::{Gateway, encoded};
 use super::{printable, report};
 use crate::diagnosis::{Counted, Verdict};
 
-/// Says what is wrong with a line: each verdict with its evidence, how sure it is, and what to do.
+/// Shows what is wrong with a line: each verdict with evidence, certainty and remedy.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate diagnose

@@ -15,10 +15,11 @@ use crate::drill::{DrillReport, DrillState, Kind};
 /// How often a drill that is under way is looked at.
 const LOOK: Duration = Duration::from_millis(500);
 
-/// Proves that a motor stops: by an order, when its client falls silent, when the gateway falls silent.
+/// Proves that a motor stops: by a command, when its client goes silent, when the gateway goes silent.
 ///
-/// The motor is started at a low speed and stopped in each way, and the time until it stands is measured. The drive's name has to
-/// be typed before it starts; Ctrl-C ends the drill and stops the motor. Have a hand on the switch, and nobody at the machine.
+/// The motor is started at low speed and stopped in each way, and the time to standstill is measured. You must type the
+/// drive's name before it starts; Ctrl-C ends the drill and stops the motor. Keep a hand on the switch, and nobody at
+/// the machine.
 #[derive(Debug, clap::Args)]
 #[command(
     args_conflicts_with_subcommands = true,
@@ -36,20 +37,20 @@ pub(super) struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum Shown {
-    /// Lists the drills that are known, the newest first.
+    /// Lists the known drills, newest first.
     #[command(after_help = "Example:\n  drivegate drill list --config drivegate.toml")]
     List {
         #[command(flatten)]
         gateway: Gateway,
     },
-    /// Prints a drill as a page of HTML.
+    /// Prints a drill as an HTML page.
     #[command(
         after_help = "Example:\n  drivegate drill report --config drivegate.toml 20261128T074744.695Z-pump-1 > report.html"
     )]
     Report {
         #[command(flatten)]
         gateway: Gateway,
-        /// Its id, as `list` prints it.
+        /// Id of the drill, as printed by `list`.
         id: String,
     },
 }
@@ -60,16 +61,16 @@ struct Wish {
     gateway: Gateway,
     /// Name of the drive.
     drive: Option<String>,
-    /// By an order to stop.
+    /// By a stop command.
     #[arg(long)]
     order: bool,
-    /// When its client falls silent.
+    /// When its client goes silent.
     #[arg(long)]
     client: bool,
-    /// When the gateway falls silent: nothing is sent to the drive for `limit`.
+    /// When the gateway goes silent: nothing is sent to the drive for `limit`.
     #[arg(long = "gateway")]
     silence: bool,
-    /// Speed at which the motor is stopped, %; without it `max_speed` of [drill].
+    /// Speed at which the motor is stopped, % [default: `max_speed` of [drill]].
     #[arg(long, value_name = "PERCENT")]
     speed: Option<f64>,
 }

@@ -22,8 +22,8 @@ const TEMPLATES: [&str; 3] = ["{{", "{%", "{#"];
 /// Prints a configuration as an Ansible inventory (YAML): the gateway as a host of group `drivegate`, the file as its variable
 /// `drivegate_configuration`
 ///
-/// The file must be valid, as for `check`. Values from the environment are not in the inventory, except the gateway's name. A file
-/// with a password in it is refused: an inventory is shared and kept in repositories.
+/// The file must be valid, as for `check`. Values from the environment are not in the inventory, except the gateway's
+/// name. A file containing a password is refused, because inventories are shared and kept in repositories.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate inventory plant3/pump-house.toml > inventory/pump-house.yml")]
 pub(super) struct Args {

@@ -48,28 +48,28 @@ enum What {
     Show {
         /// Name of the profile.
         name: String,
-        /// Print the file of the profile, as a template for your own.
+        /// Print the profile file, as a template for your own.
         #[arg(long)]
         toml: bool,
     },
-    /// Prints the beginning of a profile, from a frame or over another profile.
+    /// Prints a new profile to fill in, from a template or based on another profile.
     #[command(after_help = "Examples:\n  drivegate profiles new our-drive > our-drive.toml\n  \
             drivegate profiles new our-pump --base danfoss-fc > /etc/drivegate/profiles/our-pump.toml")]
     New {
         /// Name of the new profile.
         name: String,
-        /// The profile from which it differs.
+        /// The profile it is based on.
         #[arg(long, value_name = "FAMILY")]
         base: Option<String>,
     },
-    /// Checks the file of a profile and proves its commands; exits with 78 and a counterexample if one fails.
+    /// Checks a profile file and proves its commands; exits with 78 and a counterexample if one fails.
     #[command(after_help = "Examples:\n  drivegate profiles check our-drive.toml")]
     Check {
-        /// The file of the profile.
+        /// The profile file.
         #[arg(value_name = "FILE")]
         file: PathBuf,
     },
-    /// Prints the profile that a register list (CSV) makes; the columns are in docs/profiles.md.
+    /// Converts a register list (CSV) to a profile; the columns are in docs/profiles.md.
     #[command(after_help = "Examples:\n  drivegate profiles import our-meter.csv > our-meter.toml")]
     Import {
         /// The list, with a header line.

@@ -7,9 +7,9 @@ use super::drive_access::{OneDrive, Target};
 use super::report;
 use crate::north::http::messages::Recorded;
 
-/// Makes the running gateway record a drive: the time before now, and the time after.
+/// Makes the running gateway record a drive: the time just before and after.
 ///
-/// Prints the id of the recording. How long before and after: `before` and `after` of [recordings].
+/// Prints the id of the recording. The times are `before` and `after` of [recordings].
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:
   drivegate record --config drivegate.toml pump-1

@@ -11,10 +11,10 @@ use crate::config::{Settings, environment};
 use crate::north::http::messages::ReloadOutcome;
 use crate::north::local::SocketPath;
 
-/// Lets the running gateway reload its configuration, and waits for the outcome.
+/// Makes the running gateway reload its configuration, and waits for the result.
 ///
-/// Prints what changed. If the gateway refuses the configuration, its errors are printed, the exit code is 78, and
-/// the gateway goes on with the former one.
+/// Prints what changed. If the gateway refuses the configuration, its errors are printed, the exit code is 78, and the
+/// gateway keeps the previous one.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate reload --config /etc/drivegate/drivegate.toml")]
 pub(super) struct Args {

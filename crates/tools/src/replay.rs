@@ -24,7 +24,7 @@ const AFTERWARDS: Duration = Duration::from_millis(200);
 /// Longest step of virtual time.
 const STEP: Duration = Duration::from_millis(100);
 
-/// Plays a capture of a serial line through the code that listens, in virtual time, and prints events and the values at its end.
+/// Replays a capture of a serial line in virtual time, and prints events and final values.
 ///
 /// Reads pcap and pcapng with link type RTAC Serial (250), as `drivegate trace --pcap` and `recordings export --pcap` write them, or
 /// a USER link type (147 to 162), whose packets are bare bytes. Opens no port.
@@ -42,7 +42,7 @@ pub(super) struct Args {
     capture: PathBuf,
     #[command(flatten)]
     config: ConfigFile,
-    /// The bus of the configuration whose line it is [default: the only one].
+    /// The bus of the configuration that it was captured on [default: the only one].
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
 }

@@ -54,7 +54,7 @@ pub(super) struct Args {
     /// Include the profiles (*.toml) of this directory; may be repeated
     #[arg(long, value_name = "DIR", conflicts_with = "config")]
     pub profile_dir: Vec<PathBuf>,
-    /// What a point of a profile without a simulator of its own shows, such as voltage_l1=231.5; may be repeated
+    /// Value of a point, for profiles without their own simulator, such as voltage_l1=231.5; may be repeated
     #[arg(long, value_name = "POINT=VALUE", conflicts_with = "config")]
     pub set: Vec<String>,
     /// Their addresses, such as 1-10 or 1,2,7
@@ -84,7 +84,7 @@ pub(super) struct Args {
     /// Faults and their probabilities, such as drop=0.01,corrupt=0.02
     #[arg(long, value_name = "LIST", default_value = "")]
     pub fault: Rates,
-    /// Seed of the faults and of what the drives do on their own
+    /// Seed of the faults and of the autopilot
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,
     /// Let the drives start, stop and fault on their own until a master writes to them
@@ -102,7 +102,7 @@ pub(super) struct Args {
     /// Let each TECO 7300PA answer a request with a wrong check code with error 00H, as in its error table, instead of not at all
     #[arg(long)]
     pub teco_answer_check_error: bool,
-    /// Characters delivered to the master at once: 0 the whole reply, 14 like a UART's FIFO, 1 one by one
+    /// Characters delivered to the master at a time: 0 the whole reply, 14 like a UART's FIFO, 1 one by one
     #[arg(long, value_name = "CHARACTERS", default_value_t = 0)]
     pub chunk: u8,
     /// True wire times, or as fast as the programs are

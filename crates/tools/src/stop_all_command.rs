@@ -8,9 +8,9 @@ use super::client::{Asked, Gateway};
 use super::{EXIT_FAILED, printable, report};
 use crate::stop_all::{StopReport, Stopped};
 
-/// Stops every controlled drive through the running gateway, and waits up to 10 s for them to stand.
+/// Stops every controlled drive through the running gateway, and waits up to 10 s for them to stop.
 ///
-/// Prints each drive; the exit code is 1 if one is not proven to stand. This is no emergency stop.
+/// Prints each drive; the exit code is 1 if one is not proven to have stopped. This is not an emergency stop.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate stop-all --config drivegate.toml
@@ -19,7 +19,7 @@ use crate::stop_all::{StopReport, Stopped};
 pub(super) struct Args {
     #[command(flatten)]
     gateway: Gateway,
-    /// Only the drives of this bus.
+    /// Only the drives on this bus.
     #[arg(long, value_name = "BUS")]
     bus: Option<String>,
     /// Only the drives with this `group`.

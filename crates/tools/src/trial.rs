@@ -19,7 +19,7 @@ use super::{EXIT_FAILED, report};
 /// How long the line is listened to before anything is sent.
 const LISTEN: Duration = Duration::from_secs(1);
 
-/// Finds the drives of a line, shows their values on a page, offers to write a configuration; only reads.
+/// Finds the drives on a line, shows their values on a page, offers to write a configuration; only reads.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate try

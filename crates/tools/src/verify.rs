@@ -9,7 +9,7 @@ use super::{printable, profiles, read, report};
 use crate::drive::{ModelPoint, Profile};
 use crate::north::http::messages::PointValue;
 
-/// Prints the form for confirming the profile of a drive on hardware: what the gateway reads, next to what the panel shows.
+/// Prints a form for confirming a drive's profile on hardware: what the gateway reads, next to what the panel shows.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate verify --config drivegate.toml pump-1 > pump-1.md

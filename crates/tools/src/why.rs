@@ -9,7 +9,7 @@ use super::drive_access::{Needs, OneDrive, Target};
 use super::{printable, report};
 use crate::north::http::messages::Why;
 
-/// Says why a drive does not run: each cause with its evidence, its age and what to do.
+/// Shows why a drive does not run: each cause with evidence, age and remedy.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate why --config drivegate.toml pump-1
