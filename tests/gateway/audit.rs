@@ -189,7 +189,7 @@ fn a_missing_disk_delays_no_order_and_is_logged_once() {
     (0..5).for_each(|value| write_registers(site.modbus, 1, SPEED_REFERENCE, &[value]));
     gateway.until_printed("audit file: cannot write");
     std::fs::remove_file(site.file("state")).unwrap();
-    gateway.until_printed("is written again");
+    gateway.until_printed("audit file: writing to ");
     until("all orders in the file", || (entries(&site).len() >= 5).then_some(()));
     assert_eq!(gateway.output().matches("audit file: cannot write").count(), 1);
     assert!(verify(&site, &[]).status.success());

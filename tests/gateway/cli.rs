@@ -361,7 +361,7 @@ fn stops_at_shutdown_are_told_with_their_time() {
     );
     let path = "tests/doubtful/shutdown.toml";
     let ran = run(&["check", "--config", path]);
-    let wanted = "  shutdown    3 drives stopped in 0.28 s, 108.98 s if none answers\n";
+    let wanted = "  shutdown    3 drives stopped in 0.28 s, 108.98 s if none replies\n";
     assert!(ran.out.contains(wanted), "{}", ran.out);
     let bus = &json(&run(&["check", "--json", "--config", path]))["buses"][0];
     let seconds = |key: &str| bus[key].as_f64().unwrap() / 1e3;

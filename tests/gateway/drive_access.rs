@@ -72,7 +72,7 @@ impl Line {
     /// The gateway of this configuration, once its socket listens.
     pub(crate) fn gateway(&self) -> Running {
         let gateway = Running::drivegate(&["run", "--config", self.config().to_str().unwrap()]);
-        gateway.until_printed("drivegate runs");
+        gateway.until_printed("drivegate is running");
         gateway
     }
 
@@ -186,7 +186,7 @@ impl Line {
             let ran = self.command("write", &[&["pump-1"], values].concat());
             assert_eq!(ran.code, 1, "{values:?}: {}", ran.err);
             let wanted = format!(
-                ": the command sets `{twice}` twice; name each point once, and one reference only (bad_value)\n"
+                ": the command sets `{twice}` twice; set each point once, and only one reference (bad_value)\n"
             );
             assert!(ran.err.ends_with(&wanted), "{values:?}: {}", ran.err);
         }
@@ -322,9 +322,9 @@ fn a_gateway_with_another_configuration_is_reported_and_not_commanded() {
     edited("\"plant\"", "\"works\"");
     refused("the gateway is `plant`, the file has `works`");
     edited("address = 1\n", "address = 9\n");
-    refused("the gateway has `pump-1` with the address `1`, the file has it with `9`");
+    refused("the gateway has `pump-1` with address `1`, the file with `9`");
     edited("\"ours\"", "\"others\"");
-    refused("the gateway has `pump-1` with the profile `ours`, the file has it with `others`");
+    refused("the gateway has `pump-1` with profile `ours`, the file with `others`");
     edited("name = \"pump-1\"", "name = \"pump-one\"");
     let ran = line.command("write", &["pump-one", "run=true"]);
     assert!(
@@ -396,7 +396,7 @@ fn a_drive_that_is_away_has_the_quality_that_http_tells() {
     }
     // One reason for all of its points is reported once.
     let ran = drivegate(&["read", "--config", &config, "pump-2"]);
-    let wanted = "error: no point of `pump-2` has a value: the drive does not answer\n";
+    let wanted = "error: no point of `pump-2` has a value: the drive does not reply\n";
     assert_eq!((ran.code, ran.out.as_str(), ran.err.as_str()), (1, "", wanted));
     // Nobody ever asked for this one, so nothing of it can be old.
     let ran = drivegate(&["read", "--json", "--config", &config, "pump-1", "fault_code_id99"]);

@@ -102,7 +102,7 @@ fn a_state_directory_that_cannot_be_written_costs_the_history_only() {
     start_and_stop(&site, 1);
     assert_eq!(log(&site, "?kind=started").len(), 1, "they are in memory");
     fs::remove_file(site.file("state")).unwrap();
-    gateway.until_printed("events and counters are written again; 0 events are missing");
+    gateway.until_printed("writing events and counters again; 0 events are missing");
     let text = fs::read_to_string(site.file("state/events.jsonl")).unwrap();
     assert!(text.contains("\"started\"") && text.contains("\"stopped\""), "{text}");
 }

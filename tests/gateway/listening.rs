@@ -328,7 +328,7 @@ fn check_refuses_what_needs_a_byte() {
     let told = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(78), "{told}");
     for wish in ["access = \"control\"", "on_shutdown = \"stop\"", "supervision"] {
-        let wanted = format!("error: `{wish}` of drive `a` needs a gateway that writes, and this bus only listens");
+        let wanted = format!("error: `{wish}` of drive `a` needs a gateway that writes, but this bus only listens");
         assert!(told.contains(&wanted), "{wanted}: {told}");
     }
     site.configure(&[bus, drive, HTTP]);

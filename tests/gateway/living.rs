@@ -41,7 +41,7 @@ fn an_absent_drive_with_a_long_timeout_holds_up_neither_the_watchdog_nor_a_reloa
         .env("NOTIFY_SOCKET", site.file("notify"))
         .env("WATCHDOG_USEC", "1000000");
     let mut gateway = Running::spawn(&mut command);
-    gateway.until_printed("20s is longer than any drive takes to begin its reply; 5s is used");
+    gateway.until_printed("20s is longer than any drive takes to start its reply; 5s is used");
     until_notified("STATUS=1 of 1 buses up, 0 of 1 drives online");
     // The watchdog is looked at twice a second, an exchange takes 5 s.
     until("two requests", || (line.transcript().len() > 1).then_some(()));
@@ -137,7 +137,7 @@ fn drivegate_events(site: &Site) -> String {
 fn health_is_an_exit_code() {
     let site = site();
     let gateway = site.run();
-    gateway.until_printed("drivegate runs");
+    gateway.until_printed("drivegate is running");
     let unready = command(&site, &["health"]);
     assert_eq!(unready.code, 1);
     assert!(unready.err.contains("bus line1"), "{}", unready.err);

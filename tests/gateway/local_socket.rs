@@ -161,7 +161,7 @@ fn gateways_of_one_user_are_told_apart() {
     lines[2].reconfigure(|text| text.replace("\"plant\"", "\"works\""));
     let start = |line: &Line| {
         let gateway = Running::spawn(&mut command(line, &["run"]));
-        gateway.until_printed("drivegate runs");
+        gateway.until_printed("drivegate is running");
         gateway
     };
     let gateways = [start(&lines[0]), start(&lines[1])];
@@ -317,7 +317,7 @@ impl Family {
         );
         std::fs::write(&config, text).unwrap();
         let gateway = Running::drivegate(&["run", "--config", config.to_str().unwrap()]);
-        let printed = gateway.until_printed("drivegate runs");
+        let printed = gateway.until_printed("drivegate is running");
         let listening = printed
             .split("\"message\":\"Modbus TCP: listening\",\"address\":\"127.0.0.1:")
             .nth(1);

@@ -45,7 +45,7 @@ fn the_state_and_the_fault_text_are_read_like_points() {
     assert_eq!(row.split_whitespace().collect::<Vec<_>>(), ["state", "ready", "good"]);
     site.change("name = \"test\"", "name = \"test\"\nsocket = \"own.sock\"");
     let gateway = site.run();
-    gateway.until_printed("drive pump-1 answers");
+    gateway.until_printed("drive pump-1 is online");
     let through = crate::support::process::until("the state through the gateway", || {
         Some(command(&words)).filter(|ended| ended.code == 0)
     });

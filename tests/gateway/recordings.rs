@@ -57,7 +57,7 @@ fn a_recording_by_command_is_listed_shown_and_exported() {
     assert_eq!(list, Value::from(listed(&site)));
     let shown = printed(&site, &["recordings", "show", &id]);
     assert!(
-        shown.contains("trigger  command") && shown.contains("asked for by uid "),
+        shown.contains("trigger  command") && shown.contains("requested by uid "),
         "{shown}"
     );
     let json: Value = serde_json::from_str(&printed(&site, &["recordings", "export", &id, "--json"])).unwrap();

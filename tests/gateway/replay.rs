@@ -80,7 +80,7 @@ fn the_worked_frames_show_what_the_manuals_say() {
             );
         }
         for told in [
-            "online: drive drive answers",
+            "online: drive drive is online",
             "foreign_command: the other master commands drive",
         ] {
             assert!(printed.contains(told), "{name}: {printed}");

@@ -197,7 +197,7 @@ fn a_reload_does_not_end_supervision() {
     site.change("silence = \"chars\"", "silence = \"spec\"");
     gateway.signal("HUP");
     gateway.until_printed("configuration reloaded");
-    gateway.until_printed("no commanding client of pump-1");
+    gateway.until_printed("no client has commanded pump-1");
     site.until_point("pump-1", "run", false);
 }
 

@@ -228,7 +228,7 @@ fn a_script_has_an_option_for_the_question() {
     assert!(again.err.contains("exists already"), "{}", again.err);
     // Nobody to ask, and nothing said.
     let mut silent = Running::drivegate(&words(&bench.arguments(&[])));
-    silent.until_printed("no configuration is written; --write FILE writes one");
+    silent.until_printed("no configuration was written; --write FILE writes one");
     silent.signal("INT");
     assert!(silent.ended().success());
     bench.is_only_read();

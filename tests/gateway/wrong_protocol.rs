@@ -44,7 +44,7 @@ fn a_client_with_frames_of_rtu_is_named() {
     let line = "[gateway]\nname = \"test\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\n";
     let site = Site::of(&[line, &drive("pump-1", 1, ""), MODBUS_TCP, HTTP]);
     let gateway = site.run();
-    gateway.until_printed("drivegate runs");
+    gateway.until_printed("drivegate is running");
     let script = root().join("tests/peers/rtu_client.py").display().to_string();
     // From 0, where the request passes for the beginning of Modbus TCP, and from where it does not.
     for (start, count) in [("0", "10"), ("0", "2"), ("2100", "11")] {

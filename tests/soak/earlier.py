@@ -8,11 +8,11 @@ COUNT = 6000  # more than the gateway keeps
 # As the load of the soak makes them: whether they come from each drive, each bus or the gateway, and their text.
 KINDS = {
     "online": ("drive", "drive {drive} answers"),
-    "offline": ("drive", "drive {drive} is offline: it does not answer; retrying at least every 10 s"),
-    "started": ("drive", "drive {drive} has started: ordered by mqtt drivegate/soak/drive/{drive}/set"),
-    "stopped": ("drive", "drive {drive} has stopped: ordered by mqtt drivegate/soak/drive/{drive}/set"),
+    "offline": ("drive", "drive {drive} is offline: it does not reply; retrying at least every 10 s"),
+    "started": ("drive", "drive {drive} has started: commanded by mqtt drivegate/soak/drive/{drive}/set"),
+    "stopped": ("drive", "drive {drive} has stopped: commanded by mqtt drivegate/soak/drive/{drive}/set"),
     "fault": ("drive", "drive {drive} has fault 14: drive overtemperature"),
-    "fault_end": ("drive", "the fault of drive {drive} is gone"),
+    "fault_end": ("drive", "the fault of drive {drive} has cleared"),
     "not_confirmed": (
         "drive",
         "drive {drive} acknowledged run=true speed_reference=24.53 but did not show it within 2s: the motor does not run; blocked by "
@@ -20,7 +20,7 @@ KINDS = {
     ),
     "recording": (
         "drive",
-        "recording 20260203T082147.555Z-{drive}: 10 of the transactions on the line failed within 10 s, 4 of them with this drive; 1.6 s "
+        "recording 20260203T082147.555Z-{drive}: 10 transactions on the line failed within 10 s, 4 of them with this drive; 1.6 s "
         "before: 1 timeout, 2 corrupt replies; speed 0 %, current 0 A, DC 560 V",
     ),
     "refused_command": (
@@ -32,16 +32,16 @@ KINDS = {
     "bus_down": (
         "bus",
         "bus {bus} is down: cannot open lines/{bus}: No such file or directory; check that the adapter is plugged in and the path is "
-        "right; trying again every 3 s at the latest",
+        "right; retrying at least every 3 s",
     ),
     "diagnosis": (
         "bus",
-        "line of bus {bus}: requests arrive truncated (likely): 6 replies came after the time limit of 150 ms in the last minute; "
+        "{bus}: requests arrive truncated (likely): 6 replies came after the timeout of 150 ms in the last minute; "
         "check the cable and its terminals, and the supply of the drives",
     ),
     "reload_refused": (
         "gateway",
-        "the configuration was not applied, the former one stays: unknown key `fil`; gateway.toml:119, audit.fil; did you mean `file`?",
+        "the configuration was not applied, the previous one stays: unknown key `fil`; gateway.toml:119, audit.fil; did you mean `file`?",
     ),
 }
 

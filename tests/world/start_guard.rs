@@ -391,12 +391,15 @@ fn an_interlock_that_fails_stops_the_motor_and_keeps_it_from_starting() {
     assert!(
         tripped
             .text
-            .contains("an interlock of d0-1 does not hold: `running` of d0-4"),
+            .contains("an interlock of d0-1 is not satisfied: `running` of d0-4"),
         "{}",
         tripped.text
     );
     let stopped = told.iter().find(|event| event.text.contains("d0-1 has stopped"));
-    assert!(stopped.unwrap().text.contains("an interlock does not hold"), "{told:?}");
+    assert!(
+        stopped.unwrap().text.contains("an interlock is not satisfied"),
+        "{told:?}"
+    );
     let why = play.rig.drive(1).why(&play.rig.drive(1).reading(play.rig.now)).words();
     assert!(why.contains(&"interlocked".to_string()), "{why:?}");
 }

@@ -220,7 +220,7 @@ impl Watch {
             );
         }
         if let Some(unseen) = &self.unseen {
-            return format!("acknowledged {what}, and whether it took effect is not known: {unseen}");
+            return format!("acknowledged {what}; whether it took effect is unknown: {unseen}");
         }
         let passed = now.saturating_duration_since(self.since).as_secs();
         let within = (*within).max(Duration::from_secs(passed));

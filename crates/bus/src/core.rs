@@ -303,7 +303,8 @@ impl BusCore {
             return &[];
         };
         if self.line.babbles(since) {
-            tracing::warn!(target: "drivegate::bus::core", bus = %self.bus.image.spec.name, "the line does not fall silent; speaking all the same");
+            tracing::warn!(target: "drivegate::bus::core", bus = %self.bus.image.spec.name, "the line does not fall \
+                                                                                             silent; sending anyway");
         }
         let quiet_since = self.line.quiet_since();
         self.report

@@ -148,7 +148,8 @@ fn or_end_the_process<T>(work: impl FnOnce() -> T) -> T {
     std::panic::catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| {
         let bus = std::thread::current().name().unwrap_or_default().to_string();
         tracing::error!(
-            target: "drivegate::bus::line_loop", "the thread {bus} panicked, which is a fault of drivegate; the process ends to be started again"
+            target: "drivegate::bus::line_loop", "the thread {bus} panicked, which is a bug in drivegate; the process \
+                                                  exits to be restarted"
         );
         // Log lines are written by a thread of their own.
         std::thread::sleep(LAST_WORDS);

@@ -405,7 +405,7 @@ impl Shortage {
             let requests = if missed.requests == 1 { "request" } else { "requests" };
             cadences.push(format!("{key} = \"{}\"", format_duration(missed.wanted)));
             rounds.push(format!(
-                "{class} rounds of {} {requests} take {:.1} ms and come every {:.1} ms",
+                "{class} polling of {} {requests} takes {:.1} ms, every {:.1} ms",
                 missed.requests,
                 milliseconds(missed.round),
                 milliseconds(missed.achieved)
@@ -413,7 +413,7 @@ impl Shortage {
         }
         let remedies: Vec<String> = self.remedies.iter().map(Remedy::to_string).collect();
         let remedy = match remedies.is_empty() {
-            true => "use fewer drives or longer cadences".to_string(),
+            true => "use fewer drives or longer cycles".to_string(),
             false => remedies.join(", or "),
         };
         let (cadences, rounds) = (cadences.join(" and "), rounds.join(", "));
@@ -425,11 +425,11 @@ impl fmt::Display for Remedy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Remedy::Baud(baud) => write!(f, "set baud = {baud}"),
-            Remedy::Split { buses, baud: None } => write!(f, "split the bus in {buses} buses"),
+            Remedy::Split { buses, baud: None } => write!(f, "split the bus into {buses} buses"),
             Remedy::Split {
                 buses,
                 baud: Some(baud),
-            } => write!(f, "split the bus in {buses} buses with baud = {baud}"),
+            } => write!(f, "split the bus into {buses} buses with baud = {baud}"),
             Remedy::Cycle { cycle, baud: None } => write!(f, "set cycle = \"{}\"", format_duration(*cycle)),
             Remedy::Cycle {
                 cycle,

@@ -481,7 +481,7 @@ impl<'p> Case<'p> {
     ) -> Result<(), Box<Counterexample>> {
         let runs = progress.drive.running.is_some();
         if (self.is_stop() && outcome.is_ok() || stopped) && runs {
-            return Err(self.wrong("the motor runs behind a stop", progress));
+            return Err(self.wrong("the motor runs after a stop", progress));
         }
         if self.is_stop() && event == Event::None {
             // Bits of a word stay as the drive has them, which takes a read before where that is not known.
@@ -494,12 +494,12 @@ impl<'p> Case<'p> {
         }
         // A drive that refuses its end says so.
         if progress.drive.reset_stands() && !matches!(outcome, Outcome::Exception(_)) {
-            return Err(self.wrong("a reset is left standing", progress));
+            return Err(self.wrong("a reset bit is left set", progress));
         }
         let sequence = matches!(self.control.run, Run::Steps(_));
         let refused = matches!(outcome, Outcome::Exception(_) | Outcome::Refused(_));
         if !outcome.is_ok() && runs && !progress.ran && (sequence || refused) {
-            return Err(self.wrong("the command failed and the motor runs", progress));
+            return Err(self.wrong("the command failed but the motor runs", progress));
         }
         if event != Event::None {
             return Ok(());

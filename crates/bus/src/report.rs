@@ -113,8 +113,8 @@ impl Report {
             News::ActionRefused { drive, what, refusal } => {
                 self.action_failed(*drive, |name| {
                     Some(format!(
-                        "the lease of {name} ran out, and {what} cannot be written: {refusal}; it is tried again every \
-                         second, until a client commands the drive"
+                        "the lease of {name} expired, but {what} cannot be written: {refusal}; retrying every second \
+                         until a client commands the drive"
                     ))
                 });
             }
@@ -123,15 +123,15 @@ impl Report {
                 self.action_failed(*drive, |name| {
                     let why = why.as_ref()?;
                     Some(format!(
-                        "the lease of {name} ran out, and {action} failed: {why}; it is tried again every second, until the \
-                         drive acknowledges it or a client commands it"
+                        "the lease of {name} expired, but {action} failed: {why}; retrying every second until the \
+                         drive acknowledges it or a client commands the drive"
                     ))
                 });
             }
             News::ActionTaken { drive, failures } => {
                 let action = self.action_of(*drive);
                 self.drive_event(*drive, EventKind::Supervision, None, |name| {
-                    format!("drive {name} acknowledged {action} of its lease, after {failures} failed tries")
+                    format!("drive {name} acknowledged {action} of its lease, after {failures} failed attempts")
                 });
             }
             News::RunningUnknown(drive) => {
@@ -150,7 +150,7 @@ impl Report {
                 refusal,
             } => self.start_refused(*drive, origin, what, refusal, now),
             News::Tripped { drive, why } => self.drive_event(*drive, EventKind::Interlock, None, |name| {
-                format!("an interlock of {name} does not hold: {why}; the drive is being stopped")
+                format!("an interlock of {name} is not satisfied: {why}; the drive is being stopped")
             }),
         }
         let News::Read { drive, read, at, .. } = news else {
@@ -242,7 +242,7 @@ impl Report {
                 EventKind::BusDown,
                 None,
                 None,
-                format!("bus {name} is down: {why}; trying again every 3 s at the latest"),
+                format!("bus {name} is down: {why}; retrying at least every 3 s"),
             );
         }
         for index in gone {
@@ -256,13 +256,13 @@ impl Report {
         if let Some(response) = self.responses.get_mut(index) {
             response.looked_at = false;
         }
-        self.drive_event(index, EventKind::Online, None, |name| format!("drive {name} answers"));
+        self.drive_event(index, EventKind::Online, None, |name| format!("drive {name} is online"));
     }
 
     fn offline(&mut self, index: usize) {
         self.selections.interrupted(index);
         if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
-            self.offline_event(index, "it does not answer");
+            self.offline_event(index, "it does not reply");
         }
     }
 
@@ -274,7 +274,7 @@ impl Report {
         }
         tracing::warn!(
             target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
-            "the drive refuses {} {} with {exception}; its points are bad; asked again after 2 s, later every minute",
+            "the drive refuses {} {} with {exception}; its points are bad; retrying after 2 s, later every minute",
             read.table, read.start
         );
     }
@@ -299,8 +299,8 @@ impl Report {
         if drive.spec.supervision.is_some() {
             tracing::warn!(
                 target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
-                "the drive does not respond to a silent master ({point}), its lease stops it only while the gateway \
-                 works; set the parameter to a stop if the process allows it"
+                "the drive itself does not respond to a silent master ({point}); its lease stops it only while the \
+                 gateway works; set the parameter to a stop if the process allows it"
             );
             return;
         }
@@ -338,13 +338,13 @@ impl Report {
         }
         match active {
             Some(0) => self.drive_event(index, EventKind::Fault, None, |name| {
-                format!("drive {name} has a fault; its code is not known")
+                format!("drive {name} has a fault with an unknown code")
             }),
             Some(code) => self.drive_event(index, EventKind::Fault, Some(code), |name| {
                 format!("drive {name} has fault {code}: {}", drive.spec.profile.fault_text(code))
             }),
             None => self.drive_event(index, EventKind::FaultEnd, None, |name| {
-                format!("the fault of drive {name} is gone")
+                format!("the fault of drive {name} has cleared")
             }),
         }
         active.is_some()
@@ -476,7 +476,7 @@ impl Report {
                 .and_then(|drive| self.drive(drive))
                 .map(|drive| drive.spec.name.clone());
             let about = drive.as_ref().map_or(String::new(), |drive| format!(", drive {drive}"));
-            let text = format!("line of bus {}{about}: {text}", self.image.spec.name);
+            let text = format!("{}{about}: {text}", self.image.spec.name);
             self.event(EventKind::Diagnosis, drive, None, text);
         }
         let window = now.saturating_duration_since(self.window);

@@ -64,8 +64,8 @@ impl Lease {
     pub fn ends(self) -> Option<&'static str> {
         match self.0 {
             State::Unheard | State::RunsUnheard | State::Ended => None,
-            State::Held(_) => Some("nobody stops it any more when its client falls silent"),
-            State::RanOut => Some("its action, which the drive has not acknowledged, is not written any more"),
+            State::Held(_) => Some("nothing stops it any more if its client goes silent"),
+            State::RanOut => Some("its action, which the drive has not acknowledged, is no longer written"),
         }
     }
 }

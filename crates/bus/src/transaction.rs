@@ -27,7 +27,7 @@ const WHOLE_AFTER: Duration = Duration::from_millis(20);
 pub const MAY_BE_LATE: &str = "it may be the late reply to an earlier request";
 
 /// Why an exchange has no answer whose request went to a device server that closed its connection then.
-pub const CONNECTION_CLOSED: &str = "the device server closed the connection, and no reply came by the next one";
+pub const CONNECTION_CLOSED: &str = "the device server closed the connection, and no reply arrived over the next one";
 
 /// How an exchange ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -178,7 +178,7 @@ impl Transaction {
         let room = MOST_BYTES.saturating_sub(self.seen.len());
         self.seen.extend(bytes.iter().take(room));
         if self.received.len() > MOST_BYTES {
-            return Step::Done(Ended::Corrupt("the line babbles"));
+            return Step::Done(Ended::Corrupt("bytes without end on the line"));
         }
         loop {
             if self.strip_echo() {

@@ -469,7 +469,7 @@ impl Daemon {
         let NotStopped { drive, why } = missing;
         let image = bus.image.drives.iter().find(|image| image.spec.name == *drive);
         image.into_iter().for_each(|image| image.count_supervision_failure());
-        let text = format!("the gateway shuts down, and drive {drive} {why}; nothing stops it from now on");
+        let text = format!("the gateway is shutting down, and drive {drive} {why}; nothing stops it from now on");
         self.events.publish(Event {
             bus: bus.image.spec.name.clone(),
             drive: Some(drive.clone()),

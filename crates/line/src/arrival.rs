@@ -40,7 +40,11 @@ impl Arrival {
             Ok(Arrival { inotify, watched })
         };
         watch()
-            .inspect_err(|error| tracing::debug!(target: "drivegate::line::arrival", port, "cannot watch for the device: {error}; trying in pauses"))
+            .inspect_err(|error| {
+                tracing::debug!(target: "drivegate::line::arrival", port, "cannot watch for the \
+                                                                                            device: {error}; polling \
+                                                                                            for it instead")
+            })
             .ok()
     }
 

@@ -30,9 +30,11 @@ pub fn sharpen_timers() {
     };
     // Linux takes "this process" for the calling thread alone.
     match rustix::process::setpriority_process(None, NICE) {
-        Ok(()) => tracing::debug!(target: "drivegate::line::clock", "no real time, but nice {NICE}: {refused}"),
+        Ok(()) => tracing::debug!(target: "drivegate::line::clock", "no real-time scheduling, but nice {NICE}: \
+                                                                     {refused}"),
         Err(error) => {
-            tracing::debug!(target: "drivegate::line::clock", "no precedence over other threads: no real time: {refused}; no nice: {error}")
+            tracing::debug!(target: "drivegate::line::clock", "no priority over other threads: no real-time \
+                                                               scheduling: {refused}; no nice: {error}")
         }
     }
 }
@@ -48,7 +50,7 @@ fn real_time() -> Result<(), String> {
 /// Takes back what a thread has from the thread of a line that started it.
 pub(super) fn be_ordinary() {
     if let Err(error) = ordinary() {
-        tracing::debug!(target: "drivegate::line::clock", "a thread keeps the precedence of its line: {error}");
+        tracing::debug!(target: "drivegate::line::clock", "a thread keeps the priority of its line: {error}");
     }
 }
 

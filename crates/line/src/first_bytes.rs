@@ -27,8 +27,9 @@ impl Server {
                 "the device server speaks telnet on this port; write rfc2217:// instead of tcp://, or the server's raw TCP port"
             }
             Server::ModbusTcp => {
-                "a Modbus TCP server answers on this port, and tcp:// sends the frames of the serial line (RTU over TCP); set the \
-                 converter to raw TCP (also called transparent, TCP server or RTU over TCP), or connect to its raw port"
+                "a Modbus TCP server answers on this port, but tcp:// sends the frames of the serial line (RTU over \
+                 TCP); set the converter to raw TCP (also called transparent, TCP server or RTU over TCP), or connect \
+                 to its raw port"
             }
         }
     }

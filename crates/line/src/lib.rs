@@ -301,7 +301,7 @@ impl Drop for Exclusive {
     fn drop(&mut self) {
         if let Err(error) = rustix::termios::ioctl_tiocnxcl(&self.0) {
             // An adapter that was unplugged.
-            tracing::debug!(target: "drivegate::line", "the exclusive mode of the port is not taken back: {error}");
+            tracing::debug!(target: "drivegate::line", "the exclusive mode of the port was not released: {error}");
         }
     }
 }
@@ -315,7 +315,7 @@ fn write_all(port: BorrowedFd<'_>, mut bytes: &[u8]) -> Result<(), Lost> {
             Err(rustix::io::Errno::INTR) => {}
             Err(rustix::io::Errno::AGAIN) => {
                 if Instant::now() >= deadline {
-                    return Err(Lost::new("it takes no more bytes"));
+                    return Err(Lost::new("it accepts no more bytes"));
                 }
                 poll_port(&mut [PollFd::from_borrowed_fd(port, PollFlags::OUT)], deadline)?;
             }
@@ -418,7 +418,7 @@ fn open_serial(port: &str, format: &LineFormat, options: &LineOptions) -> Result
             })?;
         if !differences.is_empty() {
             warnings.push(format!(
-                "{port}: the driver does not do all of RS-485 as configured: {}",
+                "{port}: the driver does not support all configured RS-485 settings: {}",
                 differences.join("; ")
             ));
         }
@@ -436,7 +436,7 @@ fn open_serial(port: &str, format: &LineFormat, options: &LineOptions) -> Result
     }
     if let Some(read_back) = read_back(&fd).filter(|f| f != &format.to_string()) {
         warnings.push(format!(
-            "{port} reports {read_back} where {format} was asked for; check that the adapter can do it"
+            "{port} reports {read_back} instead of {format}; check that the adapter supports it"
         ));
     }
     Ok((fd, warnings))
@@ -485,7 +485,7 @@ fn explain(error: &tokio_serial::Error) -> String {
         }
         // A lock, or the kernel's exclusive mode.
         tokio_serial::ErrorKind::NoDevice | tokio_serial::ErrorKind::Io(io::ErrorKind::WouldBlock) => {
-            "another program has it; end that program, or give this bus another port"
+            "another program has it; end that program, or use another port for this bus"
         }
         _ => {
             "it is not a serial port or does not work as one; give the path of the adapter, such as \

@@ -91,7 +91,8 @@ impl Names {
             Err(error) if self.known.is_empty() || error.kind() == io::ErrorKind::Interrupted => return Err(error),
             Err(error) => {
                 if !std::mem::replace(&mut self.doubtful, true) {
-                    tracing::warn!(target: "drivegate::line::names", "no address of {address}: {error}; going on with the last ones known");
+                    tracing::warn!(target: "drivegate::line::names", "cannot resolve {address}: {error}; continuing \
+                                                                      with the last known addresses");
                 }
             }
         }
@@ -119,13 +120,13 @@ impl Names {
                     self.failure = found.as_ref().err().map(io::Error::to_string);
                     return found;
                 }
-                Err(RecvTimeoutError::Disconnected) => return Err(io::Error::other("nobody looks up the name")),
+                Err(RecvTimeoutError::Disconnected) => return Err(io::Error::other("the resolver thread has ended")),
                 Err(RecvTimeoutError::Timeout) if !go_on() => io::ErrorKind::Interrupted.into(),
                 Err(RecvTimeoutError::Timeout) if left.is_zero() => {
                     let known = self.failure.as_deref();
                     io::Error::new(
                         io::ErrorKind::TimedOut,
-                        known.unwrap_or("no name server answers in time"),
+                        known.unwrap_or("no name server answered in time"),
                     )
                 }
                 Err(RecvTimeoutError::Timeout) => continue,

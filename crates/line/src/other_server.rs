@@ -83,7 +83,7 @@ impl OtherServer {
             .name("other server".to_string())
             .spawn(asking);
         if let Err(error) = started {
-            tracing::debug!(target: "drivegate::line", "the server is not asked for Modbus TCP: {error}");
+            tracing::debug!(target: "drivegate::line", "the server was not probed for Modbus TCP: {error}");
         }
     }
 }

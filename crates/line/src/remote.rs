@@ -134,7 +134,7 @@ impl Remote {
                 State::Setting => {
                     let missing = remote.session.borrow().missing();
                     return Err(failed(format!(
-                        "the device server does not confirm {missing}; look at its settings"
+                        "the device server does not confirm {missing}; check its settings"
                     )));
                 }
             }
@@ -147,7 +147,7 @@ impl Remote {
         let warnings = match took == asked {
             true => Vec::new(),
             false => vec![format!(
-                "{port} reports {took} where {asked} was asked for; check that the device server can do it"
+                "{port} reports {took} instead of {asked}; check that the device server supports it"
             )],
         };
         Ok((remote, warnings))

@@ -125,7 +125,7 @@ impl Kind {
     /// What it is for, in words.
     pub(super) fn shown_names(&self) -> String {
         match (self.names.as_slice(), &self.common_name) {
-            ([], Some(common)) => format!("the common name `{}` only", printable(common)),
+            ([], Some(common)) => format!("only the common name `{}`", printable(common)),
             ([], None) => "no host".to_string(),
             (names, _) => names
                 .iter()

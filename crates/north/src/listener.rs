@@ -266,7 +266,8 @@ impl<H: ConnectionHandler> Listeners<H> {
                 }
                 Err(why) => tracing::error!(
                     target: "drivegate::north::listener", address = %bound,
-                    "{server}: not listening: {why}; the drives are polled, and the address is tried again until the machine has it"
+                    "{server}: not listening: {why}; the drives are polled, and the address is retried until the \
+                     machine has it"
                 ),
             }
             self.accept(&mut listener, socket);

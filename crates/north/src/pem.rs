@@ -77,7 +77,7 @@ impl Found {
     fn what(self, expected: &str) -> &'static str {
         match self {
             Found::EncryptedKey if expected == PRIVATE_KEY => {
-                " that can be read: it is encrypted, and nobody can type its passphrase"
+                " that can be read: it is encrypted, and there is nobody to enter its passphrase"
             }
             Found::EncryptedKey | Found::Key => ", but a private key",
             Found::SshKey => ", but a key in the format of OpenSSH",
@@ -96,7 +96,7 @@ impl Found {
     fn remedy(self, file: &str, expected: &str) -> String {
         match (self, expected) {
             (Found::EncryptedKey, PRIVATE_KEY) => {
-                format!("write it without a passphrase, readable by the gateway only: openssl pkey -in {file} -out NEW")
+                format!("save it without a passphrase, readable only by the gateway: openssl pkey -in {file} -out NEW")
             }
             (Found::EncryptedKey | Found::Key | Found::SshKey, CERTIFICATE) => {
                 "specify the certificate: are certificate and key swapped?".to_string()

@@ -17,7 +17,7 @@ pub(crate) fn reasons(plant: &Plant, stats: &NorthStats) -> Vec<String> {
         }
         for drive in &bus.image.drives {
             if !drive.snapshot().link.is_tried() {
-                reasons.push(format!("drive {} on bus {name}: not tried yet", drive.spec.name));
+                reasons.push(format!("drive {} on bus {name}: not polled yet", drive.spec.name));
             }
         }
     }

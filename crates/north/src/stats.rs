@@ -254,7 +254,7 @@ impl BacnetStats {
             Registration::Refused(code) => Some(format!(
                 "BACnet/IP: the BBMD {bbmd} refuses the registration with code {code:#06x}; retrying"
             )),
-            Registration::Unanswered => Some(format!("BACnet/IP: the BBMD {bbmd} does not answer; retrying")),
+            Registration::Unanswered => Some(format!("BACnet/IP: the BBMD {bbmd} does not reply; retrying")),
             Registration::None | Registration::Registered => None,
         }
     }

@@ -91,7 +91,7 @@ fn found<'a>(error: &'a (dyn StdError + 'static)) -> Option<&'a Error> {
 
 fn not_tls(peer: Peer) -> &'static str {
     match peer {
-        BROKER => "write the broker's port for TLS into mqtt.url, usually 8883, or mqtt:// for a port without TLS",
+        BROKER => "set the broker's TLS port in mqtt.url, usually 8883, or mqtt:// for a port without TLS",
         Peer::Server { .. } => "write http:// for a gateway without TLS",
         Peer::Client => "let the client use TLS here, or the port without TLS",
     }
@@ -128,12 +128,12 @@ fn certificate(cause: &CertificateError, peer: Peer) -> (String, String) {
         ),
         E::NotValidForNameContext { expected, presented } => wrong_name(&expected.to_str(), presented, &pin),
         E::UnknownIssuer => (
-            format!("its certificate is of a CA that is not in {ca}"),
+            format!("its certificate was issued by a CA that is not in {ca}"),
             format!("add the certificate of that CA to {ca}"),
         ),
         E::BadSignature => (
-            format!("its certificate was not signed by the key of the CA in {ca} that it names"),
-            format!("put the current certificate of that CA into {ca}: a renewed CA may have another key"),
+            format!("its certificate was not signed with the key of the CA in {ca} that it names"),
+            format!("put the current certificate of that CA into {ca}: a renewed CA may have a new key"),
         ),
         E::Revoked => (
             "its certificate was revoked".to_string(),
@@ -145,7 +145,7 @@ fn certificate(cause: &CertificateError, peer: Peer) -> (String, String) {
                 Peer::Client => ("a client", "clientAuth"),
             };
             (
-                format!("its certificate must not be used by {role}"),
+                format!("its certificate is not valid for use by {role}"),
                 format!("have it reissued with extendedKeyUsage = {usage}"),
             )
         }
@@ -230,8 +230,8 @@ fn wrong_name(expected: &str, presented: &[String], pin: &str) -> (String, Strin
 
 fn critical_extension() -> (String, String) {
     (
-        "its certificate has a critical extension that the gateway does not know".to_string(),
-        "have it reissued without that extension, or with it not critical".to_string(),
+        "its certificate has a critical extension that the gateway does not support".to_string(),
+        "have it reissued without that extension, or with the extension not critical".to_string(),
     )
 }
 
@@ -239,27 +239,27 @@ fn by_webpki(cause: &webpki::Error, reissue: &dyn Fn(&str) -> String) -> (String
     use webpki::Error as E;
     let (what, as_what) = match cause {
         E::CaUsedAsEndEntity => (
-            "its certificate is one of a CA (basicConstraints CA:TRUE), not of a server or client",
+            "its certificate is a CA certificate (basicConstraints CA:TRUE), not one for a server or client",
             "with basicConstraints = CA:FALSE",
         ),
         E::EndEntityUsedAsCa => (
-            "its certificate is signed by one that is not a CA (basicConstraints is not CA:TRUE)",
+            "its certificate is signed by a certificate that is not a CA (basicConstraints is not CA:TRUE)",
             "by a CA",
         ),
         E::UnsupportedCertVersion => (
-            "its certificate, or that of a CA on the way, is of X.509 version 1, which has no names and no uses",
+            "its certificate, or that of a CA in its chain, is X.509 version 1, which has no names and usages",
             "as version 3, for which openssl x509 -req needs -extfile with a subjectAltName",
         ),
         E::UnsupportedCriticalExtension => return critical_extension(),
         E::NameConstraintViolation => (
-            "its certificate is for a name that its CA may not issue",
+            "its certificate is for a name that its CA may not certify",
             "with a name within the CA's nameConstraints",
         ),
         E::PathLenConstraintViolated => (
-            "there are more CAs between its certificate and the root than the root allows (pathlen)",
-            "by a CA nearer to the root",
+            "there are more intermediate CAs than the root allows (pathlen)",
+            "by a CA closer to the root",
         ),
-        E::SignatureAlgorithmMismatch => ("its certificate contradicts itself about its signature", ""),
+        E::SignatureAlgorithmMismatch => ("its certificate is inconsistent about its signature algorithm", ""),
         cause => return (format!("its certificate is refused ({cause:?})"), reissue("")),
     };
     (what.to_string(), reissue(as_what).replace("  ", " "))
@@ -274,8 +274,8 @@ fn alerted(alert: AlertDescription, peer: Peer) -> (String, String) {
     };
     let (what, remedy) = match (alert, peer) {
         (A::HandshakeFailure | A::InsufficientSecurity, Peer::Server { .. }) => (
-            "it has nothing in common with the gateway: its certificate has perhaps a key that the gateway does not support, such as P-521, \
-             or it does not allow TLS 1.2 with ECDHE",
+            "it has no algorithm in common with the gateway: perhaps its certificate has a key that the gateway does \
+             not support, such as P-521, or it does not allow TLS 1.2 with ECDHE",
             format!("give it a certificate with a key of {SUPPORTED_KEYS}, and allow TLS 1.2 or 1.3"),
         ),
         (A::ProtocolVersion, _) => (
@@ -301,17 +301,17 @@ fn alerted(alert: AlertDescription, peer: Peer) -> (String, String) {
         (A::BadCertificate | A::CertificateUnknown | A::UnsupportedCertificate | A::AccessDenied, _) => (
             "it does not accept the gateway's certificate",
             match peer {
-                Peer::Server { .. } => format!("look into its log for the reason, and check {own}"),
+                Peer::Server { .. } => format!("check its log for the reason, and check {own}"),
                 Peer::Client => {
                     "give the client the CA of this server, and let it connect by a name in the certificate".to_string()
                 }
             },
         ),
         (A::UnrecognisedName, _) => (
-            "it has no certificate for the name it was connected by",
-            "connect by a name that it has".to_string(),
+            "it has no certificate for the name used to connect to it",
+            "connect by a name that its certificate has".to_string(),
         ),
-        _ => ("it ended the handshake", "look into its log for the reason".to_string()),
+        _ => ("it ended the handshake", "check its log for the reason".to_string()),
     };
     (format!("{what} (alert {shown})"), remedy)
 }

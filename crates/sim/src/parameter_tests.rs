@@ -174,7 +174,7 @@ fn the_counters_of_a_drive_are_read_behind_its_parameters() {
         let file = bench.read(known.clone());
         // The counters are read one after the other, and count themselves.
         let (received, own) = (known.len() + 1, known.len() + 4);
-        let of = format!("{received} messages received, 0 damaged ones, {own} to this drive");
+        let of = format!("{received} messages received, 0 damaged, {own} to this drive");
         match profile.counts_messages {
             true => assert!(file.counters.starts_with(&of), "{}: {}", profile.name, file.counters),
             false => assert_eq!(file.counters, "", "{}", profile.name),

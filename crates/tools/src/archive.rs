@@ -171,7 +171,7 @@ pub(super) fn read(
     let mut entries = archive.entries().map_err(broken)?.raw(true);
     let first = entries.next().ok_or("it is empty")?.map_err(broken)?;
     if first.path_bytes().as_ref() != MANIFEST.as_bytes() || first.size() > MOST_MANIFEST {
-        return Err("it is not a backup of drivegate: it does not begin with a manifest".to_string());
+        return Err("it is not a backup of drivegate: it does not start with a manifest".to_string());
     }
     let mut json = Vec::new();
     first.take(MOST_MANIFEST).read_to_end(&mut json).map_err(broken)?;
@@ -194,11 +194,11 @@ pub(super) fn read(
         let mut hashed = Hashed::new(&mut entry);
         take(member, root, &path, &mut hashed).map_err(|error| format!("{name}: {error}"))?;
         if hashed.finish() != (member.bytes, member.sha256.clone()) {
-            return Err(format!("{name} is damaged: its content is not what the manifest says"));
+            return Err(format!("{name} is damaged: its content differs from the manifest"));
         }
     }
     match expected.next() {
-        Some(missing) => Err(format!("{} is missing: the archive was cut", missing.name)),
+        Some(missing) => Err(format!("{} is missing: the archive is truncated", missing.name)),
         None => Ok(manifest),
     }
 }
@@ -211,7 +211,7 @@ fn parse(json: &[u8]) -> Result<Manifest, String> {
     }
     if json.len() as u64 > MOST_MANIFEST {
         return Err(format!(
-            "its manifest has {} bytes, more than that of any backup",
+            "its manifest has {} bytes, more than any backup has",
             json.len()
         ));
     }
@@ -221,7 +221,8 @@ fn parse(json: &[u8]) -> Result<Manifest, String> {
     } = serde_json::from_slice(json).map_err(no_manifest)?;
     if format > FORMAT {
         return Err(format!(
-            "it has format {format}, and this version reads {FORMAT}: restore it with the version that made it, or a later one"
+            "it has format {format}, but this version reads {FORMAT}: restore it with the version that made it, or a \
+             later one"
         ));
     }
     let manifest: Manifest = serde_json::from_slice(json).map_err(no_manifest)?;
@@ -231,7 +232,7 @@ fn parse(json: &[u8]) -> Result<Manifest, String> {
         place(&member.name)?;
         bytes = bytes.saturating_add(member.bytes);
         if !names.insert(&member.name) {
-            return Err(format!("{} is in it twice", member.name));
+            return Err(format!("it contains {} twice", member.name));
         }
     }
     for directory in &manifest.directories {
@@ -242,7 +243,7 @@ fn parse(json: &[u8]) -> Result<Manifest, String> {
     if manifest.directories.len() > MOST_MEMBERS || manifest.members.len() > MOST_MEMBERS || bytes > MOST_BYTES {
         let count = manifest.members.len();
         return Err(format!(
-            "it says it has {count} files of {bytes} bytes, more than any backup"
+            "it claims {count} files of {bytes} bytes, more than any backup has"
         ));
     }
     match manifest.members.first() {

@@ -28,17 +28,17 @@ enum Command {
 
 /// Checks that nothing in the file was changed or removed
 ///
-/// Each line has the hash of the line before it, so a changed line and a cut inside show by themselves. A cut at the end
-/// shows against a hash that the gateway logged: once a minute, under target `audit`.
+/// Each line has the hash of the line before it, which reveals changed and missing lines. To detect a truncated end,
+/// compare with a hash that the gateway logged: once a minute, under target `audit`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  drivegate audit verify audit.jsonl\n  \
     drivegate audit verify audit.jsonl* --last 9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08\n\n\
-    Exit codes: 0 the file is whole, 1 it is not or cannot be read.")]
+    Exit codes: 0 the file is intact, 1 it is not or cannot be read.")]
 struct Verify {
-    /// The audit file; several, if older ones are to be checked with it, in any order.
+    /// The audit file, or several in any order to include older ones.
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
-    /// The hash of a line that must be there.
+    /// The hash of a line that must be present.
     #[arg(long, value_name = "HASH")]
     last: Option<Hash>,
 }
@@ -82,11 +82,17 @@ impl Verify {
                 }
             }
             if file.cut {
-                faults.push(fault("the line is incomplete: cut by a crash or by somebody", &place));
+                faults.push(fault(
+                    "the line is incomplete: truncated by a crash or by someone",
+                    &place,
+                ));
             }
             lines += number;
         }
-        if let (Err(why), false) = (verifier.finish(), faults.iter().any(|fault| fault.contains("cut it"))) {
+        if let (Err(why), false) = (
+            verifier.finish(),
+            faults.iter().any(|fault| fault.contains("truncated")),
+        ) {
             faults.push(fault(&why, &place));
         }
         match verifier.chain() {

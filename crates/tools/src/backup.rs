@@ -19,8 +19,8 @@ const TRANSIENT: [&str; 2] = ["lock", "partial"];
 
 /// Writes configuration, profiles and state into one file, from which `restore` sets the gateway up again.
 ///
-/// The gateway may run. Certificates, keys, passwords and tokens are named in the backup, and are in it only with
-/// --with-keys: keep such a file as secret as the keys. Recordings are listed, not copied.
+/// The gateway may be running. Certificates, keys, passwords and tokens are only listed in the backup, unless
+/// --with-keys is given: keep such a file as secret as the keys. Recordings are listed, not copied.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate backup pump-house.tar --config /etc/drivegate/drivegate.toml")]
 pub(super) struct Args {
@@ -29,7 +29,7 @@ pub(super) struct Args {
     file: PathBuf,
     #[command(flatten)]
     config: ConfigFile,
-    /// Also certificates, keys, passwords and tokens.
+    /// Include certificates, keys, passwords and tokens.
     #[arg(long)]
     with_keys: bool,
 }
@@ -155,7 +155,7 @@ fn state(dir: &Path, below: &Path, decided: &[PathBuf], sources: &mut Sources) -
         if kind.is_dir() {
             state(dir, &below, decided, sources)?;
         } else if !kind.is_file() {
-            sources.leave_out(&path, "it is not a plain file");
+            sources.leave_out(&path, "it is not a regular file");
         } else if path.extension().is_some_and(|ending| ending == "tar") {
             // Else each backup would have those before it.
             sources.leave_out(&path, "it is an archive");
@@ -291,7 +291,7 @@ mod tests {
             why: why.to_string(),
         };
         let expected = [
-            left_out("params/pump-1", "it is not a plain file"),
+            left_out("params/pump-1", "it is not a regular file"),
             left_out("yesterday.tar", "it is an archive"),
         ];
         assert_eq!(sources.left_out, expected);

@@ -27,8 +27,8 @@ use crate::process_image::{Access, DriveSpec};
 
 /// Checks a configuration and predicts wire times, cycles and load of each bus.
 ///
-/// Opens only the files that the configuration names, and the journals of restores in the state directory. Errors and warnings go to stderr, with --json to
-/// stdout with all the rest.
+/// Opens only the files that the configuration names, and the journals of restores in the state directory. Errors and
+/// warnings go to stderr, with --json to stdout with everything else.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  drivegate check --config /etc/drivegate/drivegate.toml\n  \
@@ -142,7 +142,7 @@ fn unproven_stops(settings: &Settings) -> Option<Problem> {
         Ok(saved) => saved.unwrap_or_default(),
         Err(why) => {
             return Some(problem(
-                format!("what drills have proven cannot be read: {why}"),
+                format!("the results of drills cannot be read: {why}"),
                 "run check as the gateway's user".to_string(),
             ));
         }
@@ -159,10 +159,7 @@ fn unproven_stops(settings: &Settings) -> Option<Problem> {
         })
         .collect();
     let first = unproven.first()?.split(' ').next().unwrap_or_default().to_string();
-    let what = format!(
-        "stops that no drill has proven, or not within `every`: {}",
-        unproven.join(", ")
-    );
+    let what = format!("stops not proven by a drill within `every`: {}", unproven.join(", "));
     Some(problem(
         what,
         format!("run `drivegate drill {first}`, and so on, at the machine"),
@@ -390,7 +387,8 @@ fn bacnet(settings: &Settings) -> String {
     };
     let objects: usize = devices.iter().map(|shown| shown.device.objects().len()).sum();
     format!(
-        "BACnet/IP on {}: {} with {}; a change of all of them takes {} kB of notifications for each subscriber, nothing on the lines\n\n",
+        "BACnet/IP on {}: {} with {}; a change of all of them takes {} kB of notifications per subscriber, and \
+         nothing on the lines\n\n",
         options.listen,
         counted(devices.len(), "device", "devices"),
         counted(objects, "object", "objects"),
@@ -429,8 +427,8 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
     };
     let behind = match bus.spec.port.starts_with("tcp://") {
         true => {
-            "  baud        only for timing: it sets nothing at the device server; `drivegate diagnose` reports replies that\n              \
-             come sooner, and which rate fits\n"
+            "  baud        used only for timing, not set in the device server; `drivegate diagnose` reports replies \
+             that come\n              too soon, and which rate fits\n"
         }
         false => "",
     };
@@ -480,7 +478,7 @@ fn shutdown(bus: &BusSettings) -> String {
         return String::new();
     }
     format!(
-        "  shutdown    {} in {:.2} s, {:.2} s if none answers\n",
+        "  shutdown    {} in {:.2} s, {:.2} s if none replies\n",
         counted(time.drives, "drive stopped", "drives stopped"),
         time.answered.as_secs_f64(),
         time.unanswered.as_secs_f64()

@@ -138,7 +138,7 @@ impl CredentialsFile<'_> {
         let owned = old.map_or(Ok(()), |old| {
             like(&file, &old).map_err(|error| {
                 format!(
-                    "cannot give the {what} file its owner {}:{} again: {error}; {shown}; run this as root",
+                    "cannot restore the owner {}:{} of the {what} file: {error}; {shown}; run this as root",
                     old.uid(),
                     old.gid()
                 )

@@ -9,15 +9,15 @@ use super::client::{Gateway, encoded};
 use super::{printable, report};
 use crate::diagnosis::{Counted, Verdict};
 
-/// Says what is wrong with a line: each verdict with its evidence, how sure it is, and what to do.
+/// Shows what is wrong with a line: each verdict with evidence, certainty and remedy.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate diagnose
   drivegate diagnose line1 --url http://10.0.0.5:9488
   drivegate diagnose --json
 
-Asks a running gateway, which watches its lines all the time: verdicts rest on the last minute, and a verdict needs half
-a minute to come and a minute to go. Exit code 0 whatever is found.")]
+Asks a running gateway, which monitors its lines continuously. Verdicts are based on the last minute: one takes half a
+minute to appear and a minute to clear. Exit code 0 whatever is found.")]
 pub(super) struct Args {
     #[command(flatten)]
     gateway: Gateway,
@@ -84,8 +84,8 @@ async fn diagnose(args: &Args) -> Result<String, String> {
 fn text(diagnosis: &Diagnosis) -> String {
     let mut text = format!("{}:", printable::line(&diagnosis.bus));
     text += match (&diagnosis.time, diagnosis.verdicts.as_slice()) {
-        (None, _) => " not looked at yet; ask again in some seconds\n",
-        (_, []) => " nothing wrong was recognised in the last minute\n",
+        (None, _) => " not available yet; try again in a few seconds\n",
+        (_, []) => " no problems detected in the last minute\n",
         _ => "\n",
     };
     for verdict in &diagnosis.verdicts {
@@ -130,8 +130,8 @@ fn text(diagnosis: &Diagnosis) -> String {
         if let Some(by_drive) = &one.by_drive {
             let _ = writeln!(
                 text,
-                "    counted by the drive: {} sound and {} damaged messages on the line, {} to it, {} of them unanswered, {} \
-                 exceptions",
+                "    counted by the drive: {} valid and {} damaged messages on the line, {} to it, {} of them \
+                 unanswered, {} exceptions",
                 by_drive.messages, by_drive.damaged, by_drive.own, by_drive.unanswered, by_drive.exceptions
             );
         }
@@ -158,13 +158,10 @@ mod tests {
         };
         assert_eq!(
             text(&diagnosis),
-            "line1: not looked at yet; ask again in some seconds\n"
+            "line1: not available yet; try again in a few seconds\n"
         );
         diagnosis.time = Some("2026-03-02T06:11:09.480Z".to_string());
-        assert_eq!(
-            text(&diagnosis),
-            "line1: nothing wrong was recognised in the last minute\n"
-        );
+        assert_eq!(text(&diagnosis), "line1: no problems detected in the last minute\n");
         diagnosis.verdicts.push(Verdict {
             verdict: Cause::OneDrive,
             drive: Some("pump-1".to_string()),

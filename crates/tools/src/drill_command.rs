@@ -15,10 +15,11 @@ use crate::drill::{DrillReport, DrillState, Kind};
 /// How often a drill that is under way is looked at.
 const LOOK: Duration = Duration::from_millis(500);
 
-/// Proves that a motor stops: by an order, when its client falls silent, when the gateway falls silent.
+/// Proves that a motor stops: by a command, when its client goes silent, when the gateway goes silent.
 ///
-/// The motor is started at a low speed and stopped in each way, and the time until it stands is measured. The drive's name has to
-/// be typed before it starts; Ctrl-C ends the drill and stops the motor. Have a hand on the switch, and nobody at the machine.
+/// The motor is started at low speed and stopped in each way, and the time to standstill is measured. You must type the
+/// drive's name before it starts; Ctrl-C ends the drill and stops the motor. Keep a hand on the switch, and nobody at
+/// the machine.
 #[derive(Debug, clap::Args)]
 #[command(
     args_conflicts_with_subcommands = true,
@@ -36,20 +37,20 @@ pub(super) struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum Shown {
-    /// Lists the drills that are known, the newest first.
+    /// Lists the known drills, newest first.
     #[command(after_help = "Example:\n  drivegate drill list --config drivegate.toml")]
     List {
         #[command(flatten)]
         gateway: Gateway,
     },
-    /// Prints a drill as a page of HTML.
+    /// Prints a drill as an HTML page.
     #[command(
         after_help = "Example:\n  drivegate drill report --config drivegate.toml 20261128T074744.695Z-pump-1 > report.html"
     )]
     Report {
         #[command(flatten)]
         gateway: Gateway,
-        /// Its id, as `list` prints it.
+        /// Id of the drill, as printed by `list`.
         id: String,
     },
 }
@@ -60,16 +61,16 @@ struct Wish {
     gateway: Gateway,
     /// Name of the drive.
     drive: Option<String>,
-    /// By an order to stop.
+    /// By a stop command.
     #[arg(long)]
     order: bool,
-    /// When its client falls silent.
+    /// When its client goes silent.
     #[arg(long)]
     client: bool,
-    /// When the gateway falls silent: nothing is sent to the drive for `limit`.
+    /// When the gateway goes silent: nothing is sent to the drive for `limit`.
     #[arg(long = "gateway")]
     silence: bool,
-    /// Speed at which the motor is stopped, %; without it `max_speed` of [drill].
+    /// Speed at which the motor is stopped, % [default: `max_speed` of [drill]].
     #[arg(long, value_name = "PERCENT")]
     speed: Option<f64>,
 }
@@ -146,7 +147,8 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
     let armed: DrillReport = asked(&client, &Asked::post("/api/v1/drills", &body)).await?;
     let ways: Vec<&str> = armed.steps.iter().map(|step| step.kind.name()).collect();
     let warning = format!(
-        "Drive {} is started at {} % and stopped by: {}. Allowed are {} s each.\nType its name to start the motor: ",
+        "Drive {} will be started at {} % and stopped by: {}. Time allowed: {} s each.\nType its name to start the \
+         motor: ",
         armed.drive,
         armed.speed,
         ways.join(", "),
@@ -162,7 +164,7 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
         ended.map_err(|why| format!("{why}; nothing was started"))?;
         return Err("the name was not typed; nothing was started".to_string());
     }
-    let lost = "whether it started is not known: look at the motor, and end it with Ctrl-C on the machine";
+    let lost = "it is unknown whether it started: check the motor, and stop it at the machine";
     let start = Asked::post(format!("{}/start", path(&armed.id)), &json!({})).if_lost(lost);
     let started: DrillReport = asked(&client, &start).await?;
     watch(&client, started).await
@@ -191,7 +193,7 @@ async fn watch(client: &Client, started: DrillReport) -> Result<DrillReport, Str
         };
         let next = match ends {
             true => Asked::delete(path(&now.id))
-                .if_lost("whether the drill ended is not known: stop the motor by its switch"),
+                .if_lost("it is unknown whether the drill ended: stop the motor at its switch"),
             false => Asked::view(path(&now.id)),
         };
         now = asked(client, &next).await?;

@@ -7,10 +7,10 @@ use hyper::StatusCode;
 use super::client::{Asked, Gateway};
 use super::{EXIT_FAILED, report};
 
-/// Says whether the running gateway is ready, for containers and scripts.
+/// Reports whether the running gateway is ready, for containers and scripts.
 ///
-/// Exit code 0 if every bus is open, each drive was tried and every server listens, as `/readyz` says; else 1 with
-/// the reasons. Asks through the local socket; with `socket = ""` or --url, through HTTP.
+/// Exit code 0 if every bus is open, each drive was polled and every server listens, as with `/readyz`; else 1 with the
+/// reasons. Uses the local socket; with `socket = ""` or --url, HTTP.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  drivegate health --config /etc/drivegate/drivegate.toml\n  \

@@ -8,9 +8,9 @@ use serde_json::json;
 use super::client::{Asked, Gateway, encoded};
 use super::{printable, report};
 
-/// Prints who holds a drive: holder, rank and seconds left; or takes, renews, releases or breaks that.
+/// Prints who holds a drive: holder, rank and seconds left; or takes, renews, releases or breaks the hold.
 ///
-/// Through the local socket it acts as its user, who has the first rank unless a principal names that user.
+/// Over the local socket it acts as the calling user, who has the first rank unless a principal names that user.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate hold --config drivegate.toml pump-1
@@ -20,7 +20,7 @@ pub(super) struct Args {
     gateway: Gateway,
     /// Name of the drive.
     drive: String,
-    /// What to do; without it, who holds the drive is printed.
+    /// What to do; by default only the holder is printed.
     #[arg(value_parser = ["take", "renew", "release", "break"])]
     action: Option<String>,
 }
@@ -61,7 +61,7 @@ async fn hold(args: &Args) -> Result<Hold, String> {
     let asked = match &args.action {
         None => Asked::get(path),
         Some(action) => {
-            let lost = "whether the hold changed is not known: ask again without an action";
+            let lost = "it is unknown whether the hold changed: run it again without an action";
             Asked::post(path, &json!({ "action": action })).if_lost(lost)
         }
     };

@@ -22,8 +22,8 @@ const TEMPLATES: [&str; 3] = ["{{", "{%", "{#"];
 /// Prints a configuration as an Ansible inventory (YAML): the gateway as a host of group `drivegate`, the file as its variable
 /// `drivegate_configuration`
 ///
-/// The file must be valid, as for `check`. Values from the environment are not in the inventory, except the gateway's name. A file
-/// with a password in it is refused: an inventory is shared and kept in repositories.
+/// The file must be valid, as for `check`. Values from the environment are not in the inventory, except the gateway's
+/// name. A file containing a password is refused, because inventories are shared and kept in repositories.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate inventory plant3/pump-house.toml > inventory/pump-house.yml")]
 pub(super) struct Args {
@@ -65,7 +65,7 @@ fn of(name: &str, source: &str) -> Result<String, (String, Finding)> {
     }
     let configuration = Value::Table(configuration);
     if let Some((key, text)) = template(&configuration, "") {
-        let what = format!("Ansible would take `{text}` for a template");
+        let what = format!("Ansible would treat `{text}` as a template");
         return Err((key, Finding::new(what, "write it without {{, {% and {#")));
     }
     let nested = |key: &str, value| Value::Table([(key.to_string(), value)].into_iter().collect());

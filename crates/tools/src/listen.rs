@@ -31,7 +31,8 @@ const BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400, 120
 /// Formats that are tried by default; Modbus ASCII with 7 data bits is seen through 8N1.
 const FORMATS: [&str; 3] = ["8N1", "8E1", "8O1"];
 
-/// Listens to a line that another master owns: finds protocol and format, lists who is asked what how often, prints a configuration.
+/// Listens to a line that another master owns: finds protocol and format, lists what is polled and how often, prints a
+/// configuration.
 ///
 /// Never sends.
 #[derive(Debug, clap::Args)]
@@ -45,10 +46,10 @@ pub(super) struct Args {
     /// Serial device, or rfc2217://host:port or tcp://host:port of a device server.
     #[arg(long, value_name = "PORT", value_parser = scan::parse_port)]
     port: String,
-    /// Time to listen once the setting is known.
+    /// Time to listen once the settings are known.
     #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     seconds: u64,
-    /// Report in words what confirms or contradicts what is assumed of N2.
+    /// Report what confirms or contradicts the assumptions about N2.
     #[arg(long)]
     n2_report: bool,
     /// Protocols: modbus-rtu, modbus-ascii, n2, or all.
@@ -113,7 +114,8 @@ fn settings(args: &Args) -> Result<(Vec<Protocol>, Vec<LineFormat>), String> {
     }
     if formats.is_empty() {
         return Err(
-            "no protocol supports these bauds and formats; --baud, --format; N2 is always 9600 8N1, Modbus RTU has 8 data bits"
+            "no protocol supports these baud rates and formats; --baud, --format; N2 is always 9600 8N1, Modbus RTU \
+             has 8 data bits"
                 .to_string(),
         );
     }
@@ -142,7 +144,7 @@ impl Ear<'_> {
         report::lines_to_stderr(&words(&survey, profiles, protocol));
         if self.args.n2_report {
             report::lines_to_stderr(&format!(
-                "\nWhat is assumed of N2, and what was seen of it\n{}",
+                "\nAssumptions about N2, and what was seen of them\n{}",
                 n2.report()
             ));
         }
@@ -256,8 +258,7 @@ fn nothing(bytes: u64, port: &str) -> String {
         ),
         bytes => format!(
             "{bytes} bytes were received, but no valid request with any setting; {port}; check A and B, name --baud \
-             and --format, or the \
-             line has another protocol"
+             and --format, or the line uses another protocol"
         ),
     }
 }

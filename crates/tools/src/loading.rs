@@ -24,9 +24,9 @@ pub(super) enum NotLoaded {
         "its files could not be read within {TIMEOUT:?}: one of them is a pipe or on a file system that does not respond"
     )]
     Timeout,
-    #[error("{MAX_READERS} earlier reloads still wait for files that cannot be read; restart the service")]
+    #[error("{MAX_READERS} earlier reloads are still waiting for files that cannot be read; restart the service")]
     TooMany,
-    #[error("reading the configuration failed; report this")]
+    #[error("reading the configuration failed; please report this")]
     Panic,
     #[error("cannot start a thread: {0}")]
     Thread(#[from] io::Error),

@@ -38,7 +38,7 @@ pub(super) struct Args {
     /// BACnet objects instead: device, object, name, type, unit, access
     #[arg(long, conflicts_with_all = ["json", "listener"])]
     bacnet: bool,
-    /// Also write an EDE table to FILE, with the tables of state texts and units beside it
+    /// Also write an EDE table to FILE, with the tables of state texts and units next to it
     #[arg(long, value_name = "FILE", requires = "bacnet")]
     ede: Option<PathBuf>,
     /// Only the units of the listener at this address

@@ -18,8 +18,8 @@ use crate::parameters::{Names, ParameterFile, Store, differences, read as read_f
 
 /// Reads, compares, restores and shows the parameters of drives.
 ///
-/// Parameters are read at the lowest rank: through a running gateway its process data goes on, without one the command opens the port
-/// itself. A drive is named as in the configuration, a file by its path.
+/// Parameters are read at the lowest priority, through a running gateway alongside its process data; without one the
+/// command opens the port itself. A drive is named as in the configuration, a file by its path.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate params read pump-1 -o pump-1.params
@@ -48,12 +48,12 @@ enum Action {
 
 Exit code 0: nothing differs; 1: something does, or it could not be found out.")]
     Diff {
-        /// Path of a file, or name of a drive, which is read.
+        /// Path of a file, or name of a drive to read.
         before: String,
         /// Likewise.
         after: String,
     },
-    /// Writes what differs from a file to a drive, while its motor stands.
+    /// Writes the parameters that differ from a file to a drive, while its motor is stopped.
     #[command(after_help = "Examples:
   drivegate params restore pump-1.params pump-1
   drivegate params restore pump-1.params pump-1 --only 102 --yes
@@ -63,30 +63,30 @@ Shows first what would be written, and asks. The drive needs access = \"control\
 the drive takes no commands but stops; a restore that was cut off keeps it so until it is resumed, undone or released. A gateway
 goes on with the restore when the command is interrupted.")]
     Restore(restore::RestoreArgs),
-    /// Reads a drive and restores that to another of the same kind.
+    /// Copies the parameters of a drive to another of the same kind.
     #[command(after_help = "Example:\n  drivegate params clone pump-1 pump-2 --dry-run")]
     Clone {
-        /// Name of the drive that is read.
+        /// Name of the drive to read.
         from: String,
-        /// Name of the drive that is written.
+        /// Name of the drive to write.
         to: String,
         #[command(flatten)]
         how: restore::How,
     },
-    /// Lists the readings that the gateway has kept, oldest first.
+    /// Lists the stored readings, oldest first.
     #[command(after_help = "Example:\n  drivegate params list pump-1")]
     List {
         /// Name of a drive [default: all].
         drive: Option<String>,
     },
-    /// Shows a file, or the last reading of a drive that the gateway has kept.
+    /// Shows a file, or the last stored reading of a drive.
     #[command(after_help = "Examples:
   drivegate params show pump-1
   drivegate params show pump-1.params --names vacon-nx.csv")]
     Show {
         /// Path of a file, or name of a drive.
         of: String,
-        /// List of names of your own: CSV with id, name, unit, scale.
+        /// Your own list of names: CSV with id, name, unit, scale.
         #[arg(long, value_name = "FILE")]
         names: Option<PathBuf>,
     },
@@ -96,16 +96,16 @@ goes on with the restore when the command is interrupted.")]
 struct ReadArgs {
     /// Name of the drive.
     drive: String,
-    /// File to write [default: the standard output].
+    /// File to write [default: standard output].
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Asks the drive for every address, whatever earlier readings found.
+    /// Reads every address, regardless of what earlier readings found.
     #[arg(long)]
     afresh: bool,
-    /// Takes up to 18 % of a busy line from process data, in place of 1.5 %.
+    /// Takes up to 18 % of a busy line from process data, instead of 1.5 %.
     #[arg(long)]
     brisk: bool,
-    /// List of names of your own: CSV with id, name, unit, scale.
+    /// Your own list of names: CSV with id, name, unit, scale.
     #[arg(long, value_name = "FILE")]
     names: Option<PathBuf>,
 }
@@ -175,8 +175,7 @@ fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Resul
     });
     line.end();
     let file = text.map_err(|why| report::failed(&why)).and_then(|text| {
-        ParameterFile::parse(&text)
-            .map_err(|why| report::failed(&format!("the gateway's file is not understood: {why}")))
+        ParameterFile::parse(&text).map_err(|why| report::failed(&format!("the gateway's file is invalid: {why}")))
     })?;
     let profile = match target.profile() {
         Some(profile) => profile.clone(),
@@ -335,7 +334,7 @@ fn show(config: &Path, of: &str, names: Option<&Path>) -> Result<ExitCode, ExitC
                 .map_err(|why| report::failed(&format!("{why}; correct or remove it")))?;
             last.ok_or_else(|| {
                 report::failed(&format!(
-                    "no reading of `{of}` is kept; {}; read it by `drivegate params read {of}`",
+                    "no reading of `{of}` is stored; {}; read it with `drivegate params read {of}`",
                     store.dir().display()
                 ))
             })?

@@ -48,28 +48,28 @@ enum What {
     Show {
         /// Name of the profile.
         name: String,
-        /// Print the file of the profile, as a template for your own.
+        /// Print the profile file, as a template for your own.
         #[arg(long)]
         toml: bool,
     },
-    /// Prints the beginning of a profile, from a frame or over another profile.
+    /// Prints a new profile to fill in, from a template or based on another profile.
     #[command(after_help = "Examples:\n  drivegate profiles new our-drive > our-drive.toml\n  \
             drivegate profiles new our-pump --base danfoss-fc > /etc/drivegate/profiles/our-pump.toml")]
     New {
         /// Name of the new profile.
         name: String,
-        /// The profile from which it differs.
+        /// The profile it is based on.
         #[arg(long, value_name = "FAMILY")]
         base: Option<String>,
     },
-    /// Checks the file of a profile and proves its commands; exits with 78 and a counterexample if one fails.
+    /// Checks a profile file and proves its commands; exits with 78 and a counterexample if one fails.
     #[command(after_help = "Examples:\n  drivegate profiles check our-drive.toml")]
     Check {
-        /// The file of the profile.
+        /// The profile file.
         #[arg(value_name = "FILE")]
         file: PathBuf,
     },
-    /// Prints the profile that a register list (CSV) makes; the columns are in docs/profiles.md.
+    /// Converts a register list (CSV) to a profile; the columns are in docs/profiles.md.
     #[command(after_help = "Examples:\n  drivegate profiles import our-meter.csv > our-meter.toml")]
     Import {
         /// The list, with a header line.
@@ -361,7 +361,7 @@ fn remarks(profile: &Profile, point: &Point) -> String {
         parts.push(format!("commands go to {}", name_of(profile, target)));
     }
     if point.fast_if_carried {
-        parts.push("fast where the line carries it".to_string());
+        parts.push("fast if the line can carry it".to_string());
     }
     if point.on_change {
         parts.push("written on change only".to_string());
@@ -391,7 +391,7 @@ fn remarks(profile: &Profile, point: &Point) -> String {
 fn unverified(profile: &Profile) -> &'static str {
     match profile.verified {
         true => "",
-        false => "no: nobody has confirmed it on hardware yet; docs/verifying.md says how to",
+        false => "no: nobody has confirmed it on hardware yet; docs/verifying.md explains how",
     }
 }
 
@@ -465,7 +465,7 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
             )
         }
         Derived::Zero { within, .. } => format!("true up to {within}"),
-        Derived::Equal { within, .. } => format!("true while they differ by {within} at most"),
+        Derived::Equal { within, .. } => format!("true while they differ by at most {within}"),
         Derived::State { any } => {
             let one = |state: &Mask| format!("{:#06x} of {:#06x}", state.is, state.mask);
             any.iter().map(one).collect::<Vec<_>>().join(" or ")

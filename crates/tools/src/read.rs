@@ -14,8 +14,8 @@ use crate::north::http::messages::{PointValue, Word};
   drivegate read --config drivegate.toml pump-1 output_frequency motor_current
   drivegate read --config drivegate.toml pump-1 state fault_text
 
-Without points: all that are polled. state and fault_text are made of points. A running gateway is asked through its local socket; without one the command opens
-the port itself.")]
+Without points: all that are polled. state and fault_text are derived from points. A running gateway is asked through its local socket; without one the command
+opens the port itself.")]
 pub(super) struct Args {
     #[command(flatten)]
     drive: OneDrive,

@@ -7,9 +7,9 @@ use super::drive_access::{OneDrive, Target};
 use super::report;
 use crate::north::http::messages::Recorded;
 
-/// Makes the running gateway record a drive: the time before now, and the time after.
+/// Makes the running gateway record a drive: the time just before and after.
 ///
-/// Prints the id of the recording. How long before and after: `before` and `after` of [recordings].
+/// Prints the id of the recording. The times are `before` and `after` of [recordings].
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:
   drivegate record --config drivegate.toml pump-1
@@ -29,7 +29,7 @@ fn record(target: &Target) -> ExitCode {
     let reply = target.ask_gateway(&asked);
     match reply.and_then(|reply| Ok(reply.accepted::<Recorded>(&asked)?)) {
         Ok(record) => {
-            report::note(&format!("it is complete in {:.0} s", record.after_s));
+            report::note(&format!("it will be complete in {:.0} s", record.after_s));
             report::print(&format!("{}\n", record.id))
         }
         Err(message) => report::failed(&message),

@@ -13,7 +13,7 @@ use crate::history::{Entry, Recording, export, pcapng, store};
 
 /// Lists, shows and exports recordings.
 ///
-/// Reads the files of the gateway, which need not run. A recording is named by its id, or by the path of its file.
+/// Reads the gateway's files; no gateway needs to run. A recording is given by its id, or by the path of its file.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate recordings
@@ -24,7 +24,7 @@ pub(super) struct Args {
     /// Configuration file; its state_dir has the recordings.
     #[arg(long = "config", value_name = "FILE", default_value = DEFAULT_CONFIG, global = true)]
     config: PathBuf,
-    /// Directory with recordings, in place of that of the configuration.
+    /// Directory with recordings, instead of that of the configuration.
     #[arg(long, value_name = "DIR", global = true)]
     dir: Option<PathBuf>,
     #[command(subcommand)]
@@ -46,7 +46,7 @@ enum Action {
         /// Id, or path of the file.
         id: String,
     },
-    /// Writes a recording in another form.
+    /// Exports a recording to another format.
     #[command(after_help = "Example:\n  drivegate recordings export 20260302T074012.118Z-pump-1 --csv > trip.csv")]
     Export(Export),
 }
@@ -56,16 +56,16 @@ enum Action {
 struct Export {
     /// Id, or path of the file.
     id: String,
-    /// The samples: a line for each, a column for each point.
+    /// The samples: one line each, one column per point.
     #[arg(long)]
     csv: bool,
-    /// All of it as one JSON object.
+    /// Everything as one JSON object.
     #[arg(long)]
     json: bool,
     /// The frames of the line as pcapng, each with a comment.
     #[arg(long)]
     pcap: bool,
-    /// File to write [default: the standard output].
+    /// File to write [default: standard output].
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
 }
@@ -140,7 +140,7 @@ fn open(args: &Args, id: &str) -> Result<Recording, ExitCode> {
             path
         }
     };
-    let unreadable = |error| report::failed(&format!("{error}; name a recording of `drivegate recordings list`"));
+    let unreadable = |error| report::failed(&format!("{error}; choose a recording from `drivegate recordings list`"));
     store::read(&path).map_err(unreadable)
 }
 

@@ -11,10 +11,10 @@ use crate::config::{Settings, environment};
 use crate::north::http::messages::ReloadOutcome;
 use crate::north::local::SocketPath;
 
-/// Lets the running gateway reload its configuration, and waits for the outcome.
+/// Makes the running gateway reload its configuration, and waits for the result.
 ///
-/// Prints what changed. If the gateway refuses the configuration, its errors are printed, the exit code is 78, and
-/// the gateway goes on with the former one.
+/// Prints what changed. If the gateway refuses the configuration, its errors are printed, the exit code is 78, and the
+/// gateway keeps the previous one.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate reload --config /etc/drivegate/drivegate.toml")]
 pub(super) struct Args {
@@ -39,7 +39,7 @@ async fn reload(config: &Path) -> Result<ReloadOutcome, String> {
             config.display()
         ));
     }
-    let asked = Asked::post("/api/v1/reload", &serde_json::json!({})).if_lost("look at its log");
+    let asked = Asked::post("/api/v1/reload", &serde_json::json!({})).if_lost("check its log");
     let reply = Client::of_configuration(config)?.ask(&asked).await?;
     match reply.status {
         StatusCode::OK | StatusCode::UNPROCESSABLE_ENTITY => Ok(reply.document()?),
@@ -51,7 +51,7 @@ fn reported(outcome: &ReloadOutcome) -> ExitCode {
     outcome.warnings.iter().for_each(|warning| report::warning(warning));
     outcome.errors.iter().for_each(|error| report::error(error));
     if !outcome.errors.is_empty() {
-        report::note("the gateway keeps the former configuration");
+        report::note("the gateway keeps the previous configuration");
         return ExitCode::from(EXIT_CONFIG);
     }
     report::print(&match outcome.changes.as_slice() {

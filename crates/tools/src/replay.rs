@@ -24,23 +24,25 @@ const AFTERWARDS: Duration = Duration::from_millis(200);
 /// Longest step of virtual time.
 const STEP: Duration = Duration::from_millis(100);
 
-/// Plays a capture of a serial line through the code that listens, in virtual time, and prints events and the values at its end.
+/// Replays a capture of a serial line in virtual time, and prints events and final values.
 ///
 /// Reads pcap and pcapng with link type RTAC Serial (250), as `drivegate trace --pcap` and `recordings export --pcap` write them, or
 /// a USER link type (147 to 162), whose packets are bare bytes. Opens no port.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate replay line1.pcap --config drivegate.toml
-  drivegate replay trip.pcapng --config drivegate.toml --bus line1
+  drivegate replay \
+                        trip.pcapng --config drivegate.toml --bus line1
 
-Exit codes: 0 played, 1 failure, 2 wrong command line, 65 no sound capture, 78 invalid configuration.")]
+Exit codes: 0 played, 1 failure, 2 wrong \
+                        command line, 65 no valid capture, 78 invalid configuration.")]
 pub(super) struct Args {
     /// The capture.
     #[arg(value_name = "FILE")]
     capture: PathBuf,
     #[command(flatten)]
     config: ConfigFile,
-    /// The bus of the configuration whose line it is [default: the only one].
+    /// The bus of the configuration that it was captured on [default: the only one].
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
 }
@@ -63,7 +65,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Ok(capture) => {
             if let Some(error) = capture.broken {
                 report::warning(&format!(
-                    "the capture is read up to a damaged part: {error}; {}; what follows is left out",
+                    "the capture is read up to a damaged part: {error}; {}; the rest is ignored",
                     args.capture.display()
                 ));
             }
@@ -217,7 +219,8 @@ impl Player {
         let _ = write!(self.text, "\n{}", report::lines(&table));
         let _ = writeln!(
             self.text,
-            "\n{:.3} s: {} answered, {} refused, {} unanswered, {} damaged or doubtful, {} pieces outside transactions",
+            "\n{:.3} s: {} answered, {} refused, {} unanswered, {} damaged or doubtful, {} fragments outside \
+             transactions",
             at.as_secs_f64(),
             counted(Outcome::Ok),
             counted(Outcome::Exception),

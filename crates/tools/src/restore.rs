@@ -17,8 +17,8 @@ use crate::config::{Loaded, Settings, environment};
 
 /// Sets a gateway up again from a file that `backup` wrote.
 ///
-/// The gateway must not run. The configuration is checked before anything is put in place; certificates and keys that
-/// the backup does not have must be in their places by then.
+/// The gateway must not be running. The configuration is checked before anything is put in place; certificates and keys
+/// that the backup lacks must be in place by then.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  drivegate restore pump-house.tar --config /etc/drivegate/drivegate.toml\n  \
@@ -71,7 +71,7 @@ fn restore(args: &Args) -> Result<String, Refused> {
     let runtime = super::runtime()?;
     if runtime.block_on(is_running(config)) {
         return Err(Refused::Because(
-            "the gateway runs: stop it first (systemctl stop drivegate)".to_string(),
+            "the gateway is running: stop it first (systemctl stop drivegate)".to_string(),
         ));
     }
     let file = File::open(&args.file).map_err(|error| format!("cannot read the backup: {error}"))?;

@@ -50,7 +50,8 @@ fn run_from(path: &Path) -> io::Result<ExitCode> {
         return Ok(ExitCode::from(EXIT_CONFIG));
     };
     let log = super::log::start(&settings.log);
-    tracing::info!(target: "drivegate::cli::run", version = VERSION.as_str(), config = %path.display(), "drivegate starts");
+    tracing::info!(target: "drivegate::cli::run", version = VERSION.as_str(), config = %path.display(), "drivegate is \
+                                                                                                         starting");
     loaded
         .warnings
         .iter()
@@ -86,7 +87,7 @@ async fn serve(settings: Settings, path: &Path, log: &LogHandle, signals: Signal
         Ok(daemon) => daemon,
         Err(error) => return report::failed(&error.to_string()),
     };
-    tracing::info!(target: "drivegate::cli::run", gateway, buses, "drivegate runs");
+    tracing::info!(target: "drivegate::cli::run", gateway, buses, "drivegate is running");
     notify(&[NotifyState::Ready]);
     let daemon = serving::until_stopped(daemon, orders, path, log, signals).await;
     notify(&[NotifyState::Stopping]);

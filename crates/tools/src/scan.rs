@@ -21,7 +21,7 @@ use super::{EXIT_CONFIG, EXIT_FAILED, report};
 use crate::bus::Mode;
 use crate::drive::profile::Profiles;
 
-/// Finds the drives of a line and prints a configuration for them; only reads.
+/// Finds the drives on a line and prints a configuration for them; only reads.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate scan --port /dev/ttyUSB0
@@ -35,7 +35,7 @@ pub(super) struct Args {
     port: String,
     #[command(flatten)]
     options: Options,
-    /// Go on with other settings after a drive has answered.
+    /// Continue with other settings after a drive has replied.
     #[arg(long)]
     exhaustive: bool,
 }

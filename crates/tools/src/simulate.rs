@@ -28,16 +28,22 @@ use std::time::Duration;
 #[derive(Debug, clap::Args)]
 #[command(after_help = format!("Examples:
   drivegate simulate --addresses 1-10 --link /tmp/line1 --baud 38400
-  drivegate simulate --addresses 1,2 --link /tmp/line1 --fault drop=0.01,late:150ms=0.01 --seed 7
-  drivegate simulate --profile teco-7300pa --addresses 1-3 --link /tmp/line2
-  drivegate simulate --profile our-meter.toml --set voltage_l1=231.5 --link /tmp/line3
-  drivegate simulate --config drivegate.toml
+  \
+                                drivegate simulate --addresses 1,2 --link /tmp/line1 --fault \
+                                drop=0.01,late:150ms=0.01 --seed 7
+  drivegate simulate --profile teco-7300pa \
+                                --addresses 1-3 --link /tmp/line2
+  drivegate simulate --profile our-meter.toml --set \
+                                voltage_l1=231.5 --link /tmp/line3
+  drivegate simulate --config \
+                                drivegate.toml
 
 Faults: {NAMES}.
 
-A simulated drive obeys the bus. Writing a fault, as its registers show it, to a holding register that no real drive \
-has trips it; PDU address by the key `simulator` of the profile: {}; others 9998. So does the signal USR1 with all \
-drives of the process; USR2 gives them to their panels, or back to the bus.", trip_registers()))]
+A simulated drive obeys the bus. Writing a fault \
+                                code to a holding register that no real drive has trips it; PDU address by the key \
+                                `simulator` of the profile: {}; others 9998. The signal USR1 trips all drives of the \
+                                process; USR2 gives them to their panels, or back to the bus.", trip_registers()))]
 pub(super) struct Args {
     /// Simulate every bus of a gateway configuration, each under its own `port`
     #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "protocol", "baud", "format"])]
@@ -48,7 +54,7 @@ pub(super) struct Args {
     /// Include the profiles (*.toml) of this directory; may be repeated
     #[arg(long, value_name = "DIR", conflicts_with = "config")]
     pub profile_dir: Vec<PathBuf>,
-    /// What a point of a profile without a simulator of its own shows, such as voltage_l1=231.5; may be repeated
+    /// Value of a point, for profiles without their own simulator, such as voltage_l1=231.5; may be repeated
     #[arg(long, value_name = "POINT=VALUE", conflicts_with = "config")]
     pub set: Vec<String>,
     /// Their addresses, such as 1-10 or 1,2,7
@@ -78,7 +84,7 @@ pub(super) struct Args {
     /// Faults and their probabilities, such as drop=0.01,corrupt=0.02
     #[arg(long, value_name = "LIST", default_value = "")]
     pub fault: Rates,
-    /// Seed of the faults and of what the drives do on their own
+    /// Seed of the faults and of the autopilot
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,
     /// Let the drives start, stop and fault on their own until a master writes to them
@@ -96,7 +102,7 @@ pub(super) struct Args {
     /// Let each TECO 7300PA answer a request with a wrong check code with error 00H, as in its error table, instead of not at all
     #[arg(long)]
     pub teco_answer_check_error: bool,
-    /// Characters delivered to the master at once: 0 the whole reply, 14 like a UART's FIFO, 1 one by one
+    /// Characters delivered to the master at a time: 0 the whole reply, 14 like a UART's FIFO, 1 one by one
     #[arg(long, value_name = "CHARACTERS", default_value_t = 0)]
     pub chunk: u8,
     /// True wire times, or as fast as the programs are

@@ -8,9 +8,9 @@ use super::client::{Asked, Gateway};
 use super::{EXIT_FAILED, printable, report};
 use crate::stop_all::{StopReport, Stopped};
 
-/// Stops every controlled drive through the running gateway, and waits up to 10 s for them to stand.
+/// Stops every controlled drive through the running gateway, and waits up to 10 s for them to stop.
 ///
-/// Prints each drive; the exit code is 1 if one is not proven to stand. This is no emergency stop.
+/// Prints each drive; the exit code is 1 if one is not proven to have stopped. This is not an emergency stop.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate stop-all --config drivegate.toml
@@ -19,7 +19,7 @@ use crate::stop_all::{StopReport, Stopped};
 pub(super) struct Args {
     #[command(flatten)]
     gateway: Gateway,
-    /// Only the drives of this bus.
+    /// Only the drives on this bus.
     #[arg(long, value_name = "BUS")]
     bus: Option<String>,
     /// Only the drives with this `group`.
@@ -48,7 +48,7 @@ async fn stop_all(args: &Args) -> Result<StopReport, String> {
         (None, Some(group)) => json!({ "group": group }),
         (None, None) => json!({}),
     };
-    let asked = Asked::post("/api/v1/stop", &scope).if_lost("whether the drives stopped is not known: look at them");
+    let asked = Asked::post("/api/v1/stop", &scope).if_lost("it is unknown whether the drives stopped: check them");
     let reply = args.gateway.client()?.ask(&asked).await?;
     match reply.parsed() {
         // Of either status.
@@ -68,8 +68,8 @@ fn shown(stopped: &StopReport) -> String {
         let reason = drive.reason.as_deref().unwrap_or_default();
         match drive.outcome {
             Stopped::Standing => format!("{name}: standing\n"),
-            Stopped::Stopping => format!("{name}: NOT PROVEN TO STAND, stopping: {}\n", printable::line(reason)),
-            Stopped::Unproven => format!("{name}: NOT PROVEN TO STAND, unproven: {}\n", printable::line(reason)),
+            Stopped::Stopping => format!("{name}: NOT PROVEN STOPPED, stopping: {}\n", printable::line(reason)),
+            Stopped::Unproven => format!("{name}: NOT PROVEN STOPPED, unproven: {}\n", printable::line(reason)),
         }
     };
     others.iter().chain(&standing).map(line).collect()

@@ -9,7 +9,8 @@ use crate::north::http::{Scope, Token};
 
 /// Adds, lists and removes access tokens of the HTTP server
 ///
-/// The file is `tokens_file` of [http]; a running gateway reads it at a reload. It holds only the SHA-256 of each token.
+/// The file is `tokens_file` of [http]; a running gateway reads it at a reload. It contains only the SHA-256 of each
+/// token.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     drivegate token add --file /etc/drivegate/tokens --scope metrics prometheus >prometheus.token\n  \
@@ -29,7 +30,7 @@ enum Action {
     Add {
         #[command(flatten)]
         file: TokenFile,
-        /// What it permits: read (status page, JSON), metrics, control (nothing: commands are given by users). Repeatable.
+        /// What it permits: read (status page, JSON), metrics, control (nothing: only users command). Repeatable.
         #[arg(long = "scope", value_name = "SCOPE", required = true)]
         scopes: Vec<Scope>,
         /// Its name, for the file and the log.

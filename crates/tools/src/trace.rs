@@ -21,8 +21,8 @@ const FLUSH: Duration = Duration::from_secs(1);
 
 /// Shows the frames on the lines of a running gateway, with times, gaps and meaning.
 ///
-/// Costs the line nothing. Times are UTC: of a request when it was given to the port, of a reply when its last byte
-/// arrived. The gap is the silence before the frame, in microseconds.
+/// Adds no traffic to the line. Times are UTC: for a request when it was passed to the port, for a reply when its last
+/// byte arrived. The gap is the silence before the frame, in microseconds.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  drivegate trace --bus line1\n  \
     drivegate trace --bus line1 --count 1000 --pcap line1.pcap\n\n\

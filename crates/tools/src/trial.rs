@@ -19,7 +19,7 @@ use super::{EXIT_FAILED, report};
 /// How long the line is listened to before anything is sent.
 const LISTEN: Duration = Duration::from_secs(1);
 
-/// Finds the drives of a line, shows their values on a page, offers to write a configuration; only reads.
+/// Finds the drives on a line, shows their values on a page, offers to write a configuration; only reads.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate try
@@ -98,7 +98,7 @@ fn attempt(args: &Args, stop: &Stop) -> Result<ExitCode, ExitCode> {
     };
     let (settings, profiles) = scan::prepare(&args.options, &port)?;
     report::note(&format!(
-        "looking for drives on {port}; nothing is written to them, and Ctrl-C ends it"
+        "looking for drives on {port}; nothing is written to them; Ctrl-C to stop"
     ));
     let mut search = Search::new(&port, &args.options, profiles, stop.flag.clone());
     let outcome = match settings.first() {

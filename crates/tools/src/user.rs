@@ -12,8 +12,8 @@ use crate::north::http::{MAX_PASSWORD, User};
 
 /// Adds, lists and removes the users who may command over HTTP
 ///
-/// The file is `users_file` of [http]; a running gateway reads it at a reload. It holds only an Argon2id hash of each
-/// password.
+/// The file is `users_file` of [http]; a running gateway reads it at a reload. It contains only an Argon2id hash of
+/// each password.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     drivegate user add --file /etc/drivegate/users alice\n  \
@@ -26,7 +26,7 @@ pub(super) struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum Action {
-    /// Adds a user, or gives one another password. Asks for it on a terminal, else reads it from standard input.
+    /// Adds a user, or changes a user's password. Asks for it on a terminal, else reads it from standard input.
     #[command(after_help = "Examples:\n  drivegate user add --file /etc/drivegate/users alice\n  \
         drivegate user add --file /etc/drivegate/users alice <password.txt")]
     Add {
@@ -35,7 +35,7 @@ enum Action {
         /// Its name, for the login and the audit.
         name: String,
     },
-    /// Prints the names.
+    /// Prints the user names.
     #[command(after_help = "Example:\n  drivegate user list --file /etc/drivegate/users")]
     List {
         #[command(flatten)]
@@ -87,7 +87,7 @@ fn add(file: &UsersFile, name: &str) -> Result<String, String> {
     let user =
         User::new(name, &password()?).map_err(|error| format!("{error}; {}; choose another", file.path.display()))?;
     Ok(match file.open().put(&user, true)? {
-        true => format!("{name} has another password; reload the gateway\n"),
+        true => format!("{name} has a new password; reload the gateway\n"),
         false => format!("{name} was added; reload the gateway\n"),
     })
 }

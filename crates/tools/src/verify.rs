@@ -9,13 +9,13 @@ use super::{printable, profiles, read, report};
 use crate::drive::{ModelPoint, Profile};
 use crate::north::http::messages::PointValue;
 
-/// Prints the form for confirming the profile of a drive on hardware: what the gateway reads, next to what the panel shows.
+/// Prints a form for confirming a drive's profile on hardware: what the gateway reads, next to what the panel shows.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate verify --config drivegate.toml pump-1 > pump-1.md
 
-Fill it in at the drive and send it in, with the frames: drivegate trace --pcap. It only reads; the commands are given by
-hand.")]
+Fill it in at the drive and send it in, with the frames: drivegate trace --pcap. It only reads; you send the commands
+yourself.")]
 pub(super) struct Args {
     #[command(flatten)]
     drive: OneDrive,
@@ -28,7 +28,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
 fn form(target: &Target) -> Result<String, String> {
     let profile = target
         .profile()
-        .ok_or("the profile is not known here; --url; name the configuration with --config")?;
+        .ok_or("the profile is unknown here; --url; name the configuration with --config")?;
     let rows = read::rows(target, &[])?;
     let time = humantime::format_rfc3339_seconds(SystemTime::now()).to_string();
     Ok(text(profile, &rows, &time))
@@ -58,8 +58,8 @@ fn text(profile: &Profile, rows: &[PointValue], time: &str) -> String {
         // Writing to a String cannot fail.
         let _ = writeln!(text, "| {} | {at} | {value} | {} | | |", row.point, row.unit);
     }
-    text += "\n## Commands\n\nThe smallest reference first; somebody stands at the emergency stop.\n\n";
-    text += "| order | motor | panel |\n|---|---|---|\n";
+    text += "\n## Commands\n\nSmallest reference first, with someone at the emergency stop.\n\n";
+    text += "| command | motor | panel |\n|---|---|---|\n";
     let has = |point: ModelPoint| profile.model_point(point).is_some_and(|point| point.write);
     let reference = has(ModelPoint::SpeedReference).then_some("speed_reference=10");
     let orders = [
@@ -71,14 +71,17 @@ fn text(profile: &Profile, rows: &[PointValue], time: &str) -> String {
         ),
         (has(ModelPoint::Run) && has(ModelPoint::Reverse), "run=false in reverse"),
         (has(ModelPoint::FaultReset), "fault_reset=true after a fault"),
-        (has(ModelPoint::FaultReset), "fault_reset=true, the fault still there"),
         (
             has(ModelPoint::FaultReset),
-            "fault_reset=true, run given at the panel: it must not start",
+            "fault_reset=true with the fault still present",
+        ),
+        (
+            has(ModelPoint::FaultReset),
+            "fault_reset=true with run given at the panel: it must not start",
         ),
         (
             has(ModelPoint::Run),
-            "bus cable pulled while it runs: what it does, after how long",
+            "bus cable unplugged while it runs: what it does, after how long",
         ),
     ];
     let orders = orders.iter().filter(|(has, _)| *has).map(|(_, order)| *order);

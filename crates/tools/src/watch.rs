@@ -57,7 +57,7 @@ async fn watch(args: &Args) -> Result<ExitCode, String> {
         // Survive a restart of the gateway.
         let text = match page(&client).await {
             Ok(text) => text,
-            Err(why) => format!("{why}\n\ntrying again\n"),
+            Err(why) => format!("{why}\n\nretrying\n"),
         };
         let mut stdout = io::stdout().lock();
         // Redraws from the top, clearing the rest of each line and of the screen.

@@ -9,7 +9,7 @@ use super::drive_access::{Needs, OneDrive, Target};
 use super::{printable, report};
 use crate::north::http::messages::Why;
 
-/// Says why a drive does not run: each cause with its evidence, its age and what to do.
+/// Shows why a drive does not run: each cause with evidence, age and remedy.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate why --config drivegate.toml pump-1
@@ -44,7 +44,7 @@ fn text(drive: &str, why: &Why) -> String {
     let mut text = match explanation.runs {
         Some(true) => format!("{drive} runs\n"),
         Some(false) => format!("{drive} does not run\n"),
-        None => format!("whether {drive} runs is not known\n"),
+        None => format!("it is unknown whether {drive} runs\n"),
     };
     for cause in &explanation.causes {
         let age = cause.age_ms.map_or(String::new(), |ms| {
@@ -57,14 +57,14 @@ fn text(drive: &str, why: &Why) -> String {
     if explanation.runs != Some(true) && !explanation.not_told.is_empty() {
         let _ = write!(
             text,
-            "\n  not known, because the drive does not tell: {}\n",
+            "\n  not reported by this drive, so not ruled out: {}\n",
             explanation.not_told.join(", ")
         );
     }
     if !why.profile_verified {
         let _ = write!(
             text,
-            "\n  the profile {} is not verified on hardware: what it takes the drive's state for may be wrong\n",
+            "\n  the profile {} is not verified on hardware: its reading of the drive's state may be wrong\n",
             printable::line(&why.profile)
         );
     }
@@ -99,7 +99,7 @@ mod tests {
             not_told: vec!["enable input".to_string()],
         };
         let expected = "fan-1 does not run\n\n  interlocked: interlocked is on (0.1 s ago)\n      close it\n\n  \
-                        not known, because the drive does not tell: enable input\n";
+                        not reported by this drive, so not ruled out: enable input\n";
         let of = |explanation: &Explanation, profile: &str, profile_verified| Why {
             explanation: explanation.clone(),
             profile: profile.to_string(),

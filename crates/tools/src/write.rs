@@ -137,7 +137,7 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
         (Kind::Bool, _) => Err(bad("true or false, on or off, yes or no, 1 or 0")),
         _ if meaning.is_some() => Ok(Value::Integer(meaning.unwrap_or_default())),
         (Kind::Integer, _) => text.parse().map(Value::Integer).map_err(|_| bad("a whole number")),
-        (Kind::Text, _) => Err(bad("another point: this one is a text, which is only read")),
+        (Kind::Text, _) => Err(bad("another point: this one is a read-only text")),
         (Kind::Number, _) => {
             let number = text.parse::<f64>().ok().filter(|n| n.is_finite());
             number.map(Value::Number).ok_or_else(|| bad("a number"))
@@ -150,7 +150,7 @@ fn command(target: &Target, settings: &[Setting]) -> Result<String, String> {
     let what = format!("{} {}", target.drive, shown.join(" "));
     let names: Vec<String> = settings.iter().map(|setting| setting.point.clone()).collect();
     let asked = Asked::post(target.path("commands"), &Body(settings))
-        .if_lost("whether the drive took the command is not known: read before you repeat it");
+        .if_lost("it is unknown whether the drive executed the command: read before you repeat it");
     let (reply, way) = target.ask(&asked, Needs::Commands(&names))?;
     let Some(written) = reply.parsed::<Written>() else {
         return Err(reply.refusal(&asked).to_string());

@@ -74,7 +74,7 @@ edited=$(md5sum /etc/drivegate/drivegate.toml)
 
 step "the journal has version, commit, fields and priorities"
 first=$(journalctl --no-pager --unit drivegate --identifier drivegate --output cat | head -n 1)
-contains "$first" "drivegate starts version=\"$(drivegate --version | sed 's/^drivegate //')\""
+contains "$first" "drivegate is starting version=\"$(drivegate --version | sed 's/^drivegate //')\""
 contains "$(journalctl --no-pager --unit drivegate DRIVE=pump-1)" "pump-1"
 sed -i 's/^cycle = .*/&\nresponse_timeout = "20s"/' /etc/drivegate/drivegate.toml
 systemctl restart drivegate

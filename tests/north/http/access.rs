@@ -312,7 +312,7 @@ fn a_gateway_with_tokens_and_tls() {
     );
     std::fs::write(at("drivegate.toml"), text).unwrap();
     let daemon = Running::drivegate(&["run", "--config", &at("drivegate.toml")]);
-    daemon.until_printed("drivegate runs");
+    daemon.until_printed("drivegate is running");
     let url = format!("https://localhost:{port}");
     let watch = |more: &[&str]| {
         let output = drivegate(&[&["watch", "--once", "--url", &url], more].concat());

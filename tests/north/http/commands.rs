@@ -133,10 +133,10 @@ async fn without_users_nothing_of_it_is_there() {
             (405, Some("GET, HEAD")),
             "{path}"
         );
-        assert_eq!(reply.body, "this interface is read only: use GET or HEAD\n");
+        assert_eq!(reply.body, "this interface is read-only: use GET or HEAD\n");
     }
     let page = get(rig.address(), "/").await.body;
-    assert!(page.contains("read only") && !page.contains("operate"), "{page}");
+    assert!(page.contains("read-only") && !page.contains("operate"), "{page}");
     assert_eq!(rig.bus.orders(), []);
 }
 
@@ -145,7 +145,7 @@ async fn a_user_logs_in_commands_and_logs_out() {
     let rig = Rig::new().await;
     let page = get(rig.address(), "/").await.body;
     assert!(
-        page.contains("assets/operate.js") && !page.contains("read only"),
+        page.contains("assets/operate.js") && !page.contains("read-only"),
         "{page}"
     );
     assert_eq!(get(rig.address(), "/assets/operate.js").await.status, 200);
@@ -228,7 +228,7 @@ async fn results_have_their_status() {
     let not_served = post(rig.address(), "/api/v1/drives", &alice, STOP).await;
     assert_eq!(
         (not_served.status, not_served.body.as_str()),
-        (405, "this is read only: use GET or HEAD\n")
+        (405, "this is read-only: use GET or HEAD\n")
     );
 }
 

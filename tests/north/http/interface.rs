@@ -119,14 +119,14 @@ async fn ready_once_all_buses_are_open_and_all_drives_were_tried() {
     assert_eq!(
         unready().await,
         "not ready\nbus line1: its port has not been opened yet\n\
-         drive pump-1 on bus line1: not tried yet\ndrive fan-2 on bus line1: not tried yet\n"
+         drive pump-1 on bus line1: not polled yet\ndrive fan-2 on bus line1: not polled yet\n"
     );
     bus.image
         .update_health(|health| health.reason = Some("cannot open /dev/x".to_string()));
     assert!(unready().await.contains("bus line1: cannot open /dev/x\n"));
     plant::open(&bus);
     plant::answer(&drives[0], Instant::now(), plant::nx_running);
-    assert_eq!(unready().await, "not ready\ndrive fan-2 on bus line1: not tried yet\n");
+    assert_eq!(unready().await, "not ready\ndrive fan-2 on bus line1: not polled yet\n");
     plant::silence(&drives[1]);
     let reply = get(server.address, "/readyz").await;
     assert_eq!(

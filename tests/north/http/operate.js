@@ -176,7 +176,7 @@ async function operate(browser) {
   assert.ok(await browser.run("document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')"), "cancelled");
   await browser.press("#stop-all");
   await browser.press("#stops .operate-stop");
-  await browser.until("all stand", "document.getElementById('stops').innerText.includes('Every drive stands: 1 of 1')");
+  await browser.until("all stand", "document.getElementById('stops').innerText.includes('All drives have stopped: 1 of 1')");
   await browser.until("it stands", "!document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
   await browser.press("#stops .operate-button");
   assert.strictEqual(await browser.run("document.getElementById('stops').innerText"), "");

@@ -160,7 +160,7 @@ fn commands_need_users_and_a_private_way() {
         site.write("drivegate.conf", &before);
     }
     let mut gateway = Running::drivegate(&["run", "--config", &site.config()]);
-    gateway.until_printed("drivegate runs");
+    gateway.until_printed("drivegate is running");
     assert!(gateway.runs());
 }
 

@@ -285,7 +285,7 @@ fn few_files_mean_few_connections() {
     let script = "ulimit -n 160; exec \"$0\" run --config \"$1\"";
     let (binary, file) = (env!("CARGO_BIN_EXE_drivegate"), file.to_str().unwrap());
     let daemon = Running::start(Path::new("/bin/sh"), &["-c", script, binary, file]);
-    daemon.until_printed("drivegate runs");
+    daemon.until_printed("drivegate is running");
     let log = daemon.output();
     assert!(
         log.contains("at most 64 instead of 400 connections") && log.contains("raise LimitNOFILE of the service"),

@@ -73,7 +73,7 @@ async fn offline_drives_and_closed_buses() {
     assert_eq!(
         client.ask(3, &words(6, &[0x8102, 2500])).await,
         [0x86, 0x0B],
-        "its range is not known since it does not answer"
+        "its range is unknown since it does not reply"
     );
     assert_eq!(
         client.ask(3, &words(3, &[0x8000, 5])).await,

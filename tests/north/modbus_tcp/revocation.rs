@@ -264,7 +264,7 @@ fn the_daemon_takes_a_new_list() {
     );
     std::fs::write(at("drivegate.toml"), text).unwrap();
     let daemon = Running::drivegate(&["run", "--config", &at("drivegate.toml")]);
-    daemon.until_printed("drivegate runs");
+    daemon.until_printed("drivegate is running");
     let client = |name: &str| {
         let script = tools::root().join("tests/peers/tls_client.py");
         let (port, files) = (

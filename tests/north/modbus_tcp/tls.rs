@@ -483,7 +483,7 @@ async fn the_daemon_takes_new_certificates() {
     let file = at("drivegate.toml");
     std::fs::write(&file, text).unwrap();
     let daemon = Running::drivegate(&["run", "--config", file.to_str().unwrap()]);
-    daemon.until_printed("drivegate runs");
+    daemon.until_printed("drivegate is running");
     let config = || WORKS.client(Some("own/hmi"), &TLS13);
     let identify = [43, 14, 4, 0];
     let mut before = TlsClient::connect(port, config()).await.unwrap();

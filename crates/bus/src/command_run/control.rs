@@ -123,7 +123,7 @@ impl AwaitedState {
             .seen
             .map_or("was not read".to_string(), |seen| format!("is {seen:#06x}"));
         format!(
-            "{step}: `{name}` {seen}, not {:#06x} in {:#06x}, within {timeout:?}; the start was given up",
+            "{step}: `{name}` {seen}, not {:#06x} in {:#06x}, within {timeout:?}; the start was abandoned",
             mask.is, mask.mask
         )
     }
@@ -348,8 +348,7 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
         Some(own) => pulsed.map_or(own, |pulsed| pulsed.released(own)),
         None if known.running && !word.names_run() => {
             return Made::Refused(Refusal::NotKnown(
-                "what the drive was commanded last is not known; say with the same command whether the motor is to run"
-                    .to_string(),
+                "the last command to the drive is unknown; include `run` true or false in this command".to_string(),
             ));
         }
         None => 0,
@@ -448,7 +447,7 @@ fn reset_low(
     let stops = reset.place.is_none() && control.runs().iter().any(|run| !reset.agrees(run));
     if known.running && stops {
         return Made::Refused(Refusal::NotAllowed(
-            "the motor runs, and the reset of this family would stop it; nothing was written".to_string(),
+            "the motor is running, and on this family a reset would stop it; nothing was written".to_string(),
         ));
     }
     let low = match known.running {

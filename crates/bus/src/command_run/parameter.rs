@@ -174,7 +174,8 @@ impl ParameterRun {
         Then::Over(match self.in_doubt && self.order.from.is_none() {
             true => unanswered.clone(),
             false => Outcome::Refused(Refusal::MotorRuns(
-                "the motor runs, and parameters are written only while it stands; nothing was written".to_string(),
+                "the motor is running, and parameters are written only while it is stopped; nothing was written"
+                    .to_string(),
             )),
         })
     }
@@ -200,8 +201,8 @@ impl ParameterRun {
         Then::Over(match self.in_doubt {
             true => Outcome::NotTaken(shown),
             false => Outcome::Refused(Refusal::OtherValue(format!(
-                "{shown}, neither what it had when the restore began ({}) nor what is restored ({}): somebody changed it; nothing \
-                 was written",
+                "{shown}, neither its value when the restore started ({}) nor the one to restore ({}): someone \
+                 changed it; nothing was written",
                 before.map_or(f64::NAN, RawValue::number),
                 self.order.to.number()
             ))),
@@ -223,7 +224,7 @@ impl ParameterRun {
 
 fn shown(value: Option<RawValue>) -> String {
     match value {
-        Some(value) => format!("it shows {}", value.number()),
-        None => "what it shows is not a value".to_string(),
+        Some(value) => format!("it reads {}", value.number()),
+        None => "it does not read as a value".to_string(),
     }
 }

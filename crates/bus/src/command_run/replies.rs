@@ -212,7 +212,7 @@ impl CommandRun {
             return over.then(|| self.without_answer());
         }
         match step.purpose {
-            StepPurpose::Release if over => return self.not_released("no answer"),
+            StepPurpose::Release if over => return self.not_released("no reply"),
             StepPurpose::Compare if self.urgency == Urgency::Stop => {
                 self.check = Check::InVain;
                 return None;

@@ -144,10 +144,10 @@ pub(super) fn unsendable(profile: &Profile, values: &[(usize, Value)]) -> Option
         }
         match point.raw().map(|raw| raw.encode(*value, 0)) {
             Some(Ok(words)) if !words.is_empty() => None,
-            Some(Ok(_)) => Some(Refusal::BadValue(format!("`{name}` = {value} is nothing to write"))),
+            Some(Ok(_)) => Some(Refusal::BadValue(format!("`{name}` = {value} cannot be encoded"))),
             Some(Err(why)) => Some(Refusal::BadValue(format!("`{name}`: {why}"))),
             None => Some(Refusal::NotWritable(format!(
-                "`{name}` is not a register of the drive; the command does not name those that it rests on"
+                "`{name}` is derived, not a register of the drive, and cannot be written"
             ))),
         }
     })

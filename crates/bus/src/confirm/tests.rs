@@ -412,7 +412,7 @@ fn a_stop_is_not_confirmed_while_the_motor_may_be_fed_past_the_drive() {
         assert!(why.contains(point), "{why}");
         let told = bench.expired();
         assert!(
-            told.len() == 1 && told[0].contains("not known") && told[0].contains(point),
+            told.len() == 1 && told[0].contains("is unknown") && told[0].contains(point),
             "{told:?}"
         );
         let audited = audited(bench.stats.audit())[0]["text"].to_string();

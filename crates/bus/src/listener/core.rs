@@ -154,7 +154,7 @@ impl ListenCore {
             let is_silent = now.saturating_duration_since(known.heard) > silent;
             let due = known.commands.due(now);
             if is_silent {
-                let why = format!("no reply of it for {} s", silent.as_secs());
+                let why = format!("no reply from it for {} s", silent.as_secs());
                 self.report.gone(index, &why);
             }
             if let Some(commanded) = due {
@@ -233,8 +233,8 @@ impl ListenCore {
         if new {
             tracing::info!(
                 target: "drivegate::bus::listener", bus = %self.bus.image.spec.name, address,
-                "a drive without an entry answers the other master at address {address}; write [[bus.drive]] for it to see its \
-                 values, `drivegate listen` shows what is read of it"
+                "a drive without an entry answers the other master at address {address}; add a [[bus.drive]] for it \
+                 to see its values; `drivegate listen` shows what is read from it"
             );
         }
     }

@@ -33,7 +33,7 @@ const KEPT: usize = 512;
 
 const NO_REPLY_IN_FRONT: &str = "invalid bytes came between request and reply";
 const AMBIGUOUS: &str = "it could be a request as well";
-const BEHIND_MANGLED: &str = "it may be the late reply to a request that was mangled";
+const BEHIND_MANGLED: &str = "it may be the late reply to a damaged request";
 
 /// Something that was heard.
 #[derive(Debug, Clone, PartialEq)]

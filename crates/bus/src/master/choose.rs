@@ -479,7 +479,8 @@ impl Master {
 
 fn range_changed() -> Refusal {
     Refusal::NotKnown(
-        "the drive's frequency range was written, or changed, since the command was given; nothing was written; send it again"
+        "the drive's frequency range was written, or changed, since the command was accepted; nothing was written; \
+         send it again"
             .to_string(),
     )
 }

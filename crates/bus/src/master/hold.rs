@@ -55,7 +55,7 @@ fn stop_at_local(bus: &BusHandle, index: usize, drive: &DriveState, reading: &Re
     if let Err(refusal) = bus.own_order(index, reading, stop, origin, DEFAULT_EXPIRY, writes) {
         tracing::error!(
             target: "drivegate::bus::master", drive = %reading.spec.name,
-            "its run command stands while the local control place has it, and no stop can be sent: {refusal}"
+            "its run command is set while it is under local control, and no stop can be sent: {refusal}"
         );
     }
 }

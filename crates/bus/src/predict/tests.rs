@@ -96,8 +96,7 @@ fn a_saturated_line_gives_slow_polls_five_percent() {
     assert_eq!(shortage.remedies, [Remedy::Cycle { cycle, baud: None }]);
     assert_eq!(
         shortage.finding().to_string(),
-        "the line cannot carry cycle = \"10ms\" and slow_cycle = \"1s\": fast rounds of 10 requests take 114.4 ms \
-         and come every 120.4 ms, slow rounds of 20 requests take 218.3 ms and come every 4366.7 ms; set cycle = \"148ms\""
+        "the line cannot carry cycle = \"10ms\" and slow_cycle = \"1s\": fast polling of 10 requests takes 114.4 ms, every 120.4 ms, slow polling of 20 requests takes 218.3 ms, every 4366.7 ms; set cycle = \"148ms\""
     );
     let carried = predict(&spec(38_400, 148, 1000), Silence::Chars, &drives);
     assert_eq!(carried.shortage, None);
@@ -165,7 +164,7 @@ fn else_the_bus_is_split() {
             .unwrap()
             .finding()
             .to_string()
-            .contains("split the bus in 4 buses")
+            .contains("split the bus into 4 buses")
     );
     // At 19200 one drive takes 22.4 ms: seven buses there, four at 38400.
     let p = predict(&spec(19_200, 25, 1000), Silence::Chars, &drives);

@@ -49,10 +49,10 @@ impl Start {
             Start::Prepared => "prepared to run",
             Start::Running { reverse: false } => "running forward",
             Start::Running { reverse: true } => "running in reverse",
-            Start::FaultedRunning => "faulted, the run command stands",
+            Start::FaultedRunning => "faulted, the run command still set",
             Start::FaultedStopped => "faulted and stopped",
             Start::Local => "commanded at its panel, stopped",
-            Start::LocalRunning => "commanded at its panel, the run command stands",
+            Start::LocalRunning => "commanded at its panel, the run command still set",
         }
     }
 }

@@ -22,7 +22,7 @@ pub(super) const WATCHED: [(ModelPoint, [(EventKind, &str); 2]); 3] = [
         ModelPoint::Warning,
         [
             (EventKind::Warning, "reports a warning"),
-            (EventKind::WarningEnd, "reports no warning any more"),
+            (EventKind::WarningEnd, "no longer reports a warning"),
         ],
     ),
     (
@@ -111,9 +111,9 @@ fn cause(who: &str) -> String {
     match who.split_once(' ') {
         Some(("supervision", Origin::LOCAL)) => ": its local control place took it over".to_string(),
         Some(("supervision", _)) => ": supervision timed out".to_string(),
-        Some(("shutdown", _)) => ": the gateway shuts down".to_string(),
-        Some(("interlock", _)) => ": an interlock does not hold".to_string(),
-        _ => format!(": ordered by {who}"),
+        Some(("shutdown", _)) => ": the gateway is shutting down".to_string(),
+        Some(("interlock", _)) => ": an interlock is not satisfied".to_string(),
+        _ => format!(": commanded by {who}"),
     }
 }
 
@@ -145,10 +145,7 @@ impl Report {
                 None => {}
             }
             if change.left_out > 0 {
-                text += &format!(
-                    " ({} changes before it are left out: they come too often)",
-                    change.left_out
-                );
+                text += &format!(" ({} changes before it omitted, too frequent)", change.left_out);
             }
             self.publish(Event {
                 drive: Some(name.clone()),

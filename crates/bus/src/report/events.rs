@@ -85,7 +85,7 @@ impl Report {
         if late.own {
             self.action_failed(index, |name| {
                 Some(format!(
-                    "the action of the lease of {name} shows no effect: the drive {}",
+                    "the lease action of {name} shows no effect: the drive {}",
                     late.text
                 ))
             });
@@ -115,7 +115,7 @@ impl Report {
         };
         let timeout = supervision.timeout;
         self.drive_event(index, EventKind::Supervision, None, |name| {
-            format!("no commanding client of {name} for {timeout:?}: {action}")
+            format!("no client has commanded {name} for {timeout:?}: {action}")
         });
     }
 
@@ -129,7 +129,7 @@ impl Report {
             }
         };
         self.drive_event(index, EventKind::Unsupervised, None, |name| {
-            format!("drive {name} runs, and its supervision knows of no client that has commanded it; {then}")
+            format!("drive {name} runs without a lease, since no client has commanded it; {then}")
         });
     }
 
@@ -152,7 +152,7 @@ impl Report {
         let Some(drive) = self.drive(index) else { return };
         drive.update(Snapshot::outlive);
         self.drive_event(index, EventKind::Restarted, None, |name| {
-            format!("drive {name} has restarted; it is read again, and takes only commands sent from now on")
+            format!("drive {name} has restarted; it is read again and accepts only commands sent from now on")
         });
     }
 
@@ -162,8 +162,8 @@ impl Report {
         let profile = &drive.spec.profile;
         self.drive_event(index, EventKind::UnlikeProfile, None, |name| {
             format!(
-                "drive {name} says that it is a device of type {device:02X}h, its profile `{}` expects {:02X}h; check \
-                 address and profile, or set device_type in [n2] of the profile",
+                "drive {name} reports device type {device:02X}h, but its profile `{}` expects {:02X}h; check address \
+                 and profile, or set device_type in [n2] of the profile",
                 profile.name, profile.n2.device_type
             )
         });

@@ -66,8 +66,8 @@ impl Report {
             return;
         }
         let text = format!(
-            "process data of drive {} does not hold what profile `{}` says: {}; the monitoring register is used; restore the \
-             selection of process data at the drive, or describe it in a profile of your own",
+            "process data of drive {} does not match profile `{}`: {}; the monitoring register is used; restore the \
+             process data selection in the drive, or describe it in a profile of your own",
             drive.spec.name,
             drive.spec.profile.name,
             differ.join(", ")

@@ -296,5 +296,5 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
     let all = kinds(EventKind::Started) + kinds(EventKind::Stopped);
     assert!((15..30).contains(&all), "{all}");
     let last = events.recent().pop().unwrap();
-    assert!(last.text.contains("changes before it are left out"), "{}", last.text);
+    assert!(last.text.contains("changes before it omitted"), "{}", last.text);
 }

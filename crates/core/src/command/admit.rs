@@ -100,7 +100,7 @@ fn parameter(drive: &Reading<'_>, order: &ParameterOrder) -> Result<(), Refusal>
     may_restore(spec).map_err(Refusal::NotAllowed)?;
     if drive.hold.and_then(Hold::why).is_none() {
         return Err(Refusal::NotAllowed(format!(
-            "parameter {id} of `{}` is written by a restore only; nothing was written",
+            "parameter {id} of `{}` can only be written by a restore; nothing was written",
             spec.name
         )));
     }
@@ -128,7 +128,7 @@ pub fn may_restore(spec: &DriveSpec) -> Result<(), String> {
     }
     if spec.params != ParamsAccess::Write {
         return Err(format!(
-            "the parameters of `{name}` are only read; set params = \"write\" for the drive"
+            "the parameters of `{name}` are read-only; set params = \"write\" for the drive"
         ));
     }
     Ok(())
@@ -217,14 +217,14 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
 /// The refusal of a command that sets `point` twice, by its name or by that of a point that rests on it.
 pub fn sets_twice(point: &str) -> Refusal {
     Refusal::BadValue(format!(
-        "the command sets `{point}` twice; name each point once, and one reference only"
+        "the command sets `{point}` twice; set each point once, and only one reference"
     ))
 }
 
 fn changes_its_range(end: &str) -> Refusal {
     Refusal::BadValue(format!(
-        "the command sets `{end}` and a reference that is converted or limited by it; send `{end}` first, and the reference \
-         when it was read; nothing was written"
+        "the command sets `{end}` and a reference that is converted or limited by it; send `{end}` first, and the \
+         reference once that has been read back; nothing was written"
     ))
 }
 
@@ -273,7 +273,7 @@ fn listed(point: &Point, value: Value) -> Result<(), Refusal> {
     let known = point.texts.iter().take(MOST_TEXTS);
     let known: Vec<String> = known.map(|(code, text)| format!("{code} {text}")).collect();
     Err(Refusal::BadValue(format!(
-        "`{}` = {number} is none of its values: {}; nothing was written",
+        "`{}` = {number} is not one of its values: {}; nothing was written",
         point.name,
         known.join(", ")
     )))
@@ -293,8 +293,8 @@ fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value)
         };
         let Some(figure) = figure.map(Value::as_f64) else {
             return Err(Refusal::NotKnown(format!(
-                "the limits of `{}` cannot be kept while the drive's frequency range is not known, or was not read for \
-                 {:.0} s; set frequency_range for the drive",
+                "the limits of `{}` cannot be checked: the drive's frequency range is unknown, or was not read in the \
+                 last {:.0} s; set frequency_range for the drive",
                 point.name,
                 drive.parameter_age().as_secs_f64()
             )));
@@ -360,13 +360,13 @@ fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
             let name = &point.name;
             let Some((of, minimum, maximum)) = derived.band() else {
                 return Err(Refusal::NotWritable(format!(
-                    "`{name}` is made of other points and cannot be written"
+                    "`{name}` is derived from other points and cannot be written"
                 )));
             };
             let band = drive.band_for_commands(minimum, maximum).ok_or_else(|| {
                 Refusal::NotKnown(format!(
-                    "`{name}` needs the drive's frequency range, which is not known, or was not read for {:.0} s; set \
-                     frequency_range for the drive",
+                    "`{name}` needs the drive's frequency range, which is unknown, or was not read in the last {:.0} \
+                     s; set frequency_range for the drive",
                     drive.parameter_age().as_secs_f64()
                 ))
             })?;
@@ -408,7 +408,7 @@ fn below_minimum(point: &Point, value: Value, minimum: f64) -> Refusal {
 fn no_sign(point: &Point, value: Value) -> Refusal {
     let (name, unit) = (&point.name, &point.unit);
     Refusal::BadValue(format!(
-        "`{name}` = {value} {unit} is 0 % in reverse, and 0 % has no sign; use `reverse` for it; nothing was written"
+        "`{name}` = {value} {unit} is 0 % in reverse, and 0 % has no sign; use `reverse` instead; nothing was written"
     ))
 }
 
@@ -475,7 +475,7 @@ fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<Vec<FrequencyRange
     if items.len() > usize::from(range.write) {
         let (count, most) = (items.len(), range.write);
         return Err(Refusal::BadValue(format!(
-            "{count} items in one write, the drive takes {most}; nothing was written"
+            "{count} items in one write, but the drive accepts at most {most}; nothing was written"
         )));
     }
     raw_values(drive, table, &items)
@@ -512,7 +512,8 @@ fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Res
     match items.iter().find(refused) {
         None => Ok(()),
         Some((address, word)) => Err(Refusal::BadValue(format!(
-            "{word:#06x} at {table} {address} of `{}` neither stops nor runs the drive by its profile; nothing was written",
+            "{word:#06x} at {table} {address} of `{}` neither stops nor runs the drive according to its profile; \
+             nothing was written",
             drive.spec.name
         ))),
     }
@@ -522,11 +523,11 @@ fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Res
 /// no value.
 fn one_object(table: Table, first: u16, count: usize) -> Result<(), Refusal> {
     let object = Object::at(table, first)
-        .ok_or_else(|| Refusal::NotWritable(format!("no object begins at {table} {first}; nothing was written")))?;
+        .ok_or_else(|| Refusal::NotWritable(format!("no object starts at {table} {first}; nothing was written")))?;
     let items = object.items();
     if count != usize::from(items) {
         return Err(Refusal::BadValue(format!(
-            "{object} takes {items} items in one write, no more and no less; nothing was written"
+            "{object} must be written with exactly {items} items; nothing was written"
         )));
     }
     Ok(())
@@ -562,7 +563,7 @@ fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result
             }
             None => {
                 return Err(Refusal::BadValue(format!(
-                    "`{}`: no number; nothing was written",
+                    "`{}`: not a number; nothing was written",
                     point.name
                 )));
             }

@@ -545,27 +545,32 @@ impl fmt::Display for Outcome {
             Outcome::Unknown(code) => {
                 write!(
                     f,
-                    "the answer was {code}; whether the drive took the command is not known"
+                    "the drive replied {code}; whether it executed the command is unknown"
                 )
             }
             Outcome::Refused(refusal) => refusal.fmt(f),
-            Outcome::TimedOut => f.write_str("the drive did not answer; whether it took the command is not known"),
-            Outcome::Garbled => f.write_str("the drive's answer was garbled; whether it took the command is not known"),
-            Outcome::Expired => f.write_str("its time ran out before its turn came; it was not sent"),
-            Outcome::Replaced => f.write_str("a newer one took its place; it was not sent"),
-            Outcome::Purged => f.write_str("a stop came in after it was asked for; it was not sent"),
+            Outcome::TimedOut => f.write_str("the drive did not reply; whether it executed the command is unknown"),
+            Outcome::Garbled => {
+                f.write_str("the drive's reply was garbled; whether it executed the command is unknown")
+            }
+            Outcome::Expired => f.write_str("it expired before its turn came; it was not sent"),
+            Outcome::Replaced => f.write_str("a newer command replaced it; it was not sent"),
+            Outcome::Purged => f.write_str("a stop arrived after it was requested; it was not sent"),
             Outcome::Withdrawn => f.write_str("a client commands the drive again; it was not sent"),
             Outcome::NotTaken(shown) => write!(f, "the drive acknowledged it, but {shown}"),
             Outcome::Interrupted(why) => {
                 let why = match why {
-                    Interruption::Stop => "a stop came in",
-                    Interruption::Expired => "its time ran out",
+                    Interruption::Stop => "a stop arrived",
+                    Interruption::Expired => "it expired",
                     Interruption::BusDown => "the bus went down",
                     Interruption::Offline => "the drive went offline",
-                    Interruption::ShuttingDown => "the gateway stops",
+                    Interruption::ShuttingDown => "the gateway is shutting down",
                     Interruption::Taken => "another client took the drive",
                 };
-                write!(f, "it was started, then {why}; whether the drive took it is unknown")
+                write!(
+                    f,
+                    "it was started, then {why}; whether the drive executed it is unknown"
+                )
             }
             Outcome::NotStopped => f.write_str("the stop of the same command failed; it was not sent"),
             Outcome::StopOnly(rest) => {
@@ -580,8 +585,8 @@ impl fmt::Display for Outcome {
             Outcome::StopFailed(stop) => write!(f, "{stop}; the rest of the command was not sent"),
             Outcome::BusDown => f.write_str("the bus is down; it was not sent"),
             Outcome::Offline => f.write_str("the drive is offline; it was not sent"),
-            Outcome::QueueFull => write!(f, "{CAPACITY} commands wait already; it was not sent, try again"),
-            Outcome::ShuttingDown => f.write_str("the gateway stops; it was not sent"),
+            Outcome::QueueFull => write!(f, "{CAPACITY} commands are already waiting; it was not sent, try again"),
+            Outcome::ShuttingDown => f.write_str("the gateway is shutting down; it was not sent"),
         }
     }
 }

@@ -183,7 +183,7 @@ impl Pending {
         Some(Refusal::HeldByOther(Box::new(Holder {
             who: format!("the BACnet client {}", protects.client),
             rank: format!("priority {priority}"),
-            keeps: format!("keeps `{what}` until it gives that slot back"),
+            keeps: format!("holds `{what}` until it releases that slot"),
             left_s: None,
         })))
     }

@@ -128,16 +128,17 @@ fn judge(drive: &Reading<'_>, sets: &[(usize, Value)], begun: Option<LastWritten
         let end = profile.points.get(end).map_or("?", |end| end.name.as_str());
         let Some(figure) = standing.becomes(derived) else {
             return Err(Refusal::NotKnown(format!(
-                "the limits of `{}` rest on `{end}`, and what the reference that stands would be is not known: it, or the drive's \
-                 frequency range, was not read for a while, or was written since; nothing was written; send it again",
+                "the limits of `{}` depend on `{end}`, and its effect on the present reference is unknown: the \
+                 reference or the drive's frequency range was not read recently, or was written since; nothing was \
+                 written; send it again",
                 point.name
             )));
         };
         if !limits.contains(&figure) {
             let (low, high, unit) = (limits.start(), limits.end(), &point.unit);
             return Err(Refusal::BadValue(format!(
-                "by that `{end}` the reference that stands makes `{}` {figure} {unit}, outside the limits {low} to {high} {unit}; \
-                 nothing was written; lower the reference first",
+                "with that `{end}` the present reference would make `{}` {figure} {unit}, outside the limits {low} to \
+                 {high} {unit}; nothing was written; lower the reference first",
                 point.name
             )));
         }

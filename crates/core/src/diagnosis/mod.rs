@@ -272,16 +272,16 @@ impl CountedByDrive {
         match (*damaged, damaged_here) {
             (0, 0) => None,
             (0, here) => Some(format!(
-                "{name} received all of {messages} messages sound while {here} of its replies arrived damaged: the way from the \
-                 drive to the gateway is disturbed"
+                "{name} received all {messages} messages intact, but {here} of its replies arrived damaged: the \
+                 direction from the drive to the gateway is disturbed"
             )),
             (damaged, 0) => Some(format!(
-                "{name} received {damaged} messages damaged and {messages} sound, and its replies arrived sound: the way from the \
-                 gateway to the drive is disturbed"
+                "{name} received {damaged} messages damaged and {messages} intact, and its replies arrived intact: \
+                 the direction from the gateway to the drive is disturbed"
             )),
             (damaged, here) => Some(format!(
-                "{name} received {damaged} messages damaged and {messages} sound, and {here} of its replies arrived damaged: both \
-                 ways are disturbed"
+                "{name} received {damaged} messages damaged and {messages} intact, and {here} of its replies arrived \
+                 damaged: both directions are disturbed"
             )),
         }
     }
@@ -298,7 +298,7 @@ impl fmt::Display for CountedByDrive {
         } = self;
         write!(
             f,
-            "{messages} messages received, {damaged} damaged ones, {own} to this drive, {unanswered} of them unanswered, \
+            "{messages} messages received, {damaged} damaged, {own} to this drive, {unanswered} of them unanswered, \
              {exceptions} exceptions sent"
         )
     }

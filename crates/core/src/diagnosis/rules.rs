@@ -149,11 +149,11 @@ impl Rules<'_> {
             return false;
         }
         let heard = match (damaged, figures.sum(Sign::Echoed)) {
-            (0, 0) => "not one byte came back".to_string(),
+            (0, 0) => "not a single byte came back".to_string(),
             (0, echoes) => {
-                format!("{echoes} came back as the adapter's own echo and nothing else, so the adapter sends")
+                format!("{echoes} came back as the adapter's own echo and nothing else, so the adapter does send")
             }
-            (_, _) => format!("{damaged} replies are not valid frames: baud, format or protocol are likely to differ"),
+            (_, _) => format!("{damaged} replies are not valid frames: baud rate, format or protocol probably differ"),
         };
         let certainty = if figures.answered_since_opened() || drives < 3 {
             Certainty::Fits
@@ -161,7 +161,7 @@ impl Rules<'_> {
             Certainty::Likely
         };
         let evidence = format!(
-            "{} requests to {drives} drives in the last minute were not answered; {heard}",
+            "{} requests to {drives} drives in the last minute got no reply; {heard}",
             tried + damaged
         );
         self.add(Cause::AllSilent, None, certainty, evidence);
@@ -198,8 +198,8 @@ impl Rules<'_> {
             };
             let name = self.name(known.place);
             let evidence = format!(
-                "{second} times in the last minute a second sound reply came behind that of {name}, and {overlong} replies were \
-                 longer than asked for; {of_others} times with all other drives"
+                "{second} times in the last minute a second valid reply followed that of {name}, and {overlong} \
+                 replies were longer than requested; {of_others} times for all other drives"
             );
             self.disturbed += second + overlong;
             self.add(Cause::AddressTwice, Some(known.place), certainty, evidence);
@@ -227,8 +227,8 @@ impl Rules<'_> {
         let [standing, runs] = running.failed.map(f32::round);
         let [of_standing, of_runs] = running.asked.map(f32::round);
         let evidence = format!(
-            "{runs} of {of_runs} transactions failed lately while a drive ran, {standing} of {of_standing} while all \
-             were stopped"
+            "recently, {runs} of {of_runs} transactions failed while a drive ran, {standing} of {of_standing} while \
+             all were stopped"
         );
         let certainty = if runs >= 30.0 && of_standing >= 300.0 {
             Certainty::Likely
@@ -250,7 +250,8 @@ impl Rules<'_> {
             return;
         }
         let evidence = format!(
-            "{count:.0} damaged replies lately came at the same place of the {hertz:.0} Hz period, which the sound ones avoid"
+            "{count:.0} recent damaged replies came at the same phase of the {hertz:.0} Hz period, which valid ones \
+             avoid"
         );
         let certainty = if closer > 0.5 {
             Certainty::Likely
@@ -316,7 +317,7 @@ impl Rules<'_> {
         if silent.is_empty() || answering == 0 || self.has(Cause::FromAddress) {
             return;
         }
-        let others = format!("{answering} of {} drives of the line do", self.figures.drives.len());
+        let others = format!("{answering} of {} drives on the line do", self.figures.drives.len());
         if silent.len() > NAMED {
             let names = self.names_of(silent.iter().map(|(place, ..)| *place));
             let evidence = format!("{names} have never answered since the bus was started; {others}");
@@ -339,7 +340,7 @@ impl Rules<'_> {
         let slow = self.sum(bad.place, Sign::Slow);
         let tail = if slow >= FEW && bad.silent > bad.damaged {
             let slowest = self.figures.drives.get(bad.place).map_or(0.0, super::Drive::slowest_ms);
-            format!("; its replies begin after up to {slowest:.1} ms")
+            format!("; its replies start after up to {slowest:.1} ms")
         } else {
             String::new()
         };

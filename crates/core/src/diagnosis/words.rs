@@ -14,21 +14,21 @@ impl Cause {
     pub const fn meaning(self) -> &'static str {
         match self {
             Cause::AllSilent => "no drive answers",
-            Cause::OneDrive => "one drive is badly connected or slow, the others are good",
-            Cause::FromAddress => "all drives are bad from one address on",
-            Cause::NeverAnswered => "it has never answered, and other drives do",
+            Cause::OneDrive => "one drive is badly connected or slow, the others are fine",
+            Cause::FromAddress => "all drives from one address upwards have errors",
+            Cause::NeverAnswered => "it has never answered, while other drives do",
             Cause::AddressTwice => "two drives answer to one address",
-            Cause::WhileRunning => "errors come only while drives run",
-            Cause::Mains => "errors come in step with the mains",
-            Cause::Bias => "stray bytes come while nobody speaks",
-            Cause::ReplyStartLost => "the beginning of replies is lost",
+            Cause::WhileRunning => "errors occur only while drives run",
+            Cause::Mains => "errors follow the mains frequency",
+            Cause::Bias => "stray bytes while the line is idle",
+            Cause::ReplyStartLost => "the start of replies is lost",
             Cause::RequestEndLost => "requests arrive truncated",
-            Cause::Echo => "the adapter hears its own requests",
-            Cause::LatencyTimer => "the adapter hands replies over in steps of 16 ms",
+            Cause::Echo => "the adapter receives its own requests",
+            Cause::LatencyTimer => "the adapter delivers replies in steps of 16 ms",
             Cause::SilenceTooShort => "requests sent soon after a reply are ignored",
-            Cause::PortResets => "the adapter goes and comes back",
-            Cause::ConnectionCloses => "the device server closes its connection again and again",
-            Cause::FasterThanBaud => "replies come sooner than the configured baud rate allows",
+            Cause::PortResets => "the adapter keeps disconnecting",
+            Cause::ConnectionCloses => "the device server keeps closing its connection",
+            Cause::FasterThanBaud => "replies arrive faster than the configured baud rate allows",
             Cause::Noise => "errors without a pattern",
         }
     }
@@ -37,65 +37,70 @@ impl Cause {
     pub const fn remedy(self) -> &'static str {
         match self {
             Cause::AllSilent => {
-                "check the supply of the drives, A and B (swap them), baud, format and protocol, and that the bus is enabled at \
-                 the drives; `drivegate scan` tries other settings"
+                "check the drives' power supply, A and B (try swapping them), baud rate, format and protocol, and \
+                 that the fieldbus is enabled in the drives; `drivegate scan` tries other settings"
             }
             Cause::OneDrive => {
-                "check the cable and terminals of this drive, that no other drive has its address, and its supply; where its \
-                 replies come late, raise response_timeout of the bus"
+                "check this drive's cable, terminals and power supply, and that no other drive has its address; if \
+                 its replies are late, raise response_timeout of the bus"
             }
             Cause::FromAddress => {
-                "check the cable and terminals before the first of these drives, if addresses follow the cable, and the \
-                 termination at both ends of the line"
+                "if addresses follow the cable, check cable and terminals just before the first of these drives; \
+                 check the termination at both ends of the line"
             }
             Cause::NeverAnswered => {
-                "check its supply and that its bus is enabled, and, at its panel, address, protocol, baud and format; `drivegate scan` shows \
-                 which addresses answer; then its cable and terminals; take it out of the configuration if it is not there"
+                "check its power supply, that its fieldbus is enabled, and at its panel address, protocol, baud rate \
+                 and format; `drivegate scan` shows which addresses answer; then check its cable and terminals; \
+                 remove it from the configuration if it does not exist"
             }
             Cause::AddressTwice => {
-                "switch this drive off: if its address still answers, give the other drive another one"
+                "switch this drive off: if its address still answers, change the address of the other drive"
             }
             Cause::WhileRunning => {
-                "use shielded twisted pair, earth the shield as the drives' manual says, and keep it away from motor cables (30 cm \
-                 or more); earth the motor cables at both ends"
+                "use shielded twisted pair, earth the shield as the drives' manual says, and keep it away from motor \
+                 cables (30 cm or more); earth the motor cable shields at both ends"
             }
             Cause::Mains => {
-                "look for a loop through earth: connect the reference conductor of the line, the shield as the drives' manual \
-                 says, and keep the line away from mains cables; an isolated adapter helps"
+                "look for an earth loop: connect the reference conductor of the line, the shield as the drives' \
+                 manual says, and keep the line away from mains cables; an isolated adapter helps"
             }
             Cause::Bias => {
-                "bias the line at one place (pull-up at one conductor, pull-down at the other, often switches of the adapter), \
-                 terminate both ends, and connect the reference conductor"
+                "bias the line at one point (pull-up on one conductor, pull-down on the other, often switches on the \
+                 adapter), terminate both ends, and connect the reference conductor"
             }
             Cause::ReplyStartLost => {
-                "the adapter turns from sending to receiving too late: use one that turns by itself, or with rs485 = \"kernel\" a \
-                 shorter delay after sending; at the drive, raise the delay before its reply"
+                "the adapter switches from sending to receiving too late: use one that switches by itself, or with \
+                 rs485 = \"kernel\" a shorter delay after sending; or increase the reply delay of the drive"
             }
             Cause::RequestEndLost => {
-                "if the adapter is turned by RTS, it stops sending too early: lengthen the RTS delay or use an adapter that turns \
-                 by itself; else look for what disturbs the way to the drives"
+                "if the adapter is switched by RTS, it stops sending too early: lengthen the RTS delay or use an \
+                 adapter that switches by itself; otherwise look for interference on the way to the drives"
             }
             Cause::Echo => {
-                "harmless, but it costs bytes and hides collisions: two-wire wiring of a four-wire adapter, switch its echo \
-                 suppression on"
+                "harmless, but it costs bytes and hides collisions: a four-wire adapter is wired for two wires; \
+                 switch on its echo suppression"
             }
-            Cause::LatencyTimer => "set the latency timer of the USB adapter to 1 ms: docs/performance.md, adapters",
-            Cause::SilenceTooShort => "set a longer silence of the bus, such as silence = \"10ms\"",
+            Cause::LatencyTimer => {
+                "set the latency timer of the USB adapter to 1 ms: docs/performance.md, real \
+                                    adapters"
+            }
+            Cause::SilenceTooShort => "set a longer silence for the bus, such as silence = \"10ms\"",
             Cause::PortResets => {
-                "check the USB cable, plug and hub, and the supply of the adapter; an isolated adapter survives what drives \
-                 induce; the log has the reasons"
+                "check the USB cable, plug and hub, and the adapter's power supply; an isolated adapter withstands \
+                 interference from drives; the log has the reasons"
             }
             Cause::ConnectionCloses => {
-                "set the device server to keep its connection: switch off its idle or inactivity timeout, and a mode that closes \
-                 after each request; that no second program connects to it in turn; each new connection takes time from the line"
+                "set the device server to keep its connection: switch off its idle or inactivity timeout and any mode \
+                 that closes after each request, and make sure that no second program connects to it; each new \
+                 connection takes time from the line"
             }
             Cause::FasterThanBaud => {
-                "set baud of the bus to the rate of the line behind the device server: it decides how long a request \
-                 and its reply are on the wire, and what a late reply is"
+                "set baud of the bus to the rate of the line behind the device server: the time on the wire, and what \
+                 counts as a late reply, are calculated from it"
             }
             Cause::Noise => {
-                "check termination at both ends, the reference conductor, and shield and course of the cable; a lower baud rate \
-                 shows whether it is the cable"
+                "check termination at both ends, the reference conductor, and the cable's shield and route; trying a \
+                 lower baud rate shows whether it is the cable"
             }
         }
     }

@@ -23,7 +23,7 @@ pub const PARTIAL: &str = "partial";
 pub fn set_aside(path: &Path, aside: &Path) -> String {
     match fs::rename(path, aside) {
         Ok(()) => format!("it is kept as {}", aside.display()),
-        Err(error) => format!("it cannot be kept aside ({error})"),
+        Err(error) => format!("it cannot be renamed ({error})"),
     }
 }
 

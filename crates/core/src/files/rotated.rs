@@ -76,7 +76,7 @@ impl Rotated {
             .mode(0o640)
             .open(&self.path)?;
         flock(&file, FlockOperation::NonBlockingLockExclusive)
-            .map_err(|_| io::Error::other("another process writes it; give each gateway its own"))?;
+            .map_err(|_| io::Error::other("another process is writing to it; give each gateway its own"))?;
         let bytes = file.metadata()?.len();
         let open = self.open.insert(Open {
             file,

@@ -104,7 +104,7 @@ impl Bytes<'_> {
     fn length(self, at: usize) -> Result<usize, CaptureError> {
         let length = self.u32(at)? as usize;
         if length > LONGEST {
-            return Err(error(at, format!("a length of {length} bytes is not to be believed")));
+            return Err(error(at, format!("a length of {length} bytes is not plausible")));
         }
         Ok(length)
     }
@@ -116,7 +116,7 @@ fn read_pcap(file: &[u8], magic: [u8; 4], packets: &mut Vec<Packet>) -> Result<(
         [0xD4, 0xC3, 0xB2, 0xA1] => (false, false),
         [0xA1, 0xB2, 0x3C, 0x4D] => (true, true),
         [0x4D, 0x3C, 0xB2, 0xA1] => (false, true),
-        _ => return Err(error(0, "the file begins neither as pcap nor as pcapng")),
+        _ => return Err(error(0, "the file is neither pcap nor pcapng")),
     };
     let bytes = Bytes { file, big };
     let link = bytes.u32(20)? & 0xFFFF;
@@ -263,7 +263,7 @@ fn interface(bytes: Bytes<'_>, at: usize, length: usize) -> Result<Interface, Ca
         {
             let exponent = u32::from(resolution & 0x7F);
             let base: u64 = if resolution & 0x80 == 0 { 10 } else { 2 };
-            let too_fine = || error(option + 4, "the times are too fine");
+            let too_fine = || error(option + 4, "the resolution of its times is too fine");
             ticks = base.checked_pow(exponent).ok_or_else(too_fine)?;
         }
         if code == 0 {
@@ -402,17 +402,11 @@ mod tests {
     fn what_is_no_capture_of_a_line_is_told_with_its_place() {
         let told = |file: &[u8]| read(file).unwrap_err().to_string();
         assert_eq!(told(b"PK"), "the file is too short for a capture, at byte 0");
-        assert_eq!(
-            told(b"time,drive"),
-            "the file begins neither as pcap nor as pcapng, at byte 0"
-        );
+        assert_eq!(told(b"time,drive"), "the file is neither pcap nor pcapng, at byte 0");
         assert!(told(&pcap(1, &[])).starts_with("link type 1 is not a serial line"));
         let mut long = pcap(250, &[(0, 0, &[0; 12])]);
         long[32..36].copy_from_slice(&[255, 255, 255, 0]);
-        assert_eq!(
-            told(&long),
-            "a length of 16777215 bytes is not to be believed, at byte 32"
-        );
+        assert_eq!(told(&long), "a length of 16777215 bytes is not plausible, at byte 32");
         let short = pcap(250, &[(0, 0, &[0; 5])]);
         assert_eq!(told(&short), "a packet is shorter than its header, at byte 40");
     }

@@ -129,8 +129,8 @@ impl Writer {
         if wrong > 0 {
             tracing::warn!(
                 target: "drivegate::history",
-                "{wrong} lines of {} and the files before it are cut, or no events that this version knows; they are left there and \
-                 not shown", self.events.path().display()
+                "{wrong} lines of {} and the files before it are truncated, or not events that this version knows; \
+                 they are kept but not shown", self.events.path().display()
             );
         }
         earlier
@@ -198,8 +198,8 @@ impl Writer {
                 let kept = files::set_aside(path, &kept_aside(path));
                 tracing::error!(
                     target: "drivegate::history",
-                    "cannot use the run hours and starts in {}: {why}; {kept}, and counting begins at 0; to count on from it, stop the \
-                     gateway, mend the file and give it its name back", path.display()
+                    "cannot use the run hours and starts in {}: {why}; {kept}, and counting starts at 0; to continue \
+                     from it, stop the gateway, repair the file and rename it back", path.display()
                 );
             }
         }
@@ -231,7 +231,7 @@ impl Writer {
                 if std::mem::take(&mut self.failing) || lost > 0 {
                     tracing::warn!(
                         target: "drivegate::history",
-                        "events and counters are written again; {lost} events are missing in {path}"
+                        "writing events and counters again; {lost} events are missing in {path}"
                     );
                 }
             }
@@ -239,13 +239,13 @@ impl Writer {
                 if !std::mem::replace(&mut self.failing, true) {
                     tracing::error!(
                         target: "drivegate::history",
-                        "cannot keep events and counters in {path}: {error}; a restart forgets those from now on; \
+                        "cannot save events and counters in {path}: {error}; a restart loses those from now on; \
                          everything else continues; check state_dir of [gateway] and the disk"
                     );
                 }
                 self.events.close();
                 if end {
-                    tracing::error!(target: "drivegate::history", "{waiting} events are not written");
+                    tracing::error!(target: "drivegate::history", "{waiting} events have not been written");
                 }
             }
         }
@@ -276,7 +276,7 @@ fn read_counters(bytes: &[u8]) -> Result<BTreeMap<String, Totals>, String> {
         return Err(format!("it has {} drives, more than {MOST_DRIVES}", file.drives.len()));
     }
     match file.drives.iter().find(|(_, totals)| !totals.is_sane()) {
-        Some((drive, _)) => Err(format!("what it has of `{drive}` cannot have been counted")),
+        Some((drive, _)) => Err(format!("its figures for `{drive}` are impossible")),
         None => Ok(file.drives),
     }
 }

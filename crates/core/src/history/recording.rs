@@ -244,7 +244,7 @@ impl Header {
         let value: BTreeMap<String, Json> = match serde_json::from_slice(line) {
             Ok(value) => value,
             Err(_) if end.is_none() && line.starts_with(b"{\"drivegate_recording\":") => {
-                return Err(fault(bytes.len(), "the file ends within its header: it is cut short"));
+                return Err(fault(bytes.len(), "the file ends within its header: it is truncated"));
             }
             Err(error) if line.starts_with(b"{\"drivegate_recording\":") => {
                 return Err(fault(error.column(), format!("the header is damaged ({error})")));
@@ -263,7 +263,7 @@ impl Header {
             .map_err(|error| fault(error.column(), format!("the header is damaged ({error})")))?;
         match end {
             Some(end) => Ok((header, end + 1)),
-            None => Err(fault(bytes.len(), "the file ends after its header: it is cut short")),
+            None => Err(fault(bytes.len(), "the file ends after its header: it is truncated")),
         }
     }
 }
@@ -332,7 +332,7 @@ impl Recording {
         loop {
             let rest = bytes.get(offset..).unwrap_or_default();
             let Some(length) = rest.iter().position(|byte| *byte == b'\n') else {
-                return Err(fault(bytes.len(), "the file has no end line: it is cut short"));
+                return Err(fault(bytes.len(), "the file has no end line: it is truncated"));
             };
             let text = rest.get(..length).unwrap_or_default();
             let line: Line<'_> = serde_json::from_slice(text)
@@ -352,7 +352,7 @@ impl Recording {
                     recording.check_end(bytes, offset, lines, &end)?;
                     let after = offset + length + 1;
                     return match bytes.len() {
-                        all if all > after => Err(fault(after, "something follows the end line")),
+                        all if all > after => Err(fault(after, "there is data after the end line")),
                         _ => Ok(recording),
                     };
                 }
@@ -371,12 +371,12 @@ impl Recording {
         }
         let check = format!("{:04X}", crc16(bytes.get(..offset).unwrap_or_default()));
         if end.check != check {
-            let what = format!("the check code of what is before is {check} instead of {}", end.check);
+            let what = format!("the check code of the data before is {check} instead of {}", end.check);
             return Err(fault(offset, what));
         }
         let places = self.header.reads.iter().flat_map(|read| &read.points);
         if places.max().is_some_and(|place| *place >= self.header.points.len()) {
-            return Err(fault(0, "a read of the header names a point that is not there"));
+            return Err(fault(0, "a read in the header names a point that does not exist"));
         }
         Ok(())
     }

@@ -156,7 +156,7 @@ impl Store {
     pub fn open(options: &RecorderOptions) -> Store {
         let (entries, faults) = list(&options.dir).unwrap_or_default();
         for fault in faults {
-            tracing::warn!(target: "drivegate::history", "{fault}; it is left alone");
+            tracing::warn!(target: "drivegate::history", "{fault}; it is left as it is");
         }
         let mut storm = Storm::default();
         for entry in &entries {

@@ -222,7 +222,7 @@ impl Taker {
                     let trigger = Trigger {
                         kind: TriggerKind::Command,
                         at: clock.now,
-                        text: format!("asked for by {who}"),
+                        text: format!("requested by {who}"),
                     };
                     // The client may have gone.
                     let _ = reply.send(self.recorder.trigger(&drive, trigger, clock));
@@ -252,7 +252,7 @@ impl Taker {
     fn report_left_out(&mut self) {
         let lost = std::mem::take(&mut self.left_out);
         if lost > 0 {
-            let text = format!("{lost} recordings are lost: {WAITING} wait for the disk, which is too slow for more");
+            let text = format!("{lost} recordings are lost: {WAITING} are waiting for the disk, which is too slow");
             publish(&self.events, String::new(), None, text, None);
         }
     }
@@ -365,8 +365,8 @@ impl Writer {
                 Err(error) => {
                     self.failing = true;
                     let text = format!(
-                        "the recording of {drive} is lost: cannot write {}: {error}; further ones are lost, too, \
-                         until there is room and permission; everything else continues",
+                        "the recording of {drive} is lost: cannot write {}: {error}; so are further ones until there \
+                         is space and permission; everything else continues",
                         store::path_of(self.store.dir(), &header.id).display()
                     );
                     publish(&self.events, bus, Some(drive), text, None);

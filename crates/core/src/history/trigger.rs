@@ -235,7 +235,7 @@ impl LineErrors {
             .map(|(_, drive)| *drive)
             .max_by_key(|drive| of(*drive))?;
         let text = format!(
-            "{} of the transactions on the line failed within {} s, {} of them with this drive",
+            "{} transactions on the line failed within {} s, {} of them with this drive",
             self.recent.len(),
             BURST_IN.as_secs(),
             of(most)

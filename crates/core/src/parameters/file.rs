@@ -117,7 +117,7 @@ pub enum FileError {
     #[error("line {0}: {1}")]
     Line(usize, String),
     /// Values were changed by hand, or the file is damaged.
-    #[error("its values do not fit its checksum: it was edited, or is damaged")]
+    #[error("its values do not match its checksum: it was edited, or is damaged")]
     Checksum,
 }
 
@@ -215,7 +215,7 @@ impl ParameterFile {
                 let entry = entry(value.trim(), note.trim())
                     .ok_or_else(|| wrong(format!("`{}` is not a value; write 0 to 65535", value.trim())))?;
                 if file.values.insert(id.clone(), entry).is_some() {
-                    return Err(wrong(format!("`{id}` is there twice")));
+                    return Err(wrong(format!("`{id}` appears twice")));
                 }
             } else if let Some((key, value)) = line.split_once(':') {
                 let value = value.trim().to_string();
@@ -356,7 +356,7 @@ mod tests {
         };
         assert!(line("102 = 70000").starts_with("line 2: `70000` is not a value"));
         assert!(line("102 = NaN").starts_with("line 2"));
-        assert!(line("a = 1\na = 2").contains("line 3: `a` is there twice"));
+        assert!(line("a = 1\na = 2").contains("line 3: `a` appears twice"));
         assert!(line("colour: red").contains("unknown key `colour`"));
     }
 

@@ -120,7 +120,7 @@ fn body_of(text: &str) -> Result<String, String> {
         return Err(format!("its first line is not `{HEAD}`"));
     }
     if sum.strip_prefix("checksum: ") != Some(checksum(&body).as_str()) {
-        return Err("it does not fit its checksum: it is damaged, or was edited".to_string());
+        return Err("it does not match its checksum: it is damaged, or was edited".to_string());
     }
     Ok(body)
 }
@@ -130,7 +130,7 @@ fn header<'a>(lines: &mut impl Iterator<Item = &'a str>, key: &str) -> Result<St
     let line = lines.next().unwrap_or_default();
     let value = line.strip_prefix(key).and_then(|rest| rest.strip_prefix(": "));
     let value = value.map(str::to_string);
-    value.ok_or_else(|| format!("expected `{key}: …`, there is `{line}`"))
+    value.ok_or_else(|| format!("expected `{key}: …`, found `{line}`"))
 }
 
 fn owner<'a>(lines: &mut impl Iterator<Item = &'a str>) -> Result<Owner, String> {
@@ -240,7 +240,7 @@ impl Journal {
         let of = owner(&mut lines)?;
         if of.family != profile.name {
             return Err(format!(
-                "it is of a drive of family {}, and the drive is configured as {}",
+                "it is for a drive of family {}, but the drive is configured as {}",
                 of.family, profile.name
             ));
         }
@@ -251,7 +251,7 @@ impl Journal {
             .iter()
             .find(|(_, name)| *name == phase)
             .map(|(phase, _)| *phase);
-        let phase = phase.ok_or("its phase is not known")?;
+        let phase = phase.ok_or("its phase is unknown")?;
         let done = header("done")?.parse().map_err(|_| "`done` is not a number")?;
         let saved = yes_or_no(&header("saved")?)?;
         let save = match header("save")?.as_str() {

@@ -92,7 +92,7 @@ pub fn plan(
     let of_another = [wanted, present].into_iter().find(|file| file.family != profile.name);
     if let Some(file) = of_another {
         return Err(vec![format!(
-            "the parameters of {} are those of the family `{}`, the drive is of `{}`: their parameters are not the same; nothing \
+            "the parameters of {} are for the family `{}`, but the drive is of `{}`: their parameters differ; nothing \
              can be restored",
             file.drive, file.family, profile.name
         )]);
@@ -108,7 +108,7 @@ impl Plan {
         let writes = self.writes.iter().take(done).rev().map(|write| ParameterWrite {
             from: write.to,
             to: write.from,
-            line: format!("taken back: {}", write.line),
+            line: format!("undone: {}", write.line),
             ..write.clone()
         });
         Plan {

@@ -163,7 +163,7 @@ impl Reading {
             Outcome::Acknowledged(reply) => {
                 let values = reply.words().unwrap_or_default();
                 if values.len() != usize::from(block.count * words) {
-                    return Next::Failed("the reply has another length than what was asked for".to_string());
+                    return Next::Failed("the length of the reply differs from what was requested".to_string());
                 }
                 let addresses = (block.start..).step_by(usize::from(words));
                 for (address, words) in addresses.zip(values.chunks(usize::from(words))) {
@@ -196,11 +196,11 @@ impl Reading {
             }
             Outcome::TimedOut | Outcome::Garbled | Outcome::Unknown(_) => {
                 self.found
-                    .insert(block.start, Err("the drive did not answer to be believed".to_string()));
+                    .insert(block.start, Err("the drive gave no valid reply".to_string()));
                 Next::Go
             }
             Outcome::Refused(refusal) => Next::Failed(refusal.to_string()),
-            Outcome::ShuttingDown => Next::Failed("the gateway stops, or its bus restarts".to_string()),
+            Outcome::ShuttingDown => Next::Failed("the gateway is shutting down, or the bus restarts".to_string()),
             Outcome::Expired => {
                 self.todo.push_front(block);
                 Next::Go
@@ -208,7 +208,7 @@ impl Reading {
             away => {
                 self.todo.push_front(block);
                 let why = match away {
-                    Outcome::Offline => "the drive does not answer".to_string(),
+                    Outcome::Offline => "the drive does not reply".to_string(),
                     Outcome::BusDown => "the bus is down".to_string(),
                     other => other.to_string(),
                 };
@@ -247,7 +247,7 @@ impl Reading {
                 Err("the object does not hold a number".to_string())
             }
             Some(value) => Ok(value),
-            None => Err("the reply has another length than what was asked for".to_string()),
+            None => Err("the length of the reply differs from what was requested".to_string()),
         };
         self.found.insert(address, value);
     }

@@ -185,7 +185,9 @@ impl Restoration {
         if let State::Removing(end) = &self.state {
             self.state = State::Over(match result {
                 Ok(()) => end.clone(),
-                Err(why) => End::Unfinished(format!("all is written, but the journal cannot be removed: {why}")),
+                Err(why) => End::Unfinished(format!(
+                    "everything is written, but the journal cannot be removed: {why}"
+                )),
             });
         }
     }
@@ -207,14 +209,14 @@ impl Restoration {
             }
             Outcome::NotTaken(_) => self.stop(outcome.to_string()),
             Outcome::Refused(Refusal::MotorRuns(_)) => self.wait_for_people(
-                "the motor runs; stop it".to_string(),
-                "the motor runs, and parameters are written only while it stands",
+                "the motor is running; stop it".to_string(),
+                "the motor is running, and parameters are written only while it is stopped",
                 now,
             ),
             Outcome::Exception(code) => self.refused(*code, now),
             Outcome::Refused(refusal) => self.stop(refusal.to_string()),
             Outcome::TimedOut | Outcome::Garbled | Outcome::Unknown(_) => {
-                self.pause(PAUSE, "the drive does not answer to be believed", now)
+                self.pause(PAUSE, "the drive gives no valid reply", now)
             }
             Outcome::Interrupted(_)
             | Outcome::Purged
@@ -222,11 +224,11 @@ impl Restoration {
             | Outcome::Withdrawn
             | Outcome::NotStopped
             | Outcome::StopOnly(_)
-            | Outcome::StopFailed(_) => self.pause(BUSY_PAUSE, "something else went first", now),
+            | Outcome::StopFailed(_) => self.pause(BUSY_PAUSE, "another request went first", now),
             Outcome::Expired | Outcome::QueueFull => self.pause(PAUSE, "the line is busy", now),
-            Outcome::Offline => self.pause(PAUSE, "the drive does not answer", now),
+            Outcome::Offline => self.pause(PAUSE, "the drive does not reply", now),
             Outcome::BusDown => self.pause(PAUSE, "the bus is down", now),
-            Outcome::ShuttingDown => self.pause(PAUSE, "the gateway stops, or the bus restarts", now),
+            Outcome::ShuttingDown => self.pause(PAUSE, "the gateway is shutting down, or the bus restarts", now),
         }
     }
 
@@ -268,8 +270,7 @@ impl Restoration {
             return Then::Go;
         }
         if self.saves == MOST_SAVES {
-            return self
-                .stop("the drive loses again and again what is written: is it switched off and on?".to_string());
+            return self.stop("the drive keeps losing what is written: is it being switched off and on?".to_string());
         }
         self.journal.saved = true;
         self.journal.phase = match self.journal.phase {

@@ -145,7 +145,7 @@ pub fn read(path: &Path) -> Result<ParameterFile, String> {
     taken.map_err(|error| format!("cannot read {shown}: {error}"))?;
     if text.len() as u64 > MOST_BYTES {
         return Err(format!(
-            "{shown} is larger than {MOST_BYTES} bytes: no parameter file is"
+            "{shown} is larger than {MOST_BYTES} bytes, too large for a parameter file"
         ));
     }
     ParameterFile::parse(&text).map_err(|error| format!("{shown}: {error}"))

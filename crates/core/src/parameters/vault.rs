@@ -263,7 +263,7 @@ impl Vault {
         let mut state = self.lock();
         let restore = state.restores.get_mut(drive).filter(|restore| restore.number == number);
         let restore = restore.filter(|restore| restore.stage == RestoreStage::Prepared);
-        let restore = restore.ok_or_else(|| format!("that restore of `{name}` is not prepared any more"))?;
+        let restore = restore.ok_or_else(|| format!("that restore of `{name}` is no longer prepared"))?;
         restore.stage = RestoreStage::Working;
         restore.progress = (0, restore.prepared.plan.writes.len());
         Ok(restore.prepared.clone())

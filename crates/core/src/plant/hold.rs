@@ -32,7 +32,8 @@ impl BusHandle {
         for (drive, Unheld { client, why }) in unheld {
             tracing::warn!(
                 target: "drivegate::command", drive = name_of(drive),
-                "carried out an order of {client}, which `mode = \"exclusive\"` would refuse: {why}; logged once a client and minute"
+                "carried out a command from {client} that `mode = \"exclusive\"` would refuse: {why}; logged once per \
+                 client and minute"
             );
         }
         for (drive, told) in told {
@@ -134,7 +135,7 @@ impl DriveHandle {
         let mut queue = self.bus.queue.lock();
         let acted = queue.hold_act(self.index, origin, verb, now).unwrap_or_else(|| {
             Err(Refusal::NotAllowed(
-                "nobody holds drives here: [authority] is off; set its mode".to_string(),
+                "drives cannot be held: [authority] is off; set its mode".to_string(),
             ))
         });
         let view = queue.hold_view(self.index, None, now);
@@ -192,11 +193,11 @@ impl DriveHandle {
         let (who, rank) = (view.holder.unwrap_or_default(), view.rank.unwrap_or_default());
         let left = view.left_s.unwrap_or_default();
         let mut evidence = format!("{who} ({rank}) stopped it; reserved for another {left} s");
-        let mut remedy = format!("wait, or have {who} release it; ranks from {rank} up take it");
+        let mut remedy = format!("wait, or have {who} release it; ranks from {rank} up may take it");
         if let Some(repeater) = self.bus.queue.lock().repeater(self.index) {
             evidence += &format!("; {repeater} repeats its stop, which ended the hold of another client");
             remedy = format!(
-                "set cyclic = true for principal `{repeater}` if it writes its command word all the time; else {remedy}"
+                "set cyclic = true for principal `{repeater}` if it writes its command word cyclically; else {remedy}"
             );
         }
         why.causes.push(Cause {
@@ -271,7 +272,7 @@ fn words(told: &Told, rules: &Rules) -> (EventKind, String) {
     let who = named(&told.who);
     match &told.what {
         What::Held => (EventKind::Held, format!("{who} holds the drive")),
-        What::Released(why) => (EventKind::Released, format!("{who} holds the drive no more: {why}")),
+        What::Released(why) => (EventKind::Released, format!("{who} no longer holds the drive: {why}")),
         What::Broken(by) => (
             EventKind::HoldBroken,
             format!("{} took the drive from {who}", named(by)),

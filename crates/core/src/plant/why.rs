@@ -28,7 +28,7 @@ pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Ex
 /// Why the motor may not be started, as a cause.
 pub(super) fn guarded(hindrance: &Guarded) -> Cause {
     let (cause, remedy) = match hindrance.reason {
-        Reason::Interlock => ("interlocked", "see to what the interlock asks for, then send run again"),
+        Reason::Interlock => ("interlocked", "satisfy the interlock, then send run again"),
         _ => ("guarded", "send run again at that time, or with `\"wait\": true`"),
     };
     Cause {

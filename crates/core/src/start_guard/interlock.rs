@@ -30,7 +30,7 @@ impl fmt::Display for Unmet {
         let Unmet {
             drive, point, is, but, ..
         } = self;
-        write!(f, "`{point}` of {drive} must be {is} and {but}")
+        write!(f, "`{point}` of {drive} must be {is}, but {but}")
     }
 }
 
@@ -65,10 +65,10 @@ impl Interlock {
         let but = match sample.good().map(Value::as_bool) {
             Some(is) if is == self.is => return None,
             Some(is) => format!("is {is}"),
-            None if !reading.snapshot.link.is_online() => "is not known: the drive is offline".to_string(),
+            None if !reading.snapshot.link.is_online() => "is unknown: the drive is offline".to_string(),
             None if sample.at.is_none() => "was never read".to_string(),
             None if sample.quality == Quality::Stale => format!("is stale: read {:.1} s ago", age()),
-            None => "is not known: its value is bad".to_string(),
+            None => "is unknown: its value is bad".to_string(),
         };
         Some((but, sample.at.is_some()))
     }

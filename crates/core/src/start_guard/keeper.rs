@@ -45,7 +45,7 @@ fn run(path: &Path, guards: &Guards, end: &Receiver<()>) {
 fn report(path: &Path, done: &io::Result<()>, failing: &mut bool) {
     match done {
         Ok(()) if std::mem::take(failing) => {
-            tracing::warn!(target: "drivegate::start_guard", "starts are counted in {} again", path.display());
+            tracing::warn!(target: "drivegate::start_guard", "counting starts in {} again", path.display());
         }
         Ok(()) => {}
         Err(error) if !std::mem::replace(failing, true) => tracing::error!(

@@ -209,7 +209,7 @@ impl Ledger {
         (!retry_after.is_zero()).then(|| Guarded {
             reason: Reason::Stagger,
             why: format!(
-                "drives of {name} start {} apart (guard.stagger); it may start in {}",
+                "drives of {name} must start {} apart (guard.stagger); it may start in {}",
                 shown(guard.stagger),
                 shown(retry_after)
             ),
@@ -270,7 +270,7 @@ impl Ledger {
                 ..
             } if *generation >= reserved.generation => Kept::Failed(why.clone()),
             Disk::File { .. } if now >= reserved.at + DISK => {
-                Kept::Failed(format!("the disk does not take them within {}", shown(DISK)))
+                Kept::Failed(format!("the disk did not take them within {}", shown(DISK)))
             }
             Disk::File { .. } => Kept::NotYet,
         }

@@ -135,12 +135,12 @@ impl Motor {
         }
         let (since, retry_after) = match self.stands_since {
             Some(since) => ("", (since + guard.min_off).saturating_duration_since(now)),
-            None => (", and was not seen to stand yet", guard.min_off),
+            None => (", and has not been seen stopped yet", guard.min_off),
         };
         (!retry_after.is_zero()).then(|| Guarded {
             reason: Reason::MinOff,
             why: format!(
-                "the motor must stand for {} before a start (guard.min_off){since}; it may start in {}",
+                "the motor must be stopped for {} before a start (guard.min_off){since}; it may start in {}",
                 shown(guard.min_off),
                 shown(retry_after)
             ),

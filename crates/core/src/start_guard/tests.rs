@@ -336,12 +336,12 @@ fn only_a_good_point_holds_an_interlock() {
         other => format!("{other:?}"),
     };
     assert!(
-        text(0.0).contains("`running` of d3 must be true and is not known: the drive is offline"),
+        text(0.0).contains("`running` of d3 must be true, but is unknown: the drive is offline"),
         "{}",
         text(0.0)
     );
     bench.read(2, false, 1.0);
-    assert!(text(1.0).contains("must be true and is false"), "{}", text(1.0));
+    assert!(text(1.0).contains("must be true, but is false"), "{}", text(1.0));
     bench.read(2, true, 2.0);
     assert_eq!(bench.refused(0, 2.5), None);
     assert!(text(3.5).contains("is stale: read 1.5 s ago"), "{}", text(3.5));

@@ -142,7 +142,7 @@ impl BusGuards {
         let unmet: Vec<String> = unmet.iter().map(Unmet::to_string).collect();
         (!unmet.is_empty()).then(|| Guarded {
             reason: Reason::Interlock,
-            why: format!("an interlock does not hold: {}", unmet.join(", ")),
+            why: format!("an interlock is not satisfied: {}", unmet.join(", ")),
             retry_after: Duration::ZERO,
         })
     }
@@ -197,7 +197,8 @@ impl BusGuards {
         }
         if let Some(of) = started.iter().find(|of| self.is_together(of, started)) {
             let why = format!(
-                "one order would start several drives whose starts are {} apart (guard.stagger); start them one by one",
+                "one command would start several drives whose starts must be {} apart (guard.stagger); start them one \
+                 by one",
                 shown(of.guard.stagger)
             );
             let refused = Guarded {
@@ -264,7 +265,7 @@ impl BusGuards {
         };
         let stopped = || Guarded {
             reason: Reason::MinOff,
-            why: "the motor ran when the order came, and has stopped since; send it again".to_string(),
+            why: "the motor was running when the command arrived, and has stopped since; send it again".to_string(),
             retry_after: of.guard.min_off,
         };
         let refused = match motor.is_cleared(number) {

@@ -87,7 +87,7 @@ impl OneStop {
 
     /// Why it is not acknowledged.
     pub(crate) fn why_not(&self) -> String {
-        let why = self.failed.as_deref().unwrap_or("it was not answered");
+        let why = self.failed.as_deref().unwrap_or("it got no reply");
         format!("not acknowledged: {why}")
     }
 
@@ -126,7 +126,7 @@ impl OneStop {
             Step::Again(at) if now >= *at => match plant.drive_at(&self.machine) {
                 Some(drive) => self.try_at(&drive, now),
                 None => {
-                    self.failed = Some("the drive is not configured any more".to_string());
+                    self.failed = Some("the drive is no longer configured".to_string());
                     self.step = Step::Refused;
                 }
             },
@@ -155,13 +155,13 @@ impl OneStop {
                 Standstill::Stands => (Stopped::Standing, None),
                 Standstill::Turns(what) => (
                     Stopped::Stopping,
-                    Some(format!("it acknowledged its stop and still turns: {what}")),
+                    Some(format!("it acknowledged its stop but still turns: {what}")),
                 ),
-                Standstill::Unknown(why) => (Stopped::Unproven, Some(format!("it acknowledged its stop, and {why}"))),
+                Standstill::Unknown(why) => (Stopped::Unproven, Some(format!("it acknowledged its stop, but {why}"))),
             },
             (Step::Acknowledged(_), None) => (
                 Stopped::Unproven,
-                Some("it acknowledged its stop and is not configured any more".to_string()),
+                Some("it acknowledged its stop and is no longer configured".to_string()),
             ),
             (Step::Refused, _) => {
                 let why = self.failed.as_deref().unwrap_or_default();
@@ -170,7 +170,7 @@ impl OneStop {
             (Step::Placed(_) | Step::Again(_), _) => {
                 let why = match &self.failed {
                     Some(why) => format!("it did not acknowledge its stop: {why}"),
-                    None => "its stop still waits for its turn on the line".to_string(),
+                    None => "its stop is still waiting for its turn on the line".to_string(),
                 };
                 (Stopped::Unproven, Some(why))
             }

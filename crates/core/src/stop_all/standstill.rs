@@ -44,9 +44,9 @@ impl Reading<'_> {
             (_, _, Some(hertz)) if hertz > STANDS => Standstill::Turns(format!("`output_frequency` {hertz:.1} Hz")),
             (Some(false), _, Some(_)) => Standstill::Stands,
             _ if !self.tells_standstill() => Standstill::Unknown(
-                "standstill cannot be seen: the drive has no `zero_speed` and no frequency".to_string(),
+                "standstill cannot be verified: the drive has neither `zero_speed` nor a frequency".to_string(),
             ),
-            _ => Standstill::Unknown("it was not read since".to_string()),
+            _ => Standstill::Unknown("it has not been read since".to_string()),
         }
     }
 
@@ -77,12 +77,12 @@ impl Reading<'_> {
                 None => {
                     let raw = point.raw()?;
                     let is_awaited = self.words(raw.table, raw.address, raw.form.items()) == Err(Unavailable::Stale);
-                    is_awaited.then(|| format!("`{}` is not known", point.name))
+                    is_awaited.then(|| format!("`{}` is unknown", point.name))
                 }
             }
         });
         let reasons: Vec<String> = reasons.collect();
-        let motor = "the motor may turn though the drive stands";
+        let motor = "the motor may turn although the drive is stopped";
         (!reasons.is_empty()).then(|| format!("{motor}, {}", reasons.join(", ")))
     }
 }

@@ -28,7 +28,7 @@ pub(super) fn parse_rank(text: &str) -> Result<String, Finding> {
     match !text.is_empty() && text.len() <= 64 && text.chars().all(is_name) {
         true => Ok(text.to_string()),
         false => Err(Finding::new(
-            format!("`{text}` is not a name of a rank"),
+            format!("`{text}` is not a valid rank name"),
             "use letters, digits, - and _",
         )),
     }
@@ -46,8 +46,8 @@ pub(super) fn read(reader: &Reader<'_>) -> Authority {
     if let Some((_, rank)) = twice {
         reader.problem(
             AUTHORITY.ranks.name,
-            format!("the rank `{rank}` is named twice"),
-            "name each rank once, the highest first",
+            format!("the rank `{rank}` is listed twice"),
+            "list each rank once, highest first",
         );
     }
     let tables = AUTHORITY.principal.tables(reader);
@@ -149,8 +149,8 @@ fn unique(tables: &[Reader<'_>], principals: &[Option<Principal>]) {
             if let Some(other) = other {
                 table.problem(
                     key,
-                    format!("{key} = {value} names principal `{other}` already"),
-                    "name each client once, or write a longer prefix",
+                    format!("{key} = {value} already belongs to principal `{other}`"),
+                    "list each client once, or write a longer prefix",
                 );
             }
         }
@@ -206,8 +206,8 @@ pub(super) fn warn_of_nobody(reader: &Reader<'_>, rules: &Rules, sides: &Sides) 
         if commands && !known {
             reader.warning(
                 AUTHORITY.mode.name,
-                format!("on {side} everybody is nobody, and may only stop"),
-                format!("name a principal with `{key}`, or turn commands off there"),
+                format!("over {side} no client is a principal, so clients may only stop"),
+                format!("give a principal `{key}`, or turn commands off there"),
             );
         }
     }

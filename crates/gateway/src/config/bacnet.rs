@@ -43,7 +43,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, buses: &[
     if is_open {
         reader.problem(
             BACNET.listen.name,
-            "0.0.0.0 receives from every network of this machine, and nothing says who may read",
+            "0.0.0.0 receives from every network of this machine, and nothing limits who may read",
             "write `allow`, or the address of one interface",
         );
     }
@@ -79,11 +79,11 @@ fn ipv4(reader: &Reader<'_>, listen: SocketAddr) -> Option<SocketAddrV4> {
     match listen {
         SocketAddr::V4(listen) => Some(listen),
         SocketAddr::V6(_) => {
-            let what = format!("{listen} is an address of IPv6, and BACnet/IP is served over IPv4 only");
+            let what = format!("{listen} is an IPv6 address, but BACnet/IP is served over IPv4 only");
             reader.problem(
                 BACNET.listen.name,
                 what,
-                "write an address of IPv4, such as \"192.168.1.5:47808\"",
+                "write an IPv4 address, such as \"192.168.1.5:47808\"",
             );
             None
         }
@@ -145,7 +145,7 @@ fn warn(reader: &Reader<'_>, options: &Options) {
     if options.commands && options.write.is_empty() {
         reader.warning(
             BACNET.commands.name,
-            "commands are on, and no client may write",
+            "commands are on, but no client may write",
             "add networks to `write`",
         );
     }
@@ -177,7 +177,7 @@ fn warn(reader: &Reader<'_>, options: &Options) {
     }
     let only_here = options.allow.iter().all(|network| network.network().is_loopback());
     if only_here && listening.ip() != &Ipv4Addr::LOCALHOST {
-        let what = format!("{listening} listens to the network, but `allow` admits no client from there");
+        let what = format!("{listening} listens on the network, but `allow` admits no client from there");
         reader.warning(allow, what, "add the network to `allow`");
     }
 }
@@ -202,7 +202,7 @@ pub(super) fn check_instances(reader: &Reader<'_>, buses: &[Found], bacnet: &Bac
                     device + u32::from(*unit)
                 ),
                 format!(
-                    "give each a `{}` of its own, or serve fewer buses with `buses` of [bacnet]",
+                    "give each its own `{}`, or serve fewer buses with `buses` of [bacnet]",
                     DRIVE.unit.name
                 ),
             );

@@ -131,9 +131,9 @@ fn read_options(
         let [timeout, limit] = [options.response_timeout, LONG_TIMEOUT].map(format_duration);
         reader.warning(
             BUS.response_timeout.name,
-            format!("each try to reach an absent drive takes the line for {timeout}"),
+            format!("each attempt to reach an absent drive takes the line for {timeout}"),
             format!(
-                "write {limit} or less; drives begin their replies within milliseconds, device servers within 0.5 s"
+                "write {limit} or less; drives start their replies within milliseconds, device servers within 0.5 s"
             ),
         );
     }
@@ -154,7 +154,10 @@ fn check_listening(reader: &Reader<'_>, drives: &[drive::Found]) {
             let Some(place) = place else { continue };
             reader.document().problem(
                 place,
-                format!("`{wish}` of drive `{name}` needs a gateway that writes, and this bus only listens (mode = \"listen\")"),
+                format!(
+                    "`{wish}` of drive `{name}` needs a gateway that writes, but this bus only listens (mode = \
+                         \"listen\")"
+                ),
                 format!("leave {key} out, or make the gateway the only master of the line and write mode = \"master\""),
             );
         }
@@ -298,7 +301,7 @@ fn read_silence(reader: &Reader<'_>, protocol: Protocol, format: Option<&LineFor
         let [time, least] = [time, format.silence_chars()].map(format_duration);
         reader.warning(
             BUS.silence.name,
-            format!("{time} is less than 3.5 characters at {format}, so drives may take two frames for one"),
+            format!("{time} is less than 3.5 characters at {format}, so drives may mistake two frames for one"),
             format!("write \"chars\", or {least} or more"),
         );
     }
@@ -348,7 +351,7 @@ fn check_fit(reader: &Reader<'_>, format: &LineFormat, options: &BusOptions, dri
             reader.warning(
                 BUS.response_timeout.name,
                 format!(
-                    "drive `{}` takes {turnaround} to begin its reply, and response_timeout is {timeout}",
+                    "drive `{}` takes {turnaround} to start its reply, but response_timeout is {timeout}",
                     drive.name
                 ),
                 "raise response_timeout",

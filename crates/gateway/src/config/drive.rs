@@ -142,7 +142,7 @@ fn read_params(reader: &Reader<'_>, access: Access) -> ParamsAccess {
     if params == ParamsAccess::Write && access != Access::Control {
         reader.problem(
             DRIVE.params.name,
-            "params = \"write\" lets parameters be restored, and nothing is written to a drive that is only monitored",
+            "params = \"write\" allows restoring parameters, but nothing is written to a drive that is only monitored",
             "set access = \"control\" for the drive, or params = \"read\"",
         );
     }
@@ -181,7 +181,7 @@ fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<
         reader.problem(
             key,
             format!(
-                "profile `{name}` is for {}, the bus uses {}",
+                "profile `{name}` is for {}, but the bus uses {}",
                 spoken.join(", "),
                 around.protocol.name()
             ),
@@ -200,7 +200,7 @@ fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<
     if !Plan::of(profile).reads.iter().any(polled) {
         reader.problem(
             key,
-            format!("profile `{name}` has no polled point, so the gateway could not detect whether the drive answers"),
+            format!("profile `{name}` has no polled point, so the gateway could not detect whether the drive replies"),
             "give one of its points class = \"fast\" or \"slow\"",
         );
     }
@@ -281,7 +281,10 @@ fn trigger_point(name: &str, profile: &Profile) -> Result<usize, Finding> {
             )
         };
         Finding::new(
-            format!("profile `{}` has no number `{name}` that is polled", profile.name),
+            format!(
+                "profile `{}` has no numeric point `{name}` that is polled",
+                profile.name
+            ),
             remedy.unwrap_or_else(list),
         )
     })
@@ -393,8 +396,8 @@ fn read_supervision(reader: &Reader<'_>, profile: Option<&Profile>, limits: &Lim
         reader.problem(
             DRIVE.supervision.name,
             format!(
-                "profile `{}` has neither `running` nor a run command that is read, so the gateway could not detect whether a \
-                 drive runs when its lease runs out",
+                "profile `{}` has neither `running` nor a run command that is read, so the gateway could not detect \
+                 whether a drive runs when its lease expires",
                 profile.name
             ),
             "add one of them to the profile, or leave supervision out",

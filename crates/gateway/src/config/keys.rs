@@ -86,7 +86,7 @@ const TIMES: Time = Time(MILLISECOND..=HOUR);
 pub(super) const RESPONSE_TIMEOUT: Capped = Capped {
     range: MILLISECOND..=Duration::from_secs(5),
     before: HOUR,
-    why: "is longer than any drive takes to begin its reply",
+    why: "is longer than any drive takes to start its reply",
     until: "0.2",
 };
 /// Range of the delays of RS-485 by the kernel, in whole milliseconds.
@@ -190,7 +190,7 @@ keys! {
         /// What the recorder keeps.
         recordings: Present = Own { schema: Recordings::schema, range: "[recordings]" }, or "the defaults";
         /// When parameters are read by themselves, and what they are called.
-        params: Present = Own { schema: Params::schema, range: "[params]" }, or "only when asked";
+        params: Present = Own { schema: Params::schema, range: "[params]" }, or "only on request";
         /// What is logged.
         log: Present = Own { schema: Log::schema, range: "[log]" }, or "the defaults";
     }
@@ -199,10 +199,10 @@ keys! {
     GATEWAY: Gateway {
         /// Name of the gateway, used in MQTT topics and in the metric `drivegate_build_info`.
         name: String = Name("-"), required;
-        /// Path of the local socket, mode 0660, through which `drivegate read`, `write`, `reload` and `health` [reach
-        /// the running gateway](commissioning.md#through-the-gateway); `""`: none.
+        /// Path of the local socket, mode 0660, for `drivegate read`, `write`, `reload` and `health` to [reach the
+        /// running gateway](commissioning.md#through-the-gateway); `""`: none.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
-        /// Directory of what the gateway keeps: [recordings](history.md#recordings), [events, run hours and starts](history.md),
+        /// Directory for stored data: [recordings](history.md#recordings), [events, run hours and starts](history.md),
         /// [parameters](parameters.md), and the [audit file](commands.md#the-audit-file).
         state_dir: PathBuf = PATH, or "the state directory of the systemd unit, else `/var/lib/drivegate`";
         /// Directories with custom [profiles](profiles.md), `*.toml`; one with the name of a built-in profile replaces
@@ -236,14 +236,16 @@ keys! {
         rs485: Rs485 = Words(&[
             ("off", Rs485::Off), ("kernel", Rs485::Kernel), ("kernel-inverted", Rs485::KernelInverted),
         ]), default "off";
-        /// With `rs485 = "kernel"`: time between switching to sending and the first bit, in whole milliseconds. What
-        /// the driver does not take, of this and the next three keys, is logged when the port is opened.
+        /// With `rs485 = "kernel"`: time between switching to sending and the first bit, in whole milliseconds.
+        /// Settings that the driver does not accept, of this and the next three keys, are logged when the port is
+        /// opened.
         rts_before_send: Duration = RTS_DELAYS, default "0ms";
-        /// With `rs485 = "kernel"`: time between the last bit and switching back; a reply that begins earlier is lost.
+        /// With `rs485 = "kernel"`: time between the last bit and switching back; a reply that starts earlier is lost.
         rts_after_send: Duration = RTS_DELAYS, default "0ms";
-        /// With `rs485 = "kernel"`: whether the port receives what it sends. Only for drivers that receive nothing otherwise.
+        /// With `rs485 = "kernel"`: whether the port receives what it sends. Only for drivers that otherwise receive
+        /// nothing.
         rx_during_tx: bool = Flag, default false;
-        /// With `rs485 = "kernel"`: whether the driver switches the terminating resistor of the board on.
+        /// With `rs485 = "kernel"`: whether the driver switches on the board's terminating resistor.
         termination: bool = Flag, default false;
         /// Level of RTS, for adapters that are powered or enabled by it; also with `rfc2217://`. `"driver"`: on, as Linux leaves
         /// it. Not with `rs485 = "kernel"`.
@@ -256,11 +258,11 @@ keys! {
         /// Target poll cycle of process data (poll class fast). If the line cannot carry it, cycles follow one another
         /// without a pause.
         cycle: Duration = TIMES, default "10ms";
-        /// Target poll cycle of class slow. A motor speed that is slow in its profile is read every `cycle` where the
-        /// line has time for it (`fast_if_carried`).
+        /// Target poll cycle of class slow. A motor speed that is slow in its profile is read every `cycle` if the line
+        /// has time for it (`fast_if_carried`).
         slow_cycle: Duration = TIMES, default "1s";
-        /// Time a drive may take to begin its reply; the time on the wire is added. Each try to reach an absent drive
-        /// takes the line for that time.
+        /// Time a drive may take to start its reply; the time on the wire is added. Each attempt to reach an absent
+        /// drive takes the line for that time.
         response_timeout: Duration = RESPONSE_TIMEOUT,
             by_protocol |protocol| format!("\"{}\"", format_duration(protocol.usual_timeout()));
         /// Retries after the first attempt before a drive counts as offline.
@@ -274,21 +276,21 @@ keys! {
         }, default "spec";
         /// The drives on the line.
         drive: Present = Own { schema: || each(Drive::schema()), range: "[[bus.drive]]" }, or "none";
-        /// Where vendors' tools reach the line, see [Tool slot](tool-slot.md).
+        /// Access to the line for vendors' tools, see [Tool slot](tool-slot.md).
         slot: Present = Own { schema: || each(SlotTable::schema()), range: "[[bus.slot]]" }, or "none";
     }
 
     /// A slot for vendors' tools: a program that speaks the protocol of the line, as if it were alone on it.
     SLOT: SlotTable {
-        /// Address with the bare frames of the line: Modbus RTU or ASCII over TCP (not Modbus TCP), or N2.
+        /// Address for the bare frames of the line: Modbus RTU or ASCII over TCP (not Modbus TCP), or N2.
         listen: SocketAddr = SOCKET, or "none";
-        /// Address with a COM port by RFC 2217, for programs on Windows behind a COM port redirector.
+        /// Address of a COM port by RFC 2217, for programs on Windows behind a COM port redirector.
         rfc2217: SocketAddr = SOCKET, or "none";
         /// Path of a serial port (a link to a pseudo-terminal, mode 0660) that a program on this machine opens.
         pty: PathBuf = PATH, or "none";
-        /// `"read"`: every request that may write is refused. `"write"`: writes are passed on as those of a Modbus TCP
-        /// client that may write. `"raw"`: also what cannot be checked: broadcasts, functions that drivegate does not
-        /// decode, writes to addresses without a configured drive.
+        /// `"read"`: every request that may write is refused. `"write"`: writes are passed on like those of a Modbus
+        /// TCP client that may write. `"raw"`: also what cannot be checked: broadcasts, functions that drivegate does
+        /// not decode, writes to addresses without a configured drive.
         access: SlotAccess = Words(&[
             ("read", SlotAccess::Read), ("write", SlotAccess::Write), ("raw", SlotAccess::Raw),
         ]), default "read";
@@ -325,12 +327,12 @@ keys! {
         supervision: Present = Own { schema: Supervision::schema, range: "[bus.drive.supervision]" }, or "none";
         /// How often and how soon the motor may be [started](commands.md#guards).
         guard: Present = Own { schema: GuardTable::schema, range: "[bus.drive.guard]" }, or "none";
-        /// What must hold before the motor is [started](commands.md#interlocks).
+        /// Conditions for [starting](commands.md#interlocks) the motor.(commands.md#interlocks).
         interlocks: Present = Own { schema: || each(InterlockTable::schema()), range: "[[bus.drive.interlocks]]" }, or "none";
         /// What is written at [shutdown](commands.md#shutdown): nothing, or a stop. Nothing is ever written to a
         /// monitored drive.
         on_shutdown: OnShutdown = Words(&[("hold", OnShutdown::Hold), ("stop", OnShutdown::Stop)]), default "hold";
-        /// Time the drive takes to begin its reply, used only for the prediction of `check`; the measured value is a
+        /// Time the drive takes to start its reply, used only for the prediction of `check`; the measured value is a
         /// metric.
         turnaround: Duration = Time(Duration::ZERO..=Duration::from_secs(1)), or "the profile's";
         /// Minimum and maximum frequency, used to convert `frequency_reference` if the drive's own cannot be read, or
@@ -340,7 +342,7 @@ keys! {
             range: "[lowest, highest], Hz",
         }, or "none";
         /// What [raw writes](modbus-tcp.md#what-raw-writes-may-set) may set besides the registers of writable points:
-        /// nothing, everything that the profile lets write (`true`), or ranges of PDU addresses, of registers and coils
+        /// nothing, everything that the profile allows (`true`), or ranges of PDU addresses, for registers and coils
         /// alike.
         raw_writes: Present = Own {
             schema: || json!({ "anyOf": [{ "type": "boolean" }, { "type": "array", "items": {
@@ -349,8 +351,8 @@ keys! {
             } }] }),
             range: "true, false or ranges of PDU addresses such as [[101, 199]]",
         }, or "`false`";
-        /// What may be done with its [parameters](parameters.md#restoring): `"read"`, or `"write"`: they may be restored, too, which
-        /// needs `access = "control"`.
+        /// What may be done with its [parameters](parameters.md#restoring): `"read"`, or `"write"`: they may also be
+        /// restored, which needs `access = "control"`.
         params: ParamsAccess = Words(&[("read", ParamsAccess::Read), ("write", ParamsAccess::Write)]), default "read";
         /// Values that trigger a [recording](history.md#recordings), besides faults.
         trigger: Present = Own { schema: || each(Trigger::schema()), range: "[[bus.drive.trigger]]" }, or "none";
@@ -358,7 +360,7 @@ keys! {
 
     /// A value that makes a recording: `above` or `below` a limit, for a time.
     TRIGGER: Trigger {
-        /// A number of the drive that is polled.
+        /// A polled numeric point of the drive.
         point: String = Text("^[a-z][a-z0-9_]*$", "the name of a point"), required;
         /// The value must be above this, in the point's unit.
         above: f64 = Figure, or "none";
@@ -370,29 +372,28 @@ keys! {
 
     /// Lease of the drive: if it expires while the drive runs, the action is executed once. Not a safety function.
     SUPERVISION: Supervision {
-        /// Time after which the lease expires. Every command that reaches the wire and every accepted heartbeat renews
-        /// it.
+        /// Time after which the lease expires. Every command sent on the line and every accepted heartbeat renews it.
         timeout: Duration = Time(Duration::from_millis(50)..=HOUR), required;
-        /// What is done then, if the drive runs: `"stop"` stops it, `"hold"` only raises the event, `{ speed_reference
-        /// = 20.0 }` (percent) writes this reference.
+        /// Action then, if the drive runs: `"stop"` stops it, `"hold"` only raises the event,
+        /// `{ speed_reference = 20.0 }` (percent) writes this reference.
         action: Present = Own {
             schema: || json!({ "anyOf": [ { "enum": ["stop", "hold"] }, Reference::schema() ] }),
             range: "\"stop\", \"hold\" or { speed_reference = 20.0 }",
         }, default "stop";
-        /// Whether the [lease](commands.md#leases) of a drive that is running when the gateway starts begins
-        /// immediately; nothing is written.
+        /// Whether a drive that is running when the gateway starts gets its [lease](commands.md#leases) immediately;
+        /// nothing is written.
         adopt: bool = Flag, default false;
     }
 
     /// Guard of the motor: starts that come too often or too soon are refused.
     GUARD: GuardTable {
-        /// Starts within any hour.
+        /// Maximum starts within any hour.
         starts_per_hour: u32 = Number(1..=MOST_STARTS as i64, None), or "any number";
-        /// Time that the motor stands before a start.
+        /// Time the motor must be stopped before a start.
         min_off: Duration = Time(Duration::ZERO..=HOUR), default "0s";
-        /// Time that the motor runs before an [ordinary stop](commands.md#guards).
+        /// Time the motor must run before an [ordinary stop](commands.md#guards).
         min_run: Duration = Time(Duration::ZERO..=HOUR), default "0s";
-        /// Time between two starts of drives of the same `group`; without `group`, of the same bus.
+        /// Time between two starts in the same `group`; without `group`, on the same bus.
         stagger: Duration = Time(Duration::ZERO..=HOUR), default "0s";
     }
 
@@ -400,11 +401,11 @@ keys! {
     INTERLOCK: InterlockTable {
         /// Name of the other drive.
         drive: String = Name("-_"), required;
-        /// A point of it that is true or false and polled. One that is not good does not hold.
+        /// A polled boolean point of it. If it is not good, the interlock is not satisfied.
         point: String = Text("^[a-z][a-z0-9_]*$", "the name of a point"), required;
-        /// What the point must be.
+        /// Required value of the point.
         is: bool = Flag, default true;
-        /// Whether the running motor is stopped when the point does not hold any more.
+        /// Whether the running motor is stopped when the interlock is no longer satisfied.
         trip: bool = Flag, default false;
     }
 
@@ -423,8 +424,8 @@ keys! {
         allow: Vec<IpNet> = NETWORKS, default ["127.0.0.0/8", "::1/128"];
         /// Who may write; no one by default. Modbus TCP has no passwords: keep it narrow, or use TLS.
         write: Vec<IpNet> = NETWORKS, default [];
-        /// Concurrent connections, over all listeners; an eighth of them only for clients that may write. If the system
-        /// does not permit enough open files, fewer are served, with a warning.
+        /// Concurrent connections, over all listeners; an eighth of them reserved for clients that may write. If the
+        /// system does not permit enough open files, fewer are served, with a warning.
         max_connections: usize = CONNECTIONS, default 64;
         /// Concurrent connections from one address. Clients behind one NAT or proxy share an address.
         max_connections_per_address: usize = CONNECTIONS, default 16;
@@ -502,7 +503,7 @@ keys! {
         username: String = Parsed { parse: mqtt::parse_username, words: &[], pattern: "", range: "a string in quotes" }, or "none";
         /// Password of the user; `password_file` is better.
         password: String = STRING, or "none";
-        /// File whose only line is the password: a systemd credential, a container secret.
+        /// File whose only line is the password, such as a systemd credential or a container secret.
         password_file: PathBuf = PATH, or "none";
         /// PEM file with the CA certificates used to verify the broker's certificate.
         ca: PathBuf = PATH, or "the system's";
@@ -521,9 +522,10 @@ keys! {
         }, default ["state", "points"];
         /// Quality of service of published messages.
         qos: Present = Own { schema: MqttQos::schema, range: "[mqtt.qos]" }, or "the defaults";
-        /// The broker drops telemetry that is older (message expiry); `"0s"` is never.
+        /// The broker drops telemetry that is older (message expiry); `"0s"`: never.
         expiry: Duration = Time(Duration::ZERO..=Duration::from_secs(365 * 86_400)), default "5min";
-        /// The broker drops `online`, and telemetry at the latest, after this time; renewed after half of it; `"0s"` is never.
+        /// The broker drops `online`, and telemetry at the latest, after this time; renewed after half of it; `"0s"`:
+        /// never.
         message_expiry: Duration = Time(Duration::ZERO..=Duration::from_secs(365 * 86_400)), default "10min";
         /// Values of an outage that are published afterwards, on `history` topics: those that changed, or all samples.
         history: History = Words(&[
@@ -531,12 +533,12 @@ keys! {
         ]), default "off";
         /// How often values are published.
         publish: Present = Own { schema: Publish::schema, range: "[mqtt.publish]" }, or "the defaults";
-        /// Whether commands are accepted on the set topics, for drives with `access = "control"`, from anyone whom the
-        /// broker lets publish there.
+        /// Whether commands are accepted on the set topics, for drives with `access = "control"`, from anyone the
+        /// broker allows to publish there.
         commands: bool = Flag, default false;
         /// Whether commands without an `id` are refused, except stops: only with an `id` a repetition is recognised.
         require_id: bool = Flag, default false;
-        /// Filters of response topics below `base` that results may be sent to. Topics outside of `base` are always
+        /// Filters of response topics below `base` that results may be sent to. Topics outside `base` are always
         /// allowed.
         response_topics: Vec<String> = List {
             parse: mqtt::parse_filter, empty: None, range: "topic filters, such as [\"drivegate/answers/#\"]",
@@ -548,13 +550,13 @@ keys! {
             schema: || json!({ "anyOf": [{ "const": false }, MqttHomeAssistant::schema()] }),
             range: "[mqtt.home_assistant], or false",
         }, or "off";
-        /// The gateway as an edge node of [Sparkplug B](sparkplug.md), on a connection of its own.
+        /// The gateway as an edge node of [Sparkplug B](sparkplug.md), on its own connection.
         sparkplug: Present = Own { schema: Sparkplug::schema, range: "[mqtt.sparkplug]" }, or "not published";
     }
 
     /// Discovery for Home Assistant; off without this table.
     MQTT_HOME_ASSISTANT: MqttHomeAssistant {
-        /// The discovery prefix that is set in Home Assistant.
+        /// The discovery prefix set in Home Assistant.
         discovery_prefix: String = Parsed {
             parse: mqtt::parse_base, words: &[], pattern: "", range: "a topic without + and #",
         }, default "homeassistant";
@@ -570,9 +572,10 @@ keys! {
 
     /// Quality of service of published messages: 0 is sent once, 1 until the broker acknowledges it.
     MQTT_QOS: MqttQos {
-        /// Of states, points and buses. With 1 a distant broker limits the rate to its receive maximum per round trip.
+        /// For states, points and buses. With 1, a distant broker limits the rate to its receive maximum per round
+        /// trip.
         telemetry: u8 = Number(0..=1, None), default 0;
-        /// Of events and history; results of commands have 1.
+        /// For events and history; results of commands use 1.
         events: u8 = Number(0..=1, None), default 1;
     }
 
@@ -599,7 +602,7 @@ keys! {
         }, default "";
         /// Whether data messages name their metrics by aliases, which are shorter.
         alias: bool = Flag, default true;
-        /// Whether values of an outage are published afterwards, as historical ones.
+        /// Whether values of an outage are published afterwards, as historical.
         history: bool = Flag, default true;
     }
 
@@ -608,7 +611,7 @@ keys! {
         /// Status page, metrics, health and JSON interface. Read-only without `commands`; open to everybody who can connect
         /// unless there is a `tokens_file`.
         listen: SocketAddr = SOCKET, default "127.0.0.1:9488";
-        /// Names and addresses, without a port, under which the server is reached besides `localhost`, the host name of
+        /// Names and addresses, without a port, by which the server is reached besides `localhost`, the host name of
         /// this machine and its own addresses. Requests for any other [host](http.md#hosts) get 421.
         hosts: Vec<String> = HOSTS, default [];
         /// File of access [tokens](http.md#tokens), made by `drivegate token add`. With it, all paths except `/healthz`
@@ -630,27 +633,29 @@ keys! {
     BACNET: Bacnet {
         /// Listen address: that of one interface, whose broadcast address is used, or `0.0.0.0`, which needs `allow`.
         listen: SocketAddr = SOCKET, default "127.0.0.1:47808";
-        /// Instance of the gateway; unique in the whole BACnet network, with those of all drives.
+        /// Device instance of the gateway; it and those of all drives must be unique in the whole BACnet network.
         device: u32 = Number(0..=4_194_302, None), default 100;
         /// Number of the virtual network of the drives, unique in the whole BACnet network.
         network: u16 = Number(1..=65_534, Some((65_535, "network 65535 means all networks"))), default 1001;
-        /// A drive that is away: `"silent"`: answers nothing; `"fault"`: answers with the flag fault.
+        /// An offline drive: `"silent"`: does not answer; `"fault"`: answers with the flag fault.
         offline: WhenOffline = Words(&[("silent", WhenOffline::Silent), ("fault", WhenOffline::Fault)]), default "silent";
         /// Whether clients in `write` may command drives with `access = "control"`.
         commands: bool = Flag, default false;
-        /// Who may ask.
+        /// Who may read.
         allow: Vec<IpNet> = NETWORKS, default ["127.0.0.0/8"];
         /// Who may write; no one by default. BACnet has no passwords: keep it narrow.
         write: Vec<IpNet> = NETWORKS, default [];
-        /// Whether `run` = inactive at priority 1 to 5 outlives a restart: it refuses starts as before; nothing is written.
+        /// Whether `run` = inactive at priority 1 to 5 survives a restart: it refuses starts as before; nothing is
+        /// written.
         keep_priorities: bool = Flag, default false;
-        /// BBMD in another subnet at which the gateway registers as a foreign device, to hear its broadcasts; `""`: none.
+        /// BBMD in another subnet where the gateway registers as a foreign device, to receive its broadcasts; `""`:
+        /// none.
         bbmd: Option<(String, u16)> = Parsed {
             parse: bacnet::parse_bbmd, words: &[], pattern: "", range: "\"host:port\", or \"\"",
         }, default "";
         /// Vendor identifier, registered with ASHRAE; 0 is that of ASHRAE itself.
         vendor: u16 = Number(0..=65_535, None), default 0;
-        /// File whose only line is the password of DeviceCommunicationControl; without one that is refused.
+        /// File whose only line is the password of DeviceCommunicationControl; without it, that service is refused.
         dcc_password_file: PathBuf = PATH, or "none";
         /// Buses whose drives are devices; `[]`: all. Units must be unique among them.
         buses: Vec<String> = List { parse: values::any_text, empty: None, range: "names of buses" }, default [];
@@ -658,30 +663,31 @@ keys! {
 
     /// [Who holds a drive](commands.md#who-holds-a-drive), where several clients command it.
     AUTHORITY: AuthorityTable {
-        /// `"exclusive"`: only its holder commands a drive, stops apart. `"advisory"`: all is reported, nothing refused.
+        /// `"exclusive"`: only its holder commands a drive, except stops. `"advisory"`: everything is reported, nothing
+        /// refused.
         mode: Option<authority::Mode> = Words(&[
             ("off", None), ("advisory", Some(authority::Mode::Advisory)), ("exclusive", Some(authority::Mode::Exclusive)),
         ]), default "off";
-        /// Ranks, the highest first.
+        /// Ranks, highest first.
         ranks: Vec<String> = List {
             parse: authority::parse_rank, empty: Some("name at least one rank"), range: "names of ranks",
         }, default ["site", "operator", "automation", "remote"];
         /// How long a hold lasts without renewal, and how long a stop reserves the drive.
         lease: Duration = Time(Duration::from_secs(1)..=HOUR), default "30s";
-        /// Whether a stop is written when a drive whose run command stands is switched to its local control place, so that nothing
-        /// starts when it is switched back.
+        /// Whether a stop is written when a drive whose run command is set is switched to local control, so that
+        /// nothing starts when it is switched back.
         stop_at_local: bool = Flag, default true;
-        /// Those who may hold drives.
+        /// Clients that may hold drives.
         principal: Present = Own { schema: || each(PrincipalTable::schema()), range: "[[authority.principal]]" }, or "none";
     }
 
     /// [Drills](safety.md#drills): proving that motors stop.
     DRILL: DrillTable {
-        /// Highest speed at which a drill stops a motor, % of its range, more than 0 to 100.
+        /// Highest speed of a drill, % of the motor's range, more than 0 to 100.
         max_speed: f64 = Figure, default 20.0;
-        /// Time in which the motor has to stand: more than the timeout of its supervision, and than that of the drive's own.
+        /// Time within which the motor must stop: longer than the timeouts of its supervision and of the drive itself.
         limit: Duration = Time(Duration::from_secs(1)..=HOUR), default "10s";
-        /// Age from which `check`, page and metrics call a proof too old.
+        /// Age after which `check`, page and metrics report a proof as too old.
         every: Duration = Time(HOUR..=LONGEST_EVERY), default "8760h";
     }
 
@@ -699,21 +705,21 @@ keys! {
         http_user: String = STRING, or "none";
         /// WHO in its MQTT topics `…/as/WHO/set`; the access rules of the broker secure them.
         mqtt: String = Name("-_"), or "none";
-        /// It is the Sparkplug host.
+        /// Whether it is the Sparkplug host.
         sparkplug: bool = Flag, default false;
         /// Its addresses over BACnet; the longest prefix counts.
         bacnet: Vec<IpNet> = NETWORKS, default [];
-        /// Its user, or user id, at the local socket. Anyone else there has the first rank.
+        /// Its user name or user id at the local socket. Anyone else there has the first rank.
         socket: String = STRING, or "none";
-        /// It writes its command word all the time, as most PLCs do: a word that repeats its last stop is not a new stop.
+        /// It writes its command word cyclically, as most PLCs do: a word that repeats its last stop is not a new stop.
         cyclic: bool = Flag, default false;
     }
 
     /// File of all commands, in which every change shows; see [the audit file](commands.md#the-audit-file).
     AUDIT: AuditTable {
-        /// The file, none of the others that the gateway keeps; a relative path is relative to `state_dir` of `[gateway]`.
+        /// The file, used for nothing else; a relative path is relative to `state_dir` of `[gateway]`.
         file: PathBuf = PATH, default "audit.jsonl";
-        /// Size of the file and the seven older ones; the oldest is removed.
+        /// Total size of the file and the seven older ones; the oldest is deleted.
         max_bytes: u64 = Parsed {
             parse: mqtt::parse_buffer_size, words: &[], pattern: SIZE, range: "\"64KiB\" to \"1024GiB\"",
         }, default "64MiB";
@@ -721,9 +727,9 @@ keys! {
 
     /// What the recorder keeps: [recordings](history.md#recordings) of the time around faults.
     RECORDINGS: Recordings {
-        /// How much is kept from before the trigger.
+        /// Time recorded before the trigger.
         before: Duration = Time(Duration::from_secs(1)..=Duration::from_secs(600)), default "30s";
-        /// How long the recording goes on after it.
+        /// Time recorded after it.
         after: Duration = Time(Duration::ZERO..=Duration::from_secs(600)), default "10s";
         /// Maximum size of all recordings on disk.
         max_bytes: u64 = Parsed {
@@ -731,17 +737,17 @@ keys! {
         }, default "256MiB";
         /// Maximum number of recordings; 0: nothing is recorded.
         max_count: usize = Number(0..=100_000, None), default 200;
-        /// Whether a warning of a drive makes a recording, too.
+        /// Whether a warning of a drive also triggers a recording.
         warnings: bool = Flag, default false;
     }
 
     /// When [parameters](parameters.md) are read by themselves, and what they are called.
     PARAMS: Params {
-        /// How often all parameters of every drive are read, one drive of a bus after the other. Readings are kept in
-        /// `params` of the `state_dir`; what changed without the gateway is an event.
+        /// How often all parameters of every drive are read, one drive per bus at a time. Readings are kept in `params`
+        /// of the `state_dir`; changes not made by the gateway raise an event.
         every: Duration = Time(Duration::from_secs(60)..=Duration::from_secs(366 * 86_400)), or "never";
-        /// Lists of names, units and scales of your own, [CSV](parameters.md#names-of-your-own); `vacon-cx.csv` is for the drives of
-        /// profile `vacon-cx`.
+        /// Your own lists of names, units and scales, [CSV](parameters.md#names-of-your-own); `vacon-cx.csv` is for the
+        /// drives of profile `vacon-cx`.
         names: Vec<PathBuf> = List { parse: values::path, empty: None, range: "files" }, or "none";
     }
 

@@ -45,7 +45,7 @@ pub(super) fn read(reader: &Reader<'_>, port: Option<&str>) -> LineOptions {
     } else if options.rts != Level::Driver {
         reader.problem(
             BUS.rts.name,
-            "with rs485 = \"kernel\" RTS switches the direction, so it has no level of its own",
+            "with rs485 = \"kernel\" RTS switches the direction, so it has no fixed level",
             "leave `rts` out, or write rs485 = \"off\"",
         );
     }
@@ -56,7 +56,7 @@ pub(super) fn read(reader: &Reader<'_>, port: Option<&str>) -> LineOptions {
         if delay.subsec_micros() % 1000 != 0 {
             reader.problem(
                 key,
-                format!("the kernel takes whole milliseconds, not {}", format_duration(delay)),
+                format!("the kernel accepts whole milliseconds, not {}", format_duration(delay)),
                 "write for example \"1ms\"",
             );
         }

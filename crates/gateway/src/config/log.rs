@@ -50,7 +50,7 @@ pub(super) fn read_audit(reader: &Reader<'_>, state_dir: &Path, buffer: Option<&
     {
         reader.problem(
             AUDIT.file.name,
-            format!("the gateway keeps other things in `{name}`"),
+            format!("the gateway uses `{name}` for something else"),
             "give the audit file another name, such as \"audit.jsonl\"",
         );
     }

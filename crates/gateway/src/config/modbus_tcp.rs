@@ -161,7 +161,7 @@ fn read_buses(reader: &Reader<'_>, key: &Key<Vec<String>>, known: &[&str]) -> Op
         }
         let remedy = match nearest(name, known.iter().copied()) {
             Some(near) => format!("did you mean `{near}`?"),
-            None if known.is_empty() => "the file has no bus to show".to_string(),
+            None if known.is_empty() => "the file has no bus to serve".to_string(),
             None => format!("write one of {}", known.join(", ")),
         };
         reader.problem(key.name, format!("there is no bus `{name}`"), remedy);
@@ -316,7 +316,7 @@ fn warn_of_reach(reader: &Reader<'_>, listener: &modbus_tcp::Listener) {
         if !listener.allow.iter().any(|allowed| allowed.contains(network)) {
             reader.warning(
                 write,
-                format!("{network} may write but not all of it may connect"),
+                format!("{network} may write, but not all of it may connect"),
                 "add it to `allow`",
             );
         }
@@ -336,7 +336,7 @@ fn warn_of_reach(reader: &Reader<'_>, listener: &modbus_tcp::Listener) {
     if only_here && reader.has(listen) {
         reader.warning(
             listen,
-            format!("{open} listens to the network, but `allow` admits no client from there"),
+            format!("{open} listens on the network, but `allow` admits no client from there"),
             "add the network to `allow`",
         );
     }

@@ -62,14 +62,14 @@ fn read_brokers(reader: &Reader<'_>) -> Option<Vec<Broker>> {
             reader.problem(MQTT.urls.name, what, "write mqtts:// for all brokers or for none");
         }
         if before.contains(&address) {
-            let what = format!("the broker {shown} is there twice");
+            let what = format!("the broker {shown} is listed twice");
             reader.problem(MQTT.urls.name, what, "remove it from urls");
         }
         before.push(address);
     }
     if brokers.len() > MOST_BROKERS {
-        let what = format!("there are {} brokers, with that of mqtt.url", brokers.len());
-        reader.problem(MQTT.urls.name, what, format!("name {MOST_BROKERS} at most"));
+        let what = format!("there are {} brokers, including mqtt.url", brokers.len());
+        reader.problem(MQTT.urls.name, what, format!("list at most {MOST_BROKERS}"));
     }
     Some(brokers)
 }
@@ -186,7 +186,7 @@ fn within_mqtt<'t>(what: &str, text: &'t str, most: usize) -> Result<&'t str, Fi
     match text.len() {
         bytes if bytes > most => Err(Finding::new(
             format!("{what} has {bytes} bytes"),
-            format!("write {most} bytes at most"),
+            format!("write at most {most} bytes"),
         )),
         _ => Ok(text),
     }
@@ -281,8 +281,7 @@ fn warn_of_clear_text(reader: &Reader<'_>, host: &str, password: bool, commands:
     }
     if commands {
         let what = format!(
-            "commands come from `{host}` without TLS: anyone who can change them on the way commands the \
-                drives"
+            "commands come from `{host}` without TLS: anyone who can alter them in transit commands the drives"
         );
         reader.warning(MQTT.commands.name, what, remedy);
     }
@@ -332,14 +331,14 @@ pub(super) fn parse_base(text: &str) -> Result<String, Finding> {
     let bad = text.contains(['+', '#', '\0']) || text.starts_with('$') || levels().any(str::is_empty);
     if bad {
         return Err(Finding::new(
-            format!("`{text}` cannot be the beginning of a topic"),
+            format!("`{text}` cannot be the start of a topic"),
             "write levels joined by /, none of them empty, without + and #, not starting with $",
         ));
     }
     if levels().count() > MOST_LEVELS {
         return Err(Finding::new(
             format!("the topic has {} levels", levels().count()),
-            format!("write {MOST_LEVELS} levels at most: brokers refuse deeper topics"),
+            format!("write at most {MOST_LEVELS} levels: brokers refuse deeper topics"),
         ));
     }
     Ok(within_mqtt("the topic", text, LONGEST_NAME)?.to_string())
@@ -382,7 +381,7 @@ fn read_expiry(reader: &Reader<'_>, max_interval: Duration) -> Option<Duration> 
         let [expiry, max] = [expiry, max_interval].map(format_duration);
         reader.warning(
             MQTT.expiry.name,
-            format!("expiry = {expiry}: an unchanged value vanishes before it is published again after {max}"),
+            format!("expiry = {expiry}: an unchanged value expires before it is published again after {max}"),
             "write a longer expiry or a shorter publish.max_interval",
         );
     }
@@ -465,7 +464,7 @@ pub(super) fn parse_sparkplug_id(text: &str) -> Result<String, Finding> {
     }
     if text == "STATE" {
         return Err(Finding::new(
-            "`STATE` is the level of the states of hosts",
+            "`STATE` is reserved for the state of hosts",
             "write another id",
         ));
     }

@@ -37,8 +37,8 @@ impl ShutdownTime {
             drives => format!("{drives} drives"),
         };
         let what = format!(
-            "stopping {drives} of bus `{bus}` with the gateway takes {:.1} s, and {:.0} s if they do not answer, longer \
-             than TimeoutStopSec={}s of drivegate.service allows",
+            "stopping {drives} of bus `{bus}` with the gateway takes {:.1} s, and {:.0} s if they do not reply, \
+             longer than TimeoutStopSec={}s of drivegate.service allows",
             self.answered.as_secs_f64(),
             seconds(self.unanswered),
             UNIT_STOP_TIME.as_secs(),

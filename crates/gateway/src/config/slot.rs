@@ -36,7 +36,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, around: &Surroundings<'_>) 
     if around.mode == Mode::Listen && !tables.is_empty() {
         reader.problem(
             BUS.slot.name,
-            "a slot passes on what a tool sends, and this bus only listens (mode = \"listen\")",
+            "a slot passes on what a tool sends, but this bus only listens (mode = \"listen\")",
             "leave the slot out, or make the gateway the only master of the line and write mode = \"master\"",
         );
     }
@@ -68,7 +68,8 @@ fn read_one(reader: &Reader<'_>, base: &Path, around: &Surroundings<'_>) -> Foun
     if writes && !around.drives.is_empty() && !around.drives.contains(&Access::Control) {
         reader.warning(
             SLOT.access.name,
-            "the slot lets tools write, but every drive of the bus is only monitored, so all writes to them are refused",
+            "the slot lets tools write, but every drive on the bus is only monitored, so all writes to them are \
+             refused",
             "set access = \"control\" for the drives that may be written, or write access = \"read\"",
         );
     }

@@ -30,7 +30,7 @@ pub(super) fn read(reader: &Reader<'_>, access: Access, profile: Option<&Profile
         if reader.has(key) && access != Access::Control {
             reader.problem(
                 key,
-                "the drive is only monitored, so nothing starts it here",
+                "the drive is only monitored, so the gateway never starts it",
                 format!("set access = \"control\" for the drive, or remove `{key}`"),
             );
         }
@@ -83,7 +83,7 @@ pub(super) fn check(document: &Document, buses: &[bus::Found]) {
                 document.problem(
                     drive_at,
                     format!("`{}` is an interlock on itself", interlock.drive),
-                    "name another drive; what its own points forbid, the drive itself looks after",
+                    "name another drive; the drive itself enforces what its own points forbid",
                 );
                 continue;
             }

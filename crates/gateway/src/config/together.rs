@@ -73,7 +73,7 @@ fn check_numbers_of_home_assistant(reader: &Reader<'_>, buses: &[bus::Found]) {
             let only = range.start();
             reader.document().problem(
                 &drive.limits,
-                format!("the limits of `{point}` leave only {only}, and Home Assistant takes no such number"),
+                format!("the limits of `{point}` allow only {only}, and Home Assistant accepts no such number"),
                 "write a range, access = \"monitor\", or home_assistant = false",
             );
         }
@@ -89,15 +89,15 @@ fn warn_of_emptiness(reader: &Reader<'_>) {
         reader.document().warning(
             &of_file(ROOT.bus.name),
             "the configuration has no bus, so nothing is read",
-            "write [[bus]] with its drives",
+            "add a [[bus]] with its drives",
         );
     }
     let servers = [ROOT.modbus_tcp.name, ROOT.mqtt.name, ROOT.http.name, ROOT.bacnet.name];
     if !servers.iter().any(|server| reader.has(server)) {
         reader.document().warning(
             &of_file(""),
-            "no server is configured, so nobody can see the drives",
-            "write [modbus_tcp], [mqtt], [http] or [bacnet]",
+            "no server is configured, so no client can see the drives",
+            "add [modbus_tcp], [mqtt], [http] or [bacnet]",
         );
     }
 }
@@ -148,13 +148,13 @@ fn warn_of_fault_time(reader: &Reader<'_>, found: &bus::Found, cycle: Option<Dur
     reader.document().warning(
         &found.cadence.0,
         format!(
-            "each drive is polled every {:.2} s, and drive `{}` may have a communication fault where that is near its \
-             {fault_time}",
+            "each drive is polled every {:.2} s, and drive `{}` may trip on a communication fault if that is close to \
+             its {fault_time}",
             cycle.as_secs_f64(),
             first.name
         ),
-        "set that parameter (Cn-31 of a TECO 7300PA, 1 s in the manual's example) well above the cycle, or raise the baud or \
-         lower the number of drives",
+        "set that parameter (Cn-31 of a TECO 7300PA, 1 s in the manual's example) well above the cycle, or raise the \
+         baud rate or reduce the number of drives",
     );
 }
 
@@ -180,12 +180,12 @@ fn warn_of_idle_stops(reader: &Reader<'_>, buses: &[bus::Found]) {
         let effects = [
             (
                 &drive.lease,
-                "it has no lease that could run out",
+                "it has no lease that could expire",
                 DRIVE.supervision.name,
             ),
             (
                 &drive.shutdown_stop,
-                "it is not stopped with the gateway",
+                "it is not stopped at shutdown",
                 DRIVE.on_shutdown.name,
             ),
         ];
@@ -234,7 +234,8 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
             .collect();
         let own = match known.is_empty() {
             true if spec.profile.may_stop_by_itself => {
-                "the drive may stop when its master falls silent, which cannot be read over this protocol".to_string()
+                "whether the drive itself stops when its master goes silent cannot be read over this protocol"
+                    .to_string()
             }
             true => "the profile has no parameter for the drive's own response to a silent master".to_string(),
             false => format!(
@@ -245,7 +246,7 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
         reader.document().warning(
             place,
             format!(
-                "drive `{}` has no lease, so it runs on when its client falls silent",
+                "drive `{}` has no lease, so it keeps running if its client goes silent",
                 spec.name
             ),
             format!("{own}; set supervision = {{ timeout = \"5s\", action = \"stop\" }}"),

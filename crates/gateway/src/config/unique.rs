@@ -35,7 +35,7 @@ fn check_names<'a>(document: &Document, what: &str, many: &str, names: impl Iter
             Some(first) => document.problem(
                 place,
                 format!(
-                    "there are two {many} `{name}`, the other one is {}{}",
+                    "there are two {many} `{name}`, the other is {}{}",
                     first.key.trim_end_matches(".name"),
                     line(first)
                 ),
@@ -89,7 +89,7 @@ fn check_ptys(document: &Document, buses: &[Found]) {
             document.problem(
                 place,
                 format!("the path {} already belongs to {owner}", path.display()),
-                "give each slot a path of its own",
+                "give each slot its own path",
             );
         }
         seen.push((path, format!("{}{}", place.key, line(place))));

@@ -27,7 +27,7 @@ pub(super) fn between(before: &Settings, after: &Settings) -> Vec<String> {
     let changed = values.into_iter().filter(|(_, same)| !same);
     changes.extend(changed.map(|(what, _)| format!("changed: {what}")));
     if before.log.format != after.log.format {
-        changes.push("the log format changes with the next start".to_string());
+        changes.push("the log format changes at the next start".to_string());
     }
     changes
 }

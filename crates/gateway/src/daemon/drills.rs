@@ -39,7 +39,8 @@ pub(super) fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, drills: &Dril
         Ok(None) => {}
         Err(why) => tracing::error!(
             target: "drivegate::daemon",
-            "cannot read {}: {why}; what was proven before is not known, and the next drill replaces the file; move it away to keep it",
+            "cannot read {}: {why}; earlier drills are unknown, and the next drill replaces the file; move it away to \
+             keep it",
             path.display()
         ),
     }
@@ -154,7 +155,7 @@ pub(super) async fn end(plant: &SharedPlant, file: &DrillsFile, by: &str, of_bus
     if !ended {
         tracing::error!(
             target: "drivegate::daemon", drive = %report.drive,
-            "the stop with which a drill ends was not acknowledged in time ({by}); look at the motor"
+            "the stop with which a drill ends was not acknowledged in time ({by}); check the motor"
         );
     }
     until_on_disk(&drills, file).await;

@@ -148,7 +148,8 @@ impl Daemon {
         match started {
             Ok(file) => audit.write_to(Some(Arc::new(file))),
             Err(error) => tracing::error!(
-                target: "drivegate::daemon", "cannot start the thread of the audit file: {error}; the audit stays where it was; free memory or threads"
+                target: "drivegate::daemon", "cannot start the thread of the audit file: {error}; the audit file \
+                                              stays as before; free memory or threads"
             ),
         }
     }

@@ -108,7 +108,7 @@ impl Leases {
             let ends = left.lease.ends()?;
             let text = format!(
                 "the reload ended the lease of {} ({machine}), which has no drive to command in the new \
-                 configuration: {ends}; a reload within {} s that brings the drive back goes on with it",
+                 configuration: {ends}; it continues if a reload within {} s brings the drive back",
                 left.drive,
                 RETURN.as_secs()
             );

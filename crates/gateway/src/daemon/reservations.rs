@@ -33,7 +33,7 @@ pub(super) fn restore(file: &ReservationsFile, plant: &Plant) {
         Ok(kept) => plant.restore_reservations(&kept, Instant::now(), SystemTime::now()),
         Err(why) => tracing::error!(
             target: "drivegate::daemon",
-            "cannot read {}: {why}; a drive that was stopped just before the start is reserved no more", path.display()
+            "cannot read {}: {why}; drives stopped just before the restart are no longer reserved", path.display()
         ),
     }
 }
@@ -77,7 +77,7 @@ pub(super) fn keep(plant: SharedPlant, file: ReservationsFile) -> tokio::task::J
                 Ok(Ok(())) => (seen, told) = (now, false),
                 Ok(Err(why)) if !std::mem::replace(&mut told, true) => tracing::error!(
                     target: "drivegate::daemon",
-                    "the reservations that stops leave behind cannot be written: {why}; they end with the process; trying again"
+                    "reservations after stops cannot be saved: {why}; they end with the process; retrying"
                 ),
                 _ => {}
             }

@@ -297,19 +297,19 @@ impl Control {
             found.push((
                 "stop",
                 "a word can be a run command and a stop at once".to_string(),
-                "write bits that the run command has the other way round",
+                "write bits that the run command sets differently",
             ));
         }
         match &self.run {
             Run::Pair { .. } if self.reverse.is_some() => found.push((
                 "reverse",
-                "`run` says the direction already".to_string(),
+                "`run` already sets the direction".to_string(),
                 "leave `reverse` out",
             )),
             Run::Pair { forward, reverse } if forward.agrees(reverse) => found.push((
                 "run",
                 "a word can run forward and in reverse at once".to_string(),
-                "write bits that tell the two apart",
+                "write bits that distinguish the two",
             )),
             _ => {}
         }
@@ -321,7 +321,7 @@ impl Control {
             found.push((
                 "reverse",
                 "the direction shares bits with the run command".to_string(),
-                "write the bits that say the direction only, or `run` as a pair",
+                "write only the bits of the direction, or `run` as a pair",
             ));
         }
         found

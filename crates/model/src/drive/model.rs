@@ -308,11 +308,11 @@ model_points! {
     Energy "energy" "kWh" Number "Energy counter.",
     OperatingHours "operating_hours" "h" Number "Operating hours.",
     FaultCode "fault_code" "" Integer "Active fault code, 0 without a fault.",
-    Run "run" "" Bool "Command: run; read: as the drive has it.",
-    Reverse "reverse" "" Bool "Command: reverse; read: as the drive has it.",
-    FaultReset "fault_reset" "" Bool "Command: true resets a fault by one pulse.",
-    SpeedReference "speed_reference" "%" Number "Speed reference, command and as the drive has it.",
-    FrequencyReference "frequency_reference" "Hz" Number "Frequency reference, command and as the drive has it.",
+    Run "run" "" Bool "Command: run; read: the state in the drive.",
+    Reverse "reverse" "" Bool "Command: reverse; read: the state in the drive.",
+    FaultReset "fault_reset" "" Bool "Command: true resets a fault with one pulse.",
+    SpeedReference "speed_reference" "%" Number "Speed reference, command and value in the drive.",
+    FrequencyReference "frequency_reference" "Hz" Number "Frequency reference, command and value in the drive.",
 }
 
 impl ModelPoint {

@@ -251,23 +251,23 @@ impl Look<'_> {
             Contact::Fresh => return None,
             Contact::Stale => (
                 "stale",
-                "its process data is too old to say anything".to_string(),
-                "see load and errors of the bus: the line may be overloaded or disturbed",
+                "its process data is too old to tell".to_string(),
+                "check load and errors of the bus: the line may be overloaded or disturbed",
             ),
             Contact::Silent if self.profile.counts_messages => (
                 "offline",
-                "it does not answer".to_string(),
-                "check its supply, the wiring and its address; if a master has set it to listen only (function 08, subfunction \
-                 04), write restart_communication=true with `drivegate write`",
+                "it does not reply".to_string(),
+                "check its power supply, wiring and address; if a master has set it to listen-only mode (function 08, \
+                 subfunction 04), write restart_communication=true with `drivegate write`",
             ),
             Contact::Silent => (
                 "offline",
-                "it does not answer".to_string(),
-                "check its supply, the wiring and its address; a drive whose control board has no supply is silent",
+                "it does not reply".to_string(),
+                "check its power supply, wiring and address; a drive whose control board has no power is silent",
             ),
             Contact::Untried => (
                 "offline",
-                "it was not asked yet".to_string(),
+                "it has not been polled yet".to_string(),
                 "wait until the bus has polled it",
             ),
             Contact::BusDown(why) => (
@@ -301,7 +301,7 @@ impl Look<'_> {
                 format!("fault {code}: {}{because}{panel}{unsure}", fault.text)
             }
             (Some(code), None) => format!("fault {code}, without a text in the profile"),
-            (None, _) => "a fault is active; its code is not known".to_string(),
+            (None, _) => "a fault is active; its code is unknown".to_string(),
         };
         let reset = match self
             .profile
@@ -316,7 +316,7 @@ impl Look<'_> {
             .filter(|remedy| !remedy.is_empty())
         {
             Some(remedy) => format!("{remedy}; {reset}"),
-            None => format!("remove what caused it, as the manual of the drive says; {reset}"),
+            None => format!("remove the cause as described in the drive's manual; {reset}"),
         };
         Some(self.cause("fault", evidence, at, &remedy))
     }
@@ -365,8 +365,8 @@ impl Look<'_> {
         if found.iter().any(|cause| cause.cause != LOCAL_CONTROL) {
             return None;
         }
-        let evidence = "ready is off, and the drive does not tell why".to_string();
-        let remedy = "check its enable and interlock inputs, the mains, and what its display shows";
+        let evidence = "ready is off, and the drive does not report why".to_string();
+        let remedy = "check its enable and interlock inputs, the mains and its display";
         let note = self
             .profile
             .model_point(ModelPoint::Ready)
@@ -380,7 +380,8 @@ impl Look<'_> {
 
     /// It takes no order to run, whoever gives it.
     fn held(&self) -> Option<Cause> {
-        let remedy = "let the restore of its parameters end; `drivegate params restore` resumes, undoes or releases one that was cut off";
+        let remedy = "wait for its parameter restore to finish; `drivegate params restore` resumes, undoes or \
+                      releases an interrupted one";
         let held = self.situation.held.clone();
         held.map(|why| self.cause("held", why, None, remedy))
     }
@@ -423,39 +424,39 @@ impl Look<'_> {
         let (cause, evidence, remedy) = match (order.run, order.fate, order.by) {
             (RunWish::Run, Fate::Refused, _) => (
                 "order_refused",
-                format!("run of {who} was refused: {text}"),
-                "correct what it names, then send run again",
+                format!("run from {who} was refused: {text}"),
+                "correct this, then send run again",
             ),
             (RunWish::Run, Fate::NotSent, _) => (
                 "order_expired",
-                format!("run of {who} was not sent: {text}"),
-                "send it again; see the load of the bus if it happens again",
+                format!("run from {who} was not sent: {text}"),
+                "send it again; check the load of the bus if it happens again",
             ),
             (RunWish::Run, Fate::Unsure, _) => (
                 "order_unanswered",
-                format!("run of {who} was not acknowledged: {text}"),
+                format!("run from {who} was not acknowledged: {text}"),
                 "check whether the drive replies, then send it again",
             ),
             (RunWish::Run, Fate::Taken, _) if read_at > ended => (
                 "other_master",
-                format!("run of {who} was acknowledged, and run is off in the drive now"),
+                format!("run from {who} was acknowledged, but run is now off in the drive"),
                 "look for another master that writes the control word; a drive that restarted has lost the command",
             ),
             (RunWish::Run, Fate::Taken, _) => return None,
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Supervision) => (
                 "supervision",
-                format!("its lease ran out, and {}", stopped(order.fate, text)),
-                "have the client renew the lease by commands or heartbeats, then send run again",
+                format!("its lease expired, and {}", stopped(order.fate, text)),
+                "have the client renew the lease with commands or heartbeats, then send run again",
             ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Shutdown) => (
                 "stopped_by_gateway",
-                format!("the gateway ended, and {}", stopped(order.fate, text)),
+                format!("the gateway shut down, and {}", stopped(order.fate, text)),
                 "send run again",
             ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Interlock) => (
                 "stopped_by_interlock",
-                format!("an interlock did not hold, and {}", stopped(order.fate, text)),
-                "send run again once it holds",
+                format!("an interlock was not satisfied, and {}", stopped(order.fate, text)),
+                "send run again once it is satisfied",
             ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::LocalControl) => (
                 "stopped_by_gateway",
@@ -468,14 +469,14 @@ impl Look<'_> {
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Client) => (
                 "stopped_by_order",
                 match order.fate {
-                    Fate::Unsure => format!("a stop of {who} was sent, and not acknowledged: {text}"),
+                    Fate::Unsure => format!("a stop from {who} was sent but not acknowledged: {text}"),
                     _ => format!("{who} stopped it"),
                 },
                 "send run again if it may run",
             ),
             (RunWish::Reset, Fate::Taken | Fate::Unsure, _) => (
                 "fault_was_reset",
-                format!("{who} reset its fault, and a reset starts nothing"),
+                format!("{who} reset its fault, and a reset does not start the motor"),
                 "send run again",
             ),
             (RunWish::Stop | RunWish::Reset, Fate::Refused | Fate::NotSent, _) => return None,
@@ -509,8 +510,8 @@ impl Look<'_> {
         let (reversed, _) = self.bit(ModelPoint::Reversed)?;
         let is_ready = self.bit(ModelPoint::Ready).is_some_and(|(ready, _)| ready);
         (found.is_empty() && is_ready && !reversed).then(|| {
-            let evidence = "run and reverse are on, the drive is ready and does not turn in reverse".to_string();
-            let remedy = "send reverse = false, or allow the direction by the parameter of the drive";
+            let evidence = "run and reverse are on and the drive is ready, but it does not turn in reverse".to_string();
+            let remedy = "send reverse = false, or allow the direction in the drive's parameters";
             self.cause("direction_blocked", evidence, at, remedy)
         })
     }
@@ -518,13 +519,13 @@ impl Look<'_> {
     fn warning(&self) -> Option<Cause> {
         let (_, at) = self.bit(ModelPoint::Warning).filter(|(warning, _)| *warning)?;
         let evidence = "the drive reports a warning".to_string();
-        Some(self.cause("warning", evidence, at, "read it at the display of the drive"))
+        Some(self.cause("warning", evidence, at, "read it on the drive's display"))
     }
 
     fn unknown(&self) -> Cause {
         let (_, at) = self.bit(ModelPoint::Running).unzip();
-        let evidence = "nothing that the drive reports keeps it from running".to_string();
-        let remedy = "look at its display; check what it does not tell";
+        let evidence = "nothing that the drive reports prevents it from running".to_string();
+        let remedy = "look at its display; check what it does not report";
         self.cause(NOT_KNOWN, evidence, at.flatten(), remedy)
     }
 
@@ -550,7 +551,7 @@ impl Look<'_> {
 fn stopped(fate: Fate, text: &str) -> String {
     match fate {
         Fate::Taken => "it acknowledged the stop".to_string(),
-        _ => format!("a stop was sent, and not acknowledged: {text}"),
+        _ => format!("a stop was sent but not acknowledged: {text}"),
     }
 }
 

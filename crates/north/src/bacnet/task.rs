@@ -253,7 +253,8 @@ impl Task {
             }
             Err(why) => tracing::error!(
                 target: "drivegate::bacnet",
-                "cannot read {}: {why}; the slots of before the restart are not kept; write them again, or remove the file", path.display()
+                "cannot read {}: {why}; the slots from before the restart are lost; write them again, or remove the \
+                 file", path.display()
             ),
         }
     }
@@ -267,7 +268,7 @@ impl Task {
             tokio::task::spawn_blocking(move || {
                 if let Err(why) = kept::save(&path, &slots) {
                     tracing::error!(
-                        target: "drivegate::bacnet", "cannot write {}: {why}; slots are not kept over a restart", path.display()
+                        target: "drivegate::bacnet", "cannot write {}: {why}; slots will not survive a restart", path.display()
                     );
                 }
             });
@@ -285,7 +286,9 @@ impl Task {
     fn watch_kept(&mut self) {
         let view = &self.desk.view;
         self.watched.retain(|device| {
-            let Some(drive) = view.drives.get(device) else { return false };
+            let Some(drive) = view.drives.get(device) else {
+                return false;
+            };
             let now = Instant::now();
             let Some(running) = drive.handle.reading(now).model(ModelPoint::Running).good() else {
                 return true;
@@ -297,8 +300,8 @@ impl Task {
             if let (true, Some((priority, who))) = (running.as_bool(), slot) {
                 let spec = &drive.handle.image.spec;
                 let text = format!(
-                    "drive {} runs, and BACnet client {who} keeps `run` inactive at priority {priority} since before the restart; \
-                     nothing was written; stop it, or give the slot back",
+                    "drive {} runs, and BACnet client {who} has held `run` inactive at priority {priority} since \
+                     before the restart; nothing was written; stop the drive, or release the slot",
                     spec.name
                 );
                 drive.handle.publish(Event {
@@ -367,7 +370,8 @@ impl Task {
         match lookup.now_or_never() {
             Some(Ok(Some(address))) => self.desk.server.set_bbmd(Some(address), now),
             _ => tracing::warn!(
-                target: "drivegate::bacnet", "cannot find the BBMD {host}:{port}; trying again every 30 s; check `bbmd` of [bacnet]"
+                target: "drivegate::bacnet", "cannot find the BBMD {host}:{port}; retrying every 30 s; check `bbmd` \
+                                              of [bacnet]"
             ),
         }
     }

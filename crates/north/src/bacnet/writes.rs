@@ -185,7 +185,7 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
         .map_or("NULL".to_string(), |entry| entry.value.to_string());
     tracing::info!(
         target: "drivegate::bacnet", drive, priority, client = %origin.who,
-        "{} = {value} stands in its slot; nothing is sent", write.what.point().name()
+        "{} = {value} is in its slot; nothing is sent", write.what.point().name()
     );
     Some(Begun::Answered(Ok(())))
 }

@@ -173,7 +173,7 @@ impl<R: Clone> Memory<R> {
         }
         if known.stops != stops {
             return Some(Repetition::Outdated(
-                "but the drive was stopped since, or added again by a reload",
+                "but the drive has been stopped since, or added again by a reload",
             ));
         }
         if let Some(last) = self.last_of.get(&known.identity)

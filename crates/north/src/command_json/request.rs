@@ -128,7 +128,7 @@ pub(crate) fn order(payload: &[u8], profile: &Profile) -> Result<Asked, Refusal>
 pub(crate) fn check_size(size: usize) -> Result<(), Refusal> {
     match size > MAX_PAYLOAD {
         true => Err(Refusal::BadValue(format!(
-            "the payload has {size} bytes, {MAX_PAYLOAD} are allowed"
+            "the payload has {size} bytes, at most {MAX_PAYLOAD} are allowed"
         ))),
         false => Ok(()),
     }
@@ -220,7 +220,7 @@ pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(us
         }
         (Kind::Number | Kind::Integer, Json::String(text)) if !point.texts.is_empty() => match point.code_of(text) {
             Some(code) => Value::Integer(code),
-            None => return Err(wrong("a text of its values, or a number")),
+            None => return Err(wrong("one of its texts, or a number")),
         },
         (Kind::Number | Kind::Integer, Json::String(_)) => return Err(wrong("a number; remove the quotes")),
         (Kind::Text, _) => return Err(wrong("written: the point is a text")),

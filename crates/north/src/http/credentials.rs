@@ -26,7 +26,7 @@ pub enum CredentialError {
     #[error("there are two {0}s named `{1}`")]
     Repeated(&'static str, String),
     /// An unknown scope.
-    #[error("`{0}` is not a scope; there are read, metrics and control")]
+    #[error("`{0}` is not a scope; use read, metrics or control")]
     Scope(String),
     /// Not a hash of the kind in the text.
     #[error("the hash is not {0}")]
@@ -36,13 +36,13 @@ pub enum CredentialError {
     Many(&'static str, usize),
     /// A password that is easily guessed, or no text.
     #[error(
-        "a password has at least {} characters, at most {} bytes and no control characters",
+        "a password must have at least {} characters, at most {} bytes and no control characters",
         super::MIN_PASSWORD,
         super::MAX_PASSWORD
     )]
     Password,
     /// The system does not provide them.
-    #[error("the system has no random numbers")]
+    #[error("the system provides no random numbers")]
     Random,
 }
 

@@ -30,7 +30,7 @@ fn search(query: Option<&str>, now: SystemTime) -> Result<Search, QueryError> {
         kinds.push(kind.ok_or_else(|| QueryError::Value {
             name: "kind",
             value: name.to_string(),
-            expected: "it is the `event` of an event, such as `fault`; several are separated by commas",
+            expected: "give values of `event`, such as `fault`, separated by commas",
         })?);
     }
     let point = |text: String| match Before::event(&text) {

@@ -25,7 +25,7 @@ pub(super) fn check(headers: &HeaderMap, plant: &Plant, reached: &Reached) -> Re
     let expected = serde_json::from_slice(&text).map_err(|error| {
         (
             StatusCode::BAD_REQUEST,
-            format!("the header {EXPECT} is not understood: {error}"),
+            format!("the header {EXPECT} is invalid: {error}"),
         )
     })?;
     match expected {
@@ -39,7 +39,7 @@ fn has_configuration(wanted: &Path, reached: &Reached) -> Result<(), Unmet> {
     let other = match local.and_then(|local| local.control.as_ref()) {
         Some(control) if absolute(control.config()) == wanted => return Ok(()),
         Some(control) => format!("the gateway runs with {}", control.config().display()),
-        None => "the gateway runs without a configuration file, or is not asked at its socket".to_string(),
+        None => "the gateway runs without a configuration file, or this is not its local socket".to_string(),
     };
     Err((StatusCode::MISDIRECTED_REQUEST, other))
 }
@@ -72,7 +72,7 @@ fn has_drive(expected: &ExpectedDrive, plant: &Plant) -> Result<(), Unmet> {
     ];
     match pairs.into_iter().find(|(_, runs, wanted)| runs != *wanted) {
         Some((what, runs, wanted)) => other(format!(
-            "the gateway has `{name}` with the {what} `{runs}`, the file has it with `{wanted}`"
+            "the gateway has `{name}` with {what} `{runs}`, the file with `{wanted}`"
         )),
         None => Ok(()),
     }

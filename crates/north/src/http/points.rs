@@ -102,7 +102,7 @@ fn word_of(word: Word, drive: &DriveHandle, reading: &Reading<'_>) -> Result<Str
 fn wanted(profile: &Profile, names: &[&str]) -> Result<Vec<Wanted>, String> {
     if names.len() > MAX_POINTS {
         return Err(format!(
-            "{} points are requested; {MAX_POINTS} are allowed",
+            "{} points are requested; at most {MAX_POINTS} are allowed",
             names.len()
         ));
     }
@@ -161,7 +161,7 @@ fn why_not_good(drive: &DriveHandle, reading: &Reading<'_>, index: usize) -> Str
     }
     match reading.snapshot.link {
         Link::Untried => return "the drive has not been polled yet".to_string(),
-        Link::Offline(_) => return "the drive does not answer".to_string(),
+        Link::Offline(_) => return "the drive does not reply".to_string(),
         Link::Online(_) => {}
     }
     let profile = &reading.spec.profile;
@@ -184,7 +184,7 @@ fn why_not_good(drive: &DriveHandle, reading: &Reading<'_>, index: usize) -> Str
         .into_iter()
         .next()
         .unwrap_or_else(|| match point.map(|point| &point.source) {
-            Some(Source::Derived(_)) => "it cannot be derived: its range is not known".to_string(),
+            Some(Source::Derived(_)) => "it cannot be derived: its range is unknown".to_string(),
             _ => NO_NUMBER.to_string(),
         })
 }

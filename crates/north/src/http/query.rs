@@ -19,7 +19,7 @@ pub(super) enum QueryError {
     Unknown(String, &'static [&'static str]),
     #[error("`{0}` is given twice")]
     Twice(&'static str),
-    #[error("`{name}={value}` is not understood: {expected}")]
+    #[error("`{name}={value}` is invalid: {expected}")]
     Value {
         name: &'static str,
         value: String,

@@ -212,7 +212,7 @@ fn described() -> Api {
         )
         .get(
             "/api/v1/drives/{name}/trend",
-            Doc::any("What values were; without `point` which are kept").query(&[
+            Doc::any("Trend of values; without `point`, which ones are kept").query(&[
                 ("point", POINT),
                 ("from", TIME),
                 ("to", TIME),
@@ -227,27 +227,27 @@ fn described() -> Api {
         )
         .get(
             "/api/v1/drives/{name}/params",
-            Doc::object::<Parameters<'_>>("The last reading of the parameters, and what goes on"),
+            Doc::object::<Parameters<'_>>("The last reading of the parameters, and what is in progress"),
             views::params,
         )
         .get(
             "/api/v1/drives/{name}/params/reading",
-            Doc::object::<ParameterReading>("How far the reading of parameters is"),
+            Doc::object::<ParameterReading>("Progress of the reading of parameters"),
             operating::parameters::progress,
         )
         .post(
             "/api/v1/drives/{name}/params/reading",
-            Doc::object::<ParameterReading>("Starts to read parameters").body::<ReadParameters>(),
+            Doc::object::<ParameterReading>("Starts reading parameters").body::<ReadParameters>(),
             operating::parameters::read,
         )
         .get(
             "/api/v1/drives/{name}/params/restore",
-            Doc::object::<Restore>("How far the restore of parameters is"),
+            Doc::object::<Restore>("Progress of the restore of parameters"),
             operating::parameters::look,
         )
         .post(
             "/api/v1/drives/{name}/params/restore",
-            Doc::object::<Restore>("Prepares a restore of parameters, or goes on with it").body::<RestoreAct>(),
+            Doc::object::<Restore>("Prepares a restore of parameters, or continues it").body::<RestoreAct>(),
             operating::parameters::restore,
         )
         .get(
@@ -289,7 +289,7 @@ fn described() -> Api {
         )
         .get(
             "/api/v1/audit",
-            Doc::any("The last commands").query(&[("drive", "only those to this drive")]),
+            Doc::any("The last commands").query(&[("drive", "only those for this drive")]),
             views::audit,
         )
         .get("/api/v1/recordings", Doc::list::<Entry>("Recordings"), recordings::list)
@@ -305,11 +305,11 @@ fn described() -> Api {
         )
         .get(
             "/api/v1/events/log",
-            Doc::list::<event_log::Shown<'_>>("Events of earlier runs, too, newest first").query(&[
+            Doc::list::<event_log::Shown<'_>>("Events, including earlier runs, newest first").query(&[
                 ("kind", POINT),
                 ("drive", "only of this drive"),
                 ("bus", "only of this bus"),
-                ("text", "only those that contain it"),
+                ("text", "only those that contain this"),
                 ("before", "time, or number of an event"),
                 ("limit", "1 to 1000"),
             ]),
@@ -337,7 +337,7 @@ fn described() -> Api {
         )
         .post(
             "/api/v1/stop",
-            Doc::object::<StopReport>("Stops all drives; 504 if one is not proven to stand").body::<StopBody>(),
+            Doc::object::<StopReport>("Stops all drives; 504 unless all are known to have stopped").body::<StopBody>(),
             operating::stop,
         )
         .get(
@@ -362,7 +362,7 @@ fn described() -> Api {
         )
         .post(
             "/api/v1/drills/{id}/start",
-            Doc::object::<DrillReport>("Starts an armed drill, by who armed it, within 60 s"),
+            Doc::object::<DrillReport>("Starts an armed drill within 60 s; only for the client that armed it"),
             operating::start_drill,
         )
 }
@@ -401,8 +401,8 @@ async fn guard(
         next.run(request).await
     } else if !matches!(*method, Method::GET | Method::HEAD) {
         let text = match is_on {
-            true => "this is read only: use GET or HEAD\n",
-            false => "this interface is read only: use GET or HEAD\n",
+            true => "this is read-only: use GET or HEAD\n",
+            false => "this interface is read-only: use GET or HEAD\n",
         };
         let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
         (StatusCode::METHOD_NOT_ALLOWED, allow, text).into_response()

@@ -91,7 +91,7 @@ pub(super) async fn trend(
         let Some(point) = known.iter().find(|point| point.name() == name) else {
             let known = known.iter().map(|point| point.name().to_string()).collect();
             let drive = &drive.image.spec.name;
-            let why = format!("no trend of `{name}` is kept of drive `{drive}`");
+            let why = format!("no trend of `{name}` is kept for drive `{drive}`");
             return Err(not_found(why, known));
         };
         points.push(*point);

@@ -51,7 +51,7 @@ pub(super) async fn exposition(State(app): State<Arc<AppState>>, headers: Header
             (headers, text).into_response()
         }
         Err(error) => {
-            tracing::error!(target: "drivegate::http", "cannot encode the metrics: {error}; report this");
+            tracing::error!(target: "drivegate::http", "cannot encode the metrics: {error}; please report this");
             StatusCode::INTERNAL_SERVER_ERROR.into_response()
         }
     }

@@ -55,8 +55,8 @@ pub fn absolute(config: &Path) -> PathBuf {
 /// # Errors
 /// It has none, or stops.
 pub(crate) async fn reload(control: Option<&Control>, who: String) -> Result<ReloadOutcome, String> {
-    let stops = || "the gateway stops, and reads its configuration no more".to_string();
-    let control = control.ok_or("the gateway has no configuration file that it could read")?;
+    let stops = || "the gateway is shutting down and no longer reads its configuration".to_string();
+    let control = control.ok_or("the gateway has no configuration file to reload")?;
     let (answer, outcome) = oneshot::channel();
     let order = ReloadOrder { who, answer };
     control.orders.send(order).await.map_err(|_| stops())?;
@@ -87,6 +87,6 @@ mod tests {
         let (outcome, ()) = tokio::join!(reload(Some(&control), who()), async {
             drop(orders.recv().await);
         });
-        assert!(outcome.unwrap_err().contains("the gateway stops"));
+        assert!(outcome.unwrap_err().contains("the gateway is shutting down"));
     }
 }

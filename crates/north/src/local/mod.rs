@@ -101,7 +101,8 @@ impl server::Server for Local {
     /// Its file is removed; a request that is being carried out gets its response from the bus.
     async fn stopped(self) {
         if let Err(error) = self.task.await {
-            tracing::error!(target: "drivegate::local", "the local socket ended by itself: {error}; report this");
+            tracing::error!(target: "drivegate::local", "the local socket ended unexpectedly: {error}; please report \
+                                                         this");
         }
     }
 }
@@ -120,7 +121,7 @@ async fn accept(bound: Bound, door: Arc<Door>, cancel: CancellationToken) {
                 Err(_) => turn_away(&stream),
             },
             Err(error) => {
-                tracing::debug!(target: "drivegate::local", "cannot accept a local client: {error}; trying again");
+                tracing::debug!(target: "drivegate::local", "cannot accept a local client: {error}; retrying");
                 cancel.run_until_cancelled(tokio::time::sleep(ACCEPT_PAUSE)).await;
             }
         }
@@ -129,7 +130,7 @@ async fn accept(bound: Bound, door: Arc<Door>, cancel: CancellationToken) {
 
 /// Answers a client that is too many. What does not fit the socket's buffer at once is dropped.
 fn turn_away(stream: &UnixStream) {
-    let body = format!("{{\"error\":\"{MAX_CLIENTS} local clients are connected already; try again\"}}");
+    let body = format!("{{\"error\":\"{MAX_CLIENTS} local clients are already connected; try again\"}}");
     let head =
         "HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/json\r\nretry-after: 1\r\nconnection: close";
     let _ = stream.try_write(format!("{head}\r\ncontent-length: {}\r\n\r\n{body}", body.len()).as_bytes());

@@ -172,7 +172,7 @@ async fn remove_if_dead(path: &Path) -> io::Result<()> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
         Err(error) => return Err(error),
         Ok(file) if !file.file_type().is_socket() => {
-            return Err(io::Error::other("a file that is not a socket is in its place"));
+            return Err(io::Error::other("its path is taken by a file that is not a socket"));
         }
         Ok(_) => {}
     }

@@ -36,11 +36,11 @@ pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Famili
 fn drives(plant: &Plant, now: Instant, all: &mut Families) {
     let up = all.gauge(
         "drivegate_drive_up",
-        "Whether the drive answers: 1, else 0 (also before its first answer).",
+        "Whether the drive replies: 1, else 0 (also before its first reply).",
     );
     let state = all.gauge(
         "drivegate_drive_state",
-        "State of the drive: 1 for the state it is in, 0 for the others; absent while it is not known.",
+        "State of the drive: 1 for the state it is in, 0 for the others; absent while it is unknown.",
     );
     let blocked = all.gauge(
         "drivegate_drive_blocked",
@@ -57,7 +57,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
     let model = MODEL.map(|(_, name, help)| all.gauge(name, help));
     let point = all.gauge(
         "drivegate_point_value",
-        "Points of a drive without a metric of their own, in their unit; true is 1.",
+        "Points of a drive that have no metric of their own, in their unit; true is 1.",
     );
     let transactions = all.counter(
         "drivegate_drive_transactions_total",
@@ -65,7 +65,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
     );
     let turnaround = all.gauge(
         "drivegate_drive_turnaround_seconds",
-        "Time from the end of the last request to the beginning of the drive's answer.",
+        "Time from the end of the last request to the start of the drive's reply.",
     );
     let refused = all.counter(
         "drivegate_starts_refused_total",
@@ -73,11 +73,11 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
     );
     let supervision = all.counter(
         "drivegate_supervision_actions_total",
-        "Leases that ran out while the drive ran or had its run command.",
+        "Leases that expired while the drive ran or had its run command set.",
     );
     let failed = all.counter(
         "drivegate_supervision_failed_total",
-        "Tries of the action of a lease, or of the stop of a shutdown, that failed.",
+        "Failed attempts at the action of a lease, or at the stop at shutdown.",
     );
     let unsupervised = all.gauge(
         "drivegate_drive_unsupervised",
@@ -89,13 +89,16 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
     );
     let unheld = all.counter(
         "drivegate_orders_unheld_total",
-        "Orders of clients that did not hold the drive, which advisory mode carried out.",
+        "Commands from clients that did not hold the drive, executed in advisory mode.",
     );
     let drill_age = all.gauge(
         "drivegate_drill_age_seconds",
-        "Time since the last drill of that way was tried to its end; no series where none was.",
+        "Time since the last completed drill of that kind; no series before the first.",
     );
-    let drill_passed = all.gauge("drivegate_drill_passed", "1 if the motor stood in time in that drill.");
+    let drill_passed = all.gauge(
+        "drivegate_drill_passed",
+        "1 if the motor stopped in time in that drill.",
+    );
     let drills = plant.drills.options().is_some();
     for drive in plant.drives() {
         let image = &drive.image;
@@ -159,11 +162,11 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
 fn runs(plant: &Plant, all: &mut Families) {
     let starts = all.counter(
         "drivegate_drive_starts_total",
-        "Starts of the motor that were seen; kept over restarts of the gateway.",
+        "Observed starts of the motor; kept across restarts of the gateway.",
     );
     let running = all.counter(
         "drivegate_drive_running_seconds_total",
-        "Time that the motor was seen running; kept over restarts of the gateway.",
+        "Observed run time of the motor; kept across restarts of the gateway.",
     );
     for drive in plant.drives() {
         let spec = &drive.image.spec;
@@ -240,11 +243,11 @@ fn buses(handles: &[BusHandle], all: &mut Families) {
     );
     let queue = all.gauge(
         "drivegate_bus_queue_depth",
-        "Commands and forwarded reads that wait for the bus.",
+        "Commands and forwarded reads waiting for the bus.",
     );
     let reconnects = all.counter(
         "drivegate_port_reconnects_total",
-        "Times that a device server closed its connection after replies, and was connected to again at once.",
+        "Connections that a device server closed after replies and that were reopened at once.",
     );
     let diagnosis = all.gauge(
         "drivegate_line_diagnosis",
@@ -270,7 +273,7 @@ fn buses(handles: &[BusHandle], all: &mut Families) {
 }
 
 fn writes(plant: &Plant, all: &mut Families) {
-    let results = all.counter("drivegate_writes_total", "Commands answered, by source and result.");
+    let results = all.counter("drivegate_writes_total", "Completed commands, by source and result.");
     for ((source, result), count) in plant.writes.results() {
         let labels = Labels::default().with_both(("source", source.name().into()), ("result", result.into()));
         all.add(results, labels, count);
@@ -278,12 +281,12 @@ fn writes(plant: &Plant, all: &mut Families) {
     all.one(
         Kind::Histogram,
         "drivegate_write_seconds",
-        "Time from the acceptance of a command to its answer.",
+        "Time from the acceptance of a command to its result.",
         plant.writes.seconds(),
     );
     let lost = all.counter(
         "drivegate_audit_lost_total",
-        "Records that the audit file lacks because the disk did not take them.",
+        "Records missing from the audit file because the disk did not accept them.",
     );
     if let Some(file) = plant.writes.audit().file() {
         let (sent, not_sent) = file.lost();
@@ -296,7 +299,7 @@ fn writes(plant: &Plant, all: &mut Families) {
 fn recordings(plant: &Plant, all: &mut Families) {
     let made = all.counter(
         "drivegate_recordings_total",
-        "Recordings made since the start, by what made them.",
+        "Recordings made since the start, by trigger.",
     );
     let counts = plant.recordings.made();
     for kind in TriggerKind::ALL {
@@ -308,7 +311,7 @@ fn recordings(plant: &Plant, all: &mut Families) {
 fn parameters(plant: &Plant, all: &mut Families) {
     let changed = all.counter(
         "drivegate_parameters_changed_total",
-        "Parameters of the drive that changed from one reading to the next and that the gateway did not write.",
+        "Parameters of the drive that changed between two readings without being written by the gateway.",
     );
     let counts = plant.parameters.changed();
     for drive in plant.drives() {
@@ -323,13 +326,15 @@ fn bacnet(stats: &NorthStats, all: &mut Families) {
     let counters = figures.counters;
     let requests = all.counter(
         "drivegate_bacnet_requests_total",
-        "BACnet requests that were answered, by outcome.",
+        "BACnet requests answered, by outcome.",
     );
     for (outcome, count) in [("ok", counters.done), ("refused", counters.refused)] {
         all.add(requests, Labels::of([("outcome", outcome)]), count);
     }
-    let datagrams = all.counter("drivegate_bacnet_datagrams_total",
-        "BACnet datagrams: received, discarded (not understood, or not allowed), dropped (the address had its share of answers).",
+    let datagrams = all.counter(
+        "drivegate_bacnet_datagrams_total",
+        "BACnet datagrams: received, discarded (invalid, or not allowed), dropped (the address had used up its share \
+         of answers).",
     );
     let fates = [
         ("received", counters.received),
@@ -348,14 +353,14 @@ fn bacnet(stats: &NorthStats, all: &mut Families) {
     all.one(
         Kind::Gauge,
         "drivegate_bacnet_subscriptions",
-        "Subscriptions of BACnet clients now.",
+        "Current subscriptions of BACnet clients.",
         counters.subscriptions as f64,
     );
     if let Some((_, registration)) = figures.bbmd {
         all.one(
             Kind::Gauge,
             "drivegate_bacnet_bbmd_registered",
-            "Whether the BBMD passes broadcasts on: 1, else 0.",
+            "Whether the gateway is registered at the BBMD: 1, else 0.",
             registration == drivegate_bacnet::Registration::Registered,
         );
     }
@@ -365,7 +370,7 @@ fn north(stats: &NorthStats, all: &mut Families) {
     all.one(
         Kind::Gauge,
         "drivegate_modbus_tcp_connections",
-        "Modbus TCP clients connected now.",
+        "Currently connected Modbus TCP clients.",
         stats.modbus_tcp.connections() as f64,
     );
     let requests = all.counter(
@@ -387,7 +392,7 @@ fn north(stats: &NorthStats, all: &mut Families) {
     bacnet(stats, all);
     let listener_up = all.gauge(
         "drivegate_listener_up",
-        "Whether all addresses of a server are listened on: 1; 0 while one of them is not, which /readyz names.",
+        "Whether a server listens on all its addresses: 1, else 0; /readyz names the one that fails.",
     );
     for (server, up) in stats.listeners.up() {
         let labels = Labels::of([("server", server.name())]);
@@ -420,18 +425,18 @@ fn north(stats: &NorthStats, all: &mut Families) {
     all.one(
         Kind::Counter,
         "drivegate_mqtt_published_total",
-        "Messages sent to the MQTT broker; with QoS 1 those that it acknowledged.",
+        "Messages sent to the MQTT broker; with QoS 1, those it acknowledged.",
         mqtt.published.load(Ordering::Relaxed),
     );
     all.one(
         Kind::Gauge,
         "drivegate_mqtt_buffered_messages",
-        "Messages that wait for the MQTT broker.",
+        "Messages waiting for the MQTT broker.",
         mqtt.buffered.load(Ordering::Relaxed) as f64,
     );
     let lost = all.counter(
         "drivegate_mqtt_lost_total",
-        "Messages that MQTT lost, by kind: the buffer was full or damaged, or the broker refused them.",
+        "Lost MQTT messages, by kind: the buffer was full or damaged, or the broker refused them.",
     );
     for (kind, count) in mqtt.losses() {
         all.add(lost, Labels::default().with("kind", kind.name()), count);
@@ -450,7 +455,7 @@ fn reload(stats: &NorthStats, all: &mut Families) {
     all.one(
         Kind::Gauge,
         "drivegate_config_last_reload_timestamp_seconds",
-        "When the last reload of the configuration ended, applied or refused; the start counts as one.",
+        "When the last reload of the configuration ended, applied or refused; startup counts as one.",
         (since_epoch.as_secs_f64() * 1e3).round() / 1e3,
     );
 }

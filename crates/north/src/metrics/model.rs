@@ -16,7 +16,7 @@ pub(super) const MODEL: [(ModelPoint, &str, &str); 19] = gauges! {
     AtReference "drivegate_drive_at_reference" "Whether the output has reached the reference."
     ActualSpeed "drivegate_drive_actual_speed_percent" "Speed in percent of the speed range."
     SpeedReference "drivegate_drive_speed_reference_percent"
-        "Speed reference as the drive has it, in percent of the speed range."
+        "Speed reference as read from the drive, in percent of the speed range."
     OutputFrequency "drivegate_drive_output_frequency_hertz" "Output frequency."
     MotorSpeed "drivegate_drive_motor_speed_rpm" "Motor speed in revolutions per minute."
     MotorCurrent "drivegate_drive_motor_current_amperes" "Motor current."

@@ -242,7 +242,7 @@ fn remedy(reached: LimitReached) -> String {
 }
 
 fn handshake_remedy(_: LimitReached) -> String {
-    "their TLS handshakes are not complete; they have 10 s for that".to_string()
+    "their TLS handshakes are not complete; they have 10 s for them".to_string()
 }
 
 fn contains(networks: &[IpNet], address: IpAddr) -> bool {

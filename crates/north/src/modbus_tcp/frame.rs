@@ -40,8 +40,8 @@ pub(crate) enum NotModbus {
     Length(u16),
     /// As from a client of a serial line that a device server would pass on.
     #[error(
-        "the client speaks Modbus {0} over TCP; set it to Modbus TCP (MBAP), or let it use a tool slot of the bus ([[bus.slot]]), \
-         which accepts frames of the line"
+        "the client speaks Modbus {0} over TCP; set it to Modbus TCP (MBAP), or let it use a tool slot of the bus \
+         ([[bus.slot]]), which accepts serial frames"
     )]
     Serial(&'static str),
 }

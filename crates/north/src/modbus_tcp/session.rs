@@ -199,7 +199,7 @@ impl ClientSession {
     fn log_foreign_code(&self, drive: &str, code: Exception, now: Instant) {
         if let Some(suppressed) = self.foreign_codes.permit(now) {
             tracing::warn!(target: "drivegate::north::modbus_tcp", drive, client = %self.client.who, suppressed,
-                "Modbus TCP: the drive answered {code}; passed on as exception 04");
+                "Modbus TCP: the drive replied {code}; passed on as exception 04");
         }
     }
 

@@ -46,17 +46,17 @@ impl BrokerLimits {
         let all = [
             (
                 self.acknowledges,
-                "has no QoS 1: events and results that are under way when a connection breaks are lost",
+                "has no QoS 1: events and results in flight when a connection breaks are lost",
             ),
             (
                 self.retains,
-                "keeps no retained messages: later subscribers see no status, and each value only when it is \
-                 published again",
+                "keeps no retained messages: later subscribers get no status, and each value only when it is next \
+                 published",
             ),
             (
                 self.wildcards,
-                "accepts no filters with wildcards: the gateway subscribes drive by drive, and commands for \
-                 unknown drives or points get no answer",
+                "accepts no filters with wildcards: the gateway subscribes drive by drive, and commands for unknown \
+                 drives or points get no result",
             ),
         ];
         all.into_iter().filter(|(has, _)| !has).map(|(_, lost)| lost).collect()

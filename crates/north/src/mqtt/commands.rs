@@ -191,7 +191,7 @@ impl Commands {
                 Some(Repetition::Outdated(why)) => Some(repeats(why)),
                 // Its stop is carried out once more, and answered once more.
                 Some(Repetition::Pending | Repetition::Answered(_)) if stop.is_some() => {
-                    Some(repeats("and only its stop is carried out again"))
+                    Some(repeats("so only its stop is executed again"))
                 }
                 Some(Repetition::Pending) => return None,
                 Some(Repetition::Answered(previous)) => return Some(reply.with(previous.to_vec())),
@@ -253,7 +253,7 @@ impl Commands {
                     .to_string(),
             )),
             None => Err(Refusal::BadValue(
-                "the payload is take, renew, release or break".to_string(),
+                "the payload must be take, renew, release or break".to_string(),
             )),
             Some(verb) => Ok(verb),
         };
@@ -309,7 +309,7 @@ impl Commands {
         if crowded(reply.topic()) {
             let topic = excerpt(reply.topic().as_bytes());
             return Err(format!(
-                "too many results wait for the broker on {topic}; wait for them; nothing was written"
+                "too many results are waiting for the broker on {topic}; wait for them; nothing was written"
             ));
         }
         if id.is_some() && !self.memory.lock().has_room(now) {

@@ -508,8 +508,9 @@ const MQTT_5: &str = "the gateway requires MQTT 5: use Mosquitto 1.6 or later, o
 pub(super) const CLOSED: &str = "the broker closed the connection";
 
 /// The broker ended the connection before TLS was there, and did not say why.
-const HANDSHAKE_END: &str = "the broker closed the connection during the TLS handshake: it does perhaps not speak TLS on this port, \
-    or refuses the gateway; check the port in mqtt.url, usually 8883, and the broker's log";
+const HANDSHAKE_END: &str = "the broker closed the connection during the TLS handshake: perhaps it does not use TLS \
+                             on this port, or refuses the gateway; check the port in mqtt.url, usually 8883, and the \
+                             broker's log";
 
 /// Whether the other end closed the connection.
 fn is_closed(error: &ConnectionError) -> bool {
@@ -550,7 +551,7 @@ fn reason(error: &ConnectionError) -> String {
     }
     let advice = match code {
         BadUserNamePassword | NotAuthorized | Banned => {
-            "; check mqtt.username, mqtt.password_file and the permissions at the broker"
+            "; check mqtt.username, mqtt.password_file and the permissions on the broker"
         }
         ClientIdentifierNotValid => "; change mqtt.client_id",
         _ => "",

@@ -146,8 +146,9 @@ impl Journal {
         let bytes = fs::read(&path)?;
         if let Some(version) = record::other_version(&bytes) {
             tracing::warn!(
-                target: "drivegate::north::mqtt", "{} was written by another version of drivegate (form {:?}, this one reads 'J'); it is left as it is; that \
-                 version publishes what is in it, or remove it",
+                target: "drivegate::north::mqtt", "{} was written by another version of drivegate (form {:?}, this \
+                                                   one reads 'J'); it is left as it is; that version publishes its \
+                                                   messages, or remove it",
                 path.display(),
                 char::from(version),
             );
@@ -170,7 +171,8 @@ impl Journal {
             {
                 // Nothing in it is understood, and nothing of it could be kept elsewhere.
                 let path = path.display();
-                tracing::warn!(target: "drivegate::north::mqtt", "{path}: none of it is valid; it is left as it is, and nothing of it is published");
+                tracing::warn!(target: "drivegate::north::mqtt", "{path}: nothing in it is valid; it is left as it \
+                                                                  is, and nothing from it is published");
                 return Ok(());
             }
             self.lost += 1;
@@ -495,8 +497,9 @@ impl Journal {
         }
         (self.wiped, self.unsynced) = (true, true);
         tracing::error!(
-            target: "drivegate::north::mqtt", "the files of {} in {} were deleted while the gateway runs: written again, {kept} bytes; do not clean this \
-             directory, or stop the gateway before",
+            target: "drivegate::north::mqtt", "the files of {} in {} were deleted while the gateway was running: \
+                                               rewritten, {kept} bytes; do not clean this directory, or stop the \
+                                               gateway first",
             place.name,
             place.dir.display()
         );
@@ -543,7 +546,7 @@ impl Journal {
         let path = dir.join(format!("{name}-{segment:012}-{offset}{DAMAGED}"));
         let kept = remove_old_quarantine(dir, name).and_then(|()| fs::write(&path, bytes));
         let shown = match &kept {
-            Err(error) => format!("they cannot be kept: {error}"),
+            Err(error) => format!("they cannot be saved: {error}"),
             Ok(()) => format!("kept in {}", path.display()),
         };
         tracing::warn!(

@@ -191,7 +191,7 @@ impl BrokerLink {
             State::Up(_, Phase::Subscribing { since, .. })
                 if now.saturating_duration_since(*since) > SUBSCRIBE_TIMEOUT =>
             {
-                Due::GiveUp("the broker does not answer the subscription")
+                Due::GiveUp("the broker does not reply to the subscription")
             }
             State::Up(connection, phase) => match connection.is_silent(phase.limits().copied(), now) {
                 true => Due::GiveUp("the broker is silent"),
@@ -280,7 +280,7 @@ impl BrokerLink {
             .is_some_and(|outages| outages.permit(why, now))
         {
             let hint = match why.contains("SessionTakenOver") {
-                true => "; another client has the same client id: give each gateway a name or a `client_id` of its own",
+                true => "; another client has the same client id: give each gateway its own name or `client_id`",
                 false => "",
             };
             let next = match self.rotation.is_single() {

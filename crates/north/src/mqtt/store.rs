@@ -375,7 +375,8 @@ impl Thread {
         if unkept > 0 {
             self.lost.add(unkept);
             tracing::error!(
-                target: "drivegate::north::mqtt", "{unkept} messages that the broker did not take are lost: {} does not take them either; check mqtt.buffer",
+                target: "drivegate::north::mqtt", "{unkept} messages that the broker did not accept are lost: {} does \
+                                                   not accept them either; check mqtt.buffer",
                 self.dir.display()
             );
         }

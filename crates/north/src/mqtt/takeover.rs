@@ -34,9 +34,9 @@ impl Takeovers {
     /// What it looks like, and the remedy.
     pub(super) fn words(client_id: &str) -> String {
         format!(
-            "the broker closed {CLOSED} connections within a minute without giving a reason; this is what it looks like when another \
-             client uses the client id `{client_id}`, too: each takes the connection from the other; give each gateway a name or a \
-             `client_id` of its own"
+            "the broker closed {CLOSED} connections within a minute without giving a reason; this usually means that \
+             another client also uses the client id `{client_id}`, and the two disconnect each other; give each \
+             gateway its own name or `client_id`"
         )
     }
 }

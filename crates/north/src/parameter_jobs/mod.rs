@@ -223,7 +223,7 @@ async fn latest(store: Option<Store>, drive: String) -> Option<ParameterFile> {
     let store = store?;
     let read = tokio::task::spawn_blocking(move || store.latest(&drive)).await.ok()?;
     read.unwrap_or_else(|why| {
-        tracing::warn!(target: "drivegate::north::parameter_jobs", "the last reading of parameters is left out: {why}");
+        tracing::warn!(target: "drivegate::north::parameter_jobs", "the last reading of parameters is skipped: {why}");
         None
     })
 }
@@ -232,8 +232,8 @@ async fn keep(store: Store, file: ParameterFile) {
     let dir = store.dir().display().to_string();
     let kept = tokio::task::spawn_blocking(move || store.keep(&file)).await;
     if let Ok(Err(error)) = kept {
-        tracing::warn!(target: "drivegate::north::parameter_jobs", "a reading of parameters cannot be kept in {dir}: \
-            {error}; free space or correct its permissions");
+        tracing::warn!(target: "drivegate::north::parameter_jobs", "a reading of parameters cannot be saved in {dir}: \
+                                                                    {error}; free space or correct its permissions");
     }
 }
 

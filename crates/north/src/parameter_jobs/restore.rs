@@ -180,7 +180,12 @@ pub async fn take_up(plant: &SharedPlant, drive: &DriveHandle, again: Again, ori
     let spec = &drive.image.spec;
     may_restore(spec)?;
     let vault = plant.load().parameters.clone();
-    let nothing = || format!("no restore of `{}` was cut off: there is nothing to take up", spec.name);
+    let nothing = || {
+        format!(
+            "no restore of `{}` was interrupted: there is nothing to resume",
+            spec.name
+        )
+    };
     let concerned = concerning(&vault, plant, drive).await?.ok_or_else(nothing)?;
     let (file, text) = concerned.own(drive)?;
     let mut journal = Journal::parse(&text, &spec.profile).map_err(|why| not_understood(&file, &spec.name, &why))?;
@@ -226,12 +231,13 @@ pub async fn release(plant: &SharedPlant, drive: &DriveHandle, origin: &Origin) 
     };
     let stage = match released {
         Err(why) => RestoreStage::Failed(why),
-        Ok(None) if drive.image.hold.why().is_none() => {
-            RestoreStage::Failed(format!("no restore of `{}` was cut off: nothing is held", spec.name))
-        }
+        Ok(None) if drive.image.hold.why().is_none() => RestoreStage::Failed(format!(
+            "no restore of `{}` was interrupted: nothing is held",
+            spec.name
+        )),
         Ok(None) => {
             drive.image.hold.set(None);
-            RestoreStage::Ended(format!("`{}` takes commands again; the journal is gone", spec.name))
+            RestoreStage::Ended(format!("`{}` accepts commands again; the journal is gone", spec.name))
         }
         Ok(Some(aside)) => {
             drive.image.hold.set(None);
@@ -240,7 +246,8 @@ pub async fn release(plant: &SharedPlant, drive: &DriveHandle, origin: &Origin) 
                 "the restore of its parameters was released half done; the journal is {}", aside.display()
             );
             RestoreStage::Ended(format!(
-                "`{}` takes all orders again; its parameters are as the restore left them, and the former values are in {}",
+                "`{}` accepts all commands again; its parameters are as the restore left them, and the former values \
+                 are in {}",
                 spec.name,
                 aside.display()
             ))
@@ -251,7 +258,7 @@ pub async fn release(plant: &SharedPlant, drive: &DriveHandle, origin: &Origin) 
 }
 
 fn no_store() -> String {
-    "the gateway keeps no readings, so there is no place for a journal".to_string()
+    "the gateway stores no readings, so there is no place for a journal".to_string()
 }
 
 /// Something with the disk, by a thread that may wait for it.
@@ -260,7 +267,7 @@ pub(super) async fn blocking<T: Send + 'static>(
 ) -> Result<T, String> {
     match tokio::task::spawn_blocking(work).await {
         Ok(done) => done.map_err(|error| error.to_string()),
-        Err(_) => Err("the gateway stops".to_string()),
+        Err(_) => Err("the gateway is shutting down".to_string()),
     }
 }
 
@@ -278,18 +285,18 @@ fn identified(drive: &DriveHandle, of: &Owner) -> Identified {
     if *then == now || then == NO_IDENTIFICATION || then.contains(NOT_KNOWN) {
         Identified::Same
     } else if now.contains(NOT_KNOWN) {
-        Identified::NotYet(format!("`{name}` has not said yet which drive it is"))
+        Identified::NotYet(format!("`{name}` has not reported its identification yet"))
     } else {
         Identified::Other(format!(
-            "`{name}` is another drive than that of the restore: it says `{now}` of itself, and the journal belongs to one that says \
-             `{then}`; put that back, or set the journal aside by `drivegate params restore --release {name}`"
+            "`{name}` is not the drive of the restore: it identifies itself as `{now}`, but the journal belongs to \
+             `{then}`; put that drive back, or set the journal aside with `drivegate params restore --release {name}`"
         ))
     }
 }
 
 /// Why the drive takes no orders while parameters are written.
 fn held_while_written(name: &str) -> String {
-    format!("the parameters of `{name}` are being restored: until then the drive takes no commands but stops")
+    format!("the parameters of `{name}` are being restored: until then the drive accepts only stops")
 }
 
 fn start(
@@ -340,7 +347,7 @@ impl Run {
                 .is_some_and(|restore| restore.is_unwanted)
                 && self.restoration.end().is_none()
             {
-                self.restoration.give_up("it was to be released".to_string());
+                self.restoration.give_up("it is to be released".to_string());
             }
             match self.restoration.wanted() {
                 Wanted::Record => {
@@ -385,7 +392,7 @@ impl Run {
             if plant.drive(&self.name).is_some() {
                 return Err(format!(
                     "in the new configuration `{}` is another drive: the restore and its journal belong to {of}, \
-                     which is `{name}` now",
+                     which is now `{name}`",
                     self.name
                 ));
             }
@@ -446,7 +453,7 @@ impl Run {
         let drive = self.plant.load().drive_at(&self.machine);
         let name = drive.as_ref().map_or(&self.name, |drive| &drive.image.spec.name);
         let saved = match self.restoration.journal().plan.handling.save {
-            Some(_) => ", and was made to keep them",
+            Some(_) => ", and has saved them",
             None => "",
         };
         let (stage, held) = match self.restoration.end() {
@@ -467,7 +474,7 @@ impl Run {
                     Some(End::Unfinished(why)) => why.as_str(),
                     _ => "it was interrupted",
                 };
-                let text = held_unfinished(name, &format!("{why}; {done} of {all} are done"));
+                let text = held_unfinished(name, &format!("{why}; {done} of {all} done"));
                 (RestoreStage::Failed(text.clone()), Some(text))
             }
         };
@@ -476,7 +483,9 @@ impl Run {
                 tracing::error!(target: "drivegate::north::parameter_jobs", drive = %name, "its parameters were not restored: {why}")
             }
             RestoreStage::Ended(text) => {
-                tracing::warn!(target: "drivegate::north::parameter_jobs", drive = %name, "the restore of its parameters is over: {text}")
+                tracing::warn!(target: "drivegate::north::parameter_jobs", drive = %name, "the restore of its \
+                                                                                           parameters has ended: \
+                                                                                           {text}")
             }
             _ => {}
         }

@@ -38,7 +38,7 @@ impl Concerning {
         match self.text {
             Ok(Some(text)) => Ok((self.file, text)),
             Ok(None) => Err(format!(
-                "no restore of `{}` was cut off: there is nothing to take up",
+                "no restore of `{}` was interrupted: there is nothing to resume",
                 spec.name
             )),
             Err(error) => Err(not_understood(&self.file, &spec.name, &error.to_string())),
@@ -56,7 +56,7 @@ pub(super) async fn concerning(
     drive: &DriveHandle,
 ) -> Result<Option<Concerning>, String> {
     let store = vault.store();
-    let store = store.ok_or("the gateway keeps no readings, so there is no place for a journal")?;
+    let store = store.ok_or("the gateway stores no readings, so there is no place for a journal")?;
     let plant = plant.load_full();
     let (machine, others) = (drive.machine(), vault.others());
     blocking(move || {
@@ -133,8 +133,8 @@ fn orphaned((file, owner): &Found) -> (PathBuf, String, &'static str) {
         ),
         Err(why) => (
             file.path(),
-            format!("the journal of a restore of parameters is not understood: {why}"),
-            "look at it, then move it away",
+            format!("the journal of a restore of parameters cannot be read: {why}"),
+            "examine it, then move it away",
         ),
     }
 }
@@ -142,8 +142,8 @@ fn orphaned((file, owner): &Found) -> (PathBuf, String, &'static str) {
 /// Why a drive is held when a restore of it was interrupted.
 pub(super) fn held_unfinished(name: &str, why: &str) -> String {
     format!(
-        "the parameters of `{name}` may be half restored ({why}): the drive takes no commands but stops until \
-         `drivegate params restore --resume {name}` has written the rest, --undo {name} the former values, or --release {name} \
+        "the parameters of `{name}` may be half restored ({why}): the drive accepts only stops until `drivegate \
+         params restore --resume {name}` has written the rest, --undo {name} the former values, or --release {name} \
          leaves them as they are"
     )
 }
@@ -152,22 +152,20 @@ pub(super) fn held_unfinished(name: &str, why: &str) -> String {
 fn belongs_elsewhere(name: &str, profile: &str, claim: Claim, owner: &Owner) -> String {
     let but = match claim {
         Claim::Own | Claim::Name => "where no drive is configured now".to_string(),
-        Claim::Place => format!("and the drive there is configured with profile `{profile}` now"),
+        Claim::Place => format!("and the drive there is now configured with profile `{profile}`"),
     };
     format!(
-        "a restore of parameters was interrupted, and its journal belongs to {}, {but}: whether `{name}` is the drive \
-         that may be \
-         half restored is not known; it takes no commands but stops until that drive is configured as it was, or \
-         `drivegate params restore \
-         --release {name}` sets the journal aside",
+        "a restore of parameters was interrupted, and its journal belongs to {}, {but}: it is unknown whether \
+         `{name}` is the drive that may be half restored; it accepts only stops until that drive is configured as \
+         before, or `drivegate params restore --release {name}` sets the journal aside",
         owner.place()
     )
 }
 
 pub(super) fn not_understood(file: &JournalFile, name: &str, why: &str) -> String {
     format!(
-        "the journal of a restore, {}, is not understood: {why}; look at it, then set it aside by `drivegate params restore \
-         --release {name}`",
+        "the journal of a restore, {}, cannot be read: {why}; examine it, then set it aside with `drivegate params \
+         restore --release {name}`",
         file.path().display()
     )
 }
@@ -210,7 +208,7 @@ pub async fn hold_unfinished<'a>(
     for drive in drives.iter().filter(|drive| drive.is_new) {
         vault.hold(&drive.machine).set(Some(format!(
             "a restore of the parameters of `{}` may have been interrupted; until its journal is read, the drive \
-             takes no commands but stops",
+             accepts only stops",
             drive.spec.name
         )));
     }
@@ -218,8 +216,8 @@ pub async fn hold_unfinished<'a>(
     let looked = tokio::task::spawn_blocking(move || look(&vault, &events, store.dir(), &drives));
     if tokio::time::timeout(LOOK, looked).await.is_err() {
         tracing::warn!(
-            target: "drivegate::north::parameter_jobs", "the disk is slow: the drives take no commands but stops \
-                before the journals of restores are read"
+            target: "drivegate::north::parameter_jobs", "the disk is slow: the drives accept only stops until the \
+                                                         journals of restores are read"
         );
     }
 }
@@ -230,10 +228,7 @@ fn look(vault: &Vault, events: &Events, params: &Path, drives: &[Configured]) {
         Err(error) => {
             for drive in drives.iter().filter(|drive| drive.is_new) {
                 let name = &drive.spec.name;
-                let why = format!(
-                    "the journals of restores in {} cannot be looked for: {error}",
-                    params.display()
-                );
+                let why = format!("cannot look for journals of restores in {}: {error}", params.display());
                 hold(vault, events, drive, held_unfinished(name, &why));
             }
             return;

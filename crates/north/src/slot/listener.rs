@@ -113,5 +113,5 @@ impl ConnectionHandler for SlotListener {
 }
 
 fn remedy(_: LimitReached) -> String {
-    format!("an address of a slot serves {MAX_TOOLS} tools at one time; close one, or open another slot")
+    format!("an address of a slot serves {MAX_TOOLS} tools at a time; close one, or open another slot")
 }

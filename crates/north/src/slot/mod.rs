@@ -53,7 +53,7 @@ impl SlotAccess {
     /// In words.
     pub fn meaning(self) -> &'static str {
         match self {
-            SlotAccess::Read => "tools read only",
+            SlotAccess::Read => "tools may only read",
             SlotAccess::Write => "tools may write what Modbus TCP clients may",
             SlotAccess::Raw => "tools may write, broadcast and send what cannot be checked",
         }

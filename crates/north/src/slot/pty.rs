@@ -51,7 +51,8 @@ pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: Cancellation
         };
         let why = why.to_string();
         if why != told {
-            tracing::warn!(target: "drivegate::north::slot", %bus, "tool slot: no pseudo-terminal: {why}; trying again every {} s", AGAIN.as_secs());
+            tracing::warn!(target: "drivegate::north::slot", %bus, "tool slot: no pseudo-terminal: {why}; retrying \
+                                                                    every {} s", AGAIN.as_secs());
             told = why;
         }
         if cancel.run_until_cancelled(tokio::time::sleep(AGAIN)).await.is_none() {

@@ -233,7 +233,7 @@ impl Tool {
             false => "what it writes cannot be checked",
         };
         if self.terms.slot.access != SlotAccess::Raw {
-            let text = format!("{why}; only a slot with access = \"raw\" passes it on");
+            let text = format!("{why}; only a slot with access = \"raw\" forwards it");
             return self.refuse_any(case, request, drives, pdu, Refusal::NotAllowed(text));
         }
         for drive in drives {

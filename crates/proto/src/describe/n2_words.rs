@@ -46,7 +46,7 @@ pub(super) fn stray(bytes: &[u8]) -> String {
         return format!("foreign: a request to address {address}");
     }
     if is_answer(bytes) {
-        return "foreign: an answer that nobody asked for, or too late".to_string();
+        return "foreign: an unsolicited or late reply".to_string();
     }
     super::no_frame(bytes)
 }

@@ -340,8 +340,5 @@ fn n2_in_the_words_of_its_objects() {
         assert_eq!(reply(Protocol::N2, &Request::new(1, pdu), bytes.as_bytes()), reported);
     }
     assert_eq!(stray(Protocol::N2, b">01FA7\r"), "foreign: a request to address 1");
-    assert_eq!(
-        stray(Protocol::N2, b"A1061\r"),
-        "foreign: an answer that nobody asked for, or too late"
-    );
+    assert_eq!(stray(Protocol::N2, b"A1061\r"), "foreign: an unsolicited or late reply");
 }

@@ -68,7 +68,7 @@ impl Exception {
             0x06 => "device busy",
             0x08 => "memory parity error",
             0x0A => "gateway path unavailable",
-            0x0B => "device behind the gateway does not answer",
+            0x0B => "device behind the gateway does not reply",
             0x21 => "data value error (TECO)",
             0x22 => "register write error: only in PRGM mode (TECO, assumed)",
             0x80 => "the drive has restarted and waits for Identify",
@@ -107,7 +107,7 @@ mod tests {
             (Exception::ADDRESS, "exception 02 (illegal data address)"),
             (
                 Exception::GATEWAY_TARGET,
-                "exception 0B (device behind the gateway does not answer)",
+                "exception 0B (device behind the gateway does not reply)",
             ),
             (
                 Exception(0x22),

@@ -264,7 +264,7 @@ impl Answer {
                 open(text).and_then(|code| byte_at(code, 0).map(Answer::Nak).ok_or("no code"))
             }
             (b'N' | b'n', _) => Err("the refusal has not the length of an error code"),
-            _ => Err("the reply begins with neither A nor N"),
+            _ => Err("the reply starts with neither A nor N"),
         }
     }
 }

@@ -162,7 +162,7 @@ fn what_a_backup_never_has_is_refused() {
         drivegate_backup: FORMAT + 1,
         ..sound
     };
-    refused(&later, &[config], "it has format 2, and this version reads 1");
+    refused(&later, &[config], "it has format 2, but this version reads 1");
     for bytes in [&b""[..], b"{}", &[0; 1024], &[b'x'; 5000]] {
         assert!(taken(bytes).is_err());
     }

@@ -206,7 +206,7 @@ impl Asked {
     }
 
     pub(super) fn lost(&self, place: &str, why: &str) -> ClientError {
-        ClientError::Lost(format!("the gateway did not answer: {why}; {place}; {}", self.lost))
+        ClientError::Lost(format!("the gateway did not reply: {why}; {place}; {}", self.lost))
     }
 }
 
@@ -241,8 +241,7 @@ impl Reply {
     /// # Errors
     /// It is not such a one.
     pub(crate) fn document<T: DeserializeOwned>(self) -> Result<T, ClientError> {
-        serde_json::from_slice(&self.text)
-            .map_err(|error| self.strange(format!("the reply is not what was asked for ({error})")))
+        serde_json::from_slice(&self.text).map_err(|error| self.strange(format!("unexpected reply ({error})")))
     }
 
     /// The text of a reply of any status.
@@ -262,7 +261,7 @@ impl Reply {
         let Some(ErrorReply { error, known }) = self.parsed() else {
             return match self.status {
                 StatusCode::METHOD_NOT_ALLOWED if !asked.only_reads() => ClientError::Refused(format!(
-                    "the gateway takes no commands over HTTP; {}; set commands = true in its [http] section",
+                    "the gateway accepts no commands over HTTP; {}; set commands = true in its [http] section",
                     self.place
                 )),
                 StatusCode::SERVICE_UNAVAILABLE => {
@@ -281,7 +280,8 @@ impl Reply {
             }
             StatusCode::MISDIRECTED_REQUEST if self.over_network => "reload the gateway after that".to_string(),
             StatusCode::PRECONDITION_FAILED => {
-                "the gateway there runs with another configuration: reload it, or name its file by --config".to_string()
+                "the gateway there runs with another configuration: reload it, or name its file with --config"
+                    .to_string()
             }
             StatusCode::NOT_FOUND if !self.over_network => {
                 "the gateway there runs with another configuration or version: reload or restart it".to_string()

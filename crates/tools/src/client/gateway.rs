@@ -16,16 +16,16 @@ const USUAL: &str = "http://127.0.0.1:9488";
 /// The options that say which gateway is asked, and how.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct Gateway {
-    /// Configuration file of the gateway, which is asked through its local socket [default: /etc/drivegate/drivegate.toml].
+    /// Configuration file of the gateway, to use its local socket [default: /etc/drivegate/drivegate.toml].
     #[arg(long, value_name = "FILE", global = true)]
     config: Option<PathBuf>,
-    /// The gateway's HTTP server instead.
+    /// Use the gateway's HTTP server at this address instead.
     #[arg(long, value_name = "URL", global = true, conflicts_with = "config")]
     url: Option<Url>,
-    /// PEM file of the CA that signed the gateway's certificate, for https:// [default: those of the system].
+    /// PEM file of the CA that signed the gateway's certificate, for https:// [default: the system's CAs].
     #[arg(long, value_name = "FILE", global = true, requires = "url")]
     ca: Option<PathBuf>,
-    /// File whose only line is a token of the gateway, with scope `read`, or USER:PASSWORD of one who may command.
+    /// File whose only line is a token with scope `read`, or USER:PASSWORD of a user who may command.
     #[arg(long, value_name = "FILE", global = true, requires = "url")]
     token_file: Option<PathBuf>,
 }
@@ -117,7 +117,7 @@ fn http_of(config: &Path) -> Result<Url, String> {
     })?;
     if http.identity.is_some() {
         return Err(format!(
-            "the HTTP server has TLS, and the name in its certificate is not known here; {shown}; pass --url and --ca"
+            "the HTTP server has TLS, and the name in its certificate is unknown here; {shown}; pass --url and --ca"
         ));
     }
     format!("http://{}", from_here(http.listen)).parse()

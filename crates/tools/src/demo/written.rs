@@ -22,7 +22,7 @@ impl Written {
         let written = Written { dir: absolute };
         std::fs::create_dir_all(&written.dir).map_err(|why| {
             format!(
-                "cannot make the directory {}: {why}; --write-config; choose another",
+                "cannot create the directory {}: {why}; --write-config; choose another",
                 dir.display()
             )
         })?;
@@ -31,7 +31,8 @@ impl Written {
             Ok(text) if text.starts_with(MARK) => Ok(written),
             Err(why) if why.kind() == ErrorKind::NotFound => Ok(written),
             _ => Err(format!(
-                "{} exists and is not of a demo, so it is left as it is; --write-config; choose another directory",
+                "{} exists and does not belong to a demo, so it is left as it is; --write-config; choose another \
+                 directory",
                 config.display()
             )),
         }
@@ -68,7 +69,7 @@ impl Written {
         let config = self.config();
         std::fs::write(
             &config,
-            format!("{MARK}: its ports are there while that demo runs.\n\n{text}"),
+            format!("{MARK}: its ports exist while that demo runs.\n\n{text}"),
         )
         .map_err(|why| {
             format!(

@@ -19,7 +19,7 @@ pub(super) fn of(drill: &DrillReport) -> String {
         state = said(drill.state),
         text = escaped(&drill.text),
     );
-    let not = "not known".to_string();
+    let not = "unknown".to_string();
     let rows = [
         ("Drill", drill.id.clone()),
         (
@@ -51,25 +51,26 @@ pub(super) fn of(drill: &DrillReport) -> String {
         // A string takes all that is written.
         let _ = writeln!(page, "<tr><th>{head}</th><td>{}</td></tr>", escaped(&value));
     }
-    page += "</table>\n<h2>What was tried</h2>\n<table>\n<tr><th>Way</th><th>Result</th><th>Cause</th><th>Until it stood</th><th>Seen</th></tr>\n";
+    page += "</table>\n<h2>Tests</h2>\n<table>\n<tr><th>Stopped by</th><th>Result</th><th>Cause</th><th>Time to \
+             standstill</th><th>Observed</th></tr>\n";
     for kind in Kind::ALL {
         let step = drill.steps.iter().find(|step| step.kind == kind);
         page += &row(kind, step);
     }
-    page += "</table>\n<p>A drill shows that this motor stopped in this way, at this speed and load, at that time. It is not a safety \
-        function and replaces no test of one.</p>\n<table class=\"sign\"><tr><td>Name</td><td>Date</td><td>Signature</td></tr></table>\n\
-        </body></html>\n";
+    page += "</table>\n<p>A drill shows that this motor stopped in this way, at this speed and load, at that time. It \
+             is not a safety function and does not replace testing one.</p>\n<table \
+             class=\"sign\"><tr><td>Name</td><td>Date</td><td>Signature</td></tr></table>\n</body></html>\n";
     page
 }
 
 fn row(kind: Kind, step: Option<&DrillStep>) -> String {
     let way = match kind {
-        Kind::Order => "an order to stop",
-        Kind::Client => "a client that falls silent (supervision)",
-        Kind::Gateway => "a gateway that falls silent (the drive's own timeout)",
+        Kind::Order => "a stop command",
+        Kind::Client => "a client that goes silent (supervision)",
+        Kind::Gateway => "a gateway that goes silent (the drive's own timeout)",
     };
     let Some(step) = step else {
-        return format!("<tr><td>{way}</td><td>not tried</td><td></td><td></td><td></td></tr>\n");
+        return format!("<tr><td>{way}</td><td>not tested</td><td></td><td></td><td></td></tr>\n");
     };
     let took = step.took_ms.map_or_else(String::new, |took| {
         let at_most = if step.upper_bound { "at most " } else { "" };

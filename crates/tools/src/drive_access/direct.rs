@@ -122,7 +122,7 @@ impl Direct {
         if !link().is_online() {
             let spec = &target.bus.spec;
             return Err(format!(
-                "drive `{}` does not answer at address {}; {} {} on {}; check power, wiring and address, or let \
+                "drive `{}` does not reply at address {}; {} {} on {}; check power, wiring and address, or let \
                  `drivegate scan` look for it",
                 target.spec.name,
                 target.spec.address,

@@ -27,7 +27,7 @@ impl Target {
         how: ReadParameters,
         mut progress: impl FnMut(&ParameterReading),
     ) -> Result<String, String> {
-        let remedy = "parameters can be read of drives whose profile lists them, on lines that the gateway owns";
+        let remedy = "parameters can be read from drives whose profile lists them, on lines that the gateway owns";
         let path = self.path("params/reading");
         let (begin, look) = (Asked::post(&path, &how), Asked::get(&path));
         let [begin, look] = [begin, look].map(|asked| asked.if_refused(remedy).if_lost("try again"));

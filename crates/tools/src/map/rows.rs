@@ -103,15 +103,15 @@ fn entry_row(profile: &Profile, plan: &Plan, entry: &Entry, access: Access) -> R
         Content::Status => (
             "status",
             "",
-            "bits: 0 ready, 1 running, 2 reversed, 3 fault, 4 warning, 5 at_reference, 6 zero_speed, 7 remote, \
-             14 stale (or a bit not known), 15 online",
+            "bits: 0 ready, 1 running, 2 reversed, 3 fault, 4 warning, 5 at_reference, 6 zero_speed, 7 remote, 14 \
+             stale (or a bit unknown), 15 online",
         ),
         Content::State => (
             "state",
             "",
-            "0 offline, 1 not_ready, 2 ready, 3 running, 4 fault; 0xFFFF not known",
+            "0 offline, 1 not_ready, 2 ready, 3 running, 4 fault; 0xFFFF unknown",
         ),
-        Content::Age => ("age", "ms", "of the process data; 65534 at most; 0xFFFF never read"),
+        Content::Age => ("age", "ms", "of the process data; at most 65534; 0xFFFF never read"),
         Content::Command => ("command", "", "bits: 0 run, 1 reverse, 2 fault_reset (0 to 1)"),
         Content::Heartbeat => ("heartbeat", "", "any write renews the supervision; reads 0"),
         Content::Holder => (

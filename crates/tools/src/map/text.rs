@@ -21,8 +21,8 @@ pub(super) fn render(map: &Map<'_>) -> String {
         out += "\nListeners\n";
         out += &listeners(map.listeners);
     }
-    out += "\nAddresses are PDU addresses, from 0. Functions 03 and 04 read both tables of the blocks from 0x8000 on;\n\
-            32-bit values lie high word first; age and state show why a value is not available.\n";
+    out += "\nAddresses are PDU addresses, from 0. Functions 03 and 04 read both tables of the blocks from 0x8000 \
+            on;\n32-bit values have the high word first; age and state show why a value is not available.\n";
     let mut seen: Vec<&DriveSpec> = Vec::new();
     for drive in &map.drives {
         let spec = &drive.image.spec;
@@ -125,7 +125,7 @@ fn ranges(spec: &DriveSpec) -> String {
             table => table.name(),
         };
         let written = if range.write == 0 {
-            "read only".to_string()
+            "read-only".to_string()
         } else {
             range.write.to_string()
         };

@@ -16,32 +16,32 @@ pub(super) struct RestoreArgs {
     /// File that `params read` wrote.
     #[arg(required_unless_present_any = ["resume", "undo", "release", "look"])]
     file: Option<PathBuf>,
-    /// Name of the drive to which it is restored.
+    /// Name of the drive to restore it to.
     #[arg(required_unless_present_any = ["resume", "undo", "release", "look"])]
     drive: Option<String>,
     #[command(flatten)]
     how: How,
-    /// Writes the rest of a restore that was cut off.
+    /// Writes the rest of an interrupted restore.
     #[arg(long, value_name = "DRIVE", conflicts_with_all = ["file", "drive", "only", "force", "yes", "dry_run"])]
     resume: Option<String>,
-    /// Writes the former values of a restore that was cut off.
+    /// Writes back the former values of an interrupted restore.
     #[arg(long, value_name = "DRIVE", conflicts_with_all = ["file", "drive", "only", "force", "yes", "dry_run", "resume"])]
     undo: Option<String>,
-    /// Leaves the drive as a restore that was cut off left it, and lets it take all orders again. One that goes on ends before its
-    /// next parameter.
+    /// Leaves the drive as an interrupted restore left it, and accepts all commands again. A running restore ends
+    /// before its next parameter.
     #[arg(long, value_name = "DRIVE", conflicts_with_all = ["file", "drive", "only", "force", "yes", "dry_run", "resume", "undo"])]
     release: Option<String>,
-    /// Shows how far a restore is, until it is over.
+    /// Shows the progress of a restore until it ends.
     #[arg(long, value_name = "DRIVE", conflicts_with_all = ["file", "drive", "only", "force", "yes", "dry_run", "resume", "undo", "release"])]
     look: Option<String>,
 }
 
 #[derive(Debug, clap::Args)]
 pub(super) struct How {
-    /// This parameter alone; may be given several times, and names also those that are never restored otherwise.
+    /// Only this parameter; may be given several times, also for those that are otherwise never restored.
     #[arg(long, value_name = "ID")]
     only: Vec<String>,
-    /// Restores to a drive that differs; what is risked is named.
+    /// Restores to a drive that differs; the risks are listed.
     #[arg(long)]
     force: bool,
     /// Writes without asking.
@@ -76,7 +76,7 @@ pub(super) fn restore(gateway: &Gateway, args: &RestoreArgs) -> Result<ExitCode,
 /// Reads one drive and restores that to another.
 pub(super) fn clone(gateway: &Gateway, from: &str, to: &str, how: &How) -> Result<ExitCode, ExitCode> {
     if from == to {
-        let why = "a drive is not cloned to itself; command line; name two drives";
+        let why = "a drive cannot be cloned to itself; command line; name two drives";
         return Err(report::misused(why));
     }
     let brisk = ReadParameters {
@@ -192,7 +192,7 @@ fn agrees(drive: &str, how: &How) -> Result<(), ExitCode> {
     let (stdin, mut stderr) = (std::io::stdin(), std::io::stderr());
     if !stdin.is_terminal() || !stderr.is_terminal() {
         return Err(report::failed(
-            "nothing was written: there is no terminal on which to ask; command line; add --yes to write that, or --dry-run",
+            "nothing was written: there is no terminal to ask on; command line; add --yes to write, or --dry-run",
         ));
     }
     // A terminal that is gone gives no answer.

@@ -9,7 +9,7 @@ use crate::drive::control::{Control, Mask, OwnWord, Place, Run, Setting, Step, U
 pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, String)> {
     let own = match control.own_word {
         OwnWord::Read | OwnWord::Kept => "",
-        OwnWord::Shadow => ", which does not read as it was written",
+        OwnWord::Shadow => ", which does not read back as written",
     };
     let mut lines = vec![("control word", format!("{}{own}", place(control.at)))];
     if control.always != Default::default() {

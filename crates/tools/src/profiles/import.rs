@@ -319,8 +319,8 @@ fn quoted(text: &str) -> String {
 fn written(name: &str, points: &[(usize, Row)]) -> String {
     let name = if name.is_empty() { "imported" } else { name };
     let mut text = format!(
-        "# Made from a register list. Fit to the manual: protocols, bauds, and `read` and `write` of each range.\n\
-         name = \"{name}\"\nprotocols = [\"modbus-rtu\"]\nverified = false\n"
+        "# Made from a register list. Adapt to the manual: protocols, bauds, and `read` and `write` of each \
+         range.\nname = \"{name}\"\nprotocols = [\"modbus-rtu\"]\nverified = false\n"
     );
     let mut all: Vec<&Row> = points.iter().map(|(_, row)| row).collect();
     all.sort_by_key(|row| (row.table, row.address));

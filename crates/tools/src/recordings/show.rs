@@ -80,7 +80,7 @@ fn timeline(recording: &Recording) -> String {
             .and_then(|place| drives.get(place))
             .map_or("-", String::as_str);
         let what = match frame.verdict {
-            Verdict::Corrupt => format!("a reply of {name} cannot be believed: {}", hex(&frame.bytes)),
+            Verdict::Corrupt => format!("an invalid reply from {name}: {}", hex(&frame.bytes)),
             _ => format!("{name} did not reply"),
         };
         (frame.t, what)

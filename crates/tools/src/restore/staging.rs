@@ -110,7 +110,7 @@ impl Staging {
     /// It cannot be made.
     pub(super) fn make_directory(&mut self, path: &Path) -> Result<(), String> {
         let to = self.config.aside.join(path);
-        let failed = |error: io::Error| format!("cannot make {}: {error}", to.display());
+        let failed = |error: io::Error| format!("cannot create {}: {error}", to.display());
         fs::create_dir_all(&to).map_err(failed)?;
         self.directories.push(path.to_path_buf());
         Ok(())
@@ -131,7 +131,7 @@ impl Staging {
             .parent()
             .map_or(Ok(()), fs::create_dir_all)
             .and_then(|()| symlink(&path, &link));
-        made.map_err(|error| format!("cannot look at {}: {error}", path.display()))
+        made.map_err(|error| format!("cannot read {}: {error}", path.display()))
     }
 
     /// Destinations that exist.
@@ -146,7 +146,7 @@ impl Staging {
     /// One file cannot be put in place: which, and what is in place already.
     pub(super) fn place(&self) -> Result<Vec<PathBuf>, String> {
         for path in &self.directories {
-            let failed = |error: io::Error| format!("cannot make {}: {error}", path.display());
+            let failed = |error: io::Error| format!("cannot create {}: {error}", path.display());
             // The directory of any file in it.
             directory_of(&self.config.to, &path.join("file")).map_err(failed)?;
         }

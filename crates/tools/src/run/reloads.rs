@@ -34,7 +34,7 @@ impl Reloads<'_> {
     /// Begins to read the configuration, or does so after the one that is being read.
     pub(super) fn begin(&mut self, order: Option<ReloadOrder>, watch: &mut Watch<'_>) {
         if let Some(order) = &order {
-            tracing::info!(target: "drivegate::cli::run", who = order.who, "a local client asks for a reload");
+            tracing::info!(target: "drivegate::cli::run", who = order.who, "a local client requests a reload");
         }
         let [current, next] = &mut self.waiting;
         if self.loads.is_loading() {

@@ -80,7 +80,7 @@ impl Watch<'_> {
             self.plant.load().events.publish(Event::new(
                 EventKind::ReloadRefused,
                 now,
-                format!("the configuration was not applied, the former one stays: {why}"),
+                format!("the configuration was not applied, the previous one stays: {why}"),
             ));
         }
         self.refused = why.map(|why| (now, why));

@@ -30,7 +30,7 @@ impl Found {
         ];
         let more: Vec<String> = more.into_iter().flatten().collect();
         match (names.as_str(), more.as_slice()) {
-            ("", _) if self.unanswered > 0 => format!("family not known, because {}", self.silence()),
+            ("", _) if self.unanswered > 0 => format!("family unknown, because {}", self.silence()),
             ("", _) => "no known profile".to_string(),
             (names, []) => names.to_string(),
             (names, more) => format!("{names} ({})", more.join("; ")),
@@ -43,11 +43,11 @@ impl Found {
         self.profiles.iter().filter_map(text).find(|text| !text.is_empty())
     }
 
-    /// `2 reads got no answer`.
+    /// `2 reads got no reply`.
     pub(super) fn silence(&self) -> String {
         match self.unanswered {
-            1 => "1 read got no answer".to_string(),
-            more => format!("{more} reads got no answer"),
+            1 => "1 read got no reply".to_string(),
+            more => format!("{more} reads got no reply"),
         }
     }
 }
@@ -72,7 +72,7 @@ mod tests {
         let profiles = Profiles::built_in();
         let title = |names: &[&str], unanswered| found(names, unanswered).title(&profiles);
         assert_eq!(title(&[], 0), "no known profile");
-        assert_eq!(title(&[], 2), "family not known, because 2 reads got no answer");
+        assert_eq!(title(&[], 2), "family unknown, because 2 reads got no reply");
         assert_eq!(title(&["a", "b"], 0), "a or b (indistinguishable by reading)");
         assert_eq!(title(&["vacon-cx"], 1), "vacon-cx");
         // The board's answers do not prove the make of the drive.

@@ -263,7 +263,7 @@ impl<'a> Search<'a> {
             }
         }
         self.progress.print_line(&format!(
-            "the usual format of these drives is {}: they answer at it too",
+            "the usual format of these drives is {}: they also reply with it",
             format.characters()
         ));
         self.found.iter_mut().for_each(|found| found.setting = better);

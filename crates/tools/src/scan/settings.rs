@@ -40,10 +40,10 @@ pub(crate) struct Options {
     /// Addresses to try; N2 has addresses up to 255.
     #[arg(long, value_name = "LIST", default_value = "1-247", value_parser = parse_addresses)]
     pub(super) addresses: Addresses,
-    /// Time for the first byte of a reply [default: that of the protocol].
+    /// Timeout for the first byte of a reply [default: that of the protocol].
     #[arg(long, value_name = "TIME", value_parser = report::duration)]
     pub(super) timeout: Option<Duration>,
-    /// Tries for each address.
+    /// Attempts per address.
     #[arg(long, value_name = "COUNT", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=10))]
     pub(super) tries: u32,
     /// Include the profiles (*.toml) of this directory; may be repeated.
@@ -112,8 +112,8 @@ pub(super) fn settings(args: &Options, port: &str) -> Result<Vec<Setting>, Strin
     check_addresses(args, &settings)?;
     if settings.is_empty() {
         return Err(
-            "no protocol supports these bauds and formats; --baud, --format; N2 is always 9600 8N1, Modbus \
-                    RTU has 8 data bits"
+            "no protocol supports these baud rates and formats; --baud, --format; N2 is always 9600 8N1, Modbus RTU \
+             has 8 data bits"
                 .to_string(),
         );
     }

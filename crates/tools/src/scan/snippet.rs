@@ -65,7 +65,7 @@ impl Snippet<'_> {
         for (index, setting) in settings.iter().enumerate() {
             let other = index > 0;
             if other {
-                text += "\n# Drives also answered with other settings; a line has one, so choose.\n";
+                text += "\n# Drives also replied with other settings; a line has only one, so choose.\n";
             }
             let cadence = if other { "" } else { cadence };
             text += &commented(other, &self.bus(*setting, index + 1, cadence));
@@ -88,7 +88,7 @@ impl Snippet<'_> {
             protocol.name()
         );
         if port.starts_with("tcp://") {
-            text += "# The device server sets up the line itself: write what is set there.\n";
+            text += "# The device server sets up the line itself: enter its settings here.\n";
         }
         text += &format!(
             "baud = {}\nformat = \"{}\"\n{cadence}",
@@ -122,10 +122,10 @@ impl Snippet<'_> {
         let first = match drive.profiles.as_slice() {
             [] => {
                 let why = match drive.unanswered {
-                    0 => "No profile matches the answers of this drive: docs/profiles.md says how to write one."
+                    0 => "No profile matches the replies of this drive: docs/profiles.md explains how to write one."
                         .to_string(),
                     _ => format!(
-                        "The family of this drive is not known, because {}: scan again with --tries 3.",
+                        "The family of this drive is unknown, because {}: scan again with --tries 3.",
                         drive.silence()
                     ),
                 };
@@ -144,7 +144,7 @@ impl Snippet<'_> {
         let note = note + &identified.map_or(String::new(), |text| format!("# This is {text}.\n"));
         let functions = self.profiles.get(first).map(|profile| profile.functions.notes());
         let functions = functions.filter(|notes| !notes.is_empty());
-        let functions = functions.map(|notes| format!("# Once it is commanded: {}.\n", notes.join("; ")));
+        let functions = functions.map(|notes| format!("# Before commanding it: {}.\n", notes.join("; ")));
         let note = note + &functions.unwrap_or_default();
         let turnaround = self.profiles.get(first).map(|profile| profile.turnaround);
         let slower = drive
@@ -281,8 +281,8 @@ mod tests {
             "\n# By reading alone eaton-hvx cannot be distinguished from eaton-svx: check the nameplate.\n# This is \
              an older OPT-C2 board: an Eaton, or a Vacon NX with an older board.\n[[bus.drive]]\nname = \"drive-1\"\n",
             "\n# This is an OPT-C2 board of 2012 or later: a Vacon NX, or an Eaton with a newer board.\n[[bus.drive]]\nname = \"drive-4\"\n",
-            "\n# No profile matches the answers of this drive: docs/profiles.md says how to write one.\n# [[bus.drive]]\n",
-            "\n# The family of this drive is not known, because 2 reads got no answer: scan again with --tries 3.\n# [[bus.drive]]\n",
+            "\n# No profile matches the replies of this drive: docs/profiles.md explains how to write one.\n# [[bus.drive]]\n",
+            "\n# The family of this drive is unknown, because 2 reads got no reply: scan again with --tries 3.\n# [[bus.drive]]\n",
             "profile = \"vacon-nx\"\nturnaround = \"16ms\"    # measured\n",
             "\ncycle = \"",
             "\n[http]\nlisten = \"127.0.0.1:9488\"",

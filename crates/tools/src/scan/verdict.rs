@@ -16,9 +16,9 @@ const FEW_BYTES: usize = 8;
 pub(crate) fn somebody_speaks(heard: &Heard, port: &str, listened: Duration) -> Option<String> {
     (heard.unasked >= FEW_BYTES).then(|| {
         format!(
-            "{} bytes came within {listened:?} before anything was sent, so nothing was sent: another master speaks on this \
-             line, or it is not terminated and picks up noise; {port}; stop the other master (PLC, gateway, tool), or \
-             terminate the line; `drivegate scan` sends all the same",
+            "{} bytes came within {listened:?} before anything was sent, so nothing was sent: another master sends on \
+             this line, or it is not terminated and picks up noise; {port}; stop the other master (PLC, gateway, \
+             tool), or terminate the line; `drivegate scan` sends anyway",
             heard.unasked
         )
     })
@@ -32,43 +32,40 @@ pub(crate) fn nobody_answers(heard: &Heard, port: &str) -> String {
     }
     if heard.no_way > 0 {
         return format!(
-            "no drive answered: the gateway at the port did, {} times for {requests} requests, and says by exception 0A or 0B \
-             that it reaches no drive at these addresses; {port}; check baud, format and wiring of the line behind \
-             that gateway, \
-             and the power of its drives",
+            "no drive answered: the gateway at the port did, {} times for {requests} requests, and reports with \
+             exception 0A or 0B that it reaches no drive at these addresses; {port}; check baud rate, format and \
+             wiring of the line behind that gateway, and the power of its drives",
             heard.no_way
         );
     }
     if let Some((setting, count)) = most_garbage(heard) {
         return format!(
             "no drive answered, but {} bytes came that are not a valid reply, most of them at {setting} ({count} \
-             times): \
-             something is connected and answers, so the wiring carries data; {port}; try the baud and format shown on the \
-             drive's panel, or --baud all --format all; two drives with one address look the same",
+             times): something is connected and answers, so the wiring carries data; {port}; try the baud rate and \
+             format shown on the drive's panel, or --baud all --format all; two drives with one address look the same",
             heard.bytes
         );
     }
     if heard.bytes > 0 || heard.unasked >= FEW_BYTES {
         return format!(
-            "no drive answered, but {} bytes came that belong to no request: another master speaks on this line, or it picks \
-             up noise; {port}; stop the other master, check termination and the reference conductor, and try again",
+            "no drive answered, but {} bytes came that belong to no request: another master sends on this line, or it \
+             picks up noise; {port}; stop the other master, check termination and the reference conductor, and try \
+             again",
             heard.bytes + heard.unasked
         );
     }
     if heard.echoes > 0 {
         return format!(
             "no drive answered: {} of {requests} requests came back as the adapter's own echo and nothing else was \
-             received, so the adapter sends, and the drives are silent; {port}; check power, wiring (swap - and +) \
-             and that the bus is \
-             enabled at the drive; then try --baud all --format all",
+             received, so the adapter does send, but the drives are silent; {port}; check power, wiring (swap - and \
+             +) and that the fieldbus is enabled in the drive; then try --baud all --format all",
             heard.echoes
         );
     }
     format!(
-        "no drive answered: after {requests} requests no byte was received; {port}; a drive is silent at wrong \
-         settings as \
-         well as on a dead line, so first check power, wiring (swap - and +), termination and that the bus is enabled at the \
-         drive, and whether the transmit light blinks; then try --baud all --format all"
+        "no drive answered: after {requests} requests no byte was received; {port}; a drive with other settings is as \
+         silent as a dead line, so first check power, wiring (swap - and +), termination and that the fieldbus is \
+         enabled in the drive, and whether the transmit light blinks; then try --baud all --format all"
     )
 }
 
@@ -94,7 +91,7 @@ fn told_by_shape(heard: &Heard) -> Option<String> {
         ),
         (
             *stray_before,
-            format!("{stray_before} replies came with stray bytes before them"),
+            format!("{stray_before} replies had stray bytes before them"),
             Cause::Bias,
         ),
     ];
@@ -109,8 +106,8 @@ pub(crate) fn beside_answers(heard: &Heard) -> Option<String> {
     }
     let (setting, address) = heard.garbage.first()?;
     Some(format!(
-        "received invalid frames {} times, first at {setting}, address {address}: the line may have another baud, format or \
-         protocol, or two drives the same address",
+        "received invalid frames {} times, first at {setting}, address {address}: the line may have another baud \
+         rate, format or protocol, or two drives the same address",
         heard.garbage.len(),
     ))
 }
@@ -126,8 +123,8 @@ pub(crate) fn at_silent_drives(heard: &Heard, tried: &[Setting], profiles: &Prof
         .filter(|profile: &&Profile| profile.base.is_none() && profile.verified);
     let families: Vec<&Profile> = families.filter(speaks).collect();
     let (heading, steps) = match most_garbage(heard) {
-        Some(_) => ("settings at the drives", [Step::Settings]),
-        None => ("what lamps and panel of the drives show", [Step::Lamps]),
+        Some(_) => ("settings in the drives", [Step::Settings]),
+        None => ("what the drives' lamps and panels show", [Step::Lamps]),
     };
     let lines = grouped(&gather(&families, &steps));
     if lines.is_empty() {
@@ -225,7 +222,7 @@ mod tests {
         for (heard, wanted) in [
             (
                 late,
-                "4 replies are valid once their first bytes are restored: the beginning of replies is lost; ",
+                "4 replies are valid once their first bytes are restored: the start of replies is lost; ",
             ),
             (
                 early,

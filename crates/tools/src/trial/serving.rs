@@ -50,7 +50,7 @@ pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Result<ExitCode, Ex
     report::print(&values(&daemon.plant()));
     if let Some(address) = daemon.http_address() {
         report::print(&format!(
-            "\nStatus page, from this machine only: http://{address}/\nThe drives are only read. Ctrl-C ends it.\n"
+            "\nStatus page, from this machine only: http://{address}/\nThe drives are only read. Ctrl-C to stop.\n"
         ));
     }
     let code = match offer(args, stop, text) {
@@ -113,12 +113,12 @@ fn offer(args: &Args, stop: &Stop, text: &str) -> Result<(), String> {
         return Ok(());
     }
     if !is_terminal() {
-        report::note("no configuration is written; --write FILE writes one");
+        report::note("no configuration was written; --write FILE writes one");
         return Ok(());
     }
     while !stop.is_wanted() {
         let answer = ask(
-            "\nWrite this as a configuration? Name of a new file, y for drivegate.toml, or Enter for none:",
+            "\nSave this as a configuration? Name of a new file, y for drivegate.toml, or Enter for none:",
             stop,
         );
         let Some(file) = answer.and_then(|answer| wanted_file(&answer)) else {

@@ -28,7 +28,7 @@ COUNTS = {
     "drivegate_drive_fault": "drive {drive} has a fault",
     "drivegate_drive_unsupervised": "drive {drive} runs without a lease",
     "drivegate_supervision_actions_total": "the lease of drive {drive} ran out",
-    "drivegate_supervision_failed_total": "the action of the lease of drive {drive} failed",
+    "drivegate_supervision_failed_total": "the lease action of drive {drive} failed",
 }
 LEASE = "drivegate_drive_unsupervised"
 LEASE_GONE = "drive {drive} has no lease any more"

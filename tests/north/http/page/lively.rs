@@ -198,7 +198,7 @@ impl Lively {
 fn tell(plant: &Plant) {
     let ago = |seconds: u64| std::time::SystemTime::now() - Duration::from_secs(seconds);
     let events = [
-        (1190, EventKind::Online, "line1", "pump-1", "drive pump-1 answers"),
+        (1190, EventKind::Online, "line1", "pump-1", "drive pump-1 is online"),
         (1188, EventKind::Started, "line1", "pump-1", "drive pump-1 has started"),
         (
             640,

@@ -158,7 +158,7 @@ async function referencesAreUnderstoodAsTyped(gateway, page) {
   await page.until(() => document.querySelector(".operate .operate-result").textContent.includes("Reference 3.5 %: confirmed"));
   for (const [text, understood] of [["3.5", "= 3.5 %"], [" 62,25 ", "= 62.25 %"], ["0", "= 0 %"], ["+7,", "= 7 %"]]) assert.equal(await typed(text), understood, text);
   for (const text of ["3,5,1", "1.234,5", "3 5", "1e3", "12a", "0x10", "-", ","]) {
-    assert.match(await typed(text), /write a number from 0 to 80 %/, text);
+    assert.match(await typed(text), /enter a number from 0 to 80 %/, text);
     await page.press("Enter");
     await page.until(() => document.querySelector(".operate .operate-result").textContent.includes("nothing was sent"));
   }
@@ -190,7 +190,7 @@ async function startsTellTheirDirection(gateway, page) {
   assert.equal(await page.eval(shown, "button[aria-label='Start pump-1']"), false);
   await page.eval(click, "button[aria-label='pump-1: Forward …']");
   assert.match(await page.eval(asked), /pump-1 forward, 62\.5 %\?/);
-  await page.eval(click, "button[aria-label='Turn round now: pump-1']");
+  await page.eval(click, "button[aria-label='Change direction now: pump-1']");
   await page.until(() => document.querySelector(".operate .operate-result").textContent.includes("Direction forward: confirmed"));
   assert.deepEqual(gateway.commands, [{ reverse: false }]);
   // A drive that has no reverse is not asked for it.

@@ -272,8 +272,8 @@ impl Verifier {
         let named = head.bytes.zip(head.sha256).filter(|_| head.entry == "fragment");
         if fragment != named {
             let why = match fragment {
-                Some(_) => "the line is not an entry, and none names it as the rest of a crash",
-                None => "the rest of a crash before this line was removed",
+                Some(_) => "the line is not an entry, and no entry declares it as left by a crash",
+                None => "a fragment left by a crash before this line was removed",
             };
             return Err(Fault {
                 before: fragment.is_some(),
@@ -291,11 +291,11 @@ impl Verifier {
     /// What is wrong with the end.
     pub fn finish(&self) -> Result<(), String> {
         if self.fragment.is_some() {
-            return Err("the last line is incomplete: cut by a crash or by somebody".to_string());
+            return Err("the last line is incomplete: truncated by a crash or by someone".to_string());
         }
         match self.wanted {
             Some(wanted) => Err(format!(
-                "no line has the hash {wanted}: the end was cut, or it is another file"
+                "no line has the hash {wanted}: the end was cut off, or this is another file"
             )),
             None => Ok(()),
         }
@@ -309,7 +309,7 @@ fn follows(head: &Head, before: Chain) -> Result<(), Fault> {
     }
     let step = head.seq.checked_sub(before.seq);
     let why = match step {
-        Some(1) => "the line was changed: the next one has the hash of another".to_string(),
+        Some(1) => "the line was changed: its hash is not the one in the next line".to_string(),
         Some(0) | None => format!("entry {} follows entry {}: out of order", head.seq, before.seq),
         Some(step) => format!(
             "entries {} to {} before this line are missing",
@@ -382,7 +382,7 @@ mod tests {
             .unwrap()
             .replace("\"a\"", "\"b\"")
             .into_bytes();
-        let expected = "the line was changed: the next one has the hash of another";
+        let expected = "the line was changed: its hash is not the one in the next line";
         assert_eq!(faults(&changed, None), [(3, expected.to_string())]);
     }
 

@@ -279,15 +279,16 @@ impl Writer {
         let path = path.display();
         match done {
             Ok(()) if std::mem::replace(&mut self.failing, false) => {
-                tracing::warn!(target: "drivegate::command::audit", "audit file: {path} is written again");
+                tracing::warn!(target: "drivegate::command::audit", "audit file: writing to {path} again");
             }
             Ok(()) => {}
             Err(error) => {
                 self.file.close();
                 if !std::mem::replace(&mut self.failing, true) {
                     tracing::error!(
-                        target: "drivegate::command::audit", "audit file: cannot write {path}: {error}; commands are carried out all the same and are in the log; \
-                         {} records wait in memory; check [audit] and the disk",
+                        target: "drivegate::command::audit", "audit file: cannot write {path}: {error}; commands are \
+                                                              still carried out and are in the log; {} records wait \
+                                                              in memory; check [audit] and the disk",
                         WAITING.0
                     );
                 }
@@ -295,7 +296,8 @@ impl Writer {
                 if end && queues.end {
                     let (sent, others) = (queues.sent.len(), queues.unsent.len());
                     tracing::error!(
-                        target: "drivegate::command::audit", "audit file: {sent} records of commands that were sent and {others} others are not written"
+                        target: "drivegate::command::audit", "audit file: {sent} records of commands that were sent \
+                                                              and {others} others have not been written"
                     );
                 }
             }
@@ -352,7 +354,8 @@ impl Writer {
         }
         if let Some((bytes, sha256)) = fragment {
             tracing::warn!(
-                target: "drivegate::command::audit", "audit file: {} ends with {bytes} bytes of a line that was cut; they are kept and named",
+                target: "drivegate::command::audit", "audit file: {} ends with {bytes} bytes of a truncated line; \
+                                                      they are kept, and recorded as a fragment",
                 self.file.path().display()
             );
             let time = SystemTime::now();
@@ -399,7 +402,7 @@ fn only_fragment(file: &mut File, bytes: u64) -> io::Result<(Option<(u64, Hash)>
     let window = read_end(file, bytes, LONGEST_TAIL)?;
     if bytes > LONGEST_TAIL || window.iter().filter(|byte| **byte == b'\n').count() > 1 {
         return Err(io::Error::other(
-            "it is not an audit file; move it away or name another",
+            "it is not an audit file; move it, or set another `file`",
         ));
     }
     Ok(chain::fragment(&window))

@@ -45,7 +45,7 @@ impl Denial {
                 "this client is not a principal of [authority], so it may only stop; nothing was written".to_string(),
             ),
             Denial::Held(by, left) => {
-                let keeps = format!("holds the drive for {} s, unless that is renewed", seconds(*left));
+                let keeps = format!("holds the drive for another {} s, longer if renewed", seconds(*left));
                 Refusal::HeldByOther(holder(by, *left, keeps))
             }
             Denial::Reserved(by, left) => {
@@ -53,18 +53,19 @@ impl Denial {
                 Refusal::HeldByOther(holder(by, *left, keeps))
             }
             Denial::Repeats(by, left) => {
-                let keeps = "holds the drive, and this repeats a stop that was given before".to_string();
+                let keeps = "holds the drive, and this only repeats an earlier stop".to_string();
                 Refusal::HeldByOther(holder(by, *left, keeps))
             }
             Denial::NeedsTake(by) => {
-                let keeps = "stopped the drive while this client went on with run; stop, or take the drive, before run"
+                let keeps = "stopped the drive while this client kept sending run; send a stop, or take the drive, \
+                             before run"
                     .to_string();
                 Refusal::NeedsTake(holder(by, Duration::ZERO, keeps))
             }
             Denial::Local => Refusal::HeldByOther(Box::new(Holder {
                 who: "the drive's local control place".to_string(),
                 rank: "local".to_string(),
-                keeps: "has the drive until `remote` is set again".to_string(),
+                keeps: "controls the drive until `remote` is set again".to_string(),
                 left_s: None,
             })),
             Denial::NotHeld => Refusal::NeedsTake(Box::new(Holder {

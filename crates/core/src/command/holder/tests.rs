@@ -513,6 +513,6 @@ fn a_refusal_names_the_holder() {
     let text = refusal.to_string();
     assert_eq!(
         text,
-        "op (operator) holds the drive for 25 s, unless that is renewed; it was not sent"
+        "op (operator) holds the drive for another 25 s, longer if renewed; it was not sent"
     );
 }

@@ -60,7 +60,7 @@ fn what_a_limit_rests_on_is_judged_with_the_reference_that_stands() {
     assert!(matches!(why, Refusal::BadValue(_)));
     assert_eq!(
         why.to_string(),
-        "by that `maximum_frequency` the reference that stands makes `frequency_reference` 80 Hz, outside the limits 0 to 40 Hz; nothing was \
+        "with that `maximum_frequency` the present reference would make `frequency_reference` 80 Hz, outside the limits 0 to 40 Hz; nothing was \
          written; lower the reference first"
     );
     assert!(set(&image, "maximum_frequency", 45.0).is_ok(), "80 % of it are 36 Hz");
@@ -161,7 +161,7 @@ fn a_restore_names_the_limits_that_it_passes() {
         limits_passed(&reading, [(6, RawValue::Float(f32::to_bits(value)))].into_iter())
     };
     assert_eq!(passed(&image, 45.0), Vec::<String>::new());
-    assert!(passed(&image, 100.0)[0].contains("makes `frequency_reference` 80 Hz"));
+    assert!(passed(&image, 100.0)[0].contains("would make `frequency_reference` 80 Hz"));
     image.spec.limits.insert("maximum_frequency".to_string(), 0.0..=60.0);
     assert_eq!(passed(&image, 100.0).len(), 2);
     assert_eq!(

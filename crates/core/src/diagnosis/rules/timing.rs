@@ -22,7 +22,7 @@ impl Rules<'_> {
             }
             let limit = self.figures.line.response_timeout.as_millis();
             let evidence = format!(
-                "{own} replies of {} came after the time limit of {limit} ms in the last minute, {} of the others",
+                "{own} replies of {} came after the timeout of {limit} ms in the last minute, {} of the others",
                 self.name(place),
                 late - own
             );
@@ -54,7 +54,7 @@ impl Rules<'_> {
         }
         let places = self.known.iter().filter(|one| one.silent > 0).map(|one| one.place);
         let evidence = format!(
-            "{:.0} of {:.0} requests that followed a reply closely got no reply ({}), {:.0} of {:.0} after a pause",
+            "{:.0} of {:.0} requests sent soon after a reply got none ({}), {:.0} of {:.0} after a pause",
             close.0,
             close.1,
             self.names_of(places),
@@ -84,8 +84,8 @@ impl Rules<'_> {
             return;
         }
         let evidence = format!(
-            "{led} of {answered} replies in the last minute had stray bytes before them ({zero} times only zeros), and {idle} times \
-             stray bytes came while nobody was to speak"
+            "{led} of {answered} replies in the last minute had stray bytes before them ({zero} times only zeros), \
+             and {idle} times stray bytes came while the line should have been idle"
         );
         let certainty = if zero * 2 > led || (led > 0 && idle > 0) {
             Certainty::Likely
@@ -108,7 +108,7 @@ impl Rules<'_> {
             .enumerate()
             .filter(|(_, drive)| drive.sum(Sign::StartLost) > 0);
         let evidence = format!(
-            "{lost} of {damaged} damaged replies in the last minute are sound once their first bytes are put back ({})",
+            "{lost} of {damaged} damaged replies in the last minute are valid once their first bytes are restored ({})",
             self.names_of(with.map(|(place, _)| place))
         );
         let certainty = if lost >= 20 && share(lost, damaged) > 0.8 {
@@ -134,7 +134,7 @@ impl Rules<'_> {
             return;
         }
         let evidence = format!(
-            "{silent} of {asked} requests in the last minute got no reply, of all drives alike, and only {}",
+            "{silent} of {asked} requests in the last minute got no reply, from all drives alike, and only {}",
             damaged_replies(failed - silent)
         );
         self.add(Cause::RequestEndLost, None, Certainty::Fits, evidence);
@@ -158,7 +158,8 @@ impl Rules<'_> {
             return;
         }
         let evidence = format!(
-            "{arrivals} replies in the last minute arrived in steps of 16 ms ({:.0} % in step), whatever the drive and the length",
+            "{arrivals} replies in the last minute arrived in steps of 16 ms ({:.0} % in step), for all drives and \
+             lengths",
             lock * 100.0
         );
         self.add(Cause::LatencyTimer, None, Certainty::Likely, evidence);
@@ -179,8 +180,8 @@ impl Rules<'_> {
         }
         let answered = self.figures.sum(Sign::Answered);
         let evidence = format!(
-            "the device server closed the connection {closed} times in the last minute, in which {answered} replies came; it was \
-             connected to again at once each time, and no drive was taken for offline"
+            "the device server closed the connection {closed} times in the last minute, in which {answered} replies \
+             came; each time it was reopened at once, and no drive went offline"
         );
         self.add(Cause::ConnectionCloses, None, Certainty::Certain, evidence);
     }
@@ -200,15 +201,15 @@ impl Rules<'_> {
             fit * 20 >= early * 19
         });
         let fits = match place.and_then(|place| BAUDS.get(place)) {
-            Some(baud) => format!("{baud} baud is the lowest usual rate that fits"),
+            Some(baud) => format!("{baud} baud is the lowest standard rate that fits"),
             None => format!(
-                "no usual rate fits, so that no serial line seems to be behind it; {} comes closest",
+                "no standard rate fits, so there seems to be no serial line behind it; {} comes closest",
                 BAUDS.last().copied().unwrap_or_default()
             ),
         };
         let configured = self.figures.line.format.baud;
         let evidence = format!(
-            "{early} of {answered} replies in the last minute came sooner than {configured} baud, which is configured, could \
+            "{early} of {answered} replies in the last minute came sooner than the configured {configured} baud could \
              carry them; {fits}"
         );
         self.add(Cause::FasterThanBaud, None, Certainty::Certain, evidence);

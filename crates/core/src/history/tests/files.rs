@@ -45,7 +45,7 @@ fn what_is_broken_is_told_of_with_its_place() {
     // Cut short anywhere.
     for length in [30, 500, bytes.len() / 2, bytes.len() - 1] {
         let RecordingError { offset, what } = told(&bytes[..length]);
-        assert!(what.contains("cut short"), "{what} of {length}");
+        assert!(what.contains("truncated"), "{what} of {length}");
         assert!(offset <= length);
     }
     // Any other byte at any place.
@@ -66,7 +66,7 @@ fn what_is_broken_is_told_of_with_its_place() {
     let more = [&bytes[..], b"{}\n"].concat();
     assert_eq!(
         told(&more).to_string(),
-        format!("something follows the end line, at byte {}", bytes.len())
+        format!("there is data after the end line, at byte {}", bytes.len())
     );
     // Other files, and other versions.
     for foreign in [

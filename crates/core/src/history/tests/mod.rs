@@ -279,7 +279,7 @@ fn triggers_while_a_recording_goes_on_are_noted_in_it() {
     let command = |at| Trigger {
         kind: TriggerKind::Command,
         at,
-        text: "asked for by uid 0".to_string(),
+        text: "requested by uid 0".to_string(),
     };
     let clock = rig.clock;
     let first = rig.recorder.trigger("pump-1", command(clock.now), clock);

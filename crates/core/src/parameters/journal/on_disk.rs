@@ -56,8 +56,8 @@ impl JournalFile {
         match there.filter(|there| !is_same(there)) {
             None => Ok(()),
             Some(there) => Err(io::Error::other(format!(
-                "there is the journal of a restore of {}, which was interrupted; resume or undo it, or set it aside by \
-                 `drivegate params restore --release {}`",
+                "a restore of {} was interrupted; resume or undo it, or set its journal aside with `drivegate params \
+                 restore --release {}`",
                 there.place(),
                 self.drive()
             ))),

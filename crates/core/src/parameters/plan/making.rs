@@ -102,20 +102,21 @@ impl<'a> Making<'a> {
         let (profile, wanted, present) = (self.profile, self.wanted, self.present);
         if wanted.identification != present.identification {
             let what = format!(
-                "the drives say different things of themselves: {} `{}`, in the file `{}`",
+                "the drives identify themselves differently: {} `{}`, in the file `{}`",
                 present.drive, present.identification, wanted.identification
             );
             self.doubt(what, "restore to a drive of the same kind");
         } else if present.identification.contains(NOT_KNOWN) {
             let what = format!(
-                "whether the drives are of one kind is not known: `{}`",
+                "whether the drives are of the same kind is unknown: `{}`",
                 present.identification
             );
             self.doubt(what, "read them again");
         }
         if !self.same_application {
             let what = format!(
-                "the drives have different parameters: {} {}, in the file {}: another application, size or software",
+                "the drives have different parameters: {} {}, in the file {}: their application, size or software \
+                 differs",
                 present.drive,
                 present.application(),
                 wanted.application()
@@ -132,11 +133,11 @@ impl<'a> Making<'a> {
             match (value_of(wanted, id), value_of(present, id)) {
                 (Some(there), Some(here)) if same(there, here) => {}
                 (Some(there), Some(here)) => {
-                    let what = format!("the drives are not of one size: {}", self.line(id, here, there));
+                    let what = format!("the drives differ in size: {}", self.line(id, here, there));
                     self.doubt(what, "restore to a drive of the same size");
                 }
                 _ => {
-                    let what = format!("whether the drives are of one size is not known: {id} was not read on both");
+                    let what = format!("whether the drives are the same size is unknown: {id} was not read from both");
                     self.doubt(what, "read them again");
                 }
             }
@@ -208,7 +209,7 @@ impl<'a> Making<'a> {
             return Some(why.to_string());
         }
         (!self.same_application && !self.has_name(address))
-            .then(|| "it has no name, and may be something else in the drive's application".to_string())
+            .then(|| "it has no name, and may mean something else in the drive's application".to_string())
     }
 
     fn has_name(&self, address: u16) -> bool {
@@ -220,14 +221,15 @@ impl<'a> Making<'a> {
         let is_object = self.profile.parameter_words() == 2;
         if !same_kind(from, to) || is_object != matches!(to, RawValue::Float(_)) {
             return Err(format!(
-                "{id}: one of its values is a register, the other an analog output of N2; the file is not of this drive's family"
+                "{id}: one of its values is a register, the other an analog output of N2; the file is not for this \
+                 drive's family"
             ));
         }
         let parameter = self.profile.parameters.at(address);
         match parameter.and_then(|parameter| parameter.range.as_ref().filter(|_| !parameter.takes(to))) {
             None => Ok(()),
             Some(range) => Err(format!(
-                "{}: outside of what the drive takes, {} to {}; restore the others with --only",
+                "{}: outside the drive's range, {} to {}; restore the others with --only",
                 self.line(id, from, to),
                 range.start(),
                 range.end()
@@ -285,8 +287,8 @@ impl<'a> Making<'a> {
         let unnamed = ids(unnamed.map(|write| &write.id));
         if !unnamed.is_empty() {
             self.plan.notes.push(format!(
-                "the profile has no name for {}: whether one of them chooses the control place, restarts by itself or sets the bus \
-                 up is not known; look at them",
+                "the profile has no name for {}: any of them may select the control place, restart the drive by \
+                 itself or configure the bus; check them",
                 text::list(&unnamed)
             ));
         }
@@ -371,7 +373,7 @@ impl<'a> Making<'a> {
         };
         let volatile = ids(writes.iter().filter(|write| write.volatile).map(|write| &write.id));
         if !volatile.is_empty() {
-            let note = format!("the drive loses these without power: {}", text::list(&volatile));
+            let note = format!("the drive loses these at power-off: {}", text::list(&volatile));
             self.plan.notes.push(note);
         }
         if !rules.note.is_empty() && !self.plan.writes.is_empty() {

@@ -293,10 +293,9 @@ fn teco_takes_them_in_program_mode_and_saves_once() {
         all.to_string(),
         "3 parameters to write, in this order:\n  Cn-02 Max. Output Frequency: 60.0 Hz → 50.0 Hz (600 → 500)\n  On-20 Motor Constant R1: \
          0.000 Ohm → 0.007 Ohm (0 → 7)\n  Bn-01 Acceleration Time 1: 3.0 s → 6000.0 s (30 → 60000)\nthen 0 to register 0900H, so that \
-         the drive keeps them without power\nleft out, although they differ; --only ID restores one:\n  Sn-08 Operation Mode \
+         the drive keeps them at power-off\nleft out, although they differ; --only ID restores one:\n  Sn-08 Operation Mode \
          Selection 5: 12 → 15; source of run command and reference\n  Sn-23 Inverter station address: 1 → 2; station \
-         address\nnote: the drive loses these without power: On-20\nfirst switch the operator to PRGM: the drive refuses some of them \
-         otherwise\n"
+         address\nnote: the drive loses these at power-off: On-20\nfirst switch the operator to PRGM: otherwise the drive refuses some of them\n"
     );
     let ramp = plan(&teco, &wanted, &present, &only(&["Bn-01"])).unwrap().0;
     assert_eq!(
@@ -319,7 +318,7 @@ fn drives_that_are_not_alike() {
     assert_eq!(
         refused(&of_nx, &FORCED),
         [
-            "the parameters of pump-1 are those of the family `vacon-nx`, the drive is of `teco-7300pa`: their parameters are not the same; \
+            "the parameters of pump-1 are for the family `vacon-nx`, but the drive is of `teco-7300pa`: their parameters differ; \
           nothing can be restored"
         ]
     );
@@ -328,7 +327,7 @@ fn drives_that_are_not_alike() {
     let reasons = refused(&other, &ALL);
     let parts = [
         "fan-1 `none`, in the file `software_version 2`",
-        "the drives are not of one size: Sn-01 Inverter Capacity Selection: 3 → 4",
+        "the drives differ in size: Sn-01 Inverter Capacity Selection: 3 → 4",
         "ratings of supply or motor change: Cn-09 Motor Rated Current: 2.2 A → 4.4 A (22 → 44)",
     ];
     assert_eq!(reasons.len(), parts.len(), "{reasons:?}");
@@ -350,7 +349,7 @@ fn drives_that_are_not_alike() {
         .for_each(|file| file.identification = "software_version not known".to_string());
     let reasons = plan(&teco, &unknown[0], &unknown[1], &ALL).unwrap_err();
     assert!(
-        reasons[0].starts_with("whether the drives are of one kind is not known"),
+        reasons[0].starts_with("whether the drives are of the same kind is unknown"),
         "{reasons:?}"
     );
     // The file of the drive itself: the motor behind it is the same.
@@ -370,7 +369,7 @@ fn drives_that_are_not_alike() {
     assert!(
         refused(&unread, &ALL)
             .iter()
-            .any(|reason| reason.contains("Sn-01 was not read on both"))
+            .any(|reason| reason.contains("Sn-01 was not read from both"))
     );
 }
 
@@ -383,11 +382,11 @@ fn parameters_without_a_name_go_to_the_same_application_only() {
     assert_eq!(ids_of(&all), ["1.2", "2.5"]);
     assert_eq!(all.left_out.len(), 1, "{all}");
     assert!(
-        all.notes[0].starts_with("the profile has no name for 2.5: whether"),
+        all.notes[0].starts_with("the profile has no name for 2.5: any of them"),
         "{all}"
     );
     let other = words(&cx, "b", &[("0.1", 3), ("1.2", 60), ("2.5", 2), ("2.6", 2)]);
-    assert!(plan(&cx, &other, &here, &ALL).unwrap_err()[0].contains("another application"));
+    assert!(plan(&cx, &other, &here, &ALL).unwrap_err()[0].contains("application, size or software differs"));
     let (forced, risks) = plan(&cx, &other, &here, &FORCED).unwrap();
     assert_eq!((ids_of(&forced), risks.len()), (vec!["1.2"], 1));
     assert!(forced.left_out[1].1.contains("it has no name"), "{forced}");
@@ -440,7 +439,7 @@ fn what_is_missing_or_not_legal() {
     let outside = refused(&only(&["733"]));
     assert!(
         outside[0].contains("733 Response to fieldbus fault: 0 → 4 (0 → 4): outside")
-            || outside[0].contains("outside of what the drive takes, 0 to 3"),
+            || outside[0].contains("outside the drive's range, 0 to 3"),
         "{outside:?}"
     );
     assert_eq!(
@@ -461,7 +460,7 @@ fn what_is_missing_or_not_legal() {
             ("733", word(0)),
         ]),
     );
-    assert!(plan(&nx, &float, &here, &FORCED).unwrap_err()[0].contains("not of this drive's family"));
+    assert!(plan(&nx, &float, &here, &FORCED).unwrap_err()[0].contains("not for this drive's family"));
     // A limit that only the mixture would break.
     let (low, high) = (
         words(&nx, "a", &[("101", 0), ("102", 50)]),

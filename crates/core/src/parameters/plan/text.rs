@@ -35,7 +35,7 @@ pub(super) fn list(ids: &[Id]) -> String {
 impl Display for Plan {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.writes.len() {
-            0 => writeln!(f, "nothing to write")?,
+            0 => writeln!(f, "nothing to restore")?,
             1 => writeln!(f, "1 parameter to write:")?,
             count => writeln!(f, "{count} parameters to write, in this order:")?,
         }
@@ -45,7 +45,7 @@ impl Display for Plan {
         if let Some((address, value)) = self.handling.save {
             writeln!(
                 f,
-                "then {value} to register {address:04X}H, so that the drive keeps them without power"
+                "then {value} to register {address:04X}H, so that the drive keeps them at power-off"
             )?;
         }
         if !self.left_out.is_empty() {
@@ -58,7 +58,7 @@ impl Display for Plan {
             writeln!(f, "note: {note}")?;
         }
         if let Some(need) = &self.handling.needs {
-            writeln!(f, "first {}: the drive refuses some of them otherwise", need.remedy)?;
+            writeln!(f, "first {}: otherwise the drive refuses some of them", need.remedy)?;
         }
         Ok(())
     }

@@ -37,7 +37,7 @@ fn the_audit_has_a_file_of_its_own() {
         (path("elsewhere"), "events.jsonl"),
     ] {
         let expected = format!(
-            "the gateway keeps other things in `{name}`; /etc/drivegate/t.toml:8, audit.file; give the audit file another name, such as \
+            "the gateway uses `{name}` for something else; /etc/drivegate/t.toml:8, audit.file; give the audit file another name, such as \
              \"audit.jsonl\""
         );
         assert_eq!(said_of(&file), [expected], "{file}");

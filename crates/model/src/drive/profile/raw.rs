@@ -77,7 +77,7 @@ pub enum Unwritable {
         value: f64,
     },
     /// There is no way back from the value to its registers.
-    #[error("the point is only read")]
+    #[error("the point is read-only")]
     ReadOnly,
 }
 

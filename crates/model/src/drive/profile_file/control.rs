@@ -85,7 +85,7 @@ fn read_at(table: &Reader<'_>, around: &Around<'_>) -> Option<Place> {
         table.problem(
             "at",
             format!("{kind} {address} is in no [[range]] with `write`"),
-            "add the range, or set `write` there",
+            "add the range, or set `write` in it",
         );
     }
     Some(Place { table: kind, address })
@@ -113,7 +113,11 @@ fn read_always(table: &Reader<'_>) -> Always {
         clear: bits("clear"),
     };
     if always.set & always.clear != 0 {
-        given.problem("clear", "a bit is in `set` and in `clear`", "name each bit once");
+        given.problem(
+            "clear",
+            "a bit is in `set` and in `clear`",
+            "list each bit in one of them only",
+        );
     }
     given.finish();
     always
@@ -279,7 +283,7 @@ fn read_step(table: &Reader<'_>, around: &Around<'_>) -> Option<Step> {
     if table.has("until") && table.has("time") {
         table.problem(
             "time",
-            "a step ends by a state or after a time",
+            "a step ends at a state or after a time",
             "leave one of them out",
         );
     }
@@ -342,7 +346,7 @@ pub(super) fn read_mask(table: &Reader<'_>, around: &Around<'_>, key: &str) -> O
     if mask == 0 || is & !mask != 0 {
         table.problem(
             key,
-            format!("{is:#06x} is not within the mask {mask:#06x}: it is never so"),
+            format!("{is:#06x} is not within the mask {mask:#06x}: this can never be true"),
             "write a value of the bits of the mask",
         );
     }

@@ -20,7 +20,7 @@ fn read_mask(reader: &Reader<'_>, mut raw: Raw) -> Raw {
     if !raw.form.takes_mask() || raw.table.is_bits() {
         reader.problem(
             "mask",
-            format!("a mask takes bits of u16, u32 or u64, not of {}", raw.form.name()),
+            format!("a mask applies to u16, u32 or u64, not to {}", raw.form.name()),
             "leave the key out, or write such a type",
         );
         return raw;
@@ -31,7 +31,7 @@ fn read_mask(reader: &Reader<'_>, mut raw: Raw) -> Raw {
         _ => {
             reader.problem(
                 "mask",
-                format!("{mask:#x} names no bits of {} registers", raw.form.items()),
+                format!("{mask:#x} selects no bits of {} registers", raw.form.items()),
                 format!("write a number of at most {width} bits that is not 0"),
             );
             return raw;
@@ -86,7 +86,7 @@ fn read_invalid(reader: &Reader<'_>, mut raw: Raw) -> Raw {
     if raw.table.is_bits() || matches!(raw.form, Form::Text { .. }) {
         reader.problem(
             "invalid",
-            "only a register with a number has values that mean \"not available\"",
+            "only a numeric register has values that mean \"not available\"",
             "leave the key out",
         );
         return raw;

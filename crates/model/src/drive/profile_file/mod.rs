@@ -349,7 +349,8 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     if profile.broadcast_stop && (profile.protocols.contains(&Protocol::N2) || profile.broadcast_stop().is_none()) {
         reader.problem(
             "broadcast_stop",
-            "no broadcast can stop these drives: `run` is not a bit of a register or coil that 0 stops, or the protocol is n2",
+            "no broadcast can stop these drives: writing 0 to the register or coil of `run` does not stop them, or \
+             the protocol is n2",
             "leave the key out",
         );
     }
@@ -507,7 +508,7 @@ fn read_fault_help(
             (Some(fault), Some(text)) => *part(fault) = text,
             (None, _) => table.problem(
                 code,
-                format!("there is no text of a fault `{code}`"),
+                format!("there is no text for a fault `{code}`"),
                 "add it to [faults] or [faults_unverified]",
             ),
             (Some(_), None) => {}

@@ -29,7 +29,7 @@ pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options 
         other => {
             table.problem(
                 "region_width",
-                format!("{other} is not a width of the region"),
+                format!("{other} is not a valid width of the region"),
                 "write 1 or 2",
             );
             default.region_width
@@ -55,7 +55,7 @@ pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options 
     if options.unreliable_bit == Some(options.state_bit) {
         table.problem(
             "unreliable_bit",
-            "the bit is already that of the state",
+            "the bit is already used for the state",
             "write another one or leave the key out",
         );
     }

@@ -127,7 +127,7 @@ impl Rules<'_, '_> {
         let limits: Vec<Limit> = read.collect();
         if let Some(limit) = in_circle(&limits) {
             let id = self.list.id(limit.upper).unwrap_or_default();
-            let what = format!("the limits of `{id}` lead back to itself");
+            let what = format!("the limits of `{id}` are circular");
             self.table.problem(KEY, what, "leave one of them out");
         }
         limits
@@ -337,9 +337,9 @@ list = ["A-1, 50, Upper, Hz, 0.1, 0, 50", "A-2, 51, Lower, Hz, 0.1", "A-3, 52, O
             ),
             (
                 "limits = [\"1 >= 2\", \"2 >= 3\", \"3 >= 4\", \"4 >= 2\"]",
-                "the limits of `2` lead back to itself; p.toml:19, parameters.limits",
+                "the limits of `2` are circular; p.toml:19, parameters.limits",
             ),
-            ("limits = [\"1 >= 1\"]", "the limits of `1` lead back to itself"),
+            ("limits = [\"1 >= 1\"]", "the limits of `1` are circular"),
             ("save = \"16\"", "`16` is not a write; p.toml:19, parameters.save"),
             (
                 "save = \"150 = 1\"",
@@ -371,7 +371,7 @@ list = ["A-1, 50, Upper, Hz, 0.1, 0, 50", "A-2, 51, Lower, Hz, 0.1", "A-3, 52, O
             .map(|problem| format!("{problem}\n"))
             .collect();
         assert!(
-            found.contains("`50` to `0` is not a range") && found.contains("6 fields in place of 5 or 7"),
+            found.contains("`50` to `0` is not a range") && found.contains("6 fields instead of 5 or 7"),
             "{found}"
         );
     }

@@ -28,7 +28,8 @@ pub(super) fn read(
             Err(why) => table.problem(
                 "list",
                 format!("`{row}`: {why}"),
-                "write \"id, address, name, unit, scale\", such as \"Cn-02, 0x0201, Max. output frequency, Hz, 0.1\"; behind it, where they are known, \"least, greatest\" in the unit",
+                "write \"id, address, name, unit, scale\", such as \"Cn-02, 0x0201, Max. output frequency, Hz, 0.1\"; \
+                 followed, if known, by \"least, greatest\" in the unit",
             ),
         }
     }
@@ -101,10 +102,10 @@ fn read_row(row: &str) -> Result<Parameter, String> {
             let range = read_range(least, greatest)?;
             (id, address, name, unit, scale, Some(range))
         }
-        _ => return Err(format!("{} fields in place of 5 or 7", fields.len())),
+        _ => return Err(format!("{} fields instead of 5 or 7", fields.len())),
     };
     if id.is_empty() || id.contains(['#', '=']) {
-        return Err("the id is empty or has # or = in it".to_string());
+        return Err("the id is empty or contains # or =".to_string());
     }
     let scale: f64 = scale.parse().map_err(|_| format!("`{scale}` is not a scale"))?;
     Ok(Parameter {

@@ -50,7 +50,7 @@ pub(super) fn read_point(
     if TAKEN.contains(&name.as_str()) {
         reader.problem(
             "name",
-            format!("`{name}` is a key of the gateway's own in states, commands or metrics"),
+            format!("`{name}` is a key that the gateway itself uses in states, commands or metrics"),
             format!("write another name, such as `drive_{name}`"),
         );
     }
@@ -61,7 +61,7 @@ pub(super) fn read_point(
     if let Some(meant) = misspelt(&name).filter(|_| model.is_none()) {
         reader.warning(
             "name",
-            format!("`{name}` is not a point of the common model, but one letter away from `{meant}`"),
+            format!("`{name}` is not a point of the common model, but differs from `{meant}` by one letter"),
             format!("write `{meant}`, or choose a name that cannot be mistaken for it"),
         );
     }
@@ -119,7 +119,7 @@ pub(super) fn read_point(
         reader.problem(
             "hidden",
             format!(
-                "`{}` is a point of the common model, which every side shows",
+                "`{}` is a point of the common model, which every server shows",
                 point.name
             ),
             "give a helper a name of its own",
@@ -305,7 +305,7 @@ fn check_texts(reader: &Reader<'_>, point: &Point, names: &[String]) {
     if point.unlisted && (point.texts.is_empty() || !point.write) {
         reader.problem(
             "unlisted",
-            "only an enumeration that is written takes other values than those of `texts`",
+            "only a writable enumeration accepts values that `texts` does not list",
             "leave the key out",
         );
     }
@@ -372,7 +372,7 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
         let key = keys.into_iter().find(|key| reader.has(key)).unwrap_or("type");
         reader.problem(
             "write",
-            format!("there is no way back from such a value to its registers (`{key}`)"),
+            format!("such a value cannot be converted back to its registers (`{key}`)"),
             "leave `write` out; bits are written with `at = \"holding 300.4-6\"`",
         );
         return;

@@ -31,10 +31,7 @@ pub(super) fn read_range(reader: &Reader<'_>, offsets: &Offsets) -> Option<Addre
     if try_read > 0 && (!is_bits || try_read <= read || try_read > 16) {
         reader.problem(
             "try_read",
-            format!(
-                "{try_read} is not a number of bits from {} to 16 that is to be tried",
-                read + 1
-            ),
+            format!("{try_read} is not a number of bits from {} to 16", read + 1),
             "write it for a range of bits, above `read`, or leave it out",
         );
     }
@@ -95,7 +92,7 @@ pub(super) fn read_functions(reader: &Reader<'_>, ranges: &[AddressRange]) -> Wr
             15 => (Table::Coil, &mut functions.coils_by_15),
             16 => (Table::Holding, &mut functions.registers_by_16),
             _ => {
-                let what = format!("{function} is not a function that writes several items");
+                let what = format!("{function} is not a function that writes multiple items");
                 given.problem("single_write", what, "write 16 (registers), 15 (coils) or [15, 16]");
                 continue;
             }

@@ -23,7 +23,7 @@ pub(super) fn apply(reader: &Reader<'_>, points: &mut [Point]) {
     let (Some(speed), Some(frequency)) = (found, points.iter().position(of_reference)) else {
         reader.problem(
             "speed_reference",
-            "the family has no register with a reference in percent",
+            "the family has no register for a reference in percent",
             "leave the table out",
         );
         return;

@@ -251,7 +251,7 @@ fn each_mistake_of_the_whole() {
         ),
         (
             top("speed_reference.signed = true"),
-            "no register with a reference in percent; m:2, speed_reference",
+            "no register for a reference in percent; m:2, speed_reference",
         ),
         (
             top("").replace("[\"modbus-rtu\"]", "[\"modbus-rtu\", \"n2\"]"),
@@ -621,9 +621,9 @@ fn each_mistake_of_a_value() {
             "type = \"u32\"\norder = \"CDAB\"\nwords = \"low-first\"",
             "`order` says it already; m:15, point[0].words",
         ),
-        ("type = \"i16\"\nmask = 3", "not of i16; m:14, point[0].mask"),
-        ("mask = 0", "names no bits of 1 registers; m:13, point[0].mask"),
-        ("mask = 0x10000", "names no bits of 1 registers; m:13, point[0].mask"),
+        ("type = \"i16\"\nmask = 3", "not to i16; m:14, point[0].mask"),
+        ("mask = 0", "selects no bits of 1 registers; m:13, point[0].mask"),
+        ("mask = 0x10000", "selects no bits of 1 registers; m:13, point[0].mask"),
         (
             "mask = 0x0003\nequals = 4",
             "4 is never reached: the value is 0 to 3; m:14, point[0].equals",

@@ -235,7 +235,7 @@ fn what_became_of_the_last_order() {
         .off("run")
         .ordered(RunWish::Run, Fate::Refused, Giver::Client)
         .explain();
-    assert_eq!(refused.causes[0].evidence, "run of mqtt plc was refused: the text");
+    assert_eq!(refused.causes[0].evidence, "run from mqtt plc was refused: the text");
     let mut read_before = stands("vacon-nx")
         .off("run")
         .ordered(RunWish::Run, Fate::Taken, Giver::Client);

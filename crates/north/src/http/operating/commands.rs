@@ -228,7 +228,8 @@ impl Operating {
                 Ok(remembered) => shared = Some(remembered),
                 Err(Known::Reply(reply)) if stop.is_none() => return Progress::Repeated(reply),
                 Err(Known::Reply(_)) => {
-                    let why = "it repeats an earlier command, and only its stop is carried out again; send it with another `id`";
+                    let why = "it repeats an earlier command, so only its stop is executed again; send it with \
+                               another `id`";
                     refused = Some(Refusal::NotAllowed(why.to_string()));
                 }
                 Err(Known::Refused(why)) => refused = Some(Refusal::NotAllowed(why)),
@@ -268,7 +269,7 @@ impl Operating {
         now: Instant,
     ) -> Result<(watch::Sender<Option<CommandReply>>, OwnedSemaphorePermit), Known> {
         let refused = |why: &str| Known::Refused(format!("{why}; nothing was written"));
-        let busy = || refused("too many commands wait for their results");
+        let busy = || refused("too many commands are waiting for their results");
         let permit = self.in_progress.clone().try_acquire_owned().map_err(|_| busy())?;
         let (sender, reply) = watch::channel(None);
         let Some(id) = id else {

@@ -34,7 +34,7 @@ pub(in crate::http) async fn hold_of(
         Some((view, own)) => Ok(Json(HoldReply::of(&name, view).own(own)).into_response()),
         None => Err(refused(
             StatusCode::CONFLICT,
-            "nobody holds drives here: [authority] is off",
+            "drives cannot be held: [authority] is off",
         )),
     }
 }
@@ -48,7 +48,7 @@ pub(in crate::http) async fn hold(
 ) -> Replied {
     let wanted = serde_json::from_slice::<HoldAct>(&payload).ok();
     let verb = wanted.and_then(|wanted| Verb::of(&wanted.action)).ok_or_else(|| {
-        let why = "the body is {\"action\": …} with \"take\", \"renew\", \"release\" or \"break\"";
+        let why = "the body must be {\"action\": …} with \"take\", \"renew\", \"release\" or \"break\"";
         refused(StatusCode::UNPROCESSABLE_ENTITY, why)
     })?;
     let drive = app.drive(&name)?;

@@ -68,7 +68,7 @@ pub(in crate::http) async fn look(
 }
 
 fn understood<T: DeserializeOwned>(body: &[u8]) -> Replied<T> {
-    let failed = |error| format!("the body is not understood: {error}");
+    let failed = |error| format!("the body is invalid: {error}");
     serde_json::from_slice(body).map_err(|error| refused(StatusCode::UNPROCESSABLE_ENTITY, failed(error)))
 }
 
@@ -76,7 +76,7 @@ async fn act_on(app: &AppState, drive: &DriveHandle, act: RestoreAct, origin: Or
     let shared = &app.plant;
     match act {
         RestoreAct::Prepare { file, only, force } => {
-            let wanted = ParameterFile::parse(&file).map_err(|why| format!("the file is not understood: {why}"))?;
+            let wanted = ParameterFile::parse(&file).map_err(|why| format!("the file is invalid: {why}"))?;
             let wishes = Wishes {
                 only: only.iter().map(|id| Id::new(id)).collect(),
                 force,
@@ -94,7 +94,7 @@ async fn act_on(app: &AppState, drive: &DriveHandle, act: RestoreAct, origin: Or
 fn reading(app: &AppState, drive: &DriveHandle) -> Replied<Json<ParameterReading>> {
     let status = app.plant.load().parameters.status(&drive.machine());
     let name = &drive.image.spec.name;
-    let status = status.ok_or_else(|| conflict(format!("the parameters of `{name}` were not read yet")))?;
+    let status = status.ok_or_else(|| conflict(format!("the parameters of `{name}` have not been read yet")))?;
     Ok(Json(ParameterReading::new(&status)))
 }
 
@@ -103,7 +103,7 @@ fn restored(app: &AppState, drive: &DriveHandle) -> Replied<Json<Restore>> {
     let name = &drive.image.spec.name;
     let none = || {
         conflict(format!(
-            "no parameters of `{name}` were restored since the gateway started"
+            "no parameters of `{name}` have been restored since the gateway started"
         ))
     };
     Ok(Json(Restore::new(&status.ok_or_else(none)?)))

@@ -15,14 +15,14 @@ const BACK: Duration = Duration::from_secs(12);
 const LOOK: Duration = Duration::from_millis(50);
 
 /// What to do where the drive does not answer.
-const NO_ANSWER: &str = "the drive does not answer: check its supply, the wiring and its address";
+const NO_ANSWER: &str = "the drive does not reply: check its power supply, wiring and address";
 
 /// Sends it, and waits until the drive answers again. Nothing is told as done that was not seen.
 pub(super) async fn communication(drive: &DriveHandle, origin: Origin, asked: Instant) -> (Answer, Shown) {
     let (spec, now) = (&drive.image.spec, Instant::now());
     if spec.access != Access::Control {
         let refusal = Refusal::NotAllowed(format!(
-            "drive `{}` takes no commands; set access = \"control\"",
+            "drive `{}` accepts no commands; set access = \"control\"",
             spec.name
         ));
         return (

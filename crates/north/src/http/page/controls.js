@@ -34,7 +34,7 @@ function limits({ minimum, maximum, unit: name }) {
 /// The reference that stands in the drive, in words.
 function standingReference({ points }) {
   const point = [points.speed_reference, points.frequency_reference].find(isGood);
-  return point ? figureOf(Math.round(point.value * 100) / 100, point.unit) : t("reference not known");
+  return point ? figureOf(Math.round(point.value * 100) / 100, point.unit) : t("reference unknown");
 }
 
 /// The direction that the drive has been ordered, else the one that it shows: true for reverse.
@@ -87,7 +87,7 @@ function buildReference(panel, name, { command, tell, known }) {
 function reading(typed, point) {
   const value = numberOf(typed);
   const allowed = limits(point);
-  if (value === null) return { point, problem: allowed ? t("write a number {limits}", { limits: allowed }) : t("write a number") };
+  if (value === null) return { point, problem: allowed ? t("enter a number {limits}", { limits: allowed }) : t("enter a number") };
   const words = figureOf(value, point.unit);
   const outside = (point.minimum !== null && value < point.minimum) || (point.maximum !== null && value > point.maximum);
   return { point, value, words, problem: outside ? t("{value} is not {limits}", { value: words, limits: allowed }) : "" };
@@ -147,15 +147,15 @@ function ask(panel, name, { json, about }) {
   const told = { drive: name, direction: directionWord(isReverse), reference: standingReference(json) };
   hide(panel.choice, !starts || !hasReverse(about));
   if (!starts) {
-    text(panel.asked, t("{drive} {direction}, {reference}? The motor turns round.", told));
-    text(panel.really, t("Turn round now"));
+    text(panel.asked, t("{drive} {direction}, {reference}? The motor will change direction.", told));
+    text(panel.really, t("Change direction now"));
     panel.order = [{ reverse: isReverse }, t("Direction {direction}", told)];
   } else if (hasReverse(about)) {
-    text(panel.asked, t("Start {drive} {direction}, {reference}? The motor turns.", told));
+    text(panel.asked, t("Start {drive} {direction}, {reference}? The motor will turn.", told));
     text(panel.really, panel.takesOver ? t("Take over and start") : t("Start now"));
     panel.order = [{ run: true, reverse: isReverse }, t("Start {direction}", told)];
   } else {
-    text(panel.asked, t("Start {drive}, {reference}? The motor turns.", told));
+    text(panel.asked, t("Start {drive}, {reference}? The motor will turn.", told));
     text(panel.really, panel.takesOver ? t("Take over and start") : t("Start now"));
     panel.order = [{ run: true }, t("Start")];
   }

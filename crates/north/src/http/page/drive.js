@@ -129,7 +129,7 @@ function showTop(parts, drive) {
   hide(parts.fault, !fault);
   text(parts.quality, drive.quality === "good" ? "" : old(drive.age_ms, drive.quality));
   hide(parts.quality, drive.quality === "good");
-  const access = drive.access === "control" ? t("may be commanded") : t("is only read");
+  const access = drive.access === "control" ? t("may be commanded") : t("is read-only");
   const line = anchor(places.line(drive.bus), "", drive.bus);
   if (parts.known === JSON.stringify([drive.bus, drive.address, drive.unit, drive.profile, access])) return;
   parts.known = JSON.stringify([drive.bus, drive.address, drive.unit, drive.profile, access]);
@@ -155,18 +155,18 @@ const isKnown = (value) => value !== null && value !== undefined;
 
 function showCounters(facts, drive) {
   const { starts, running_seconds: running, energy_kwh: energy } = drive;
-  facts.set("running", isKnown(running) ? hours(running) : t("not known"));
-  facts.set("starts", isKnown(starts) ? String(starts) : t("not known"));
-  facts.set("energy", isKnown(energy) ? `${figure(energy, "kWh")} kWh` : t("not known"));
+  facts.set("running", isKnown(running) ? hours(running) : t("unknown"));
+  facts.set("starts", isKnown(starts) ? String(starts) : t("unknown"));
+  facts.set("energy", isKnown(energy) ? `${figure(energy, "kWh")} kWh` : t("unknown"));
 }
 
 /// What drills have proven of its stops.
 function showStops(element, stops) {
   hide(element, !stops?.length);
-  const ways = { order: t("an order"), client: t("a silent client"), gateway: t("a silent gateway") };
+  const ways = { order: t("a stop command"), client: t("a silent client"), gateway: t("a silent gateway") };
   const said = ({ kind, passed, age_s: seconds, due }) => {
-    if (passed === null) return `${ways[kind]}: ${t("never tried")}`;
-    const result = passed ? t("stood in time") : t("did not stand in time");
+    if (passed === null) return `${ways[kind]}: ${t("never tested")}`;
+    const result = passed ? t("stopped in time") : t("did not stop in time");
     return `${ways[kind]}: ${result}, ${t("{age} ago", { age: hours(seconds) })}${due ? `, ${t("due")}` : ""}`;
   };
   text(element, `${t("Stops proven by drills")}: ${(stops ?? []).map(said).join(" · ")}`);
@@ -181,7 +181,7 @@ function showLine(facts, drive) {
   facts.set("exchanges", String(total));
   facts.set("invalid", `${timeout + corrupt}${share}`);
   facts.set("failures", failures(drive.transactions));
-  facts.set("turnaround", drive.turnaround_ms === null ? t("not known") : `${decimal(drive.turnaround_ms, 1)} ms`);
+  facts.set("turnaround", drive.turnaround_ms === null ? t("unknown") : `${decimal(drive.turnaround_ms, 1)} ms`);
 }
 
 // ---- Commands, recordings
@@ -218,9 +218,9 @@ function log(id, title, none, columns, row) {
 export function open(root, { name }) {
   const parts = {
     top: top(name), figures: figures(), why: whyPanel(), trends: trends(name), points: pointList(), operate: make("div", "operate"),
-    counters: factList({ running: t("Running"), starts: t("Starts"), energy: t("Energy") }),
-    line: factList({ online: t("Online"), exchanges: t("Exchanges"), invalid: t("Without a valid reply"), failures: t("Failures"), turnaround: t("Turnaround") }),
-    commands: log("commands", t("Commands"), t("No command to this drive is known."), [t("Time"), t("Command"), t("By"), t("Client"), t("Result"), t("Took")], commandRow),
+    counters: factList({ running: t("Run time"), starts: t("Starts"), energy: t("Energy") }),
+    line: factList({ online: t("Online"), exchanges: t("Transactions"), invalid: t("Without a valid reply"), failures: t("Failures"), turnaround: t("Turnaround") }),
+    commands: log("commands", t("Commands"), t("No commands to this drive."), [t("Time"), t("Command"), t("By"), t("Client"), t("Result"), t("Duration")], commandRow),
     recordings: log("recordings", t("Recordings"), t("There is no recording of this drive."), [t("Time"), t("Trigger"), t("Summary"), t("Size")], recordingRow),
     events: eventList(false), strip: make("div", "strip-bars"), stops: make("p", "note"),
   };

@@ -68,7 +68,7 @@ function show(isLost) {
   text($("link-text"), lost ? t("Connection lost") : t("Live"));
   const since = lastGoodTime ? t("No connection to the gateway since {time}.", { time: clock(lastGoodTime) }) : t("No connection to the gateway yet.");
   hide($("banner"), !lost);
-  text($("banner-text"), lost ? `${since} ${t("What is shown below is old.")}` : "");
+  text($("banner-text"), lost ? `${since} ${t("The data below is out of date.")}` : "");
   showTries();
 }
 

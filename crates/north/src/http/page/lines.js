@@ -8,7 +8,7 @@ import { decimal, plain, t } from "./texts.js";
 
 const RATE_MS = 5000;
 const DIAGNOSIS_MS = 10000;
-const TITLES = { load: t("Line load"), fast: t("Fast cycle"), slow: t("Slow cycle"), exchanges: t("Exchanges"), errors: t("Errors"), waiting: t("Waiting"), online: t("Drives online") };
+const TITLES = { load: t("Line load"), fast: t("Fast cycle"), slow: t("Slow cycle"), exchanges: t("Transactions"), errors: t("Errors"), waiting: t("Waiting"), online: t("Drives online") };
 const FACTS = Object.keys(TITLES);
 /// Those of a line among others.
 export const FEW_FACTS = ["load", "fast", "errors"];
@@ -136,7 +136,7 @@ function diagnosisPanel() {
     show(found) {
       hide(element, found === null);
       const state = JSON.stringify(found?.verdicts ?? []);
-      text(note, found?.verdicts.length ? "" : found?.time ? t("Nothing wrong is seen on this line.") : t("Not made yet."));
+      text(note, found?.verdicts.length ? "" : found?.time ? t("No problems detected on this line.") : t("Not available yet."));
       if (state === element.state) return;
       element.state = state;
       element.classList.toggle("quiet", !found?.verdicts.length);
@@ -193,13 +193,13 @@ export function openLine(root, { name }) {
   const facts = busFacts();
   const strips = make("div", "strips");
   const answers = make("div", "histogram");
-  const drives = table(t("Drives of this line"), t("Drive"), t("State"), t("Exchanges"), t("Errors"), t("Turnaround"));
+  const drives = table(t("Drives of this line"), t("Drive"), t("State"), t("Transactions"), t("Errors"), t("Turnaround"));
   const diagnosis = diagnosisPanel();
   const unknown = make("p", "note");
   const card = make("article", "card", make("p", "state", facts.badge), facts.where, facts.why, facts.bar, facts.list, unknown);
   const hour = lastHour();
   root.append(make("h1", "", t("Line {line}", { line: name })), card, diagnosis.element, section("hour", t("Load and cycle, the last hour"), hour.element),
-    section("errors", t("Errors by drive, the last hour"), strips), section("turnaround", t("How fast the drives answer"), answers), section("members", t("Drives"), drives.element));
+    section("errors", t("Errors by drive, the last hour"), strips), section("turnaround", t("Turnaround times of the drives"), answers), section("members", t("Drives"), drives.element));
   diagnosis.show(null);
   let nextDiagnosis = 0;
   const rows = new Map();
@@ -211,7 +211,7 @@ export function openLine(root, { name }) {
       const [bus, all] = await Promise.all([load(path), load("drives?points=")]);
       showFacts(facts, bus);
       hide(unknown, !bus.unknown_drives?.length);
-      text(unknown, t("Answer on this line without an entry in the configuration: addresses {addresses}.", { addresses: (bus.unknown_drives ?? []).join(", ") }));
+      text(unknown, t("Devices without an entry in the configuration answer on this line: addresses {addresses}.", { addresses: (bus.unknown_drives ?? []).join(", ") }));
       strip(strips, bus.by_drive);
       histogram(answers, bus.turnaround);
       hour.show(bus);

@@ -65,13 +65,13 @@ pub(in crate::http) fn render(plant: &Plant, operating: bool, now: Instant) -> S
 
 /// The document without any value, for somebody who has to log in first.
 pub(in crate::http) fn render_login(plant: &Plant) -> String {
-    document(plant, true, "<p>Log in to see the drives; that needs scripts.</p>")
+    document(plant, true, "<p>Log in to see the drives; this requires scripts.</p>")
 }
 
 fn document(plant: &Plant, operating: bool, tables: &str) -> String {
     let (head, mode) = match operating {
         true => (OPERATE_HEAD, "commands after login"),
-        false => ("", "read only"),
+        false => ("", "read-only"),
     };
     DOCUMENT
         .replace("{{operate}}", head)
@@ -225,7 +225,7 @@ mod tests {
 
     /// The texts that the page says, in English: what is given to `t`, and what the document marks.
     fn said() -> BTreeSet<&'static str> {
-        let mut said: BTreeSet<&str> = ["read only", "commands after login"].into();
+        let mut said: BTreeSet<&str> = ["read-only", "commands after login"].into();
         for script in ASSETS.iter().filter(|asset| asset.name.ends_with(".js")) {
             for (at, _) in script.body.match_indices("t(\"") {
                 let before = script.body[..at].chars().next_back();

@@ -63,10 +63,10 @@ async function ask(name) {
 // The words of a result: what the gateway knows, and nothing more.
 function words(status, json) {
   const ms = (value) => `${Math.round(value)} ms`;
-  if (json.result === "confirmed") return t("confirmed: the drive shows it, after {time}", { time: ms(json.confirmed_ms) });
-  if (json.result === "acknowledged") return t("acknowledged by the drive after {time}", { time: ms(json.latency_ms) }) + `; ${json.note || t("no read has shown its effect yet")}`;
+  if (json.result === "confirmed") return t("confirmed: the drive shows the effect, after {time}", { time: ms(json.confirmed_ms) });
+  if (json.result === "acknowledged") return t("acknowledged by the drive after {time}", { time: ms(json.latency_ms) }) + `; ${json.note || t("no read has shown the effect yet")}`;
   if (json.error && json.error.message) return `${wordsOf(json.error.code)}: ${json.error.message}`;
-  return json.error || t("The gateway answered {status}.", { status });
+  return json.error || t("The gateway replied {status}.", { status });
 }
 
 // A start takes the drive first, where somebody may hold it, and takes it over where that was asked.
@@ -96,7 +96,7 @@ async function command(name, points, what, takesOver = false) {
     if (status === 200) drive.ours = true;
     if (!drive.stopping) tell(name, `${what}: ${words(status, json)}`, status === 200);
   } catch {
-    if (!drive.stopping) tell(name, t("{what}: no answer from the gateway; whether the drive took it is not known", { what }), false);
+    if (!drive.stopping) tell(name, t("{what}: no reply from the gateway; it is unknown whether the drive executed it", { what }), false);
   }
   drive.pending.delete(abort);
 }
@@ -112,7 +112,7 @@ async function tryStop(name) {
     if (status === 200) return { certainty: "stopped", why: words(status, json) };
     return { certainty: UNKNOWN.includes(status) ? "unknown" : "refused", why: words(status, json), again: AGAIN.includes(status), login: status === 401 || status === 403 };
   } catch {
-    return { certainty: "unknown", why: t("The gateway does not answer."), again: true };
+    return { certainty: "unknown", why: t("The gateway does not respond."), again: true };
   }
 }
 
@@ -208,7 +208,7 @@ function renews(drive) {
 
 function leaseWords(drive) {
   if (!renews(drive)) return drive.lost || "";
-  if (idle() >= ACTIVE_MS) return t("Nobody is active here: its lease is no longer renewed.");
+  if (idle() >= ACTIVE_MS) return t("No activity here: its lease is no longer renewed.");
   if (idle() >= WARN_MS) return t("Move the mouse or press a key, or its lease is no longer renewed.");
   return t("Supervised by this page while you are active.");
 }

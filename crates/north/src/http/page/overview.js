@@ -207,7 +207,7 @@ function legend() {
 }
 
 function frame(root, headingRow) {
-  const parts = { rows: make("div", "rows"), none: make("p", "note", t("No drive is like that.")), news: make("p", "unseen") };
+  const parts = { rows: make("div", "rows"), none: make("p", "note", t("No matching drives.")), news: make("p", "unseen") };
   parts.rows.setAttribute("role", "rowgroup");
   const head = make("div", "", headingRow);
   head.setAttribute("role", "rowgroup");
@@ -259,7 +259,7 @@ export function open(root, { query }) {
     for (const [name, entry] of Object.entries(tileBar.entries)) entry.button.setAttribute("aria-pressed", String(filter.tile === name));
     hide(bar.bus, !filter.bus);
     text(bar.bus, `${t("line {line}", { line: filter.bus })} ✕`);
-    bar.bus.setAttribute("aria-label", t("Show other lines than {line}, too", { line: filter.bus }));
+    bar.bus.setAttribute("aria-label", t("Also show lines other than {line}", { line: filter.bus }));
     text(bar.count, shown === drives.length ? t("{count} drives", { count: shown }) : t("{shown} of {count} drives", { shown, count: drives.length }));
     hide(parts.none, shown > 0 || drives.length === 0);
   }

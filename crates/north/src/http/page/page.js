@@ -124,7 +124,7 @@ function refused(error) {
   view.problem ??= make("p", "note problem");
   view.problem.setAttribute("role", "alert");
   const known = error.known.length ? ` ${t("Known: {names}.", { names: `${error.known.slice(0, 20).join(", ")}${error.known.length > 20 ? " …" : ""}` })}` : "";
-  text(view.problem, `${t("The gateway answers: {message}.", { message: error.message })}${known}`);
+  text(view.problem, `${t("The gateway replied: {message}.", { message: error.message })}${known}`);
   if (!view.problem.isConnected) view.root.querySelector("h1").after(view.problem);
 }
 

@@ -154,9 +154,9 @@ class Plot {
     // Its own view cuts off what lies beyond the range.
     const inner = draw("svg", { x: LEFT, width: this.width, height, viewBox: `${LEFT} 0 ${this.width} ${height}` }, ...this.gaps(), ...this.lines());
     const parts = [...this.grid(), inner, ...this.events()];
-    if (known.length === 0) parts.push(draw("text", { class: "none", x: LEFT + this.width / 2, y: height / 2 }, this.loading ? t("loading …") : t("no values in this time")));
+    if (known.length === 0) parts.push(draw("text", { class: "none", x: LEFT + this.width / 2, y: height / 2 }, this.loading ? t("loading …") : t("no values in this period")));
     this.svg.replaceChildren(...parts, this.needle, this.dot);
-    const said = known.length ? t("between {low} and {high} {unit}", { low: this.figure(low), high: this.figure(high), unit: this.unit }) : this.loading ? t("loading …") : t("no values in this time");
+    const said = known.length ? t("between {low} and {high} {unit}", { low: this.figure(low), high: this.figure(high), unit: this.unit }) : this.loading ? t("loading …") : t("no values in this period");
     this.svg.setAttribute("aria-label", `${this.title}, ${this.group.spoken()}: ${said}`);
     this.cursor();
   }

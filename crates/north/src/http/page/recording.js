@@ -136,7 +136,7 @@ function show(root, recording) {
   };
   root.replaceChildren(...head(recording, time));
   const rest = numbers.filter((column) => !known.includes(column));
-  const plots = section("plots", t("What was read"), zoom(group, from, to), group.element, choice(rest, addPlot));
+  const plots = section("plots", t("Values read"), zoom(group, from, to), group.element, choice(rest, addPlot));
   group.grid.before(lanes(group, states));
   const frames = frameList(recording);
   const happened = thingList(things, (time) => group.point(time * SECOND));
@@ -156,7 +156,7 @@ function head(recording, time) {
   const where = make("p", "where", anchor(places.drive(drive.name), "", drive.name), ` · ${drive.profile} · ${t("address {address}", drive)} · `, anchor(places.line(bus.name), "", bus.name),
     ` · ${bus.protocol} ${bus.format} · `, stamp(time), ` · ${t("{from} to {to}", { from: seconds(recording.from), to: seconds(recording.to) })}`);
   const downloads = make("p", "files", `${t("Download:")} `, files(recording.id, ["csv", "pcap", "json"]));
-  const lost = make("p", "note problem", t("{count} entries could not be taken in time.", { count: recording.lost }));
+  const lost = make("p", "note problem", t("{count} entries could not be recorded in time.", { count: recording.lost }));
   hide(lost, recording.lost === 0);
   return [make("p", "crumbs", anchor("#/recordings", "", t("Recordings")), " › "), make("h1", "", t("Recording: {trigger} of {drive}", { trigger: words(recording.trigger), drive: drive.name })), where,
     told("p", "why summary", recording.summary), downloads, lost];
@@ -227,7 +227,7 @@ function thingList(things, go) {
     return make("li", "", button, make("span", `tag ${thing.colour}`, thing.kind), make("span", "text", thing.text));
   });
   list.append(...items);
-  const element = things.length ? list : make("p", "note", t("Neither events nor commands."));
+  const element = things.length ? list : make("p", "note", t("No events or commands."));
   return { element, mark: (time) => items.forEach((item, place) => item.classList.toggle("past", things[place].t <= time + SAME_MOMENT)) };
 }
 

@@ -26,7 +26,7 @@ export async function post(path, body, ms, abort = new AbortController()) {
   try {
     const reply = await fetch(path, options);
     const json = reply.status === 204 ? {} : await reply.json().catch(() => ({}));
-    if (reply.status === 401 && path !== "api/v1/login") await check(t("What was sent last was not executed."));
+    if (reply.status === 401 && path !== "api/v1/login") await check(t("The last command was not executed."));
     return { status: reply.status, json };
   } finally {
     clearTimeout(timer);
@@ -116,9 +116,9 @@ async function logIn() {
   try {
     const { status, json } = await post("api/v1/login", { user: corner.user.value, password: corner.password.value }, LOGIN_MS);
     if (status === 200) set(json);
-    say(status === 200 ? "" : json.error || t("The gateway answered {status}.", { status }), false);
+    say(status === 200 ? "" : json.error || t("The gateway replied {status}.", { status }), false);
   } catch {
-    say(t("The gateway does not answer; nobody was logged in."), false);
+    say(t("The gateway does not respond; login failed."), false);
   }
   corner.password.value = "";
   corner.send.disabled = false;
@@ -130,7 +130,7 @@ async function logOut() {
   try {
     await post("api/v1/logout", undefined, 10000);
   } catch {
-    say(t("The gateway does not answer; the session may still be open there."), false);
+    say(t("The gateway does not respond; the session may still be open there."), false);
   }
   set(null);
   corner.open.focus();

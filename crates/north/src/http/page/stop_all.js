@@ -43,13 +43,13 @@ function close() {
 function told({ drives }) {
   const open = drives.filter(({ outcome }) => outcome !== "standing");
   for (const { drive, outcome, reason } of open) {
-    notStopped(drive, "unknown", outcome === "stopping" ? t("It acknowledged the stop and still turns.") : `${reason}.`);
+    notStopped(drive, "unknown", outcome === "stopping" ? t("It acknowledged the stop but is still turning.") : `${reason}.`);
   }
   for (const { drive } of drives) {
-    if (!open.some((other) => other.drive === drive)) stopped(drive, t("it stands"));
+    if (!open.some((other) => other.drive === drive)) stopped(drive, t("it has stopped"));
   }
-  if (!open.length) return [t("Every drive stands: {count} of {count}, at {time}.", { count: drives.length, time: clock(new Date()) }), "not-stopped ended"];
-  return [t("{shown} of {count} drives are not known to stand.", { shown: open.length, count: drives.length })];
+  if (!open.length) return [t("All drives have stopped: {count} of {count}, at {time}.", { count: drives.length, time: clock(new Date()) }), "not-stopped ended"];
+  return [t("{shown} of {count} drives are not known to have stopped.", { shown: open.length, count: drives.length })];
 }
 
 /// One try: what is said of it, or nothing where nobody answered.
@@ -58,7 +58,7 @@ async function sendOnce() {
     const { status, json } = await post("api/v1/stop", {}, ANSWER_MS);
     if (json.drives) return told(json);
     if (status === 401 || status === 403) await check();
-    if (status !== 503) return [`${t("Stop all")}: ${json.error?.message ?? json.error ?? t("The gateway answered {status}.", { status })}`];
+    if (status !== 503) return [`${t("Stop all")}: ${json.error?.message ?? json.error ?? t("The gateway replied {status}.", { status })}`];
   } catch {
     // It is sent again.
   }
@@ -73,11 +73,11 @@ async function send() {
   for (;;) {
     ended = await sendOnce();
     if (ended || performance.now() - begun > STOP_MS || !isLoggedIn()) break;
-    say(`${t("Stop all")}: ${t("The gateway does not answer.")} ${t("It is being sent again.")}`);
+    say(`${t("Stop all")}: ${t("The gateway does not respond.")} ${t("It is being sent again.")}`);
     await new Promise((done) => setTimeout(done, PAUSE_MS));
   }
   sending = false;
-  say(...(ended ?? [`${t("Stop all")}: ${t("The gateway does not answer.")} ${t("Stop the drives at the machine.")}`]));
+  say(...(ended ?? [`${t("Stop all")}: ${t("The gateway does not respond.")} ${t("Stop the drives at the machine.")}`]));
   bar.no.focus();
 }
 

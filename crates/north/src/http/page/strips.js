@@ -72,7 +72,7 @@ export function histogram(parent, { le_ms: bounds, counts }) {
   const total = items.reduce((sum, item) => sum + item.count, 0);
   const most = Math.max(1, ...items.map((item) => item.count));
   parent.rows ??= parent.appendChild(make("dl"));
-  parent.none ??= parent.appendChild(make("p", "note", t("No drive has answered yet.")));
+  parent.none ??= parent.appendChild(make("p", "note", t("No drive has replied yet.")));
   hide(parent.none, total > 0);
   parent.entries ??= new Map();
   const create = () => {

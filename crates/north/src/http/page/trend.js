@@ -78,7 +78,7 @@ export function trends(drive) {
       const replies = chosen.points.length ? [await load(address(`point=${[...plots.keys()].join(",")}&`, span))].flat() : [];
       if (span !== chosen.span) return;
       chosen.next = performance.now() + span[2];
-      text(note, replies.length ? "" : t("This family has none of the points that are kept."));
+      text(note, replies.length ? "" : t("This family has none of the points with trends."));
       hide(note, replies.length > 0);
       if (!replies.length) return;
       const step = replies[0].step_s * 1000;

@@ -26,7 +26,7 @@ impl Client {
         let for_now = matches!(why, PubAckReason::QuotaExceeded | PubAckReason::PacketIdentifierInUse);
         let (now, root) = (Instant::now(), self.topics.root());
         let remedy = match for_now {
-            true => "raise its limits if that lasts".to_string(),
+            true => "raise its limits if this persists".to_string(),
             false => {
                 let discovery = self
                     .announcer

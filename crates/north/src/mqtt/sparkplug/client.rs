@@ -295,14 +295,15 @@ impl Client {
                 self.bd_seq = after;
                 (number, written)
             }
-            _ => (self.bd_seq.unkept(), Err("the disk does not answer".to_string())),
+            _ => (self.bd_seq.unkept(), Err("the disk does not respond".to_string())),
         };
         match written {
             Ok(()) => self.bd_seq_fails = false,
             Err(why) if !std::mem::replace(&mut self.bd_seq_fails, true) => {
                 tracing::warn!(
-                    target: "drivegate::north::mqtt", "{}: {why}; the session number of Sparkplug (bdSeq) begins with 0 after a restart; make the \
-                     directory writable, or set gateway.state_dir",
+                    target: "drivegate::north::mqtt", "{}: {why}; the session number of Sparkplug (bdSeq) starts at 0 \
+                                                       after a restart; make the directory writable, or set \
+                                                       gateway.state_dir",
                     self.bd_seq.path().display()
                 );
             }

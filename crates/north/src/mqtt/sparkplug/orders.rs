@@ -238,7 +238,7 @@ impl Request {
         }
         if let Some(bytes) = incoming.oversized {
             return refused(Refusal::BadValue(format!(
-                "the payload has {bytes} bytes, 65536 are allowed"
+                "the payload has {bytes} bytes, at most 65536 are allowed"
             )));
         }
         let payload = match Payload::decoded(&incoming.payload) {
@@ -247,7 +247,7 @@ impl Request {
         };
         let count = payload.metrics.len();
         if count > METRICS {
-            let why = format!("the command has {count} metrics, {METRICS} are allowed");
+            let why = format!("the command has {count} metrics, at most {METRICS} are allowed");
             return refused(Refusal::BadValue(why));
         }
         let placed = |mut metric: Metric| {
@@ -298,8 +298,8 @@ impl Request {
             {
                 let name = excerpt(name.as_bytes());
                 return Err(Refusal::BadValue(format!(
-                    "the metric {name} has the alias {own}, not {sent}; send the name or the alias, and ask for a birth with \
-                     `Node Control/Rebirth` if the aliases are old"
+                    "the metric {name} has the alias {own}, not {sent}; send the name or the alias, and request a \
+                     birth with `Node Control/Rebirth` if the aliases are old"
                 )));
             }
             let name = match (&metric.name, place.and_then(&name)) {
@@ -310,7 +310,7 @@ impl Request {
                         .alias
                         .map_or_else(|| "none".to_string(), |alias| alias.to_string());
                     return Err(Refusal::NotWritable(format!(
-                        "no metric of the drive has the alias {alias}; ask for a birth with `Node Control/Rebirth`"
+                        "no metric of the drive has the alias {alias}; request a birth with `Node Control/Rebirth`"
                     )));
                 }
             };

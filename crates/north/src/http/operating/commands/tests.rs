@@ -72,7 +72,7 @@ fn no_stop_is_refused_for_what_waits() {
     let (status, body) = refused(bench.take(&alice, "p2", "{\"speed_reference\": 1}"));
     assert_eq!(status, StatusCode::FORBIDDEN);
     assert!(
-        body.contains("too many commands wait for their results; nothing was written"),
+        body.contains("too many commands are waiting for their results; nothing was written"),
         "{body}"
     );
     for _ in 0..100 {

@@ -76,8 +76,9 @@ impl Client {
                 .keep(packet.device.as_deref(), packet.payload.metrics.len() - fixed);
             omitted.reverse();
             tracing::warn!(
-                target: "drivegate::north::mqtt", "Sparkplug: {topic} is too large for the broker, which accepts {most} bytes per packet: {} of {all} metrics \
-                 are left out until the next connection ({}); raise the broker's limit",
+                target: "drivegate::north::mqtt", "Sparkplug: {topic} is too large for the broker, which accepts \
+                                                   {most} bytes per packet: {} of {all} metrics are omitted until the \
+                                                   next connection ({}); raise the broker's limit",
                 omitted.len(),
                 omitted.join(", ")
             );
