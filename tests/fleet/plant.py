@@ -1,4 +1,4 @@
-"""Gateways with simulated drives that run under leases, and a broker with TLS, for what is tried on a fleet.
+"""What is tried on a fleet: processes and what they cost, gateways with simulated drives that run under leases, a broker with TLS.
 
 Everything listens on loopback and lives in one directory.
 """
@@ -14,12 +14,17 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.parse
+import urllib.request
 
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 sys.path.insert(0, str(ROOT / "deploy/fleet/plugins/module_utils"))
 from toml_text import to_toml  # noqa: E402
 
+MOSQUITTO = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
+PROMETHEUS = shutil.which("prometheus") or "/usr/bin/prometheus"
+TICKS = os.sysconf("SC_CLK_TCK")
 BAUD = 38400
 CYCLE = 0.2
 LEASE = 20
@@ -73,6 +78,55 @@ def until(what, ready, seconds=30):
             return result
         time.sleep(0.05)
     raise SystemExit(f"{what} did not happen within {seconds} s")
+
+
+def listens(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def processor_seconds(pid):
+    fields = pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def memory(pid):
+    """Resident and proportional memory in MiB."""
+    text = pathlib.Path(f"/proc/{pid}/smaps_rollup").read_text()
+    values = {line.split(":")[0]: int(line.split()[1]) for line in text.splitlines()[1:] if line.endswith("kB")}
+    return values["Rss"] / 1024, values["Pss"] / 1024
+
+
+def query_api(port, what, **parameters):
+    """The data that Prometheus, or what is asked like it, answers with."""
+    address = f"http://127.0.0.1:{port}/api/v1/{what}?" + urllib.parse.urlencode(parameters)
+    with urllib.request.urlopen(address, timeout=60) as answer:
+        return json.load(answer)["data"]
+
+
+class Processes:
+    """What was started, each with its log in the directory; ended with the program."""
+
+    def __init__(self, directory):
+        self.directory = directory
+        self.processes = []
+
+    def start(self, name, command, stdin=subprocess.DEVNULL, **environment):
+        with open(self.directory / f"{name}.log", "ab") as log:
+            process = subprocess.Popen([str(each) for each in command], stdin=stdin, stdout=log, stderr=log, env=os.environ | environment)
+        self.processes.append(process)
+        return process
+
+    def end(self):
+        for process in self.processes:
+            if process.poll() is None:
+                process.terminate()
+        for process in self.processes:
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 def openssl(*arguments, **options):
@@ -171,10 +225,10 @@ class Gateway:
         return sum(float(line.rsplit(" ", 1)[1]) for line in lines if line.startswith((name + "{", name + " ")))
 
 
-class Plant:
+class Plant(Processes):
     def __init__(self, directory, binary, gateways):
-        self.directory, self.binary = directory, binary
-        self.processes = []
+        super().__init__(directory)
+        self.binary = binary
         self.certificates = Certificates(directory / "certificates")
         self.broker_tls, self.broker_plain = free_ports(2)
         self.broker()
@@ -182,13 +236,6 @@ class Plant:
         self.writes = directory / "writes"
         self.writes.touch()
         self.renewing = threading.Event()
-
-    def start(self, name, command, **environment):
-        with open(self.directory / f"{name}.log", "ab") as log:
-            process = subprocess.Popen([str(each) for each in command], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                                       env=os.environ | environment)
-        self.processes.append(process)
-        return process
 
     def broker(self):
         """Two listeners: TLS with certificates of clients, and one with a password."""
@@ -206,7 +253,7 @@ allow_anonymous true
 listener {self.broker_plain} 127.0.0.1
 password_file {passwords}
 """)
-        self.start("mosquitto", [shutil.which("mosquitto") or "/usr/sbin/mosquitto", "-c", config])
+        self.start("mosquitto", [MOSQUITTO, "-c", config])
 
     def simulate(self):
         """All drives, and the lines of the buses `a`."""
@@ -277,11 +324,4 @@ password_file {passwords}
 
     def end(self):
         self.renewing.set()
-        for process in self.processes:
-            process.terminate()
-        for process in self.processes:
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        super().end()

@@ -7,7 +7,6 @@ written to, and its other bus lost no cycle. `--part` names what runs; ends with
 
 import argparse
 import collections
-import copy
 import json
 import os
 import pathlib
@@ -19,7 +18,7 @@ import tempfile
 import time
 
 import changes
-from plant import CYCLE, HERE, ROOT, Plant, to_toml, until
+from plant import CYCLE, ROOT, Plant, to_toml, until
 
 PLAYBOOKS = ROOT / "deploy/fleet/playbooks"
 

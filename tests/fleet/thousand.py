@@ -20,29 +20,23 @@ import time
 
 import paho.mqtt.client as paho
 
-from fleet import listens, memory, processor_seconds
-from plant import ROOT, Certificates, ask, free_ports, to_toml, until
+from plant import MOSQUITTO, ROOT, Certificates, Processes, ask, free_ports, listens, memory, processor_seconds, to_toml, until
 from sparkplug_host import Host, rebirth
 
 BOUND = 30.0
 GROUP = "fleet"
 
 
-class Fleet:
+class Fleet(Processes):
     def __init__(self, directory, options):
-        self.directory, self.options = directory, options
+        super().__init__(directory)
+        self.options = options
         self.certificates = Certificates(directory / "certificates")
         self.port = free_ports(1)[0]
         self.plain = free_ports(1)[0]
-        self.all, self.gateways = [], []
+        self.gateways = []
         self.host = Host(options.drives)
         self.online = {}
-
-    def start(self, name, command, stdin=subprocess.DEVNULL, **environment):
-        with open(self.directory / f"{name}.log", "ab") as log:
-            process = subprocess.Popen([str(each) for each in command], stdin=stdin, stdout=log, stderr=log, env=os.environ | environment)
-        self.all.append(process)
-        return process
 
     def start_broker(self):
         certificates, config = self.certificates, self.directory / "mosquitto.conf"
@@ -57,7 +51,7 @@ max_queued_messages 1000000
 max_connections -1
 user root
 """)
-        self.broker = self.start("mosquitto", [shutil.which("mosquitto") or "/usr/sbin/mosquitto", "-c", config])
+        self.broker = self.start("mosquitto", [MOSQUITTO, "-c", config])
         until("the broker", lambda: listens(self.plain), 20)
 
     def watch(self):
@@ -156,17 +150,6 @@ user root
             lines = ask(self.directory / f"site-{number:04}.socket", "/metrics")[1].splitlines()
             count += sum(int(line.rsplit(" ", 1)[1]) for line in lines if line.startswith("drivegate_mqtt_lost_total"))
         return count
-
-    def end(self):
-        for process in self.all:
-            if process.poll() is None:
-                process.terminate()
-        for process in self.all:
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
 
 
 def tried(fleet):
