@@ -24,7 +24,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from brokers import BROKERS
-from plant import ROOT, Processes, ask, to_toml, until
+from plant import ROOT, Processes, ask, events_of, to_toml, until
 
 CYCLE = "200ms"
 # Seconds that a fault is watched after its end.
@@ -240,10 +240,7 @@ class Gateway:
             return False
 
     def events(self):
-        """The numbers of the events that the gateway raised: those that go to MQTT carry them."""
-        found = json.loads(ask(self.socket, "/api/v1/events/log?limit=10000")[1])
-        found = found["events"] if isinstance(found, dict) else found
-        return {(each["boot"], each["id"]) for each in found if each.get("drive")}
+        return events_of(self.socket)
 
 
 class Site(Processes):
