@@ -238,7 +238,9 @@ fn dashboards_and_alerts_use_metrics_that_exist() {
 fn rules_of(path: &str) -> Vec<Value> {
     let file = yaml(path);
     let groups = file["groups"].as_array().unwrap().iter();
-    groups.flat_map(|group| group["rules"].as_array().unwrap().clone()).collect()
+    groups
+        .flat_map(|group| group["rules"].as_array().unwrap().clone())
+        .collect()
 }
 
 #[test]

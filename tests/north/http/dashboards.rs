@@ -39,7 +39,9 @@ fn panels() -> Vec<String> {
 
 /// Whether a query adds all gateways up, as only the fleet does.
 fn is_total(query: &str) -> bool {
-    ["sum(", "count(", "count by (version"].iter().any(|start| query.starts_with(start))
+    ["sum(", "count(", "count by (version"]
+        .iter()
+        .any(|start| query.starts_with(start))
 }
 
 /// The expressions of all alerts without what they compare with: what a sound plant has, too.
