@@ -15,7 +15,7 @@ IN_OWN_TMP := tests/tools/in_own_tmp.sh
 
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
-.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak fleet fleet-rollout fleet-cluster fleet-thousand interop book clean
+.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak fleet fleet-rollout fleet-cluster fleet-thousand fleet-metrics interop book clean
 .PHONY: package-tools deb image release test-package test-static test-image
 
 help: ## Show this list
@@ -89,6 +89,7 @@ PARTS ?=
 fleet-rollout: tools build ## Roll out good and bad configurations to 20 gateways with Ansible, which it installs; takes half an hour. PARTS="good cut-off" runs these
 	tests/fleet/install.sh ansible
 	cd deploy/fleet && ANSIBLE_COLLECTIONS_PATH=playbooks/collections ../../.tools/ansible/bin/ansible-lint --offline
+	cd deploy/fleet && PATH="$(CURDIR)/.tools/ansible/bin:$$PATH" DRIVEGATE="$(CURDIR)/target/release/drivegate" molecule test
 	.tools/ansible/bin/python tests/fleet/rollout.py $(addprefix --part ,$(PARTS))
 
 BROKERS ?= mosquitto rmqttd ejabberd
@@ -99,6 +100,10 @@ fleet-cluster: tools build ## Run gateways with brokers that are clusters, and h
 fleet-thousand: tools build ## Run 100 gateways and 900 more sessions at one broker with TLS: start, rebirths at once, broker back
 	cargo bench --locked --no-run --bench sessions
 	.tools/venv/bin/python tests/fleet/thousand.py --sessions-binary "$$(ls -t target/release/deps/sessions-* | grep -v '[.]d$$' | head -n 1)"
+
+fleet-metrics: tools build ## Let one Prometheus read 1,000 gateways for ten minutes, with VictoriaMetrics behind it, which it installs
+	tests/fleet/install.sh victoria-metrics
+	.tools/venv/bin/python tests/fleet/metrics.py
 
 CHECKS ?=
 interop: ## Run the gateway with Home Assistant, pysparkplug and Node-RED; installs them, which takes minutes. CHECKS=name runs one

@@ -1,7 +1,8 @@
 //! Many gateways' sessions with a broker in one process: the real MQTT and Sparkplug clients, each with a plant of its own.
 //!
 //! `tests/fleet/thousand.py` starts it: `cargo bench --bench sessions -- --port 8883 --sessions 900 --drives 10 --ca ca.crt --dir DIR`.
-//! `--cycle` (s): each drive has new values so often; `--primary` is the id of the host that births wait for. Ends with its standard input.
+//! `--cycle` (s): each drive has new values so often; `--min-interval` (s) as in `[mqtt.publish]`; `--primary` is the id of the
+//! host that births wait for. Ends with its standard input.
 
 mod common;
 
@@ -101,7 +102,7 @@ fn options(name: &str) -> Result<Options, Box<dyn Error>> {
         event_qos: Qos::AtLeastOnce,
         expiry: Some(Duration::from_secs(300)),
         message_expiry: Some(Duration::from_secs(600)),
-        min_interval: Duration::from_millis(50),
+        min_interval: Duration::from_secs_f64(option("--min-interval", 0.05)?),
         max_interval: Duration::from_secs(60),
         commands: true,
         require_id: false,

@@ -2,20 +2,13 @@
 
 import os
 import pathlib
-import shutil
 import signal
-import socket
 import subprocess
 import time
 
-from plant import free_ports, until
+from plant import MOSQUITTO, free_ports, listens, processor_seconds, until
 
 NODES = 3
-
-
-def listens(port):
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 class Node:
@@ -59,12 +52,7 @@ class Broker:
         pass
 
     def processor_seconds(self):
-        ticks = 0
-        for node in self.nodes:
-            if node.process.poll() is None:
-                fields = pathlib.Path(f"/proc/{node.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-                ticks += int(fields[11]) + int(fields[12])
-        return ticks / os.sysconf("SC_CLK_TCK")
+        return sum(processor_seconds(node.process.pid) for node in self.nodes if node.process.poll() is None)
 
     def resident(self):
         """MiB of each node."""
@@ -94,7 +82,7 @@ class Mosquitto(Broker):
         config = node.directory / "conf"
         config.write_text(f"listener {node.port} 127.0.0.1\nallow_anonymous true\npersistence true\n"
                           f"persistence_location {node.directory}/\nmax_queued_messages 100000\nuser root\n")
-        return [shutil.which("mosquitto") or "/usr/sbin/mosquitto", "-c", config], {}
+        return [MOSQUITTO, "-c", config], {}
 
 
 class Rmqtt(Broker):

@@ -17,12 +17,11 @@ def without(name):
     return lambda configuration, gateway: configuration.pop(name)
 
 
-def certificate(name):
-    """A client certificate of the test's authority."""
+def certificate(of, name):
+    """One of the test's authority, or one that it did not sign."""
     def spoil(configuration, gateway):
         certificates = gateway.plant.certificates
-        keys = {"certificate": certificates.path(f"{name}.crt"), "key": certificates.path(f"{name}.key")}
-        configuration["mqtt"].update(keys)
+        configuration[of].update(certificate=certificates.path(f"{name}.crt"), key=certificates.path(f"{name}.key"))
 
     return spoil
 
@@ -31,16 +30,6 @@ def plain_broker(configuration, gateway):
     url = f"mqtt://localhost:{gateway.plant.broker_plain}"
     (gateway.directory / "wrong-password").write_text("wrong")
     configuration["mqtt"] = {"url": url, "username": "fleet", "password_file": "wrong-password"}
-
-
-def http_certificate(name):
-    """An https certificate that the fleet's authority did not sign, or one that has expired."""
-    def spoil(configuration, gateway):
-        certificates = gateway.plant.certificates
-        keys = {"certificate": certificates.path(f"{name}.crt"), "key": certificates.path(f"{name}.key")}
-        configuration["http"].update(keys)
-
-    return spoil
 
 
 def another(name):
@@ -107,8 +96,8 @@ INVALID = {
     "broker without a scheme": section("mqtt", url="localhost:1883"),
     "address without a port": section("modbus_tcp", listen=["127.0.0.1"]),
     "network that is none": section("modbus_tcp", write=["10.0.0.0/99"]),
-    "https certificate expired": http_certificate("expired"),
-    "client certificate expired": certificate("expired"),
+    "https certificate expired": certificate("http", "expired"),
+    "client certificate expired": certificate("mqtt", "expired"),
 }
 
 # What the gateway refuses, or what makes it worse: tried, and taken back.
@@ -127,7 +116,7 @@ WORSE = {
     "no broker any more": without("mqtt"),
     "no Modbus TCP any more": without("modbus_tcp"),
     "no http any more": without("http"),
-    "https certificate of nobody": http_certificate("strange"),
+    "https certificate of nobody": certificate("http", "strange"),
     "baud 9600": bus_a(lambda bus: bus.update(baud=9600)),
     "baud 19200": bus_a(lambda bus: bus.update(baud=19200)),
     "baud 115200": bus_a(lambda bus: bus.update(baud=115200)),

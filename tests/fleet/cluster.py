@@ -14,7 +14,6 @@ import pathlib
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
@@ -25,7 +24,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from brokers import BROKERS
-from plant import ROOT, ask, to_toml, until
+from plant import ROOT, Processes, ask, events_of, to_toml, until
 
 CYCLE = "200ms"
 # Seconds that a fault is watched after its end.
@@ -241,24 +240,14 @@ class Gateway:
             return False
 
     def events(self):
-        """The numbers of the events that the gateway raised: those that go to MQTT carry them."""
-        found = json.loads(ask(self.socket, "/api/v1/events/log?limit=10000")[1])
-        found = found["events"] if isinstance(found, dict) else found
-        return {(each["boot"], each["id"]) for each in found if each.get("drive")}
+        return events_of(self.socket)
 
 
-class Site:
+class Site(Processes):
     def __init__(self, directory, binary, broker, gateways):
-        self.directory, self.binary, self.broker = directory, binary, broker
-        self.processes = []
+        super().__init__(directory)
+        self.binary, self.broker = binary, broker
         self.gateways = [Gateway(self, number) for number in range(gateways)]
-
-    def start(self, name, command, **environment):
-        with open(self.directory / f"{name}.log", "ab") as log:
-            process = subprocess.Popen([str(each) for each in command], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                                       env=os.environ | environment)
-        self.processes.append(process)
-        return process
 
     def run(self):
         buses = []
@@ -277,16 +266,6 @@ class Site:
 
     def all_connected(self):
         return all(gateway.is_connected() for gateway in self.gateways)
-
-    def end(self):
-        for process in self.processes:
-            process.terminate()
-        for process in self.processes:
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
 
 
 class Host:

@@ -13,20 +13,17 @@ import os
 import pathlib
 import shutil
 import signal
-import socket
-import subprocess
 import sys
 import tempfile
 import threading
 import time
-import urllib.parse
-import urllib.request
 
 import paho.mqtt.client as paho
 
+from plant import MOSQUITTO, PROMETHEUS, Processes, free_ports, listens, memory, processor_seconds, query_api, until
+
 # docs/mqtt.md: the gateway tries again at intervals of up to 5 s; the rest is for the connection itself.
 BOUND = 8.0
-TICKS = os.sysconf("SC_CLK_TCK")
 
 
 def gateway_name(number):
@@ -48,12 +45,6 @@ def bus(directory, number, options):
     return lines
 
 
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def write(path, text):
     path.write_text(text + "\n")
     return path
@@ -65,12 +56,8 @@ def configurations(directory, options, broker_port):
     lines = [line for number in numbers for line in bus(directory, number, options)]
     everything = ["[gateway]", 'name = "all-lines"', *lines]
     write(directory / "lines.toml", "\n".join(everything))
-    ports = []
-    for number in numbers:
-        port = free_port()
-        while port in ports:
-            port = free_port()
-        ports.append(port)
+    ports = free_ports(options.gateways)
+    for number, port in zip(numbers, ports):
         own = [
             "[gateway]",
             f'name = "{gateway_name(number)}"',
@@ -87,46 +74,6 @@ def configurations(directory, options, broker_port):
     return ports
 
 
-class Processes:
-    """Everything that was started; ended with the program."""
-
-    def __init__(self, directory):
-        self.directory = directory
-        self.all = []
-
-    def start(self, name, command, **environment):
-        output = open(self.directory / f"{name}.log", "ab")
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=os.environ | environment
-        )
-        output.close()
-        self.all.append(process)
-        return process
-
-    def end(self):
-        for process in self.all:
-            if process.poll() is None:
-                process.terminate()
-        for process in self.all:
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-
-def processor_seconds(pid):
-    fields = pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
-
-
-def memory(pid):
-    """Resident and proportional memory in MiB."""
-    text = pathlib.Path(f"/proc/{pid}/smaps_rollup").read_text()
-    values = {line.split(":")[0]: int(line.split()[1]) for line in text.splitlines()[1:] if line.endswith("kB")}
-    return values["Rss"] / 1024, values["Pss"] / 1024
-
-
 class Subscriber:
     """Counts what arrives, and when each gateway says that it is online."""
 
@@ -134,7 +81,6 @@ class Subscriber:
         self.messages = 0
         self.payload = 0
         self.online = {}
-        self.states = collections.Counter()
         self.lock = threading.Lock()
         self.client = paho.Client(paho.CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
         self.client.reconnect_delay_set(0.05, 0.05)
@@ -168,37 +114,22 @@ class Subscriber:
             return self.messages, self.payload
 
 
-def until(what, ready, seconds):
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        if ready():
-            return
-        time.sleep(0.05)
-    raise SystemExit(f"fleet: {what} did not happen within {seconds} s; the logs stand in the directory that is named above")
-
-
 def start_broker(processes, directory, port):
     text = f"listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nset_tcp_nodelay true\n"
     text += "max_queued_messages 100000\n"
-    mosquitto = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
-    return processes.start("mosquitto", [mosquitto, "-c", str(write(directory / "mosquitto.conf", text))])
-
-
-def listens(port):
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+    return processes.start("mosquitto", [MOSQUITTO, "-c", write(directory / "mosquitto.conf", text)])
 
 
 def start_prometheus(processes, directory, ports):
-    port = free_port()
+    port = free_ports(1)[0]
     targets = json.dumps([f"127.0.0.1:{each}" for each in ports])
-    text = f"global:\n  scrape_interval: 5s\n  scrape_timeout: 5s\nscrape_configs:\n- job_name: drivegate\n"
+    text = "global:\n  scrape_interval: 5s\n  scrape_timeout: 5s\nscrape_configs:\n- job_name: drivegate\n"
     text += f"  static_configs:\n  - targets: {targets}\n"
     config = write(directory / "prometheus.yml", text)
     process = processes.start(
         "prometheus",
         [
-            shutil.which("prometheus") or sys.exit("fleet: no prometheus; `make tools` installs it"),
+            PROMETHEUS,
             f"--config.file={config}",
             f"--storage.tsdb.path={directory}/prometheus",
             f"--web.listen-address=127.0.0.1:{port}",
@@ -208,9 +139,7 @@ def start_prometheus(processes, directory, ports):
 
 
 def query(port, expression):
-    address = f"http://127.0.0.1:{port}/api/v1/query?" + urllib.parse.urlencode({"query": expression})
-    with urllib.request.urlopen(address, timeout=20) as answer:
-        result = json.load(answer)["data"]["result"]
+    result = query_api(port, "query", query=expression)["result"]
     return float(result[0]["value"][1]) if result else float("nan")
 
 
@@ -295,7 +224,7 @@ def main():
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     well = False
     try:
-        broker_port = free_port()
+        broker_port = free_ports(1)[0]
         broker = start_broker(processes, directory, broker_port)
         until("the broker's start", lambda: listens(broker_port), 20)
         ports = configurations(directory, options, broker_port)

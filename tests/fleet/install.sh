@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Installs what the tests of a fleet need into .tools: install.sh WHAT..., of ansible (PyPI), ejabberd (Debian packages, unpacked: nothing
-# is started), rmqttd (built from its crate without the bridges to other systems, which takes many minutes), mosquitto (there already).
+# Installs what the tests of a fleet need into .tools: install.sh WHAT..., of ansible (PyPI), ejabberd and victoria-metrics (Debian packages,
+# unpacked: nothing is started), rmqttd (built from its crate without the bridges to other systems, which takes many minutes), mosquitto (there already).
 # Quick when nothing is missing.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
@@ -40,6 +40,13 @@ install_ejabberd() {
     fi
 }
 
+install_victoria_metrics() {
+    if ! command -v victoria-metrics >/dev/null && [ ! -d .tools/victoria-metrics ]; then
+        say "unpacking victoria-metrics into .tools"
+        unpack .tools/victoria-metrics victoria-metrics
+    fi
+}
+
 install_rmqttd() {
     [ ! -x .tools/brokers/bin/rmqttd ] || return 0
     say "building rmqttd $rmqttd"
@@ -61,8 +68,8 @@ install_rmqttd() {
 mkdir -p .tools/brokers
 for what in "$@"; do
     case $what in
-        ansible | ejabberd | rmqttd) "install_$what" ;;
+        ansible | ejabberd | rmqttd | victoria-metrics) "install_${what//-/_}" ;;
         mosquitto) ;;
-        *) fail "$what is unknown; write ansible, ejabberd, rmqttd or mosquitto" ;;
+        *) fail "$what is unknown; write ansible, ejabberd, rmqttd, victoria-metrics or mosquitto" ;;
     esac
 done

@@ -1,4 +1,4 @@
-"""Gateways with simulated drives that run under leases, and a broker with TLS, for what is tried on a fleet.
+"""What is tried on a fleet: processes and what they cost, gateways with simulated drives that run under leases, a broker with TLS.
 
 Everything listens on loopback and lives in one directory.
 """
@@ -14,12 +14,17 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.parse
+import urllib.request
 
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 sys.path.insert(0, str(ROOT / "deploy/fleet/plugins/module_utils"))
 from toml_text import to_toml  # noqa: E402
 
+MOSQUITTO = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
+PROMETHEUS = shutil.which("prometheus") or "/usr/bin/prometheus"
+TICKS = os.sysconf("SC_CLK_TCK")
 BAUD = 38400
 CYCLE = 0.2
 LEASE = 20
@@ -49,6 +54,13 @@ def ask(path, target, body=None):
         connection.close()
 
 
+def events_of(path):
+    """Boot and number of the events of drives that a gateway raised: those that go to MQTT carry them."""
+    found = json.loads(ask(path, "/api/v1/events/log?limit=10000")[1])
+    found = found["events"] if isinstance(found, dict) else found
+    return {(each["boot"], each["id"]) for each in found if each.get("drive")}
+
+
 TAKEN = set()
 
 
@@ -65,14 +77,69 @@ def free_ports(count):
     return ports
 
 
+def slowness():
+    """How many times longer things take than on an idle machine, about."""
+    return min(max(1.0, os.getloadavg()[0] / os.cpu_count()), 8.0)
+
+
 def until(what, ready, seconds=30):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
+    """Waits for so long; longer on a busy machine."""
+    began = time.monotonic()
+    while time.monotonic() < began + seconds * slowness():
         result = ready()
         if result:
             return result
         time.sleep(0.05)
-    raise SystemExit(f"{what} did not happen within {seconds} s")
+    raise SystemExit(f"{what} did not happen within {time.monotonic() - began:.0f} s")
+
+
+def listens(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def processor_seconds(pid):
+    fields = pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def memory(pid):
+    """Resident and proportional memory in MiB."""
+    text = pathlib.Path(f"/proc/{pid}/smaps_rollup").read_text()
+    values = {line.split(":")[0]: int(line.split()[1]) for line in text.splitlines()[1:] if line.endswith("kB")}
+    return values["Rss"] / 1024, values["Pss"] / 1024
+
+
+def query_api(port, what, **parameters):
+    """The data that Prometheus, or what is asked like it, answers with."""
+    address = f"http://127.0.0.1:{port}/api/v1/{what}?" + urllib.parse.urlencode(parameters)
+    with urllib.request.urlopen(address, timeout=60) as answer:
+        return json.load(answer)["data"]
+
+
+class Processes:
+    """What was started, each with its log in the directory; ended with the program."""
+
+    def __init__(self, directory):
+        self.directory = directory
+        self.processes = []
+
+    def start(self, name, command, stdin=subprocess.DEVNULL, **environment):
+        with open(self.directory / f"{name}.log", "ab") as log:
+            process = subprocess.Popen([str(each) for each in command], stdin=stdin, stdout=log, stderr=log, env=os.environ | environment)
+        self.processes.append(process)
+        return process
+
+    def end(self):
+        for process in self.processes:
+            if process.poll() is None:
+                process.terminate()
+        for process in self.processes:
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 def openssl(*arguments, **options):
@@ -150,7 +217,7 @@ class Gateway:
             "drivegate_url": f"https://localhost:{self.http}",
             "drivegate_ca": str(self.directory / "authority.crt"),
             "drivegate_install": False,
-            "drivegate_patience": 5,
+            "drivegate_patience": round(5 * slowness()),
             "drivegate_settle": 2,
             "drivegate_configuration": configuration,
         }
@@ -171,10 +238,10 @@ class Gateway:
         return sum(float(line.rsplit(" ", 1)[1]) for line in lines if line.startswith((name + "{", name + " ")))
 
 
-class Plant:
+class Plant(Processes):
     def __init__(self, directory, binary, gateways):
-        self.directory, self.binary = directory, binary
-        self.processes = []
+        super().__init__(directory)
+        self.binary = binary
         self.certificates = Certificates(directory / "certificates")
         self.broker_tls, self.broker_plain = free_ports(2)
         self.broker()
@@ -182,13 +249,6 @@ class Plant:
         self.writes = directory / "writes"
         self.writes.touch()
         self.renewing = threading.Event()
-
-    def start(self, name, command, **environment):
-        with open(self.directory / f"{name}.log", "ab") as log:
-            process = subprocess.Popen([str(each) for each in command], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                                       env=os.environ | environment)
-        self.processes.append(process)
-        return process
 
     def broker(self):
         """Two listeners: TLS with certificates of clients, and one with a password."""
@@ -206,7 +266,7 @@ allow_anonymous true
 listener {self.broker_plain} 127.0.0.1
 password_file {passwords}
 """)
-        self.start("mosquitto", [shutil.which("mosquitto") or "/usr/sbin/mosquitto", "-c", config])
+        self.start("mosquitto", [MOSQUITTO, "-c", config])
 
     def simulate(self):
         """All drives, and the lines of the buses `a`."""
@@ -247,7 +307,8 @@ password_file {passwords}
 
     def run_motors(self):
         """Each drive runs, and its lease is renewed from now on."""
-        threading.Thread(target=self.renew, daemon=True).start()
+        for gateway in self.gateways:
+            threading.Thread(target=self.renew, args=[gateway], daemon=True).start()
         for gateway in self.gateways:
             for drive in gateway.drives:
                 until(f"the start of {gateway.name} {drive}", lambda: self.command(gateway, drive), 10)
@@ -263,25 +324,17 @@ password_file {passwords}
     def has_counted(gateway):
         return gateway.metric("drivegate_drive_starts_total") == len(gateway.drives)
 
-    def renew(self):
+    def renew(self, gateway):
         while not self.renewing.wait(2):
-            for gateway in self.gateways:
-                for drive in gateway.drives:
-                    try:
-                        ask(gateway.socket, f"/api/v1/drives/{drive}/heartbeat", "")
-                    except OSError:
-                        pass
+            for drive in gateway.drives:
+                try:
+                    ask(gateway.socket, f"/api/v1/drives/{drive}/heartbeat", "")
+                except (OSError, http.client.HTTPException):
+                    pass
 
     def running(self, gateway):
         return all(each["state"] == "running" for each in gateway.drive_states().values())
 
     def end(self):
         self.renewing.set()
-        for process in self.processes:
-            process.terminate()
-        for process in self.processes:
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        super().end()

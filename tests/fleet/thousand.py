@@ -2,8 +2,9 @@
 """A thousand nodes at one broker with TLS: PROCESSES gateways of `drivegate run`, and SESSIONS of the same MQTT and Sparkplug code in one
 process (benches/sessions.rs), with DRIVES drives each.
 
-All start at once; the broker is away for a while; then a host asks all nodes for their births at once. Prints how long it takes until every
-birth is there, and what that costs. Ends with 1 if it takes longer than BOUND, if data had an alias that the host does not know, or if an event was lost.
+All start at once; a host that starts again asks all nodes for their births at once; the broker is restarted, and later killed, and comes
+back after a while. Prints how long it takes until every birth is there, and what that costs. Ends with 1 if it takes longer than BOUND, if
+data had an alias that the host does not know, if an event was lost, or if the nodes came back twice in the same order.
 """
 
 import argparse
@@ -19,30 +20,27 @@ import tempfile
 import time
 
 import paho.mqtt.client as paho
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
 
-from fleet import listens, memory, processor_seconds
-from plant import ROOT, Certificates, ask, free_ports, to_toml, until
+from plant import MOSQUITTO, ROOT, Certificates, Processes, ask, events_of, free_ports, listens, memory, processor_seconds, to_toml, until
 from sparkplug_host import Host, rebirth
 
 BOUND = 30.0
 GROUP = "fleet"
 
 
-class Fleet:
+class Fleet(Processes):
     def __init__(self, directory, options):
-        self.directory, self.options = directory, options
+        super().__init__(directory)
+        self.options = options
         self.certificates = Certificates(directory / "certificates")
         self.port = free_ports(1)[0]
         self.plain = free_ports(1)[0]
-        self.all, self.gateways = [], []
+        self.gateways = []
         self.host = Host(options.drives)
         self.online = {}
-
-    def start(self, name, command, stdin=subprocess.DEVNULL, **environment):
-        with open(self.directory / f"{name}.log", "ab") as log:
-            process = subprocess.Popen([str(each) for each in command], stdin=stdin, stdout=log, stderr=log, env=os.environ | environment)
-        self.all.append(process)
-        return process
+        self.events = collections.Counter()
 
     def start_broker(self):
         certificates, config = self.certificates, self.directory / "mosquitto.conf"
@@ -52,28 +50,36 @@ certfile {certificates.path("broker.crt")}
 keyfile {certificates.path("broker.key")}
 listener {self.plain} 127.0.0.1
 allow_anonymous true
-persistence false
+persistence true
+persistence_location {self.directory}/
 max_queued_messages 1000000
 max_connections -1
 user root
 """)
-        self.broker = self.start("mosquitto", [shutil.which("mosquitto") or "/usr/sbin/mosquitto", "-c", config])
+        self.broker = self.start("mosquitto", [MOSQUITTO, "-c", config])
         until("the broker", lambda: listens(self.plain), 20)
 
     def watch(self):
         """The host, by the listener without TLS: its own decryption is not part of what is measured."""
-        client = paho.Client(paho.CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+        client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id="host", protocol=paho.MQTTv5)
         client.reconnect_delay_set(0.1, 0.1)
-        client.on_connect = lambda client, *_: client.subscribe([(f"spBv1.0/{GROUP}/#", 0), ("drivegate/+/status", 1)])
+        topics = [(f"spBv1.0/{GROUP}/#", 0), ("drivegate/+/status", 1), ("drivegate/+/drive/+/event", 1)]
+        client.on_connect = lambda client, *_: client.subscribe(topics)
         client.on_message = self.received
-        client.connect("127.0.0.1", self.plain)
+        # The broker keeps the session while it is restarted.
+        session = Properties(PacketTypes.CONNECT)
+        session.SessionExpiryInterval = 600
+        client.connect("127.0.0.1", self.plain, clean_start=False, properties=session)
         client.loop_start()
         self.client = client
 
     def received(self, _client, _data, message):
         if message.topic.startswith("spBv1.0/"):
             self.host.received(message.topic, message.payload)
-        elif message.payload == b"online":
+        elif message.topic.endswith("/event"):
+            event = json.loads(message.payload)
+            self.events[message.topic.split("/")[1], event["boot"], event["id"]] += 1
+        elif message.payload == b"online" and not message.retain:
             self.online[message.topic.split("/")[1]] = time.monotonic()
 
     def names(self):
@@ -89,7 +95,7 @@ user root
             "gateway": {"name": name, "socket": str(self.directory / f"{name}.socket"), "state_dir": str(self.directory / name)},
             "bus": [bus],
             "mqtt": {"url": f"mqtts://localhost:{self.port}", "ca": self.certificates.path("authority.crt"), "topics": ["state"],
-                     "sparkplug": {"group": GROUP}},
+                     "publish": {"min_interval": f"{1000 * options.min_interval:.0f}ms"}, "sparkplug": {"group": GROUP}},
             "recordings": {"max_count": 0},
         }
 
@@ -109,7 +115,7 @@ user root
             until("the lines", lambda: all(os.path.exists(bus["port"]) for bus in buses), 60)
         command = [options.sessions_binary, "--port", self.port, "--sessions", options.sessions, "--drives", options.drives,
                    "--ca", self.certificates.path("authority.crt"), "--dir", self.directory / "sessions",
-                   "--cycle", options.cycle.removesuffix("s")]
+                   "--cycle", options.cycle.removesuffix("s"), "--min-interval", options.min_interval]
         self.sessions = self.start("sessions", command, stdin=subprocess.PIPE)
         for number in range(options.processes):
             name = f"site-{number:04}"
@@ -146,6 +152,32 @@ user root
               f"{memory(self.broker.pid)[0]:.0f} MiB; {self.options.sessions} sessions {100 * used['sessions']:.0f} %, "
               f"{memory(self.sessions.pid)[0]:.0f} MiB; {len(self.gateways)} gateways {100 * used['gateways']:.0f} %", flush=True)
 
+    def outage(self, what, end):
+        """The broker ends and comes back; whether all births were there in time, and when each node was whole."""
+        end(self.broker)
+        self.broker.wait()
+        self.host.forget()
+        self.online.clear()
+        time.sleep(self.options.outage)
+        self.start_broker()
+        began = time.monotonic()
+        is_well = self.births(f"the broker {what}, back after {self.options.outage:.0f} s", began)
+        print(f"  the broker took {processor_seconds(self.broker.pid):.1f} s of a core", flush=True)
+        self.costs("  the 10 s after that", 10)
+        unknown = sum(self.host.unknown.values())
+        print(f"  status online: {len(self.online)}; data with an unknown alias: {unknown}", flush=True)
+        return is_well and len(self.online) == len(self.names()) and not unknown, dict(self.host.whole_at)
+
+    def missing_events(self):
+        """Raised by the gateways, and not received by the host."""
+        sockets = [(f"site-{n:04}", self.directory / f"site-{n:04}.socket") for n in range(self.options.processes)]
+        raised = {(name, boot, id) for name, socket in sockets for boot, id in events_of(socket)}
+        time.sleep(3)
+        missing = raised - self.events.keys()
+        print(f"  events: {len(raised)} raised, {len(missing)} not received, "
+              f"{sum(count > 1 for count in self.events.values())} twice", flush=True)
+        return len(missing)
+
     def lost(self):
         """Messages that gateways and sessions gave up."""
         self.sessions.stdin.close()
@@ -157,16 +189,13 @@ user root
             count += sum(int(line.rsplit(" ", 1)[1]) for line in lines if line.startswith("drivegate_mqtt_lost_total"))
         return count
 
-    def end(self):
-        for process in self.all:
-            if process.poll() is None:
-                process.terminate()
-        for process in self.all:
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+
+def likeness(first, second):
+    """How much alike two orders are: 1 the same, 0 not at all."""
+    names = first.keys() & second.keys()
+    one, other = ({name: rank for rank, name in enumerate(sorted(names, key=times.get))} for times in (first, second))
+    count = max(len(names), 2)
+    return 1 - 6 * sum((one[name] - other[name]) ** 2 for name in names) / (count * (count**2 - 1))
 
 
 def tried(fleet):
@@ -185,19 +214,12 @@ def tried(fleet):
     is_well &= fleet.births("rebirths of all, asked for at once", began)
     print(f"  the broker took {processor_seconds(fleet.broker.pid) - used:.1f} s of a core", flush=True)
 
-    fleet.broker.kill()
-    fleet.broker.wait()
-    fleet.host.forget()
-    fleet.online.clear()
-    time.sleep(options.outage)
-    fleet.start_broker()
-    began = time.monotonic()
-    is_well &= fleet.births(f"the broker back after {options.outage:.0f} s", began)
-    print(f"  the broker took {processor_seconds(fleet.broker.pid):.1f} s of a core", flush=True)
-    time.sleep(10)
-    is_well &= len(fleet.online) == len(fleet.names())
-    print(f"status online: {len(fleet.online)}; data with an unknown alias since then: {sum(fleet.host.unknown.values())}", flush=True)
-    is_well &= not fleet.host.unknown
+    ok, first = fleet.outage("restarted", subprocess.Popen.terminate)
+    is_well &= ok and not fleet.missing_events()
+    ok, second = fleet.outage("killed", subprocess.Popen.kill)
+    alike = likeness(first, second)
+    print(f"order of the nodes in the two storms: {alike:.2f} alike", flush=True)
+    is_well &= ok and alike < 0.3
     ended = [process.poll() for process in fleet.gateways if process.poll() is not None]
     lost = fleet.lost()
     print(f"lost: {lost}; gateways that ended: {len(ended)}", flush=True)
@@ -210,6 +232,7 @@ def main():
     parser.add_argument("--sessions", type=int, default=900)
     parser.add_argument("--drives", type=int, default=10)
     parser.add_argument("--cycle", default="10s", help="each drive has new values so often")
+    parser.add_argument("--min-interval", type=float, default=0.05, help="`publish.min_interval`, s: how often each looks for what is new")
     parser.add_argument("--seconds", type=float, default=30)
     parser.add_argument("--outage", type=float, default=10)
     parser.add_argument("--binary", type=pathlib.Path, default=ROOT / "target/release/drivegate")

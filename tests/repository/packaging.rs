@@ -89,6 +89,7 @@ const SHOWN: [&str; 15] = [
 
 const DASHBOARDS: [&str; 4] = ["fleet", "gateway", "line", "drive"];
 const ALERTS: &str = "deploy/compose/prometheus/alerts.yml";
+const RECORDING: &str = "deploy/compose/prometheus/recording.yml";
 
 fn read(path: &str) -> String {
     fs::read_to_string(root().join(path)).unwrap_or_else(|error| panic!("{path}: {error}"))
@@ -156,27 +157,27 @@ fn nothing_that_ships_fills_the_machine() {
 }
 
 #[test]
-fn prometheus_takes_its_configuration_and_the_alerts_do_what_they_say() {
+fn prometheus_takes_its_configuration_and_the_rules_do_what_they_say() {
     let promtool = tool("promtool");
     run_well(
         &promtool,
         &["check", "config", "deploy/compose/prometheus/prometheus.yml"],
     );
-    run_well(&promtool, &["check", "rules", ALERTS]);
+    run_well(&promtool, &["check", "rules", ALERTS, RECORDING]);
     run_well(
         &tool("amtool"),
         &["check-config", "deploy/compose/alertmanager/alertmanager.yml"],
     );
-    run_well(
-        &promtool,
-        &["test", "rules", "deploy/compose/prometheus/alerts_test.yml"],
-    );
+    for rules in [ALERTS, RECORDING] {
+        run_well(&promtool, &["test", "rules", &rules.replace(".yml", "_test.yml")]);
+    }
 }
 
+/// Metrics, and what rules record of them.
 fn metrics_in(text: &str) -> BTreeSet<String> {
-    let word = |c: char| c.is_ascii_alphanumeric() || c == '_';
+    let word = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == ':';
     text.split(|c| !word(c))
-        .filter(|w| w.starts_with("drivegate_"))
+        .filter(|w| w.starts_with("drivegate_") || w.starts_with("instance:"))
         .map(str::to_string)
         .collect()
 }
@@ -202,7 +203,16 @@ fn expressions(dashboard: &Value) -> Vec<String> {
 
 #[test]
 fn dashboards_and_alerts_use_metrics_that_exist() {
-    let known: BTreeSet<String> = METRICS.iter().map(ToString::to_string).collect();
+    let mut known: BTreeSet<String> = METRICS.iter().map(ToString::to_string).collect();
+    // A rule may use what was recorded before it.
+    for rule in rules_of(RECORDING) {
+        let unknown: Vec<_> = metrics_in(&rule["expr"].to_string())
+            .into_iter()
+            .filter(|m| !known.contains(m))
+            .collect();
+        assert!(unknown.is_empty(), "{RECORDING}: {unknown:?}");
+        known.insert(rule["record"].as_str().unwrap().to_string());
+    }
     let mut queries = Vec::new();
     for dashboard in dashboards() {
         queries.extend(expressions(&dashboard));
@@ -217,7 +227,7 @@ fn dashboards_and_alerts_use_metrics_that_exist() {
     assert!(missing.is_empty(), "the dashboards do not show {missing:?}");
 
     // Label values such as a file name may begin like a metric; expressions are what counts.
-    let expressions: Vec<String> = alert_rules().iter().map(|rule| rule["expr"].to_string()).collect();
+    let expressions: Vec<String> = rules_of(ALERTS).iter().map(|rule| rule["expr"].to_string()).collect();
     let unknown: Vec<_> = metrics_in(&expressions.join("\n"))
         .into_iter()
         .filter(|m| !known.contains(m))
@@ -225,14 +235,18 @@ fn dashboards_and_alerts_use_metrics_that_exist() {
     assert!(unknown.is_empty(), "{ALERTS}: {unknown:?}");
 }
 
-fn alert_rules() -> Vec<Value> {
-    yaml(ALERTS)["groups"][0]["rules"].as_array().unwrap().clone()
+fn rules_of(path: &str) -> Vec<Value> {
+    let file = yaml(path);
+    let groups = file["groups"].as_array().unwrap().iter();
+    groups
+        .flat_map(|group| group["rules"].as_array().unwrap().clone())
+        .collect()
 }
 
 #[test]
 fn every_alert_is_documented() {
     let page = read("docs/http.md");
-    for rule in alert_rules() {
+    for rule in rules_of(ALERTS) {
         let name = rule["alert"].as_str().unwrap();
         assert!(page.contains(&format!("| `{name}` |")), "{name}");
     }

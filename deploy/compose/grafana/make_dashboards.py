@@ -2,7 +2,7 @@
 """Writes the Grafana dashboards in dashboards/ from the panels below; with --check it only compares.
 
 Every query keeps the label instance, so that gateways with equal bus names stay apart. Only the totals of the
-fleet add gateways up.
+fleet add gateways up; its other panels show the worst.
 """
 
 import json
@@ -159,7 +159,8 @@ def table(title, description, expression, shown, width=12, link=None, unit="shor
     }
     overrides = []
     if link:
-        links = [{"id": "links", "value": [link]}]
+        # In a table labels are columns.
+        links = [{"id": "links", "value": [link | {"url": link["url"].replace("__field.labels.", "__data.fields.")}]}]
         overrides = [{"matcher": {"id": "byName", "options": shown[-1] if shown[-1] != "Value" else shown[-2]}, "properties": links}]
     defaults = {"unit": unit, "custom": {"align": "auto", "cellOptions": {"type": "auto"}, "inspect": False}}
     options = {"showHeader": True, "cellHeight": "sm"}
@@ -204,70 +205,64 @@ def load(width):
 
 
 def fleet():
+    """Worst first, and never one line for each gateway: there may be a thousand. Reads what prometheus/recording.yml records."""
+
+    def of(name):
+        return f"instance:drivegate_{name}{{{INSTANCE}}}"
+
     def total(title, description, expression, thresholds=PLAIN):
         return stat(title, description, expression, "", 4, thresholds)
 
+    def worst(title, description, unit, expression):
+        return graph(title, f"The ten gateways with the most. {description}", unit, query(f"topk(10, {expression})", OF_INSTANCE), links=[TO_GATEWAY])
+
     gateways = f'up{{job="drivegate", {INSTANCE}}}'
     drives = f"{{{INSTANCE}}}"
+    count, online, running = (of(name) for name in ("drives:count", "drives_online:sum", "drives_running:sum"))
     return [
         row("All gateways together"),
         total("Gateways that answer", "Gateways that Prometheus reads.", f"sum({gateways})"),
         total("Gateways that do not answer", "Gateways that Prometheus cannot read.", f"count({gateways}) - sum({gateways})", NONE_IS_GOOD),
-        total("Drives online", "Drives that reply.", f"sum(drivegate_drive_up{drives})"),
-        total("Drives offline", "Drives that do not reply.", f"count(drivegate_drive_up{drives}) - sum(drivegate_drive_up{drives})", NONE_IS_GOOD),
-        total("Motors running", "Drives whose motor runs.", f"sum(drivegate_drive_running{drives})"),
-        total("Faults", "Drives with an active fault.", f"sum(drivegate_drive_fault{drives})", NONE_IS_GOOD),
-        row("What needs attention"),
+        total("Drives online", "Drives that reply.", f"sum({online})"),
+        total("Drives offline", "Drives that do not reply.", f"sum({count}) - sum({online})", NONE_IS_GOOD),
+        total("Motors running", "Drives whose motor runs.", f"sum({running})"),
+        total("Faults", "Drives with an active fault.", f"sum({of('drives_fault:sum')})", NONE_IS_GOOD),
+        row("Worst first"),
+        table(
+            "Gateways with problems",
+            "Drives offline, with a fault or without a lease, buses that are down, servers that do not listen, a broker that is away, a refused reload: all counted.",
+            f"topk(50, {of('problems:sum')}) > 0",
+            ["instance", "Value"],
+            link=TO_GATEWAY,
+        ),
+        table("Gateways that do not answer", "Fifty of them at most.", f"bottomk(50, {gateways}) == 0", ["instance"], link=TO_GATEWAY),
         table(
             "Faults",
-            "Drives with an active fault, with its text.",
-            f"drivegate_drive_fault_info{drives} == 1",
+            "Drives with an active fault, with its text; a hundred at most.",
+            f"topk(100, drivegate_drive_fault_info{drives}) == 1",
             ["instance", "bus", "drive", "text"],
             link=TO_DRIVE,
         ),
         table(
             "Motors that do not run, and why",
-            "What keeps the motor of a drive from running; a motor that was ordered to stand is listed, too.",
-            f"drivegate_drive_blocked{drives} == 1",
+            "What keeps the motor of a drive from running; a motor that was ordered to stand is listed, too. A hundred at most.",
+            f"topk(100, drivegate_drive_blocked{drives}) == 1",
             ["instance", "bus", "drive", "reason"],
             link=TO_DRIVE,
         ),
-        graph(
-            "Failed transactions",
-            "The ten drives with the largest share of transactions that failed.",
-            "percentunit",
-            query(
-                f'topk(10, sum by (instance, bus, drive) (rate(drivegate_drive_transactions_total{{{INSTANCE}, outcome!~"ok|exception"}}[$__rate_interval]))'
-                f" / sum by (instance, bus, drive) (rate(drivegate_drive_transactions_total{drives}[$__rate_interval])))",
-                "{{instance}} {{bus}} {{drive}}",
-            ),
-            links=[TO_DRIVE],
-        ),
-        graph(
-            "Oldest sample",
-            "The ten drives with the oldest process data.",
-            "s",
-            query(f"topk(10, drivegate_drive_sample_age_seconds{drives})", "{{instance}} {{bus}} {{drive}}"),
-            links=[TO_DRIVE],
-        ),
-        row("Gateways"),
+        table("Buses that are down", "Fifty of them at most.", f"bottomk(50, drivegate_bus_up{drives}) == 0", ["instance", "bus"], link=TO_LINE),
         table(
             "Versions",
-            "The version of each gateway.",
-            f"drivegate_build_info{drives}",
-            ["instance", "gateway", "version", "commit"],
+            "How many gateways run each version.",
+            f"count by (version, commit) (drivegate_build_info{drives})",
+            ["version", "commit", "Value"],
         ),
-        graph("Drives online", "Drives that reply, by gateway.", "short", query(f"sum by (instance) (drivegate_drive_up{drives})", OF_INSTANCE), links=[TO_GATEWAY]),
-        graph("Motors running", "By gateway.", "short", query(f"sum by (instance) (drivegate_drive_running{drives})", OF_INSTANCE), links=[TO_GATEWAY]),
-        graph("Load of the busiest line", "By gateway.", "percentunit", query(f"max by (instance) (drivegate_bus_load_ratio{drives})", OF_INSTANCE), links=[TO_GATEWAY]),
-        timeline(
-            "Buses",
-            "Whether the port of each bus is open.",
-            f"drivegate_bus_up{drives}",
-            OF_BUS,
-            [("down", "red"), ("up", "green")],
-            links=[TO_LINE],
-        ),
+        worst("Drives offline", "Drives that do not reply.", "short", f"{count} - {online}"),
+        worst("Failed transactions", "The drive with the largest share.", "percentunit", of("transactions_failed:max_ratio_rate5m")),
+        worst("Oldest sample", "The drive with the oldest process data.", "s", of("sample_age_seconds:max")),
+        worst("Load of the busiest line", "Near 100 %: the configured cycle is not reached.", "percentunit", of("bus_load:max")),
+        worst("Commands that failed", "All that were not acknowledged.", "ops", of("writes_failed:rate5m")),
+        graph("Drives", "Of all gateways.", "short", query(f"sum({count})", "all"), query(f"sum({online})", "online"), query(f"sum({running})", "running")),
     ]
 
 
@@ -391,17 +386,28 @@ def annotation(name, colour, expression, title, text):
     }
 
 
-def annotations(selector):
+def annotations(selector, most=None):
+    """At most so many of a kind at a time."""
+
+    def some(expression):
+        return f"topk({most}, {expression})" if most else expression
+
     return [
-        annotation("Faults", "red", f"drivegate_drive_fault_info{{{selector}}} == 1", "{{drive}}: fault", "{{text}}"),
+        annotation("Faults", "red", some(f"drivegate_drive_fault_info{{{selector}}}") + " == 1", "{{drive}}: fault", "{{text}}"),
         annotation(
             "Supervision",
             "orange",
-            f"changes(drivegate_supervision_actions_total{{{selector}}}[30s]) > 0",
+            some(f"changes(drivegate_supervision_actions_total{{{selector}}}[30s])") + " > 0",
             "{{drive}}: action of supervision",
             "its client fell silent while the motor ran",
         ),
-        annotation("Starts of the gateway", "blue", f'changes(process_start_time_seconds{{job="drivegate", {INSTANCE}}}[30s]) > 0', "{{instance}} started", ""),
+        annotation(
+            "Starts of the gateway",
+            "blue",
+            some(f'changes(process_start_time_seconds{{job="drivegate", {INSTANCE}}}[30s])') + " > 0",
+            "{{instance}} started",
+            "",
+        ),
     ]
 
 
@@ -488,7 +494,7 @@ def dashboard(uid, panels, variables, selector):
         "time": {"from": "now-30m", "to": "now"},
         "timezone": "browser",
         "timepicker": {},
-        "annotations": {"list": annotations(selector)},
+        "annotations": {"list": annotations(selector, 20 if uid == "drivegate-fleet" else None)},
         "links": links,
         "templating": {"list": [source, *variables]},
         "panels": placed(panels),
