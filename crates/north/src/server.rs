@@ -55,7 +55,7 @@ pub trait Reconfigure: Server {
     /// Forgets what was prepared.
     fn abort(&mut self, change: Self::Change);
 
-    /// Takes no more from any client; what was begun is answered.
+    /// Takes no more from any client; what was started is answered.
     async fn retire(&mut self);
 
     /// Whether everybody was answered and has gone, after it retired.

@@ -226,7 +226,7 @@ impl ModbusTcpStats {
 #[derive(Debug, Default)]
 pub struct BacnetStats(Mutex<Option<BacnetFigures>>);
 
-/// Counters of the BACnet server and what became of its registration.
+/// Counters of the BACnet server and the result of its registration.
 #[derive(Debug, Clone)]
 pub struct BacnetFigures {
     /// Since it was started.
@@ -350,7 +350,8 @@ pub struct MqttStats {
     retained: Mutex<Vec<String>>,
     /// The events that the last client left unread when it ended, for the one that a reload puts in its place.
     unread_events: Mutex<Option<Receiver<Arc<Event>>>>,
-    /// The orders whose results the last client still owed when it ended, for the one that a reload puts in its place.
+    /// The commands whose results the last client still owed when it ended, for the one that a reload puts in its
+    /// place.
     orders: Mutex<Option<OrdersLeft>>,
     /// Those of the last edge node.
     node_orders: Mutex<Option<NodeOrdersLeft>>,
@@ -404,7 +405,7 @@ impl MqttStats {
         std::mem::replace(&mut kept, events)
     }
 
-    /// Keeps the orders whose results a client owes when it ends, or forgets them; returns those kept before.
+    /// Keeps the commands whose results a client owes when it ends, or forgets them; returns those kept before.
     pub(crate) fn keep_orders(&self, orders: Option<OrdersLeft>) -> Option<OrdersLeft> {
         let mut kept = self.orders.lock().unwrap_or_else(PoisonError::into_inner);
         std::mem::replace(&mut kept, orders)

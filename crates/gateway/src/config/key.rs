@@ -267,7 +267,8 @@ impl<T> Form<T> for Parsed<T> {
     }
 }
 
-/// The value of a key whose type says less than its range: that is what is to be written in place of one of another type.
+/// The value of a key whose type says less than its range: that is what is to be written instead of one of another
+/// type.
 fn of_type<T: FromNode>(reader: &Reader<'_>, key: &str, range: &str) -> Option<T> {
     let value = T::from_node(reader.raw(key)?);
     reader.accept(

@@ -16,7 +16,7 @@ pub enum LogFormat {
     Auto,
     /// Lines with a priority for the journal, without time.
     Journal,
-    /// Lines for people, coloured on a terminal.
+    /// Lines as text, coloured on a terminal.
     Text,
     /// One JSON object per line.
     Json,

@@ -108,7 +108,7 @@ fn credentials<C: Credential>(
     }
 }
 
-/// Whether commands can be on: somebody has to be known, and passwords must not travel in clear text.
+/// Whether commands can be on: someone has to be known, and passwords must not travel in clear text.
 fn is_safe_to_command(reader: &Reader<'_>, listen: Option<SocketAddr>, has_users: bool) -> bool {
     let key = HTTP.commands.name;
     if !has_users {

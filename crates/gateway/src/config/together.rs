@@ -214,7 +214,7 @@ fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
     }
 }
 
-/// Commanded drives that nothing stops when the commanding client falls silent.
+/// Commanded drives that nothing stops when the commanding client goes silent.
 fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
     for drive in buses.iter().flat_map(|bus| &bus.drives) {
         let (Some(spec), (Access::Control, place)) = (&drive.spec, &drive.access) else {

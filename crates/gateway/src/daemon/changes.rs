@@ -1,4 +1,4 @@
-//! What a reload changes, for people. Pure.
+//! What a reload changes, as text. Pure.
 
 use crate::config::Settings;
 

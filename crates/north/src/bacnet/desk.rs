@@ -49,7 +49,7 @@ pub(super) struct Desk {
     pub(super) server: Server,
     /// Drives that answered when they were looked at last.
     present: HashSet<u32>,
-    /// Leases that ran out so far, by device.
+    /// Leases that expired so far, by device.
     leases: HashMap<u32, u64>,
     /// Devices of which a slot waits for the next reading.
     uncertain: BTreeSet<u32>,

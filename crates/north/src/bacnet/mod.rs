@@ -1,7 +1,8 @@
 //! The BACnet/IP server: each drive is a device of its own behind a virtual network (`docs/bacnet.md`).
 //!
-//! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` says what a drive shows, `view` reads it from the process image,
-//! `writes` makes orders of what clients write, `desk` brings them together, `task` moves datagrams, `offline` does so without sockets.
+//! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` says what a drive shows, `view` reads it from
+//! the process image, `writes` makes commands of what clients write, `desk` brings them together, `task` moves
+//! datagrams, `offline` does so without sockets.
 
 mod desk;
 pub mod ede;
@@ -218,7 +219,7 @@ impl Reconfigure for Server {
         let _ = self.to_task.send(ToTask::Apply(Box::new(options), sockets));
     }
 
-    /// Takes no more from any client; what was begun is answered.
+    /// Takes no more from any client; what was started is answered.
     async fn retire(&mut self) {
         let _ = self.to_task.send(ToTask::Retire);
     }

@@ -32,13 +32,13 @@ impl Offline {
         }
     }
 
-    /// A datagram came. What it orders is in the queue of its bus when this returns.
+    /// A datagram came. What it commands is in the queue of its bus when this returns.
     pub fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
         self.desk.receive(from, datagram, now);
         self.take_up(now);
     }
 
-    /// Tells the clients what became of their writes by now.
+    /// Tells the clients the result of their writes by now.
     pub fn collect(&mut self, now: Instant) {
         let mut place = 0;
         while let Some((_, waiting)) = self.waiting.get_mut(place) {

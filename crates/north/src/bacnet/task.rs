@@ -37,7 +37,7 @@ const LOOK: Duration = Duration::from_millis(5);
 const BATCH: usize = 64;
 /// How often a BBMD whose name is not found is looked up again.
 const RESOLVE: Duration = Duration::from_secs(30);
-/// How long what was begun is waited for at the end.
+/// How long what was started is waited for at the end.
 const LAST_ANSWERS: Duration = Duration::from_millis(1500);
 
 /// What the server tells its task.
@@ -60,7 +60,7 @@ pub(super) struct Task {
     writes: FuturesUnordered<Ending>,
     /// Woken by every update of a drive.
     news: Arc<Notify>,
-    /// What was seen of each drive to which somebody subscribes.
+    /// What was seen of each drive to which someone subscribes.
     seen: HashMap<u32, Arc<Snapshot>>,
     kept: Vec<KeptSlot>,
     /// Devices with a slot of before the restart against which the motor may run.
@@ -137,7 +137,7 @@ impl Task {
         self.stats.bacnet.set(None);
     }
 
-    /// Whoever waits for a drive is answered, as long as the gateway waits.
+    /// Anyone who waits for a drive is answered, as long as the gateway waits.
     async fn answer_what_was_begun(&mut self) {
         let until = tokio::time::Instant::now() + LAST_ANSWERS;
         while let Ok(Some(ended)) = tokio::time::timeout_at(until, self.writes.next()).await {
@@ -217,7 +217,7 @@ impl Task {
         }
     }
 
-    /// Tells what changed at drives to which somebody subscribes.
+    /// Tells what changed at drives to which someone subscribes.
     fn look(&mut self) {
         let now = Instant::now();
         for device in self.desk.server.subscribed() {

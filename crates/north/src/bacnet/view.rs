@@ -146,7 +146,7 @@ impl View {
                     ..sample
                 }
             }
-            // A pulse is over when it can be read.
+            // A pulse has ended when it can be read.
             Meaning::Reset(index) => Sample {
                 value: Some(Datum::Bool(false)),
                 ..self.point(&reading, index, |value| Datum::Bool(value.as_bool()))

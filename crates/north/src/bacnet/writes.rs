@@ -1,4 +1,4 @@
-//! What a client wrote becomes an order, or a slot that waits (`docs/bacnet.md`, Commands).
+//! What a client wrote becomes a command, or a slot that waits (`docs/bacnet.md`, Commands).
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -190,7 +190,7 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
     Some(Begun::Answered(Ok(())))
 }
 
-/// Whether the drive could be given that value at all; what is not known yet is judged when it becomes an order.
+/// Whether the drive could be given that value at all; what is not known yet is judged when it becomes a command.
 fn possible(handle: &DriveHandle, index: usize, value: Value, now: Instant) -> Result<(), Refusal> {
     let order = Order::Points(vec![(index, value)]);
     match command::admit(order, &handle.reading(now), Authority::Write) {

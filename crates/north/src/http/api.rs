@@ -152,7 +152,7 @@ impl<'d> Drive<'d> {
     }
 }
 
-/// Exchanges by their outcome.
+/// Transactions by their outcome.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Outcomes {
     ok: u64,
@@ -322,7 +322,7 @@ impl<'b> Bus<'b> {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct Diagnosis<'d> {
     bus: &'d str,
-    /// `null` before the first five seconds are over.
+    /// `null` before the first five seconds have ended.
     #[schema(value_type = Option<String>)]
     time: Option<Time>,
     verdicts: &'d [Verdict],

@@ -1,4 +1,5 @@
-//! What a client and the gateway say to each other beside drives, buses and events. Fields are added, never renamed or removed.
+//! What a client and the gateway say to each other besides drives, buses and events. Fields are added, never renamed or
+//! removed.
 
 use std::path::{Path, PathBuf};
 
@@ -101,7 +102,7 @@ pub struct Why {
 pub struct ReadParameters {
     /// The drive is asked for every address, whatever earlier readings found.
     pub afresh: bool,
-    /// It may take 18 % of a busy line in place of 1.5 %.
+    /// It may take 18 % of a busy line instead of 1.5 %.
     pub brisk: bool,
 }
 
@@ -180,7 +181,7 @@ pub struct ParameterReading {
     /// Why it waits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waits: Option<String>,
-    /// The file, once it is over.
+    /// The file, once it has ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub file: Option<String>,
     /// Why it failed.
@@ -221,7 +222,7 @@ pub struct Restore {
     /// Why it waits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waits: Option<String>,
-    /// What is written, and what is to be known of it, for people; once that is known.
+    /// What is written, and what is to be known of it, as text; once that is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<String>,
     /// What the user takes upon himself.
@@ -247,7 +248,7 @@ pub enum Stage {
     Refused,
     /// Parameters are written.
     Working,
-    /// It is over.
+    /// It has ended.
     Done,
     /// It was given up.
     Failed,

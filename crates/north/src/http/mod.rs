@@ -425,7 +425,7 @@ impl HttpConnections {
         let router = TowerToHyperService::new(self.router.clone());
         let service = service_fn(|mut request: hyper::Request<Incoming>| {
             let in_use = InUse::new(place.clone());
-            // Somebody may have logged in, or out, since the connection came.
+            // Someone may have logged in, or out, since the connection came.
             place
                 .rights()
                 .set(self.operating.authority_at(peer.ip(), Instant::now()));

@@ -39,7 +39,7 @@ struct ParameterRow<'a> {
     id: &'a str,
     /// As the drive gives it; `null` where it was not read.
     raw: Option<f64>,
-    /// Value in its unit and name, for people.
+    /// Value in its unit and name, as text.
     text: &'a str,
     #[serde(skip_serializing_if = "Option::is_none")]
     why: Option<&'a str>,

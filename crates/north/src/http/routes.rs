@@ -72,7 +72,7 @@ pub(super) struct Client {
     pub(super) coverage: Coverage,
 }
 
-/// Who came over no network: whoever may open the local socket may do everything.
+/// Who came over no network: anyone who may open the local socket may do everything.
 #[derive(Debug, Clone)]
 pub(crate) struct LocalUser {
     /// The way in, as the audit shows it.
@@ -380,7 +380,7 @@ async fn guard(
     let is_local = reached.local.is_some();
     // Nobody logs in at the socket.
     let is_on = app.operating.is_on() || (is_local && !operating::is_session(path));
-    // A command of somebody who may give it is served on the last connection too.
+    // A command of someone who may give it is served on the last connection too.
     let is_urgent = ["/healthz", "/readyz"].contains(&path) || (is_on && operating::is_command(method, path));
     let access = match is_local {
         true => Ok(()),

@@ -70,7 +70,7 @@ impl User {
     }
 }
 
-/// Whether this is the password behind that hash. Takes as long as the hash asks for, whatever the password.
+/// Whether this is the password after that hash. Takes as long as the hash asks for, whatever the password.
 pub(super) fn is_password(hash: &str, password: &str) -> bool {
     let Ok(hash) = PasswordHash::new(hash) else {
         return false;

@@ -193,7 +193,7 @@ impl Admission {
         let refused = pin!(client.certificate.refused());
         let served = pin!(self.serve_client(stream, peer, Some(&client.name), &permit));
         if let Either::Left(((), served)) = select(refused, served).await {
-            // Commands that are under way are answered.
+            // Commands that are in progress are answered.
             permit.place().close(CloseReason::CertificateRefused);
             served.await;
         }

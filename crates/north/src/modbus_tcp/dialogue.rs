@@ -89,7 +89,8 @@ impl Dialogue {
     }
 
     /// Processes the frames in the input, [`TURN`] at most, while there is room for their results. Input that is not
-    /// Modbus ends it: the requests before that are answered or wait for the bus, and nothing behind it can be processed.
+    /// Modbus ends it: the requests before that are answered or wait for the bus, and nothing after it can be
+    /// processed.
     pub(super) fn process(&mut self, now: Instant) -> (Consumed, Option<NotModbus>) {
         let mut consumed = Consumed::default();
         self.session.refresh();

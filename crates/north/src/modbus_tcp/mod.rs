@@ -2,7 +2,7 @@
 //! in [`super::register_map`].
 //!
 //! Requests may be pipelined. Answers from the process image are sent in one write. A request that needs the bus does
-//! not delay the ones behind it, so replies can overtake one another; each has its transaction id.
+//! not delay the ones after it, so replies can overtake one another; each has its transaction id.
 
 mod admission;
 mod client;

@@ -118,7 +118,7 @@ impl Commands {
         }
     }
 
-    /// What the client that comes after goes on with, beside these results.
+    /// What the client that comes after goes on with, besides these results.
     pub(super) fn leave(self, results: Vec<Message>) -> OrdersLeft {
         OrdersLeft {
             waiting: self.waiting,
@@ -351,7 +351,7 @@ impl Commands {
         }
     }
 
-    /// There are no more of them than orders that the gateway keeps.
+    /// There are no more of them than commands that the gateway keeps.
     fn poll_stopped(&mut self, cx: &mut Context<'_>) -> Poll<(Reply, StopReport)> {
         for (index, stop) in self.stopping.iter_mut().enumerate() {
             if let Poll::Ready(report) = Pin::new(&mut stop.report).poll(cx) {

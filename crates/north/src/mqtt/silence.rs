@@ -52,8 +52,8 @@ impl Silence {
         std::mem::take(&mut self.asked)
     }
 
-    /// `interval` is the one that the broker set in place of ours, 0: no keep-alive. A broker that is pinged less often than we
-    /// want, or never, has no reason to speak, and is asked.
+    /// `interval` is the one that the broker set instead of ours, 0: no keep-alive. A broker that is pinged less often
+    /// than we want, or never, has no reason to speak, and is asked.
     pub(super) fn judge(&self, interval: Option<u16>, now: Instant) -> Verdict {
         let silent = now.saturating_duration_since(self.heard);
         let pinged = interval.is_none_or(|seconds| (1..=KEEP_ALIVE_S).contains(&seconds));

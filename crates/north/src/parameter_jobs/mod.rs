@@ -1,4 +1,5 @@
-//! Parameters of drives: read by background exchanges, on demand of a client and every so often, and restored (`restore`).
+//! Parameters of drives: read by background transactions, on demand of a client and every so often, and restored
+//! (`restore`).
 
 mod restore;
 mod unfinished;
@@ -18,7 +19,7 @@ use crate::parameters::{
 use crate::plant::{DriveHandle, SharedPlant};
 use crate::process_image::{Access, Machine};
 
-/// A request waits no longer than that for its turn; then it is asked anew.
+/// A request waits no longer than that for its turn; then it is asked again.
 const EXPIRY: Duration = Duration::from_secs(60);
 /// A drive that does not answer for that long ends its reading.
 const AWAY: Duration = Duration::from_secs(3600);

@@ -72,7 +72,7 @@ impl WritePaces {
     }
 }
 
-/// A slot as it is configured now, with the plant behind it.
+/// A slot as it is configured now, with the plant after it.
 #[derive(Debug)]
 pub(super) struct Terms {
     pub(super) slot: Slot,

@@ -93,7 +93,8 @@ fn status(outcome: &Outcome) -> StatusCode {
     }
 }
 
-/// When a request came, as the first argument of its handler: passwords are compared, and the body is waited for, behind that.
+/// When a request came, as the first argument of its handler: passwords are compared, and the body is waited for, after
+/// that.
 pub(in crate::http) struct Asked(Instant);
 
 impl<S: Sync> FromRequestParts<S> for Asked {
@@ -125,7 +126,7 @@ pub(in crate::http) async fn command(
         Progress::Repeated(reply) => shared(reply).await,
         Progress::Placed(mut waiting) => match waiting.shared.take() {
             None => Ok(waiting.finished().await),
-            // The result is kept for whoever repeats the command, also if this client has gone.
+            // The result is kept for anyone who repeats the command, also if this client has gone.
             Some((sender, permit)) => {
                 let reply = sender.subscribe();
                 tokio::spawn(async move {

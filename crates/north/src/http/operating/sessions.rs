@@ -22,7 +22,7 @@ pub(super) struct Secrets {
     pub(super) csrf: [u8; 32],
 }
 
-/// A session that was begun by a login.
+/// A session that was started by a login.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Session {
     pub(super) user: Arc<str>,
