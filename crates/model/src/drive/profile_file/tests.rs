@@ -639,7 +639,7 @@ fn each_mistake_of_a_value() {
         ),
         (
             "type = \"string:2\"\ninvalid = [0]",
-            "only a register with a number; m:14",
+            "only a numeric register has values",
         ),
         ("scale_from = \"b\"", "there is no point `b`; m:13, point[0].scale_from"),
         (
