@@ -131,7 +131,7 @@ where
     }
 }
 
-/// What a client may do; a reload can change it while the client is connected.
+/// The rights of a client; a reload can change them while the client is connected.
 #[derive(Debug, Clone)]
 pub(super) struct Rights(Arc<AtomicBool>);
 
@@ -191,7 +191,7 @@ impl Place {
         self.address
     }
 
-    /// What the client may do.
+    /// The rights of the client.
     pub(super) fn rights(&self) -> &Rights {
         &self.rights
     }
@@ -263,7 +263,7 @@ impl ConnectionPermit {
     }
 }
 
-/// A connection that asks for a place.
+/// A new connection that needs a place.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Newcomer<'c> {
     /// Address of the client.

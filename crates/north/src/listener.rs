@@ -23,7 +23,7 @@ use self::accept::{AcceptLoop, ListeningSocket, stop_listening};
 pub(crate) use self::state::ListenerState;
 pub use self::state::ListenerStates;
 
-/// What a server does with the connections to one of its listeners.
+/// Handles the connections to one of a server's listeners.
 pub(super) trait ConnectionHandler: Send + Sync + 'static {
     /// The place of a connection; it is given back when this is dropped.
     type Permit: Send;
@@ -281,7 +281,7 @@ impl<H: ConnectionHandler> Listeners<H> {
         }
     }
 
-    /// Closes all listeners; what their connections have started is answered as if a reload closed each of them.
+    /// Closes all listeners; requests in progress complete as if a reload closed each of them.
     pub(super) async fn close(&mut self) {
         for mut listener in std::mem::take(&mut self.open) {
             tracing::info!(target: "drivegate::north::listener", address = %listener.bound, "{}: no longer listening", self.server.title());

@@ -13,7 +13,7 @@ use super::listener::ListenerStates;
 use super::mqtt::{Broker, NodeOrdersLeft, OrdersLeft};
 use crate::event::Event;
 
-/// What outlives the servers that a reload replaces: counters of all north sides, and which commands were taken.
+/// State that survives the servers a reload replaces: counters of all servers, and the accepted commands.
 #[derive(Debug, Default)]
 pub struct NorthStats {
     /// Of the Modbus TCP server.
@@ -30,9 +30,9 @@ pub struct NorthStats {
     pub listeners: Arc<ListenerStates>,
     /// The last time the configuration was read.
     pub reload: ReloadStats,
-    /// Commands that came by way of the broker in the last minutes, and their results as payloads.
+    /// Recent commands from the broker, and their results as payloads.
     pub(super) taken: SharedMemory,
-    /// Commands that came over HTTP.
+    /// Recent commands over HTTP.
     pub(super) posted: PostedCommands,
 }
 
@@ -263,7 +263,7 @@ impl BacnetStats {
 /// How a request of a tool ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum SlotOutcome {
-    /// Answered with what the drive said; a broadcast: sent.
+    /// The drive's reply was passed on; a broadcast was sent.
     Answered,
     /// The drive refused it.
     Exception,
@@ -271,9 +271,9 @@ pub enum SlotOutcome {
     Refused,
     /// There was no answer to pass on: the drive is silent or away, or the request was not sent.
     NoAnswer,
-    /// The tool asked again before it was answered.
+    /// The tool sent another request before the reply.
     Abandoned,
-    /// No answer came within a second.
+    /// No reply arrived within a second.
     Late,
     /// No sound frame.
     Broken,
@@ -368,7 +368,7 @@ pub(crate) enum LinkOf {
     Node,
 }
 
-/// What the MQTT client lost.
+/// A kind of message lost by the MQTT client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MqttLoss {
     Event,

@@ -22,7 +22,7 @@ pub enum LogFormat {
     Json,
 }
 
-/// What is logged, and how.
+/// The settings of the log.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LogSettings {
     /// Level, also per target: `info,drivegate::bus=debug`. Checked: every part is a level or

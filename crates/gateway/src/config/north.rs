@@ -1,4 +1,4 @@
-//! `[http]`, and what all listeners share.
+//! `[http]`, and settings shared by all listeners.
 
 use std::net::SocketAddr;
 use std::path::Path;
@@ -142,7 +142,7 @@ fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<ServerIdentity> {
     })
 }
 
-/// Warns of what the network can read.
+/// Warns about data that the network can read.
 fn warn_of_reach(reader: &Reader<'_>, listen: SocketAddr) {
     if listen.ip().is_loopback() {
         return;

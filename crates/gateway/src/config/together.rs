@@ -1,4 +1,4 @@
-//! What is wrong or doubtful about sections together.
+//! Errors and warnings about combinations of sections.
 
 use std::time::Duration;
 
@@ -16,7 +16,7 @@ pub(super) struct Clients<'c> {
     pub(super) bacnet: Option<&'c bacnet::Bacnet>,
 }
 
-/// Reports what is wrong or doubtful about the sections together.
+/// Checks combinations of sections.
 pub(super) fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients<'_>) {
     let Clients {
         modbus_tcp,

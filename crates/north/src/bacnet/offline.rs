@@ -32,7 +32,7 @@ impl Offline {
         }
     }
 
-    /// A datagram came. What it commands is in the queue of its bus when this returns.
+    /// A datagram arrived. Its command is in the queue of its bus when this returns.
     pub fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
         self.desk.receive(from, datagram, now);
         self.take_up(now);
@@ -53,7 +53,7 @@ impl Offline {
         self.take_up(now);
     }
 
-    /// Does what time has made due; to be called ten times a second.
+    /// Does what is due; call it ten times a second.
     pub fn poll(&mut self, now: Instant) {
         if self.desk.is_outdated() {
             self.desk.see(self.options.clone());

@@ -1,4 +1,4 @@
-//! What a client wrote becomes a command, or a slot that waits (`docs/bacnet.md`, Commands).
+//! Turns a client's write into a command, or a waiting slot (`docs/bacnet.md`, Commands).
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -20,7 +20,7 @@ const MINIMUM_TIMES: u8 = 6;
 /// That of a write that names none.
 const LOWEST: u8 = 16;
 
-/// What becomes of a job.
+/// The progress of a job.
 #[derive(Debug)]
 pub(super) enum Begun {
     Answered(Result<(), Error>),

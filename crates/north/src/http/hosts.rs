@@ -1,5 +1,5 @@
-//! Which names and addresses the HTTP server answers under. A web page of a stranger whose name is made to resolve to
-//! this machine (DNS rebinding) could otherwise read everything through the browser of a user. Pure.
+//! The names and addresses that the HTTP server accepts. Otherwise a malicious web page whose name resolves to this
+//! machine (DNS rebinding) could read everything through a user's browser. Pure.
 
 use std::net::IpAddr;
 
@@ -17,7 +17,7 @@ pub(super) enum Host {
 }
 
 impl Host {
-    /// Reads a host as it stands in the header `Host` or in a URL: a name or an address, maybe with a port.
+    /// Parses a host as in the header `Host` or in a URL: a name or an address, possibly with a port.
     pub(super) fn parse(text: &str) -> Option<Host> {
         let (host, port) = match text.strip_prefix('[') {
             Some(rest) => {

@@ -66,7 +66,7 @@ async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) 
     points
 }
 
-/// What is asked for by a name.
+/// What a name requests.
 #[derive(Debug, Clone, Copy)]
 enum Wanted {
     /// A point, by its index.
@@ -122,7 +122,7 @@ fn wanted(profile: &Profile, names: &[&str]) -> Result<Vec<Wanted>, String> {
     names.iter().map(of).collect()
 }
 
-/// A point that is not polled: the drive is asked for it.
+/// A point that is not polled: it is read from the drive.
 async fn forwarded(drive: &DriveHandle, point: &Point, raw: &Raw, origin: Origin, deadline: Instant) -> PointValue {
     let pdu = RequestPdu::Read {
         table: raw.table,

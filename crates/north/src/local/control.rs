@@ -6,7 +6,7 @@ use tokio::sync::{mpsc, oneshot};
 
 use crate::http::messages::ReloadOutcome;
 
-/// Commands that wait; there are no more clients than that.
+/// Most waiting commands; there are no more clients than that.
 const WAITING: usize = super::MAX_CLIENTS;
 
 /// Someone wants the gateway to read its configuration again.

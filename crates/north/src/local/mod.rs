@@ -42,7 +42,7 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// How the server is configured.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// Where it listens.
+    /// The path of the socket.
     pub socket: SocketPath,
     /// The gateway that it belongs to, where that has a configuration file.
     pub control: Option<Control>,
@@ -63,7 +63,7 @@ pub struct Local {
 }
 
 impl Local {
-    /// Where it listens.
+    /// The path of the socket.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -136,7 +136,7 @@ fn turn_away(stream: &UnixStream) {
     let _ = stream.try_write(format!("{head}\r\ncontent-length: {}\r\n\r\n{body}", body.len()).as_bytes());
 }
 
-/// What a client is told that does not speak HTTP.
+/// The reply to a client that does not use HTTP.
 const NOT_HTTP: &str =
     "{\"error\":\"this socket serves HTTP; try curl --unix-socket PATH http://gateway/api/v1/drives\"}\n";
 

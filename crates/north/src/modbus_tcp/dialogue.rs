@@ -22,7 +22,7 @@ pub(super) const MOST_WAITING: usize = 16;
 /// Number of requests processed before other clients are served.
 const TURN: usize = 128;
 
-/// What one call of [`Dialogue::process`] consumed.
+/// The input consumed by one call of [`Dialogue::process`].
 #[derive(Debug, Default, Clone, Copy)]
 pub(super) struct Consumed {
     pub(super) bytes: usize,
@@ -36,9 +36,9 @@ pub(super) struct Dialogue {
     input: Vec<u8>,
     /// Bytes in `input` that are not processed yet.
     filled: usize,
-    /// Whether any frame came.
+    /// Whether any frame arrived.
     begun: bool,
-    /// When they came.
+    /// Their arrival times.
     arrivals: Arrivals,
     pub(super) output: Vec<u8>,
 }

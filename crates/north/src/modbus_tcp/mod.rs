@@ -169,7 +169,7 @@ pub struct Server {
     tasks: TaskTracker,
 }
 
-/// What [`Server::commit`] needs to apply new options: all that can fail is done.
+/// A prepared change of options for [`Server::commit`]: everything that can fail is done.
 #[derive(Debug)]
 pub struct Change {
     options: Options,
@@ -321,7 +321,7 @@ impl Reconfigure for Server {
     }
 }
 
-/// What all connections share.
+/// The state shared by all connections.
 #[derive(Debug)]
 struct ServerState {
     options: ArcSwap<Options>,

@@ -15,7 +15,7 @@ use crate::identity::seconds;
 /// Longest time between two looks at the calendar, which can be set at any time.
 const LOOK: Duration = Duration::from_secs(60);
 
-/// The connected clients, and what their certificates are held against.
+/// The connected clients, and the requirements for their certificates.
 #[derive(Debug)]
 pub(super) struct OpenClients(Mutex<State>);
 
@@ -62,7 +62,7 @@ impl OpenClients {
         })))
     }
 
-    /// What new clients are held against.
+    /// The requirements for new clients.
     pub(super) fn requirements(&self) -> Arc<Requirements> {
         self.lock().requirements.clone()
     }

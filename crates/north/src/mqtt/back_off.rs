@@ -1,4 +1,4 @@
-//! Which broker comes next, and the wait before the attempt.
+//! Chooses the next broker, and the wait before the attempt.
 
 use std::hash::{BuildHasher, RandomState};
 use std::time::Duration;

@@ -54,7 +54,7 @@ const HISTORY_PACE: Duration = Duration::from_millis(50);
 /// Minimum time between two log lines about messages that the broker refused.
 const REFUSED_LOGGED: Duration = Duration::from_secs(60);
 
-/// What expires after a time is renewed after this part of it.
+/// Expiring messages are renewed after this fraction of their time.
 const RENEWED: u32 = 2;
 
 /// An expiry in whole seconds: 0 would mean at once.
@@ -102,7 +102,7 @@ struct Client {
     announcer: Option<Announcer>,
     /// Whether discovery messages of an earlier run were asked for, or need not be.
     leftovers_known: bool,
-    /// What the present connection subscribed to.
+    /// The subscriptions of the present connection.
     subscriptions: Vec<Subscription>,
     /// Woken when a drive was updated.
     fresh: Arc<Notify>,

@@ -33,7 +33,7 @@ pub(super) struct Update {
     pub(super) payload: Vec<u8>,
 }
 
-/// Observes the process image and returns what is to be published.
+/// Observes the process image and returns the messages to publish.
 #[derive(Debug)]
 pub(super) struct Publisher {
     topics: Topics,

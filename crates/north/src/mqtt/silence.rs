@@ -2,19 +2,19 @@
 
 use std::time::{Duration, Instant};
 
-/// Keep-alive interval that the gateway asks for, s.
+/// Keep-alive interval that the gateway requests, s.
 pub(super) const KEEP_ALIVE_S: u16 = 10;
 /// Keep-alive interval.
 const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
 /// Without a packet from the broker for this long, the connection is considered lost.
 const LOST: Duration = KEEP_ALIVE.saturating_mul(3);
 
-/// What is to be done about a broker that may be silent.
+/// The decision about a broker that may be silent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Verdict {
     /// Nothing.
     Fine,
-    /// It is to be asked something that it has to answer.
+    /// Send it a request that it must answer.
     Ask,
     /// The connection is lost.
     Lost,

@@ -54,7 +54,7 @@ enum Job {
     Topics(Vec<String>),
 }
 
-/// What the disk reports.
+/// A report from the disk thread.
 #[derive(Debug)]
 pub(super) enum Loaded {
     /// Messages of earlier runs, and the topics published then.
@@ -66,7 +66,7 @@ pub(super) enum Loaded {
     },
 }
 
-/// What keeps the messages of one kind.
+/// The store of one kind of message.
 #[derive(Debug, Default)]
 pub(super) struct Store {
     disk: Option<Disk>,

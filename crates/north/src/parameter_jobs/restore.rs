@@ -1,4 +1,4 @@
-//! Restores of parameters: prepared, carried out, and where they were cut off taken up again or set aside.
+//! Restores of parameters: preparing, executing, and resuming or setting aside interrupted ones.
 //!
 //! What the machine in `parameters::restoration` wants is done here: files by threads that may block, commands by the
 //! queue of the bus, one behind the other. While parameters are written the drive takes no commands but stops, and it
@@ -25,16 +25,16 @@ const EXPIRY: Duration = Duration::from_secs(30);
 /// Share of the time of a line that the writes of a restore take at most: one part in so many.
 const SHARE: u32 = 5;
 
-/// What is done with a restore that was cut off.
+/// What to do with an interrupted restore.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Again {
-    /// It goes on.
+    /// Resume it.
     Resume,
     /// The former values are written.
     Undo,
 }
 
-/// Begins to find out what a restore of `wanted` would write; its number.
+/// Starts preparing a restore of `wanted`. Returns its number.
 ///
 /// # Errors
 /// Why nothing can be restored to the drive now.
@@ -111,7 +111,7 @@ fn passes(drive: &DriveHandle, plan: &Plan) -> Vec<String> {
     limits_passed(&drive.reading(Instant::now()), writes)
 }
 
-/// Begins to write what the restore of that number found out.
+/// Starts writing the prepared restore of that number.
 ///
 /// # Errors
 /// Why not; nothing was written.
@@ -322,7 +322,7 @@ fn start(
 
 /// A restore that is carried out.
 struct Run {
-    /// What the machine is called now.
+    /// The present name of the machine.
     name: String,
     machine: Machine,
     file: JournalFile,
@@ -445,7 +445,7 @@ impl Run {
         tokio::time::sleep(pause).await;
     }
 
-    /// It has ended: the drive takes commands again, or is held for what was left half done.
+    /// It has ended: the drive accepts commands again, or is held because it is half restored.
     fn over(self) {
         let (done, all) = self.restoration.progress();
         // A reload may have given the drive another name, by which it is resumed.

@@ -1,4 +1,4 @@
-//! What one tool says and is answered, bytes in and out, with the time as an argument.
+//! The dialogue with one tool, bytes in and out, with the time as an argument.
 //!
 //! A line has one request at a time: a tool that asks again has given the request before up, whose answer is dropped, however it
 //! ends. What was accepted for the bus is done all the same.
@@ -54,7 +54,7 @@ pub(super) struct Dialogue {
     asked: Option<Instant>,
     /// When more of the tool is read, while that is not now.
     reads_at: Option<Instant>,
-    /// What the tool is answered.
+    /// The reply to the tool.
     pub(super) output: Vec<u8>,
 }
 

@@ -15,7 +15,7 @@ use crate::codec::{LineFormat, Protocol};
 /// and the delayed acknowledgements of TCP, shorter than tools wait before they ask again.
 const HALF_FRAME: Duration = Duration::from_millis(250);
 
-/// What a tool said.
+/// A request of a tool.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Said {
     /// A sound request.
@@ -44,7 +44,7 @@ impl Framing {
         }
     }
 
-    /// Bytes came in at `now`.
+    /// Bytes were received at `now`.
     pub(super) fn add(&mut self, bytes: &[u8], now: Instant) {
         self.frames.add(bytes, now);
         self.arrivals.came(bytes.len(), now);

@@ -57,7 +57,7 @@ pub(super) use self::stop_all::stop;
 const VERIFIED: Duration = Duration::from_secs(300);
 /// Most of them, and most addresses that are known to belong to someone who may command.
 const MOST: usize = 256;
-/// Most commands whose results are awaited, stops apart.
+/// Most commands with pending results, except stops.
 const IN_PROGRESS: usize = 256;
 
 /// Header with the token of a session.
@@ -97,7 +97,7 @@ pub(super) struct Operator {
     /// See [`crate::command::Origin::with_login`].
     login: Arc<str>,
     address: IpAddr,
-    /// The way in.
+    /// The interface.
     kind: SourceKind,
     proof: Proof,
     /// The cookie of its session; `None` for a program.
@@ -105,7 +105,7 @@ pub(super) struct Operator {
 }
 
 impl Operator {
-    /// Who came through the local socket.
+    /// A user of the local socket.
     fn local(local: &LocalUser, address: IpAddr) -> Operator {
         Operator {
             login: format!("{} {}", local.kind.name(), local.who).into(),
@@ -256,8 +256,7 @@ impl Operating {
 
     /// Who may give the request that changes something.
     ///
-    /// # Errors
-    /// Nobody, or it does not come from this gateway's own page.
+    /// # Errors No user, or the request does not come from this gateway's own page.
     pub(super) async fn commander(
         &self,
         headers: &HeaderMap,

@@ -28,7 +28,7 @@ pub(super) struct Session {
     pub(super) user: Arc<str>,
     /// The user and a number that no other login has.
     pub(super) login: Arc<str>,
-    /// What every request that changes something has to repeat.
+    /// The token that every POST request must repeat.
     pub(super) csrf: String,
     begun: Instant,
     used: Instant,

@@ -27,7 +27,7 @@ pub(super) const FIXED_METRICS: usize = 2;
 /// The metric by which a host asks for a birth.
 pub(super) const REBIRTH_METRIC: &str = "Node Control/Rebirth";
 
-/// What is configured of the session.
+/// The configuration of the session.
 #[derive(Debug, Clone)]
 pub(super) struct Rules {
     pub(super) topics: Topics,
@@ -360,7 +360,7 @@ impl Session {
         self.rebirth = self.is_alive();
     }
 
-    /// What the node is now.
+    /// The present values of the node.
     pub(super) fn tell_node(&mut self, samples: Vec<Sample>) {
         self.node.changed = true;
         self.node.now_is = samples;
