@@ -26,7 +26,7 @@ use crate::command::{
 };
 use crate::drive::Profile;
 
-/// Stops to a drive that go before the end of a pulse that was begun.
+/// Most stops to a drive that are sent before the end of a started pulse.
 const MOST_STOPS: u32 = 8;
 
 /// What a command needs next.
@@ -39,12 +39,12 @@ pub enum Next {
     Done,
 }
 
-/// What the command is, as far as its steps depend on it.
+/// The properties of the command that its steps depend on.
 #[derive(Debug)]
 struct Scope {
-    /// It sets every bit that can be commanded, reset bits apart.
+    /// It sets every bit that can be commanded, except reset bits.
     whole: bool,
-    /// It says whether the motor is to run.
+    /// It sets the run command.
     names_run: bool,
     /// It sets references only.
     reference_only: bool,
@@ -54,18 +54,18 @@ struct Scope {
 #[derive(Debug)]
 struct Tries {
     failures: u32,
-    /// How the last try without an answer that says anything failed: [`Outcome::TimedOut`], [`Outcome::Garbled`] or
+    /// How the last attempt without a conclusive reply failed: [`Outcome::TimedOut`], [`Outcome::Garbled`] or
     /// [`Outcome::Unknown`].
     unanswered: Outcome,
-    /// A write was sent and not answered: whether the drive took it is not known.
+    /// A write was sent but not acknowledged: whether the drive executed it is unknown.
     in_doubt: bool,
-    /// Answers in a row by which the drive was busy.
+    /// Consecutive "busy" replies.
     busy: u32,
     /// It is tried again after that time.
     pause: Option<Duration>,
 }
 
-/// A command that the bus has begun.
+/// A command that the bus has started.
 #[derive(Debug)]
 pub struct CommandRun {
     urgency: Urgency,
@@ -75,7 +75,7 @@ pub struct CommandRun {
     actions: VecDeque<Action>,
     not_before: Option<Instant>,
     expires: Instant,
-    /// All who wait for its answer: whoever gave it, then those who joined.
+    /// Everyone waiting for its result: the client that sent it, then those that joined.
     tickets: Vec<Ticket>,
     effects: Vec<Effect>,
     tries: Tries,
@@ -84,11 +84,11 @@ pub struct CommandRun {
     /// Nothing is left but the end of a pulse, which is sent whatever happens.
     only_ends: bool,
     reply: Reply,
-    /// It, or a part of it, was on the wire; a read of what the drive has before it is none of it.
+    /// It, or a part of it, was sent; a preparatory read does not count.
     begun: bool,
     /// Any step of it was on the wire.
     reached_the_wire: bool,
-    /// What the drive last said of its motor.
+    /// Whether the motor runs, as the drive last reported.
     running: bool,
     check: Check,
     /// The drive refused the function by which its present step was written: the other one is tried.
@@ -109,15 +109,15 @@ pub struct CommandRun {
     started: bool,
     /// A stop as it was ordered, for a bus that takes the place of this one.
     stop: Option<Order>,
-    /// The order by which it starts a motor whose starts count.
+    /// The start that it causes, of a motor whose starts are counted.
     pub(super) start: Option<Start>,
-    /// The silence of whoever gave it is the one that counts for supervision.
+    /// Supervision follows the client that sent it.
     pub renews: bool,
 }
 
 impl CommandRun {
-    /// Lays the command out in the order that is safe: a stop before anything, references before run, a reset
-    /// before a new run edge. One that cannot be sent as a whole is refused; only of a stop goes out what can.
+    /// Arranges the steps in a safe order: a stop first, references before run, a reset before a new run edge. A
+    /// command that cannot be sent as a whole is refused; a stop is sent as far as possible.
     pub fn new(command: Command, profile: &Profile) -> CommandRun {
         let Command {
             order,
@@ -247,18 +247,18 @@ impl CommandRun {
         self.scope.reference_only
     }
 
-    /// When its time runs out.
+    /// When its time expires.
     pub fn expires(&self) -> Instant {
         self.expires
     }
 
-    /// Whether a client gave it: no order of the gateway's own.
+    /// Whether a client sent it, not the gateway itself.
     pub fn is_of_client(&self) -> bool {
         let kind = |ticket: &Ticket| ticket.origin().kind;
         self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| kind(ticket).is_client())
     }
 
-    /// Whether it renews the lease of its drive: a client gave it whose silence counts.
+    /// Whether it renews the lease of its drive.
     pub fn is_heard(&self) -> bool {
         self.renews && self.is_of_client()
     }
@@ -268,7 +268,7 @@ impl CommandRun {
         self.tickets.iter().map(Ticket::origin)
     }
 
-    /// Whether a tool gave it: its share of the line is that of background exchanges.
+    /// Whether a tool sent it: it then has the line share of background transactions.
     pub fn is_of_tool(&self) -> bool {
         self.tickets
             .iter()
@@ -280,8 +280,8 @@ impl CommandRun {
         self.tickets.iter().all(|ticket| ticket.origin().is_lease())
     }
 
-    /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
-    /// sent any more, but a reset bit that is set is taken away.
+    /// What the command needs next. `running` is what the drive last reported. Once it has expired nothing more is
+    /// sent, except to clear a reset bit that is set.
     pub fn next(&mut self, words: &KnownWords, profile: &Profile, running: bool, now: Instant) -> Next {
         self.running = running;
         if self.is_late(now) {
@@ -410,14 +410,14 @@ impl CommandRun {
         !self.only_ends
     }
 
-    /// It goes no further, but for the end of a pulse. Who gave it, and what it was.
+    /// Ends it, except for the end of a pulse. Returns who sent it, and what it was.
     pub fn refuse(&mut self, refusal: Refusal) -> Option<(Origin, String)> {
         self.cut_off(Outcome::Refused(refusal));
         let ticket = self.tickets.first()?;
         Some((ticket.origin().clone(), ticket.what().to_string()))
     }
 
-    /// Whether it is still owed: nothing of it was on the wire, or the drive said each time that it was too busy.
+    /// Whether it is still pending: nothing of it was sent, or the drive was busy each time.
     pub fn is_owed(&self) -> bool {
         !self.begun || (self.tries.busy > 0 && !self.tries.in_doubt)
     }
@@ -448,15 +448,15 @@ impl CommandRun {
         }
     }
 
-    /// Whether it sets a parameter and the drive just said that its motor stands, or a bit of settings that the drive just
-    /// told: the write goes next on the line.
+    /// Whether its write must be the next transaction: it sets a parameter and the drive just reported that its motor
+    /// is stopped, or a bit of a settings register that was just read.
     pub fn is_checked(&mut self) -> bool {
         let settings = self.check == Check::Read && self.settings().is_some();
         settings || self.parameter().is_some_and(|run| run.is_checked())
     }
 
-    /// Something else goes on the line: whether the motor runs is asked again before a parameter is written, and what
-    /// other settings a register holds.
+    /// Another transaction goes first: before a parameter is written, the motor state is read again, and so are the
+    /// other settings in the register.
     pub fn others_go_first(&mut self) {
         if self.settings().is_some() {
             self.check = Check::NotYet;
@@ -498,7 +498,7 @@ impl CommandRun {
         self.overtaken = self.overtaken.saturating_add(1);
     }
 
-    /// Whether so many stops were that what is left of it, the end of a pulse, goes before the next one.
+    /// Whether the end of its pulse goes before the next stop, because so many stops went first.
     pub fn is_put_off(&self) -> bool {
         self.only_ends && self.overtaken >= MOST_STOPS
     }
@@ -508,7 +508,8 @@ impl CommandRun {
         if self.begun { Outcome::Interrupted(why) } else { unbegun }
     }
 
-    /// The answer to its last step may have been a late reply: the step is done again when none can come any more.
+    /// The reply to its last step may have been a late one: the step is repeated when no late reply can arrive any
+    /// more.
     pub fn wait_for_late_replies(&mut self) {
         self.ask_before_repeating();
         self.tries.in_doubt = true;
@@ -521,18 +522,19 @@ impl CommandRun {
         }
     }
 
-    /// Whether it waits while a late reply could pass for the answer to its step. A stop does only when it was sent once.
+    /// Whether it waits while a late reply could be mistaken for the reply to its step. A stop waits only once it was
+    /// sent.
     pub fn waits_for_late(&self) -> bool {
         self.urgency != Urgency::Stop || self.waits_for_late
     }
 
-    /// It must wait for a late reply: what it has read by then is old.
+    /// It must wait for a late reply: what it has read is outdated by then.
     pub fn hold_up(&mut self) {
         self.held_up = true;
     }
 
-    /// It may go on. Whether it asks again first for what it read before it was held up: a motor may have been stopped
-    /// meanwhile.
+    /// It may continue. Returns whether it first repeats the reads from before the wait: the motor may have been
+    /// stopped meanwhile.
     pub fn asks_again(&mut self) -> bool {
         let held_up = std::mem::take(&mut self.held_up);
         if held_up && self.is_checked() {
@@ -552,13 +554,13 @@ impl CommandRun {
         self.by_other_function = false;
     }
 
-    /// Its time ran out, and what is left of it was not cut off yet.
+    /// It has expired, and its remaining steps are not cancelled yet.
     pub fn is_late(&self, now: Instant) -> bool {
         now >= self.expires && !self.only_ends
     }
 
-    /// A stop came in: what is not sent yet is not sent any more, but a reset bit that is set is taken away.
-    /// The outcome, if the command is over by that.
+    /// A stop arrived: remaining steps are cancelled, except clearing a reset bit that is set. Returns the outcome if
+    /// that ends the command.
     pub fn purge(&mut self) -> Option<Outcome> {
         // The stop that came in is on its way.
         self.started = false;
@@ -566,7 +568,8 @@ impl CommandRun {
         self.actions.is_empty().then(|| self.success())
     }
 
-    /// Another client took the drive: it goes no further, but the motor is left as it is. The outcome, if it is over by that.
+    /// Another client took the drive: the command ends, but the motor is left as it is. Returns the outcome if that
+    /// ends it at once.
     pub fn taken(&mut self, refusal: Refusal) -> Option<Outcome> {
         self.started = false;
         self.cut_off(self.unless_begun(Outcome::Refused(refusal), Interruption::Taken));
@@ -582,7 +585,7 @@ impl CommandRun {
         let high = self.actions.iter().any(Action::is_reset);
         self.actions
             .retain(|a| !high && (a.ends_reset() || matches!(a, Action::Hold(_))));
-        // A hold without the end of a pulse behind it holds nothing.
+        // A hold without the end of a pulse after it holds nothing.
         if !self.actions.iter().any(Action::ends_reset) {
             self.actions.clear();
         }
@@ -606,7 +609,7 @@ impl CommandRun {
         }
     }
 
-    /// Answers a command that the drive took; what a read must show, and the receipts of those who wait for that.
+    /// Reports the acknowledgement. Returns what a read must show, and the receipts of those waiting for that.
     pub fn acknowledge(self, outcome: &Outcome, now: Instant) -> (Vec<Effect>, Vec<Receipt>) {
         let receipts = self.tickets.into_iter();
         let receipts = receipts
@@ -615,14 +618,14 @@ impl CommandRun {
         (self.effects, receipts)
     }
 
-    /// Answers the command with that outcome.
+    /// Ends the command with that outcome.
     pub fn finish(self, outcome: &Outcome, now: Instant) {
         self.tickets
             .into_iter()
             .for_each(|ticket| ticket.answer(outcome.clone(), now));
     }
 
-    /// Answers the command, which cannot go on: with `unbegun` where nothing of it was sent.
+    /// Ends a command that cannot continue: with `unbegun` if nothing of it was sent.
     pub fn abandon(self, unbegun: Outcome, why: Interruption, now: Instant) {
         let outcome = match &self.cut {
             Some(outcome) => outcome.clone(),
@@ -632,7 +635,7 @@ impl CommandRun {
     }
 }
 
-/// Why no parameter of a family is written whose motor cannot be seen to stand.
+/// Why no parameter is written: the family does not report whether the motor is stopped.
 fn running_unknown(profile: &Profile) -> Refusal {
     Refusal::NotWritable(format!(
         "profile `{}` does not say where the drive reports whether its motor runs; no parameter is written",

@@ -9,11 +9,11 @@ use crate::process_image::Reading;
 
 /// Commands to one drive that are watched at one time; beyond that the oldest stays "acknowledged".
 const WATCHED: usize = 8;
-/// A motor whose speed fell by more than that, in Hz, or in percent where no frequency is read, is on its way to a stop.
-/// Less is ripple.
+/// A motor is decelerating if its speed falls by more than this, in Hz, or in percent if no frequency is read. Less is
+/// ripple.
 const RIPPLE: f64 = 0.25;
 
-/// On a busy line the next read may come late: so many times the time for confirmation pass before that is reported.
+/// On a busy line the next read may come late: it is reported only after this multiple of the confirmation time.
 const UNREAD: u32 = 5;
 
 /// What a read must show.
@@ -21,7 +21,7 @@ const UNREAD: u32 = 5;
 pub enum Effect {
     /// The motor runs.
     Runs,
-    /// The motor does not run, or stands.
+    /// The motor does not run, or is at standstill.
     Stops,
     /// No fault is active.
     NoFault,
@@ -39,7 +39,7 @@ impl Effect {
         }
     }
 
-    /// For people: what was not seen.
+    /// What was not seen, as text.
     fn missing(self, profile: &Profile) -> String {
         match self {
             Effect::Runs => "the motor does not run".to_string(),
@@ -53,7 +53,7 @@ impl Effect {
     }
 }
 
-/// What the order must show, as far as the plan reads it; empty when nothing of it is read.
+/// The effects of the command that the plan reads; empty if it reads none.
 pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
     let mut effects: Vec<Effect> = Vec::new();
     let mut add = |effect: Option<Effect>| {
@@ -155,7 +155,7 @@ struct Awaited {
     was_read: bool,
 }
 
-/// An acknowledged command whose effect is waited for.
+/// An acknowledged command that awaits confirmation.
 #[derive(Debug)]
 struct Watch {
     effects: Vec<Awaited>,
@@ -164,13 +164,13 @@ struct Watch {
     /// Least speed since the acknowledgement, and when it last fell.
     slowest: Option<f64>,
     fell_at: Instant,
-    /// What it was, for people.
+    /// What it was, as text.
     what: String,
     /// Why its effect cannot be seen, as it was last.
     unseen: Option<String>,
     /// Supervision wanted it, or the gateway that stops.
     own: bool,
-    /// Of those who wait for the effect; none once its time is over while nothing can be said of it yet.
+    /// Of those waiting for confirmation; empty once the time has passed without a conclusion.
     receipts: Vec<Receipt>,
 }
 
@@ -188,18 +188,19 @@ impl Watch {
         self.has(Effect::Stops) && now.saturating_duration_since(self.fell_at) < self.within
     }
 
-    /// Whether it is too early to say that an effect is missing that was not read.
+    /// Whether it is too early to report an effect as missing because it was not read yet.
     fn waits_for_reads(&self, now: Instant) -> bool {
         now.saturating_duration_since(self.since) < self.within * UNREAD
     }
 
-    /// Whether it is too early to say that the effect is missing: the motor still slows down, or the drive was not read.
+    /// Whether it is too early to report the effect as missing: the motor is still decelerating, or the drive was not
+    /// read.
     fn is_open(&self, now: Instant) -> bool {
         let unread = self.effects.iter().any(|awaited| !awaited.was_read);
         (unread && self.waits_for_reads(now)) || self.slows_down(now)
     }
 
-    /// What can be said now to be missing, which is waited for no longer.
+    /// Takes the effects that can now be reported as missing.
     fn take_missing(&mut self, now: Instant) -> Vec<Awaited> {
         let waits = self.waits_for_reads(now);
         let (missing, open) = self
@@ -210,7 +211,7 @@ impl Watch {
         missing
     }
 
-    /// For people: what was not seen.
+    /// What was not seen, as text.
     fn report(&self, missing: &[Awaited], profile: &Profile, now: Instant) -> String {
         let Watch { what, within, .. } = self;
         if missing.iter().all(|awaited| !awaited.was_read) {
@@ -230,7 +231,7 @@ impl Watch {
         format!("acknowledged {what} but did not show it within {within:?}: {missing}")
     }
 
-    /// Nobody waits for it any longer: they learn why it was not seen, where that is known.
+    /// Ends the wait: those waiting are given the reason, if known.
     fn let_go(&mut self) {
         for receipt in self.receipts.drain(..) {
             match &self.unseen {
@@ -255,7 +256,7 @@ impl Watch {
 /// A command that showed no effect in time.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unconfirmed {
-    /// For people: what was not seen.
+    /// What was not seen, as text.
     pub text: String,
     /// The motor was to run, and does not.
     pub does_not_run: bool,
@@ -301,7 +302,7 @@ impl Confirmations {
         });
     }
 
-    /// The drive was read: what shows its effect now, in time, is confirmed.
+    /// The drive was read: confirms the commands whose effect it shows in time.
     pub fn look(&mut self, reading: &Reading<'_>, now: Instant) {
         let mut index = 0;
         while let Some(watch) = self.0.get_mut(index) {
@@ -330,8 +331,8 @@ impl Confirmations {
         }
     }
 
-    /// What showed no effect in time, in words, each once. Of a motor that still slows down, and of what was not read since,
-    /// nothing is said yet, but nobody waits for it any longer.
+    /// The commands that had no effect in time, as text, each once. For a motor still decelerating, or points not read
+    /// since, nothing is reported yet, but the wait ends.
     pub fn expire(&mut self, profile: &Profile, now: Instant) -> Vec<Unconfirmed> {
         let mut late = Vec::new();
         self.0.retain_mut(|watch| {
@@ -356,7 +357,7 @@ impl Confirmations {
         late
     }
 
-    /// Waits for nothing any more: what was acknowledged stays so.
+    /// Ends all waits: acknowledged commands stay acknowledged.
     pub fn clear(&mut self) {
         self.0.clear();
     }

@@ -1,5 +1,5 @@
-//! A bus without its thread: the line, the master and what is reported of them. Pure: bytes and time are arguments, and
-//! what is to be done with the port is what [`BusCore::poll`] returns.
+//! A bus without its thread: the line, the master and their reports. Pure: bytes and time are arguments;
+//! [`BusCore::poll`] returns what to do with the port.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -18,48 +18,48 @@ use crate::event::Events;
 use crate::plant::BusHandle;
 use crate::process_image::Taping;
 
-/// What is to be done with the port.
+/// What to do with the port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Action {
-    /// Read what has come in; if that is nothing, give what [`BusCore::sending`] returns to the port.
+    /// Read the received bytes; if there are none, write what [`BusCore::sending`] returns to the port.
     Send,
     /// Wait for bytes, or until then.
     Wait {
         /// When to come back at the latest.
         until: Instant,
-        /// Whether a command that comes in ends the wait.
+        /// Whether an arriving command ends the wait.
         commands: bool,
         /// Whether tens of microseconds count.
         precise: bool,
     },
 }
 
-/// What the end of a connection means that a device server closed.
+/// What to do after a device server closed the connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Closed {
-    /// It is connected to again at once: the server has answered by it, or a reply may come by the next one.
+    /// Reconnect at once: the server has replied over it, or a reply may arrive over the next one.
     Reconnect,
-    /// It is connected to again when something is to be asked.
+    /// Reconnect when there is something to send.
     ReconnectToAsk,
     /// The port is lost.
     Lost,
 }
 
-/// What happened since the port was opened or connected to anew.
+/// What happened since the port was opened or reconnected.
 #[derive(Debug, Default)]
 struct Connection {
-    /// It took the place of one by which the server had answered.
+    /// It replaced a connection over which the server had replied.
     anew: bool,
-    /// It was made because something is to be asked.
+    /// It was made to send something.
     to_ask: bool,
     asked: bool,
     answered: bool,
-    /// So many before it ended while a request was on the line, and nothing was answered since.
+    /// How many connections before it ended during a transaction, with no reply since.
     vain: u32,
 }
 
-/// So many connections in a row may end in mid-exchange: a server may have a shorter patience with a drive that is off, or
-/// close upon one request, but one that answers nothing is no way to the drives.
+/// Most consecutive connections that may end during a transaction: a server may have a shorter timeout for a drive that
+/// is off, or close after one request, but one that never replies does not reach the drives.
 const MOST_IN_VAIN: u32 = 3;
 
 /// What was chosen to go out when the line is clear.
@@ -79,9 +79,9 @@ pub struct BusCore {
     master: Master,
     report: Report,
     chosen: Option<Chosen>,
-    /// Until when a reply to what the bus before asked may come: the line is left alone.
+    /// Until when a reply to a request of the previous bus may arrive: the line is left idle.
     quiet_until: Option<Instant>,
-    /// What is on the line.
+    /// The transaction on the line.
     asked: Option<Turn>,
     connection: Connection,
     tap: Option<Tap>,
@@ -92,7 +92,7 @@ pub struct BusCore {
 }
 
 impl BusCore {
-    /// A bus whose port is not open yet; `before` is what the bus before it left.
+    /// A bus whose port is not open yet; `before` is the handover of the previous bus.
     pub fn new(
         bus: BusHandle,
         options: &BusOptions,
@@ -135,8 +135,8 @@ impl BusCore {
         self.report.bus_up(now);
     }
 
-    /// A device server closed the connection, which is no fault of the line where it answers: nothing that is known of the drives
-    /// changes, and whoever waits goes on waiting. What that means for the port.
+    /// A device server closed the connection, which is not a line fault if it replies: the drives' states stay as they
+    /// are, and pending requests keep waiting. Returns what to do with the port.
     pub fn closed(&mut self) -> Closed {
         self.line.cut();
         let Connection {
@@ -178,7 +178,7 @@ impl BusCore {
         self.command_came();
     }
 
-    /// The port is gone or cannot be opened: everything is stale at once, everybody who waits is answered.
+    /// The port is lost or cannot be opened: everything is stale at once, and all pending requests end.
     pub fn lost(&mut self, why: &str, now: Instant) {
         self.bus.queue.close(Outcome::BusDown, now);
         (self.chosen, self.asked, self.tap) = (None, None, None);
@@ -186,8 +186,8 @@ impl BusCore {
         self.report.bus_down(why, now);
     }
 
-    /// The bus ends: everybody who waits is answered. What the bus that comes after has to know; the reply to an exchange
-    /// that is broken off may still come.
+    /// The bus ends: all pending requests end. Returns the handover for the next bus; the reply to an aborted
+    /// transaction may still arrive.
     pub fn ended(&mut self, now: Instant) -> Handover {
         let broken_off = self.asked.as_ref().and(self.line.deadline());
         Handover {
@@ -215,7 +215,7 @@ impl BusCore {
             if now < clear {
                 return wait(clear, !chosen.turn.is_stop(), true);
             }
-            // What came too late while the line fell silent is not sent.
+            // What came too late while the line went silent is not sent.
             if self.master.is_still_due(&chosen.turn, now) {
                 return Action::Send;
             }
@@ -223,7 +223,7 @@ impl BusCore {
         }
     }
 
-    /// Chooses what goes out next; else until when nothing does.
+    /// Chooses what to send next; else until when nothing is sent.
     fn choose(&mut self, now: Instant) -> Option<Instant> {
         let mut news = std::mem::take(&mut self.news);
         let next = self.master.next(now, &mut news);
@@ -278,20 +278,20 @@ impl BusCore {
         self.master.remains(now)
     }
 
-    /// The turn whose exchange is on the line.
+    /// The turn whose transaction is on the line.
     pub fn asked(&self) -> Option<&Turn> {
         self.asked.as_ref()
     }
 
-    /// A command came in while nothing was on the line: what goes next is chosen anew, but for a stop.
+    /// A command arrived while the line was idle: the next request is chosen again, unless it is a stop.
     pub fn command_came(&mut self) {
         if self.chosen.as_ref().is_some_and(|chosen| !chosen.turn.is_stop()) {
             self.chosen = None;
         }
     }
 
-    /// The chosen frame goes to the port at `now`: to be called before the port gets it, since what the port does with
-    /// it is not known.
+    /// The chosen frame is written to the port at `now`: call this before writing, since what the port does with it is
+    /// unknown.
     pub fn sending(&mut self, now: Instant) -> &[u8] {
         let Some(Chosen {
             turn,
@@ -320,7 +320,7 @@ impl BusCore {
         self.line.frame()
     }
 
-    /// Bytes came in.
+    /// Bytes were received.
     pub fn heard(&mut self, bytes: &[u8], now: Instant) {
         if !self.line.is_underway() {
             if !bytes.is_empty() {

@@ -1,5 +1,5 @@
-//! What drives counted of the line themselves (function 08), read while exchanges with them fail: it tells whether the way to the
-//! drive or the way back is bad. In the share of the line that nobody notices.
+//! The drives' own counters of the line (function 08), read while transactions with them fail: they show which
+//! direction is disturbed. Uses only a negligible share of the line.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -15,7 +15,7 @@ use crate::plant::BusHandle;
 
 /// Pause between two readings of a drive.
 const PAUSE: Duration = Duration::from_secs(30);
-/// Pause before a counter is asked for again whose reply was lost.
+/// Pause before a counter whose reply was lost is read again.
 const AGAIN: Duration = Duration::from_secs(1);
 /// Not sent after this.
 const EXPIRY: Duration = Duration::from_secs(20);
@@ -49,7 +49,7 @@ impl DriveCounters {
         }
     }
 
-    /// Asks for what is due, and takes what was told.
+    /// Requests what is due, and takes what was read.
     pub(super) fn look(
         &mut self,
         bus: &BusHandle,

@@ -1,4 +1,4 @@
-//! All that the master knows of one drive beside its image, its polls and its N2 session.
+//! The master's state of one drive, besides its image, polls and N2 session.
 
 use std::time::{Duration, Instant};
 
@@ -28,13 +28,13 @@ pub(super) struct DriveState {
     pub(super) supervision: Supervision,
     /// Commands that it acknowledged and has not shown yet.
     pub(super) confirmations: Confirmations,
-    /// Begun commands: one of each rank, so that they keep their order.
+    /// Started commands: one of each rank, so that they keep their order.
     runs: [Option<CommandRun>; 3],
     /// When a stop was acknowledged after which nothing was sent but references and more stops, acknowledged too.
     stopped: Option<Instant>,
-    /// Stops that it did not answer.
+    /// Stops without a reply.
     pub(super) vain_stops: VainStops,
-    /// The longest that an exchange with it took lately.
+    /// The longest recent transaction.
     pub(super) answers_within: Duration,
     /// It was read since its confirmations were looked at.
     pub(super) was_read: bool,
@@ -42,14 +42,14 @@ pub(super) struct DriveState {
     pub(super) written: LastWritten,
     /// A start (true) or a stop was acknowledged, and the guards have not taken note of it.
     pub(super) acknowledged: Option<bool>,
-    /// Whether `[authority]` is on: then those are kept whose orders were carried out.
+    /// Whether `[authority]` is on: then the senders of executed commands are kept.
     pub(super) guarded: bool,
     pub(super) carried_out: Vec<Origin>,
     /// Whether its local control place has it; none while that is not known.
     pub(super) local: Option<bool>,
 }
 
-/// What the begun commands of a drive want.
+/// What the started commands of a drive need.
 #[derive(Debug)]
 pub(super) enum Wanted {
     /// A step of the command of that rank.
@@ -64,7 +64,7 @@ fn slot(urgency: Urgency) -> usize {
 }
 
 impl DriveState {
-    /// A drive of which nothing is known; its status is read every `round` at best.
+    /// A drive about which nothing is known; its status is read every `round` at best.
     pub(super) fn new(round: Duration) -> DriveState {
         DriveState {
             fresh: FRESH.max(3 * round),
@@ -85,23 +85,23 @@ impl DriveState {
         }
     }
 
-    /// It answered something, in an exchange that took the line for `took`.
+    /// The drive replied, in a transaction that took the line for `took`.
     pub(super) fn exchanged(&mut self, took: Duration) {
         self.vain_stops.answered();
         self.answers_within = took.max(self.answers_within - self.answers_within / 64);
     }
 
-    /// The begun command of that rank.
+    /// The started command of that rank.
     pub(super) fn run(&mut self, urgency: Urgency) -> Option<&mut CommandRun> {
         self.runs.get_mut(slot(urgency))?.as_mut()
     }
 
-    /// Whether a command of that rank is begun.
+    /// Whether a command of that rank has started.
     pub(super) fn is_busy(&self, urgency: Urgency) -> bool {
         self.runs.get(slot(urgency)).is_some_and(Option::is_some)
     }
 
-    /// Whether any command is begun.
+    /// Whether any command has started.
     pub(super) fn has_runs(&self) -> bool {
         self.runs.iter().any(Option::is_some)
     }
@@ -112,13 +112,13 @@ impl DriveState {
         }
     }
 
-    /// Until when a begun order of a client holds the lease.
+    /// Until when a started client command holds the lease.
     pub(super) fn client_holds_until(&self) -> Option<Instant> {
         let of_client = self.runs.iter().flatten().filter(|run| run.is_heard());
         of_client.map(CommandRun::expires).max()
     }
 
-    /// What the begun commands want at `now`: that of the highest rank first. Those that are over are answered.
+    /// What the started commands need at `now`, highest rank first. Those that have ended get their result.
     pub(super) fn wanted(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Wanted {
         let reading = image.reading(now, self.fresh);
         let profile = &image.spec.profile;
@@ -170,13 +170,13 @@ impl DriveState {
         waits && !stop.as_ref().is_some_and(CommandRun::reached_the_wire)
     }
 
-    /// The drive answered a step of a begun command. The outcome, when the command is over.
+    /// The drive replied to a step of a started command. Returns the outcome when the command has ended.
     pub(super) fn answered(&mut self, urgency: Urgency, step: &Step, reply: Reply) -> Option<Outcome> {
         let run = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut)?;
         run.answered(step, reply, &mut self.words)
     }
 
-    /// A begun command is over.
+    /// A started command has ended.
     pub(super) fn end(&mut self, urgency: Urgency, outcome: &Outcome, image: &DriveImage, now: Instant) {
         let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::take) else {
             return;
@@ -219,7 +219,7 @@ impl DriveState {
         }
     }
 
-    /// A step of a begun command goes onto the wire.
+    /// A step of a started command is sent.
     pub(super) fn sent(&mut self, urgency: Urgency, step: &Step, now: Instant) {
         let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut) else {
             return;
@@ -233,7 +233,7 @@ impl DriveState {
         }
     }
 
-    /// It heard an order that is no begun command: one to several drives, or one that is not decoded.
+    /// The drive received a command that is not a started one: a broadcast, or one that is not decoded.
     pub(super) fn heard_order(&mut self, renews: bool, now: Instant) {
         self.stopped = None;
         if renews {
@@ -246,8 +246,8 @@ impl DriveState {
         self.stopped.is_some()
     }
 
-    /// Whether a stop is redundant: the drive acknowledged one, a later sample shows the motor standing, and
-    /// nothing that is begun may start it.
+    /// Whether a stop is redundant: the drive acknowledged one, a later sample shows the motor stopped, and no started
+    /// command may start it.
     pub(super) fn stands_by_stop(&self, reading: &Reading<'_>) -> bool {
         let begun = self.runs.get(slot(Urgency::Command)).and_then(Option::as_ref);
         let running = reading.model(ModelPoint::Running);
@@ -259,7 +259,7 @@ impl DriveState {
                 .is_some_and(|stopped| running.at.is_some_and(|at| at > stopped))
     }
 
-    /// A stop came in: nothing that was begun goes on, but a reset bit that is set is taken away.
+    /// A stop arrived: started commands end, except clearing a reset bit that is set.
     pub(super) fn purge(&mut self, image: &DriveImage, now: Instant) {
         let outcome = self.run(Urgency::Command).and_then(CommandRun::purge);
         if let Some(outcome) = outcome {
@@ -267,7 +267,7 @@ impl DriveState {
         }
     }
 
-    /// Another client took the drive: what `refuses` says of the begun command goes no further.
+    /// Another client took the drive: started commands that `refuses` rejects end.
     pub(super) fn taken(&mut self, refuses: impl Fn(&Origin) -> Option<Refusal>, image: &DriveImage, now: Instant) {
         let taken = |run: &mut CommandRun| {
             let refusal = run.origins().find_map(&refuses)?;
@@ -279,7 +279,7 @@ impl DriveState {
         }
     }
 
-    /// What supervision wants and was begun, but not sent, is taken back: a client commands the drive again.
+    /// Withdraws a supervision action that was started but not sent: a client commands the drive again.
     pub(super) fn withdraw_supervision(&mut self, now: Instant) {
         for run in &mut self.runs {
             if let Some(run) = run.take_if(|run| run.is_of_supervision() && run.is_owed()) {
@@ -289,7 +289,7 @@ impl DriveState {
         }
     }
 
-    /// The drive does not answer any more. A stop is tried on; what else was begun has failed.
+    /// The drive no longer replies. A stop is retried; other started commands have failed.
     pub(super) fn went_offline(&mut self, now: Instant) {
         self.words.forget();
         self.stopped = None;
@@ -303,13 +303,13 @@ impl DriveState {
         }
     }
 
-    /// The drive has started anew: nothing that is known of it holds.
+    /// The drive has restarted: everything known about it is void.
     pub(super) fn restarted(&mut self) {
         self.words.forget();
         self.stopped = None;
     }
 
-    /// The stop of a client that is begun, for the bus that takes the place of this one.
+    /// A client's started stop, for the bus that replaces this one.
     pub(super) fn take_stop(&mut self, drive: usize, now: Instant) -> Option<Command> {
         let run = self.runs.get_mut(slot(Urgency::Stop))?.take()?;
         if run.is_heard() && run.reached_the_wire() {
@@ -324,7 +324,7 @@ impl DriveState {
         }
     }
 
-    /// Everything that was begun is answered; what was acknowledged stays so.
+    /// Ends all started commands; acknowledged ones stay acknowledged.
     pub(super) fn close(&mut self, unbegun: &Outcome, why: Interruption, now: Instant) {
         for run in self.runs.iter_mut().filter_map(Option::take) {
             if run.is_heard() && run.reached_the_wire() {

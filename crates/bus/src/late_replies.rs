@@ -1,8 +1,8 @@
-//! Replies that a drive may still send after its exchange was given up: a late one must not be taken for the answer to a
-//! later request. Pure: time is an argument.
+//! Replies that a drive may still send after its transaction was given up: a late one must not be mistaken for the
+//! reply to a later request. Pure: time is an argument.
 //!
-//! A Modbus reply names neither register nor request. After an exchange without a believable answer, the reply may come
-//! during a later exchange. It is recognised by address, function and length; only a request to the same drive whose
+//! A Modbus reply names neither register nor request. After a transaction without a valid reply, the reply may come
+//! during a later transaction. It is recognised by address, function and length; only a request to the same drive whose
 //! reply would look the same could be answered wrongly. Such a request waits until no late reply can come any more. The
 //! same request may be sent again at once: whichever reply comes, it is true of the same registers.
 //!
@@ -20,19 +20,19 @@
 //! it may belong to the earlier stop, and the stop is sent once more, which does no harm. Where nothing was
 //! written in between, either acknowledgement is true: the drive's last word is a stop.
 //!
-//! Nor does a stop wait for look-alikes. The acknowledgement of a write of several registers or coils has first address and
-//! count, not the values. So a stop by such a write is sent once more for each acknowledgement of another one that may
-//! still come. From then on it is the stop whose acknowledgement may come late, in place of the other write's.
+//! Nor does a stop wait for look-alikes. The acknowledgement of a write of several registers or coils has first address
+//! and count, not the values. So a stop by such a write is sent once more for each acknowledgement of another one that
+//! may still come. From then on it is the stop whose acknowledgement may come late, instead of the other write's.
 
 use std::time::{Duration, Instant};
 
 use crate::codec::RequestPdu;
 
-/// A reply that has not come by then will not come.
+/// A reply that has not arrived by then will not arrive.
 pub const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);
-/// A look-alike waits no longer than that before the request whose reply is late is held back for it.
+/// How long a look-alike waits before the request whose reply is late is held back for it.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// No more tries of one write than that are acknowledged late: neither the drive nor what is before it keeps more.
+/// Most attempts of one write that may be acknowledged late: neither the drive nor anything in between buffers more.
 const KEPT: u32 = 3;
 
 /// Replies that one drive may still send.
@@ -44,16 +44,16 @@ pub struct LateReplies {
 #[derive(Debug)]
 struct LateReply {
     pdu: RequestPdu,
-    /// When the first of the exchanges that were given up in a row began; `None` once the request was answered.
+    /// When the first of the transactions that were given up in a row began; `None` once the request was answered.
     since: Option<Instant>,
     until: Instant,
-    /// How late the answer was, if it was the older reply.
+    /// How late the reply was, if it was the older one.
     late: Duration,
-    /// When the request was sent that was answered last: if that answer was the older reply, the next one is the reply to this.
+    /// When the last answered request was sent: if its reply was the older one, the next reply belongs to this request.
     before: Option<Instant>,
     /// Until when the newer reply may come.
     newer: Option<Instant>,
-    /// Each answer is that to its own request: the drive answered something else since.
+    /// Each reply belongs to its own request: the drive has replied to another request since.
     settled: bool,
     /// Since when a look-alike waits.
     wanted: Option<Instant>,
@@ -93,7 +93,7 @@ impl LateReply {
 }
 
 impl LateReplies {
-    /// No believable answer to `pdu` came in an exchange from `began` to `now`.
+    /// No valid reply to `pdu` arrived in a transaction from `began` to `now`.
     pub fn given_up(&mut self, pdu: &RequestPdu, began: Instant, now: Instant) {
         self.expected.retain(|late| late.ends() > now);
         self.overtake(pdu);
@@ -116,7 +116,7 @@ impl LateReplies {
         self.expected.iter_mut().find(|late| late.pdu == *pdu)
     }
 
-    /// An answer to `pdu`, sent at `sent`, came.
+    /// A reply to `pdu`, sent at `sent`, arrived.
     pub fn answered(&mut self, pdu: &RequestPdu, sent: Instant, now: Instant) {
         self.expected.retain(|late| late.ends() > now);
         for late in &mut self.expected {
@@ -229,7 +229,7 @@ enum Look<'r> {
     Several(u8, u16, usize),
     /// The function of a request that is not decoded.
     Function(u8),
-    /// Everything: the request comes back whole.
+    /// Everything: the request is echoed whole.
     Whole(&'r RequestPdu),
 }
 

@@ -1,17 +1,17 @@
-//! The bus: one owner of the line, one exchange at a time.
+//! The bus: one owner of the line, one transaction at a time.
 //!
 //! - `line_loop`: the thread, the port, the clock; it does what the core says. [`prober`] does the same for `scan`.
 //! - [`core`](self::core): the bus without its thread: bytes and time in, what to do with the port out.
-//! - [`line_state`]: how long the line has been silent, and the exchange that is under way, a [`transaction`].
-//! - [`master`]: what goes on the line next (`choose`), what came of it (`results`), the stops at shutdown (`shutdown`).
+//! - [`line_state`]: how long the line has been silent, and the transaction that is in progress, a [`transaction`].
+//! - [`master`]: what goes on the line next (`choose`), the result (`results`), the stops at shutdown (`shutdown`).
 //!   [`schedule`] knows which poll is due, [`predict`] what that comes to on a given line.
-//! - `drive_state`: what is known of one drive beside its samples, polls and N2 session: its begun commands
+//! - `drive_state`: what is known of one drive besides its samples, polls and N2 session: its started commands
 //!   ([`command_run`]), what they still have to show ([`confirm`]), its lease ([`supervision`]), the replies that it may
 //!   still send ([`late_replies`]).
 //! - `start_gate`: which commands to guarded drives may start them, and the stops of interlocks.
 //! - [`n2_session`] and [`n2_late_replies`]: what N2 needs beyond that, for the whole line.
 //! - [`listener`]: the bus without its thread on a line that another master owns: it decodes and never sends.
-//! - `line_diagnosis`: feeds [`crate::diagnosis`] and shows what comes of it.
+//! - `line_diagnosis`: feeds [`crate::diagnosis`] and shows the result.
 //! - [`proof`]: whether the commands of a profile are safe, tried with the commands of the bus itself.
 //! - [`news`]: what the master has to say; `report` applies it to the process image, to events and to the log.
 //!
@@ -63,7 +63,7 @@ use std::time::Duration;
 use crate::codec::wire::Silence;
 use crate::line::LineOptions;
 
-/// How a bus treats its line, beside what [`crate::process_image::BusSpec`] says.
+/// Settings of a bus for its line, besides [`crate::process_image::BusSpec`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct BusOptions {
     /// Time for the first byte of a reply; wire time is added.
@@ -81,7 +81,7 @@ pub struct BusOptions {
 /// Whose line it is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Mode {
-    /// The gateway's: it asks, the drives answer.
+    /// The gateway is the master.
     #[default]
     Master,
     /// Another master's: the gateway listens and never sends.

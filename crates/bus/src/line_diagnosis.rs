@@ -1,4 +1,5 @@
-//! Feeds the diagnosis of a line with its exchanges, and shows and tells what comes of it. No clock but the time of day of verdicts.
+//! Feeds the diagnosis of a line with its transactions, and publishes its verdicts. Uses no clock except for the time
+//! of day of verdicts.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -22,9 +23,9 @@ pub(super) struct LineDiagnosis {
     hold: Hold,
     /// Silence before the request that is on the line.
     gap: Duration,
-    /// What each drive counted itself: since the first reading of this run of errors, and the last reading.
+    /// Each drive's own counters: since the first reading of this series of errors, and the last reading.
     by_drive: Vec<Option<(CountedByDrive, CountedByDrive)>>,
-    /// When each verdict that is shown came.
+    /// Since when each current verdict holds.
     since: Vec<(Cause, Option<usize>, SystemTime)>,
 }
 
@@ -58,14 +59,14 @@ impl LineDiagnosis {
         &mut self.figures
     }
 
-    /// Whether exchanges with that drive failed in the last minute.
+    /// Whether transactions with that drive failed in the last minute.
     pub(super) fn has_errors(&self, drive: usize) -> bool {
         let failed = [Sign::Damaged, Sign::StartLost, Sign::CutEcho, Sign::Silent];
         let drive = self.figures.drives.get(drive);
         drive.is_some_and(|drive| failed.iter().any(|sign| drive.sum(*sign) > 0))
     }
 
-    /// A drive told what it counted.
+    /// The drive's own counters were read.
     pub(super) fn counted_by_drive(&mut self, drive: usize, counted: CountedByDrive) {
         if let Some(known) = self.by_drive.get_mut(drive) {
             // A drive that was switched off counts from 0 again.
@@ -75,7 +76,7 @@ impl LineDiagnosis {
         }
     }
 
-    /// What the drives of a finding counted, as far as it tells which direction is bad.
+    /// What the counters of the drives of a finding show about the disturbed direction.
     fn directions(&self, finding: &Finding) -> String {
         let about = (0..).zip(self.figures.drives.iter().zip(&self.names).zip(&self.by_drive));
         let about = about.filter(|(place, _)| finding.drive.is_none_or(|drive| drive == *place));
@@ -92,7 +93,7 @@ impl LineDiagnosis {
         self.gap = gap;
     }
 
-    /// An exchange of the gateway is over.
+    /// A transaction of the gateway has ended.
     pub(super) fn exchanged(&mut self, drive: usize, exchanged: &Exchanged, turnaround: Option<Duration>, at: Instant) {
         let transaction = &exchanged.transaction;
         // A drive may well ignore what a tool asks of it that no codec knows.
@@ -122,7 +123,7 @@ impl LineDiagnosis {
         });
     }
 
-    /// An exchange of another master is over.
+    /// A transaction of another master has ended.
     pub(super) fn overheard(&mut self, drive: usize, exchange: &Overheard) {
         let (Some(request), Some(ended)) = (&exchange.request, &exchange.ended) else {
             return;
@@ -150,7 +151,7 @@ impl LineDiagnosis {
         });
     }
 
-    /// Asks the rules when a step is over. What changed by it, in words.
+    /// Applies the rules when a step has passed. Returns the changes, as text.
     pub(super) fn tick(&mut self, now: Instant) -> Vec<(Option<usize>, String)> {
         if !self.figures.is_step_over(now) {
             return Vec::new();
@@ -225,7 +226,7 @@ impl LineDiagnosis {
     }
 }
 
-/// What the profiles of the drives that a finding is about have to do with it.
+/// The commissioning steps that a finding questions, from the profiles of its drives.
 fn steps_of(image: &BusImage, finding: &Finding) -> Vec<String> {
     let about = (0..)
         .zip(&image.drives)

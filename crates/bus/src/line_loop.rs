@@ -1,4 +1,5 @@
-//! The bus at work: the only place south that does I/O. One thread owns the line, and does what the [`BusCore`] says.
+//! The running bus: the only code on this side that does I/O. One thread owns the line and does what the [`BusCore`]
+//! returns.
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
@@ -18,8 +19,8 @@ use crate::plant::BusHandle;
 
 /// First and longest pause between two tries to open the port.
 const REOPEN: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(3));
-/// Longest wait for the end of the exchange on the line when the bus is to stop: a drive that is there replies within it,
-/// one that is absent must not hold up a stop or a reload for all of its `response_timeout`.
+/// Longest wait for the transaction on the line when the bus is to stop: a present drive replies within it, an absent
+/// one must not delay a stop or a reload for its full `response_timeout`.
 const LAST_EXCHANGE: Duration = Duration::from_secs(1);
 /// The thread shows that it is alive at least this often, also while it waits for a reply.
 const BEAT: Duration = Duration::from_millis(100);
@@ -90,7 +91,7 @@ impl BusTask {
         })
     }
 
-    /// Lets a prepared bus open its port; nothing further can fail. `before` is what the bus before left it.
+    /// Lets a prepared bus open its port; nothing further can fail. `before` is the handover of the previous bus.
     pub fn begin(&mut self, before: Handover) {
         if let Some(begin) = self.begin.take() {
             // Room for one; the thread waits for it.
@@ -98,7 +99,7 @@ impl BusTask {
         }
     }
 
-    /// Turns that the bus has taken: it hangs when this stands still for seconds.
+    /// Turns of the bus: it hangs if this does not advance for seconds.
     pub fn beats(&self) -> Arc<AtomicU64> {
         self.beats.clone()
     }
@@ -107,7 +108,7 @@ impl BusTask {
         &self.handle
     }
 
-    /// Ends the bus after the exchange that is on the line, but within a second; everything that waits is answered.
+    /// Ends the bus after the transaction on the line, but within a second; all pending requests end.
     pub fn stop(mut self) {
         self.handle.queue.close(Outcome::ShuttingDown, Instant::now());
         self.halt();
@@ -142,8 +143,8 @@ impl Drop for BusTask {
 /// Time for the log to be written before the process ends.
 const LAST_WORDS: Duration = Duration::from_millis(200);
 
-/// A bus that panicked would take commands that nobody serves, and show the last values for ever: a stop would be lost
-/// in it. A process that dies is started again, and its clients see that it is gone.
+/// A bus that panicked would accept commands that nothing serves, and show the last values forever: a stop would be
+/// lost. A process that exits is restarted, and its clients notice.
 fn or_end_the_process<T>(work: impl FnOnce() -> T) -> T {
     std::panic::catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| {
         let bus = std::thread::current().name().unwrap_or_default().to_string();
@@ -171,12 +172,12 @@ impl Default for ReopenPauses {
 }
 
 impl ReopenPauses {
-    /// The device has come back.
+    /// The device is back.
     fn begin_anew(&mut self) {
         self.next = REOPEN.0;
     }
 
-    /// A port that was open for so long begins anew.
+    /// After a port was open for that time, pauses start from the shortest again.
     fn was_open_for(&mut self, time: Duration) {
         if time >= REOPEN.1 {
             self.next = REOPEN.0;
@@ -237,7 +238,7 @@ impl Worker {
                     }
                     Arrival::of(&spec.port)
                 }
-                // Whoever ended the bus ended the try, too.
+                // Anyone who ended the bus ended the try, too.
                 Err(_) if self.stopping() => None,
                 Err(error) => {
                     core.lost(&error.to_string(), Instant::now());
@@ -300,8 +301,8 @@ impl Worker {
         self.stop.load(Ordering::Relaxed)
     }
 
-    /// Waits before the next try to open the port: for that time, or until the device has come, which it returns; never
-    /// less than the first pause.
+    /// Waits before the next attempt to open the port: for that time, or until the device appears, which it returns; at
+    /// least the first pause.
     fn rest(&self, pause: Duration, arrival: Option<&Arrival>) -> bool {
         let began = Instant::now();
         let mut until = began + pause;
@@ -320,7 +321,7 @@ impl Worker {
     fn serve_as_master(&self, core: &mut BusCore, line: &Line) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
         let mut break_off = None;
-        // The exchange on the line is ended first: whoever comes after would talk into its reply.
+        // The transaction on the line is ended first: anyone who comes after would talk into its reply.
         while !self.stopping() || core.asked().is_some() {
             let now = Instant::now();
             if self.stop.load(Ordering::Relaxed) && now >= *break_off.get_or_insert(now + LAST_EXCHANGE) {

@@ -1,5 +1,5 @@
-//! The half-duplex line as its one owner knows it: how long it has been silent, and the exchange that is under way. Pure:
-//! bytes and time are arguments; a loop with a port, or a test without one, does the rest.
+//! The half-duplex line as its owner sees it: how long it has been silent, and the transaction in progress. Pure: bytes
+//! and time are arguments; a loop with a port, or a test without one, does the rest.
 
 use std::time::{Duration, Instant};
 
@@ -8,10 +8,11 @@ use super::transaction::{CONNECTION_CLOSED, Ended, Step, Transaction, is_unlike_
 use crate::codec::{LineFormat, Protocol, Reply, Request};
 use crate::drive::plan::WireTime;
 
-/// A line that never falls silent is spoken on after this time: a stop must get out.
+/// A line that never goes silent is spoken on after this time: a stop must get out.
 pub const BABBLE: Duration = Duration::from_millis(500);
 
-/// Baud rates are off by 2 % at most, and times are not exact: what takes less than this share of its time is too early.
+/// Baud rates are off by at most 2 %, and times are not exact: anything faster than this share of its time is too
+/// early.
 const ALMOST: f64 = 0.9;
 
 /// Replies that are whole before the wire could have carried them show a line without wire time: a simulation, or another
@@ -23,13 +24,13 @@ const WITHOUT_WIRE_TIME: u32 = 64;
 const MOST_WEIGHT: u32 = 256;
 /// An early reply that can hardly belong to another request. One is enough, until the next regular reply.
 const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
-/// An early reply that was not believed, with nothing behind it: two are enough. One with the regular reply behind it came
-/// twice or late, as on a wire: that takes all weight back.
+/// An early reply that was not believed, with nothing after it: two are enough. One with the regular reply after it
+/// came twice or late, as on a wire: that takes all weight back.
 const WEIGHT_OF_DOUBTED: u32 = 40;
 /// Weight of either on an N2 line, where a reply does not show which request it answers. Three are enough.
 const WEIGHT_ON_N2: u32 = 24;
-/// What a regular reply takes back on an N2 line, where a doubled reply whose successor was lost looks like an early one:
-/// while fewer than one reply in four is early, the line keeps its protection.
+/// What a regular reply takes back on an N2 line, where a duplicate reply whose successor was lost looks like an early
+/// one: while fewer than one reply in four is early, the line keeps its protection.
 const REGULAR_ON_N2: u32 = 8;
 /// An early reply that could belong to another request and was believed. One in nine keeps the line as it is.
 const WEIGHT_OF_BELIEVED: u32 = 8;
@@ -45,10 +46,10 @@ pub struct Sending {
     pub late_may_come: bool,
 }
 
-/// An exchange that is over.
+/// A completed transaction.
 #[derive(Debug)]
 pub struct Exchanged {
-    /// How it ended, and all that came.
+    /// How it ended, and all received bytes.
     pub transaction: Transaction,
     /// How it ended.
     pub ended: Ended,
@@ -56,24 +57,24 @@ pub struct Exchanged {
     pub began: Instant,
     /// When the drive knew that the request was over.
     pub sent: Instant,
-    /// When the last bytes came; the end of the request where none did.
+    /// When the last bytes arrived; the end of the request if none did.
     pub heard_at: Instant,
-    /// Time on the wire of what came.
+    /// Time on the wire of the received bytes.
     pub reply_time: Duration,
-    /// How long the line was taken, with the silence behind.
+    /// How long the line was in use, including the silence after it.
     pub took: Duration,
     /// The reply was whole before the line could have carried it: the lowest baud rate at which it could have been.
     pub beats: Option<u32>,
 }
 
-/// What the exchanges on a line have shown of it. It holds for the next connection to the same line, too.
+/// What the transactions have shown about the line. It also holds for the next connection to the same line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Learned {
     protocol: Protocol,
     format: LineFormat,
-    /// The adapter sends back what it is given.
+    /// The adapter echoes what it sends.
     echo: bool,
-    /// Weight of the replies that came faster than the wire could carry them.
+    /// Weight of the replies that arrived faster than the wire could carry them.
     early_weight: u32,
 }
 
@@ -85,7 +86,7 @@ pub struct LineState {
     silence: Duration,
     /// End of the last character on the line, either direction.
     quiet_since: Instant,
-    /// Nothing is sent before then: a reply to whoever spoke before may come.
+    /// Nothing is sent before then: a reply to the previous master may arrive.
     left_alone: Instant,
     learned: Learned,
     underway: Option<Underway>,
@@ -122,8 +123,8 @@ impl LineState {
         }
     }
 
-    /// The port was opened anew. What was learned of the line is kept: a line without wire time would seem mute for seconds,
-    /// and what does not hold any more is unlearned by the replies.
+    /// The port was reopened. What was learned about the line is kept: a line without wire time would seem silent for
+    /// seconds, and replies correct what no longer holds.
     pub fn reset(&mut self, now: Instant) {
         let learned = self.learned;
         *self = LineState {
@@ -132,20 +133,20 @@ impl LineState {
         };
     }
 
-    /// What the exchanges have shown.
+    /// What the transactions have shown.
     pub fn learned(&self) -> Learned {
         self.learned
     }
 
-    /// Takes over what was learned of the same line, if it is set up as before.
+    /// Adopts what was learned about the same line, if its settings are the same.
     pub fn take_over(&mut self, learned: Learned) {
         if (learned.protocol, learned.format) == (self.protocol, self.format) {
             self.learned = learned;
         }
     }
 
-    /// The connection was closed. A request that was given to it may be on the wire behind the server, and its reply comes by
-    /// the next connection, if it does: the exchange goes on until its deadline.
+    /// The connection was closed. A request that was given to it may be on the wire behind the server, and its reply
+    /// comes by the next connection, if it does: the transaction goes on until its deadline.
     pub fn cut(&mut self) {
         if let Some(underway) = &mut self.underway {
             underway.cut = true;
@@ -175,7 +176,7 @@ impl LineState {
         self.quiet_since > since + BABBLE
     }
 
-    /// What an exchange without an answer takes.
+    /// Duration of a transaction without a reply.
     pub fn patience(&self, request: &Request, response_timeout: Duration) -> Duration {
         let wire = WireTime::of(self.protocol, &self.format, &request.pdu);
         self.silence + wire.request + response_timeout + wire.reply
@@ -185,7 +186,7 @@ impl LineState {
     pub fn send(&mut self, request: Request, frame: Vec<u8>, sending: Sending, late: N2LateReplies, now: Instant) {
         let wire = WireTime::of(self.protocol, &self.format, &request.pdu);
         let sent = now + self.format.chars(frame.len());
-        // A reply cannot be whole before its own time on the wire is over.
+        // A reply cannot be whole before its own time on the wire has ended.
         let least = self.format.chars(self.protocol.least_reply_chars(&request.pdu));
         let earliest = sent + least.mul_f64(ALMOST);
         let doubtful = sending.could_be_doubled || !is_unlike_its_reply(&request.pdu);
@@ -225,17 +226,17 @@ impl LineState {
             .map_or(&[], |underway| underway.transaction.frame())
     }
 
-    /// Whether an exchange is under way.
+    /// Whether a transaction is in progress.
     pub fn is_underway(&self) -> bool {
         self.underway.is_some()
     }
 
-    /// When the exchange that is under way ends at the latest.
+    /// When the transaction in progress ends at the latest.
     pub fn deadline(&self) -> Option<Instant> {
         self.underway.as_ref().map(|underway| underway.transaction.deadline())
     }
 
-    /// Bytes came in at `now`. The exchange, if it is over by them.
+    /// Bytes were received at `now`. Returns the transaction if they complete it.
     pub fn heard(&mut self, bytes: &[u8], now: Instant) -> Option<Exchanged> {
         if !bytes.is_empty() {
             self.quiet_since = now.max(self.quiet_since);
@@ -250,7 +251,7 @@ impl LineState {
     /// Time went by.
     ///
     /// # Errors
-    /// The time until which more is waited for, while the exchange is not over; none where there is no exchange.
+    /// The time until which more is waited for, while the transaction is not over; none where there is no transaction.
     pub fn on_time(&mut self, now: Instant) -> Result<Exchanged, Option<Instant>> {
         let Some(underway) = self.underway.as_mut() else {
             return Err(None);
@@ -309,8 +310,8 @@ impl LineState {
         }
     }
 
-    /// Weighs what the end of an exchange shows of the wire time. `early`: faster than the wire; `doubtful`: the reply could
-    /// be another one's.
+    /// Weighs what the end of a transaction shows of the wire time. `early`: faster than the wire; `doubtful`: the
+    /// reply could be another one's.
     fn weigh(&mut self, ended: &Ended, early: bool, doubtful: bool, transaction: &Transaction) {
         let believed = self.learned.early_weight >= WITHOUT_WIRE_TIME;
         let weight = match ended {

@@ -1,8 +1,9 @@
-//! The master of a line: what goes on the line next, and what came of it. Pure: time is an argument.
+//! The master of a line: decides the next request and applies results. Pure: time is an argument.
 //!
-//! [`Master::next`] chooses among stops, other commands, forwarded reads, polls and background exchanges; [`Master::done`] takes what became of
-//! an exchange and says what that changes. All that is known of one drive is in its `DriveState`. Choosing is in
-//! `choose`, results are in `results`, background exchanges in `background`, the end of the gateway is in `shutdown`.
+//! [`Master::next`] chooses among stops, other commands, forwarded reads, polls and background transactions;
+//! [`Master::done`] takes the result of a transaction and says what that changes. All that is known of one drive is in
+//! its `DriveState`. Choosing is in `choose`, results are in `results`, background transactions in `background`, the
+//! end of the gateway is in `shutdown`.
 
 mod background;
 mod choose;
@@ -45,7 +46,7 @@ use crate::process_image::DriveImage;
 const LOOK_ROUND: Duration = Duration::from_millis(100);
 /// Response timeouts for which an N2 reply may come late.
 const N2_LATE: u32 = 3;
-/// But no longer than that: a drive that does not answer is probed within 10 s.
+/// But no longer than this: a silent drive is probed within 10 s.
 const LONGEST_N2_LATE: Duration = Duration::from_secs(9);
 /// Time for the first byte of the reply to a probe of a drive that does not answer, or to a stop, unless it is known to be
 /// slower: probed every 10 s, it costs less than 2 % of the line by that.
@@ -53,42 +54,42 @@ const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
 /// Every so many probes of a drive one waits as long as any request: the drive may be slow.
 const PATIENT_PROBES: u32 = 6;
 
-/// One exchange: with which drive, what for, and the request.
+/// One transaction: drive, purpose and request.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Turn {
     /// Place of the drive on the bus.
     pub drive: usize,
-    /// What for.
+    /// Its purpose.
     pub purpose: Purpose,
     pdu: RequestPdu,
 }
 
-/// What an exchange is for.
+/// The purpose of a transaction.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Purpose {
     /// A read of the plan.
     Poll(Poll),
-    /// A step of the begun command in that slot, competing with that rank.
+    /// A step of the started command in that slot, competing with that rank.
     Command {
-        /// Which of the begun commands of the drive.
+        /// Which of the drive's started commands.
         slot: Urgency,
         /// With which rank it competes for the line.
         rank: Urgency,
-        /// What the step is for.
+        /// The purpose of the step.
         step: StepPurpose,
     },
     /// The background request that has its turn.
     Background,
-    /// What N2 needs said before a read of the plan, or before a step of the begun command in that slot.
+    /// A step of the N2 session, needed before a read of the plan or a step of the started command in that slot.
     Session(Session, Before),
 }
 
-/// What comes behind a step of an N2 session.
+/// What follows a step of an N2 session.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Before {
     /// A read of the plan.
     Poll(Poll),
-    /// A step of a begun command: slot and rank.
+    /// A step of a started command: slot and rank.
     Command(Urgency, Urgency),
 }
 
@@ -98,7 +99,7 @@ impl Turn {
         &self.pdu
     }
 
-    /// The rank of the command that it is for; none of a poll or a background exchange.
+    /// The rank of its command; none for a poll or a background transaction.
     pub fn rank(&self) -> Option<Urgency> {
         match &self.purpose {
             Purpose::Poll(_) | Purpose::Background | Purpose::Session(_, Before::Poll(_)) => None,
@@ -117,26 +118,26 @@ impl Turn {
 /// How a turn ended.
 #[derive(Debug)]
 pub struct TurnEnd {
-    /// How the exchange ended.
+    /// How the transaction ended.
     pub ended: Ended,
     /// When its request was given to the line.
     pub began: Instant,
     /// How long the line was taken.
     pub took: Duration,
-    /// What could not be believed was the drive's own reply, mangled.
+    /// The invalid bytes were the drive's own reply, damaged.
     pub mangled: bool,
     /// The frame of the reply, as the drive sent it, to [`Purpose::Background`].
     pub frame: Vec<u8>,
 }
 
-/// What a bus that ends leaves to the one that comes after it on the same line.
+/// What a bus that ends hands over to the next one on the same line.
 #[derive(Debug, Clone, Default)]
 pub struct Handover {
     /// The leases of its drives, in their order.
     pub leases: Vec<Lease>,
-    /// Until when a reply to what it asked may come; none where no bus spoke on the line before.
+    /// Until when a reply to its request may arrive; none if no bus used the line before.
     pub quiet_until: Option<Instant>,
-    /// What it learned of the line.
+    /// What it learned about the line.
     pub learned: Option<Learned>,
 }
 
@@ -150,25 +151,25 @@ pub struct Master {
     silence: Duration,
     schedule: Schedule,
     drives: Vec<DriveState>,
-    /// What N2 says to drives beside reading them.
+    /// The N2 sessions of the drives.
     sessions: N2Sessions,
     n2_late: N2LateReplies,
-    /// Whose reply came last on the line, sound or mangled: it may come once more.
+    /// The last reply on the line, valid or damaged: it may be repeated.
     last_answered: Option<(usize, RequestPdu)>,
     turns: Turns,
     /// The background request that has its turn, or is on the line.
     background: Option<Begun>,
-    /// The last one was passed on to drives of the bus as an order.
+    /// The last one was passed on to drives of the bus as a command.
     passed_on_last: bool,
-    /// Replies that may still come from addresses at which no drive is configured.
+    /// Replies that may still arrive from addresses without a configured drive.
     strangers: BTreeMap<u8, LateReplies>,
     shutdown: Option<Shutdown>,
     /// The line was spoken on before it was opened: by this bus, or by the one before it.
     successor: bool,
     writes: Arc<WriteStats>,
-    /// Probes in a row without an answer, by drive.
+    /// Consecutive probes without a reply, by drive.
     probes: Vec<u32>,
-    /// A reply may have come late since before the exchange that is on the line.
+    /// A reply may have come late since before the transaction that is on the line.
     late_before: bool,
     /// Which starts may be written; none where nothing is guarded.
     starts: Option<StartGate>,
@@ -236,7 +237,7 @@ impl Master {
         }
     }
 
-    /// The port was opened: every drive is found anew.
+    /// The port was opened: every drive must be found again.
     pub fn opened(&mut self, now: Instant) {
         self.schedule.reset(now);
         self.sessions.reset();
@@ -244,7 +245,7 @@ impl Master {
         self.probes.fill(0);
     }
 
-    /// The port is gone: everybody whose command was begun is answered.
+    /// The port is lost: started commands end.
     pub fn lost(&mut self, now: Instant) {
         self.successor = true;
         for drive in &mut self.drives {
@@ -253,8 +254,8 @@ impl Master {
         self.abandon_background(Outcome::BusDown, Interruption::BusDown, now);
     }
 
-    /// The bus ends: everybody whose command was begun is answered. What the bus that comes after has to know. An exchange
-    /// that is still on the line is broken off; it would have ended at `broken_off`.
+    /// The bus ends: started commands end. Returns the handover for the next bus. A transaction still on the line is
+    /// aborted; it would have ended at `broken_off`.
     pub fn ended(&mut self, broken_off: Option<Instant>, now: Instant) -> Handover {
         if let Some(shutdown) = &mut self.shutdown {
             shutdown.end(&self.bus);
@@ -296,7 +297,7 @@ impl Master {
         }
     }
 
-    /// What goes on the line next.
+    /// The next transaction.
     ///
     /// # Errors
     /// The time until which nothing does, always after `now`.
@@ -313,7 +314,7 @@ impl Master {
         next.map_err(|until| until.min(now + LOOK_ROUND))
     }
 
-    /// Looks at what time and samples have changed: leases, confirmations, drives that N2 wants asked.
+    /// Checks what time and samples have changed: leases, confirmations, N2 drives that are due for a poll.
     fn look(&mut self, now: Instant, news: &mut Vec<News>) {
         let Master {
             bus, drives, writes, ..
@@ -341,7 +342,7 @@ impl Master {
         self.look_at_shutdown(now);
     }
 
-    /// Tells the guards of starts what is known of their drives.
+    /// Updates the start guards with the state of their drives.
     fn look_at_starts(&mut self, now: Instant) {
         let Master {
             bus,
@@ -442,12 +443,12 @@ impl Master {
         (N2_LATE * self.response_timeout).min(LONGEST_N2_LATE)
     }
 
-    /// What may still come late on an N2 line, for the exchange that is about to begin.
+    /// Takes the late replies that may still arrive on an N2 line, for the transaction about to start.
     pub fn take_late(&mut self) -> N2LateReplies {
         std::mem::take(&mut self.n2_late)
     }
 
-    /// What that exchange left of it.
+    /// Puts back what that transaction left of them.
     pub fn put_late(&mut self, late: N2LateReplies) {
         self.n2_late = late;
     }

@@ -1,10 +1,10 @@
 //! Late replies on an N2 line. Pure: time is an argument.
 //!
-//! An N2 reply names neither drive nor request; it shows only its form. After an exchange without a believable answer,
-//! the reply may come during a later exchange, of whichever drive. So the line remembers which forms may still come, and
-//! for how long. Meanwhile no request goes out whose reply has such a form; others go on. A frame of a form that cannot be
-//! the reply of the present exchange is the late one, which is not expected any more from then on. What a reply shares
-//! with a late one by chance, such as a refusal, is not believed.
+//! An N2 reply names neither drive nor request; it shows only its form. After a transaction without a valid reply, the
+//! reply may come during a later transaction, of whichever drive. So the line remembers which forms may still come, and
+//! for how long. Meanwhile no request goes out whose reply has such a form; others go on. A frame of a form that cannot
+//! be the reply of the present transaction is the late one, which is no longer expected from then on. What a reply
+//! shares with a late one by chance, such as a refusal, is not believed.
 //!
 //! Two things end the wait early. A drive answers in order: once it has answered a later request whose reply has another
 //! form, nothing that it was asked before is still to come. And process data may be asked for again at once, as long as the
@@ -48,13 +48,13 @@ struct Late {
     /// When the first of the requests was sent that may be answered late.
     asked: Instant,
     until: Instant,
-    /// Replies that may still come: the request was sent so often in vain.
+    /// Replies that may still come: the request was sent so often without success.
     count: u32,
     /// The same request was answered since: by which of the replies, nobody knows.
     answered: bool,
 }
 
-/// What a sound frame is in an exchange.
+/// What a sound frame is in a transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Taken {
     /// As far as late replies are concerned it may be the reply.
@@ -66,7 +66,7 @@ pub enum Taken {
 }
 
 impl N2LateReplies {
-    /// No believable answer came until `now`, and none will later than in the time of `window`.
+    /// No valid reply came until `now`, and none will later than in the time of `window`.
     pub fn given_up(&mut self, asked: Asked<'_>, window: Duration, now: Instant) {
         self.0.retain(|late| late.until > now);
         let Some(form) = form(asked.pdu) else { return };
@@ -146,8 +146,8 @@ impl N2LateReplies {
         self.0.iter().filter(alike)
     }
 
-    /// What the whole frame at the beginning of `bytes` is, received at `now` in the exchange of `pdu` with the drive of
-    /// that address.
+    /// What the whole frame at the beginning of `bytes` is, received at `now` in the transaction of `pdu` with the
+    /// drive of that address.
     pub fn take(&mut self, address: u8, pdu: &RequestPdu, bytes: &[u8], now: Instant) -> Taken {
         self.0.retain(|late| late.until > now);
         let Some((used, answer)) = frame(bytes).filter(|_| !self.0.is_empty()) else {
@@ -184,7 +184,7 @@ impl N2LateReplies {
         }
     }
 
-    /// The frame was a late reply: it is not expected any more.
+    /// The frame was a late reply: it is no longer expected.
     pub fn came(&mut self, frame: &[u8]) {
         let answer = self::frame(frame).map(|(_, answer)| answer);
         let index = answer.and_then(|answer| self.0.iter().position(|late| late.could_be(&answer)));

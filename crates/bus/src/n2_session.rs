@@ -1,8 +1,8 @@
-//! What a bus of N2 says to a drive beside reading and commanding it (n2.md 2 and 4). Pure: time is an argument.
+//! What an N2 bus sends to a drive besides reads and commands (n2.md 2 and 4). Pure: time is an argument.
 //!
-//! A drive that has started anew answers nothing before it is identified; then it reports, to polls, all it has. So a
+//! A drive that has restarted answers nothing before it is identified; then it reports, to polls, all it has. So a
 //! drive is identified first, its report is taken (and thrown away: the layout is not known, values are read), then it
-//! is read. `N00` at any time means that it has started anew: the same again.
+//! is read. `N00` at any time means that it has restarted: the same again.
 //!
 //! Late replies are recognised in `n2_late_replies`.
 
@@ -33,24 +33,24 @@ struct Drive {
     options: N2Options,
     phase: Phase,
     polled: Option<Instant>,
-    /// It answered something since it was identified.
+    /// It has replied since it was identified.
     proved: bool,
     /// The device type that was reported last.
     device: Option<u8>,
 }
 
-/// What came of an exchange.
+/// The result of a transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Progress {
-    /// What is due next is decided anew.
+    /// The next step is decided again.
     Going,
     /// The drive is of another type than its profile says; reported once.
     Unlike(u8),
     /// Something has changed: the drive is to be read.
     Changed,
-    /// The drive has started anew.
+    /// The drive has restarted.
     Restarted,
-    /// It did not answer to be believed.
+    /// It gave no valid reply.
     Failed,
 }
 
@@ -80,7 +80,7 @@ impl N2Sessions {
         self.drives.is_empty()
     }
 
-    /// What must be said to the drive before it is read (`None`) or commanded.
+    /// The step needed before the drive is read (`None`) or commanded.
     pub fn before(&mut self, drive: usize, command: Option<Urgency>, now: Instant) -> Option<Session> {
         let drive = self.drives.get_mut(drive)?;
         if matches!(drive.phase, Phase::Unknown | Phase::Waiting) {
@@ -98,7 +98,7 @@ impl N2Sessions {
         }
     }
 
-    /// A step that [`N2Sessions::before`] gave is over.
+    /// A step returned by [`N2Sessions::before`] has ended.
     pub fn done(&mut self, drive: usize, step: Session, ended: &Ended, now: Instant) -> Progress {
         let heard = self.heard(drive, ended);
         let (Progress::Going, Ended::Reply(reply)) = (heard, ended) else {
@@ -119,7 +119,7 @@ impl N2Sessions {
         }
     }
 
-    /// Any exchange with the drive is over; [`Progress::Failed`] where it was refused though just identified.
+    /// Any transaction with the drive has ended; [`Progress::Failed`] if it was refused although just identified.
     pub fn heard(&mut self, drive: usize, ended: &Ended) -> Progress {
         if matches!(ended, Ended::Silent | Ended::Corrupt(_)) {
             return match self.drives.is_empty() {
@@ -152,7 +152,7 @@ impl N2Sessions {
         drives.filter(move |(_, drive)| due(drive)).map(|(index, _)| index)
     }
 
-    /// The drive does not answer any more: it is asked again by Identify.
+    /// The drive no longer replies: it is identified again.
     pub fn gone(&mut self, drive: usize) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.phase = first(&drive.options);
@@ -167,7 +167,7 @@ impl N2Sessions {
         drive.map_or(0, |drive| drive.device.unwrap_or(drive.options.device_type))
     }
 
-    /// The port was lost: all drives are found anew.
+    /// The port was lost: all drives must be found again.
     pub fn reset(&mut self) {
         (0..self.drives.len()).for_each(|drive| self.gone(drive));
     }
@@ -183,7 +183,7 @@ impl Drive {
         self.polled.is_none_or(|at| since(at) >= self.options.poll)
     }
 
-    /// The drive is asked what has changed.
+    /// Polls the drive for changes.
     fn report(&mut self) {
         self.phase = Phase::Reporting {
             left: MOST_POLLS,

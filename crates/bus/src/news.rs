@@ -1,4 +1,4 @@
-//! What the master has to say of its drives: for the process image, events and the log.
+//! The master's news about its drives, for the process image, events and the log.
 
 use std::time::{Duration, Instant};
 
@@ -14,32 +14,32 @@ pub enum News {
     FastRound(Option<Duration>),
     /// A round of the slow class was started.
     SlowRound(Option<Duration>),
-    /// The drive answered a read of the plan.
+    /// The drive replied to a read of the plan.
     Read {
         /// Which drive.
         drive: usize,
         /// What was read.
         read: PlannedRead,
-        /// What it said, a word for each item.
+        /// The reply, a word for each item.
         words: Vec<u16>,
         /// When, at the latest: earlier than now where it may have been the reply to an earlier try.
         at: Instant,
     },
-    /// The drive answers (again).
+    /// The drive replies (again).
     Online(usize),
-    /// The drive does not answer any more.
+    /// The drive no longer replies.
     Offline(usize),
-    /// The drive has started anew: nothing that is known of it holds.
+    /// The drive has restarted: everything known about it is void.
     Restarted(usize),
-    /// The drive says that it is a device of that N2 type, not the one that its profile expects.
+    /// The drive reports an N2 device type other than its profile expects.
     Unlike(usize, u8),
     /// The drive refuses these addresses.
     Unavailable(usize, PlannedRead, Exception),
     /// An acknowledged command showed no effect in time.
     NotConfirmed(usize, Unconfirmed),
-    /// The lease of a drive that runs ran out.
+    /// The lease of a drive that runs expired.
     LeaseRanOut(usize),
-    /// The action of a lease that ran out cannot be written.
+    /// The action of a lease that expired cannot be written.
     ActionRefused {
         /// Which drive.
         drive: usize,
@@ -48,23 +48,23 @@ pub enum News {
         /// Why not.
         refusal: Refusal,
     },
-    /// The action of a lease that ran out was tried, and failed; why, unless that was told before.
+    /// An attempt at the action of an expired lease failed; with the reason, unless reported before.
     ActionFailed {
         /// Which drive.
         drive: usize,
-        /// Why, for people.
+        /// Why, as text.
         why: Option<String>,
     },
-    /// The action of a lease that ran out was acknowledged after so many tries that failed.
+    /// The action of a lease that expired was acknowledged after so many tries that failed.
     ActionTaken {
         /// Which drive.
         drive: usize,
         /// How many.
         failures: u32,
     },
-    /// A drive whose lease ran out does not say whether it runs.
+    /// A drive whose lease expired does not report whether it runs.
     RunningUnknown(usize),
-    /// A command that waited, or was begun, is refused: it may not start its motor.
+    /// A waiting or started command is refused: it may not start its motor.
     StartRefused {
         /// Which drive.
         drive: usize,

@@ -1,4 +1,4 @@
-//! What a bus will achieve, reckoned from its configuration alone. Pure.
+//! Predicts what a bus will achieve, from its configuration alone. Pure.
 //!
 //! A round of the fast class is all fast requests of the bus once; it starts every `cycle`, or without idle
 //! time when the line cannot carry that. Slow requests fill the idle time of a round as far as they fit in
@@ -24,8 +24,8 @@ use crate::process_image::{BusSpec, DriveSpec};
 /// Baud rates that are proposed when no profile of the bus lists any.
 const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];
 
-/// Share of the line that is used at most where there is a choice: the rest is for commands, retries and drives slower
-/// than their profile says.
+/// Most of the line that is planned for if there is a choice: the rest is for commands, retries and drives slower than
+/// their profile.
 const MOST_LOAD: f64 = 0.8;
 
 /// Part of a cadence by which it may be missed before it is reported.
@@ -42,7 +42,7 @@ pub struct PredictedRequest {
     pub wire: Duration,
 }
 
-/// What a bus will do.
+/// The predicted performance of a bus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prediction {
     /// All requests, drive by drive, fast ones first.
@@ -59,7 +59,7 @@ pub struct Prediction {
     pub shortage: Option<Shortage>,
 }
 
-/// Cadences that the line cannot carry, at least one, and what would.
+/// The cycles that the line cannot carry, at least one, and the remedies.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shortage {
     /// The fast class, if it is missed.
@@ -83,7 +83,7 @@ pub struct Missed {
     pub round: Duration,
 }
 
-/// A change that lets the line carry its cadences; a baud only where it is not the present one.
+/// A change with which the line can carry its cycles; a baud rate only if it differs from the present one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Remedy {
     /// The least higher baud rate of all profiles that does.
@@ -158,7 +158,7 @@ impl Rounds {
     }
 }
 
-/// The line, its drives and what is asked of it.
+/// The line, its drives and the requested cycles.
 struct Line<'a> {
     spec: &'a BusSpec,
     silence: Silence,
@@ -284,8 +284,8 @@ impl<'a> Line<'a> {
         Some(Shortage { fast, slow, remedies })
     }
 
-    /// A higher baud that carries everything; else the least number of buses, and what the highest baud makes
-    /// of the cadence.
+    /// A higher baud rate that carries everything; else the smallest number of buses, and the cycle at the highest baud
+    /// rate.
     fn other_lines(&self) -> Vec<Remedy> {
         let bauds = self.higher_bauds();
         if let Some(baud) = bauds.iter().find(|baud| self.carries(&self.total(**baud))) {
@@ -358,7 +358,7 @@ impl<'a> Line<'a> {
         [slow_cycle].into_iter().chain(roomy).collect()
     }
 
-    /// The shortest cadence of the fast class beside which the slow one is kept.
+    /// The shortest cadence of the fast class at which the slow one is kept.
     fn shortest_cycle(&self, rounds: &Rounds) -> Option<Duration> {
         let (_, slow) = self.shares(rounds);
         match slow {
@@ -395,7 +395,7 @@ fn whole_milliseconds(seconds: f64) -> Duration {
 }
 
 impl Shortage {
-    /// What is missed and what to do about it.
+    /// The shortage and its remedies.
     pub fn finding(&self) -> Finding {
         let milliseconds = |time: Duration| time.as_secs_f64() * 1e3;
         let mut cadences = Vec::new();

@@ -1,4 +1,4 @@
-//! Single exchanges on a line that nobody else uses: for commands that look for drives.
+//! Single transactions on a line without another master, for commands that look for drives.
 
 use std::time::{Duration, Instant};
 
@@ -19,20 +19,20 @@ pub struct Prober<'l> {
     unasked: usize,
 }
 
-/// What came of a request.
+/// The result of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Answer {
-    /// How the exchange ended.
+    /// How the transaction ended.
     pub ended: Ended,
-    /// Time until the reply began, as it is seen here; with values only.
+    /// Observed time until the reply started; only for replies with values.
     pub turnaround: Option<Duration>,
     /// The adapter sent the request back.
     pub echoed: bool,
-    /// Bytes that came, beside such an echo.
+    /// Received bytes, without such an echo.
     pub bytes: usize,
     /// What they look like.
     pub shape: Shape,
-    /// A gateway in between said that nobody answers at the address, which is silence.
+    /// A gateway in between reported that nothing answers at the address, which counts as silence.
     pub no_way: bool,
 }
 
@@ -81,7 +81,7 @@ impl Prober<'_> {
         }
     }
 
-    /// What an exchange without an answer takes.
+    /// What a transaction without an answer takes.
     pub fn patience(&self, request: &Request) -> Duration {
         self.state.patience(request, self.timeout)
     }
@@ -97,7 +97,7 @@ impl Prober<'_> {
         LineState::new(protocol, format, silence, Instant::now()).patience(request, timeout)
     }
 
-    /// Bytes that came while nothing was asked for.
+    /// Bytes received without a request.
     pub fn unasked(&self) -> usize {
         self.unasked
     }
@@ -114,7 +114,7 @@ impl Prober<'_> {
         Ok(())
     }
 
-    /// One request and what became of it.
+    /// Sends one request and returns its result.
     ///
     /// # Errors
     /// When the port is gone.
@@ -146,7 +146,7 @@ impl Prober<'_> {
         }
     }
 
-    /// Listens until then, or until bytes came. The exchange, if it ended by them.
+    /// Listens until then, or until bytes arrive. Returns the transaction if they complete it.
     fn listen(&mut self, until: Instant) -> Result<Option<Exchanged>, Lost> {
         let mut buffer = [0u8; 512];
         if self.line.wait(until, None, !self.state.is_underway())? != Woken::Readable {

@@ -18,13 +18,13 @@ use crate::drive::{ModelPoint, Profile, Raw, Value};
 
 /// Requests after which a command should have ended, reads of a state for which it waits among them.
 const MOST_FRAMES: usize = 1000;
-/// What a request takes, and the pause before a state is read once more.
+/// Duration of a request, and the pause before a state is read again.
 const EXCHANGE: Duration = Duration::from_millis(10);
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
 /// Longer than the steps of any sequence may wait.
 const LONGEST: Duration = Duration::from_secs(600);
 
-/// What was explored without a counterexample.
+/// The extent of a proof without a counterexample.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Proof {
     /// Commands that were run to their end.
@@ -33,7 +33,7 @@ pub struct Proof {
     pub frames: usize,
 }
 
-/// A way in which a command does what it must not.
+/// A case in which a command does what it must not.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Counterexample {
     /// What is wrong.
@@ -41,7 +41,7 @@ pub struct Counterexample {
     /// The drive before.
     pub state: String,
     pub command: String,
-    /// The requests, with their words in hex, and what became of them.
+    /// The requests, with their words in hex, and their results.
     pub frames: Vec<String>,
 }
 
@@ -70,7 +70,7 @@ impl Counterexample {
     }
 }
 
-/// What becomes of a request.
+/// The fate of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Fate {
     RequestLost,
@@ -92,7 +92,7 @@ const FATES: [Fate; 9] = [
     Fate::Refused(Exception::BUSY),
 ];
 
-/// What happens in between, behind so many requests.
+/// What happens in between, after so many requests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Event {
     None,
@@ -211,7 +211,7 @@ struct Case<'p> {
     values: Vec<(usize, Value)>,
 }
 
-/// What a run of a case has come to.
+/// The progress of a case.
 struct Progress<'p> {
     drive: Drive<'p>,
     words: KnownWords,
@@ -336,7 +336,7 @@ impl<'p> Case<'p> {
         Ok(())
     }
 
-    /// One step of a command; the outcome, if it is over.
+    /// One step of a command; the outcome, if it has ended.
     fn step(
         &self,
         run: &mut CommandRun,
@@ -388,7 +388,7 @@ impl<'p> Case<'p> {
         })
     }
 
-    /// The frame, for people; and whether a pulse had its time.
+    /// The frame, as text; and whether a pulse had its time.
     fn note(&self, step: &Step, fate: Option<Fate>, progress: &mut Progress<'p>) -> Result<(), Box<Counterexample>> {
         let mut text = in_words(&step.pdu);
         let fate = match fate {
@@ -424,7 +424,7 @@ impl<'p> Case<'p> {
         Ok(())
     }
 
-    /// What must hold after every request.
+    /// Checks what must hold after every request.
     fn look(
         &self,
         step: &Step,
@@ -471,7 +471,7 @@ impl<'p> Case<'p> {
         bits && here(forward) && word & one == one && word & other == other
     }
 
-    /// What must hold when the command is over.
+    /// Checks what must hold when the command has ended.
     fn judge(
         &self,
         event: Event,
@@ -507,7 +507,7 @@ impl<'p> Case<'p> {
         self.judge_effect(outcome, progress)
     }
 
-    /// A command that nothing disturbs does what it says.
+    /// Checks that an undisturbed command has its effect.
     fn judge_effect(&self, outcome: &Outcome, progress: &Progress<'p>) -> Result<(), Box<Counterexample>> {
         let stands = matches!(self.start, Start::PoweredUp | Start::Stopped | Start::Prepared);
         let starts = self.says(ModelPoint::Run) == Some(true);

@@ -1,4 +1,4 @@
-//! Applies what the master has to say to the process image, and turns it into events and log lines.
+//! Applies the master's news to the process image, and turns it into events and log lines.
 
 mod changes;
 mod events;
@@ -24,9 +24,9 @@ use crate::process_image::{
     Access, BusImage, DriveImage, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Verdict,
 };
 
-/// The load of the line is reckoned over this time.
+/// The load of the line is calculated over this time.
 const LOAD_WINDOW: Duration = Duration::from_secs(1);
-/// What was read longer ago shows neither faults nor parameters.
+/// Older readings show neither faults nor parameters.
 const RECENT: Duration = Duration::from_secs(60);
 
 /// Reports what a bus does.
@@ -39,11 +39,11 @@ pub(super) struct Report {
     busy: Duration,
     /// Fault code of each drive as last reported; `None` is no fault.
     faults: Vec<Option<i64>>,
-    /// What else was reported of each drive, in the order of [`WATCHED`].
+    /// The other reported states of each drive, in the order of [`WATCHED`].
     watched: Vec<[Watched; WATCHED.len()]>,
     /// What is known of each drive's own response to a silent master.
     responses: Vec<Response>,
-    /// Whether process data holds what the profiles say.
+    /// Whether process data matches the profiles.
     selections: Selections,
     /// What is wrong with the line.
     pub(super) diagnosis: LineDiagnosis,
@@ -52,10 +52,10 @@ pub(super) struct Report {
     down_reported: bool,
 }
 
-/// What a piece of news makes the master read.
+/// What the master must read because of a piece of news.
 #[derive(Debug, Default)]
 pub(super) struct Wanted {
-    /// The drive in which a new fault came up.
+    /// The drive with a new fault.
     pub(super) fault: Option<usize>,
     /// Drive, monitoring point and time.
     pub(super) monitors: Vec<(usize, usize, Instant)>,
@@ -206,7 +206,7 @@ impl Report {
         self.event(EventKind::BusUp, None, None, text);
     }
 
-    /// A device server closed its connection after it had answered by it, and was connected to again.
+    /// A device server closed its connection after replies, and was reconnected.
     pub(super) fn reconnected(&mut self) {
         self.diagnosis.figures().reconnected();
         self.image.update_health(|h| {
@@ -312,7 +312,7 @@ impl Report {
         });
     }
 
-    /// Faults that came or went with the last poll. Whether one came.
+    /// Reports faults that appeared or cleared with the last poll. Returns whether one appeared.
     fn look_at_fault(&mut self, index: usize, now: Instant) -> bool {
         let Some(drive) = self.drive(index) else { return false };
         let reading = drive.reading(now, RECENT);
@@ -374,8 +374,8 @@ impl Report {
         });
     }
 
-    /// A request was given to the line, which had been silent since `quiet_since`, at `began`: for the recorder, and for
-    /// whoever listens to the frames; `None` while nobody does.
+    /// A request was given to the line, which had been silent since `quiet_since`, at `began`: for the recorder, and
+    /// for anyone who listens to the frames; `None` while nobody does.
     pub(super) fn tape_request(
         &self,
         index: Option<usize>,
@@ -393,23 +393,23 @@ impl Report {
         Some(tap)
     }
 
-    /// Gives the recorder what came of a request, which may be nothing.
+    /// Gives the recorder the reply to a request, which may be empty.
     pub(super) fn tape_reply(&self, index: Option<usize>, heard: &[u8], ended: &Ended, now: Instant) {
         tap::tape(&self.image, index, heard, tap::taped(ended), now);
     }
 
-    /// Bytes that are nobody's answer came in an exchange.
+    /// A transaction received bytes that are not a reply.
     fn foreign(&self) {
         self.image.update_health(|h| h.foreign += 1);
     }
 
-    /// Bytes that nobody asked for came at `now`, on a line that had been silent since `quiet_since`.
+    /// Unrequested bytes arrived at `now`, on a line that had been silent since `quiet_since`.
     pub(super) fn noise(&self, bytes: &[u8], quiet_since: Instant, now: Instant) {
         self.foreign();
         tap::noise(&self.image, bytes, quiet_since, now);
     }
 
-    /// The line was in use for so long by one exchange.
+    /// One transaction used the line for that time.
     pub(super) fn in_use(&mut self, took: Duration) {
         self.busy += took;
         self.image.transactions.observe(took);
@@ -440,7 +440,7 @@ impl Report {
         fast
     }
 
-    /// An exchange is over: counters, turnaround, load.
+    /// A transaction has ended: updates counters, turnaround, load.
     pub(super) fn exchanged(&mut self, index: usize, exchanged: &Exchanged, now: Instant) {
         let transaction = &exchanged.transaction;
         self.busy += exchanged.took;
@@ -469,7 +469,7 @@ impl Report {
         self.diagnosis.exchanged(index, exchanged, turnaround, now);
     }
 
-    /// Asks the diagnosis every 5 s, and reckons the load once a second.
+    /// Runs the diagnosis every 5 s, and calculates the load once a second.
     pub(super) fn tick(&mut self, now: Instant) {
         for (drive, text) in self.diagnosis.tick(now) {
             let drive = drive
@@ -490,7 +490,7 @@ impl Report {
     }
 }
 
-/// What the counters call an exchange that ended so.
+/// The counter for a transaction that ended this way.
 fn counted(ended: &Ended) -> Counted {
     match ended {
         Ended::Reply(Reply::Exception(_)) => Counted::Exception,
@@ -500,7 +500,7 @@ fn counted(ended: &Ended) -> Counted {
     }
 }
 
-/// Shows a drive as offline, also one of which nothing was heard before. False where it is already.
+/// Marks a drive as offline, even one that never replied. False if it already is.
 fn goes_offline(drive: &DriveImage) -> bool {
     if matches!(drive.snapshot().link, Link::Offline(_)) {
         return false;

@@ -1,9 +1,9 @@
-//! What comes next on the line: cadence, fairness and back-off. Pure: time is an argument.
+//! Decides what is sent next: cycles, fairness and back-off. Pure: time is an argument.
 //!
-//! Order: stop, other commands, forwarded reads, due fast polls, due slow polls, background exchanges.
-//! Five rules soften it: after eight commands in a row a due poll goes first; commands, and what they cause, have no more
-//! of a line that is busy with polls than process data; slow polls that had less than their share of the time
-//! ([`slow_share`]) go before fast ones; background exchanges have the time that is left over and else a small share
+//! Order: stop, other commands, forwarded reads, due fast polls, due slow polls, background transactions. Five rules
+//! soften it: after eight commands in a row a due poll goes first; commands, and what they cause, have no more of a
+//! line that is busy with polls than process data; slow polls that had less than their share of the time
+//! ([`slow_share`]) go before fast ones; background transactions have the time that is left over and else a small share
 //! ([`crate::command::Pace`]); a drive that does not answer is asked so seldom that it costs at most 2 %.
 
 mod background;
@@ -49,11 +49,11 @@ pub struct Poll {
     pub drive: usize,
     /// What is read.
     pub read: PlannedRead,
-    /// Asked to find out whether the drive answers (again).
+    /// Sent to find out whether the drive replies (again).
     pub probe: bool,
 }
 
-/// What the bus does next.
+/// The next action of the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Decision {
     /// Take a command of at least that rank.
@@ -67,24 +67,24 @@ pub enum Decision {
 /// How a poll went.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Polled {
-    /// The drive answered.
+    /// The drive replied.
     Ok,
     /// The drive refused it.
     Refused(Exception),
     /// No answer.
     Failed,
-    /// An answer that cannot be believed: tried again, but the drive is not taken for dead so soon.
+    /// An invalid reply: retried, but the drive does not count as absent so soon.
     Garbled,
 }
 
-/// What changed by a poll.
+/// The change caused by a poll.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Change {
     /// Nothing.
     None,
-    /// The drive answers (again).
+    /// The drive replies (again).
     Online,
-    /// The drive does not answer any more.
+    /// The drive no longer replies.
     Offline,
     /// The drive refuses these addresses.
     Unavailable(PlannedRead, Exception),
@@ -116,7 +116,7 @@ enum Turn {
     Due,
     /// A slow poll that goes before fast ones.
     OnCredit,
-    /// A command asked for it.
+    /// Requested by a command.
     Asked,
 }
 
@@ -139,23 +139,23 @@ pub struct Schedule {
     slow_share: f64,
     /// Why the poll that was chosen last has its turn.
     turn: Turn,
-    /// Until when the credit is reckoned.
+    /// Until when the credit is calculated.
     earned_until: Instant,
-    /// Time on the line that commands, and what they asked for, took since then.
+    /// Time on the line taken by commands, and by reads they caused, since then.
     commanded: Duration,
     /// Time on the line that slow polls took since then.
     slow_took: Duration,
     /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
     /// the slow ones sooner or later. Less than one request and the time until its turn would not be their share.
     most_credit: Duration,
-    /// A probe found nobody since the last fast poll.
+    /// A probe failed since the last fast poll.
     probed: bool,
     share: CommandShare,
     background: BackgroundShare,
 }
 
 impl Schedule {
-    /// A schedule for drives of these plans; `cost` is the whole time of an exchange on the line.
+    /// A schedule for drives with these plans; `cost` is the total time of a transaction on the line.
     pub fn new(
         cadence: Cadence,
         plans: &[&Plan],
@@ -209,7 +209,7 @@ impl Schedule {
         }
     }
 
-    /// What comes next. `waiting` is the rank of the command that would be next.
+    /// The next action. `waiting` is the rank of the command that would be next.
     pub fn next(&mut self, now: Instant, waiting: Option<Urgency>) -> Decision {
         self.earn(now);
         self.start_round(now);
@@ -262,7 +262,7 @@ impl Schedule {
         self.share.commanded(urgency, took);
     }
 
-    /// A poll is over.
+    /// A poll has ended.
     pub fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
         let item = self.drives.get_mut(poll.drive);
         if let Some(item) = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read)) {
@@ -311,7 +311,7 @@ impl Schedule {
         }
     }
 
-    /// The drive answered a command: it is alive, and probed at once if it was away.
+    /// The drive replied to a command: it is alive, and probed at once if it was offline.
     pub fn seen(&mut self, drive: usize, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive) {
             (drive.failures, drive.doubted) = (0, false);
@@ -321,7 +321,7 @@ impl Schedule {
         }
     }
 
-    /// A drive that is away did not answer a command, which was as good as a probe: the next one does not come right behind it.
+    /// An offline drive did not reply to a command, which counts as a probe: the next one does not follow immediately.
     pub fn probed_in_vain(&mut self, drive: usize, took: Duration, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive)
             && let Presence::Away(at, pause) = drive.presence
@@ -330,8 +330,8 @@ impl Schedule {
         }
     }
 
-    /// A drive that is online did not answer a command: its process data is read next in the round, which shows whether it is
-    /// there at all, before more is said to it in vain.
+    /// An online drive did not reply to a command: its process data is read next, to find out whether it is still there
+    /// before more is sent.
     pub fn doubted(&mut self, index: usize) {
         let online = |drive: &&mut DriveSchedule| drive.presence == Presence::Online;
         let Some(drive) = self.drives.get_mut(index).filter(online) else {
@@ -395,7 +395,7 @@ impl Schedule {
         }
     }
 
-    /// Process data that was postponed and may be read now takes part in the round that goes on.
+    /// Postponed process data that may now be read joins the current round.
     fn rejoin(&mut self, now: Instant) {
         if self.round.is_empty() {
             return;
@@ -425,7 +425,7 @@ impl Schedule {
         }
     }
 
-    /// Everything of a drive is read again, what is read once too.
+    /// Everything is read again from a drive, including points read once.
     pub fn read_again(&mut self, index: usize, now: Instant) {
         let Some(drive) = self.drives.get_mut(index) else {
             return;
@@ -496,7 +496,7 @@ impl Schedule {
         }
     }
 
-    /// A drive is to be asked for something, of what is read once too: so that it is not left alone.
+    /// Requests a read from a drive, also of points read once.
     pub fn ask(&mut self, drive: usize, now: Instant) {
         let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
         let mut sound = items
@@ -511,7 +511,7 @@ impl Schedule {
         }
     }
 
-    /// Something had to be said to a drive before its poll, which is still due: the others have their turn in between.
+    /// A session step was needed before a drive's poll, which is still due: the others have their turn in between.
     pub fn session_done(&mut self, drive: usize) {
         if let Some(drive) = self.drives.get_mut(drive) {
             (drive.heard, drive.failures) = (true, 0);
@@ -520,7 +520,7 @@ impl Schedule {
         self.share.polled(Duration::ZERO);
     }
 
-    /// That drive is not read until then, the others are read as ever; none: all are read.
+    /// That drive is not polled until then; none: all drives are polled.
     pub fn keep_quiet(&mut self, quiet: Option<(usize, Instant)>) {
         for (index, drive) in self.drives.iter_mut().enumerate() {
             drive.quiet_until = quiet.filter(|(quiet, _)| *quiet == index).map(|(_, until)| until);
@@ -531,12 +531,12 @@ impl Schedule {
         }
     }
 
-    /// Whether the drive answers.
+    /// Whether the drive replies.
     pub fn is_online(&self, drive: usize) -> bool {
         self.drives.get(drive).is_some_and(|d| d.presence == Presence::Online)
     }
 
-    /// Drives that are away, and reads of the others that are put off behind failures.
+    /// Offline drives, and reads of the others that are postponed after failures.
     pub fn held(&self, now: Instant) -> (usize, usize) {
         let online = |drive: &&DriveSchedule| drive.presence == Presence::Online;
         let put_off = |item: &&Item| {
@@ -551,7 +551,7 @@ impl Schedule {
         (self.drives.iter().filter(|drive| !online(drive)).count(), held.count())
     }
 
-    /// Forgets all presence: the port was lost, every drive is found anew.
+    /// The port was lost: every drive must be found again.
     pub fn reset(&mut self, now: Instant) {
         self.round.clear();
         self.state_first.clear();

@@ -29,11 +29,11 @@ pub(super) struct Selections {
 #[derive(Debug)]
 struct DriveSelections {
     points: Vec<Compared>,
-    /// An event told that its selection differs.
+    /// An event has reported that its selection differs.
     reported: bool,
 }
 
-/// A point of process data and what its comparisons showed.
+/// A point of process data and the state of its comparisons.
 #[derive(Debug)]
 struct Compared {
     point: usize,
@@ -46,7 +46,7 @@ struct Compared {
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Trust {
-    /// No comparison has proved anything; the next one where there is something to compare, and the pause behind it.
+    /// No comparison has proved anything; the next one where there is something to compare, and the pause after it.
     Unproven(Instant, Duration),
     Proven,
     /// Its comparisons differ so often, and agreed so often since.
@@ -55,7 +55,7 @@ enum Trust {
     Differs(u8),
 }
 
-/// What one comparison shows.
+/// The result of one comparison.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Verdict {
     Agrees,
@@ -64,7 +64,7 @@ enum Verdict {
     Nothing,
 }
 
-/// What follows from a read.
+/// The consequences of a read.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Findings {
     /// Monitoring points to be read, and when.
@@ -73,7 +73,7 @@ pub(super) struct Findings {
     pub(super) monitored: Option<Vec<usize>>,
     /// Points of which it is now known that they hold something else, with both values: the first ones of the drive.
     pub(super) differ: Vec<(usize, f64, f64)>,
-    /// Points that hold what the profile says again.
+    /// Points that match the profile again.
     pub(super) restored: Vec<usize>,
 }
 
@@ -100,7 +100,7 @@ impl Selections {
         }
     }
 
-    /// The drive was away: what was read before is not compared with what is read now.
+    /// The drive was offline: earlier readings are not compared with new ones.
     pub(super) fn interrupted(&mut self, drive: usize) {
         for compared in self.points(drive) {
             compared.open = None;

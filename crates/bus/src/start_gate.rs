@@ -25,7 +25,7 @@ const AGAIN: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs
 /// After the start of the bus so long a point that was not read yet stops no motor.
 const FIRST_READ: Duration = Duration::from_secs(10);
 
-/// The guards of the bus, and what of them is under way.
+/// The guards of the bus, and their starts in progress.
 #[derive(Debug)]
 pub(super) struct StartGate {
     guards: Arc<BusGuards>,
@@ -34,12 +34,12 @@ pub(super) struct StartGate {
     cleared: Vec<(u64, Vec<usize>)>,
     /// Commands that wait and are to be refused.
     refused: Vec<(u64, usize, Refusal)>,
-    /// What is to be told.
+    /// News to report.
     told: Vec<News>,
     trips: Vec<Trip>,
 }
 
-/// The order by which a command starts its motor.
+/// The start that a command causes.
 #[derive(Debug, Clone)]
 pub(crate) struct Start {
     /// Its number in the queue.
@@ -71,7 +71,7 @@ impl StartGate {
         })
     }
 
-    /// The order by which a command starts that drive, if its starts count.
+    /// The start of that drive that a command causes, if its starts are counted.
     pub(super) fn start_of(&self, command: &Command, drive: usize) -> Option<Start> {
         let starts = self.guards.guards(drive) && command.effect(drive).run == Some(true);
         starts.then(|| Start {
@@ -80,7 +80,7 @@ impl StartGate {
         })
     }
 
-    /// Whether a command that could be begun may start what it starts; a stop, whether it waits for nothing.
+    /// Whether a command that could be started may start what it starts; a stop, whether it waits for nothing.
     ///
     /// # Errors
     /// When, if it must wait.
@@ -112,7 +112,7 @@ impl StartGate {
         }
     }
 
-    /// Answers the commands that are refused. Whether there were any.
+    /// Ends the refused commands. Returns whether there were any.
     pub(super) fn refuse(&mut self, pending: &mut Pending, now: Instant) -> bool {
         let refused = std::mem::take(&mut self.refused);
         let any = !refused.is_empty();
@@ -129,7 +129,7 @@ impl StartGate {
         any
     }
 
-    /// A begun command wants to write: one that starts the motor, and may not any more, goes no further.
+    /// A started command is about to write: if it would start the motor and may no longer do so, it ends.
     pub(super) fn forbids(&mut self, index: usize, drive: &mut DriveState, wanted: &Wanted, now: Instant) -> bool {
         let Wanted::Step(Urgency::Command, step) = wanted else {
             return false;
@@ -152,7 +152,7 @@ impl StartGate {
         true
     }
 
-    /// Why the write of a begun command may not go.
+    /// Why a started command may not write.
     pub(super) fn may_not_write(
         &self,
         index: usize,
@@ -165,7 +165,7 @@ impl StartGate {
         self.guards.may_write(index, start.number, now).err()
     }
 
-    /// Whether an order that is no begun command may still start that drive.
+    /// Whether a command that was not started here may still start that drive.
     pub(super) fn may_still_write(&self, drive: usize, number: u64, now: Instant) -> bool {
         self.guards.may_write(drive, number, now).is_ok()
     }
@@ -186,7 +186,7 @@ impl StartGate {
         }
     }
 
-    /// Commands that were cleared and are over count as made, whatever they wrote.
+    /// Commands that were cleared and have ended count as made, whatever they wrote.
     pub(super) fn settle(&mut self, is_alive: impl Fn(u64) -> bool) {
         let guards = &self.guards;
         self.cleared.retain(|(number, drives)| {
@@ -216,7 +216,7 @@ impl StartGate {
         self.guards.guards(index)
     }
 
-    /// What is to be told.
+    /// News to report.
     pub(super) fn take_told(&mut self) -> Vec<News> {
         std::mem::take(&mut self.told)
     }

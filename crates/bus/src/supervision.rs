@@ -1,11 +1,12 @@
 //! Supervision: a gateway that polls keeps a drive's own watchdog content even when nobody commands the drive any more.
-//! So a drive can have a lease, renewed by the orders and heartbeats of a commanding client; when it runs out while the
-//! drive runs, or its run command is set, the configured action is written once. Not a safety function. Pure: time is an
-//! argument.
+//! So a drive can have a lease, renewed by the commands and heartbeats of a commanding client; when it expires while
+//! the drive runs, or its run command is set, the configured action is written once. Not a safety function. Pure: time
+//! is an argument.
 //!
-//! A lease begins when an order reached the wire, and anew when that order ended. An order that waits holds the lease,
-//! no longer than until the order expires; one that was refused, expired or replaced renews nothing. A client that is
-//! back suspends an action that is not on the wire yet; if its order ends without reaching the wire, the action is due again.
+//! A lease begins when a command reached the wire, and again when that order ended. A command that waits holds the
+//! lease, no longer than until the order expires; one that was refused, expired or replaced renews nothing. A client
+//! that is back suspends an action that is not on the wire yet; if its order ends without reaching the wire, the action
+//! is due again.
 
 use std::time::{Duration, Instant};
 
@@ -23,25 +24,25 @@ use crate::process_image::{LeaseAction, Reading, Unavailable};
 
 /// How long an action that was not acknowledged waits before it is written again.
 const AGAIN: Duration = Duration::from_secs(1);
-/// Reasons for which one action failed that are told apart; each is told once.
+/// Most reasons for a failed action that are distinguished; each is reported once.
 const MOST_REASONS: usize = 8;
 
-/// The lease of a drive, as a bus that starts anew takes it over.
+/// The lease of a drive, as handed over to the next bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Lease(State);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 enum State {
-    /// No client was heard of since the gateway started.
+    /// No client has commanded the drive since the gateway started.
     #[default]
     Unheard,
     /// Neither, and it was reported that the drive runs.
     RunsUnheard,
     /// It runs since then.
     Held(Instant),
-    /// It ran out while the drive ran, and the action is not acknowledged yet.
+    /// It expired while the drive ran, and the action is not acknowledged yet.
     RanOut,
-    /// It ended: the motor stood without a run command when it ran out, or the action was acknowledged.
+    /// It ended: the motor stood without a run command when it expired, or the action was acknowledged.
     Ended,
 }
 
@@ -60,7 +61,7 @@ impl Lease {
         }
     }
 
-    /// What ends with it where no drive goes on with it, in words; nothing of one that has ended, or never began.
+    /// What ends with it if no drive continues it, as text; none for one that has ended or never started.
     pub fn ends(self) -> Option<&'static str> {
         match self.0 {
             State::Unheard | State::RunsUnheard | State::Ended => None,
@@ -70,21 +71,21 @@ impl Lease {
     }
 }
 
-/// What supervision sees of a drive beside its process data.
+/// The inputs of supervision besides process data.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Orders {
-    /// Until when an order of a client holds the lease, queued or begun.
+    /// Until when a client's queued or started command holds the lease.
     pub(super) held_until: Option<Instant>,
 }
 
-/// What supervision wants done.
+/// What supervision requests.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Demand {
     /// Nothing.
     None,
-    /// This point of the model written; the answer goes to [`Supervision::ordered`].
+    /// Write this point of the model; the result goes to [`Supervision::ordered`].
     Write(ModelPoint, Value),
-    /// An action that is queued and not begun taken back.
+    /// Withdraw an action that is queued and not started.
     Withdraw,
 }
 
@@ -92,45 +93,45 @@ pub(super) enum Demand {
 #[derive(Debug, Default)]
 pub(super) struct Supervision {
     lease: Lease,
-    /// The answer to the action that is on its way.
+    /// The pending result of the action.
     answer: Option<Receiver<Answer>>,
     next_try: Option<Instant>,
     /// Why it could not be written, as it was reported.
     refused: Option<Refusal>,
-    /// It was reported that the drive does not say whether it runs.
+    /// It was reported that the drive does not report whether it runs.
     blind_reported: bool,
-    /// For how long the drive answered since the lease ran out without showing what is to be done, and until when that is
-    /// reckoned.
+    /// For how long the drive answered since the lease expired without showing what is to be done, and until when that
+    /// is calculated.
     waited: Option<(Duration, Instant)>,
     /// An action failed so, which is not told yet.
     failure: Option<Outcome>,
-    /// Tries of the present action that failed, and the reasons that were told.
+    /// Failed attempts of the present action, and the reported reasons.
     failures: u32,
     reasons: Vec<String>,
 }
 
 impl Supervision {
-    /// Goes on with the lease of the bus before.
+    /// Continues the lease of the previous bus.
     pub(super) fn take_over(&mut self, lease: Lease) {
         self.lease = lease;
     }
 
-    /// The lease, for the bus that comes after.
+    /// The lease, for the next bus.
     pub(super) fn lease(&self) -> Lease {
         self.lease
     }
 
-    /// Whether the lease ran out, and its action is not acknowledged.
+    /// Whether the lease expired, and its action is not acknowledged.
     pub(super) fn owes_action(&self) -> bool {
         self.lease.0 == State::RanOut
     }
 
-    /// Whether the drive was seen to run, and no client was heard of since the gateway started.
+    /// Whether the drive runs and no client has commanded it since the gateway started.
     pub(super) fn runs_unheard(&self) -> bool {
         self.lease.0 == State::RunsUnheard
     }
 
-    /// A client was heard of: its order reached the wire, or ended, or its heartbeat came.
+    /// Renews the lease: a client's command was sent or ended, or its heartbeat arrived.
     pub(super) fn renew(&mut self, now: Instant) {
         self.lease = Lease(match self.lease.0 {
             State::Held(since) => State::Held(since.max(now)),
@@ -146,7 +147,7 @@ impl Supervision {
         self.reasons.clear();
     }
 
-    /// What is due at `now`.
+    /// The action due at `now`.
     pub(super) fn look(
         &mut self,
         reading: &Reading<'_>,
@@ -193,7 +194,7 @@ impl Supervision {
                 self.note_answer(now);
                 self.tell_failure(news, drive);
                 match self.lease.0 {
-                    // Suspended: whoever is back decides, if the order reaches the wire.
+                    // Suspended: anyone who is back decides, if the order reaches the wire.
                     State::RanOut if held && self.answer.is_some() => Demand::Withdraw,
                     State::RanOut if !held => self.act(reading, now),
                     _ => Demand::None,
@@ -202,9 +203,9 @@ impl Supervision {
         }
     }
 
-    /// The time of the lease, which ran since `since`, is over. Of a drive that does not answer, or was not read since,
-    /// nobody knows whether it runs: its lease stays until it is. One that answers and does not say so is not waited for
-    /// without end, whatever it says instead.
+    /// The time of the lease, which ran since `since`, has ended. Of a drive that does not answer, or was not read
+    /// since, nobody knows whether it runs: its lease stays until it is. One that answers and does not say so is not
+    /// waited for without end, whatever it says instead.
     fn runs_out(
         &mut self,
         since: Instant,
@@ -237,8 +238,8 @@ impl Supervision {
         }
     }
 
-    /// Whether the drive answered since the lease ran out for as long as a read of what is to be seen may take. The time in
-    /// which it does not answer is not counted: after it everything is read anew.
+    /// Whether the drive answered since the lease expired for as long as a read of what is to be seen may take. The
+    /// time in which it does not answer is not counted: after it everything is read again.
     fn waits_in_vain(&mut self, reading: &Reading<'_>, now: Instant) -> bool {
         let online = reading.snapshot.link.is_online();
         let (time, until) = self.waited.unwrap_or((Duration::ZERO, now));
@@ -279,7 +280,7 @@ impl Supervision {
         Some(written_run(reading, words).unwrap_or(true))
     }
 
-    /// Takes note of what became of the action that is on its way.
+    /// Records the result of the pending action.
     fn note_answer(&mut self, now: Instant) {
         let Some(answer) = &mut self.answer else { return };
         match answer.try_recv() {
@@ -294,7 +295,7 @@ impl Supervision {
         self.answer = None;
     }
 
-    /// Tells of an action that failed, and of one that succeeded behind that.
+    /// Reports a failed action, and one that succeeded after that.
     fn tell_failure(&mut self, news: &mut Vec<News>, drive: usize) {
         if let Some(outcome) = self.failure.take() {
             self.failures = self.failures.saturating_add(1);
@@ -314,7 +315,7 @@ impl Supervision {
         }
     }
 
-    /// Writes the action. Nothing reaches a drive that does not answer: it is written when the drive is back.
+    /// Writes the action, for a silent drive when it is back.
     fn act(&mut self, reading: &Reading<'_>, now: Instant) -> Demand {
         let waits = self.answer.is_some();
         let due = !waits && self.next_try.is_none_or(|at| at <= now) && reading.snapshot.link.is_online();
@@ -343,7 +344,7 @@ impl Supervision {
         }
     }
 
-    /// The action was taken back, unless it is on the wire: then it is answered all the same, and what it did stands.
+    /// Withdraws the action, unless it was sent: then it still gets its result.
     pub(super) fn withdrawn(&mut self, now: Instant) {
         match self.lease.0 {
             State::RanOut => {
@@ -356,7 +357,7 @@ impl Supervision {
         }
     }
 
-    /// Takes note of what was answered, before a bus ends: what was acknowledged is not due again.
+    /// Records results before a bus ends: an acknowledged action is not due again.
     pub(super) fn settle(&mut self, now: Instant) {
         if self.lease.0 == State::RanOut {
             self.note_answer(now);
@@ -379,8 +380,9 @@ fn does_not_say(reading: &Reading<'_>) -> bool {
     }
 }
 
-/// Whether the run command is set in the drive's word, as it was read since the last order or, where it is waited for in
-/// vain or not reported, as it was last written; none while it is to be read yet. What is not known either counts as unset.
+/// Whether the run command is set in the drive's word, as it was read since the last order or, where it is waited for
+/// without success or not reported, as it was last written; none while it is to be read yet. What is not known either
+/// counts as unset.
 fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_vain: bool) -> Option<bool> {
     let sample = reading.model(ModelPoint::Run);
     if let Some(run) = sample.good().filter(|_| sample.at.is_some_and(|at| at > since)) {
@@ -405,7 +407,7 @@ pub(super) fn written_run(reading: &Reading<'_>, words: &KnownWords) -> Option<b
     Some(profile.runs_by(place.table, place.address, word).unwrap_or(false))
 }
 
-/// Whether an action failed that ended so: not where somebody else's order took its place, or the bus starts anew.
+/// Whether this outcome is a failed action: not if another command replaced it, or the bus restarts.
 fn has_failed(outcome: &Outcome) -> bool {
     !matches!(
         outcome,
@@ -413,7 +415,7 @@ fn has_failed(outcome: &Outcome) -> bool {
     )
 }
 
-/// A drive's own response to a silent master, as far as its registers say.
+/// A drive's own response to a silent master, as far as its registers show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum OwnResponse {
     /// Not read yet, or the profile knows no point for it.

@@ -1,7 +1,7 @@
-//! The frames of a line, for the recorder and for whoever listens: what was sent, what came back, when, and what it means.
+//! The frames of a line, for the recorder and the trace: requests, replies, times and meaning.
 //!
-//! Time on the wire is reckoned from the bytes: a driver may hand a reply over byte by byte, or whole when its last byte
-//! is there.
+//! Time on the wire is calculated from the bytes: a driver may hand a reply over byte by byte, or whole when its last
+//! byte is there.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -11,11 +11,10 @@ use crate::codec::describe::{self, Kind, Part};
 use crate::codec::{LineFormat, Reply, Request};
 use crate::process_image::{BusImage, Direction, FrameRecord, TapedFrame, Verdict};
 
-/// Bytes of one exchange that are kept; a line that babbles beyond shows its beginning.
+/// Bytes kept of one transaction; of a longer one the start is shown.
 const KEPT: usize = 2048;
 
-/// One exchange that somebody listens to. Somebody did when the request went out: a trace never begins with half an
-/// exchange.
+/// A traced transaction. A trace never begins in the middle of one.
 #[derive(Debug)]
 pub(super) struct Tap {
     image: Arc<BusImage>,
@@ -26,7 +25,7 @@ pub(super) struct Tap {
 }
 
 impl Tap {
-    /// The exchange whose request was given to the line at `began`.
+    /// The transaction whose request was given to the line at `began`.
     pub(super) fn new(
         image: Arc<BusImage>,
         index: Option<usize>,
@@ -64,7 +63,7 @@ impl Tap {
         self.hearing.add(bytes, now);
     }
 
-    /// Publishes what came back, a record for each frame.
+    /// Publishes the received bytes, one record per frame.
     pub(super) fn ended(self, ended: &Ended, now: Instant) {
         let protocol = self.image.spec.protocol;
         let answered = matches!(ended, Ended::Reply(_));
@@ -102,7 +101,7 @@ impl Tap {
     }
 }
 
-/// Gives the recorder a request, or all bytes that came until its exchange was over.
+/// Gives the recorder a request, or all bytes that came until its transaction was over.
 pub(super) fn tape(image: &BusImage, drive: Option<usize>, bytes: &[u8], verdict: Verdict, at: Instant) {
     image.tape.frame(|| TapedFrame {
         at,
@@ -112,7 +111,7 @@ pub(super) fn tape(image: &BusImage, drive: Option<usize>, bytes: &[u8], verdict
     });
 }
 
-/// How the recorder calls the end of an exchange.
+/// The recorder's verdict for the end of a transaction.
 pub(super) fn taped(ended: &Ended) -> Verdict {
     match ended {
         Ended::Reply(Reply::Exception(_)) => Verdict::Exception,
@@ -122,7 +121,7 @@ pub(super) fn taped(ended: &Ended) -> Verdict {
     }
 }
 
-/// Publishes bytes that came between two exchanges.
+/// Publishes bytes received between two transactions.
 pub(super) fn noise(image: &BusImage, bytes: &[u8], quiet_since: Instant, now: Instant) {
     tape(image, None, bytes, Verdict::Foreign, now);
     image.trace.publish(|| {

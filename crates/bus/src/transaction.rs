@@ -1,12 +1,12 @@
-//! One exchange on the line: pure, driven by bytes and time.
+//! One transaction on the line: pure, driven by bytes and time.
 //!
-//! Garbage does not end an exchange at once: noise may have run into the beginning of a sound reply, and the rest of a
-//! broken one may still be on the line. The exchange goes on until as many characters came as a reply has, or nothing
-//! more came for their time, never beyond the deadline. A whole Modbus reply that stands behind the garbage is believed:
-//! address, function, length and check code fit, which random bytes do once in 2^40; in Modbus ASCII they would have to
-//! be digits between a colon and CR LF too. An exception is shorter and may split a block: behind garbage it is not
-//! believed, the request is repeated. N2 replies are not believed there at all. What stands before the colon of a
-//! Modbus ASCII frame is no garbage but noise, which its decoder skips.
+//! Garbage does not end a transaction at once: noise may have run into the beginning of a sound reply, and the rest of
+//! a broken one may still be on the line. The transaction goes on until as many characters came as a reply has, or
+//! nothing more came for their time, never beyond the deadline. A whole Modbus reply that stands behind the garbage is
+//! believed: address, function, length and check code fit, which random bytes do once in 2^40; in Modbus ASCII they
+//! would have to be digits between a colon and CR LF too. An exception is shorter and may split a block: behind garbage
+//! it is not believed, the request is repeated. N2 replies are not believed there at all. What stands before the colon
+//! of a Modbus ASCII frame is no garbage but noise, which its decoder skips.
 
 use std::ops::Range;
 use std::time::{Duration, Instant};
@@ -15,41 +15,41 @@ use super::n2_late_replies::{N2LateReplies, Taken};
 use crate::codec::n2::Session;
 use crate::codec::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
 
-/// Most bytes looked at in one exchange: more is babble, whatever it says.
+/// Most bytes considered in one transaction: more is noise, whatever it contains.
 const MOST_BYTES: usize = 1024;
-/// Silence, in characters, behind garbage after which no more of it is expected.
+/// Silence, in characters, after garbage, after which no more of it is expected.
 const GARBAGE_GAP: u32 = 4;
 
-/// Silence behind a reply whose length nothing shows, after which it is whole: longer than a USB adapter holds bytes back.
+/// Silence after a reply of unknown length that makes it complete: longer than a USB adapter buffers bytes.
 const WHOLE_AFTER: Duration = Duration::from_millis(20);
 
-/// Why the answer of an exchange is not believed that may be a late one to an earlier request.
+/// Why a reply is rejected that may be a late one to an earlier request.
 pub const MAY_BE_LATE: &str = "it may be the late reply to an earlier request";
 
-/// Why an exchange has no answer whose request went to a device server that closed its connection then.
+/// Why a transaction has no reply if the device server closed the connection after its request.
 pub const CONNECTION_CLOSED: &str = "the device server closed the connection, and no reply arrived over the next one";
 
-/// How an exchange ended.
+/// How a transaction ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Ended {
-    /// The drive answered, perhaps with an exception: it is alive.
+    /// The drive replied, perhaps with an exception: it is alive.
     Reply(Reply),
-    /// Nothing believable came within the deadline: towards offline.
+    /// Nothing valid arrived before the deadline: towards offline.
     Silent,
-    /// An answer that cannot be believed: tried again once the line is silent.
+    /// An invalid reply: retried once the line is silent.
     Corrupt(&'static str),
 }
 
-/// What is to be done next.
+/// What to do next.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Step {
     /// Wait for bytes until then.
     Wait(Instant),
-    /// The exchange is over.
+    /// The transaction has ended.
     Done(Ended),
 }
 
-/// An exchange whose request is on the line.
+/// A transaction whose request is on the line.
 #[derive(Debug)]
 pub struct Transaction {
     protocol: Protocol,
@@ -59,11 +59,11 @@ pub struct Transaction {
     seen: Vec<u8>,
     deadline: Instant,
     reply_time: Duration,
-    /// What came cannot be believed; until when the rest is waited for.
+    /// The received bytes are invalid; until when to wait for the rest.
     garbage: Option<(&'static str, Instant)>,
-    /// What came may be the whole reply: until when more of it is waited for.
+    /// The received bytes may be the whole reply: until when to wait for more.
     whole_at: Option<Instant>,
-    /// Where the frame of the reply stands in `received`.
+    /// Position of the reply's frame in `received`.
     reply: Range<usize>,
     first_byte: Option<Instant>,
     foreign: u32,
@@ -72,11 +72,11 @@ pub struct Transaction {
     /// A reply that is whole before then was not made for this request.
     doubted_before: Option<Instant>,
     doubted: bool,
-    /// Something came behind such a reply.
+    /// More bytes followed such a reply.
     behind_doubted: bool,
-    /// What comes before then, and is no echo, came before the request was over.
+    /// Bytes before then, other than an echo, arrived before the request ended.
     ignored_before: Option<Instant>,
-    /// What may still come of earlier exchanges on an N2 line.
+    /// Late replies that may still arrive on an N2 line.
     late: N2LateReplies,
     /// A frame that is the reply, unless another one comes until the deadline: then it was a late one.
     unless_another: Option<(Vec<u8>, Reply)>,
@@ -129,22 +129,22 @@ impl Transaction {
         self.ignored_before = Some(end);
     }
 
-    /// Whether a reply came too early to be believed.
+    /// Whether a reply arrived too early to be valid.
     pub fn doubted(&self) -> bool {
         self.doubted
     }
 
-    /// Whether such a reply was all that came.
+    /// Whether such a reply was all that arrived.
     pub fn only_doubted(&self) -> bool {
         self.doubted && !self.behind_doubted
     }
 
-    /// What may still come of earlier exchanges on an N2 line.
+    /// Late replies that may still arrive on an N2 line.
     pub fn expect_late(&mut self, late: N2LateReplies) {
         self.late = late;
     }
 
-    /// What may still come of earlier exchanges.
+    /// Takes the late replies that may still arrive.
     pub fn take_late(&mut self) -> N2LateReplies {
         std::mem::take(&mut self.late)
     }
@@ -169,7 +169,7 @@ impl Transaction {
         &self.request
     }
 
-    /// Bytes came in.
+    /// Bytes were received.
     pub fn on_bytes(&mut self, now: Instant, bytes: &[u8]) -> Step {
         self.first_byte.get_or_insert(now);
         self.behind_doubted |= self.doubted && !bytes.is_empty();
@@ -235,7 +235,7 @@ impl Transaction {
                 }
                 Decoded::Incomplete => {
                     return self.behind_garbage(now).unwrap_or_else(|| {
-                        // A new colon began a frame anew: it has the time until the deadline.
+                        // A new colon began a frame again: it has the time until the deadline.
                         self.garbage = None;
                         self.on_time(now)
                     });
@@ -250,8 +250,9 @@ impl Transaction {
         }
     }
 
-    /// Whether a doubtful frame is worth the time until the deadline: it says that the drive started anew, or who it is, without
-    /// which nothing else can be asked. If each such answer were in doubt for the one before, that would never end.
+    /// Whether a doubtful frame is worth the time until the deadline: it says that the drive restarted, or who it is,
+    /// without which nothing else can be asked. If each such answer were in doubt for the one before, that would never
+    /// end.
     fn awaits_another(&self) -> bool {
         let identifies = matches!(self.request.pdu, RequestPdu::N2(Session::Identify));
         let restarted = matches!(
@@ -303,7 +304,7 @@ impl Transaction {
         frame.get(before..).unwrap_or_default()
     }
 
-    /// The reply that stands whole behind garbage.
+    /// A complete reply after garbage.
     fn behind_garbage(&mut self, now: Instant) -> Option<Step> {
         if self.echo && !self.echo_seen {
             // It could be the echo of a write.
@@ -378,30 +379,30 @@ impl Transaction {
         true
     }
 
-    /// Whether the adapter sends back what it is given, as far as this exchange, which ended so, shows it. Only an
-    /// answered request whose reply looks otherwise shows it: a reply without an echo before it means that an earlier echo
-    /// was a freak, and believing in it would swallow the acknowledgements of all writes.
+    /// Whether the adapter sends back what it is given, as far as this transaction, which ended so, shows it. Only an
+    /// answered request whose reply looks otherwise shows it: a reply without an echo before it means that an earlier
+    /// echo was a freak, and believing in it would swallow the acknowledgements of all writes.
     pub fn echoes(&self, ended: &Ended) -> Option<bool> {
         let answered = matches!(ended, Ended::Reply(_));
         (is_unlike_its_reply(&self.request.pdu) && (self.echo_seen || answered)).then_some(self.echo_seen)
     }
 
-    /// When the first byte of the (last) frame came.
+    /// When the first byte of the (last) frame arrived.
     pub fn first_byte(&self) -> Option<Instant> {
         self.first_byte
     }
 
-    /// Frames that were nobody's answer.
+    /// Frames that were not the reply.
     pub fn foreign(&self) -> u32 {
         self.foreign
     }
 
-    /// All bytes that came in this exchange.
+    /// All bytes received in this transaction.
     pub fn seen(&self) -> &[u8] {
         &self.seen
     }
 
-    /// Bytes that came behind the reply, or were no reply.
+    /// Bytes after the reply, or that were not a reply.
     pub fn rest(&self) -> &[u8] {
         self.received.get(self.reply.end..).unwrap_or_default()
     }

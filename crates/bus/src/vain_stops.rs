@@ -1,4 +1,4 @@
-//! Stops to a drive that does not answer: when the next one may go out. Pure: time is an argument.
+//! Stops to a silent drive: when the next one may be sent. Pure: time is an argument.
 //!
 //! A person presses the button again, and the drive may listen again at any moment: the next stop goes out after the others
 //! had the line for as long as the last one took it. Stops without end must not take half of the line: beyond a few in a row
@@ -8,27 +8,27 @@ use std::time::{Duration, Instant};
 
 /// Stops in a row that go out in turn with the rest.
 const IN_TURN: f64 = 8.0;
-/// Beyond that the pause is so many times what the last one took, and no longer than that.
+/// Beyond that the pause is this multiple of the duration of the last one, up to this limit.
 const PAUSE: (u32, Duration) = (10, Duration::from_secs(2));
 
-/// The stops that one drive did not answer.
+/// The unanswered stops of one drive.
 #[derive(Debug, Default)]
 pub(super) struct VainStops {
     /// How many in a row; one less for each pause.
     count: f64,
-    /// What the exchanges of the present one took so far.
+    /// Duration of the transactions of the present one so far.
     took: Duration,
     last: Option<Instant>,
     until: Option<Instant>,
 }
 
 impl VainStops {
-    /// An exchange of a stop was not answered; it took the line for `took`.
+    /// A transaction of a stop got no reply; it took the line for `took`.
     pub(super) fn not_answered(&mut self, took: Duration) {
         self.took += took;
     }
 
-    /// A stop failed, none of its exchanges being answered.
+    /// A stop failed without any reply.
     pub(super) fn in_vain(&mut self, now: Instant) {
         let took = std::mem::take(&mut self.took);
         let share = took * PAUSE.0;
@@ -41,7 +41,7 @@ impl VainStops {
         self.until = Some(now + if self.count <= IN_TURN { took } else { pause });
     }
 
-    /// The drive answered something.
+    /// The drive replied.
     pub(super) fn answered(&mut self) {
         *self = VainStops::default();
     }

@@ -1,4 +1,4 @@
-//! What happened: state changes that people and the cloud want to know of, each published once.
+//! Events: state changes, each published once.
 
 mod fair_ring;
 mod log;
@@ -16,46 +16,46 @@ pub use fair_ring::{FairRing, in_order};
 pub use log::{Before, LineError, Search, from_line};
 pub use refusals::RefusalLimit;
 
-/// Most events that a listener may be behind: one of every drive of 66 full lines at once, 16 of every one of a thousand drives.
+/// Most events a listener may lag behind: one of every drive of 66 full lines at once, 16 of each of a thousand drives.
 pub const BURST: usize = 16_384;
-/// Events that a listener of a small plant may be behind: 16 of every one of 256 drives. There is room for it from the start.
+/// Events a listener of a small plant may lag behind: 16 of each of 256 drives. Allocated from the start.
 const SMALL_BURST: usize = 4096;
-/// Events of each drive that a listener may be behind.
+/// Events of each drive a listener may lag behind.
 const OF_EACH_DRIVE: usize = 16;
 /// Events of drives and buses kept for late readers.
 const KEPT: usize = 4096;
-/// Refused commands kept beside them.
+/// Refused commands kept besides them.
 const REFUSALS_KEPT: usize = 512;
 
-/// What kind of thing happened.
+/// The kind of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EventKind {
-    /// A drive answers (again).
+    /// A drive replies (again).
     Online,
-    /// A drive does not answer any more.
+    /// A drive no longer replies.
     Offline,
-    /// A fault came up, or its code changed.
+    /// A fault appeared, or its code changed.
     Fault,
-    /// The fault is gone.
+    /// The fault cleared.
     FaultEnd,
     /// A motor started.
     Started,
     /// A motor stopped.
     Stopped,
-    /// A warning came up.
+    /// A warning appeared.
     Warning,
-    /// The warning is gone.
+    /// The warning cleared.
     WarningEnd,
     /// The fieldbus became the control place of a drive, or no longer is.
     ControlPlace,
-    /// A drive has started anew.
+    /// A drive has restarted.
     Restarted,
-    /// A drive says that it is another device than its profile expects.
+    /// A drive reports a different device type than its profile expects.
     UnlikeProfile,
-    /// Process data of a drive does not hold what its profile says: a selector of the drive was changed.
+    /// Process data does not match the profile: a selector in the drive was changed.
     SelectionDiffers,
-    /// A lease ran out, and its action begins.
+    /// A lease expired, and its action begins.
     Supervision,
     /// The action of a lease, or the stop of a shutdown, failed.
     SupervisionFailed,
@@ -71,7 +71,7 @@ pub enum EventKind {
     BusDown,
     /// A recording was made, or lost.
     Recording,
-    /// A new configuration was not applied; the former one goes on.
+    /// A new configuration was not applied; the previous one stays.
     ReloadRefused,
     /// The other master of a line commands a drive.
     ForeignCommand,
@@ -79,9 +79,9 @@ pub enum EventKind {
     ParametersChanged,
     /// A restore of parameters was interrupted, or its journal belongs to no drive that is configured.
     RestoreUnfinished,
-    /// A verdict about a line came, became firmer, or went.
+    /// A verdict about a line appeared, became more certain, or cleared.
     Diagnosis,
-    /// A start was refused, since it came too often or too soon.
+    /// A start was refused as too frequent or too early.
     Guarded,
     /// A start was refused, or a motor stopped, since an interlock does not hold.
     Interlock,
@@ -130,7 +130,7 @@ impl EventKind {
         EventKind::Drill,
     ];
 
-    /// Whether somebody should look: the log has it as a warning.
+    /// Whether someone should look: the log has it as a warning.
     pub fn is_trouble(self) -> bool {
         match self {
             EventKind::Offline
@@ -230,10 +230,10 @@ pub struct Event {
     /// Fault code, where there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fault_code: Option<i64>,
-    /// Refused commands only: how many of one client it stands for.
+    /// Refused commands only: how many of one client it covers.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub count: Option<u64>,
-    /// Starts and stops only: who ordered it, where an order of this gateway was the cause.
+    /// Starts and stops only: who commanded it, if a command through this gateway was the cause.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub by: Option<String>,
     /// For people.
@@ -248,10 +248,10 @@ pub struct Event {
 pub struct RecordingMade {
     /// Its id.
     pub id: String,
-    /// What made it.
+    /// Its trigger.
     #[schema(value_type = String)]
     pub trigger: Cow<'static, str>,
-    /// What it shows, for people.
+    /// Its summary.
     pub summary: String,
 }
 
@@ -313,7 +313,7 @@ pub fn rfc3339<S: serde::Serializer>(time: &SystemTime, serializer: S) -> Result
 /// A command that was refused.
 #[derive(Debug)]
 pub struct RefusedCommand<'r> {
-    /// The client, as shares are reckoned.
+    /// The client, as shares are calculated.
     pub client: &'r Arc<str>,
     /// Code of the reason.
     pub reason: &'static str,
@@ -330,7 +330,8 @@ pub struct Events {
     store: Arc<Mutex<Store>>,
 }
 
-/// The last events. Those of drives and buses are apart from refused commands, and no drive or kind pushes out another.
+/// The latest events. Those of drives and buses are stored separately from refused commands, and no drive or kind
+/// displaces another.
 ///
 /// Each is kept as its line of JSON, one block of memory: as an [`Event`] it is six blocks and twice the bytes, and as some
 /// thousands of them come and go for months, small blocks are what the free memory ends up scattered between.
@@ -338,7 +339,7 @@ pub struct Events {
 struct Store {
     /// Of the last event of this run.
     number: u64,
-    /// Events of earlier runs, which come before all of this one.
+    /// Events of earlier runs, all before those of this one.
     earlier: u64,
     kept: FairRing<(EventKind, Arc<str>), Arc<str>>,
     refused: FairRing<Arc<str>, Arc<str>>,
@@ -352,7 +353,7 @@ impl Default for Events {
 }
 
 impl Events {
-    /// For so many drives: a listener may be behind by 16 events of each, by 4,096 at least and [`BURST`] at most.
+    /// For that number of drives: a listener may lag behind by 16 events of each, at least 4,096 and at most [`BURST`].
     pub fn of_drives(drives: usize) -> Events {
         let burst = drives.saturating_mul(OF_EACH_DRIVE).clamp(SMALL_BURST, BURST);
         Events {
@@ -391,8 +392,8 @@ impl Events {
         let _ = self.sender.send(Arc::new(event));
     }
 
-    /// Publishes that a command was refused: the first of a kind at once, then one event a second for each client, which
-    /// stands for all of them.
+    /// Publishes a refused command: the first of a kind at once, then one event a second per client, covering all of
+    /// them.
     pub fn publish_refusal(&self, refused: RefusedCommand<'_>, now: Instant) {
         let kind = match refused.reason {
             "guarded" => EventKind::Guarded,
@@ -429,12 +430,13 @@ impl Events {
         self.publish_in(store, event);
     }
 
-    /// Hears all events from now on; a listener that is further behind than [`Events::of_drives`] says loses the oldest.
+    /// Receives all events from now on; a listener that lags further behind than [`Events::of_drives`] allows loses the
+    /// oldest.
     pub fn subscribe(&self) -> broadcast::Receiver<Arc<Event>> {
         self.sender.subscribe()
     }
 
-    /// Takes in what was kept of earlier runs, oldest first. To be called before the first event of this one.
+    /// Restores the events of earlier runs, oldest first. Call it before the first event of this run.
     pub fn remember(&self, earlier: Vec<Event>) {
         let mut store = self.store();
         for event in earlier {

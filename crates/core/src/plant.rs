@@ -1,4 +1,4 @@
-//! What the north sides see: images to read from, queues to write into. No clock: time is an argument.
+//! The plant as the servers see it: images to read, queues to write to. No clock: time is an argument.
 
 mod exchange;
 mod hold;
@@ -29,7 +29,7 @@ pub use self::why::explain;
 /// The plant as it is configured now; a reload puts a new one in its place.
 pub type SharedPlant = Arc<ArcSwap<Plant>>;
 
-/// Where the stops of the next drive are counted from that is started or added.
+/// The first stop number of the next drive that is started or added.
 static ADDED: AtomicU64 = AtomicU64::new(STOPS_OF_ONE);
 /// More stops than one drive gets. Few enough that the stops of all drives of a bus can be added, after any number of reloads.
 const STOPS_OF_ONE: u64 = 1 << 32;
@@ -37,9 +37,9 @@ const STOPS_OF_ONE: u64 = 1 << 32;
 /// One bus: its image and its queue.
 #[derive(Debug, Clone)]
 pub struct BusHandle {
-    /// What is known.
+    /// The process image.
     pub image: Arc<BusImage>,
-    /// What is wanted.
+    /// The command queue.
     pub queue: Arc<CommandQueue>,
 }
 
@@ -94,13 +94,13 @@ pub struct Plant {
     pub stale_after: Duration,
     /// In the order of the file.
     pub buses: Vec<BusHandle>,
-    /// What happens.
+    /// The events.
     pub events: Events,
     /// Counters of commands.
     pub writes: Arc<WriteStats>,
-    /// What the recorder has kept.
+    /// The recordings.
     pub recordings: Arc<Recordings>,
-    /// Orders that stop all drives.
+    /// Commands that stop all drives.
     pub stop_all: Arc<StopAll>,
     /// Drills.
     pub drills: Arc<Drills>,
@@ -110,13 +110,13 @@ pub struct Plant {
     pub history: Arc<History>,
 }
 
-/// One drive and the way to it.
+/// Access to one drive.
 #[derive(Debug, Clone)]
 pub struct DriveHandle {
     pub bus: BusHandle,
     /// Index on the bus.
     pub index: usize,
-    /// What is known.
+    /// The process image.
     pub image: Arc<DriveImage>,
     stale_after: Duration,
     events: Events,
@@ -124,7 +124,7 @@ pub struct DriveHandle {
     manner: Manner,
 }
 
-/// How orders are placed that guards of starts would refuse or delay.
+/// How commands are placed that guards of starts would refuse or delay.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 enum Manner {
     /// A start that must wait is refused, an ordinary stop is delayed.
@@ -160,7 +160,7 @@ impl Plant {
         self.writes.audit().record_due(now);
     }
 
-    /// Refuses a command to a drive that there is not; audited and counted. `why` names the nearest one.
+    /// Refuses a command to an unknown drive; audited and counted. `why` names the nearest one.
     pub fn refuse_unknown(&self, drive: &str, what: &str, why: String, origin: Origin, now: Instant) -> Answer {
         let outcome = Outcome::Refused(Refusal::UnknownDrive(why));
         turn_away(&self.writes, drive, what, outcome, origin, now)
@@ -202,14 +202,14 @@ impl Plant {
 }
 
 impl DriveHandle {
-    /// The same, whose orders wait where a guard lets their start wait, within their expiry.
+    /// The same, but a command whose start is guarded waits up to its expiry.
     #[must_use]
     pub fn waiting(mut self, waits: bool) -> DriveHandle {
         self.manner = if waits { Manner::Waits } else { Manner::Usual };
         self
     }
 
-    /// The same, whose stops no guard delays.
+    /// The same, but no guard delays its stops.
     #[must_use]
     pub fn at_once(mut self) -> DriveHandle {
         self.manner = Manner::AtOnce;
@@ -270,7 +270,7 @@ impl DriveHandle {
         with(self.bus.queue.lock().priorities(self.index))
     }
 
-    /// Publishes what happened to the drive.
+    /// Publishes an event of the drive.
     pub fn publish(&self, event: Event) {
         self.events.publish(event);
     }

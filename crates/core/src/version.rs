@@ -7,7 +7,7 @@ pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 static COMMIT: OnceLock<&'static str> = OnceLock::new();
 
-/// Notes the commit of the build; `main` does so, because only the program's own package is built anew with each
+/// Notes the commit of the build; `main` does so, because only the program's own package is built again with each
 /// commit. Without effect after the first call.
 pub fn set_commit(commit: Option<&'static str>) {
     if let Some(commit) = commit {
@@ -15,7 +15,7 @@ pub fn set_commit(commit: Option<&'static str>) {
     }
 }
 
-/// The commit of the build, where it is known.
+/// The commit of the build, if known.
 pub fn commit() -> Option<&'static str> {
     COMMIT.get().copied()
 }

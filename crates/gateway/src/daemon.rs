@@ -112,7 +112,7 @@ impl Daemon {
         Daemon::start_with(settings, None).await
     }
 
-    /// As [`Daemon::start`]; `control` takes the orders of local clients to the gateway itself.
+    /// As [`Daemon::start`]; `control` takes the commands of local clients to the gateway itself.
     ///
     /// # Errors
     /// As [`Daemon::start`].
@@ -325,7 +325,7 @@ impl Daemon {
         let order = |name: &str| settings.buses.iter().position(|b| b.spec.name == name);
         kept.sort_by_key(|(bus, _)| order(&bus.spec.name));
         self.show(settings, &kept);
-        // Last: whoever hears of a bus finds it in the plant.
+        // Last: anyone who hears of a bus finds it in the plant.
         for (bus, task) in &mut kept {
             if let Some(before) = handovers.remove(&bus.spec.name) {
                 tracing::info!(target: "drivegate::daemon", bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "starting the bus");
@@ -430,7 +430,7 @@ impl Daemon {
             let stops = settings.shutdown_time();
             let time = match stops.drives {
                 0 => Duration::ZERO,
-                // Before them, the exchange that is on the line.
+                // Before them, the transaction that is on the line.
                 _ => settings.options.response_timeout + stops.unanswered,
             };
             let missing = task.handle().queue.begin_shutdown(now + time, now);
@@ -493,7 +493,7 @@ async fn at_once<T: Send + 'static>(
     stopped.into_iter().filter_map(Result::ok).collect()
 }
 
-/// Watches the orders that stop all drives.
+/// Watches the commands that stop all drives.
 fn stop_all(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
     let orders = plant.load().stop_all.clone();
     tokio::spawn(async move {

@@ -94,7 +94,7 @@ impl OpenError {
     }
 }
 
-/// The port is gone: the bus closes it and opens it anew.
+/// The port is gone: the bus closes it and opens it again.
 #[derive(Debug, thiserror::Error)]
 #[error("the port is lost: {why}")]
 pub struct Lost {
@@ -169,8 +169,8 @@ impl Line {
         Line::open_by(&mut Names::default(), port, format, options, &|| true)
     }
 
-    /// As [`Line::open`], for whoever opens the same port again and again: `names` remembers the addresses of a device
-    /// server, and `go_on`, called at least once a second, says whether it is still wanted.
+    /// As [`Line::open`], for anyone who opens the same port again and again: `names` remembers the addresses of a
+    /// device server, and `go_on`, called at least once a second, says whether it is still wanted.
     ///
     /// # Errors
     /// As [`Line::open`].
@@ -296,8 +296,8 @@ impl AsFd for Exclusive {
 }
 
 impl Drop for Exclusive {
-    /// The kernel keeps the exclusive mode of a port until its last descriptor is closed and all is sent; until then whoever
-    /// opens it anew is told that it is busy.
+    /// The kernel keeps the exclusive mode of a port until its last descriptor is closed and all is sent; until then
+    /// anyone who opens it again is told that it is busy.
     fn drop(&mut self) {
         if let Err(error) = rustix::termios::ioctl_tiocnxcl(&self.0) {
             // An adapter that was unplugged.

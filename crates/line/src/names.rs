@@ -12,7 +12,7 @@ use super::other_server::OtherServer;
 
 /// Longest wait for an answer.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// Whoever waits is asked this often whether to go on.
+/// Anyone who waits is asked this often whether to go on.
 const STEP: Duration = Duration::from_millis(100);
 
 type Found = io::Result<Vec<SocketAddr>>;

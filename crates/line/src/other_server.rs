@@ -45,7 +45,7 @@ impl OtherServer {
         self.0.found.load(Ordering::Relaxed)
     }
 
-    /// Whether what was recognised is there no more: it may have been set up anew.
+    /// Whether what was recognised is there no more: it may have been set up again.
     pub(super) fn is_gone(&self, stream: &TcpStream) -> bool {
         let unit = self.0.unit.load(Ordering::Relaxed);
         let still = stream.peer_addr().is_ok_and(|server| answers(server, unit));
@@ -74,7 +74,7 @@ impl OtherServer {
         let asking = move || {
             if answers(server, unit) {
                 known.recognised(unit);
-                // Wakes whoever waits on it, and who opens it anew is told.
+                // Wakes anyone who waits on it, and who opens it again is told.
                 let ended = silent.shutdown(Shutdown::Both);
                 tracing::debug!(target: "drivegate::line", ?ended, "a Modbus TCP server answers instead of a line");
             }

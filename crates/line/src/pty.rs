@@ -1,4 +1,4 @@
-//! A pseudo-terminal that looks like a serial port to whoever opens it, with a link that keeps its name.
+//! A pseudo-terminal that looks like a serial port to anyone who opens it, with a link that keeps its name.
 
 use rustix::fs::{Mode, OFlags, fchmod, fcntl_setfl};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
@@ -111,7 +111,7 @@ impl Drop for Pty {
     }
 }
 
-/// Makes `link` point to `target`, in place of a link that an earlier pseudo-terminal left, in one step.
+/// Makes `link` point to `target`, instead of a link that an earlier pseudo-terminal left, in one step.
 fn point(link: &Path, target: &Path) -> io::Result<()> {
     let explain = |error: io::Error| {
         let text = format!(

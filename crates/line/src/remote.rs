@@ -15,7 +15,7 @@ use super::{Lost, OpenError, poll_port, read, write_all};
 
 /// Time for the server to agree and to set up its port.
 const NEGOTIATION: Duration = Duration::from_secs(3);
-/// Whoever waits is asked this often whether to go on.
+/// Anyone who waits is asked this often whether to go on.
 const STEP: Duration = Duration::from_millis(100);
 
 /// A raw connection.
@@ -103,7 +103,7 @@ impl Remote {
     /// Has the server set up its port; the texts are warnings.
     ///
     /// # Errors
-    /// When the server cannot, does not within three seconds, or is not wanted any more.
+    /// When the server cannot, does not within three seconds, or is no longer wanted.
     pub(super) fn open(
         stream: TcpStream,
         port: &str,

@@ -1,9 +1,9 @@
-//! When the bytes came that a client has sent and that are not taken yet: a request counts from its first byte. Pure.
+//! Arrival times of received bytes that are not processed yet: a request dates from its first byte. Pure.
 
 use std::collections::VecDeque;
 use std::time::Instant;
 
-/// Pieces whose times are kept apart; what comes behind them counts as the last of them.
+/// Most chunks with separate times; later ones count as the last.
 const MOST: usize = 64;
 
 /// The times of the bytes, the first ones first.
@@ -11,7 +11,7 @@ const MOST: usize = 64;
 pub(super) struct Arrivals(VecDeque<(usize, Instant)>);
 
 impl Arrivals {
-    /// So many bytes came at that time.
+    /// That number of bytes arrived at that time.
     pub(super) fn came(&mut self, count: usize, at: Instant) {
         if count == 0 {
             return;
@@ -23,7 +23,7 @@ impl Arrivals {
         }
     }
 
-    /// When the first byte came.
+    /// When the first byte arrived.
     pub(super) fn first(&self) -> Option<Instant> {
         self.0.front().map(|(_, at)| *at)
     }

@@ -1,4 +1,4 @@
-//! What the gateway itself reads in an X.509 certificate: subject, validity and role.
+//! The fields that the gateway itself reads from an X.509 certificate: subject, validity and role.
 //!
 //! Trust is decided by rustls: a client's certificate is read here after its chain and its signature were verified.
 
@@ -82,7 +82,7 @@ fn role(extensions: &[x509_cert::ext::Extension]) -> Result<Option<String>, Role
     Ok(Some(role.to_string()))
 }
 
-/// The common name as it stands, not for messages.
+/// The common name, unescaped, not for messages.
 pub(super) fn common_name(subject: &Name) -> Option<String> {
     let value = &subject.iter().find(|attribute| attribute.oid == COMMON_NAME)?.value;
     let is_text = matches!(value.tag(), Tag::Utf8String | Tag::PrintableString | Tag::Ia5String);

@@ -1,5 +1,5 @@
-//! What decides whether a certificate is accepted, beside its signature: version, key, names, uses. For checks before a
-//! connection and for words about those that failed.
+//! What decides whether a certificate is accepted, besides its signature: version, key, names, uses. For checks before
+//! a connection and for words about those that failed.
 
 use rustls_pki_types::{IpAddr, ServerName};
 use x509_cert::certificate::{Certificate, TbsCertificate, Version};

@@ -67,7 +67,7 @@ struct Open {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Decision {
     Admit,
-    /// In place of the open connection with this index.
+    /// Instead of the open connection with this index.
     Replace(usize),
     Refuse(LimitReached),
 }
@@ -84,8 +84,8 @@ pub(super) enum LimitReached {
 /// Decides about a new connection from `address`.
 ///
 /// A connection in use is not closed for another one from the same address, except for one that may write if it itself
-/// may not. When no place is left, the address with the most connections gives up its longest idle one to an address that
-/// has fewer. Who may write never yields to somebody who may not.
+/// may not. When no place is left, the address with the most connections gives up its longest idle one to an address
+/// that has fewer. Who may write never yields to someone who may not.
 fn decide<I>(limits: &Limits, open: I, address: IpAddr, authority: Authority) -> Decision
 where
     I: Iterator<Item = Open> + Clone,
@@ -131,7 +131,7 @@ where
     }
 }
 
-/// What a client may do; a reload can change it while the client is connected.
+/// The rights of a client; a reload can change them while the client is connected.
 #[derive(Debug, Clone)]
 pub(super) struct Rights(Arc<AtomicBool>);
 
@@ -191,7 +191,7 @@ impl Place {
         self.address
     }
 
-    /// What the client may do.
+    /// The rights of the client.
     pub(super) fn rights(&self) -> &Rights {
         &self.rights
     }
@@ -263,7 +263,7 @@ impl ConnectionPermit {
     }
 }
 
-/// A connection that asks for a place.
+/// A new connection that needs a place.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Newcomer<'c> {
     /// Address of the client.
@@ -344,7 +344,7 @@ impl ConnectionLimit {
         Ok((ConnectionPermit { limit, place }, displaced))
     }
 
-    /// Judges the open connections of one listener anew: what they may do from now on, or `None` to close them.
+    /// Judges the open connections of one listener again: what they may do from now on, or `None` to close them.
     pub(super) fn review(&self, listener: usize, judge: impl Fn(&Place) -> Option<Authority>) {
         let table = self.lock();
         for place in table.open.iter().filter(|place| place.listener == listener) {

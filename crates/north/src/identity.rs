@@ -40,7 +40,7 @@ pub enum TlsFile {
     ClientCrl,
 }
 
-/// A fault of one of the files, or a warning about it: what is wrong and what to do.
+/// A fault in one of the files, or a warning about it, with its remedy.
 #[derive(Debug, thiserror::Error)]
 #[error("{problem}")]
 pub struct IdentityFault {
@@ -218,7 +218,7 @@ pub(super) fn provider() -> Arc<CryptoProvider> {
     Arc::new(crypto::ring::default_provider())
 }
 
-/// Why there are no CA certificates to verify a server with, and what to do.
+/// Why there are no CA certificates to verify a server with, and the remedy.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum RootsError {
     #[error(transparent)]
@@ -265,8 +265,7 @@ pub(super) fn client_builder(ca: Option<&Path>) -> Result<ConfigBuilder<ClientCo
 
 /// TLS towards a gateway, verified by the certificates of a file or by the CAs of the system.
 ///
-/// # Errors
-/// What is wrong with them, and what to do.
+/// # Errors Their fault, and the remedy.
 pub fn client_tls(ca: Option<&Path>) -> Result<Arc<ClientConfig>, String> {
     let builder = client_builder(ca).map_err(|error| error.to_string())?;
     Ok(Arc::new(builder.with_no_client_auth()))
@@ -326,7 +325,7 @@ fn nameless(file: &Path, der: &CertificateDer<'_>) -> Option<FileProblem> {
     })
 }
 
-/// What is wrong with the period of validity of a certificate.
+/// The fault in the validity period of a certificate.
 pub(super) fn validity(file: &Path, der: &CertificateDer<'_>, now: SystemTime) -> Option<FileProblem> {
     let file = file.display().to_string();
     let Ok(certificate) = certificate::read(der) else {

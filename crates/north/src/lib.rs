@@ -69,7 +69,7 @@ pub enum ServerError {
         address: SocketAddr,
         /// Section of the configuration, in brackets.
         section: String,
-        /// What the system reports.
+        /// The system's error.
         cause: io::Error,
     },
     /// The system does not provide a thread.
@@ -80,7 +80,7 @@ pub enum ServerError {
     Local {
         /// The first path that it could have.
         path: PathBuf,
-        /// What the system reports.
+        /// The system's error.
         cause: io::Error,
     },
     /// The certificates of a server, named first, cannot be used.

@@ -23,7 +23,7 @@ use self::accept::{AcceptLoop, ListeningSocket, stop_listening};
 pub(crate) use self::state::ListenerState;
 pub use self::state::ListenerStates;
 
-/// What a server does with the connections to one of its listeners.
+/// Handles the connections to one of a server's listeners.
 pub(super) trait ConnectionHandler: Send + Sync + 'static {
     /// The place of a connection; it is given back when this is dropped.
     type Permit: Send;
@@ -141,8 +141,9 @@ impl<H: ConnectionHandler> Listeners<H> {
     /// Binds the sockets that are missing. What is open goes on, with one exception: a socket that is no longer wanted is
     /// closed early if a new one overlaps it, because the system does not allow both at one time.
     ///
-    /// A server that starts takes an address that the machine does not have yet: it comes with its interface, and whoever reads
-    /// drives until then is served. In a reload such an address is an error: it would take the place of one that works.
+    /// A server that starts takes an address that the machine does not have yet: it comes with its interface, and
+    /// anyone who reads drives until then is served. In a reload such an address is an error: it would take the place
+    /// of one that works.
     ///
     /// # Errors
     /// The first address that cannot be bound; everything is open as before.
@@ -280,7 +281,7 @@ impl<H: ConnectionHandler> Listeners<H> {
         }
     }
 
-    /// Closes all listeners; what their connections have begun is answered as if a reload closed each of them.
+    /// Closes all listeners; requests in progress complete as if a reload closed each of them.
     pub(super) async fn close(&mut self) {
         for mut listener in std::mem::take(&mut self.open) {
             tracing::info!(target: "drivegate::north::listener", address = %listener.bound, "{}: no longer listening", self.server.title());

@@ -1,4 +1,4 @@
-//! Reads certificates, keys and revocation lists from files; says what is in a file that holds something else.
+//! Reads certificates, keys and revocation lists from files; reports the content of a file that holds something else.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -26,7 +26,7 @@ pub(super) enum PemError {
     },
 }
 
-/// What a file holds instead of what was expected.
+/// The content of a file instead of the expected one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Found {
     /// A private key that needs a passphrase.
@@ -176,7 +176,7 @@ fn content(file: &Path) -> Result<Vec<u8>, PemError> {
     }
 }
 
-/// Why a file of the configuration cannot be read, and what to do.
+/// Why a configured file cannot be read, and the remedy.
 pub fn unreadable(file: &Path, error: &io::Error) -> (String, String) {
     let shown = file.display();
     if error.kind() != io::ErrorKind::PermissionDenied {

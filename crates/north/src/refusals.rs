@@ -27,7 +27,7 @@ impl Refusals {
         }
     }
 
-    /// A place under `limit` for a connection that `judge` allows. Whoever is refused or displaced is counted and
+    /// A place under `limit` for a connection that `judge` allows. Anyone who is refused or displaced is counted and
     /// logged, with the remedy for the limit that was reached.
     pub(super) fn acquire(
         &self,

@@ -22,7 +22,7 @@ pub const FIRST: u16 = 0x8000;
 pub const GATEWAY_UNIT: u8 = 255;
 /// Register of unit 255 to which 1 is written to stop all drives.
 pub const STOP_ALL: u16 = 0x0100;
-/// Register of unit 255 that counts the controlled drives that are not known to stand.
+/// Register of unit 255 with the number of controlled drives not known to have stopped.
 pub const NOT_STANDING: u16 = 0x8101;
 
 const COMMAND_WORD: u16 = 0x8100;
@@ -88,7 +88,7 @@ impl Form {
         }
     }
 
-    /// What the registers contain when there is no value, for the printed map.
+    /// The register content for "not available", for the printed map.
     pub fn not_available(self) -> &'static str {
         match self {
             Form::U16 => "0xFFFF",
@@ -121,7 +121,7 @@ fn high_low(word: u32) -> [u16; 2] {
     [(word >> 16) as u16, word as u16]
 }
 
-/// What an entry of the map contains.
+/// The content of a map entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Content {
     /// The status bits.
@@ -149,7 +149,7 @@ pub enum Content {
 pub struct Entry {
     /// First PDU address.
     pub address: u16,
-    /// What it contains.
+    /// Its content.
     pub content: Content,
     /// How it is encoded.
     pub form: Form,

@@ -1,4 +1,4 @@
-//! What all servers have in common: how they start, change and stop.
+//! The interface of all servers: start, change and stop.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -19,7 +19,7 @@ pub trait Server: Sized + std::fmt::Debug {
     const NAME: &'static str;
     /// Time limit for it to stop.
     const STOP_TIMEOUT: Duration = STOP_TIMEOUT;
-    /// What it is configured by.
+    /// Its configuration.
     type Options: Clone + PartialEq + std::fmt::Debug;
 
     /// Starts it; it runs until `cancel`.
@@ -40,7 +40,7 @@ pub trait Server: Sized + std::fmt::Debug {
 /// A server that applies new options while it runs, in two steps.
 #[allow(async_fn_in_trait, reason = "the daemon awaits it in its own task")]
 pub trait Reconfigure: Server {
-    /// What the first step has prepared.
+    /// A prepared change.
     type Change;
 
     /// Does all that can fail; nothing changes for any client.
@@ -49,16 +49,16 @@ pub trait Reconfigure: Server {
     /// It cannot run so: it runs as before.
     async fn prepare(&mut self, options: Self::Options) -> Result<Self::Change, ServerError>;
 
-    /// Applies what was prepared.
+    /// Applies a prepared change.
     fn commit(&mut self, change: Self::Change);
 
-    /// Forgets what was prepared.
+    /// Discards a prepared change.
     fn abort(&mut self, change: Self::Change);
 
-    /// Takes no more from any client; what was begun is answered.
+    /// Accepts no more requests; those in progress complete.
     async fn retire(&mut self);
 
-    /// Whether everybody was answered and has gone, after it retired.
+    /// Whether all requests have completed and all clients are gone, after it retired.
     fn is_drained(&self) -> bool;
 }
 

@@ -1,4 +1,4 @@
-//! Which servers are trusted: those whose certificate a CA signed, and those whose certificate is itself named.
+//! Server trust: certificates signed by a CA, and certificates listed themselves.
 //!
 //! rustls takes a certificate in the list of CAs only as one that signs others. Other programs accept a server that shows such a
 //! certificate, and so does this: who names a certificate trusts exactly it, so neither its version nor what it may sign
@@ -28,7 +28,7 @@ pub(super) struct ServerTrust {
     algorithms: WebPkiSupportedAlgorithms,
 }
 
-/// Whose certificate is not known.
+/// A server with an unknown issuer.
 #[derive(Debug, Clone, thiserror::Error)]
 #[error("its certificate `{name}` is signed by `{issuer}`")]
 pub(super) struct UnknownIssuer {
@@ -38,7 +38,7 @@ pub(super) struct UnknownIssuer {
 }
 
 impl ServerTrust {
-    /// Trusts what the CAs of `roots` signed, and the certificates in `named`.
+    /// Trusts certificates signed by the CAs in `roots`, and those in `named`.
     ///
     /// # Errors
     /// There is no CA.

@@ -13,7 +13,7 @@ use super::listener::ListenerStates;
 use super::mqtt::{Broker, NodeOrdersLeft, OrdersLeft};
 use crate::event::Event;
 
-/// What outlives the servers that a reload replaces: counters of all north sides, and which commands were taken.
+/// State that survives the servers a reload replaces: counters of all servers, and the accepted commands.
 #[derive(Debug, Default)]
 pub struct NorthStats {
     /// Of the Modbus TCP server.
@@ -30,9 +30,9 @@ pub struct NorthStats {
     pub listeners: Arc<ListenerStates>,
     /// The last time the configuration was read.
     pub reload: ReloadStats,
-    /// Commands that came by way of the broker in the last minutes, and their results as payloads.
+    /// Recent commands from the broker, and their results as payloads.
     pub(super) taken: SharedMemory,
-    /// Commands that came over HTTP.
+    /// Recent commands over HTTP.
     pub(super) posted: PostedCommands,
 }
 
@@ -226,7 +226,7 @@ impl ModbusTcpStats {
 #[derive(Debug, Default)]
 pub struct BacnetStats(Mutex<Option<BacnetFigures>>);
 
-/// Counters of the BACnet server and what became of its registration.
+/// Counters of the BACnet server and the result of its registration.
 #[derive(Debug, Clone)]
 pub struct BacnetFigures {
     /// Since it was started.
@@ -263,7 +263,7 @@ impl BacnetStats {
 /// How a request of a tool ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum SlotOutcome {
-    /// Answered with what the drive said; a broadcast: sent.
+    /// The drive's reply was passed on; a broadcast was sent.
     Answered,
     /// The drive refused it.
     Exception,
@@ -271,9 +271,9 @@ pub enum SlotOutcome {
     Refused,
     /// There was no answer to pass on: the drive is silent or away, or the request was not sent.
     NoAnswer,
-    /// The tool asked again before it was answered.
+    /// The tool sent another request before the reply.
     Abandoned,
-    /// No answer came within a second.
+    /// No reply arrived within a second.
     Late,
     /// No sound frame.
     Broken,
@@ -350,7 +350,8 @@ pub struct MqttStats {
     retained: Mutex<Vec<String>>,
     /// The events that the last client left unread when it ended, for the one that a reload puts in its place.
     unread_events: Mutex<Option<Receiver<Arc<Event>>>>,
-    /// The orders whose results the last client still owed when it ended, for the one that a reload puts in its place.
+    /// The commands whose results the last client still owed when it ended, for the one that a reload puts in its
+    /// place.
     orders: Mutex<Option<OrdersLeft>>,
     /// Those of the last edge node.
     node_orders: Mutex<Option<NodeOrdersLeft>>,
@@ -367,7 +368,7 @@ pub(crate) enum LinkOf {
     Node,
 }
 
-/// What the MQTT client lost.
+/// A kind of message lost by the MQTT client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MqttLoss {
     Event,
@@ -404,7 +405,7 @@ impl MqttStats {
         std::mem::replace(&mut kept, events)
     }
 
-    /// Keeps the orders whose results a client owes when it ends, or forgets them; returns those kept before.
+    /// Keeps the commands whose results a client owes when it ends, or forgets them; returns those kept before.
     pub(crate) fn keep_orders(&self, orders: Option<OrdersLeft>) -> Option<OrdersLeft> {
         let mut kept = self.orders.lock().unwrap_or_else(PoisonError::into_inner);
         std::mem::replace(&mut kept, orders)

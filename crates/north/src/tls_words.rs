@@ -1,4 +1,4 @@
-//! Why a TLS connection failed, and what to do: in words of who configures it, instead of those of the library.
+//! Why a TLS connection failed, and the remedy, in terms of the configuration instead of the library.
 
 use std::error::Error as StdError;
 use std::io;
@@ -9,7 +9,7 @@ use super::certificate_kind::{SUPPORTED_KEYS, algorithm};
 use super::identity::date;
 use super::server_trust::UnknownIssuer;
 
-/// Whose connection it is.
+/// The peer of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Peer {
     /// A server that the gateway or one of its commands connects to.
@@ -27,10 +27,10 @@ pub(super) const BROKER: Peer = Peer::Server {
     ca: "mqtt.ca",
     own: "mqtt.certificate and mqtt.key",
 };
-/// A gateway that a command asks over HTTPS.
+/// A gateway that a command connects to over HTTPS.
 pub const GATEWAY: Peer = Peer::Server { ca: "--ca", own: "" };
 
-/// What is wrong, and what to do, as `what; what to do`; `None` if it is nothing of TLS.
+/// Fault and remedy, as `what; what to do`; `None` if it is not a TLS error.
 pub fn explain(error: &(dyn StdError + 'static), peer: Peer) -> Option<String> {
     let (what, remedy) = match found(error)? {
         Error::InvalidCertificate(cause) => certificate(cause, peer),

@@ -1,8 +1,8 @@
 //! Modbus ASCII frames: colon, hexadecimal digits, LRC, CR LF (drives.md 5.1, worked frames section 7.3).
 //!
-//! A frame has a definite beginning and end, so anything outside it is recognised at once: characters before a colon are noise,
-//! and a colon in the middle begins the frame anew. Digits are sent in upper case and taken in either. Of the pause of
-//! 1 s between two characters that ends a frame only a slave needs to know: a master has its deadline.
+//! A frame has a definite beginning and end, so anything outside it is recognised at once: characters before a colon
+//! are noise, and a colon in the middle begins the frame again. Digits are sent in upper case and taken in either. Of
+//! the pause of 1 s between two characters that ends a frame only a slave needs to know: a master has its deadline.
 
 use super::checksum::lrc;
 use super::modbus::{MAX_PDU, Reply, RequestPdu};
@@ -49,7 +49,7 @@ pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     let Some(frame) = end.and_then(|end| rest.get(..end)) else {
         return match unfinished(rest) {
             Ok(()) if bytes.len() < LONGEST => Decoded::Incomplete,
-            // Noise may be longer than a frame that has only begun behind it.
+            // Noise may be longer than a frame that has only started after it.
             Ok(()) if rest.first() == Some(&BEGIN) && rest.len() < LONGEST => Decoded::Incomplete,
             Ok(()) => Decoded::Corrupt("no end of a frame in the characters of the longest one"),
             Err(why) => Decoded::Corrupt(why),

@@ -1,4 +1,4 @@
-//! Frames in plain words, one line each, for people who look at a line.
+//! Frames in plain words, one line each, as text who look at a line.
 //!
 //! Registers are in hexadecimal as on the wire, addresses are PDU addresses, counted from 0.
 
@@ -107,7 +107,7 @@ pub fn reply(protocol: Protocol, asked: &Request, bytes: &[u8]) -> String {
     }
 }
 
-/// Bytes that nobody asked for: a sound frame of somebody else, or noise.
+/// Bytes that nobody asked for: a sound frame of someone else, or noise.
 pub fn stray(protocol: Protocol, bytes: &[u8]) -> String {
     if protocol == Protocol::N2 {
         return n2_words::stray(bytes);

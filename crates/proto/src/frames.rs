@@ -1,4 +1,4 @@
-//! Cuts what is heard on a line into requests, replies and what is neither. Pure: time is an argument.
+//! Cuts what is received on a line into requests, replies and what is neither. Pure: time is an argument.
 //!
 //! Drivers and adapters hand bytes over late and in lumps, so silence decides little. A frame is known by its content: a
 //! request by function, length and check code; a reply by the request before it. Only what stays incomplete is given up by
@@ -37,7 +37,7 @@ pub enum Cut {
     Garbage,
 }
 
-/// A piece of what was heard.
+/// A piece of what was received.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Piece {
     pub cut: Cut,
@@ -68,8 +68,8 @@ pub struct Frames {
 }
 
 impl Frames {
-    /// Nothing was heard yet. Behind an incomplete frame that falls silent for `held_back`, on top of 3.5 characters, the rest is
-    /// not expected any more.
+    /// Nothing was received yet. Behind an incomplete frame that goes silent for `held_back`, on top of 3.5 characters,
+    /// the rest is no longer expected.
     pub fn new(protocol: Protocol, format: LineFormat, held_back: Duration) -> Frames {
         Frames {
             protocol,

@@ -53,13 +53,13 @@ pub enum Decoded {
         /// What the drive said.
         reply: Reply,
     },
-    /// A sound frame of somebody else (other address, function or length): drop `used` bytes and
+    /// A sound frame of someone else (other address, function or length): drop `used` bytes and
     /// read on, the deadline stays.
     Foreign {
         /// Bytes of the buffer to drop.
         used: usize,
     },
-    /// The bytes cannot become the reply any more (check code, impossible length): the exchange
+    /// The bytes cannot become the reply any more (check code, impossible length): the transaction
     /// has failed, the schedule retries it once the line is silent.
     Corrupt(&'static str),
 }
@@ -201,7 +201,7 @@ impl Protocol {
         }
     }
 
-    /// Silence by which a drive knows that a request is over, before its turnaround begins.
+    /// Silence by which a drive knows that a request has ended, before its turnaround begins.
     pub fn recognition(self, format: &LineFormat) -> Duration {
         match self {
             Protocol::ModbusRtu => format.silence_chars(),

@@ -43,10 +43,10 @@ pub const RESPONSE_TIMEOUT: Duration = Duration::from_millis(250);
 /// Tries after the first (n2.md 4: three tries).
 pub const RETRIES: u32 = 2;
 
-/// What the bus itself says to a drive, beside reads and writes.
+/// What the bus itself says to a drive, besides reads and writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Session {
-    /// Who is there? A drive that has started anew answers nothing else.
+    /// Who is there? A drive that has restarted answers nothing else.
     Identify,
     /// What has changed?
     Poll {

@@ -401,7 +401,7 @@ mod tests {
                 assert_eq!(decode_reply(&request, &bytes), too_long);
                 bytes.resize(LONGEST + 4, 0);
                 assert_eq!(decode_reply(&request, &bytes), too_long);
-                // A short frame whose third byte counts something else is somebody's.
+                // A short frame whose third byte counts something else is someone's.
                 let mut other = Vec::new();
                 encode_frame(2, &[function, count, 7], &mut other);
                 assert_eq!(decode_reply(&request, &other), Decoded::Foreign { used: 6 });

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use crate::north::http::{Credential, Credentials};
 
-/// How long somebody else may take to change the file.
+/// How long someone else may take to change the file.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// How often that is looked for.
 const AGAIN: Duration = Duration::from_millis(20);

@@ -177,7 +177,7 @@ impl Ear<'_> {
         Ok(report::print(&snippet.text()))
     }
 
-    /// Protocol and format of the line; nothing where no requests were heard with any setting.
+    /// Protocol and format of the line; nothing where no requests were received with any setting.
     fn find(
         &self,
         protocols: &[Protocol],
@@ -224,7 +224,7 @@ impl Ear<'_> {
         Ok((survey, n2))
     }
 
-    /// Gives what is heard to `take`, until that is content or the time is over.
+    /// Gives what is received to `take`, until that is content or the time has ended.
     fn hear(
         &self,
         format: &LineFormat,

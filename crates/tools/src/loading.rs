@@ -158,7 +158,7 @@ mod tests {
             assert!(loads.is_wanted_again() && !loads.is_wanted_again());
         }
         assert!(matches!(loads.begin(&pipe), Err(NotLoaded::TooMany)));
-        // Somebody writes the file after all; without a reader the system refuses that.
+        // Someone writes the file after all; without a reader the system refuses that.
         let without_waiting = i32::try_from(rustix::fs::OFlags::NONBLOCK.bits()).unwrap();
         let deadline = std::time::Instant::now() + Duration::from_secs(60);
         while loads.readers.load(Ordering::Relaxed) > 0 {

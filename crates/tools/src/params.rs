@@ -219,7 +219,7 @@ impl StatusLine {
         let _ = write!(stderr, "\r\x1b[K{text}");
     }
 
-    /// Whether a line is due off a terminal: what is over within a minute needs none.
+    /// Whether a line is due off a terminal: what has ended within a minute needs none.
     fn is_due(&mut self, now: Instant) -> bool {
         let said = *self.said.get_or_insert(now);
         let due = now.saturating_duration_since(said) >= SAID_EVERY;

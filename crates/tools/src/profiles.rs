@@ -447,7 +447,7 @@ pub(super) fn place(profile: &Profile, point: &Point) -> (String, String, String
     }
 }
 
-/// How a derived point is computed, for people.
+/// How a derived point is computed, as text.
 fn derivation(profile: &Profile, derived: &Derived) -> String {
     let bound = |bound: &Bound| match bound {
         Bound::Point(point) => name_of(profile, *point).to_string(),

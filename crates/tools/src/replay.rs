@@ -19,7 +19,7 @@ use crate::process_image::{BusImage, DriveImage, Outcome, public_points, value_o
 
 /// Largest capture that is read.
 const MOST_BYTES: u64 = 1 << 30;
-/// Time that goes by behind the last packet, so that its exchange is over.
+/// Time that goes by behind the last packet, so that its transaction has ended.
 const AFTERWARDS: Duration = Duration::from_millis(200);
 /// Longest step of virtual time.
 const STEP: Duration = Duration::from_millis(100);
@@ -109,7 +109,7 @@ fn chosen<'s>(settings: &'s Settings, name: Option<&str>) -> Result<&'s BusSetti
     }
 }
 
-/// A capture under way.
+/// A capture in progress.
 struct Player {
     core: ListenCore,
     image: Arc<BusImage>,

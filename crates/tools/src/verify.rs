@@ -1,4 +1,4 @@
-//! `drivegate verify`: the form by which somebody who has the drive confirms its profile.
+//! `drivegate verify`: the form by which someone who has the drive confirms its profile.
 
 use std::fmt::Write as _;
 use std::process::ExitCode;

@@ -32,7 +32,7 @@ pub(super) enum Word {
     ResetLow(Setting),
     /// The pulse.
     ResetHigh(Setting),
-    /// Behind it.
+    /// After it.
     ResetEnd(Setting),
     /// Bits that are no command of `[control]`.
     Others(Setting),
@@ -65,7 +65,7 @@ pub(super) struct AwaitedState {
     mask: Mask,
     /// After which the sequence is given up.
     pub(super) timeout: Duration,
-    /// For people: the step, with its word.
+    /// As text: the step, with its word.
     step: String,
     /// When the wait began.
     pub(super) since: Option<Instant>,
@@ -110,7 +110,7 @@ impl AwaitedState {
         value.is_some() && self.seen.is_some_and(|seen| self.mask.holds(seen))
     }
 
-    /// For people: what was not seen in time.
+    /// As text: what was not seen in time.
     pub(super) fn not_reached(&self) -> String {
         let AwaitedState {
             name,
@@ -129,7 +129,7 @@ impl AwaitedState {
     }
 }
 
-/// What an order says of points that follow from `[control]`.
+/// What a command says of points that follow from `[control]`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Ordered {
     run: Option<bool>,
@@ -191,7 +191,7 @@ impl Ordered {
         }
         match (self.run, self.reverse) {
             (Some(true), reverse) => actions.extend(runs(control, profile, reverse)),
-            // A stop is an order of its own; here it is one that names no other command.
+            // A stop is a command of its own; here it is one that names no other command.
             (Some(false), reverse) => actions.extend(stops(control, profile, reverse)),
             (None, Some(reverse)) if elsewhere.is_none() => actions.push(Action::Word(Word::Direction(reverse))),
             (None, _) => {}

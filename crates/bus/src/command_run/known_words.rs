@@ -16,7 +16,7 @@ pub struct KnownWords {
     pub(super) direction: Option<bool>,
     /// Those that it was asked for and reported, ever.
     reported: BTreeSet<(Table, u16)>,
-    /// The functions that it takes, which it keeps when it starts anew.
+    /// The functions that it takes, which it keeps when it restarts.
     pub(super) functions: TakenFunctions,
 }
 
@@ -67,7 +67,7 @@ impl KnownWords {
             .any(|(address, word)| self.get(table, *address).is_some_and(|has| has != *word))
     }
 
-    /// The drive may have started anew, or taken an unanswered write: its words are read again before a bit is changed.
+    /// The drive may have restarted, or taken an unanswered write: its words are read again before a bit is changed.
     pub fn forget(&mut self) {
         self.words.clear();
     }

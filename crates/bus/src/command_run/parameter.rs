@@ -52,7 +52,7 @@ pub(super) struct ParameterRun {
 }
 
 impl ParameterRun {
-    /// One that has not begun; none where the family does not report whether its motor runs.
+    /// One that has not started; none where the family does not report whether its motor runs.
     pub(super) fn new(order: ParameterOrder, profile: &Profile) -> Option<ParameterRun> {
         let running = profile.model_point(ModelPoint::Running)?;
         let mut run = ParameterRun {
@@ -117,7 +117,7 @@ impl ParameterRun {
         self.in_doubt = true;
     }
 
-    /// No answer to be believed came: what the drive has is asked before anything is written again.
+    /// No valid reply came: what the drive has is asked before anything is written again.
     pub(super) fn begin_again(&mut self) {
         if self.stage != Stage::Release {
             self.stage = self.first();
@@ -187,7 +187,7 @@ impl ParameterRun {
     fn heard_value(&mut self, reply: &Reply) -> Then {
         let value = self.value(reply);
         if value.is_some_and(|value| self.order.to.is_shown_by(value)) {
-            // Whoever asks sees by the reply that nothing was written.
+            // Anyone who asks sees by the reply that nothing was written.
             let reply = if self.in_doubt { Reply::Written } else { reply.clone() };
             return Then::Over(Outcome::Acknowledged(reply));
         }

@@ -18,7 +18,7 @@ const BUSY_PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::f
 const MOST_BUSY: u32 = 10;
 
 impl CommandRun {
-    /// The drive answered the step that [`CommandRun::next`] gave. The outcome, when the command is over.
+    /// The drive answered the step that [`CommandRun::next`] gave. The outcome, when the command has ended.
     pub fn answered(&mut self, step: &Step, reply: Reply, words: &mut KnownWords) -> Option<Outcome> {
         if reply == Reply::Exception(Exception::FUNCTION) && self.has_another_function(step, words) {
             return None;
@@ -101,8 +101,9 @@ impl CommandRun {
         None
     }
 
-    /// Whether the drive is too busy for the step, which is tried again: of a command as long as its time is not over. Nobody
-    /// waits for it at a read that a stop can do without, or that only spares a write; whoever reads waits as he likes.
+    /// Whether the drive is too busy for the step, which is tried again: of a command as long as its time is not over.
+    /// Nobody waits for it at a read that a stop can do without, or that only spares a write; anyone who reads waits as
+    /// he likes.
     fn waits_while_busy(&mut self, step: &Step, reply: &Reply) -> bool {
         let waits = match step.purpose {
             StepPurpose::Execute => self.urgency != Urgency::Read,
@@ -195,7 +196,7 @@ impl CommandRun {
         self.actions.is_empty().then(|| self.success())
     }
 
-    /// No believable answer came; `how` says which way. The outcome, when the tries are used up.
+    /// No valid reply came; `how` says which way. The outcome, when the tries are used up.
     pub fn failed(&mut self, step: &Step, how: Outcome, retries: u32) -> Option<Outcome> {
         self.tries.failures += 1;
         self.tries.unanswered = how;
@@ -250,8 +251,8 @@ impl CommandRun {
         self.tries.in_doubt
     }
 
-    /// The word was asked for in vain. Whether the command goes on with what is known all the same: where the drive never
-    /// reports it (`unreadable`), and at the end of a pulse, which no read stands in the way of.
+    /// The word was asked for without success. Whether the command goes on with what is known all the same: where the
+    /// drive never reports it (`unreadable`), and at the end of a pulse, which no read stands in the way of.
     fn goes_on(&mut self, unreadable: bool) -> bool {
         let goes_on = self.check == Check::NotYet && (unreadable || self.ends_pulse());
         if goes_on {

@@ -180,7 +180,7 @@ fn bits_of(raw: &Raw) -> u16 {
     }
 }
 
-/// The actions of a command. `stopped`: it is the rest of an order whose stop went before it.
+/// The actions of a command. `stopped`: it is the rest of a command whose stop went before it.
 pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool, stopped: bool) -> VecDeque<Action> {
     let mut numbers = VecDeque::new();
     let mut pulses = VecDeque::new();

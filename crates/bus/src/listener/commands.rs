@@ -17,14 +17,14 @@ const PAUSE: Duration = Duration::from_secs(1);
 /// Registers of one drive whose last written values are known.
 const KEPT: usize = 256;
 
-/// A command of the other master that is to be told.
+/// A command of the other master to report.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Commanded {
     /// The command in one line.
     pub what: String,
     /// What it sets.
     pub changes: Vec<Change>,
-    /// What became of it.
+    /// The result.
     pub outcome: Outcome,
     /// When it began.
     pub began: Instant,
@@ -43,7 +43,7 @@ pub struct Commands {
 }
 
 impl Commands {
-    /// A write was heard, from `began` to `at`; what is to be told of it now.
+    /// A write was received, from `began` to `at`; what is to be reported of it now.
     pub fn heard(
         &mut self,
         (spec, protocol): (&DriveSpec, Protocol),

@@ -19,18 +19,18 @@ use crate::process_image::{Cadence, Outcome as Counted};
 use crate::report::Report;
 use crate::transaction::Ended;
 
-/// A drive of which nothing was heard for that long, and for three of its usual pauses, is offline.
+/// A drive of which nothing was received for that long, and for three of its usual pauses, is offline.
 const SILENT: Duration = Duration::from_secs(5);
 /// Longest pause between two looks at the time.
 const LOOK: Duration = Duration::from_millis(100);
 
-/// What is known of one drive beside its image.
+/// What is known of one drive besides its image.
 #[derive(Debug)]
 struct Known {
     address: u8,
     /// Requests in a row that got no reply.
     unanswered: u32,
-    /// When it was heard last; the opening of the port, before that.
+    /// When it was last received; the opening of the port, before that.
     heard: Instant,
     /// Longest pause between two replies of it lately: a whole round of the other master, where that asks drive after drive.
     pause: Duration,
@@ -52,7 +52,7 @@ pub struct ListenCore {
     /// Reads of process data in this round of the other master, and when it began.
     round: (Vec<(usize, Table, u16)>, Option<Instant>),
     heard: Vec<Heard>,
-    /// Something was heard since the port was opened or connected to anew.
+    /// Something was received since the port was opened or reconnected.
     heard_any: bool,
 }
 
@@ -102,7 +102,7 @@ impl ListenCore {
         self.refuse_all(now);
     }
 
-    /// A device server closed the connection. Where something was heard by it, it is connected to again at once.
+    /// A device server closed the connection. Where something was received by it, it is connected to again at once.
     pub fn closed(&mut self) -> Closed {
         match std::mem::take(&mut self.heard_any) {
             true => Closed::Reconnect,
@@ -269,7 +269,7 @@ impl ListenCore {
             if exchange.doubt.is_none() {
                 let spec = &self.bus.image.spec;
                 let replied = exchange.replied.unwrap_or(exchange.at);
-                // By so much silence a drive knows that a request is over, which is no part of its turnaround.
+                // By so much silence a drive knows that a request has ended, which is no part of its turnaround.
                 let recognition = spec.protocol.recognition(&spec.format);
                 image.set_turnaround(replied.saturating_duration_since(exchange.sent + recognition));
             }

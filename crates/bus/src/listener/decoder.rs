@@ -1,4 +1,4 @@
-//! What another master and its drives say, exchange by exchange. Pure: bytes and time are arguments.
+//! What another master and its drives say, transaction by transaction. Pure: bytes and time are arguments.
 //!
 //! A reply is believed only where it is sure which request it answers:
 //!
@@ -11,8 +11,8 @@
 //!   that look like its reply are not believed ([`LateReplies`], [`N2LateReplies`]); the same request again is, as either
 //!   reply is true of it.
 //!
-//! What is not believed is counted and shown in the trace, and enters nothing. A mid-stream start, lost bytes and collisions cost
-//! the exchanges that they hit: the next sound request begins anew.
+//! What is not believed is counted and shown in the trace, and enters nothing. A mid-stream start, lost bytes and
+//! collisions cost the transactions that they hit: the next sound request starts again.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -24,23 +24,24 @@ use crate::late_replies::{FORGOTTEN_AFTER, LateReplies};
 use crate::n2_late_replies::{Asked, N2LateReplies, Taken};
 use crate::transaction::{Ended, MAY_BE_LATE};
 
-/// A request without a reply is over after that time, unless the next request comes first: the longest `response_timeout`.
+/// A request without a reply has ended after that time, unless the next request comes first: the longest
+/// `response_timeout`.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// No late reply of N2 comes after that time: that of the gateway as a master.
 const N2_LATE: Duration = n2::RESPONSE_TIMEOUT.saturating_mul(3);
-/// Bytes of garbage that are kept of one exchange.
+/// Bytes of garbage that are kept of one transaction.
 const KEPT: usize = 512;
 
 const NO_REPLY_IN_FRONT: &str = "invalid bytes came between request and reply";
 const AMBIGUOUS: &str = "it could be a request as well";
 const BEHIND_MANGLED: &str = "it may be the late reply to a damaged request";
 
-/// Something that was heard.
+/// Something that was received.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Heard {
-    /// A request, and what became of it.
+    /// A request, and the result.
     Exchange(Box<Exchange>),
-    /// Bytes that belong to no exchange.
+    /// Bytes that belong to no transaction.
     Stray {
         bytes: Vec<u8>,
         /// When they had come.
@@ -50,7 +51,7 @@ pub enum Heard {
     },
 }
 
-/// A request of the other master, and what became of it.
+/// A request of the other master, and the result.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Exchange {
     /// Who was asked; 0 is the broadcast.
@@ -65,11 +66,11 @@ pub struct Exchange {
     pub began: Instant,
     /// When it was over.
     pub sent: Instant,
-    /// All that came behind it.
+    /// All that came after it.
     pub heard: Vec<u8>,
     /// When the first byte of the reply began; none where nothing came.
     pub replied: Option<Instant>,
-    /// When the exchange was over.
+    /// When the transaction was over.
     pub at: Instant,
     /// When the drive was asked at the latest for what it said: earlier than `at`, where an earlier try may have been answered.
     pub asked_by: Instant,
@@ -98,7 +99,7 @@ struct Open {
     quiet_since: Instant,
     began: Instant,
     sent: Instant,
-    /// What came behind it and is no frame.
+    /// What came after it and is no frame.
     garbage: Vec<u8>,
     /// The request could be a reply: in which case the next request looks like its reply.
     ambiguous: bool,
@@ -122,7 +123,7 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// A line of which nothing was heard so far. `n2` is what is known of its drives, by address.
+    /// A line of which nothing was received so far. `n2` is what is known of its drives, by address.
     pub fn new(protocol: Protocol, format: LineFormat, n2: BTreeMap<u8, N2Options>) -> Decoder {
         Decoder {
             protocol,
@@ -145,7 +146,7 @@ impl Decoder {
 
     /// Bytes arrived at `now`, the last of them just then.
     pub fn on_bytes(&mut self, bytes: &[u8], now: Instant, heard: &mut Vec<Heard>) {
-        // What waited for its rest until a time that is over is cut before.
+        // What waited for its rest until a time that has ended is cut before.
         self.on_time(now.checked_sub(Duration::from_nanos(1)).unwrap_or(now), heard);
         self.frames.add(bytes, now);
         self.cut(now, heard);
@@ -258,7 +259,7 @@ impl Decoder {
         });
     }
 
-    /// No reply came to the request that is open: the next request came at `now`, or its time is over.
+    /// No reply came to the request that is open: the next request came at `now`, or its time has ended.
     fn give_up(&mut self, now: Instant, heard: &mut Vec<Heard>) {
         let Some(open) = &self.open else { return };
         let mangled = open
@@ -290,7 +291,7 @@ impl Decoder {
         self.over(Some(ended), now, None, None, heard);
     }
 
-    /// The exchange of the request that is open is over.
+    /// The transaction of the request that is open has ended.
     fn over(
         &mut self,
         ended: Option<Ended>,

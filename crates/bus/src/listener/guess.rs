@@ -75,7 +75,7 @@ impl Guess {
         self.bytes
     }
 
-    /// Protocol and format, once enough requests were heard.
+    /// Protocol and format, once enough requests were received.
     pub fn found(&self) -> Option<(Protocol, LineFormat)> {
         let best = self.tries.iter().max_by_key(|one| one.requests)?;
         if best.requests < ENOUGH {

@@ -1,11 +1,11 @@
 //! A line that another master owns: the gateway only listens.
 //!
-//! - [`decoder`]: bytes and their times in, exchanges of the other master out; `codec::frames` cuts the bytes. Pure.
-//! - [`core`](self::core): the bus without its thread: what was heard goes into the process image, events and the audit. Pure.
+//! - [`decoder`]: bytes and their times in, transactions of the other master out; `codec::frames` cuts the bytes. Pure.
+//! - [`core`](self::core): the bus without its thread: what was received goes into the process image, events and the audit. Pure.
 //! - [`commands`]: what the other master commands, reported when it changes. Pure.
 //! - [`survey`]: who speaks to whom how often, for `drivegate listen`. Pure.
 //! - [`n2_survey`]: what confirms or contradicts the assumptions about N2. Pure.
-//! - [`guess`]: protocol and format of a line from what is heard with a setting. Pure.
+//! - [`guess`]: protocol and format of a line from what is received with a setting. Pure.
 //!
 //! Nothing here can send: the thread ([`crate::BusTask`]) holds a [`crate::line::Receiver`], which has no way to.
 

@@ -57,7 +57,7 @@ fn count(seen: &mut Seen, what: impl Into<String>) {
 }
 
 impl N2Survey {
-    /// Takes note of what was heard.
+    /// Takes note of what was received.
     pub fn add(&mut self, heard: &Heard) {
         match heard {
             Heard::Exchange(exchange) => self.exchange(exchange),

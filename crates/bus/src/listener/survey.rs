@@ -12,14 +12,14 @@ use crate::transaction::Ended;
 /// Different requests to one address that are counted apart.
 const MOST_REQUESTS: usize = 256;
 
-/// One request, each time it was heard.
+/// One request, each time it was received.
 #[derive(Debug, Clone)]
 pub struct Asked {
     /// What is asked, in words.
     pub what: String,
     /// Table, first address and count of a read.
     pub read: Option<(Table, u16, u16)>,
-    /// Times it was heard.
+    /// Times it was received.
     pub count: u64,
     /// Times it was answered with values or an acknowledgement.
     pub answered: u64,
@@ -30,14 +30,14 @@ pub struct Asked {
 }
 
 impl Asked {
-    /// Mean time from one to the next, once it was heard twice.
+    /// Mean time from one to the next, once it was received twice.
     pub fn cycle(&self) -> Option<Duration> {
         let intervals = u32::try_from(self.count.checked_sub(1)?).ok().filter(|n| *n > 0)?;
         Some(self.last.saturating_duration_since(self.first) / intervals)
     }
 }
 
-/// What was heard of one address.
+/// What was received from one address.
 #[derive(Debug, Clone, Default)]
 pub struct Address {
     /// Each request, by what it is.
@@ -91,21 +91,21 @@ impl Address {
     }
 }
 
-/// What was heard on a line.
+/// What was received on a line.
 #[derive(Debug, Default)]
 pub struct Survey {
     /// By address; 0 is the broadcast.
     pub addresses: BTreeMap<u8, Address>,
     /// Requests heard.
     pub requests: u64,
-    /// Bytes that belong to no exchange.
+    /// Bytes that belong to no transaction.
     pub stray: u64,
     first: Option<Instant>,
     last: Option<Instant>,
 }
 
 impl Survey {
-    /// Takes note of what was heard.
+    /// Takes note of what was received.
     pub fn add(&mut self, protocol: Protocol, heard: &Heard) {
         let (began, at) = match heard {
             Heard::Stray { bytes, at, .. } => {
@@ -161,7 +161,7 @@ impl Survey {
         }
     }
 
-    /// For how long the line was heard.
+    /// For how long the line was monitored.
     pub fn time(&self) -> Duration {
         let ends = self.first.zip(self.last);
         ends.map_or(Duration::ZERO, |(first, last)| last.saturating_duration_since(first))

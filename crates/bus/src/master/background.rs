@@ -1,4 +1,4 @@
-//! Background exchanges: when one goes on the line, and what came of it.
+//! Background transactions: when one goes on the line, and the result.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -24,7 +24,7 @@ use crate::start_gate::{Start, StartGate};
 use crate::stop_of_line::BROADCAST_PAUSE;
 use crate::transaction::{CONNECTION_CLOSED, Ended};
 
-/// Time of an exchange whose request is not decoded, at most.
+/// Time of a transaction whose request is not decoded, at most.
 const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);
 
 /// A background request that has its turn.
@@ -33,17 +33,17 @@ pub(super) struct Begun {
     request: BackgroundRequest,
     /// Whose time it takes; none where it goes as a command.
     admission: Option<Admission>,
-    /// It is an order to drives of the bus, and waited among their others; the registers that it sets.
+    /// It is a command to drives of the bus, and waited among their others; the registers that it sets.
     ordered: Option<Touched>,
-    /// Its exchange is on the line, or was.
+    /// Its transaction is on the line, or was.
     sent: bool,
-    /// Its number among the orders, and what it means for each drive that it reaches.
+    /// Its number among the commands, and what it means for each drive that it reaches.
     number: u64,
     effects: Vec<(usize, Effect)>,
 }
 
 impl Begun {
-    /// Its number among the orders to drives of the bus.
+    /// Its number among the commands to drives of the bus.
     pub(super) fn number(&self) -> u64 {
         self.number
     }
@@ -81,7 +81,7 @@ pub(super) struct Late<'m> {
 }
 
 impl Late<'_> {
-    /// Until when the exchange cannot go, if it cannot now.
+    /// Until when the transaction cannot go, if it cannot now.
     fn blocks(
         &mut self,
         (drive, pdu): (usize, &RequestPdu),
@@ -109,7 +109,7 @@ impl Late<'_> {
         (request.drive == quiet || reach.contains(&quiet)).then_some(until)
     }
 
-    /// Whether what is passed on to drives of the bus can go: nothing is begun for any of them.
+    /// Whether what is passed on to drives of the bus can go: nothing has started for any of them.
     ///
     /// # Errors
     /// When it can, if it must wait.
@@ -145,7 +145,7 @@ pub(super) fn drop_in_vain(pending: &mut Pending, drives: &[Arc<DriveImage>], no
 }
 
 impl Master {
-    /// The background exchange that goes now, in time that is left over (`idle`) or in place of a poll that is due.
+    /// The background transaction that goes now, in time that is left over (`idle`) or instead of a poll that is due.
     ///
     /// # Errors
     /// When to look again; none where none waits.
@@ -172,7 +172,7 @@ impl Master {
         Err(again)
     }
 
-    /// What was chosen and not sent is chosen anew.
+    /// What was chosen and not sent is chosen again.
     pub(super) fn put_back_background(&mut self, now: Instant) {
         let Some(begun) = self.background.take_if(|begun| !begun.sent) else {
             return;
@@ -403,7 +403,7 @@ impl Master {
         Ok(begun.turn())
     }
 
-    /// What the exchange takes, as far as the profile tells.
+    /// What the transaction takes, as far as the profile tells.
     fn exchange_cost(&self, drive: usize, pdu: &RequestPdu) -> Duration {
         let spec = &self.bus.image.spec;
         let turnaround = self.bus.image.drives.get(drive);
@@ -411,7 +411,7 @@ impl Master {
         WireTime::of(spec.protocol, &spec.format, pdu).total(turnaround, self.silence)
     }
 
-    /// Whether the background exchange that was chosen may still go.
+    /// Whether the background transaction that was chosen may still go.
     pub(super) fn background_is_due(&self, now: Instant) -> bool {
         let Some(begun) = self.background.as_ref().filter(|begun| begun.request.expires > now) else {
             return false;
@@ -421,7 +421,7 @@ impl Master {
             let reach = passed_on.reach.iter();
             let mut started = reach.filter(|drive| !passed_on.stops.contains(*drive));
             let pending = self.bus.queue.lock();
-            // A stop that came in while the line fell silent.
+            // A stop that came in while the line went silent.
             !started.any(|drive| pending.was_stopped(*drive))
         }) && self.starts.as_ref().is_none_or(|starts| {
             let mut started = begun.effects.iter().filter(|(_, effect)| effect.run == Some(true));
@@ -429,7 +429,7 @@ impl Master {
         })
     }
 
-    /// The background exchange goes onto the line. It is an order to every drive that hears it.
+    /// The background transaction goes onto the line. It is a command to every drive that hears it.
     pub(super) fn background_sent(&mut self, now: Instant) {
         let Some(begun) = &mut self.background else { return };
         begun.sent = true;
@@ -456,7 +456,7 @@ impl Master {
         }
     }
 
-    /// Answers the request that has begun, for which nothing can be done any more.
+    /// Answers the request that has started, for which nothing can be done any more.
     pub(super) fn abandon_background(&mut self, unsent: Outcome, why: Interruption, now: Instant) {
         if let Some(begun) = self.background.take() {
             let outcome = if begun.sent { Outcome::Interrupted(why) } else { unsent };
@@ -464,19 +464,19 @@ impl Master {
         }
     }
 
-    /// Whether a background exchange has its turn that somebody asked for.
+    /// Whether a background transaction has its turn that someone asked for.
     pub(super) fn background_of_others(&self) -> bool {
         let begun = self.background.as_ref();
         begun.is_some_and(|begun| !begun.request.is_of_gateway())
     }
 
-    /// Whether the background exchange is the broadcast of the shutdown.
+    /// Whether the background transaction is the broadcast of the shutdown.
     pub(super) fn stops_the_line(&self) -> bool {
         let begun = self.background.as_ref();
         begun.is_some_and(|begun| begun.request.ticket.origin().kind == SourceKind::Shutdown)
     }
 
-    /// A background exchange is over: it is answered, whatever came of it.
+    /// A background transaction has ended: it is answered, whatever came of it.
     pub(super) fn background_over(&mut self, turn: &Turn, mut end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         let index = turn.drive;
         let heard = self.sessions.heard(index, &end.ended);
@@ -520,8 +520,8 @@ impl Master {
         begun.request.answer_with(outcome, frame, now);
     }
 
-    /// What was read fills the process image, too. A drive that was identified, or asked for its changes, may have started
-    /// anew or told what the gateway has not heard: it is read again.
+    /// What was read fills the process image, too. A drive that was identified, or asked for its changes, may have
+    /// restarted or told what the gateway has not heard: it is read again.
     fn note_background_read(&mut self, turn: &Turn, reply: &Reply, now: Instant, news: &mut Vec<News>) {
         match (&turn.pdu, reply) {
             (RequestPdu::Read { table, start, count }, reply) => {

@@ -1,4 +1,4 @@
-//! What goes on the line next: stops, other commands, forwarded reads, polls, background exchanges.
+//! What goes on the line next: stops, other commands, forwarded reads, polls, background transactions.
 
 use std::time::{Duration, Instant};
 
@@ -13,13 +13,13 @@ use crate::command_run::{CommandRun, Step};
 use crate::drive_state::{DriveState, Wanted};
 use crate::schedule::{Decision, Poll};
 
-/// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
+/// Transactions of one rank in a row, while a lower one waits, before that has its turn.
 const IN_A_ROW: u32 = 8;
-/// Decisions without an exchange before the rest waits for the next look: commands that end without one are answered.
+/// Decisions without a transaction before the rest waits for the next look: commands that end without one are answered.
 const MOST_DECISIONS: usize = 1000;
 
-/// How old a frequency range may be on which a command rests that is begun. Whether it was too old for the command was decided
-/// when that was admitted.
+/// How old a frequency range may be on which a command rests that has started. Whether it was too old for the command
+/// was decided when that was admitted.
 const RANGE_AGE: Duration = Duration::from_secs(60);
 
 /// The ranks, the highest first.
@@ -54,7 +54,7 @@ impl Turns {
     }
 }
 
-/// A step of a begun command that can go.
+/// A step of a started command that can go.
 struct Ready {
     drive: usize,
     slot: Urgency,
@@ -150,8 +150,8 @@ impl Master {
         }
     }
 
-    /// The write of a parameter to a drive that said, in the exchange before, that its motor stands: nothing but a stop goes
-    /// between the two.
+    /// The write of a parameter to a drive that said, in the transaction before, that its motor stands: nothing but a
+    /// stop goes between the two.
     fn checked_write(&mut self, now: Instant) -> Option<Ready> {
         let (slot, rank) = (Urgency::Command, Urgency::Command);
         let Master {
@@ -182,7 +182,7 @@ impl Master {
         }
     }
 
-    /// Nothing that was begun for a drive goes on behind a stop.
+    /// Nothing that was started for a drive goes on behind a stop.
     fn purge(&mut self, now: Instant) {
         let stopped = self.bus.queue.lock().take_stopped();
         for index in stopped {
@@ -195,7 +195,7 @@ impl Master {
         }
     }
 
-    /// Nothing that was begun for one client goes on when another one took the drive.
+    /// Nothing that was started for one client goes on when another one took the drive.
     fn end_what_was_taken(&mut self, now: Instant) {
         let pending = self.bus.queue.lock().take_taken();
         for index in pending {
@@ -260,7 +260,7 @@ impl Master {
         commands
     }
 
-    /// The queued commands that can be begun, the next one of each rank.
+    /// The queued commands that can be started, the next one of each rank.
     fn queued(&mut self, commands: &mut Commands, now: Instant) {
         let queue = self.bus.queue.clone();
         let mut pending = queue.lock();
@@ -321,7 +321,7 @@ impl Master {
         }
     }
 
-    /// A command of that rank has its turn: a begun one, or the next one of the queue is begun.
+    /// A command of that rank has its turn: a started one, or the next one of the queue has started.
     fn command(&mut self, rank: Urgency, commands: &mut Commands, now: Instant) -> Option<Result<Turn, Instant>> {
         let lower_waits = RANKS.into_iter().any(|lower| lower > rank && commands.waits(lower));
         let ready = commands.ready.get_mut(rank as usize).and_then(Option::take);
@@ -336,7 +336,7 @@ impl Master {
             return self.begin_passed_on(command, None, now).map(Ok);
         }
         self.begin(command, chosen.rank, now);
-        // What was begun is decided on anew: it may wait, or another one may go first.
+        // What was started is decided on again: it may wait, or another one may go first.
         None
     }
 
@@ -446,7 +446,7 @@ impl Master {
         Some(Ok(turn))
     }
 
-    /// Whether a turn that was chosen earlier may still go out at `now`: the time of its command has not run out.
+    /// Whether a turn that was chosen earlier may still go out at `now`: the time of its command has not expired.
     pub fn is_still_due(&mut self, turn: &Turn, now: Instant) -> bool {
         if turn.purpose == Purpose::Background {
             return self.background_is_due(now);
@@ -456,7 +456,7 @@ impl Master {
             && let Some(drive) = self.drives.get_mut(turn.drive)
             && starts.may_not_write(turn.drive, drive, turn.pdu(), now).is_some()
         {
-            // It is refused when it is chosen anew.
+            // It is refused when it is chosen again.
             return false;
         }
         let run = self.drives.get_mut(turn.drive).and_then(|drive| drive.run(slot));
@@ -464,7 +464,7 @@ impl Master {
             return false;
         };
         if run.is_of_supervision() && run.is_owed() {
-            // A client that came back while the line fell silent suspends it.
+            // A client that came back while the line went silent suspends it.
             let beats = self
                 .bus
                 .image
@@ -485,7 +485,7 @@ fn range_changed() -> Refusal {
     )
 }
 
-/// Whether a queued command can be begun now.
+/// Whether a queued command can be started now.
 ///
 /// # Errors
 /// When it can be, if it must wait.
@@ -495,7 +495,7 @@ pub(super) fn may_begin(
     online: bool,
     now: Instant,
 ) -> Result<bool, Instant> {
-    // Behind a stop that is begun nothing goes before it is over.
+    // Behind a stop that has started nothing goes before it has ended.
     if drive.is_busy(command.urgency) || (command.urgency == Urgency::Command && drive.is_busy(Urgency::Stop)) {
         return Ok(false);
     }

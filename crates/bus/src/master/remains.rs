@@ -5,15 +5,15 @@ use std::time::Instant;
 use super::Master;
 use crate::drive_state::DriveState;
 
-/// What a bus still keeps of exchanges that failed and of commands that were begun. On a sound line on which nobody commands
-/// everything of it ends by itself: its `Default`.
+/// What a bus still keeps of transactions that failed and of commands that were started. On a sound line on which
+/// nobody commands everything of it ends by itself: its `Default`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Remains {
     /// Requests whose reply may still come late.
     pub late_replies: usize,
     /// Addresses without a configured drive from which one may.
     pub strangers: usize,
-    /// Commands that were begun and are not over.
+    /// Commands that were started and are not over.
     pub begun: usize,
     /// Commands and forwarded reads that wait; one more where background requests do.
     pub waiting: usize,
@@ -21,7 +21,7 @@ pub struct Remains {
     pub unconfirmed: usize,
     /// Drives to which the next stop waits.
     pub held_stops: usize,
-    /// Leases that ran out and whose action is not acknowledged.
+    /// Leases that expired and whose action is not acknowledged.
     pub owed_actions: usize,
     /// Drives that do not answer.
     pub away: usize,

@@ -15,7 +15,7 @@ use crate::schedule::{Change, Poll, Polled, TRIAL_PAUSE};
 use crate::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 
 impl Master {
-    /// The exchange of a turn is over; what that changes.
+    /// The transaction of a turn has ended; what that changes.
     pub fn done(&mut self, turn: &Turn, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         self.note_late(turn, &end, now);
         match &turn.purpose {
@@ -57,14 +57,14 @@ impl Master {
         self.schedule.monitor(drive, covers, at);
     }
 
-    /// What may still come of the exchange: nothing where the drive's own reply came mangled, unless a late reply of an
-    /// earlier exchange may have been that.
+    /// What may still come of the transaction: nothing where the drive's own reply came mangled, unless a late reply of
+    /// an earlier transaction may have been that.
     fn note_late(&mut self, turn: &Turn, end: &TurnEnd, now: Instant) {
         if self.is_broadcast(turn) {
             // Nobody answers it.
             return;
         }
-        // The drive's own reply, unless a late one of an earlier exchange may have been that.
+        // The drive's own reply, unless a late one of an earlier transaction may have been that.
         let came_mangled = end.mangled && !self.late_before;
         if !self.sessions.is_empty() {
             self.note_late_on_n2(turn, end, came_mangled, now);
@@ -142,7 +142,7 @@ impl Master {
         }
     }
 
-    /// A step that N2 needs before a poll or a command is over: that is chosen anew, or has failed with it.
+    /// A step that N2 needs before a poll or a command has ended: that is chosen again, or has failed with it.
     fn session_went_on(
         &mut self,
         drive: usize,
@@ -178,7 +178,7 @@ impl Master {
         }
     }
 
-    /// The drive has started anew: nothing that is known of it holds.
+    /// The drive has restarted: nothing that is known of it holds.
     pub(super) fn restarted(&mut self, drive: usize, now: Instant, news: &mut Vec<News>) {
         if let Some(state) = self.drives.get_mut(drive) {
             state.restarted();
@@ -187,7 +187,7 @@ impl Master {
         news.push(News::Restarted(drive));
     }
 
-    /// What a poll that is over says of the drive.
+    /// What a poll that has ended says of the drive.
     fn polled(&mut self, poll: &Poll, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         // Of a step before the poll this is known already.
         let heard = self.sessions.heard(poll.drive, &end.ended);
@@ -244,7 +244,7 @@ impl Master {
         !shows_more
     }
 
-    /// The drive does not answer any more: whoever waits for it is answered, but for the stop, which is its probe.
+    /// The drive no longer replies: anyone who waits for it is answered, but for the stop, which is its probe.
     fn went_offline(&mut self, index: usize, now: Instant, news: &mut Vec<News>) {
         if let Some(drive) = self.drives.get_mut(index) {
             drive.went_offline(now);
@@ -309,7 +309,7 @@ impl Master {
         });
     }
 
-    /// What an exchange of a command means for the command.
+    /// What a transaction of a command means for the command.
     #[allow(clippy::too_many_arguments, reason = "all that a turn of a command is")]
     fn commanded(
         &mut self,
@@ -375,7 +375,7 @@ impl Master {
         self.read_back(index, step, now);
     }
 
-    /// A step got no believable answer. The next stop to a drive that does not answer waits a little, so that repeated
+    /// A step got no valid reply. The next stop to a drive that does not answer waits a little, so that repeated
     /// stops do not take the line from the others.
     fn step_failed(&mut self, index: usize, slot: Urgency, step: &Step, ended: &Ended, took: Duration, now: Instant) {
         let online = self.schedule.is_online(index);
@@ -383,7 +383,7 @@ impl Master {
             return;
         };
         if *ended == Ended::Corrupt(MAY_BE_LATE) {
-            // It was sent, perhaps in vain: it is sent again when the answer can be believed.
+            // It was sent, perhaps without success: it is sent again when the answer can be believed.
             if let Some(run) = drive.run(slot) {
                 run.wait_for_late_replies();
             }
@@ -419,8 +419,8 @@ impl Master {
         }
     }
 
-    /// Registers were written, or may be: they are read back soon. What was read of the frequency range before says nothing
-    /// where an end of it was among them, and both ends are read anew.
+    /// Registers were written, or may be: they are read back soon. What was read of the frequency range before says
+    /// nothing where an end of it was among them, and both ends are read again.
     pub(super) fn note_write(&mut self, index: usize, table: Table, items: &[(u16, u16)], now: Instant) {
         let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
             return;
@@ -459,7 +459,7 @@ fn says_no_answer(reply: &Reply) -> bool {
     matches!(reply, Reply::Exception(code) if code.is_no_answer())
 }
 
-/// Whether the reply to a step of a command leaves open what became of it: as if none had come.
+/// Whether the reply to a step of a command leaves open the result: as if none had come.
 fn leaves_open(reply: &Reply, step: &Step) -> bool {
     matches!(reply, Reply::Exception(code) if code.is_no_answer() || (step.pdu.is_write() && code.leaves_open()))
 }

@@ -15,8 +15,8 @@ use crate::plant::{BusHandle, Exchange, Question};
 use crate::process_image::{Access, OnShutdown};
 use crate::stop_of_line::stop_of_line;
 
-/// How long the stops wait for a broadcast that goes before them: an exchange that is on the line, the broadcast, and the time
-/// that the drives have to carry it out.
+/// How long the stops wait for a broadcast that goes before them: a transaction that is on the line, the broadcast, and
+/// the time that the drives have to carry it out.
 const BROADCAST: Duration = Duration::from_millis(500);
 /// Wait before a stop that was not acknowledged is ordered again.
 const AGAIN: Duration = Duration::from_millis(20);
@@ -37,7 +37,7 @@ struct Stop {
     state: State,
     /// It was ordered, and not acknowledged.
     in_vain: bool,
-    /// What became of it then, for people.
+    /// The result then, as text.
     last: Option<String>,
 }
 
@@ -131,7 +131,7 @@ impl Shutdown {
 }
 
 impl Master {
-    /// Begins the shutdown when it is asked for; orders what is due, ends when all is done or its time is over.
+    /// Begins the shutdown when it is asked for; commands what is due, ends when all is done or its time has ended.
     pub(super) fn look_at_shutdown(&mut self, now: Instant) {
         // The queue is free again when the broadcast is put into it.
         let stopping = self.bus.queue.lock().take_stopping();
@@ -157,8 +157,8 @@ impl Master {
             shutdown.end(bus);
             return;
         }
-        // Drives that do not answer come last: each of them costs a whole timeout. Without polls one that was online before it
-        // fell silent counts as online for good.
+        // Drives that do not answer come last: each of them costs a whole timeout. Without polls one that was online
+        // before it went silent counts as online for good.
         let answers = |stop: &Stop| schedule.is_online(stop.drive) && !stop.in_vain;
         let others_first = shutdown.stops.iter().any(|stop| !stop.is_over() && answers(stop));
         for stop in &mut shutdown.stops {

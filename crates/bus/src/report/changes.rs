@@ -7,7 +7,7 @@ use crate::command::Origin;
 use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, EventKind};
 
-/// Time from an order to the poll that shows the motor running, ramps and slow polls included.
+/// Time from a command to the poll that shows the motor running, ramps and slow polls included.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);
 /// The same until it shows it standing.
 const STOPS_WITHIN: Duration = Duration::from_secs(300);

@@ -1,27 +1,27 @@
-//! What background exchanges may take of the line: the time that is left over, and else a small share of wire time.
+//! What background transactions may take of the line: the time that is left over, and else a small share of wire time.
 
 use std::time::{Duration, Instant};
 
 use super::{Schedule, Turn};
 use crate::command::Pace;
 
-/// What the shares have earned and not used, in seconds of wire time; less than nothing after an exchange that took longer
-/// than it had earned.
+/// What the shares have earned and not used, in seconds of wire time; less than nothing after a transaction that took
+/// longer than it had earned.
 #[derive(Debug, Default)]
 pub(super) struct BackgroundShare {
     balance: [f64; 2],
-    /// The longest exchange that was wanted: so much is saved up at most.
+    /// The longest transaction that was wanted: so much is saved up at most.
     longest: Duration,
-    /// By how much exchanges took longer than reckoned of late: drives are slower than their profiles say.
+    /// By how much transactions took longer than calculated of late: drives are slower than their profiles say.
     overrun: Duration,
 }
 
-/// Whether a background exchange may go now.
+/// Whether a background transaction may go now.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Admission {
-    /// In time that is left over: its share pays for what it takes beyond what was reckoned.
+    /// In time that is left over: its share pays for what it takes beyond what was calculated.
     InIdleTime(Duration),
-    /// In place of a poll that is due: its share pays for it.
+    /// Instead of a poll that is due: its share pays for it.
     InShare,
     /// Not before then, unless the line rests earlier.
     NotBefore(Instant),
@@ -49,9 +49,9 @@ impl BackgroundShare {
 }
 
 impl Schedule {
-    /// Whether an exchange of that pace may go at `now`, which takes about `cost`. `idle`: nothing else is due. In idle time it
-    /// does not delay the next round of process data, and goes only where its share owes nothing; in place of a poll
-    /// that is due it goes once its share has earned it.
+    /// Whether a transaction of that pace may go at `now`, which takes about `cost`. `idle`: nothing else is due. In
+    /// idle time it does not delay the next round of process data, and goes only where its share owes nothing; instead
+    /// of a poll that is due it goes once its share has earned it.
     pub fn admits_background(&mut self, pace: Pace, cost: Duration, idle: bool, now: Instant) -> Admission {
         let share = &mut self.background;
         let cost = cost + share.overrun;
@@ -70,14 +70,14 @@ impl Schedule {
         Admission::NotBefore(now + missing.max(Duration::from_millis(1)))
     }
 
-    /// What is on account of the share of that pace took so long, and was no background exchange.
+    /// What is on account of the share of that pace took so long, and was no background transaction.
     pub fn background_owes(&mut self, pace: Pace, took: Duration) {
         if let Some(balance) = self.background.balance.get_mut(pace as usize) {
             *balance -= took.as_secs_f64();
         }
     }
 
-    /// A background exchange is over, for which the line was taken for `took`. `answered`: the drive replied.
+    /// A background transaction has ended, for which the line was taken for `took`. `answered`: the drive replied.
     pub fn background_done(&mut self, pace: Pace, admission: Admission, answered: bool, took: Duration) {
         let share = &mut self.background;
         let paid = match admission {

@@ -71,7 +71,7 @@ impl Schedule {
 
     pub(super) fn due_poll(&mut self, now: Instant) -> Option<Poll> {
         self.turn = Turn::Due;
-        // Many drives that are away must not keep the others waiting: one probe in vain, then a fast poll.
+        // Many drives that are away must not keep the others waiting: one probe without success, then a fast poll.
         let hold = self.probed && !self.round.is_empty();
         if let Some(probe) = self.due_probe(now).filter(|_| !hold) {
             return Some(probe);

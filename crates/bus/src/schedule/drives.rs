@@ -43,7 +43,7 @@ pub(super) struct Item {
     /// How often in a row.
     pub(super) refusals: u32,
     pub(super) failures: u32,
-    /// When it was last asked for in vain.
+    /// When it was last asked for without success.
     pub(super) failed_at: Option<Instant>,
     /// A read of the once class, or one that a fault asks for, that is still to be done.
     pub(super) wanted: bool,
@@ -77,7 +77,7 @@ pub(super) struct DriveSchedule {
     pub(super) garbled: u32,
     /// It did not answer when it was asked last.
     pub(super) unanswered: bool,
-    /// When process data was last asked for in vain.
+    /// When process data was last asked for without success.
     pub(super) troubled: Option<Instant>,
     pub(super) items: Vec<Item>,
     /// Those that decide its state.
@@ -117,12 +117,13 @@ impl EarlyProbes {
         (self.online_since, self.outage) = (Some(now), None);
     }
 
-    /// The drive is to be found anew: if it does not answer, it goes away then.
+    /// The drive is to be rediscovered: if it does not answer, it goes away then.
     pub(super) fn found_anew(&mut self) {
         self.outage = None;
     }
 
-    /// When the next one comes, after a request in vain that took the line for `took`; none when they are used up.
+    /// When the next one comes, after a request without success that took the line for `took`; none when they are used
+    /// up.
     fn next(&mut self, now: Instant, took: Duration) -> Option<Instant> {
         if let Some(since) = self.online_since.take() {
             let online = now.saturating_duration_since(since);
@@ -237,7 +238,7 @@ impl DriveSchedule {
         self.items.splice(index..=index, parts.collect::<Vec<_>>());
     }
 
-    /// The drive is away: whoever comes back may be another, and is asked by what every one answers.
+    /// The drive is away: anyone who comes back may be another, and is asked by what every one answers.
     fn doubt_trials(&mut self, now: Instant) {
         for block in self.trials.clone() {
             let within: Vec<PlannedRead> = self.items.iter().map(|item| item.read).collect();
@@ -272,8 +273,8 @@ impl DriveSchedule {
         };
     }
 
-    /// When a slow read is due. One that is put off for long and was not answered while process data was not either has the
-    /// line to blame: it is due once process data came without a fault for a while.
+    /// When a slow read is due. One that is postponed for long and was not answered while process data was not either
+    /// has the line to blame: it is due once process data came without a fault for a while.
     pub(super) fn due(&self, item: &Item) -> Instant {
         let Some((failed_at, troubled)) = item.failed_at.zip(self.troubled).filter(|_| item.failures > 0) else {
             return item.due;

@@ -1,4 +1,4 @@
-//! What a poll that is over changes: presence, retries, back-off. The pauses between probes of a silent drive and
+//! What a poll that has ended changes: presence, retries, back-off. The pauses between probes of a silent drive and
 //! between tries of a refused block are in `drives`; commands are tried again by `command_run`.
 
 use std::time::{Duration, Instant};

@@ -22,8 +22,8 @@ impl Lead {
         self.took = took;
     }
 
-    /// What goes whether there is room or not leaves none until something is paid, and is not reckoned beyond that: others
-    /// would wait without bound.
+    /// What goes whether there is room or not leaves none until something is paid, and is not calculated beyond that:
+    /// others would wait without bound.
     fn fill(&mut self, took: Duration) {
         let full = (self.time + took).min(COMMANDS_IN_A_ROW * took);
         (self.time, self.took) = (self.time.max(full), took);
@@ -40,7 +40,7 @@ impl Lead {
 
 #[derive(Debug, Default)]
 pub(super) struct CommandShare {
-    /// Of everything that commands caused, over process data; reckoned since polls last had nothing to do.
+    /// Of everything that commands caused, over process data; calculated since polls last had nothing to do.
     all: Lead,
     /// Of stops alone: they wait for no other command.
     stops: Lead,
@@ -54,7 +54,7 @@ pub(super) struct CommandShare {
 }
 
 impl CommandShare {
-    /// No poll is due: whoever wants the line may have it.
+    /// No poll is due: anyone who wants the line may have it.
     pub(super) fn line_is_free(&mut self) {
         self.all.time = Duration::ZERO;
         self.stops.time = Duration::ZERO;
@@ -106,7 +106,7 @@ impl CommandShare {
         self.all.time += took;
     }
 
-    /// A poll is over. `paid` is the time that commands may take for it.
+    /// A poll has ended. `paid` is the time that commands may take for it.
     pub(super) fn polled(&mut self, paid: Duration) {
         self.in_a_row = 0;
         self.stops_in_a_row = 0;

@@ -15,7 +15,7 @@ use crate::process_image::{Access, DriveSpec, Hold, ParamsAccess, Reading};
 /// Values of an enumeration that a refusal names.
 const MOST_TEXTS: usize = 12;
 
-/// An order that may go to the bus.
+/// A command that may go to the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Admitted {
     /// The order, derived points replaced by the points they rest on.
@@ -28,9 +28,9 @@ pub struct Admitted {
     pub ranges: Vec<FrequencyRange>,
 }
 
-/// Checks an order against what client and drive allow, the profile and the limits.
+/// Checks a command against what client and drive allow, the profile and the limits.
 ///
-/// `client` says what the client may do at all.
+/// `client` is the authority of the client.
 ///
 /// # Errors
 /// The refusal, in the order authority, address, value; nothing is clamped.
@@ -94,7 +94,8 @@ fn not_held(drive: &Reading<'_>, admitted: Admitted) -> Result<Admitted, Refusal
     }
 }
 
-/// A restore writes parameters where the drive's configuration says so, and only while it holds the drive.
+/// Parameters are written only by a restore, if the drive's configuration allows it and while the restore holds the
+/// drive.
 fn parameter(drive: &Reading<'_>, order: &ParameterOrder) -> Result<(), Refusal> {
     let (spec, id) = (drive.spec, &order.id);
     may_restore(spec).map_err(Refusal::NotAllowed)?;
@@ -117,8 +118,7 @@ fn parameter(drive: &Reading<'_>, order: &ParameterOrder) -> Result<(), Refusal>
 
 /// Whether parameters of a drive may be restored.
 ///
-/// # Errors
-/// Why not, and what to do.
+/// # Errors The reason, and the remedy.
 pub fn may_restore(spec: &DriveSpec) -> Result<(), String> {
     let name = &spec.name;
     if spec.access != Access::Control {
@@ -263,7 +263,7 @@ fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
     })
 }
 
-/// An enumeration takes the values that its profile lists, unless that says otherwise.
+/// An enumeration accepts the values that its profile lists, unless the profile allows others.
 fn listed(point: &Point, value: Value) -> Result<(), Refusal> {
     let number = value.as_f64();
     let is_known = || point.texts.keys().any(|code| *code as f64 == number);
@@ -279,8 +279,8 @@ fn listed(point: &Point, value: Value) -> Result<(), Refusal> {
     )))
 }
 
-/// The limits of the points that mean the same quantity: a command in Hz keeps the limits in percent, and the other
-/// way round. `asked` was checked itself.
+/// Checks the limits of points for the same quantity: a command in Hz keeps the limits in percent, and vice versa.
+/// `asked` itself is already checked.
 fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<(), Refusal> {
     let written = (index, as_held(drive, (index, value)));
     for (other, point) in drive.spec.profile.points.iter().enumerate() {
@@ -312,7 +312,7 @@ fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value)
     Ok(())
 }
 
-/// What a reference is in the unit of another point, once a command sets it.
+/// A reference converted to the unit of another point, once a command sets it.
 pub fn converted(drive: &Reading<'_>, (index, value): (usize, Value), to: usize) -> Option<Value> {
     let point = drive.spec.profile.points.get(index)?;
     let written = resolve(drive, index, point, value).ok()?;
@@ -383,7 +383,7 @@ fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
             let figure = derived
                 .inverse(value.as_f64(), band)
                 .ok_or_else(|| below_minimum(point, value, band.0))?;
-            // The limits of the point itself were checked; those of the one behind it hold as well.
+            // The limits of the point itself were checked; those of the one after it hold as well.
             let rounded = Value::Number((figure * 100.0).round() / 100.0);
             let order = resolve(drive, of, base, checked(drive, of, base, rounded)?)?;
             // At the minimum frequency the percentage is 0, which has no sign.
@@ -396,7 +396,7 @@ fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
     }
 }
 
-/// A drive turns no slower than its minimum frequency, so it cannot be told to.
+/// Refuses references below the drive's minimum frequency.
 fn below_minimum(point: &Point, value: Value, minimum: f64) -> Refusal {
     let (name, unit) = (&point.name, &point.unit);
     Refusal::BadValue(format!(
@@ -495,7 +495,7 @@ fn raw_rule(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(
     }
 }
 
-/// A word of a control register that is neither a stop nor clearly a run command is not passed on: what it does is not known.
+/// A control word that is neither a stop nor clearly a run command is not passed on: its effect is unknown.
 fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
     let Some(control) = &drive.spec.profile.control else {
         return Ok(());

@@ -1,7 +1,7 @@
-//! What was commanded, and what became of it: in the log, in memory and, where it is configured, in a file.
+//! The audit: commands and their results, in the log, in memory and, if configured, in a file.
 //!
-//! Commands that were sent to a drive have a way of their own through all of that, which nothing else can fill. Refusals
-//! are limited for each client.
+//! Commands that were sent to a drive are kept separately throughout, so nothing else can displace them. Refusals are
+//! limited per client.
 
 pub mod chain;
 mod file;
@@ -22,7 +22,7 @@ pub use file::{AuditFile, AuditFileOptions};
 
 /// Records of commands that were sent to a drive, kept in memory.
 pub const AUDIT_KEPT: usize = 1000;
-/// Records of commands that were not sent, kept beside them.
+/// Records of commands that were not sent, kept besides them.
 const UNSENT_KEPT: usize = 500;
 /// Name of the log events of commands that were sent: the log has a way of its own for them.
 pub const SENT: &str = "sent command";
@@ -35,10 +35,10 @@ pub struct Change {
     /// The last good value before, if there was one.
     #[serde(serialize_with = "bare_or_null")]
     pub old: Option<Value>,
-    /// The value asked for.
+    /// The requested value.
     #[serde(serialize_with = "bare")]
     pub new: Value,
-    /// What it makes of the run command: run or stop, if anything.
+    /// Its effect on the run command: run or stop, if any.
     #[serde(skip)]
     pub run: Option<bool>,
     /// It resets a fault.
@@ -46,7 +46,7 @@ pub struct Change {
     pub resets: bool,
 }
 
-/// One command and what became of it.
+/// One command and the result.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct AuditRecord {
     /// When the outcome was known.
@@ -60,19 +60,19 @@ pub struct AuditRecord {
     pub drive: String,
     /// The command in one line.
     pub command: String,
-    /// What it sets, with the values before; empty when it was refused before it was understood.
+    /// The points it sets, with the previous values; empty if it was refused before it was parsed.
     pub points: Vec<Change>,
     /// Result code; `confirmed` is an acknowledged command whose effect was read back.
     pub result: &'static str,
-    /// The outcome for people.
+    /// The outcome as text.
     pub text: String,
-    /// From acceptance to answer, ms.
+    /// From acceptance to result, ms.
     #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
     pub latency: Duration,
     /// From acceptance to the read that showed the effect, ms.
     #[serde(rename = "confirmed_ms", serialize_with = "milliseconds_or_null")]
     pub confirmed: Option<Duration>,
-    /// Commands that it stands for: refusals of one client are counted.
+    /// Number of commands covered: refusals of one client are counted.
     pub count: u64,
     /// The client among others: see [`super::Origin::client`].
     #[serde(skip)]
@@ -100,10 +100,10 @@ pub fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: 
     }
 }
 
-/// How far a command came.
+/// How far a command got.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Reach {
-    /// It was sent to the drive, or begun.
+    /// It was sent to the drive, or started.
     Sent,
     /// It was in the queue and was not sent.
     Queued,
@@ -112,7 +112,7 @@ pub(super) enum Reach {
 }
 
 impl AuditRecord {
-    /// What it makes of the run command: run or stop, if anything.
+    /// Its effect on the run command: run or stop, if any.
     pub(crate) fn run(&self) -> Option<bool> {
         self.points.iter().rev().find_map(|change| change.run)
     }
@@ -154,33 +154,33 @@ impl AuditRecord {
     }
 }
 
-/// The audit: the last records, and the way of new ones.
+/// The audit: the latest records, and where new ones go.
 #[derive(Debug, Default)]
 pub struct Audit {
     records: Mutex<Records>,
     file: ArcSwapOption<AuditFile>,
-    /// For whoever wants each record as it comes.
+    /// For subscribers to each new record.
     sender: OnceLock<broadcast::Sender<Arc<AuditRecord>>>,
 }
 
-/// An order to run or to stop that was sent to a drive.
+/// A command to run or to stop that was sent to a drive.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RunOrdered {
     /// Run, or stop.
     pub run: bool,
     /// Who gave it: source and client.
     pub who: String,
-    /// When its answer came, or was given up.
+    /// When its result arrived, or the wait was given up.
     pub at: Instant,
 }
 
-/// Records that a listener may be behind.
+/// Records a listener may lag behind.
 const IN_FLIGHT: usize = 4096;
 
 #[derive(Debug)]
 struct Records {
     number: u64,
-    /// Lines of JSON: a record that is kept takes one block of memory in place of eight, between which holes would stay.
+    /// Lines of JSON: a record that is kept takes one block of memory instead of eight, between which holes would stay.
     sent: FairRing<Arc<str>, Arc<str>>,
     unsent: FairRing<Arc<str>, Arc<str>>,
     /// By drive the last command that concerns its run command, or that reset its fault, and when it ended. As many as
@@ -219,7 +219,7 @@ impl Audit {
         self.file.load_full()
     }
 
-    /// Hears all records from now on; a listener that is 4,096 behind loses the oldest.
+    /// Receives all records from now on; a listener that lags 4,096 behind loses the oldest.
     pub fn subscribe(&self) -> broadcast::Receiver<Arc<AuditRecord>> {
         self.sender.get_or_init(|| broadcast::channel(IN_FLIGHT).0).subscribe()
     }
@@ -304,7 +304,7 @@ impl Audit {
         }
     }
 
-    /// Notes an order that was sent to a drive, before it is known whether it shows its effect.
+    /// Notes a command that was sent to a drive, before it is known whether it shows its effect.
     pub(super) fn ordered(&self, drive: &str, ordered: RunOrdered) {
         self.records().ordered.insert(drive.to_string(), ordered);
     }

@@ -1,9 +1,10 @@
-//! Background exchanges: requests of the lowest rank, for work that has time, such as reading all parameters of a drive.
-//! Pure: time is an argument.
+//! Background transactions: requests of the lowest rank, for work that has time, such as reading all parameters of a
+//! drive. Pure: time is an argument.
 //!
-//! Each request is one exchange, answered exactly once: with the drive's reply, or with the reason why there is none. The
-//! bus sends one where the line rests long enough for it, and else within a small share of the line ([`Pace`]); whoever
-//! waits for a longer work asks again and again, one request behind the other, and so can be interrupted between any two.
+//! Each request is one transaction, answered exactly once: with the drive's reply, or with the reason why there is
+//! none. The bus sends one where the line rests long enough for it, and else within a small share of the line
+//! ([`Pace`]); anyone who waits for a longer work asks again and again, one request behind the other, and so can be
+//! interrupted between any two.
 
 use std::collections::VecDeque;
 use std::time::Instant;
@@ -18,13 +19,13 @@ pub const BACKGROUND_CAPACITY: usize = 32;
 /// Background requests of one client that may wait on one bus.
 pub const BACKGROUND_PER_CLIENT: usize = 8;
 
-/// How much of a busy line background exchanges take, as shares of the wire time of process data; where the line rests they
-/// may have all of the rest. All of both kinds together take no more than a fifth of a busy line.
+/// How much of a busy line background transactions take, as shares of the wire time of process data; where the line
+/// rests they may have all of the rest. All of both kinds together take no more than a fifth of a busy line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Pace {
-    /// 18 %: somebody waits for the reply.
+    /// 18 %: someone waits for the reply.
     Brisk,
-    /// 1.5 %: nobody is to notice it.
+    /// 1.5 %: unnoticeable.
     Slow,
 }
 
@@ -44,51 +45,51 @@ impl Pace {
 /// The index of no drive: that of a request to an address of the line at which none is configured.
 pub const NO_DRIVE: usize = usize::MAX;
 
-/// A request of the lowest rank: one exchange with one drive.
+/// A request of the lowest rank: one transaction with one drive.
 #[derive(Debug)]
 pub struct BackgroundRequest {
     /// Index of the drive on its bus, or [`NO_DRIVE`].
     pub drive: usize,
-    /// What is asked. Whoever submits a write has checked that it is allowed.
+    /// The request. The submitter of a write has checked that it is allowed.
     pub pdu: RequestPdu,
     /// How much of a busy line it may take.
     pub pace: Pace,
     /// Not sent after this.
     pub expires: Instant,
-    /// Answers it.
+    /// Its ticket.
     pub ticket: Ticket,
-    /// What a request has beside that which is passed on for somebody else; none of one of the gateway itself.
+    /// What a request has besides that which is passed on for someone else; none of one of the gateway itself.
     pub passed_on: Option<PassedOn>,
 }
 
-/// A request that is passed on for a tool, which gets what the drive said.
+/// A request passed on for a tool, which gets the drive's reply.
 #[derive(Debug)]
 pub struct PassedOn {
     /// The address on the line; 0 is the broadcast, except on N2.
     pub address: u8,
-    /// It may change anything in whoever hears it.
+    /// It may change anything in anyone who hears it.
     pub may_write: bool,
     /// The drives of the bus that hear it.
     pub reach: Vec<usize>,
-    /// Those of them whose run command it takes away.
+    /// Those of them whose run command it clears.
     pub stops: Vec<usize>,
     /// What it means for the priority arrays of those that hear it.
     pub effects: Vec<(usize, Effect)>,
     /// It stops all that hear it, and goes before all that waits.
     pub first: bool,
-    /// Where the frame of the reply goes, as the drive sent it.
+    /// Receives the reply frame, as the drive sent it.
     pub frame: oneshot::Sender<Vec<u8>>,
 }
 
 impl PassedOn {
-    /// Whether it is an order to drives of the bus, which has its place among their other orders.
+    /// Whether it is a command to drives of the bus, which has its place among their other commands.
     pub fn is_order(&self) -> bool {
         self.may_write && !self.reach.is_empty()
     }
 }
 
 impl BackgroundRequest {
-    /// The command that waits among those of its drives, where it is an order to them.
+    /// The command that waits among those of its drives, where it is a command to them.
     pub fn into_command(mut self, touched: Touched) -> Command {
         let effects = self
             .passed_on
@@ -139,17 +140,17 @@ impl BackgroundRequest {
         self.answer(outcome, now);
     }
 
-    /// Answers whoever waits for it.
+    /// Reports the outcome to the requester.
     pub fn answer(self, outcome: Outcome, now: Instant) {
         self.ticket.answer(outcome, now);
     }
 }
 
-/// The background requests that wait on one bus, in the order in which they came.
+/// The background requests waiting on one bus, in order of arrival.
 #[derive(Debug, Default)]
 pub struct Background {
     waiting: VecDeque<BackgroundRequest>,
-    /// Set while the bus takes none: the answer that each gets.
+    /// Set while the bus accepts none: the outcome that each gets.
     closed: Option<Outcome>,
 }
 
@@ -192,7 +193,7 @@ impl Background {
         }
     }
 
-    /// Answers and removes the requests that `which` names.
+    /// Ends and removes the requests that `which` selects.
     pub fn remove(&mut self, now: Instant, outcome: &Outcome, which: impl Fn(&BackgroundRequest) -> bool) {
         for request in std::mem::take(&mut self.waiting) {
             if which(&request) {
@@ -203,7 +204,7 @@ impl Background {
         }
     }
 
-    /// Answers everything that waits, and all that comes from now on, with `outcome`.
+    /// Ends everything that waits, and everything submitted from now on, with `outcome`.
     pub fn close(&mut self, outcome: &Outcome, now: Instant) {
         self.remove(now, outcome, |_| true);
         self.closed = Some(outcome.clone());
@@ -214,7 +215,7 @@ impl Background {
         self.closed = None;
     }
 
-    /// Whether one waits that somebody asked for, and not the gateway by itself.
+    /// Whether a request waits that is not the gateway's own.
     pub fn has_of_others(&self) -> bool {
         self.waiting.iter().any(|request| !request.is_of_gateway())
     }

@@ -1,5 +1,5 @@
-//! Orders that stop a drive and ask for something else besides: the stop goes on its own, with the rights of a stop, and the
-//! rest is judged, queued and answered as an order of its own. Pure.
+//! Commands that stop a drive and do something else, too: the stop is sent separately, with the rights of a stop, and
+//! the rest is checked, queued and completed as a separate command. Pure.
 
 use std::sync::{Arc, OnceLock};
 
@@ -7,7 +7,7 @@ use super::{Order, Outcome, written};
 use crate::codec::{RequestPdu, Table};
 use crate::drive::{ModelPoint, Profile, Value};
 
-/// An order, its stop taken out.
+/// A command, its stop taken out.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Parts {
     /// It stops nothing, or does nothing else.
@@ -16,7 +16,7 @@ pub enum Parts {
     Two(Order, Order),
 }
 
-/// What a point is for a stop.
+/// The role of a point in a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Role {
     /// It takes the run command away.
@@ -29,7 +29,7 @@ enum Role {
 }
 
 impl Parts {
-    /// Takes the stop out of an order. One that both stops and runs says neither, and is left whole.
+    /// Splits the stop off a command. A contradictory one that both stops and runs is left whole.
     pub fn of(order: Order, profile: &Profile) -> Parts {
         match order {
             Order::Points(values) => of_points(values, profile),
@@ -42,8 +42,8 @@ impl Parts {
     }
 }
 
-/// What an order of points has of a stop: the values that are carried out even if the rest is refused. None where it does not
-/// stop, or says both.
+/// The stop part of a command: the values that are executed even if the rest is refused. None if it does not stop, or
+/// is contradictory.
 pub fn stop_of(values: &[(usize, Value)], profile: &Profile) -> Option<Vec<(usize, Value)>> {
     let role = |(index, value): &(usize, Value)| role(profile, *index, *value);
     let stops = values.iter().any(|value| role(value) == Role::Stop);
@@ -102,7 +102,7 @@ fn stop_in(pdu: &RequestPdu, profile: &Profile) -> Option<RequestPdu> {
     })
 }
 
-/// How the stop of a compound order ended, for its rest: behind a stop that failed nothing is sent.
+/// How the stop of a compound command ended, for its rest: after a failed stop nothing is sent.
 #[derive(Debug, Clone, Default)]
 pub struct StopEnd(Arc<OnceLock<bool>>);
 
@@ -118,7 +118,7 @@ impl StopEnd {
     }
 }
 
-/// The one outcome of an order in two parts; `None` while it is not known.
+/// The one outcome of a command in two parts; `None` while it is not known.
 pub fn joined(stop: Option<Outcome>, rest: Option<Outcome>) -> Option<Outcome> {
     match (stop?, rest) {
         (stop, None) if stop.is_ok() => None,

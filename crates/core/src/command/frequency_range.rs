@@ -31,7 +31,7 @@ impl FrequencyRange {
         !self.ends().any(read_before) && drive.band(self.minimum, self.maximum) == Some(self.was)
     }
 
-    /// The points of the drive that say how far it reaches.
+    /// The points of the drive with the ends of its range.
     pub(super) fn ends(&self) -> impl Iterator<Item = usize> {
         ends((self.minimum, self.maximum))
     }

@@ -1,8 +1,8 @@
-//! Commands: who may command what, and how each command gets exactly one answer.
+//! Commands: who may command what, and how each command gets exactly one result.
 //!
-//! The north sides build an [`Order`], [`admit`] checks it against authority, profile and limits, and the
-//! [`CommandQueue`] of the bus takes it. The [`Ticket`] inside a command answers when it is used or dropped,
-//! so a command can neither be answered twice nor be forgotten.
+//! The servers build an [`Order`], [`admit`] checks it against authority, profile and limits, and the [`CommandQueue`]
+//! of the bus accepts it. The [`Ticket`] inside a command yields its result when it is used or dropped, so a command
+//! can neither get two results nor be forgotten.
 //!
 //! [`Outcome`] has the code, the text and the Modbus exception of every result; the texts of refusals are where the
 //! refusal is decided, mostly in `admit`.
@@ -48,7 +48,7 @@ use crate::codec::{Exception, Reply, RequestPdu};
 use crate::drive::{Profile, Value};
 use crate::start_guard::Guarded;
 
-/// Time after which a command is not sent any more, unless it says otherwise.
+/// Default time after which a command is no longer sent.
 pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);
 
 /// The result code of an acknowledged command whose effect a read showed.
@@ -65,7 +65,7 @@ pub enum SourceKind {
     Sparkplug,
     /// HTTP: the status page, or a program.
     Http,
-    /// Lease that ran out.
+    /// Lease that expired.
     Supervision,
     /// The gateway stops.
     Shutdown,
@@ -75,7 +75,7 @@ pub enum SourceKind {
     CommandLine,
     /// The other master of a line on which the gateway only listens.
     OtherMaster,
-    /// What the gateway does every so often. It reads only.
+    /// The gateway's own periodic reads.
     Schedule,
     /// A tool at a slot of the bus.
     Slot,
@@ -131,7 +131,7 @@ impl SourceKind {
     }
 }
 
-/// What a client may do at all; the drive may allow less.
+/// The authority of a client; the drive may allow less.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Authority {
     /// Read and write.
@@ -154,9 +154,9 @@ pub struct Origin {
 }
 
 impl Origin {
-    /// Who acts when a lease runs out.
+    /// Who acts when a lease expires.
     pub const LEASE: &str = "supervision";
-    /// The client of the stop of a drive whose local control place took it while its run command stood.
+    /// The client name for the stop of a drive that was switched to local control with its run command set.
     pub const LOCAL: &str = "local control place";
 
     /// One that is a client by itself.
@@ -198,7 +198,7 @@ impl Origin {
         self
     }
 
-    /// What its connection proves.
+    /// The proof from its connection.
     pub fn proof(&self) -> &Proof {
         &self.proof
     }
@@ -225,12 +225,12 @@ impl Origin {
     }
 }
 
-/// What is wanted of a drive.
+/// A command's content.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Order {
     /// Points set as one command: index in the profile, value in engineering units.
     Points(Vec<(usize, Value)>),
-    /// A raw write, passed on as it is (bits of a control word apart).
+    /// A raw write, passed on as it is (except bits of a control word).
     Write(RequestPdu),
     /// A raw read outside the plan.
     Read(RequestPdu),
@@ -254,7 +254,7 @@ pub enum Urgency {
 pub struct Command {
     /// Index of the drive on its bus.
     pub drive: usize,
-    /// What is wanted.
+    /// Its content.
     pub order: Order,
     /// Rank.
     pub urgency: Urgency,
@@ -264,25 +264,25 @@ pub struct Command {
     pub ranges: Vec<FrequencyRange>,
     /// Not sent after this.
     pub expires: Instant,
-    /// Answers it.
+    /// Its ticket.
     pub ticket: Ticket,
     /// Those who wait for the same stop, and until when.
     pub joined: Vec<(Ticket, Instant)>,
-    /// It is the rest of an order whose stop goes before it, and is not sent if that fails.
+    /// It is the rest of a command whose stop goes first, and is not sent if that fails.
     pub behind: Option<StopEnd>,
     /// Younger commands that went before it.
     pub overtaken: usize,
     /// Its number in the queue.
     pub number: u64,
-    /// When its head came: what was asked for before a stop came in does not go behind that.
+    /// When its request began to arrive: a command requested before a stop arrived is not sent after it.
     pub asked: Option<Instant>,
     /// The registers that it sets, and on which it rests.
     pub touched: Touched,
-    /// What a write of a tool has beside that which may write anything, to one drive or to all that hear it.
+    /// What a write of a tool has besides that which may write anything, to one drive or to all that hear it.
     pub passed_on: Option<PassedOn>,
-    /// A stop that another bus had begun before this one took its place.
+    /// A stop that another bus had started before this one took its place.
     pub was_begun: bool,
-    /// What it means for the priority arrays of the drives that it reaches.
+    /// Its effects on the priority arrays of the drives that it reaches.
     pub effects: Vec<(usize, Effect)>,
     /// The write to a slot from which it follows.
     pub slot: Option<SlotWrite>,
@@ -348,7 +348,7 @@ impl Command {
         self
     }
 
-    /// What it means for the priority arrays of that drive.
+    /// Its effect on the priority arrays of that drive.
     pub fn effect(&self, drive: usize) -> Effect {
         let of_drive = self.effects.iter().find(|(of, _)| *of == drive);
         of_drive.map(|(_, effect)| *effect).unwrap_or_default()
@@ -368,13 +368,13 @@ impl Command {
         self.urgency == Urgency::Stop || is_broadcast
     }
 
-    /// The same as the rest of an order, behind its stop.
+    /// The same as the rest of a command, after its stop.
     pub fn behind(mut self, stop: StopEnd) -> Command {
         self.behind = Some(stop);
         self
     }
 
-    /// Answers whoever gave it and all who joined.
+    /// Reports the outcome to its client and all that joined.
     pub fn answer(self, outcome: &Outcome, now: Instant) {
         let outcome = &match outcome {
             Outcome::Expired if self.was_begun => Outcome::Interrupted(Interruption::Expired),
@@ -390,18 +390,18 @@ impl Command {
     }
 }
 
-/// What cut a command short that had begun.
+/// What interrupted a started command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Interruption {
-    /// A stop came in.
+    /// A stop arrived.
     Stop,
-    /// Its time ran out.
+    /// Its time expired.
     Expired,
     /// The port was lost.
     BusDown,
-    /// The drive does not answer any more.
+    /// The drive no longer replies.
     Offline,
-    /// The gateway stops, or its bus starts anew.
+    /// The gateway stops, or its bus restarts.
     ShuttingDown,
     /// Another client took the drive.
     Taken,
@@ -414,31 +414,31 @@ pub enum Outcome {
     Acknowledged(Reply),
     /// The drive refused it.
     Exception(Exception),
-    /// What was answered leaves open what became of it: 05, or a gateway's 0A or 0B.
+    /// What was answered leaves open the result: 05, or a gateway's 0A or 0B.
     Unknown(Exception),
     /// Refused before it reached the bus.
     Refused(Refusal),
-    /// The drive did not answer.
+    /// The drive did not reply.
     TimedOut,
-    /// What the drive answered cannot be believed: a wrong check code or length.
+    /// The drive's reply was invalid: wrong check code or length.
     Garbled,
-    /// Too old when its turn came; not sent.
+    /// It expired before its turn; not sent.
     Expired,
     /// A newer reference took its place; not sent.
     Replaced,
     /// A stop removed it; not sent.
     Purged,
-    /// An action of supervision that waited while a client came back; not sent.
+    /// A supervision action withdrawn because a client returned; not sent.
     Withdrawn,
     /// The drive acknowledged it and shows another value.
     NotTaken(String),
-    /// It was begun and was interrupted: whether the drive took it, or a part of it, is not known.
+    /// It was started and was interrupted: whether the drive took it, or a part of it, is not known.
     Interrupted(Interruption),
-    /// The rest of an order whose stop failed; not sent.
+    /// The rest of a command whose stop failed; not sent.
     NotStopped,
-    /// Of an order that stops and does more, the drive acknowledged the stop; what became of the rest.
+    /// Of a command that stops and does more, the drive acknowledged the stop; the result of the rest.
     StopOnly(Box<Outcome>),
-    /// Of such an order the stop failed, in that way, and the rest was not sent.
+    /// The stop of such a command failed, in that way, and the rest was not sent.
     StopFailed(Box<Outcome>),
     /// The port is not open.
     BusDown,
@@ -476,7 +476,7 @@ impl Outcome {
         }
     }
 
-    /// How far the command came.
+    /// How far the command got.
     fn reach(&self) -> audit::Reach {
         use audit::Reach;
         match self {
@@ -499,7 +499,7 @@ impl Outcome {
         }
     }
 
-    /// How a write ended that was answered with that exception.
+    /// The outcome of a write refused with that exception.
     pub fn of_exception(code: Exception) -> Outcome {
         match code.leaves_open() {
             true => Outcome::Unknown(code),
@@ -600,32 +600,32 @@ pub enum Refusal {
     /// The point or address cannot be written, or does not exist.
     #[error("{0}")]
     NotWritable(String),
-    /// It rests on something that the drive reports and has not reported so far. Of a drive that does not answer it says
-    /// nothing: that is why.
+    /// It depends on a value that was not read from the drive yet; for a silent drive, its absence is the reason
+    /// instead.
     #[error("{0}")]
     NotKnown(String),
     /// The value is outside the type, the profile or the limits, or the command contradicts itself.
     #[error("{0}")]
     BadValue(String),
-    /// Somebody else has a right to the drive that goes before that of the client.
+    /// Someone else has a right to the drive that goes before that of the client.
     #[error("{0}")]
     HeldByOther(Box<Holder>),
     /// The motor may not be started yet.
     #[error("{0}; it was not sent")]
     Guarded(Box<Guarded>),
-    /// What must hold before the motor is started does not.
+    /// An interlock is not satisfied.
     #[error("{0}; it was not sent")]
     Interlocked(String),
-    /// A client that was refused behind a stop goes on with run, or renews what it does not hold.
+    /// A client refused after a stop repeats run, or renews a hold it does not have.
     #[error("{0}")]
     NeedsTake(Box<Holder>),
     /// There is no drive of that name.
     #[error("{0}")]
     UnknownDrive(String),
-    /// The drive, asked for it, says that its motor runs: no parameter is written.
+    /// The drive reports that its motor runs: no parameter is written.
     #[error("{0}")]
     MotorRuns(String),
-    /// The drive, asked for it, has neither the value that a restore found nor the one that it is to write.
+    /// The drive has neither the value that a restore found nor the one to be written.
     #[error("{0}")]
     OtherValue(String),
 }
@@ -637,9 +637,9 @@ pub struct Holder {
     pub who: String,
     /// By which right.
     pub rank: String,
-    /// What is kept, and how that ends.
+    /// What is held, and how that ends.
     pub keeps: String,
-    /// Seconds until it ends by itself, where it does.
+    /// Seconds until it ends by itself, if it does.
     pub left_s: Option<u64>,
 }
 
@@ -667,7 +667,7 @@ impl Refusal {
         }
     }
 
-    /// Who keeps the client from the drive, where somebody does.
+    /// Who keeps the client from the drive, where someone does.
     pub fn holder(&self) -> Option<&Holder> {
         match self {
             Refusal::HeldByOther(holder) | Refusal::NeedsTake(holder) => Some(holder),
@@ -689,12 +689,12 @@ impl Refusal {
     }
 }
 
-/// The one answer to a command.
+/// The one result of a command.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Answer {
     /// How it ended.
     pub outcome: Outcome,
-    /// From acceptance to answer.
+    /// From acceptance to result.
     pub latency: Duration,
 }
 

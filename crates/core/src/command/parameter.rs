@@ -8,14 +8,14 @@ use crate::drive::parameters::RawValue;
 /// since what it keeps wears its memory: the reply is then that of the read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterOrder {
-    /// What the family calls it.
+    /// Its id in the family.
     pub id: String,
     /// PDU address of its (first) holding register.
     pub address: u16,
-    /// What the drive must have before, unless it has `to`; none of a register that cannot be read, which is written once and not
-    /// read back.
+    /// The value the drive must have before, unless it has `to`; none for a write-only register, which is written once
+    /// and not read back.
     pub from: Option<RawValue>,
-    /// What is written.
+    /// The value to write.
     pub to: RawValue,
 }
 

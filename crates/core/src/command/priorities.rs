@@ -1,8 +1,9 @@
-//! The priority arrays of a drive, for clients that command by priorities: what they wrote and still stands, nothing else. Pure.
+//! The priority arrays of a drive, for clients that command by priorities: only what they wrote and is still in force.
+//! Pure.
 //!
-//! The slots order these clients among themselves: the lowest occupied one governs. An order of any other side enters no slot; when
-//! it is accepted it withdraws what it overrules, so that nothing starts later by itself. The arrays are part of the queue of the
-//! bus, so that they and the orders have one order of acceptance.
+//! The slots order these clients among themselves: the lowest occupied one governs. A command of any other side enters
+//! no slot; when it is accepted it withdraws what it overrules, so that nothing starts later by itself. The arrays are
+//! part of the queue of the bus, so that they and the commands have one order of acceptance.
 
 mod effect;
 
@@ -17,7 +18,7 @@ pub use effect::Effect;
 
 /// Priorities of an array.
 pub const PRIORITIES: usize = 16;
-/// The priorities that protect people: they refuse what other sides want.
+/// The priorities that protect people: they refuse commands from other interfaces.
 pub const PROTECTING: u8 = 5;
 
 /// What is commanded by priorities.
@@ -52,7 +53,7 @@ impl Commanded {
         }
     }
 
-    /// What is one thing to the drive: both references are.
+    /// Points that count as one to the drive: both references do.
     fn together(self) -> &'static [Commanded] {
         match self {
             Commanded::Run => &[Commanded::Run],
@@ -64,7 +65,7 @@ impl Commanded {
     }
 }
 
-/// What stands in a slot.
+/// The entry in a slot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Entry {
     /// The value, in the unit of the point.
@@ -77,7 +78,7 @@ pub struct Entry {
 }
 
 impl Entry {
-    /// What that client wrote.
+    /// An entry written by that client.
     pub fn new(value: Value, origin: Origin, at: Instant) -> Entry {
         Entry {
             value,
@@ -103,11 +104,11 @@ pub struct SlotWrite {
     pub what: Commanded,
     /// 1..=16.
     pub priority: u8,
-    /// What is to stand there; none gives it back.
+    /// The new entry; none releases the slot.
     pub entry: Option<Entry>,
-    /// Slots that are given back with it: their owners' orders were refused when they came to govern.
+    /// Slots released with it: their owners' commands were refused when they were to govern.
     pub also: Vec<(Commanded, u8)>,
-    /// The entry that comes to govern by it, as it was planned.
+    /// The entry that is planned to govern as a result.
     heir: Option<u64>,
 }
 
@@ -124,19 +125,19 @@ impl SlotWrite {
         }
     }
 
-    /// The same, planned when that came to govern by it.
+    /// The same, planned with that entry governing as a result.
     pub fn in_favour_of(mut self, entry: &Entry) -> SlotWrite {
         self.heir = Some(entry.number);
         self
     }
 }
 
-/// What follows from a write to a slot.
+/// The consequence of a write to a slot.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Follows {
     /// Nothing: it does not govern, or the drive stays as it is.
     Nothing,
-    /// This value of a point becomes an order of whoever wrote it.
+    /// This value of a point becomes a command of anyone who wrote it.
     Order(Commanded, Box<Entry>),
     /// The last value of `run` is given back: a stop.
     Stop,
@@ -145,7 +146,7 @@ pub enum Follows {
 /// How a write to a slot ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Settled {
-    /// It stands.
+    /// The entry is in force.
     Done,
     /// Nothing was done: the slot is as it was.
     Failed,
@@ -154,7 +155,7 @@ pub enum Settled {
 }
 
 impl Settled {
-    /// How a write ended whose order ended so.
+    /// The result of a write whose command had that outcome.
     pub fn of(outcome: &Outcome) -> Settled {
         match outcome {
             Outcome::Acknowledged(_) => Settled::Done,
@@ -176,19 +177,19 @@ impl Settled {
     }
 }
 
-/// A slot: what stands, and what is asked for and not settled.
+/// A slot: the entry in force, and a requested one that is not settled.
 #[derive(Debug, Clone, Default)]
 struct Slot {
     stands: Option<Entry>,
-    /// The write by which it stands.
+    /// The write that set it.
     by: u64,
     asked: Vec<(u64, Option<Entry>)>,
-    /// What may stand, since then: whether it does is not known.
+    /// An entry that may be in force, since then.
     uncertain: Option<(Entry, Instant)>,
 }
 
 impl Slot {
-    /// What counts: what was asked for last, or else what stands.
+    /// The effective entry: the last requested, or else the one in force.
     fn counts(&self) -> Option<&Entry> {
         match self.asked.last() {
             Some((_, entry)) => entry.as_ref(),
@@ -218,24 +219,24 @@ impl Slot {
 #[derive(Debug, Clone, Default)]
 struct Arrays([[Slot; PRIORITIES]; 4]);
 
-/// The arrays of a drive, and who ordered last.
+/// The arrays of a drive, and the last commander.
 #[derive(Debug, Clone, Default)]
 pub struct Priorities {
     arrays: Option<Box<Arrays>>,
-    /// Orders that were accepted so far.
+    /// Commands that were accepted so far.
     orders: u64,
     /// Who gave the last one, and when.
     last: Option<(Origin, Instant)>,
 }
 
-/// Who keeps other sides from what they want.
+/// Who blocks commands from other interfaces.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Protects {
     /// The client.
     pub client: String,
     /// Its priority.
     pub priority: u8,
-    /// What it keeps.
+    /// The point it blocks.
     pub what: ModelPoint,
 }
 
@@ -267,7 +268,7 @@ impl Priorities {
         }
     }
 
-    /// Orders that were accepted so far.
+    /// Commands that were accepted so far.
     pub fn orders(&self) -> u64 {
         self.orders
     }
@@ -277,12 +278,12 @@ impl Priorities {
         self.last.as_ref()
     }
 
-    /// What stands in a slot.
+    /// The entry in a slot.
     pub fn stands(&self, what: Commanded, priority: u8) -> Option<&Entry> {
         self.slot(what, priority)?.stands.as_ref()
     }
 
-    /// The slot that governs by what stands, where it is one of that array.
+    /// The governing slot, if it belongs to that array.
     pub fn shown(&self, what: Commanded) -> Option<(u8, &Entry)> {
         let (of, priority, entry) = self.lowest(what, |slot| slot.stands.as_ref())?;
         (of == what).then_some((priority, entry))
@@ -297,7 +298,7 @@ impl Priorities {
         self.lowest(what, Slot::counts)
     }
 
-    /// The lowest occupied slot of what is one thing to the drive; at equal priority the later.
+    /// The lowest occupied slot among points that count as one; at equal priority the later.
     fn lowest<'a>(
         &'a self,
         what: Commanded,
@@ -316,7 +317,7 @@ impl Priorities {
         all.min_by_key(|(_, priority, entry)| (*priority, u64::MAX - entry.number))
     }
 
-    /// What follows from a write, were it accepted now.
+    /// The consequence of a write, if accepted now.
     pub fn plan(&self, write: &SlotWrite) -> Follows {
         let mut after = self.clone();
         let before = after.counting(write.what).map(|(what, priority, _)| (what, priority));
@@ -364,7 +365,7 @@ impl Priorities {
         Some((what, priority)).filter(|next| *next != (write.what, write.priority))
     }
 
-    /// A write is accepted; [`Priorities::settle`] tells how it ended.
+    /// Accepts a write; [`Priorities::settle`] takes its result.
     pub fn ask(&mut self, write: &SlotWrite) {
         if let Some(slot) = self.slot_mut(write.what, write.priority) {
             slot.asked.push((write.id, write.entry.clone()));
@@ -400,7 +401,7 @@ impl Priorities {
         self.tidy();
     }
 
-    /// Settles what is not known by what the drive shows: `reads` gives a value read since then, if there is one.
+    /// Settles uncertain entries by readings: `reads` gives a value read since then, if there is one.
     pub fn resolve(&mut self, reads: impl Fn(Commanded, Instant) -> Option<Value>) {
         for (what, slot) in self.slots_mut() {
             let Some((entry, since)) = &slot.uncertain else {
@@ -429,7 +430,7 @@ impl Priorities {
         }
     }
 
-    /// Who keeps an order of another side from being accepted.
+    /// Who keeps a command of another side from being accepted.
     pub fn refuses(&self, origin: &Origin, effect: Effect) -> Option<Protects> {
         if origin.kind == SourceKind::Bacnet || !origin.kind.is_client() {
             return None;
@@ -454,7 +455,7 @@ impl Priorities {
         })
     }
 
-    /// An order is accepted: it withdraws what it overrules, unless it follows from a slot itself.
+    /// A command is accepted: it withdraws what it overrules, unless it follows from a slot itself.
     pub fn accepted(&mut self, origin: &Origin, effect: Effect, write: Option<&SlotWrite>, now: Instant) {
         self.orders += 1;
         self.last = Some((origin.clone(), now));
@@ -513,7 +514,7 @@ impl Priorities {
         governs.next().map(|(.., entry)| entry.origin.client())
     }
 
-    /// What outlives a restart: inactives of `run` that protect people.
+    /// The entries that survive a restart: inactives of `run` that protect people.
     pub fn kept(&self) -> impl Iterator<Item = (u8, &Entry)> {
         let standing = |priority: u8| Some((priority, self.stands(Commanded::Run, priority)?));
         (1..=PROTECTING)

@@ -20,30 +20,30 @@ use crate::start_guard::BusGuards;
 
 /// Commands and forwarded reads that may wait on one bus, besides two stops for each drive.
 pub const CAPACITY: usize = 64;
-/// Clients and drives whose turns are remembered.
+/// Most clients and drives whose turns are remembered.
 const SERVED_KEPT: usize = 4 * CAPACITY;
 
 /// The waiting commands: pure, time is an argument.
 ///
 /// To one drive they go in the order in which they were accepted, from whatever client; only a stop goes ahead. What is
-/// passed on to several drives has its place among the orders of each of them. Between drives the clients take turns, and
-/// within a client its drives.
+/// passed on to several drives has its place among the commands of each of them. Between drives the clients take turns,
+/// and within a client its drives.
 #[derive(Debug, Default)]
 pub struct Pending {
     waiting: VecDeque<Command>,
-    /// Set when the queue takes nothing any more: the answer that every command gets.
+    /// Set once the queue is closed: the outcome that every command gets.
     closed: Option<Outcome>,
     /// The gateway is about to stop: only stops get in.
     stops_only: bool,
     /// Clients and their drives in the order in which they were served, the last one last.
     served: VecDeque<(String, usize)>,
-    /// Drives for which a stop came in since the bus last asked, each once.
+    /// Drives for which a stop arrived since the bus last checked, each once.
     stopped: Vec<usize>,
     /// Commands taken in so far.
     numbered: u64,
     /// Stops taken in so far, by drive.
     stops: BTreeMap<usize, u64>,
-    /// When the last of them came in.
+    /// When the last of them arrived.
     stopped_at: BTreeMap<usize, Instant>,
     /// Who gave the last of them.
     stopped_by: BTreeMap<usize, Origin>,
@@ -53,8 +53,7 @@ pub struct Pending {
     ending: bool,
     /// The queues that took over the stops of drives, and their places there.
     heirs: BTreeMap<usize, (Arc<CommandQueue>, usize)>,
-    /// The login whose command was the last that a client gave, by drive; without an entry there was none, or its client
-    /// has no login.
+    /// The login of the last client command, by drive; no entry if there was none, or its client has no login.
     commanders: BTreeMap<usize, Arc<str>>,
     /// Who commands by priorities, by drive.
     priorities: BTreeMap<usize, Priorities>,
@@ -62,7 +61,7 @@ pub struct Pending {
     holds: Holds,
     /// The stops that the gateway wants before it ends, until the bus takes note of it.
     stopping: Option<Stopping>,
-    /// What keeps motors from being started.
+    /// The start guards.
     guards: Option<Arc<BusGuards>>,
 }
 
@@ -145,7 +144,7 @@ impl Pending {
         self.waiting.push_back(command);
     }
 
-    /// Who keeps a command from being accepted, where it starts the motor or sets a reference.
+    /// Who blocks a command that starts the motor or sets a reference.
     fn refuses(&self, command: &Command, now: Instant) -> Option<Refusal> {
         let (origin, reach) = (command.ticket.origin(), command.reach());
         let waits = |drive: &usize| self.held_back(*drive, origin, command.effect(*drive));
@@ -156,8 +155,8 @@ impl Pending {
             .flatten()
     }
 
-    /// Why an order with that effect is not accepted, where it starts a motor that may not be started yet; it waits until
-    /// `until` where it says so.
+    /// Why a command with that effect is refused, if it starts a motor that may not be started yet; it may wait until
+    /// `until`.
     pub fn guarded(&self, drive: usize, effect: Effect, until: Option<Instant>, now: Instant) -> Option<Refusal> {
         self.guards.as_ref()?.refuses(drive, effect, until, now)
     }
@@ -167,7 +166,7 @@ impl Pending {
         self.waiting.iter().any(|c| c.number == number)
     }
 
-    /// Refuses a command that waits; who gave it, and what it was.
+    /// Refuses a waiting command. Returns who sent it, and what it was.
     pub fn refuse(&mut self, number: u64, refusal: &Refusal, now: Instant) -> Option<(Origin, String)> {
         let index = self.waiting.iter().position(|c| c.number == number)?;
         let command = self.waiting.remove(index)?;
@@ -176,7 +175,7 @@ impl Pending {
         Some(told)
     }
 
-    /// Why an order of that client with that effect is not accepted, where a slot of another one keeps it.
+    /// Why a command of that client with that effect is refused, if another client's slot blocks it.
     pub fn held_back(&self, drive: usize, origin: &Origin, effect: Effect) -> Option<Refusal> {
         let protects = self.priorities.get(&drive)?.refuses(origin, effect)?;
         let (what, priority) = (protects.what.name(), protects.priority);
@@ -215,8 +214,7 @@ impl Pending {
         self.commanders.get(&drive)
     }
 
-    /// What a bus that starts anew knows of a drive from the bus before: who commanded it last, how many stops it got,
-    /// and what stands by priorities.
+    /// Takes over a drive's state from the previous bus: last commander, number of stops, priority arrays.
     pub fn take_over(&mut self, drive: usize, commander: Option<Arc<str>>, stops: u64, priorities: Priorities) {
         self.set_commander(drive, commander);
         self.priorities.insert(drive, priorities);
@@ -230,8 +228,8 @@ impl Pending {
         };
     }
 
-    /// The queued reference whose place a newer one takes: the last of the same points, unless something behind it sets what
-    /// the newer one sets or rests on, or rests on what that sets.
+    /// The queued reference that a newer one replaces: the last of the same points, unless a later command conflicts
+    /// with it.
     fn replaced_by(&self, command: &Command) -> Option<usize> {
         let to_drive = |c: &Command| c.urgency != Urgency::Read && c.reaches(command.drive);
         let same = |c: &Command| c.reference_only && same_points(&c.order, &command.order);
@@ -241,8 +239,8 @@ impl Pending {
         self.waiting.get(index).is_some_and(same).then_some(index)
     }
 
-    /// Whose place a command takes in a full queue: the youngest of the client that has the most, or else, within its own
-    /// client, of the drive that has the most; neither may have fewer than it would have itself.
+    /// The command displaced in a full queue: the newest of the client with the most entries, or else, within its own
+    /// client, of the drive with the most; neither may have fewer than the new command's client or drive would have.
     fn victim(&self, command: &Command) -> Option<usize> {
         let client = command.ticket.client();
         self.youngest_of_most(|c| Some(c.ticket.client()), client)
@@ -263,9 +261,9 @@ impl Pending {
         (most > held(&own) + 1).then_some(index)
     }
 
-    /// The command of that rank that has its turn at `now`, expired ones answered and removed. `may` says whether a
-    /// command can be begun now: while the oldest of a drive cannot, the later ones to that drive wait behind it.
-    /// `redundant` says whether a stop changes nothing at its drive, which gives it the rank of a command.
+    /// The next command of that rank at `now`; expired ones are removed. `may` decides whether a command can start now:
+    /// while the oldest for a drive cannot, later ones for that drive wait. `redundant` decides whether a stop has no
+    /// effect on its drive, which gives it the rank of a command.
     pub fn next(
         &mut self,
         rank: Urgency,
@@ -286,7 +284,7 @@ impl Pending {
         for (index, command) in self.waiting.iter().enumerate() {
             let drive = command.drive;
             if command.urgency == Urgency::Stop {
-                // Of the stops of a drive the oldest goes first, whoever else its client commands.
+                // Of the stops of a drive the oldest goes first, anyone who else its client commands.
                 if stopped.contains(&drive) {
                     continue;
                 }
@@ -314,7 +312,7 @@ impl Pending {
         best.map(|(_, number)| Chosen { rank, number })
     }
 
-    /// Takes the command that [`Pending::next`] chose, unless it is gone since.
+    /// Takes the command that [`Pending::next`] chose, unless it was removed since.
     pub fn take(&mut self, chosen: Chosen) -> Option<Command> {
         let index = self.waiting.iter().position(|c| c.number == chosen.number)?;
         let command = self.waiting.remove(index)?;
@@ -356,7 +354,7 @@ impl Pending {
         self.waiting.iter().any(starts)
     }
 
-    /// Until when at most a command or stop of a client to that drive waits; none where none waits.
+    /// The latest expiry of a client's waiting command or stop for that drive; none if none waits.
     pub fn client_waits_until(&self, drive: usize) -> Option<Instant> {
         let commands = self
             .waiting
@@ -365,14 +363,14 @@ impl Pending {
         commands.filter_map(Command::client_waits_until).max()
     }
 
-    /// Answers those whose time ran out. A stop that was taken in is sent, however long it waits.
+    /// Ends expired commands. An accepted stop is sent, however long it waits.
     fn expire(&mut self, now: Instant) {
         self.remove(now, &Outcome::Expired, |c| {
             c.expires <= now && c.urgency != Urgency::Stop
         });
     }
 
-    /// Answers and removes the commands that `which` names.
+    /// Ends and removes the commands that `which` selects.
     pub fn remove(&mut self, now: Instant, outcome: &Outcome, which: impl Fn(&Command) -> bool) {
         let mut index = 0;
         while let Some(command) = self.waiting.get(index) {
@@ -403,7 +401,7 @@ impl Pending {
 }
 
 impl Command {
-    /// Until when a client waits for it; none where it is the gateway's own.
+    /// Until when a client waits for it; none for the gateway's own.
     fn client_waits_until(&self) -> Option<Instant> {
         let joined = self.joined.iter().map(|(ticket, expires)| (ticket, *expires));
         let tickets = std::iter::once((&self.ticket, self.expires)).chain(joined);

@@ -1,5 +1,5 @@
-//! The reference that stands while an order changes the frequency range on which a limit of it rests: 80 % that were 40 Hz are
-//! 80 Hz once the maximum frequency is twice what it was. Pure.
+//! The reference that stands while a command changes the frequency range on which a limit of it rests: 80 % that were
+//! 40 Hz are 80 Hz once the maximum frequency is twice what it was. Pure.
 
 use std::time::Instant;
 
@@ -19,16 +19,16 @@ pub struct LastWritten {
     pub range: Option<Instant>,
 }
 
-/// What is known of a drive for the purpose.
+/// The relevant state of a drive.
 struct Standing<'a> {
     drive: &'a Reading<'a>,
-    /// What the order sets: points with an address of their own.
+    /// The points with their own address that the command sets.
     sets: &'a [(usize, Value)],
-    /// None where the order is not begun yet: then what was read too long ago says nothing.
+    /// None if the command has not started yet: readings that are too old are then ignored.
     begun: Option<LastWritten>,
 }
 
-/// Whether the reference that stands keeps the limits once the order is carried out.
+/// Checks whether the present reference keeps the limits once the command is executed.
 ///
 /// # Errors
 /// The refusal: a limit would be passed, or it is not known whether.
@@ -36,7 +36,7 @@ pub(super) fn keeps_limits(drive: &Reading<'_>, order: &Order) -> Result<(), Ref
     judge(drive, &set_by(drive, order), None)
 }
 
-/// As at the admission, when the order is begun: another one may have been carried out since.
+/// As at the admission, when the order has started: another one may have been carried out since.
 ///
 /// # Errors
 /// The refusal.
@@ -44,8 +44,8 @@ pub fn still_keeps_limits(drive: &Reading<'_>, order: &Order, last: LastWritten)
     judge(drive, &set_by(drive, order), Some(last))
 }
 
-/// The limits that writing these parameters passes, in words: those of the parameters themselves, and those of the reference that
-/// stands.
+/// The limits that writing these parameters exceeds, as text: those of the parameters themselves, and those of the
+/// present reference.
 pub fn limits_passed(drive: &Reading<'_>, parameters: impl Iterator<Item = (u16, RawValue)>) -> Vec<String> {
     let profile = &drive.spec.profile;
     let items: Vec<(u16, u16)> = parameters
@@ -84,7 +84,7 @@ pub fn is_reference(profile: &Profile, table: Table, address: u16) -> bool {
     raws.any(|raw| raw.covers(table, address))
 }
 
-/// The points with an address of their own that an order sets.
+/// The points with an address of their own that a command sets.
 fn set_by(drive: &Reading<'_>, order: &Order) -> Vec<(usize, Value)> {
     let profile = &drive.spec.profile;
     match order {
@@ -165,7 +165,7 @@ impl<'a> Standing<'a> {
         Some(value.as_f64())
     }
 
-    /// What the point is, once the order is carried out.
+    /// The value of the point once the command is executed.
     fn becomes(&self, derived: &Derived) -> Option<f64> {
         let (of, minimum, maximum) = derived.band()?;
         let configured = self.drive.spec.frequency_range.as_ref();
@@ -182,7 +182,7 @@ impl<'a> Standing<'a> {
         Some(derived.value([Value::Number(of)], Some(band))?.as_f64())
     }
 
-    /// What the order makes of a point, or else what it is.
+    /// The value that the command gives a point, or else its present value.
     fn known(&self, point: usize, written: Option<Instant>) -> Option<f64> {
         if let Some(set) = self.set(point) {
             return Some(set);

@@ -1,4 +1,4 @@
-//! The one place where commands are answered, counted and audited.
+//! The one place where commands get their result and are counted and audited.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -24,7 +24,7 @@ impl WriteStats {
         self.results.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Time from acceptance to answer.
+    /// Time from acceptance to result.
     pub fn seconds(&self) -> HistogramSnapshot {
         self.seconds.snapshot()
     }
@@ -44,15 +44,15 @@ impl WriteStats {
     }
 }
 
-/// Answers a command exactly once: by [`Ticket::answer`] or [`Ticket::acknowledge`], or as "shutting down" when it
-/// is dropped. The audit line follows when everything about the command is known.
+/// Gives a command exactly one result: with [`Ticket::answer`] or [`Ticket::acknowledge`], or "shutting down" when
+/// dropped. The audit line follows once everything about the command is known.
 #[derive(Debug)]
 pub struct Ticket {
     origin: Origin,
     drive: String,
     what: String,
     changes: Vec<Change>,
-    /// The drives, by name, that it starts or stops beside its own.
+    /// The drives, by name, that it starts or stops besides its own.
     runs: Vec<(String, bool)>,
     write: bool,
     accepted: Instant,
@@ -68,8 +68,8 @@ pub struct Ticket {
 }
 
 impl Ticket {
-    /// A ticket and where its answer arrives. `what` describes the command for the audit; reads (`write`
-    /// false) are neither counted nor audited.
+    /// A ticket and the receiver of its result. `what` describes the command for the audit; reads (`write` false) are
+    /// neither counted nor audited.
     pub fn new(
         origin: Origin,
         drive: &str,
@@ -110,7 +110,7 @@ impl Ticket {
         self
     }
 
-    /// The stop of an order whose rest hears how it ended.
+    /// For the stop of a command whose rest depends on it.
     pub fn with_rest(mut self, end: StopEnd) -> Ticket {
         self.stop = Some(end);
         self
@@ -129,22 +129,22 @@ impl Ticket {
         &self.origin
     }
 
-    /// What was ordered, for people.
+    /// The command, as text.
     pub fn what(&self) -> &str {
         &self.what
     }
 
-    /// The client, as shares are reckoned: see [`Origin::client`].
+    /// The client, as shares are calculated: see [`Origin::client`].
     pub fn client(&self) -> &str {
         self.origin.client()
     }
 
-    /// Answers the command; nothing more will be known of it.
+    /// Ends the command with its final outcome.
     pub fn answer(mut self, outcome: Outcome, now: Instant) {
         self.settle(outcome, now);
     }
 
-    /// Answers the command; whether it shows its effect follows later.
+    /// Reports the acknowledgement; the confirmation may follow.
     pub fn acknowledge(mut self, outcome: Outcome, now: Instant) -> Receipt {
         self.settle(outcome, now);
         Receipt(self)
@@ -218,7 +218,7 @@ impl Drop for Ticket {
     }
 }
 
-/// A command that was answered and may still be confirmed. Dropped, it stays "acknowledged".
+/// An acknowledged command that may still be confirmed. If dropped, it stays "acknowledged".
 #[derive(Debug)]
 pub struct Receipt(Ticket);
 

@@ -24,7 +24,7 @@ pub enum Touched {
 }
 
 impl Touched {
-    /// The registers of an order to a drive of that profile, which rests on these frequency ranges.
+    /// The registers of a command to a drive of that profile, which rests on these frequency ranges.
     pub fn of(order: &Order, ranges: &[FrequencyRange], profile: &Profile) -> Touched {
         let raw = |index: usize| profile.points.get(index).and_then(|point| point.raw());
         let items = |raw: &Raw| {

@@ -99,10 +99,10 @@ impl InPhase {
     }
 }
 
-/// What was asked and failed under two conditions.
+/// Requests and failures under two conditions.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Contrast {
-    /// Exchanges under each condition.
+    /// Transactions under each condition.
     pub asked: [f32; 2],
     /// Those of them that failed.
     pub failed: [f32; 2],
@@ -132,7 +132,7 @@ pub(super) struct Running {
     /// Asked and failed in this slot and in the one before.
     slots: [(f32, f32); 2],
     slot_ends: Option<Instant>,
-    /// Age of the state before it was read anew, at most lately.
+    /// Age of the state before it was read again, at most lately.
     pub(super) age: Duration,
     pub(super) contrast: Contrast,
 }

@@ -1,5 +1,5 @@
-//! What is counted: for each drive and for the line, in steps of the last minute. All of it is bounded, and an exchange that goes well
-//! costs a few additions.
+//! What is counted: for each drive and for the line, in steps of the last minute. All of it is bounded, and a
+//! transaction that goes well costs a few additions.
 
 use std::time::{Duration, Instant};
 
@@ -9,7 +9,7 @@ use super::signature::{self, Shape};
 use crate::codec::describe::{self, Kind};
 use crate::codec::{LineFormat, Protocol, Request};
 
-/// Memory of a drive, at most; a line has 2 KiB beside, at most.
+/// Memory of a drive, at most; a line has 2 KiB besides, at most.
 pub const BYTES_PER_DRIVE: usize = 512;
 /// So many requests in a row without a reply are an absence: the drive is off, not badly connected.
 const ABSENCE: u16 = 12;
@@ -17,23 +17,23 @@ const ABSENCE: u16 = 12;
 const LATE: Duration = Duration::from_secs(5);
 /// The rest of a damaged reply may be on the line for so long.
 const LEFT_OVER: Duration = Duration::from_millis(50);
-/// Bytes between two exchanges that are kept until it is known whether they are a frame.
+/// Bytes between two transactions that are kept until it is known whether they are a frame.
 const MOST_IDLE: usize = 300;
 /// Losses of the port that are remembered, and for how long.
 const LOSSES: usize = 8;
 const LOSSES_FOR: Duration = Duration::from_secs(600);
 
-/// Usual baud rates, in their order; a reply that beats them all has no wire behind it.
+/// Usual baud rates, in their order; a reply that beats them all has no wire after it.
 pub const BAUDS: [u32; 8] = [2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];
 
-/// How an exchange ended.
+/// How a transaction ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum End {
-    /// The drive answered, perhaps with an exception.
+    /// The drive replied, perhaps with an exception.
     Answered,
     /// No reply in time.
     Silent,
-    /// A reply that cannot be believed.
+    /// An invalid reply.
     Damaged,
     /// A reply that may belong to another request: it says nothing about the line.
     Doubtful,
@@ -43,14 +43,14 @@ pub enum End {
 pub struct Exchange<'e> {
     /// Place of the drive on the bus.
     pub drive: usize,
-    /// What was asked.
+    /// The request.
     pub request: &'e Request,
     pub frame: &'e [u8],
-    /// All that came until the end.
+    /// All received bytes.
     pub seen: &'e [u8],
-    /// What of it stands behind the reply.
+    /// Bytes after the reply.
     pub behind: &'e [u8],
-    /// Frames that answer nothing, or stray bytes, were among it.
+    /// They include foreign frames or stray bytes.
     pub foreign: bool,
     /// How it ended.
     pub end: End,
@@ -58,11 +58,11 @@ pub struct Exchange<'e> {
     pub gap: Duration,
     /// When the request began.
     pub began: Instant,
-    /// When the exchange was over.
+    /// When the transaction was over.
     pub at: Instant,
-    /// When the last bytes came; no matter where none did.
+    /// When the last bytes arrived; irrelevant if none did.
     pub heard_at: Instant,
-    /// Time until the reply began.
+    /// Time until the reply started.
     pub turnaround: Option<Duration>,
 }
 
@@ -78,7 +78,7 @@ pub struct Line {
     pub response_timeout: Duration,
 }
 
-/// What is counted of a drive in each step.
+/// What is counted per drive in each step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sign {
     /// Sound replies.
@@ -99,15 +99,15 @@ pub enum Sign {
     StartLost,
     /// Requests that came back without their end.
     CutEcho,
-    /// Stray bytes behind a reply, while nobody was to speak.
+    /// Stray bytes after a reply, while the line should be idle.
     Idle,
-    /// Sound replies behind the one that was believed.
+    /// Further valid replies.
     Second,
     /// Sound replies after the time limit.
     Late,
     /// Replies that used more than half of the time limit.
     Slow,
-    /// Exchanges that show whether the adapter hears itself.
+    /// Transactions that show whether the adapter hears itself.
     EchoShown,
     /// It does.
     Echoed,
@@ -115,7 +115,7 @@ pub enum Sign {
 
 const SIGNS: usize = Sign::Echoed as usize + 1;
 
-/// What is counted of one drive.
+/// The counters of one drive.
 #[derive(Debug, Clone)]
 pub struct Drive {
     pub address: u8,
@@ -167,7 +167,7 @@ impl Drive {
     }
 }
 
-/// What was counted on a line.
+/// The counters of a line.
 #[derive(Debug, Clone)]
 pub struct Figures {
     /// How the line is set up.
@@ -183,7 +183,7 @@ pub struct Figures {
     wrong: Window<1>,
     idle: Vec<u8>,
     last: Option<(usize, End)>,
-    /// When the exchange before was over.
+    /// When the transaction before was over.
     last_at: Instant,
     epoch: Instant,
     step_ends: Instant,
@@ -192,7 +192,7 @@ pub struct Figures {
     losses: [Option<Instant>; LOSSES],
     /// Replies that were too early for the configured baud rate, by the lowest of [`BAUDS`] that they fit.
     early: Window<{ BAUDS.len() + 1 }>,
-    /// Connections that a device server closed, and that were made anew.
+    /// Connections that a device server closed, and that were remade.
     reconnects: Window<1>,
 }
 
@@ -248,7 +248,7 @@ impl Figures {
         }
     }
 
-    /// A device server closed its connection, and it was made anew.
+    /// A device server closed its connection, and it was remade.
     pub fn reconnected(&mut self) {
         self.reconnects.add(0, 1);
     }
@@ -311,7 +311,7 @@ impl Figures {
         self.wrong.sum(0)
     }
 
-    /// An exchange is over.
+    /// a transaction has ended.
     pub fn exchange(&mut self, exchange: &Exchange<'_>) {
         self.settle_idle(exchange.began);
         let protocol = self.line.protocol;
@@ -369,7 +369,8 @@ impl Figures {
         }
     }
 
-    /// Whether a failure may come of what was left on the line by an exchange with another drive that failed just before.
+    /// Whether a failure may come of what was left on the line by a transaction with another drive that failed just
+    /// before.
     fn is_excused(&self, exchange: &Exchange<'_>) -> bool {
         let just_before = exchange.began.saturating_duration_since(self.last_at) < LEFT_OVER;
         exchange.end != End::Answered
@@ -447,7 +448,7 @@ impl Figures {
         }
     }
 
-    /// The drive is heard of: what it left unanswered before counts, unless it was absent.
+    /// The drive is received of: what it left unanswered before counts, unless it was absent.
     fn is_there(&mut self, drive: usize, at: Instant) {
         let Some(drive) = self.drives.get_mut(drive) else {
             return;
@@ -496,13 +497,13 @@ impl Figures {
         (at.saturating_duration_since(self.epoch).as_millis() % LATENCY as u128) as usize
     }
 
-    /// Bytes came while nothing was asked for.
+    /// Bytes arrived without a request.
     pub fn stray(&mut self, bytes: &[u8]) {
         let room = MOST_IDLE.saturating_sub(self.idle.len());
         self.idle.extend(bytes.iter().take(room));
     }
 
-    /// What came since the last exchange is whole.
+    /// What came since the last transaction is whole.
     fn settle_idle(&mut self, now: Instant) {
         if self.idle.is_empty() {
             return;
@@ -543,7 +544,7 @@ impl Figures {
         true
     }
 
-    /// Time went by: whether a step is over, so that the rules are to be asked.
+    /// Time went by: whether a step has ended, so that the rules are to be asked.
     pub fn is_step_over(&self, now: Instant) -> bool {
         now >= self.step_ends
     }

@@ -35,7 +35,8 @@ pub struct Hold {
     held: Vec<Held>,
 }
 
-/// Steps for which a rule must hold, beside those in which it did not. Causes that only say that nothing else was recognised wait until it would have been.
+/// Steps for which a rule must hold, besides those in which it did not. Causes that only say that nothing else was
+/// recognised wait until it would have been.
 fn patience(cause: Cause) -> u32 {
     match cause {
         Cause::Noise | Cause::RequestEndLost => 5,

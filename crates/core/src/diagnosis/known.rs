@@ -1,13 +1,13 @@
-//! What is known of each drive of a line, and how much worse one is than the others.
+//! The known failure rates of the drives of a line, and how much worse one is than the others.
 
 use super::Drive;
 use super::figures::Sign;
 
-/// Exchanges in the last minute from which on a drive is known.
+/// Transactions in the last minute from which on a drive is known.
 const KNOWN: u32 = 15;
-/// What is seen in fewer steps of 5 s is a passing disturbance.
+/// Anything seen in fewer steps of 5 s is a passing disturbance.
 pub(super) const LASTING: usize = 3;
-/// What is seen less often in a minute is chance.
+/// Anything seen less often in a minute is chance.
 pub(super) const FEW: u32 = 5;
 /// So many standard deviations are no chance.
 pub(super) const SIGNIFICANT: f64 = 5.0;
@@ -16,7 +16,7 @@ pub(super) const ENOUGH: f64 = 6.0;
 /// A drive is bad whose errors are so many times as frequent as those of the others.
 const TIMES: f64 = 5.0;
 
-/// What is known of one drive.
+/// The known rates of one drive.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Known {
     pub(super) place: usize,

@@ -1,7 +1,7 @@
-//! What is wrong with a line, from what is seen on it anyway: a few counters a drive and rules over them. Pure: exchanges and time are
-//! arguments.
+//! Diagnoses a line from its normal traffic: a few counters per drive and rules over them. Pure: transactions and time
+//! are arguments.
 //!
-//! - [`signature`]: what the bytes of one exchange show: the echo, a stray byte before the reply, a reply without its beginning.
+//! - [`signature`]: what the bytes of one transaction show: the echo, a stray byte before the reply, a reply without its beginning.
 //! - [`counters`]: the kinds of counters.
 //! - [`figures`]: what was counted in the last minute, for each drive and for the line. Bounded: see [`figures::BYTES_PER_DRIVE`].
 //! - `known`: what is known of each drive, and which stand out.
@@ -26,7 +26,7 @@ use crate::codec::RequestPdu;
 
 pub use figures::{Drive, End, Exchange, Figures, Line};
 
-/// What may be wrong with a line.
+/// A possible cause of line errors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Cause {
@@ -44,7 +44,7 @@ pub enum Cause {
     WhileRunning,
     /// Errors in phase with the mains.
     Mains,
-    /// Stray bytes while nobody speaks.
+    /// Stray bytes while the line is idle.
     Bias,
     /// The beginning of replies is lost.
     ReplyStartLost,
@@ -60,7 +60,7 @@ pub enum Cause {
     PortResets,
     /// A device server closes its connection again and again.
     ConnectionCloses,
-    /// Replies come sooner than the configured baud rate allows.
+    /// Replies arrive faster than the configured baud rate allows.
     FasterThanBaud,
     /// Errors without a pattern.
     Noise,
@@ -116,7 +116,7 @@ impl Cause {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Certainty {
-    /// It would explain what is seen; other causes would, too.
+    /// It would explain the symptoms, but so would other causes.
     Fits,
     /// Other causes would show otherwise as a rule.
     Likely,
@@ -135,7 +135,7 @@ impl Certainty {
     }
 }
 
-/// What a rule found. Drives are named by their place on the bus.
+/// A finding of a rule. Drives are given by their place on the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
     pub cause: Cause,
@@ -143,7 +143,7 @@ pub struct Finding {
     pub drive: Option<usize>,
     /// How far the evidence goes.
     pub certainty: Certainty,
-    /// The evidence, for people.
+    /// The evidence, as text.
     pub evidence: String,
 }
 
@@ -159,13 +159,13 @@ pub struct Verdict {
     /// How far the evidence goes.
     #[schema(value_type = String)]
     pub certainty: Certainty,
-    /// What it means, in a few words.
+    /// Its meaning, in a few words.
     pub meaning: String,
-    /// What shows it.
+    /// The evidence.
     pub evidence: String,
-    /// What to do.
+    /// The remedy.
     pub remedy: String,
-    /// What to look at and to set at drives of these families, as their profiles say.
+    /// What to check and set on drives of these families, from their profiles.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub steps: Vec<String>,
     /// Since when it holds, RFC 3339.
@@ -177,24 +177,24 @@ pub struct Verdict {
 pub struct Diagnosis {
     /// When it was made; none before the first time.
     pub at: Option<SystemTime>,
-    /// What holds, most telling first.
+    /// The present verdicts, most significant first.
     pub verdicts: Vec<Verdict>,
     /// Sound replies of addresses that were not asked, in the last minute.
     pub wrong_address: u32,
-    /// What was counted in the last minute, a line for each drive in the order of the file.
+    /// The counters of the last minute, one entry per drive in the order of the file.
     pub drives: Vec<Counted>,
 }
 
-/// What was counted of one drive in the last minute.
+/// The counters of one drive in the last minute.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct Counted {
     /// Its name.
     pub drive: String,
-    /// Exchanges whose reply was sound.
+    /// Transactions with a valid reply.
     pub answered: u32,
     /// Requests without a reply.
     pub silent: u32,
-    /// Replies that could not be believed.
+    /// Invalid replies.
     pub damaged: u32,
     /// Of those, and of the sound ones: a stray byte before the reply.
     pub stray_before: u32,
@@ -202,11 +202,11 @@ pub struct Counted {
     pub start_lost: u32,
     /// Replies after the time limit.
     pub late: u32,
-    /// Further replies behind the one that was believed.
+    /// Further replies after the valid one.
     pub second: u32,
     /// Slowest beginning of a reply, ms.
     pub slowest_ms: f64,
-    /// What the drive itself counted, where it counts and there were errors.
+    /// The drive's own counters, if it has any and there were errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub by_drive: Option<CountedByDrive>,
 }
@@ -230,7 +230,7 @@ impl CountedByDrive {
     /// The first subfunction of function 08; the others follow it.
     const FIRST: u16 = 0x0B;
 
-    /// The request for the counter behind those that were read.
+    /// The request for the next counter.
     pub fn request(so_far: &[u16]) -> RequestPdu {
         let place = u16::try_from(so_far.len().min(4)).unwrap_or_default();
         RequestPdu::Diagnostics {
@@ -253,7 +253,7 @@ impl CountedByDrive {
         })
     }
 
-    /// What was counted since `before`.
+    /// The difference since `before`.
     #[must_use]
     pub fn since(&self, before: &CountedByDrive) -> CountedByDrive {
         CountedByDrive {
@@ -304,7 +304,7 @@ impl fmt::Display for CountedByDrive {
     }
 }
 
-/// How often the rules are asked.
+/// How often the rules are applied.
 pub const STEP: Duration = Duration::from_secs(5);
 
 #[cfg(test)]

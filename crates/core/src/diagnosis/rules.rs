@@ -15,7 +15,7 @@ const FEW_OF_LINE: u32 = 10;
 const IN_VAIN: u16 = 6;
 /// Most such drives that are told one by one.
 const NAMED: usize = 6;
-/// Share of exchanges below which a drive is good.
+/// Share of transactions below which a drive is good.
 const GOOD: f64 = 0.003;
 
 /// The rules, over the figures of one line.
@@ -32,7 +32,7 @@ pub struct Rules<'f> {
     found: Vec<Finding>,
 }
 
-/// What holds at `now`, most telling first; `names` are those of the drives.
+/// What holds at `now`, most significant first; `names` are those of the drives.
 pub fn find(figures: &Figures, names: &[String], now: Instant) -> Vec<Finding> {
     let known: Vec<Known> = figures
         .drives
@@ -122,7 +122,7 @@ impl Rules<'_> {
             .unwrap_or(0)
     }
 
-    /// Exchanges of the known drives, and how many of them failed.
+    /// Transactions of the known drives, and how many of them failed.
     fn exchanges(&self) -> (u32, u32) {
         sums(&self.known)
     }
@@ -206,7 +206,7 @@ impl Rules<'_> {
         }
     }
 
-    /// Whether exchanges fail under the second condition and not under the first.
+    /// Whether transactions fail under the second condition and not under the first.
     fn contrast(contrast: &Contrast) -> bool {
         let [asked, others] = contrast.asked;
         let [failed, of_others] = contrast.failed;

@@ -1,4 +1,4 @@
-//! What the bytes of one exchange show of the line.
+//! What the bytes of one transaction show of the line.
 
 use crate::codec::{Decoded, Protocol, Reply, Request, RequestPdu};
 
@@ -7,10 +7,10 @@ const MOST_STRAY: usize = 3;
 /// Bytes of the beginning of a reply that are restored to see whether the rest is sound.
 const MOST_LOST: usize = 2;
 
-/// The shape of what came.
+/// The shape of the received bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
-    /// Nothing came.
+    /// Nothing was received.
     Nothing,
     /// The reply and nothing before it.
     Sound,
@@ -28,12 +28,12 @@ pub enum Shape {
     Garbled,
 }
 
-/// What an exchange shows.
+/// The findings of a transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Signature {
     /// The request came back before the reply; `None` where it cannot be told.
     pub echoed: Option<bool>,
-    /// What else came.
+    /// The shape of the other bytes.
     pub shape: Shape,
 }
 
@@ -120,7 +120,7 @@ fn begins(protocol: Protocol, address: u8, first: u8) -> bool {
     }
 }
 
-/// Whether the reply is sound once its first bytes are put back: before what came, or in place of its mangled beginning.
+/// Whether the reply is sound once its first bytes are put back: before what came, or instead of its mangled beginning.
 fn start_lost(protocol: Protocol, request: &Request, heard: &[u8]) -> bool {
     let address = format!("{:02X}", request.address).into_bytes();
     let head: Vec<u8> = match protocol {

@@ -1,4 +1,4 @@
-//! How causes are told to people.
+//! The texts of causes.
 
 use std::collections::BTreeSet;
 
@@ -6,11 +6,11 @@ use super::Cause;
 use crate::drive::commissioning::{Shared, gather};
 use crate::drive::{Profile, Step};
 
-/// Most steps that are told with a verdict.
+/// Most steps reported with a verdict.
 const MOST_STEPS: usize = 96;
 
 impl Cause {
-    /// What it means, in a few words.
+    /// Its meaning, in a few words.
     pub const fn meaning(self) -> &'static str {
         match self {
             Cause::AllSilent => "no drive answers",
@@ -33,7 +33,7 @@ impl Cause {
         }
     }
 
-    /// What to do.
+    /// Its remedy.
     pub const fn remedy(self) -> &'static str {
         match self {
             Cause::AllSilent => {

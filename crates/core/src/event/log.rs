@@ -60,7 +60,7 @@ pub(super) fn newest<'l>(
     let words = search.text.as_ref().map(|text| text.to_lowercase());
     let read = |line: &str| from_line(line.as_bytes()).ok();
     let end = match &search.before {
-        // One that is not kept any more had older ones before it, which are gone as well.
+        // One that is no longer kept had older ones before it, which are gone as well.
         Some(Before::Event(boot, id)) => {
             let is_it = |event: Event| event.boot == *boot && event.id >= *id;
             all.clone().position(|line| read(line).is_some_and(is_it)).unwrap_or(0)

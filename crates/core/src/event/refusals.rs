@@ -1,17 +1,18 @@
 //! Limits what refusals cost: a client without a right can cause them at any rate.
 //!
-//! The first refusal of a kind passes at once, then one a second for each client, which stands for all that were refused
-//! meanwhile. So many clients are told apart; whoever invents more names shares one place with all that come later.
+//! The first refusal of a kind passes at once, then one a second for each client, which stands for all that were
+//! refused meanwhile. So many clients are distinguished; anyone who invents more names shares one place with all that
+//! come later.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Clients that are told apart.
+/// Clients that are distinguished.
 const CLIENTS: usize = 64;
 /// Kinds of one client whose first refusal passes at once.
 const KINDS: usize = 16;
-/// Shortest time between two refusals of one client that pass, beside the first of a kind.
+/// Shortest time between two refusals of one client that pass, besides the first of a kind.
 const INTERVAL: Duration = Duration::from_secs(1);
 /// A client is forgotten when it was refused nothing for so long.
 const FORGOTTEN: Duration = Duration::from_secs(60);

@@ -1,4 +1,4 @@
-//! A file of lines that only grows, until it becomes the first of the older ones beside it.
+//! A file of lines that only grows, until it becomes the first of the older ones besides it.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};

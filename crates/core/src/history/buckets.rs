@@ -70,7 +70,7 @@ impl<T: Copy + Default> Buckets<T> {
         self.slots.get_mut(place).filter(|_| holds)
     }
 
-    /// A step; `None` where it is too old or not begun.
+    /// A step; `None` where it is too old or not started.
     pub(super) fn get(&self, number: u64) -> Option<T> {
         let slot = self.slots.get(self.place(number)).copied();
         slot.filter(|_| self.holds(number))

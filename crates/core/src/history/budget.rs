@@ -12,7 +12,7 @@ use crate::process_image::{BusSpec, DriveSpec};
 pub const MOST_BYTES: usize = 20 << 20;
 /// Bytes of events and commands of a drive, where there is room for it.
 pub const NOTES: usize = 64 << 10;
-/// Room beside the planned reads: retries, reads that commands ask for, reads after a fault.
+/// Room besides the planned reads: retries, reads that commands ask for, reads after a fault.
 const RESERVE: f64 = 1.25;
 /// Rings below that size are not worth while.
 const LEAST: usize = 16 << 10;
@@ -118,7 +118,7 @@ fn scaled(bytes: usize, part: usize) -> usize {
     bytes.saturating_mul(part) / 1_000_000
 }
 
-/// Time of an exchange with a drive that answers at once, on a line without silence: no line is faster.
+/// Time of a transaction with a drive that answers at once, on a line without silence: no line is faster.
 fn least_wire(bus: &BusSpec, read: &PlannedRead) -> Duration {
     WireTime::of(bus.protocol, &bus.format, &read.pdu()).total(Duration::ZERO, Duration::ZERO)
 }

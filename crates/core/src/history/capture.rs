@@ -230,7 +230,7 @@ fn read_pcapng(file: &[u8], packets: &mut Vec<Packet>) -> Result<(), CaptureErro
         }
         at += length;
     }
-    // Of another interface beside the line nothing is said.
+    // Of another interface besides the line nothing is said.
     not_serial.filter(|_| packets.is_empty()).map_or(Ok(()), Err)
 }
 

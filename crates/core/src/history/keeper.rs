@@ -102,7 +102,7 @@ impl Writer {
         }
     }
 
-    /// Takes what earlier runs left into memory.
+    /// Loads the files of earlier runs.
     fn remember(&mut self, events: &Events) {
         let done = self.open();
         if done.is_ok() {
@@ -142,7 +142,7 @@ impl Writer {
         if self.events.is_replaced() {
             self.events.close();
         }
-        // Whoever has the events has the counters, too: another gateway with the same directory gets neither.
+        // Anyone who has the events has the counters, too: another gateway with the same directory gets neither.
         if !self.events.is_open() {
             self.open()?;
         }
@@ -281,7 +281,7 @@ fn read_counters(bytes: &[u8]) -> Result<BTreeMap<String, Totals>, String> {
     }
 }
 
-/// A name beside that path that is free.
+/// A name besides that path that is free.
 fn kept_aside(path: &Path) -> PathBuf {
     let named = |ending: String| path.with_extension(ending);
     let mut names = (1..1000).map(|number| named(format!("damaged-{number}")));

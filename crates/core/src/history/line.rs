@@ -18,7 +18,7 @@ pub const LOOK: Duration = Duration::from_secs(1);
 /// Memory of a line, and of each of its drives, bytes.
 pub const BYTES: (usize, usize) = (2 * STEPS * size_of::<Bucket>(), STEPS * size_of::<Option<Exchanges>>());
 
-/// Exchanges of a step.
+/// Transactions of a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Exchanges {
     /// All.
@@ -40,7 +40,7 @@ pub struct LineHistory {
 #[derive(Debug)]
 struct DriveLine {
     steps: Buckets<Option<Exchanges>>,
-    /// All and failed exchanges when they were last looked at.
+    /// All and failed transactions when they were last looked at.
     before: (u64, u64),
 }
 
@@ -60,7 +60,7 @@ pub struct LastHour {
     pub drives: Vec<Vec<Option<Exchanges>>>,
 }
 
-/// All exchanges of a drive so far, and those that failed.
+/// All transactions of a drive so far, and those that failed.
 fn exchanges(drive: &DriveImage) -> (u64, u64) {
     let all = Outcome::ALL.iter().map(|outcome| drive.counted(*outcome)).sum();
     (all, drive.counted(Outcome::Timeout) + drive.counted(Outcome::Corrupt))

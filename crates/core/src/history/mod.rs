@@ -4,7 +4,7 @@
 //! - [`trigger`]: what makes a recording, seen in the samples of a drive and on its line.
 //! - [`trend`]: least, greatest and last values in steps of time; [`counters`]: starts and run time; [`line`]: the last hour of a
 //!   line. [`drives`]: those of all drives and buses, as the rest of the gateway sees them.
-//! - [`recorder`]: the rings in memory and the recordings under way. Pure: time is an argument.
+//! - [`recorder`]: the rings in memory and the recordings in progress. Pure: time is an argument.
 //! - [`capture`]: reads captures of lines, its own and others, for `drivegate replay`.
 //! - [`budget`]: how much memory the rings take at most.
 //! - [`assemble`]: the raw words of a ring as points, and what they show in one sentence (`summary`).

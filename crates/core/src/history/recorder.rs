@@ -1,5 +1,5 @@
-//! The rings of all buses, the recordings under way, and what feeds the trends. Pure: time is an argument, what the buses taped is taken from their
-//! images.
+//! The rings of all buses, the recordings in progress, and what feeds the trends. Pure: time is an argument, what the
+//! buses taped is taken from their images.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -18,12 +18,12 @@ use crate::process_image::{
     BusImage, DriveImage, DriveSpec, Link, Reading, Snapshot, Taped, TapedFrame, TapedRead, Taping,
 };
 
-/// Triggers of a recording that are noted beside the first.
+/// Triggers of a recording that are noted besides the first.
 const MOST_TRIGGERS: usize = 32;
 /// Age at which a value is still good here: a recording shows what was read, whenever that was.
 const ANY_AGE: Duration = Duration::from_secs(10 * 365 * 86_400);
 
-/// What happened to a drive beside its samples.
+/// What happened to a drive besides its samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Note {
     /// When.
@@ -41,7 +41,7 @@ pub enum NoteBody {
         kind: &'static str,
         text: String,
     },
-    /// A command that was answered.
+    /// A completed command.
     Command {
         /// Kind of the source.
         source: &'static str,
@@ -51,7 +51,7 @@ pub enum NoteBody {
         command: String,
         /// The result code.
         result: &'static str,
-        /// From acceptance to answer.
+        /// From acceptance to result.
         latency: Duration,
     },
 }
@@ -103,7 +103,7 @@ pub(super) fn reading<'d>(spec: &'d DriveSpec, snapshot: &Arc<Snapshot>, at: Ins
 #[derive(Debug, Clone)]
 pub struct Capture {
     pub id: String,
-    /// Time of day and instant that the times of the capture are reckoned by.
+    /// Time of day and instant that the times of the capture are calculated by.
     pub clock: Clock,
     pub bus: Arc<BusImage>,
     pub drive: Arc<DriveImage>,
@@ -138,11 +138,11 @@ struct DriveRing {
     now: Arc<Snapshot>,
     watch: Watch,
     pending: Option<Pending>,
-    /// When the last recording of each kind was begun.
+    /// When the last recording of each kind was started.
     last: BTreeMap<TriggerKind, Instant>,
 }
 
-/// A recording that goes on.
+/// A recording in progress.
 #[derive(Debug)]
 struct Pending {
     id: String,
@@ -205,7 +205,7 @@ impl Recorder {
         captures
     }
 
-    /// What all buses together may take is shared by them anew: there may be more of them, or fewer.
+    /// What all buses together may take is shared by them again: there may be more of them, or fewer.
     fn share_memory(&mut self, reach: Reach) {
         let shares = Budget::shared(self.lines.iter().map(|line| line.need.clone()).collect());
         for (line, share) in self.lines.iter_mut().zip(shares) {

@@ -28,9 +28,9 @@ pub struct Header {
     pub id: String,
     /// Time of the trigger, RFC 3339 with microseconds, UTC. All times below are seconds from it.
     pub time: String,
-    /// What made it.
+    /// Its trigger.
     pub trigger: TriggerKind,
-    /// What it shows, in one sentence.
+    /// Its summary, in one sentence.
     pub summary: String,
     /// It is among the first of a storm of recordings, which are kept longer.
     pub first: bool,
@@ -125,10 +125,10 @@ pub struct EventNote {
     pub text: String,
 }
 
-/// A command that was answered.
+/// A completed command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CommandNote {
-    /// When it was answered.
+    /// When it completed.
     pub t: f64,
     /// Kind of the source.
     pub source: String,
@@ -138,7 +138,7 @@ pub struct CommandNote {
     pub command: String,
     /// Result code.
     pub result: String,
-    /// From acceptance to answer, ms.
+    /// From acceptance to result, ms.
     pub latency_ms: f64,
 }
 

@@ -52,7 +52,7 @@ fn what(recording: &Recording, trigger: &str, profile: &Profile) -> String {
     }
 }
 
-/// Failed exchanges with the drive shortly before the trigger.
+/// Failed transactions with the drive shortly before the trigger.
 fn errors(recording: &Recording) -> Option<String> {
     let drive = &recording.header.drive.name;
     let place = recording.header.bus.drives.iter().position(|name| name == drive);

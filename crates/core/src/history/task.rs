@@ -26,7 +26,7 @@ const WAITING: usize = 64;
 /// Characters of a text of a client that are kept.
 const MOST_TEXT: usize = 300;
 
-/// Why no recording was begun.
+/// Why no recording was started.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NotRecorded {
     /// The recorder is off.
@@ -211,7 +211,7 @@ impl Taker {
         loop {
             let order = orders.recv_timeout(TICK);
             let clock = Clock::read();
-            // What was taped before an order belongs before it.
+            // What was taped before a command belongs before it.
             self.take_notes(clock);
             let mut captures = self.recorder.tick(clock);
             match order {
@@ -360,7 +360,7 @@ impl Writer {
                     };
                     publish(&self.events, bus, Some(drive), text, Some(made));
                 }
-                // Told once: the disk stays as it is until somebody sees to it.
+                // Told once: the disk stays as it is until someone sees to it.
                 Err(_) if self.failing => {}
                 Err(error) => {
                     self.failing = true;

@@ -1,4 +1,4 @@
-//! What makes a recording. Pure.
+//! Triggers of recordings. Pure.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -19,23 +19,23 @@ pub const BURST_IN: Duration = Duration::from_secs(10);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TriggerKind {
-    /// A fault came up, be it for one poll.
+    /// A fault appeared, even for a single poll.
     Fault,
-    /// A warning came up.
+    /// A warning appeared.
     Warning,
-    /// The drive does not answer any more.
+    /// The drive no longer replies.
     Lost,
-    /// A lease ran out.
+    /// A lease expired.
     Supervision,
     /// A stop did not get its acknowledgement.
     RefusedStop,
     /// An acknowledged command showed no effect.
     NotConfirmed,
-    /// Many exchanges on the line failed.
+    /// Many transactions on the line failed.
     LineErrors,
     /// A point was beyond its limit for a time.
     Point,
-    /// Somebody asked for it.
+    /// On request.
     Command,
 }
 
@@ -105,7 +105,7 @@ pub struct Trigger {
     pub kind: TriggerKind,
     /// When.
     pub at: Instant,
-    /// What it was, for people.
+    /// What it was, as text.
     pub text: String,
 }
 
@@ -208,7 +208,7 @@ impl Watch {
     }
 }
 
-/// Failed exchanges of a line.
+/// Failed transactions of a line.
 #[derive(Debug, Default)]
 pub(super) struct LineErrors {
     /// When, and with which drive.
@@ -216,7 +216,8 @@ pub(super) struct LineErrors {
 }
 
 impl LineErrors {
-    /// Notes a failed exchange with a drive that answered before. The drive with most of them, when they are a burst.
+    /// Notes a failed transaction with a drive that answered before. The drive with most of them, when they are a
+    /// burst.
     pub(super) fn note(&mut self, at: Instant, drive: usize) -> Option<(usize, Trigger)> {
         self.recent.push_back((at, drive));
         while let Some((oldest, _)) = self.recent.front() {

@@ -10,9 +10,9 @@ use crate::process_image::Machine;
 pub enum Claim {
     /// It belongs to this machine.
     Own,
-    /// Its machine is not configured any more. At its address is this one, of another profile.
+    /// Its machine is no longer configured. At its address is this one, of another profile.
     Place,
-    /// Its machine is not configured any more. This one has the name.
+    /// Its machine is no longer configured. This one has the name.
     Name,
 }
 

@@ -14,7 +14,7 @@
 //! 117 = ?      # not read: the drive refused it with exception 03
 //! ```
 //!
-//! What follows `#` is for people. A value without a decimal point is a register, one with it an analog output of N2.
+//! What follows `#` is as text. A value without a decimal point is a register, one with it an analog output of N2.
 
 use std::collections::BTreeMap;
 use std::fmt::{self, Write as _};
@@ -86,7 +86,7 @@ impl fmt::Display for Id {
 pub struct Entry {
     /// Its value, or why it was not read.
     pub value: Result<RawValue, String>,
-    /// For people: value in its unit, and name.
+    /// As text: value in its unit, and name.
     pub note: String,
 }
 
@@ -129,7 +129,7 @@ impl ParameterFile {
         format!("{} parameters, {mark}", self.values.len())
     }
 
-    /// The checksum of names and values; what is for people is not in it.
+    /// The checksum of names and values; what is as text is not in it.
     pub fn checksum(&self) -> String {
         let mut text = format!("{}\n", self.family);
         for (id, entry) in &self.values {

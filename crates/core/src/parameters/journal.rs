@@ -9,7 +9,7 @@
 //! address: 1
 //! family: vacon-nx
 //! identification: none
-//! begun: 2026-03-02T07:40:12Z
+//! started: 2026-03-02T07:40:12Z
 //! by: local_socket uid 0
 //! phase: writing
 //! done: 1
@@ -50,11 +50,11 @@ const RELEASED: &str = "restore.released";
 pub enum Phase {
     /// It writes the new values.
     Writing,
-    /// All are written; the drive is told to keep them.
+    /// All are written; the drive is being made to save them.
     Saving,
     /// It writes the former values.
     TakingBack,
-    /// All former values are written; the drive is told to keep them.
+    /// All former values are written; the drive is being made to save them.
     SavingBack,
 }
 
@@ -75,7 +75,7 @@ impl Phase {
     }
 }
 
-/// To which machine a journal belongs. The names are those of the time when the restore began, and for people.
+/// To which machine a journal belongs. The names are those of the time when the restore began, and as text.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Owner {
     /// Name of the drive.
@@ -99,7 +99,7 @@ impl Owner {
         owner(&mut body_of(text)?.lines())
     }
 
-    /// Where it is, for people.
+    /// Where it is, as text.
     pub fn place(&self) -> String {
         match &self.machine {
             Some(machine) => format!("`{}` at {machine}", self.drive),

@@ -54,11 +54,11 @@ pub struct Handling {
 /// What a restore does.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Plan {
-    /// The writes, in an order in which every step keeps the limits between parameters.
+    /// The writes, in a command in which every step keeps the limits between parameters.
     pub writes: Vec<ParameterWrite>,
     /// How the drive takes and keeps them.
     pub handling: Handling,
-    /// Parameters that differ and are left out; how they differ and why they are left out, for people.
+    /// Parameters that differ and are left out; how they differ and why they are left out, as text.
     pub left_out: Vec<(Id, String)>,
     /// What people should know: parameters that only one side has, were not read, are not kept.
     pub notes: Vec<String>,
@@ -73,13 +73,13 @@ pub struct Wishes {
     pub force: bool,
 }
 
-/// A reason against the restore that the user overrode: for people.
+/// A reason against the restore that the user overrode: as text.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Risk(pub String);
 
 /// What would be written so that the drive, which holds `present`, comes to hold `wanted`.
 ///
-/// The notes of both files go into [`ParameterWrite::line`]; [`ParameterFile::named`] makes them anew.
+/// The notes of both files go into [`ParameterWrite::line`]; [`ParameterFile::named`] makes them again.
 ///
 /// # Errors
 /// Every reason why it may not be done, each saying what differs and what to do.

@@ -1,4 +1,4 @@
-//! A reading of all parameters of a drive: what is asked next, and what an answer means. Pure.
+//! A reading of all parameters of a drive: decides the next request and applies replies. Pure.
 //!
 //! A family names its parameters, or says where they may lie; then the drive is asked for each address, and what it refuses
 //! with 02 is not there. What an earlier reading found is asked for alone, until one of those is refused: the drive has another
@@ -16,7 +16,7 @@ use crate::diagnosis::CountedByDrive;
 use crate::drive::Profile;
 use crate::drive::parameters::{Label, Numbering, RawValue};
 
-/// Tries of a request that is not answered.
+/// Attempts of a request without a reply.
 const TRIES: u32 = 4;
 /// Tries of a request to a drive that is busy.
 const BUSY_TRIES: u32 = 20;
@@ -25,7 +25,7 @@ const BUSY_PAUSE: Duration = Duration::from_millis(200);
 /// Pause before a drive is asked again that is away.
 const AWAY_PAUSE: Duration = Duration::from_secs(1);
 
-/// What comes after an answer.
+/// The next step after a reply.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Next {
     /// The next request.
@@ -44,7 +44,7 @@ struct Block {
     tries: u32,
 }
 
-/// A reading that goes on.
+/// A reading in progress.
 #[derive(Debug)]
 pub struct Reading {
     profile: Arc<Profile>,
@@ -314,7 +314,7 @@ fn note(label: &Label, value: Option<RawValue>) -> String {
 }
 
 impl ParameterFile {
-    /// The file with what people read made anew, by the user's names and then those of the family.
+    /// The file with what people read remade, by the user's names and then those of the family.
     #[must_use]
     pub fn named(mut self, profile: &Profile, names: &Names) -> ParameterFile {
         for (id, entry) in &mut self.values {

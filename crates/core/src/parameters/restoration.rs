@@ -1,9 +1,9 @@
-//! A restore that goes on: what is done next, and what an answer means. Pure: time is an argument, what is on disk and on the
-//! line is done by whoever asks.
+//! A restore in progress: decides the next step and applies replies. Pure: time is an argument; the caller does the
+//! I/O.
 //!
-//! Every parameter is an order of its own, which the bus carries out only when the drive has the former value or the new
-//! one, and only while its motor stands; a drive that has the new value is not written. So a restore that was cut off anywhere is resumed or taken back by going
-//! through all of its parameters again, whatever had reached the drive.
+//! Every parameter is a command of its own, which the bus carries out only when the drive has the former value or the
+//! new one, and only while its motor stands; a drive that has the new value is not written. So a restore that was cut
+//! off anywhere is resumed or taken back by going through all of its parameters again, whatever had reached the drive.
 
 use std::time::{Duration, Instant};
 
@@ -17,14 +17,14 @@ use crate::drive::parameters::RawValue;
 const MOST_WAIT: Duration = Duration::from_secs(3600);
 /// Pause before a busy drive is asked again.
 const BUSY_PAUSE: Duration = Duration::from_millis(200);
-/// Pause before the next try where somebody has to do something: the motor runs, the drive is away.
+/// Pause before the next try where someone has to do something: the motor runs, the drive is away.
 const PAUSE: Duration = Duration::from_secs(1);
 /// How often the journal is told how far the restore is.
 const NOTED: Duration = Duration::from_secs(1);
-/// Saves of one restore, at most: a drive that loses what was written before it was saved is written and saved anew.
+/// Saves of one restore, at most: a drive that loses what was written before it was saved is written and saved again.
 const MOST_SAVES: u32 = 3;
 
-/// What is done next.
+/// The next step.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Wanted {
     /// The journal as it is now must be on disk before anything else.
@@ -33,11 +33,11 @@ pub enum Wanted {
     Set(ParameterOrder),
     /// The journal is removed.
     Remove,
-    /// Nothing: it is over.
+    /// Nothing: it has ended.
     Nothing,
 }
 
-/// What comes after an answer.
+/// The next step after a reply.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Then {
     /// What is wanted next.
@@ -65,12 +65,12 @@ enum State {
     Recording(usize),
     /// The parameter at that place has its turn; behind the last one the save.
     Setting(usize),
-    /// It is over, but for the journal.
+    /// It has ended, but for the journal.
     Removing(End),
     Over(End),
 }
 
-/// A restore that goes on.
+/// A restore in progress.
 #[derive(Debug)]
 pub struct Restoration {
     journal: Journal,
@@ -92,7 +92,7 @@ impl Restoration {
         Restoration::of(journal, false, now)
     }
 
-    /// One that was cut off goes on.
+    /// Resumes an interrupted one.
     pub fn resume(mut journal: Journal, now: Instant) -> Restoration {
         journal.phase = Phase::Writing;
         Restoration::of(journal, true, now)
@@ -122,7 +122,7 @@ impl Restoration {
         }
     }
 
-    /// What is done next.
+    /// The next step.
     pub fn wanted(&self) -> Wanted {
         match &self.state {
             State::Recording(_) => Wanted::Record,
@@ -158,7 +158,7 @@ impl Restoration {
         (self.journal.done, self.writes.len())
     }
 
-    /// How it ended, once it is over.
+    /// How it ended, once it has ended.
     pub fn end(&self) -> Option<&End> {
         match &self.state {
             State::Over(end) => Some(end),
@@ -237,7 +237,7 @@ impl Restoration {
         self.pause(PAUSE, why, now)
     }
 
-    /// It cannot go on: somebody stops it from outside.
+    /// It cannot go on: someone stops it from outside.
     pub fn give_up(&mut self, why: String) {
         self.state = match self.touched {
             true => State::Over(End::Unfinished(why)),
@@ -319,7 +319,7 @@ impl Restoration {
         }
     }
 
-    /// What somebody at the drive can mend is waited for once something is written; before that there is no need to.
+    /// What someone at the drive can mend is waited for once something is written; before that there is no need to.
     fn wait_for_people(&mut self, waits: String, why: &str, now: Instant) -> Then {
         match self.touched {
             true => self.pause(PAUSE, &waits, now),
@@ -360,8 +360,8 @@ mod tests {
         Restoration::begin(journal, now)
     }
 
-    /// What is wanted until it is over, of a drive that loses what is not saved when it is told to save for the first time, if
-    /// it `forgets`.
+    /// What is wanted until it has ended, of a drive that loses what is not saved when it is told to save for the first
+    /// time, if it `forgets`.
     fn wanted_ids(restoration: &mut Restoration, mut forgets: bool, now: Instant) -> Vec<String> {
         let (mut all, mut has) = (Vec::new(), std::collections::BTreeSet::new());
         let seen = Outcome::Acknowledged(Reply::Registers(vec![0]));

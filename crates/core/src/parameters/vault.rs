@@ -1,4 +1,4 @@
-//! What readings and restores go on, one of each a drive at a time, and what came of the last ones.
+//! What readings and restores go on, one of each a drive at a time, and the result of the last ones.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -23,7 +23,7 @@ pub struct Status {
     pub remaining: Option<Duration>,
     /// Why it waits.
     pub waits: Option<String>,
-    /// What came of it; nothing while it goes on.
+    /// The result of it; nothing while it goes on.
     pub result: Option<Result<Arc<ParameterFile>, String>>,
 }
 
@@ -32,13 +32,13 @@ pub struct Status {
 pub enum RestoreStage {
     /// The drive is read.
     Reading,
-    /// What would be written is known; whoever asked for it decides.
+    /// What would be written is known; the requester for it decides.
     Prepared,
     /// It may not be done: the reasons.
     Refused(Vec<String>),
     /// Parameters are written.
     Working,
-    /// It is over: what the drive has now.
+    /// It has ended: what the drive has now.
     Ended(String),
     /// It was given up: why, and what to do.
     Failed(String),
@@ -66,7 +66,7 @@ pub struct RestoreStatus {
     pub waits: Option<String>,
     /// What it writes, once that is known.
     pub prepared: Arc<Prepared>,
-    /// Somebody wants it to end before the next parameter.
+    /// Someone wants it to end before the next parameter.
     pub is_unwanted: bool,
 }
 
@@ -185,7 +185,7 @@ impl Vault {
         Ok(number)
     }
 
-    /// The reading of that drive is over.
+    /// The reading of that drive has ended.
     pub fn end(&self, drive: &Machine, result: Result<ParameterFile, String>) {
         let mut state = self.lock();
         let result = result.map(Arc::new);
@@ -205,7 +205,7 @@ impl Vault {
         }
     }
 
-    /// What keeps orders from that drive, the same under whatever configuration.
+    /// What keeps commands from that drive, the same under whatever configuration.
     pub fn hold(&self, drive: &Machine) -> Arc<Hold> {
         self.lock().holds.entry(drive.clone()).or_default().clone()
     }
@@ -216,7 +216,7 @@ impl Vault {
         Some(JournalFile::new(state.store.as_ref()?.dir(), drive))
     }
 
-    /// Whether nobody has looked for a journal of that machine; from now on somebody has.
+    /// Whether nobody has looked for a journal of that machine; from now on someone has.
     pub fn is_new(&self, drive: &Machine) -> bool {
         self.lock().looked_for.insert(drive.clone())
     }

@@ -25,7 +25,7 @@ pub enum Target {
     Address(u8),
 }
 
-/// What a tool asks. Whoever passes on what may write has checked that it is allowed.
+/// What a tool asks. Anyone who passes on what may write has checked that it is allowed.
 #[derive(Debug, Clone)]
 pub struct Question {
     /// Who is asked.
@@ -56,7 +56,7 @@ impl Question {
     }
 }
 
-/// An exchange that was asked for. Dropping it takes it back while it was not sent.
+/// a transaction that was asked for. Dropping it takes it back while it was not sent.
 #[derive(Debug)]
 pub struct Exchange {
     answer: oneshot::Receiver<Answer>,
@@ -75,8 +75,9 @@ impl Exchange {
 }
 
 impl BusHandle {
-    /// Passes a request on to the line, in the share of background exchanges. When this returns it is in the queue of the bus, or
-    /// answered. What may write is an order to every drive that hears it, with its place among their other orders.
+    /// Passes a request on to the line, in the share of background transactions. When this returns it is in the queue
+    /// of the bus, or answered. What may write is a command to every drive that hears it, with its place among their
+    /// other commands.
     pub fn ask(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
         self.pass_on(question, false, writes, now)
     }
@@ -119,7 +120,7 @@ impl BusHandle {
         let stops = stops.map(|(index, _)| index).collect();
         let effects = heard().map(|(index, drive)| (index, Effect::of(&order, &drive.spec.profile)));
         let effects = effects.filter(|_| may_write).collect();
-        // What is not decoded may write anything. The registers are the same whoever hears it.
+        // What is not decoded may write anything. The registers are the same anyone who hears it.
         let touched = heard().next().map_or(Touched::Anything, |(_, drive)| {
             Touched::of(&order, &[], &drive.spec.profile)
         });

@@ -12,7 +12,7 @@ use crate::event::{Event, EventKind, Events};
 use crate::process_image::Machine;
 
 impl BusHandle {
-    /// Whether an order of that client renews the lease of a drive.
+    /// Whether a command of that client renews the lease of a drive.
     pub fn renews(&self, drive: usize, origin: &Origin) -> bool {
         !self.queue.is_guarded() || self.queue.lock().hold_renews(drive, origin)
     }
@@ -46,7 +46,7 @@ impl BusHandle {
                 drive: Some(image.spec.name.clone()),
                 ..Event::new(kind, time, text)
             });
-            // Whoever shows the drive shows its hold.
+            // Anyone who shows the drive shows its hold.
             image.update(|_| {});
         }
     }
@@ -70,7 +70,7 @@ impl BusHandle {
         self.tell_holds(events, now, time);
     }
 
-    /// Why a command that was accepted is not begun at its turn, and whether it renews the lease of its drive.
+    /// Why a command that was accepted is not started at its turn, and whether it renews the lease of its drive.
     pub fn judges_turn(&self, command: &Command, now: Instant) -> (Option<Refusal>, bool) {
         if !self.queue.is_guarded() {
             return (None, true);
@@ -97,7 +97,7 @@ impl BusHandle {
 }
 
 impl DriveHandle {
-    /// Why an order of a client is not taken, where somebody else holds the drive.
+    /// Why a command of a client is not taken, where someone else holds the drive.
     pub(super) fn hold_refuses(&self, admitted: &Admitted, origin: &Origin, now: Instant) -> Option<Refusal> {
         if !self.bus.queue.is_guarded() || admitted.urgency == Urgency::Read {
             return None;
@@ -140,7 +140,7 @@ impl DriveHandle {
         });
         let view = queue.hold_view(self.index, None, now);
         drop(queue);
-        // What was begun for another one may have to end.
+        // What was started for another one may have to end.
         self.bus.queue.wake();
         acted?;
         if verb != Verb::Release {
@@ -169,8 +169,8 @@ impl DriveHandle {
         Some((claim.name.to_string(), below.collect()))
     }
 
-    /// The heartbeat of a client that may command: the lease of the drive runs anew, unless another client's silence counts, and
-    /// so does its hold.
+    /// The heartbeat of a client that may command: the lease of the drive runs again, unless another client's silence
+    /// counts, and so does its hold.
     pub fn heartbeat(&self, origin: &Origin, now: Instant) {
         if !self.bus.queue.is_guarded() {
             return self.image.renew_lease(now);

@@ -1,4 +1,4 @@
-//! Orders on their way into the queue of a bus, and the refusal of those that do not get there.
+//! Placing commands in the queue of a bus, and refusing those that cannot be placed.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -16,7 +16,7 @@ use crate::drive::{ModelPoint, Value};
 use crate::event::RefusedCommand;
 use crate::process_image::Reading;
 
-/// Who gives an order, what that client may do at all, until when it may be sent, when its head came, and now.
+/// Who gives a command, what that client may do at all, until when it may be sent, when its head came, and now.
 struct Terms {
     origin: Origin,
     authority: Authority,
@@ -25,7 +25,7 @@ struct Terms {
     now: Instant,
 }
 
-/// What an order sets, with the values that are known before it.
+/// What a command sets, with the values that are known before it.
 pub(super) fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
     let is = |point: ModelPoint, index: usize| reading.spec.profile.model_index(point) == Some(index);
     match order {
@@ -77,7 +77,7 @@ pub(super) fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
     }
 }
 
-/// Answers a command that is not taken; audited and counted.
+/// Refuses a command; audited and counted.
 pub fn turn_away(
     writes: &Arc<WriteStats>,
     drive: &str,
@@ -95,8 +95,9 @@ pub fn turn_away(
 }
 
 impl BusHandle {
-    /// Gives the drive of `reading`, at place `drive` on this bus, an order of the gateway itself: a point of the model and
-    /// its value. No client is behind it, so it renews no lease, and no newer reference of a client takes its place.
+    /// Gives the drive of `reading`, at place `drive` on this bus, a command of the gateway itself: a point of the
+    /// model and its value. No client is after it, so it renews no lease, and no newer reference of a client takes its
+    /// place.
     ///
     /// # Errors
     /// The refusal; it is neither audited nor counted.
@@ -128,17 +129,17 @@ impl BusHandle {
 }
 
 impl DriveHandle {
-    /// Gives an order to the drive, at `now`. When this returns it is in the queue of the bus, behind all that was placed
-    /// before, or answered: refused when it is not admitted, not sent when the bus is down or the drive offline.
+    /// Gives a command to the drive, at `now`. When this returns it is in the queue of the bus, behind all that was
+    /// placed before, or answered: refused when it is not admitted, not sent when the bus is down or the drive offline.
     ///
-    /// `authority` says what the client may do at all. The order is not sent later than `expiry` from now. Refused writes
-    /// are audited and published as an event. Of an order that stops and does more, the stop is carried out whatever becomes of
-    /// the rest; it is audited as two.
+    /// `authority` says what the client may do at all. The order is not sent later than `expiry` from now. Refused
+    /// writes are audited and published as an event. Of a command that stops and does more, the stop is carried out
+    /// whatever becomes of the rest; it is audited as two.
     pub fn place(&self, order: Order, origin: Origin, authority: Authority, expiry: Duration, now: Instant) -> Placed {
         self.place_asked(order, origin, authority, expiry, now, now)
     }
 
-    /// The same of an order whose head came at `asked`: no stop that came in since is undone by it.
+    /// The same of a command whose head came at `asked`: no stop that came in since is undone by it.
     pub fn place_asked(
         &self,
         order: Order,
@@ -166,7 +167,7 @@ impl DriveHandle {
         }
     }
 
-    /// As [`DriveHandle::place`] for an order whose stop was understood and whose rest, `what`, is refused.
+    /// As [`DriveHandle::place`] for a command whose stop was understood and whose rest, `what`, is refused.
     pub fn place_stop(
         &self,
         stop: Order,
@@ -238,7 +239,7 @@ impl DriveHandle {
         placed
     }
 
-    /// The stop of an order goes to the bus, and its rest behind it unless it is refused.
+    /// The stop of a command goes to the bus, and its rest after it unless it is refused.
     fn place_parts(&self, stop: Order, (what, rest): (&str, Result<Order, Refusal>), terms: Terms) -> Placed {
         let Terms {
             origin,
@@ -310,7 +311,7 @@ impl DriveHandle {
         (ticket.with_changes(sets), answer)
     }
 
-    /// What becomes of an order at once: why it is not sent, or that it may be.
+    /// What becomes of a command at once: why it is not sent, or that it may be.
     fn judge(
         &self,
         order: Order,
@@ -350,7 +351,7 @@ impl DriveHandle {
         }
     }
 
-    /// Answers an order that is not sent. Reads that nothing answers are no commands, and no event.
+    /// Answers a command that is not sent. Reads that nothing answers are no commands, and no event.
     fn turn_away(&self, ticket: Ticket, what: &str, outcome: Outcome, write: bool, now: Instant) {
         if let Outcome::Refused(refusal) = &outcome
             && write
@@ -360,8 +361,8 @@ impl DriveHandle {
         ticket.answer(outcome, now);
     }
 
-    /// Asks the drive for something at the lowest rank, at `now`; nothing is sent later than `expiry` from now. What came of
-    /// it; a read on a line that another master owns is refused.
+    /// Asks the drive for something at the lowest rank, at `now`; nothing is sent later than `expiry` from now. The
+    /// result of it; a read on a line that another master owns is refused.
     pub async fn read_in_background(
         &self,
         pdu: RequestPdu,
@@ -399,7 +400,7 @@ impl DriveHandle {
         answer.await.map_or(Outcome::ShuttingDown, |answer| answer.outcome)
     }
 
-    /// Refuses a command before it became an order; audited, counted and published like any other refusal.
+    /// Refuses a command before it became a command; audited, counted and published like any other refusal.
     pub fn refuse(&self, what: &str, refusal: Refusal, origin: Origin, now: Instant) -> Answer {
         self.publish_refusal(what, &refusal, &origin, now);
         let name = &self.image.spec.name;

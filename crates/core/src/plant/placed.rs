@@ -1,4 +1,4 @@
-//! An order that was given: where its answer and its confirmation arrive.
+//! A command that was given: where its answer and its confirmation arrive.
 
 use std::future::poll_fn;
 use std::pin::Pin;
@@ -9,7 +9,7 @@ use tokio::sync::oneshot;
 
 use crate::command::{Answer, Outcome, joined};
 
-/// What reads showed of an order that was acknowledged; nothing of any other.
+/// What reads showed of a command that was acknowledged; nothing of any other.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Shown {
     /// Time from acceptance to the read that showed its effect.
@@ -18,18 +18,19 @@ pub struct Shown {
     pub unseen: Option<String>,
 }
 
-/// An order that is in the queue of its bus, or was answered already. Nothing here needs a runtime: who has a task waits
-/// with [`Placed::answered`], who has none asks now and then with [`Placed::answer`]. Dropping it takes nothing back.
+/// A command that is in the queue of its bus, or was answered already. Nothing here needs a runtime: who has a task
+/// waits with [`Placed::answered`], who has none asks now and then with [`Placed::answer`]. Dropping it takes nothing
+/// back.
 #[derive(Debug)]
 pub struct Placed {
     accepted: Instant,
-    /// Of an order that stops and does more: of its stop.
+    /// Of a command that stops and does more: of its stop.
     answer: Arriving<Answer>,
     confirmation: Arriving<Result<Duration, String>>,
     rest: Option<Box<Rest>>,
 }
 
-/// What arrives of the rest of an order.
+/// What arrives of the rest of a command.
 #[derive(Debug)]
 struct Rest {
     answer: Arriving<Answer>,
@@ -50,7 +51,7 @@ impl Placed {
         }
     }
 
-    /// The same for an order of which that was the stop: the one answer tells what became of both parts.
+    /// The same for a command of which that was the stop: the one answer tells the result of both parts.
     pub(super) fn with_rest(
         mut self,
         answer: oneshot::Receiver<Answer>,
@@ -78,7 +79,7 @@ impl Placed {
         poll_fn(|cx| self.poll_answer(cx)).await
     }
 
-    /// As [`Placed::answered`], for whoever waits for several things.
+    /// As [`Placed::answered`], for anyone who waits for several things.
     pub fn poll_answer(&mut self, cx: &mut Context<'_>) -> Poll<Answer> {
         let stop = answer_of(&mut self.answer, cx);
         let Some(rest) = &mut self.rest else { return stop };
@@ -136,7 +137,7 @@ impl Placed {
         }
     }
 
-    /// As [`Placed::confirmation`], for whoever waits for several things.
+    /// As [`Placed::confirmation`], for anyone who waits for several things.
     pub fn poll_confirmation(&mut self, cx: &mut Context<'_>) -> Poll<Option<Duration>> {
         let stop = self.confirmation.poll(cx).map(|seen| seen.and_then(Result::ok));
         let Some(rest) = &mut self.rest else { return stop };
@@ -157,7 +158,7 @@ fn answer_of(arriving: &mut Arriving<Answer>, cx: &mut Context<'_>) -> Poll<Answ
     })
 }
 
-/// What arrives once, for whoever asks, as often as they ask.
+/// What arrives once, for anyone who asks, as often as they ask.
 #[derive(Debug)]
 enum Arriving<T> {
     Awaited(oneshot::Receiver<T>),

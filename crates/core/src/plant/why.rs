@@ -1,4 +1,4 @@
-//! Gathers what is known of a drive beside its points, for the causes why it does not run.
+//! Gathers what is known of a drive besides its points, for the causes why it does not run.
 
 use std::time::Duration;
 

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
 
-/// How an exchange ended.
+/// How a transaction ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
@@ -15,7 +15,7 @@ pub enum Outcome {
     Exception,
     /// No answer within the deadline.
     Timeout,
-    /// An answer that cannot be believed.
+    /// An invalid reply.
     Corrupt,
 }
 
@@ -107,7 +107,7 @@ impl Default for Histogram {
 }
 
 impl Histogram {
-    /// An empty histogram of exchanges and cycles.
+    /// An empty histogram of transactions and cycles.
     pub fn new() -> Histogram {
         Histogram::of(&BOUNDS)
     }

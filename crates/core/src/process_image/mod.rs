@@ -1,6 +1,6 @@
 //! The process image: what is known of every drive and bus. One writer a bus, any number of readers.
 //!
-//! The writer replaces a drive's [`Snapshot`] as a whole after each exchange, so a reader always sees the
+//! The writer replaces a drive's [`Snapshot`] as a whole after each transaction, so a reader always sees the
 //! registers of one poll together: a torn 32-bit value is impossible, and nobody waits for anybody.
 
 mod contradiction;
@@ -52,7 +52,7 @@ pub enum ParamsAccess {
     Write,
 }
 
-/// What is done when a drive's lease runs out.
+/// What is done when a drive's lease expires.
 #[derive(Debug, Clone, PartialEq)]
 pub enum LeaseAction {
     /// Stop the drive.
@@ -66,7 +66,7 @@ pub enum LeaseAction {
 /// Lease of a drive, renewed by commands that reach the wire and by accepted heartbeats.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Supervision {
-    /// Time without renewal after which the lease runs out.
+    /// Time without renewal after which the lease expires.
     pub timeout: Duration,
     /// What is done then, once.
     pub action: LeaseAction,
@@ -117,9 +117,9 @@ pub struct DriveSpec {
     pub turnaround: Duration,
     /// Minimum and maximum frequency, Hz, where the drive's own parameters cannot be read.
     pub frequency_range: Option<RangeInclusive<f64>>,
-    /// Values beside faults at which a recording is made.
+    /// Values besides faults at which a recording is made.
     pub triggers: Vec<PointTrigger>,
-    /// What raw writes may set beside writable points.
+    /// What raw writes may set besides writable points.
     pub raw_writes: RawWrites,
     /// What may be done with its parameters.
     pub params: ParamsAccess,
@@ -333,14 +333,14 @@ impl DriveImage {
         }
     }
 
-    /// Counts one exchange.
+    /// Counts one transaction.
     pub fn count(&self, outcome: Outcome) {
         if let Some(counter) = self.outcomes.get(outcome as usize) {
             counter.fetch_add(1, Ordering::Relaxed);
         }
     }
 
-    /// Exchanges of that outcome so far.
+    /// Transactions of that outcome so far.
     pub fn counted(&self, outcome: Outcome) -> u64 {
         self.outcomes
             .get(outcome as usize)
@@ -369,7 +369,7 @@ impl DriveImage {
         self.turnarounds.snapshot()
     }
 
-    /// A commanding client sent its heartbeat: the lease runs anew.
+    /// A commanding client sent its heartbeat: the lease runs again.
     pub fn renew_lease(&self, now: Instant) {
         if self.spec.supervision.is_some() {
             *self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner) = Some(now);
@@ -406,12 +406,12 @@ impl DriveImage {
         self.supervision_failures.load(Ordering::Relaxed)
     }
 
-    /// Counts a lease that ran out while the drive ran, or had its run command.
+    /// Counts a lease that expired while the drive ran, or had its run command.
     pub fn count_supervision(&self) {
         self.supervisions.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Leases that ran out so, so far.
+    /// Leases that expired so, so far.
     pub fn supervisions(&self) -> u64 {
         self.supervisions.load(Ordering::Relaxed)
     }
@@ -424,13 +424,13 @@ pub struct BusImage {
     pub spec: BusSpec,
     /// Its drives, in the order of the file.
     pub drives: Vec<Arc<DriveImage>>,
-    /// Time of whole exchanges, s.
+    /// Time of whole transactions, s.
     pub transactions: Histogram,
     /// Achieved cycle of the fast class, s.
     pub fast_cycles: Histogram,
     /// Achieved cycle of the slow class, s.
     pub slow_cycles: Histogram,
-    /// The frames on the line, for whoever listens.
+    /// The frames on the line, for anyone who listens.
     pub trace: Trace,
     /// What is read and what is on the line, for recorder, trends and counters.
     pub tape: Tape,
@@ -465,7 +465,7 @@ impl BusImage {
         self.health.lock().unwrap_or_else(PoisonError::into_inner).up
     }
 
-    /// Whether it was tried to open its port, as a reload starts the bus anew.
+    /// Whether it was tried to open its port, as a reload starts the bus again.
     pub fn is_tried(&self) -> bool {
         self.health.lock().unwrap_or_else(PoisonError::into_inner).tried
     }
@@ -475,12 +475,12 @@ impl BusImage {
         change(&mut self.health.lock().unwrap_or_else(PoisonError::into_inner));
     }
 
-    /// Exchanges of all drives so far.
+    /// Transactions of all drives so far.
     pub fn transactions_total(&self) -> u64 {
         Outcome::ALL.iter().map(|&o| self.counted(o)).sum()
     }
 
-    /// Exchanges that failed: no or no sound answer.
+    /// Transactions that failed: no or no sound answer.
     pub fn errors_total(&self) -> u64 {
         self.counted(Outcome::Timeout) + self.counted(Outcome::Corrupt)
     }
@@ -525,7 +525,7 @@ impl DriveSpec {
         self.guard.is_some() || self.staggers || !self.interlocks.is_empty()
     }
 
-    /// The drives with which it shares `stagger`, for people: those of its group, else those of its bus.
+    /// The drives with which it shares `stagger`, as text: those of its group, else those of its bus.
     pub fn starts_with(&self) -> Arc<str> {
         match &self.group {
             Some(group) => format!("group `{group}`").into(),

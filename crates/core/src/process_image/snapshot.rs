@@ -35,8 +35,8 @@ impl Link {
     }
 }
 
-/// How often something is heard on a line that another master owns, learned from the times between; tenths of a second, 0 is
-/// not known.
+/// How often something is received on a line that another master owns, learned from the times between; tenths of a
+/// second, 0 is not known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Cadence(u16);
 
@@ -54,7 +54,7 @@ impl Cadence {
         Cadence(interval.max(self.0 - self.0.div_ceil(4)).min(most))
     }
 
-    /// Three intervals: what was not heard again within is not good any more.
+    /// Three intervals: what was not heard again within is no longer good.
     pub fn good_for(self) -> Duration {
         Duration::from_millis(300) * u32::from(self.0)
     }
@@ -243,7 +243,7 @@ impl Snapshot {
 pub struct Reading<'d> {
     /// As configured.
     pub spec: &'d DriveSpec,
-    /// Why it takes no commands but stops, if that is so; none of a past in which nobody gives orders.
+    /// Why it takes no commands but stops, if that is so; none of a past in which nobody gives commands.
     pub hold: Option<&'d Hold>,
     /// What is known.
     pub snapshot: Arc<Snapshot>,

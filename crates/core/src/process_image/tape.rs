@@ -13,7 +13,7 @@ use crate::codec::Table;
 /// Bytes that wait for the recorder at most; what comes beyond is counted and dropped.
 pub const TAPE_BYTES: usize = 1 << 20;
 
-/// How an exchange looked on the line.
+/// How a transaction looked on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
@@ -27,7 +27,7 @@ pub enum Verdict {
     Timeout,
     /// What came cannot be believed.
     Corrupt,
-    /// Bytes between two exchanges.
+    /// Bytes between two transactions.
     Foreign,
 }
 
@@ -42,7 +42,7 @@ impl Verdict {
         Verdict::Foreign,
     ];
 
-    /// Whether the exchange failed.
+    /// Whether the transaction failed.
     pub fn is_error(self) -> bool {
         matches!(self, Verdict::Timeout | Verdict::Corrupt)
     }
@@ -60,12 +60,12 @@ pub struct TapedRead {
     pub words: Arc<[u16]>,
 }
 
-/// Bytes on the line: a request, or all that came until its exchange was over.
+/// Bytes on the line: a request, or all that came until its transaction was over.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TapedFrame {
-    /// A request: when it was given to the port. Else when the last of it came, or the exchange was given up.
+    /// A request: when it was given to the port. Else when the last of it came, or the transaction was given up.
     pub at: Instant,
-    /// Place of the drive that was asked; none for bytes between two exchanges.
+    /// Place of the drive that was asked; none for bytes between two transactions.
     pub drive: Option<usize>,
     /// What it was.
     pub verdict: Verdict,
@@ -150,7 +150,8 @@ impl Tape {
         self.taping.load(Ordering::Relaxed) >= taping as u8
     }
 
-    /// The drive at that place was read. `read` is only called while somebody takes it. Only the bus itself may call this.
+    /// The drive at that place was read. `read` is only called while someone takes it. Only the bus itself may call
+    /// this.
     pub fn read(&self, drive: usize, read: impl FnOnce() -> TapedRead) {
         if self.takes(Taping::Reads) {
             self.append(Taped::Read(drive, read()));

@@ -1,4 +1,4 @@
-//! The frames on a line, for whoever listens; costs nothing while nobody does.
+//! The frames on a line, for anyone who listens; costs nothing while nobody does.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -25,17 +25,17 @@ pub struct FrameRecord {
     /// it was given up.
     pub time: SystemTime,
     /// From the end of the frame before (the opening of the port, if there is none) to the beginning of this one; none
-    /// where nothing came. Ends of requests and beginnings of replies are reckoned from the time on the wire.
+    /// where nothing came. Ends of requests and beginnings of replies are calculated from the time on the wire.
     pub gap: Option<Duration>,
     /// Who sent it.
     pub direction: Direction,
-    /// The drive that was asked; none for bytes that came between two exchanges.
+    /// The drive that was asked; none for bytes that came between two transactions.
     pub drive: Option<String>,
     /// The bytes on the wire; empty where nothing came.
     pub bytes: Vec<u8>,
     /// The bytes in plain words ([`crate::codec::describe`]).
     pub decode: String,
-    /// What became of it: empty for a request, then `ok`, `exception 02 …`, `corrupt: …`, `foreign`, `echo`, `timeout`.
+    /// The result: empty for a request, then `ok`, `exception 02 …`, `corrupt: …`, `foreign`, `echo`, `timeout`.
     pub verdict: String,
 }
 
@@ -50,7 +50,7 @@ impl Default for Trace {
 }
 
 impl Trace {
-    /// Whether somebody listens.
+    /// Whether someone listens.
     pub fn wanted(&self) -> bool {
         self.0.receiver_count() > 0
     }

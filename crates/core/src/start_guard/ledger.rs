@@ -134,7 +134,7 @@ impl Guards {
         ledger.to_write(Instant::now(), SystemTime::now())
     }
 
-    /// What became of a write.
+    /// The result of a write.
     pub fn wrote(&self, generation: u64, done: Result<(), String>) {
         let mut ledger = self.lock();
         if let Disk::File { written, failed } = &mut ledger.disk {

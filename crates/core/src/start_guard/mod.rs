@@ -1,10 +1,10 @@
 //! Guards of starts: how often, how soon and how close together motors may be started, and what must hold before.
 //!
-//! A start is the passage of a motor from standing to running, by whomever. One [`Guards`] for the whole gateway counts them,
-//! since drives of several buses can belong to one group; every bus has its view of it, [`BusGuards`]. An order is judged when
-//! it is accepted ([`BusGuards::refuses`]), when its turn comes ([`BusGuards::clear`]), and before each of its writes
-//! ([`BusGuards::may_write`]). A start that is cleared counts from that moment, and is not written before it is on disk
-//! ([`keep`]). Stops ask nobody here, but for those that `min_run` delays.
+//! A start is the passage of a motor from standing to running, by whomever. One [`Guards`] for the whole gateway counts
+//! them, since drives of several buses can belong to one group; every bus has its view of it, [`BusGuards`]. A command
+//! is judged when it is accepted ([`BusGuards::refuses`]), when its turn comes ([`BusGuards::clear`]), and before each
+//! of its writes ([`BusGuards::may_write`]). A start that is cleared counts from that moment, and is not written before
+//! it is on disk ([`keep`]). Stops ask nobody here, but for those that `min_run` delays.
 //!
 //! - `motor`: what is known of one motor, and the rules. `ledger`: all motors, groups, and what is to be written.
 //! - `interlock`: whether the points hold that a start needs. `view`: the judgement.
@@ -116,7 +116,7 @@ impl std::fmt::Display for Guarded {
     }
 }
 
-/// A time for people: tenths below ten seconds, never 0 where something is left.
+/// A time as text: tenths below ten seconds, never 0 where something is left.
 fn shown(time: Duration) -> String {
     let tenths = time.as_millis().div_ceil(100);
     match tenths {

@@ -8,7 +8,7 @@ use super::{Guard, Guarded, MOST_STARTS, Reason, shown};
 
 /// The window of `starts_per_hour`.
 pub(super) const HOUR: Duration = Duration::from_secs(3600);
-/// A motor that is seen to start so soon after an order that starts it was started by that.
+/// A motor that is seen to start so soon after a command that starts it was started by that.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);
 /// For so long after the word that starts it a motor may still read as standing.
 const SETTLES: Duration = Duration::from_secs(1);
@@ -82,8 +82,8 @@ impl Motor {
         self.starts.iter().copied().chain(reserved)
     }
 
-    /// Whether an order to run, written now, starts it: it does not run for certain. One that slows down after a stop may stand
-    /// by the time the order reaches it.
+    /// Whether a command to run, written now, starts it: it does not run for certain. One that slows down after a stop
+    /// may stand by the time the order reaches it.
     pub(super) fn is_started_by_run(&self) -> bool {
         let since_stop = |at: Instant| self.stop_written.is_none_or(|stop| at > stop);
         let written = self.written.map(|(_, written)| written);
@@ -104,7 +104,7 @@ impl Motor {
         reserved || self.written.is_some_and(|(of, _)| of == number)
     }
 
-    /// Why it may not be started now, beside its group.
+    /// Why it may not be started now, besides its group.
     pub(super) fn hindered(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
         self.too_often(guard, now)
             .into_iter()
@@ -183,7 +183,7 @@ impl Motor {
         }
         self.written = Some((number, now));
         self.is_awaited = true;
-        // It is to be seen to stand anew, also where it was never seen to run.
+        // It is to be seen to stand again, also where it was never seen to run.
         self.stands_since = None;
         self.started = Some(Started {
             at: now,

@@ -1,4 +1,4 @@
-//! The guards of one bus: whether an order to its drives may start them. Pure: time is an argument.
+//! The guards of one bus: whether a command to its drives may start them. Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -89,7 +89,7 @@ impl BusGuards {
         self.of_drive(drive).is_some()
     }
 
-    /// Why an order with that effect is not accepted; counted. One that may wait does so until `waits_until`.
+    /// Why a command with that effect is not accepted; counted. One that may wait does so until `waits_until`.
     pub fn refuses(&self, drive: usize, effect: Effect, waits_until: Option<Instant>, now: Instant) -> Option<Refusal> {
         let of = self.of_drive(drive).filter(|_| effect.run == Some(true))?;
         let mut ledger = self.shared.lock();
@@ -104,7 +104,7 @@ impl BusGuards {
         Some(refusal(refused))
     }
 
-    /// What keeps the motor from being started now, for people; not counted.
+    /// What keeps the motor from being started now, as text; not counted.
     pub fn hindrance(&self, drive: usize, now: Instant) -> Option<Guarded> {
         let of = self.of_drive(drive)?;
         let interlocked = self.interlocked(of, now);
@@ -275,7 +275,7 @@ impl BusGuards {
         refused.map_or(Ok(()), |refused| Err(refusal(refused)))
     }
 
-    /// A begun command was refused so.
+    /// A started command was refused so.
     pub fn count_refused(&self, drive: usize, refusal: &Refusal) {
         let reason = match refusal {
             Refusal::Guarded(guarded) => guarded.reason,
@@ -294,7 +294,7 @@ impl BusGuards {
         }
     }
 
-    /// A command that was cleared is over: what it did not write counts as made.
+    /// A command that was cleared has ended: what it did not write counts as made.
     pub fn settle(&self, drive: usize, number: u64) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().settle(&of.machine, Some(number));

@@ -1,9 +1,9 @@
 //! Stop all: every controlled drive of the gateway, of a bus or of a group, each with a stop of its own that is watched until
 //! the motor stands.
 //!
-//! One mechanism for all north sides: [`StopAll::order`] places the stops before it returns, a task of the gateway calls
-//! [`StopAll::look`] while an order is under way, and [`StopAll::begun`] wakes it. Where every drive of a bus is concerned and
-//! known to obey it, one broadcast goes before their stops. Pure: time is an argument.
+//! One mechanism for all north sides: [`StopAll::order`] places the stops before it returns, a task of the gateway
+//! calls [`StopAll::look`] while a command is in progress, and [`StopAll::begun`] wakes it. Where every drive of a bus
+//! is concerned and known to obey it, one broadcast goes before their stops. Pure: time is an argument.
 
 mod one_stop;
 mod scope;
@@ -26,18 +26,18 @@ use crate::command::{Authority, Origin};
 use crate::plant::{BusHandle, DriveHandle, Exchange, Plant, Question};
 use crate::process_image::{Access, Machine};
 
-/// Time after which an order is answered though not every drive stands, unless it says otherwise.
+/// Time after which a command is answered though not every drive stands, unless it says otherwise.
 pub const WAIT: Duration = Duration::from_secs(10);
 /// Longest such time.
 pub const LONGEST_WAIT: Duration = Duration::from_secs(60);
-/// Time between two looks at an order that is under way.
+/// Time between two looks at a command that is in progress.
 pub const LOOK: Duration = Duration::from_millis(20);
 /// Time for the broadcast to go onto the line; the stops of the drives do not wait for it.
 const BROADCAST: Duration = Duration::from_millis(500);
-/// Orders that wait for their answers; beyond that the oldest is answered with what is known.
+/// Commands that wait for their answers; beyond that the oldest is answered with what is known.
 const MOST_ORDERS: usize = 256;
 
-/// What became of a drive.
+/// The result of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Stopped {
@@ -54,14 +54,14 @@ pub enum Stopped {
 pub struct StoppedDrive {
     /// Its name.
     pub drive: String,
-    /// What became of it.
+    /// The result.
     pub outcome: Stopped,
     /// Why it is not known to stand.
     #[serde(default)]
     pub reason: Option<String>,
 }
 
-/// The one answer to an order.
+/// The one answer to a command.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct StopReport {
     /// Every drive stands.
@@ -77,16 +77,16 @@ impl StopReport {
     }
 }
 
-/// Where the answers to an order arrive. A sender that is gone means that the process ends.
+/// Where the answers to a command arrive. A sender that is gone means that the process ends.
 #[derive(Debug)]
 pub struct StopOrder {
     /// Once every stop was acknowledged, or failed for the first time: whether none failed.
     pub acknowledged: oneshot::Receiver<bool>,
-    /// Once every drive stands, or the time is over.
+    /// Once every drive stands, or the time has ended.
     pub report: oneshot::Receiver<StopReport>,
 }
 
-/// The orders that are under way.
+/// The commands that are in progress.
 #[derive(Debug, Default)]
 pub struct StopAll {
     state: Mutex<State>,
@@ -95,7 +95,7 @@ pub struct StopAll {
 
 #[derive(Debug, Default)]
 struct State {
-    /// Each machine once, for all orders that concern it.
+    /// Each machine once, for all commands that concern it.
     stops: Vec<OneStop>,
     orders: Vec<UnderWay>,
     /// Dropped, they are taken back where they were not sent.
@@ -149,13 +149,13 @@ impl StopAll {
         })
     }
 
-    /// Waits until an order is under way.
+    /// Waits until a command is in progress.
     pub async fn begun(&self) {
         self.begun.notified().await;
     }
 
-    /// Looks what became of the stops, orders those again that failed, and answers what is done. Whether an order is still under
-    /// way.
+    /// Looks the result of the stops, commands those again that failed, and answers what is done. Whether a command is
+    /// still in progress.
     pub fn look(&self, plant: &Plant, now: Instant) -> bool {
         let mut state = self.state();
         state.look(plant, now);

@@ -20,7 +20,7 @@ pub(crate) struct OneStop {
     drive: String,
     origin: Origin,
     step: Step,
-    /// What became of it the last time that it failed.
+    /// The result the last time that it failed.
     failed: Option<String>,
     /// Wait before the next try.
     pause: Duration,
@@ -101,7 +101,7 @@ impl OneStop {
         self.failed.is_some()
     }
 
-    /// Looks what became of it, and places it again where it failed. A reload may have put the drive elsewhere.
+    /// Looks the result, and places it again where it failed. A reload may have put the drive elsewhere.
     pub(crate) fn look(&mut self, plant: &Plant, now: Instant) {
         match &mut self.step {
             Step::Placed(placed) => {

@@ -1,9 +1,9 @@
-//! Which drives an order stops.
+//! Which drives a command stops.
 
 use crate::plant::{DriveHandle, Plant};
 use crate::process_image::Access;
 
-/// Which drives an order stops; of them those that are controlled.
+/// Which drives a command stops; of them those that are controlled.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Scope {
     /// All of the gateway.
@@ -16,7 +16,7 @@ pub enum Scope {
     Group(String),
 }
 
-/// Why an order stops nothing.
+/// Why a command stops nothing.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NothingToStop {
     /// There is no such bus or group.

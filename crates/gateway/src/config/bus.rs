@@ -19,7 +19,7 @@ const LONG_TIMEOUT: Duration = Duration::from_secs(1);
 /// Longest fixed silence.
 const MOST_SILENCE: Duration = Duration::from_secs(1);
 
-/// What is known of a bus even when a part of it is wrong.
+/// The settings of a bus, as far as they are valid.
 pub(super) struct Found {
     pub(super) name: Option<(String, Place)>,
     pub(super) port: Option<(String, Place)>,
@@ -330,7 +330,7 @@ fn check_format(reader: &Reader<'_>, format: &LineFormat, drives: &[DriveSpec]) 
     }
 }
 
-/// What is valid but fits the drives badly.
+/// Warns about valid settings that suit the drives badly.
 fn check_fit(reader: &Reader<'_>, format: &LineFormat, options: &BusOptions, drives: &[DriveSpec]) {
     let mut reported: Vec<&str> = Vec::new();
     check_format(reader, format, drives);

@@ -22,7 +22,7 @@ const MOST_NAMED: usize = 4;
 
 type Limits = BTreeMap<String, RangeInclusive<f64>>;
 
-/// What is known of a drive even when a part of it is wrong.
+/// The settings of a drive, as far as they are valid.
 pub(super) struct Found {
     pub(super) name: Option<(String, Place)>,
     pub(super) address: Option<(u8, Place)>,
@@ -38,7 +38,7 @@ pub(super) struct Found {
     pub(super) spec: Option<DriveSpec>,
 }
 
-/// What a drive takes from its surroundings.
+/// What a drive inherits from its bus and gateway.
 pub(super) struct Surroundings<'a> {
     pub(super) bus: &'a str,
     pub(super) protocol: Protocol,
@@ -261,7 +261,7 @@ fn read_trigger(table: &Reader<'_>, profile: Option<&Profile>) -> Option<PointTr
     })
 }
 
-/// A number that is read without being asked for.
+/// A polled numeric point.
 fn trigger_point(name: &str, profile: &Profile) -> Result<usize, Finding> {
     let plan = Plan::of(profile);
     let is_number = |index: usize| {

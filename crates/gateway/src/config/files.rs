@@ -1,4 +1,4 @@
-//! What files of certificates and secrets lead to: errors, and warnings about who can read them and when they expire.
+//! Checks files of certificates and secrets: errors, and warnings about who can read them and when they expire.
 
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;

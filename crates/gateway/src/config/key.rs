@@ -24,7 +24,7 @@ pub(super) struct Key<T: 'static> {
     pub(super) meaning: &'static str,
 }
 
-/// What holds when a key is absent.
+/// The value of an absent key.
 pub(super) enum Preset {
     /// The key must be there.
     Required,
@@ -32,7 +32,7 @@ pub(super) enum Preset {
     Value(&'static str),
     /// The value on a bus of this protocol, in notation that is both TOML and JSON.
     ByProtocol(fn(Protocol) -> String),
-    /// What the loader decides, in words.
+    /// Decided by the loader; as text.
     Words(&'static str),
 }
 
@@ -267,7 +267,8 @@ impl<T> Form<T> for Parsed<T> {
     }
 }
 
-/// The value of a key whose type says less than its range: that is what is to be written in place of one of another type.
+/// The value of a key whose type says less than its range: that is what is to be written instead of one of another
+/// type.
 fn of_type<T: FromNode>(reader: &Reader<'_>, key: &str, range: &str) -> Option<T> {
     let value = T::from_node(reader.raw(key)?);
     reader.accept(
@@ -405,7 +406,7 @@ impl<T: Clone> Form<T> for Words<T> {
 /// A list of strings, each parsed; every bad item is a problem.
 pub(super) struct List<T> {
     pub(super) parse: fn(&str) -> Result<T, Finding>,
-    /// What to do about an empty list, where it may not be empty.
+    /// The remedy for an empty list, if it may not be empty.
     pub(super) empty: Option<&'static str>,
     pub(super) range: &'static str,
 }

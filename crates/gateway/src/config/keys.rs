@@ -589,8 +589,8 @@ keys! {
         }, default "64MiB";
     }
 
-    /// The gateway as an edge node of [Sparkplug B](sparkplug.md), on a connection of its own to the same broker; its client
-    /// id is that of `[mqtt]` with `-sparkplug` behind it.
+    /// The gateway as an edge node of [Sparkplug B](sparkplug.md), on a connection of its own to the same broker; its
+    /// client id is that of `[mqtt]` with `-sparkplug` after it.
     SPARKPLUG: Sparkplug {
         /// Group id: second level of all its topics.
         group: String = SPARKPLUG_ID, required;

@@ -16,13 +16,13 @@ pub enum LogFormat {
     Auto,
     /// Lines with a priority for the journal, without time.
     Journal,
-    /// Lines for people, coloured on a terminal.
+    /// Lines as text, coloured on a terminal.
     Text,
     /// One JSON object per line.
     Json,
 }
 
-/// What is logged, and how.
+/// The settings of the log.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LogSettings {
     /// Level, also per target: `info,drivegate::bus=debug`. Checked: every part is a level or

@@ -72,11 +72,11 @@ pub struct Settings {
     pub gateway: String,
     /// Where `drivegate read` and `drivegate write` reach the gateway.
     pub socket: SocketPath,
-    /// Directory of what the gateway keeps.
+    /// Directory for stored data.
     pub state_dir: PathBuf,
     /// Whether events and counters are kept there: always true as configured, false where something less than a gateway runs.
     pub keeps_history: bool,
-    /// What the recorder keeps.
+    /// The settings of the recorder.
     pub recordings: RecorderOptions,
     /// How parameters are read and kept.
     pub params: ParamsSettings,
@@ -106,16 +106,16 @@ pub struct Settings {
     pub drill: Option<DrillOptions>,
     /// File of all commands; absent: not written.
     pub audit: Option<AuditFileOptions>,
-    /// What is logged.
+    /// The settings of the log.
     pub log: LogSettings,
 }
 
 /// One bus with its drives.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BusSettings {
-    /// What other rooms see of it.
+    /// The part used by other crates.
     pub spec: BusSpec,
-    /// What only the bus itself uses.
+    /// The part used only by the bus itself.
     pub options: BusOptions,
     /// In the order of the file.
     pub drives: Vec<DriveSpec>,
@@ -153,9 +153,9 @@ impl BusSettings {
 pub struct Loaded {
     /// The settings; absent when there is any error.
     pub settings: Option<Settings>,
-    /// What must be fixed.
+    /// The errors.
     pub errors: Vec<Problem>,
-    /// What works but probably not as intended.
+    /// The warnings: valid, but probably not as intended.
     pub warnings: Vec<Problem>,
 }
 
@@ -194,7 +194,7 @@ impl Settings {
 
 /// Default path of the configuration.
 pub const DEFAULT_FILE: &str = "/etc/drivegate/drivegate.toml";
-/// What to do where there is no configuration yet.
+/// The remedy if there is no configuration yet.
 const NO_FILE: &str = "name the file with --config; `drivegate try` finds drives and writes a configuration";
 
 impl Settings {

@@ -8,7 +8,7 @@ use super::{ENVIRONMENT, values};
 use crate::config::key::Key;
 use crate::document::{self, Document, Reader};
 
-/// What a file is.
+/// The kind of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FileKind {
     /// The configuration itself.
@@ -28,7 +28,7 @@ pub struct NamedFile {
     pub key: String,
     /// The file.
     pub path: PathBuf,
-    /// What it is.
+    /// Its kind.
     pub kind: FileKind,
 }
 

@@ -1,4 +1,4 @@
-//! `[http]`, and what all listeners share.
+//! `[http]`, and settings shared by all listeners.
 
 use std::net::SocketAddr;
 use std::path::Path;
@@ -108,7 +108,7 @@ fn credentials<C: Credential>(
     }
 }
 
-/// Whether commands can be on: somebody has to be known, and passwords must not travel in clear text.
+/// Whether commands can be on: someone has to be known, and passwords must not travel in clear text.
 fn is_safe_to_command(reader: &Reader<'_>, listen: Option<SocketAddr>, has_users: bool) -> bool {
     let key = HTTP.commands.name;
     if !has_users {
@@ -142,7 +142,7 @@ fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<ServerIdentity> {
     })
 }
 
-/// Warns of what the network can read.
+/// Warns about data that the network can read.
 fn warn_of_reach(reader: &Reader<'_>, listen: SocketAddr) {
     if listen.ip().is_loopback() {
         return;

@@ -1,4 +1,4 @@
-//! `[recordings]`: what the recorder keeps.
+//! `[recordings]`: the settings of the recorder.
 
 use std::path::Path;
 

@@ -15,7 +15,7 @@ pub(crate) const UNIT_STOP_TIME: Duration = Duration::from_secs(90);
 /// The part of it that servers, broker and ports may take.
 pub(crate) const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
 
-/// How long the stops of one bus take, one after another, from the end of the current exchange.
+/// How long the stops of one bus take, one after another, from the end of the current transaction.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ShutdownTime {
     /// Drives to stop.
@@ -77,7 +77,7 @@ impl BusSettings {
         time
     }
 
-    /// A whole exchange whose reply begins after `turnaround`.
+    /// A whole transaction whose reply begins after `turnaround`.
     fn exchange(&self, pdu: &RequestPdu, turnaround: Duration) -> Duration {
         let (protocol, format) = (self.spec.protocol, &self.spec.format);
         let silence = protocol.silence(self.options.silence, format);

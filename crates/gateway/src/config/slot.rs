@@ -11,7 +11,7 @@ use crate::document::{Place, Reader};
 use crate::north::slot::{Slot, SlotAccess};
 use crate::process_image::Access;
 
-/// What is known of a slot even when a part of it is wrong.
+/// The settings of a slot, as far as they are valid.
 pub(super) struct Found {
     pub(super) listeners: Vec<Listener>,
     pub(super) pty: Option<(PathBuf, Place)>,

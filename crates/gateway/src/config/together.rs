@@ -1,4 +1,4 @@
-//! What is wrong or doubtful about sections together.
+//! Errors and warnings about combinations of sections.
 
 use std::time::Duration;
 
@@ -16,7 +16,7 @@ pub(super) struct Clients<'c> {
     pub(super) bacnet: Option<&'c bacnet::Bacnet>,
 }
 
-/// Reports what is wrong or doubtful about the sections together.
+/// Checks combinations of sections.
 pub(super) fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients<'_>) {
     let Clients {
         modbus_tcp,
@@ -214,7 +214,7 @@ fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
     }
 }
 
-/// Commanded drives that nothing stops when the commanding client falls silent.
+/// Commanded drives that nothing stops when the commanding client goes silent.
 fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
     for drive in buses.iter().flat_map(|bus| &bus.drives) {
         let (Some(spec), (Access::Control, place)) = (&drive.spec, &drive.access) else {

@@ -1,4 +1,4 @@
-//! What must be unique: names, ports, addresses, units, listeners.
+//! Checks that names, ports, addresses, units and listeners are unique.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;

@@ -1,4 +1,4 @@
-//! What a reload changes, for people. Pure.
+//! The changes of a reload, as text. Pure.
 
 use crate::config::Settings;
 

@@ -52,7 +52,7 @@ fn raise(wanted: usize) -> usize {
     }
 }
 
-/// What requires open files.
+/// The users of open files.
 #[derive(Debug, Clone)]
 struct Wanted {
     buses: usize,

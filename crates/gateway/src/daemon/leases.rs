@@ -16,7 +16,7 @@ const RETURN: Duration = Duration::from_secs(120);
 /// Buses of which that is kept, the latest ones.
 const MOST_BUSES: usize = 64;
 
-/// What the buses that a reload stopped have left, until somebody goes on with it.
+/// What the buses that a reload stopped have left, until someone goes on with it.
 #[derive(Debug, Default)]
 pub(super) struct Leases {
     left: BTreeMap<Machine, Left>,

@@ -1,4 +1,4 @@
-//! Reservations that stops left behind outlive the process: they are written beside the stop, never before it.
+//! Reservations that stops left behind outlive the process: they are written alongside the stop, never before it.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};

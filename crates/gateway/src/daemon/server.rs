@@ -8,8 +8,8 @@ use tokio_util::sync::CancellationToken;
 use crate::north::{NorthStats, Reconfigure, Server, ServerError};
 use crate::plant::SharedPlant;
 
-/// Time for what the clients of a server have begun that a reload takes away, longer than any order waits for its bus; and how often it
-/// is looked whether that is over.
+/// Time for what the clients of a server have started that a reload takes away, longer than any order waits for its
+/// bus; and how often it is looked whether that has ended.
 const RETIRE: (Duration, Duration) = (Duration::from_secs(60), Duration::from_millis(20));
 /// What [`ServerSlot::prepare`] has prepared.
 #[derive(Default)]
@@ -102,7 +102,7 @@ impl<S: Reconfigure + Send + 'static> Running<S>
 where
     S::Options: Send + Sync,
 {
-    /// Stops it behind what its clients have begun, which nobody waits for.
+    /// Stops it behind what its clients have started, which nobody waits for.
     async fn retire(mut self) {
         self.server.retire().await;
         if self.server.is_drained() {

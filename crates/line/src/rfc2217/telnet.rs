@@ -1,6 +1,6 @@
 //! Telnet as far as RFC 2217 needs it: data and commands in one stream of bytes (RFC 854, 855).
 
-/// "Interpret as command"; doubled it is the byte 255 itself.
+/// "Interpret as command"; duplicate it is the byte 255 itself.
 pub(super) const IAC: u8 = 255;
 pub(super) const SE: u8 = 240;
 pub(super) const SB: u8 = 250;
@@ -38,7 +38,7 @@ impl Verb {
     }
 }
 
-/// What the other end says beside data.
+/// What the other end says besides data.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Command {
     /// About an option.
@@ -115,7 +115,7 @@ impl Decoder {
     }
 }
 
-/// Data as it is sent: each 255 doubled.
+/// Data as it is sent: each 255 duplicate.
 pub fn escape(data: &[u8]) -> Vec<u8> {
     let mut escaped = Vec::with_capacity(data.len() + 4);
     for &byte in data {

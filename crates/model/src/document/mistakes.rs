@@ -1,4 +1,4 @@
-//! What people write in place of TOML, and what to write instead. Pure.
+//! What people write instead of TOML, and what to write instead. Pure.
 
 use super::Finding;
 

@@ -4,7 +4,7 @@
 //! [`Problem`]s with file, line and key, so that one run reports every error of a file. A key is known once it was
 //! asked for: [`Reader::finish`] reports the others, each with the nearest known key.
 //!
-//! `tree` holds the values, `value` the types they can be read as, `mistakes` what is often written in place of TOML.
+//! `tree` holds the values, `value` the types they can be read as, `mistakes` what is often written instead of TOML.
 
 mod file;
 mod mistakes;
@@ -136,7 +136,7 @@ impl Document {
             warnings: RefCell::default(),
             known: RefCell::default(),
         };
-        // One bracket that is missing makes an error of every line behind it.
+        // One bracket that is missing makes an error of every line after it.
         for (line, message) in errors.into_iter().take(1) {
             let place = Place {
                 line,

@@ -43,7 +43,7 @@ impl Step {
         }
     }
 
-    /// The heading for people.
+    /// The heading as text.
     pub const fn title(self) -> &'static str {
         match self {
             Step::Connect => "connect",

@@ -252,7 +252,7 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<P
     reads
 }
 
-/// Time an exchange takes on the line.
+/// Time a transaction takes on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WireTime {
     /// Characters of the request.
@@ -265,7 +265,7 @@ pub struct WireTime {
 }
 
 impl WireTime {
-    /// Wire time of an exchange.
+    /// Wire time of a transaction.
     pub fn of(protocol: Protocol, format: &LineFormat, pdu: &RequestPdu) -> WireTime {
         WireTime {
             request: format.chars(protocol.request_chars(pdu)),

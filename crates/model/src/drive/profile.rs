@@ -63,14 +63,14 @@ pub struct Profile {
     /// Points that a drive with a new fault is asked for at once.
     /// The drive counts what it receives, damaged or not, and tells it by function 08 (subfunctions 0B to 0F).
     pub counts_messages: bool,
-    /// The drive may stop by itself when its master falls silent, and nothing that can be read tells whether it does.
+    /// The drive may stop by itself when its master goes silent, and nothing that can be read tells whether it does.
     pub may_stop_by_itself: bool,
     /// A broadcast that clears the whole control word stops every drive of the family on the line.
     pub broadcast_stop: bool,
     pub on_fault: Vec<usize>,
     /// How it is commanded, where its profile says so in `[control]`.
     pub control: Option<Control>,
-    /// Whether somebody has seen the profile right on hardware, or it is made from manuals of that very family.
+    /// Whether someone has seen the profile right on hardware, or it is made from manuals of that very family.
     pub verified: bool,
     /// Its parameters.
     pub parameters: ParameterList,

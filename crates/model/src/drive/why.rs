@@ -39,7 +39,7 @@ pub struct Cause {
 pub struct Explanation {
     /// Whether it runs; `None` while that is not known.
     pub runs: Option<bool>,
-    /// Why it does not, the most telling first; empty while it runs.
+    /// Why it does not, the most significant first; empty while it runs.
     pub causes: Vec<Cause>,
     /// What the family does not tell, so that it can be a cause nobody sees.
     pub not_told: Vec<String>,
@@ -94,19 +94,19 @@ pub enum Contact {
 pub struct RunOrder {
     /// What it wanted of the motor.
     pub run: RunWish,
-    /// What became of it.
+    /// The result.
     pub fate: Fate,
     /// Who gave it.
     pub by: Giver,
-    /// Source and client, for people.
+    /// Source and client, as text.
     pub who: String,
-    /// The outcome for people.
+    /// The outcome as text.
     pub text: String,
     /// How long ago it ended.
     pub age: Duration,
 }
 
-/// What an order wants of the motor.
+/// What a command wants of the motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RunWish {
     /// To run.
@@ -117,7 +117,7 @@ pub enum RunWish {
     Reset,
 }
 
-/// What became of an order.
+/// The result of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fate {
     /// The drive acknowledged it.
@@ -130,12 +130,12 @@ pub enum Fate {
     Unsure,
 }
 
-/// Who gives orders.
+/// Who gives commands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Giver {
     /// A client.
     Client,
-    /// A lease that ran out.
+    /// A lease that expired.
     Supervision,
     /// The gateway, when it stopped.
     Shutdown,
@@ -145,7 +145,7 @@ pub enum Giver {
     LocalControl,
 }
 
-/// What is known beside the points.
+/// What is known besides the points.
 pub struct Situation<'s> {
     /// When the reader looks.
     pub now: Instant,
@@ -378,7 +378,7 @@ impl Look<'_> {
         Some(self.cause("not_ready", evidence, at, &remedy))
     }
 
-    /// It takes no order to run, whoever gives it.
+    /// It takes no order to run, anyone who gives it.
     fn held(&self) -> Option<Cause> {
         let remedy = "wait for its parameter restore to finish; `drivegate params restore` resumes, undoes or \
                       releases an interrupted one";
@@ -547,7 +547,7 @@ impl Look<'_> {
     }
 }
 
-/// What became of a stop of the gateway itself, in words.
+/// The result of a stop of the gateway itself, in words.
 fn stopped(fate: Fate, text: &str) -> String {
     match fate {
         Fate::Taken => "it acknowledged the stop".to_string(),

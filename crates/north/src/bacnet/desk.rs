@@ -1,5 +1,5 @@
-//! What stands between the protocol and the drives: writes that wait, slots that wait for a reading, leases, drives that come back. No
-//! sockets, no clock: `task` and `offline` bring both.
+//! Connects the protocol with the drives: waiting writes, slots that await a reading, leases, drives that come back. No
+//! sockets, no clock: `task` and `offline` provide both.
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::net::SocketAddrV4;
@@ -49,9 +49,9 @@ pub(super) struct Desk {
     pub(super) server: Server,
     /// Drives that answered when they were looked at last.
     present: HashSet<u32>,
-    /// Leases that ran out so far, by device.
+    /// Leases that expired so far, by device.
     leases: HashMap<u32, u64>,
-    /// Devices of which a slot waits for the next reading.
+    /// Devices with a slot that awaits the next reading.
     uncertain: BTreeSet<u32>,
 }
 
@@ -86,7 +86,7 @@ impl Desk {
         self.server.start(&self.view, now);
     }
 
-    /// Clients know nothing of what was before: address or numbers are others.
+    /// Address or numbers have changed: clients start from scratch.
     pub(super) fn start_anew(&mut self, at: At, now: Instant) {
         self.server = server_of(at, &self.view, now);
         self.start(now);
@@ -107,13 +107,13 @@ impl Desk {
         self.server.set_devices(self.view.devices());
     }
 
-    /// A datagram came.
+    /// A datagram arrived.
     pub(super) fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
         self.view.look(now);
         self.server.receive(from, datagram, &self.view, now);
     }
 
-    /// What that device shows may have changed.
+    /// Values of that device may have changed.
     pub(super) fn changed(&mut self, device: u32, now: Instant) {
         self.view.look(now);
         self.server.changed(device, &self.view, now);
@@ -147,7 +147,7 @@ impl Desk {
         self.server.written(ended.token, result, &self.view, now);
     }
 
-    /// Does what time has made due.
+    /// Does what is due.
     pub(super) fn poll(&mut self, now: Instant) {
         self.view.look(now);
         self.note_leases();
@@ -156,7 +156,7 @@ impl Desk {
         self.server.poll(&self.view, now);
     }
 
-    /// A drive that comes back says so.
+    /// Announces drives that are back.
     fn announce(&mut self, now: Instant) {
         let answers: HashSet<u32> = self
             .view
@@ -188,7 +188,7 @@ impl Desk {
         }
     }
 
-    /// Settles what is not known by what the drives show.
+    /// Settles uncertain slots by readings.
     fn resolve_slots(&mut self, now: Instant) {
         let drives = &self.view.drives;
         self.uncertain.retain(|device| {

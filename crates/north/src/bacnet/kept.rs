@@ -1,5 +1,5 @@
-//! What outlives a restart with `keep_priorities`: inactives of `run` at the priorities that protect people. They refuse starts as
-//! before; nothing is written to a drive.
+//! State kept across a restart with `keep_priorities`: inactives of `run` at the priorities that protect people. They
+//! refuse starts as before; nothing is written to a drive.
 
 use std::path::Path;
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! The devices of a configuration at rest, as lines for people and programs. Pure.
+//! The devices of a configuration at rest, as lines as text and programs. Pure.
 
 use drivegate_bacnet::{Access, Kind, Object};
 

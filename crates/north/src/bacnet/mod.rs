@@ -1,7 +1,8 @@
-//! The BACnet/IP server: each drive is a device of its own behind a virtual network (`docs/bacnet.md`).
+//! The BACnet/IP server: each drive is its own device behind a virtual network (`docs/bacnet.md`).
 //!
-//! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` says what a drive shows, `view` reads it from the process image,
-//! `writes` makes orders of what clients write, `desk` brings them together, `task` moves datagrams, `offline` does so without sockets.
+//! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` says what a drive shows, `view` reads it from
+//! the process image, `writes` makes commands of what clients write, `desk` brings them together, `task` moves
+//! datagrams, `offline` does so without sockets.
 
 mod desk;
 pub mod ede;
@@ -37,7 +38,7 @@ use crate::listener::ListenerState;
 use crate::plant::SharedPlant;
 use crate::server::{self, Reconfigure};
 
-/// What a drive that is away does.
+/// The behaviour of an offline drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum WhenOffline {
     /// It answers nothing.
@@ -56,7 +57,7 @@ pub struct Options {
     pub device: u32,
     /// Number of the virtual network.
     pub network: u16,
-    /// What a drive that is away does.
+    /// The behaviour of an offline drive.
     pub offline: WhenOffline,
     /// Whether clients may write at all.
     pub commands: bool,
@@ -72,9 +73,9 @@ pub struct Options {
     pub vendor: u16,
     /// The password of DeviceCommunicationControl.
     pub dcc_password: Option<Secret>,
-    /// The buses whose drives are shown; none: all.
+    /// The buses whose drives are served; none: all.
     pub buses: Option<Vec<String>>,
-    /// Directory of what is kept.
+    /// Directory for kept state.
     pub state_dir: PathBuf,
 }
 
@@ -134,7 +135,7 @@ pub struct Server {
     tasks: TaskTracker,
 }
 
-/// What [`Server::commit`] needs to apply new options: all that can fail is done.
+/// A prepared change of options for [`Server::commit`]: everything that can fail is done.
 #[derive(Debug)]
 pub struct Change {
     options: Options,
@@ -218,12 +219,12 @@ impl Reconfigure for Server {
         let _ = self.to_task.send(ToTask::Apply(Box::new(options), sockets));
     }
 
-    /// Takes no more from any client; what was begun is answered.
+    /// Accepts no more requests; those in progress complete.
     async fn retire(&mut self) {
         let _ = self.to_task.send(ToTask::Retire);
     }
 
-    /// Whether everybody was answered, after it retired.
+    /// Whether all requests have completed, after it retired.
     fn is_drained(&self) -> bool {
         !self.busy.load(Ordering::Relaxed)
     }

@@ -39,14 +39,14 @@ const BINARY: [ModelPoint; 8] = [
     ModelPoint::ZeroSpeed,
     ModelPoint::Remote,
 ];
-/// What only counts up, or has no size: every change is told.
+/// Counters: every change is reported.
 const COUNTERS: [ModelPoint; 3] = [ModelPoint::Energy, ModelPoint::OperatingHours, ModelPoint::FaultCode];
 /// The first number of the points that only the profile has.
 const OWN: u32 = 100;
 /// The last state of an enumeration: a code without a text.
 const OTHER: &str = "other";
 
-/// What an object shows, or commands.
+/// The meaning of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Meaning {
     /// That point of the profile.
@@ -68,9 +68,9 @@ pub enum Meaning {
 /// A device with the meaning of its objects, place by place.
 #[derive(Debug, Clone)]
 pub struct Shown {
-    /// What BACnet sees of it.
+    /// The device as BACnet sees it.
     pub device: Arc<Device>,
-    /// What each object means.
+    /// The meaning of each object.
     pub meanings: Vec<Meaning>,
 }
 
@@ -201,7 +201,7 @@ fn model(spec: &DriveSpec, all: &mut Objects) {
     }
 }
 
-/// What a controlled drive takes.
+/// Adds the command objects of a controlled drive.
 fn commands(spec: &DriveSpec, all: &mut Objects) {
     let bits = [
         (1, ModelPoint::Run, Some(Commanded::Run)),

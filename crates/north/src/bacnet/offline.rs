@@ -32,13 +32,13 @@ impl Offline {
         }
     }
 
-    /// A datagram came. What it orders is in the queue of its bus when this returns.
+    /// A datagram arrived. Its command is in the queue of its bus when this returns.
     pub fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
         self.desk.receive(from, datagram, now);
         self.take_up(now);
     }
 
-    /// Tells the clients what became of their writes by now.
+    /// Tells the clients the result of their writes by now.
     pub fn collect(&mut self, now: Instant) {
         let mut place = 0;
         while let Some((_, waiting)) = self.waiting.get_mut(place) {
@@ -53,7 +53,7 @@ impl Offline {
         self.take_up(now);
     }
 
-    /// Does what time has made due; to be called ten times a second.
+    /// Does what is due; call it ten times a second.
     pub fn poll(&mut self, now: Instant) {
         if self.desk.is_outdated() {
             self.desk.see(self.options.clone());

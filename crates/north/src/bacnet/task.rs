@@ -1,4 +1,4 @@
-//! Moves datagrams between the sockets and the desk, and waits for drives; keeps what outlives a restart, finds the BBMD.
+//! Moves datagrams between the sockets and the desk, and waits for drives; saves state for a restart, finds the BBMD.
 
 use std::collections::{BTreeSet, HashMap};
 use std::future::Future;
@@ -31,21 +31,21 @@ use crate::stats::BacnetFigures;
 
 /// How often time is looked at.
 const TICK: Duration = Duration::from_millis(100);
-/// Changes of the drives are told no more often.
+/// Shortest interval between reports of changes.
 const LOOK: Duration = Duration::from_millis(5);
 /// Datagrams that are taken up before anything else is.
 const BATCH: usize = 64;
 /// How often a BBMD whose name is not found is looked up again.
 const RESOLVE: Duration = Duration::from_secs(30);
-/// How long what was begun is waited for at the end.
+/// Longest wait for requests in progress at the end.
 const LAST_ANSWERS: Duration = Duration::from_millis(1500);
 
-/// What the server tells its task.
+/// A message from the server to its task.
 #[derive(Debug)]
 pub(super) enum ToTask {
     /// Other options, and other sockets where the address is another one.
     Apply(Box<Options>, Option<Sockets>),
-    /// Take no more from any client.
+    /// Accept no more requests.
     Retire,
 }
 
@@ -60,7 +60,7 @@ pub(super) struct Task {
     writes: FuturesUnordered<Ending>,
     /// Woken by every update of a drive.
     news: Arc<Notify>,
-    /// What was seen of each drive to which somebody subscribes.
+    /// What was seen of each drive to which someone subscribes.
     seen: HashMap<u32, Arc<Snapshot>>,
     kept: Vec<KeptSlot>,
     /// Devices with a slot of before the restart against which the motor may run.
@@ -137,7 +137,7 @@ impl Task {
         self.stats.bacnet.set(None);
     }
 
-    /// Whoever waits for a drive is answered, as long as the gateway waits.
+    /// Anyone who waits for a drive is answered, as long as the gateway waits.
     async fn answer_what_was_begun(&mut self) {
         let until = tokio::time::Instant::now() + LAST_ANSWERS;
         while let Ok(Some(ended)) = tokio::time::timeout_at(until, self.writes.next()).await {
@@ -146,7 +146,7 @@ impl Task {
         }
     }
 
-    /// Takes up what came.
+    /// Processes received datagrams.
     fn take(&mut self, buffer: &mut [u8], broadcast: bool) {
         let now = Instant::now();
         for _ in 0..BATCH {
@@ -163,7 +163,7 @@ impl Task {
         }
     }
 
-    /// Sends what is to be sent. What the system does not take at once is lost, as datagrams may be.
+    /// Sends pending datagrams. Any that the system does not accept at once are lost, as datagrams may be.
     fn flush(&mut self) {
         while let Some((to, datagram)) = self.desk.server.transmit() {
             let to = match to {
@@ -217,7 +217,7 @@ impl Task {
         }
     }
 
-    /// Tells what changed at drives to which somebody subscribes.
+    /// Reports changes of drives with subscriptions.
     fn look(&mut self) {
         let now = Instant::now();
         for device in self.desk.server.subscribed() {
@@ -259,7 +259,7 @@ impl Task {
         }
     }
 
-    /// Writes what outlives a restart, where it is another.
+    /// Saves the kept state if it changed.
     fn keep(&mut self) {
         let Some(path) = self.keep_file() else { return };
         let slots = kept::of_plant(&self.desk.view.plant);

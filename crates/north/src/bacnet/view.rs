@@ -91,7 +91,7 @@ impl View {
         shown.meanings.get(place).copied()
     }
 
-    /// What an object of a drive means.
+    /// The meaning of an object of a drive.
     pub(super) fn of_drive(&self, device: u32, place: usize) -> Option<(&DriveHandle, Meaning)> {
         let drive = self.drives.get(&device)?;
         Some((&drive.handle, drive.shown.meanings.get(place).copied()?))
@@ -146,7 +146,7 @@ impl View {
                     ..sample
                 }
             }
-            // A pulse is over when it can be read.
+            // A pulse has ended when it can be read.
             Meaning::Reset(index) => Sample {
                 value: Some(Datum::Bool(false)),
                 ..self.point(&reading, index, |value| Datum::Bool(value.as_bool()))

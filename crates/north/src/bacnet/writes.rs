@@ -1,4 +1,4 @@
-//! What a client wrote becomes an order, or a slot that waits (`docs/bacnet.md`, Commands).
+//! Turns a client's write into a command, or a waiting slot (`docs/bacnet.md`, Commands).
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -20,7 +20,7 @@ const MINIMUM_TIMES: u8 = 6;
 /// That of a write that names none.
 const LOWEST: u8 = 16;
 
-/// What becomes of a job.
+/// The progress of a job.
 #[derive(Debug)]
 pub(super) enum Begun {
     Answered(Result<(), Error>),
@@ -190,7 +190,7 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
     Some(Begun::Answered(Ok(())))
 }
 
-/// Whether the drive could be given that value at all; what is not known yet is judged when it becomes an order.
+/// Whether the drive could be given that value at all; what is not known yet is judged when it becomes a command.
 fn possible(handle: &DriveHandle, index: usize, value: Value, now: Instant) -> Result<(), Refusal> {
     let order = Order::Points(vec![(index, value)]);
     match command::admit(order, &handle.reading(now), Authority::Write) {

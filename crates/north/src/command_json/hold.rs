@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::result::ErrorObject;
 use crate::command::{HoldView, Refusal};
 
-/// Who holds a drive, and what became of an act upon that.
+/// Who holds a drive, and the result of an act upon that.
 #[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub(crate) struct HoldReply<'r> {
     drive: &'r str,
@@ -63,7 +63,7 @@ impl<'r> HoldReply<'r> {
         }
     }
 
-    /// What became of an act; `seen` is what is told of the hold where it was refused.
+    /// The result of an act; `seen` is what is told of the hold where it was refused.
     pub(crate) fn new(drive: &'r str, done: Result<HoldView, Refusal>, seen: Option<HoldView>) -> HoldReply<'r> {
         let (hold, refusal) = match done {
             Ok(view) => (Some(view), None),

@@ -235,7 +235,7 @@ impl<R: Clone> Memory<R> {
         number
     }
 
-    /// Whoever waited for the results of the commands so far has gone; they do not come any more.
+    /// Anyone who waited for the results of the commands so far has gone; they do not come any more.
     pub(crate) fn abandon(&mut self) {
         self.abandoned = self.taken;
     }

@@ -1,4 +1,4 @@
-//! Commands as JSON, as MQTT and HTTP have them: what a request means, whether it repeats an earlier one, and its result.
+//! Commands as JSON, for MQTT and HTTP: parsing requests, recognising repetitions, results.
 
 mod hold;
 mod memory;

@@ -78,7 +78,7 @@ pub(crate) fn find_id(payload: &[u8]) -> Option<Id> {
     Id::of(id?)
 }
 
-/// What a command asks for.
+/// The content of a command.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Asked {
     pub(crate) points: Points,
@@ -323,7 +323,7 @@ impl<'de> Visitor<'de> for IdVisitor {
     }
 }
 
-/// That there is no such drive, and which one has the nearest name.
+/// The message for an unknown drive, with the nearest name.
 pub(crate) fn unknown_drive(name: &str, plant: &Plant) -> String {
     let drives: Vec<_> = plant.drives().map(|d| d.image.spec.name.clone()).collect();
     let near = (name.len() <= MAX_NAME).then(|| nearest(name, drives.iter().map(String::as_str)));

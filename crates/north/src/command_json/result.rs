@@ -62,7 +62,7 @@ struct KeptBy {
     hold_left_s: Option<u64>,
 }
 
-/// Of an outcome that somebody else's right to the drive is the reason for.
+/// Of an outcome that someone else's right to the drive is the reason for.
 fn kept_by(outcome: &Outcome) -> Option<KeptBy> {
     match outcome {
         Outcome::Refused(refusal) => refusal.holder().map(|holder| KeptBy {

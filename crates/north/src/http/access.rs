@@ -14,7 +14,7 @@ use super::tokens::{Scope, Tokens};
 #[derive(Debug, PartialEq)]
 pub(super) struct Access {
     pub(super) hosts: Hosts,
-    /// `None`: everybody.
+    /// `None`: no token is needed.
     pub(super) tokens: Option<Tokens>,
 }
 
@@ -82,7 +82,7 @@ impl Access {
     }
 }
 
-/// What a token must permit for this path; `None` where no token is needed, so that supervisors can ask.
+/// The scope a token needs for this path; `None` if no token is needed, for health checks.
 fn scope(path: &str) -> Option<Scope> {
     match path {
         "/healthz" | "/readyz" => None,

@@ -48,7 +48,7 @@ pub(super) struct Drive<'d> {
     address: u8,
     unit: u8,
     profile: &'d str,
-    /// Told where nobody has confirmed the profile on hardware.
+    /// `false` if nobody has confirmed the profile on hardware; else absent.
     #[serde(skip_serializing_if = "Clone::clone")]
     profile_verified: bool,
     access: &'static str,
@@ -77,7 +77,7 @@ pub(super) struct Drive<'d> {
     #[serde(flatten)]
     #[schema(value_type = HoldFields)]
     hold: Option<HoldFields>,
-    /// What drills have proven of its stops, where `[drill]` is on.
+    /// Stops proven by drills, if `[drill]` is on.
     #[serde(skip_serializing_if = "Option::is_none")]
     stops: Option<Vec<StopProof>>,
     turnaround_ms: Option<f64>,
@@ -152,7 +152,7 @@ impl<'d> Drive<'d> {
     }
 }
 
-/// Exchanges by their outcome.
+/// Transactions by their outcome.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Outcomes {
     ok: u64,
@@ -318,15 +318,15 @@ impl<'b> Bus<'b> {
     }
 }
 
-/// What is wrong with the line of a bus.
+/// The diagnosis of the line of a bus.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct Diagnosis<'d> {
     bus: &'d str,
-    /// `null` before the first five seconds are over.
+    /// `null` before the first five seconds have ended.
     #[schema(value_type = Option<String>)]
     time: Option<Time>,
     verdicts: &'d [Verdict],
-    /// Sound replies of addresses that were not asked, in the last minute.
+    /// Valid replies from addresses that were not polled, in the last minute.
     wrong_address: u32,
     /// Counted in the last minute.
     drives: &'d [Counted],

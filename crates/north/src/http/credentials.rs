@@ -1,4 +1,4 @@
-//! What the files of tokens and users have in common: one of them a line, each with a name of its own.
+//! The common part of token and user files: one entry per line, each with its own name.
 
 use std::str::FromStr;
 

@@ -1,4 +1,4 @@
-//! `GET /api/v1/events/log`: what happened, also before the last start.
+//! `GET /api/v1/events/log`: events, including those before the last start.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -76,7 +76,7 @@ pub(super) struct Shown<'e> {
     shown_in: Option<RecordingMade>,
 }
 
-/// The recordings that there are, by the time that they cover.
+/// The kept recordings, by the time that they cover.
 struct Recorded {
     before: Duration,
     after: Duration,

@@ -1,9 +1,9 @@
-//! Which names and addresses the HTTP server answers under. A web page of a stranger whose name is made to resolve to
-//! this machine (DNS rebinding) could otherwise read everything through the browser of a user. Pure.
+//! The names and addresses that the HTTP server accepts. Otherwise a malicious web page whose name resolves to this
+//! machine (DNS rebinding) could read everything through a user's browser. Pure.
 
 use std::net::IpAddr;
 
-/// Names that always mean this machine, beside those that end in `.localhost`.
+/// Names that always mean this machine, besides those that end in `.localhost`.
 const LOOPBACK: [&str; 4] = ["localhost", "localhost.localdomain", "ip6-localhost", "ip6-loopback"];
 /// Longest name of a host.
 const MOST: usize = 255;
@@ -17,7 +17,7 @@ pub(super) enum Host {
 }
 
 impl Host {
-    /// Reads a host as it stands in the header `Host` or in a URL: a name or an address, maybe with a port.
+    /// Parses a host as in the header `Host` or in a URL: a name or an address, possibly with a port.
     pub(super) fn parse(text: &str) -> Option<Host> {
         let (host, port) = match text.strip_prefix('[') {
             Some(rest) => {

@@ -1,4 +1,5 @@
-//! What a client and the gateway say to each other beside drives, buses and events. Fields are added, never renamed or removed.
+//! Messages between a client and the gateway other than drives, buses and events. Fields are added, never renamed or
+//! removed.
 
 use std::path::{Path, PathBuf};
 
@@ -13,9 +14,9 @@ use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 /// An error reply.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ErrorReply {
-    /// What is wrong, and what to do.
+    /// The error and its remedy.
     pub error: String,
-    /// The names that there are, where one was not known.
+    /// The known names, if one was unknown.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub known: Vec<String>,
 }
@@ -30,8 +31,7 @@ impl ErrorReply {
     }
 }
 
-/// What a client has in mind, in the header [`EXPECT`]: a gateway that is another one answers 421, and one that runs with
-/// another configuration 412.
+/// What a client expects, in the header [`EXPECT`]: another gateway replies 421, one with another configuration 412.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Expected {
@@ -44,7 +44,7 @@ pub enum Expected {
 /// Header with an [`Expected`] as JSON, percent-encoded.
 pub const EXPECT: &str = "x-drivegate-expect";
 
-/// What the client's configuration file says of gateway and drive.
+/// The client's configuration of gateway and drive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ExpectedDrive {
@@ -99,17 +99,17 @@ pub struct Why {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ReadParameters {
-    /// The drive is asked for every address, whatever earlier readings found.
+    /// Reads every address, regardless of what earlier readings found.
     pub afresh: bool,
-    /// It may take 18 % of a busy line in place of 1.5 %.
+    /// It may take 18 % of a busy line instead of 1.5 %.
     pub brisk: bool,
 }
 
-/// What is to be done with a restore.
+/// An action on a restore.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum RestoreAct {
-    /// The drive is read, and what would be written is found out.
+    /// Reads the drive and prepares what would be written.
     Prepare {
         /// The file of parameters.
         file: String,
@@ -120,12 +120,12 @@ pub enum RestoreAct {
         #[serde(default)]
         force: bool,
     },
-    /// What the restore of that number found out is written.
+    /// Writes the prepared restore of that number.
     CarryOut {
         /// Its number.
         number: u64,
     },
-    /// One that was cut off goes on.
+    /// Resumes an interrupted one.
     Resume,
     /// One that was cut off is taken back.
     Undo,
@@ -136,13 +136,13 @@ pub enum RestoreAct {
 /// The configuration was read again; it applies unless there are errors.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ReloadOutcome {
-    /// What must be corrected; the gateway runs as before.
+    /// The errors; the gateway runs as before.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub errors: Vec<String>,
-    /// What works but probably not as intended.
+    /// Warnings: valid, but probably not as intended.
     #[serde(default)]
     pub warnings: Vec<String>,
-    /// What changed.
+    /// The changes.
     #[serde(default)]
     pub changes: Vec<String>,
 }
@@ -156,7 +156,7 @@ pub struct Health {
     pub reasons: Vec<String>,
 }
 
-/// A recording that goes on.
+/// A recording in progress.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Recorded {
     /// Its id.
@@ -180,7 +180,7 @@ pub struct ParameterReading {
     /// Why it waits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waits: Option<String>,
-    /// The file, once it is over.
+    /// The file, once it has ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub file: Option<String>,
     /// Why it failed.
@@ -212,7 +212,7 @@ impl ParameterReading {
 pub struct Restore {
     /// Its number.
     pub number: u64,
-    /// What it is at.
+    /// Its stage.
     pub stage: Stage,
     /// Addresses that were read, or parameters that are done.
     pub done: usize,
@@ -221,10 +221,10 @@ pub struct Restore {
     /// Why it waits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waits: Option<String>,
-    /// What is written, and what is to be known of it, for people; once that is known.
+    /// The plan, as text; once that is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<String>,
-    /// What the user takes upon himself.
+    /// The risks the user accepts.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub risks: Vec<String>,
     /// Why it may not be done.
@@ -235,19 +235,19 @@ pub struct Restore {
     pub text: Option<String>,
 }
 
-/// What a restore is at.
+/// The stage of a restore.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Stage {
     /// The drive is read.
     Reading,
-    /// What would be written is known.
+    /// The plan is ready.
     Prepared,
     /// It may not be done.
     Refused,
     /// Parameters are written.
     Working,
-    /// It is over.
+    /// It has ended.
     Done,
     /// It was given up.
     Failed,
@@ -295,14 +295,14 @@ impl Restore {
     }
 }
 
-/// A point with what is known of it.
+/// A point with its value.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct PointValue {
     /// Name.
     pub point: String,
     /// `null` unless the quality is good.
     pub value: Json,
-    /// What the value of an enumeration means.
+    /// The text of an enumeration's value.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub text: Option<String>,
     /// Unit of the value.

@@ -120,9 +120,9 @@ pub struct Options {
     pub listen: SocketAddr,
     /// Names and addresses that it answers under, besides its own and those of the loopback.
     pub hosts: Vec<String>,
-    /// Who may read what; `None`: everybody everything.
+    /// The tokens for reading; `None`: everything is open.
     pub tokens: Option<Tokens>,
-    /// Who may command; `None`: nobody, commands are off.
+    /// The users who may command; `None`: commands are off.
     pub users: Option<Users>,
     /// Certificate and key; `None`: without TLS.
     pub identity: Option<ServerIdentity>,
@@ -131,7 +131,7 @@ pub struct Options {
 }
 
 impl Options {
-    /// Listens on that address, open to everybody, without TLS.
+    /// Listens on that address, open to everyone, without TLS.
     pub fn at(listen: SocketAddr) -> Options {
         Options {
             listen,
@@ -176,7 +176,7 @@ pub struct Http {
     stopping: CancellationToken,
 }
 
-/// What [`Http::commit`] needs to apply new options: all that can fail is done.
+/// A prepared change of options for [`Http::commit`]: everything that can fail is done.
 #[derive(Debug)]
 pub struct Change {
     options: Options,
@@ -309,7 +309,7 @@ struct HttpPermit {
     coverage: Coverage,
 }
 
-/// What a connection is served.
+/// What a connection may request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Coverage {
     Everything,
@@ -425,7 +425,7 @@ impl HttpConnections {
         let router = TowerToHyperService::new(self.router.clone());
         let service = service_fn(|mut request: hyper::Request<Incoming>| {
             let in_use = InUse::new(place.clone());
-            // Somebody may have logged in, or out, since the connection came.
+            // Someone may have logged in, or out, since the connection came.
             place
                 .rights()
                 .set(self.operating.authority_at(peer.ip(), Instant::now()));

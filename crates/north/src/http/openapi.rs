@@ -1,4 +1,4 @@
-//! The routes with their description, made in one go: what is served is described.
+//! The routes and their description, built together: everything served is described.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
@@ -32,7 +32,7 @@ pub(super) struct Api {
 
 type Schemas = BTreeMap<String, RefOr<Schema>>;
 
-/// What a route is for.
+/// The description of a route.
 pub(super) struct Doc {
     summary: &'static str,
     query: &'static [(&'static str, &'static str)],

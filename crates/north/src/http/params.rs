@@ -11,11 +11,11 @@ pub(super) struct Parameters<'a> {
     drive: &'a str,
     /// The last reading; `null` where there is none.
     last: Option<LastReading<'a>>,
-    /// The reading that goes on; `null` where none does.
+    /// The reading in progress; `null` if none.
     reading: Option<RunningReading<'a>>,
     /// Why the last try failed.
     error: Option<&'a str>,
-    /// The last restore since the gateway started, or the one that goes on.
+    /// The last restore since the gateway started, or the one in progress.
     #[serde(skip_serializing_if = "Option::is_none")]
     restore: Option<Restore>,
 }
@@ -26,7 +26,7 @@ struct LastReading<'a> {
     identification: &'a str,
     application: String,
     time: &'a str,
-    /// What the drive counted of its line (function 08), in words.
+    /// The drive's own counters of its line (function 08), as text.
     #[serde(skip_serializing_if = "str::is_empty")]
     counters: &'a str,
     checksum: String,
@@ -37,9 +37,9 @@ struct LastReading<'a> {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct ParameterRow<'a> {
     id: &'a str,
-    /// As the drive gives it; `null` where it was not read.
+    /// The raw value; `null` if it was not read.
     raw: Option<f64>,
-    /// Value in its unit and name, for people.
+    /// Value in its unit and name, as text.
     text: &'a str,
     #[serde(skip_serializing_if = "Option::is_none")]
     why: Option<&'a str>,

@@ -22,8 +22,8 @@ const MAX_POINTS: usize = 1024;
 /// Time for all points that are not polled and have to be read from the drive.
 const FORWARDED: Duration = Duration::from_secs(10);
 
-/// The points of a drive that are polled, or those of `names`. One that is not polled is read from the drive for whoever may
-/// command it.
+/// The points of a drive that are polled, or those of `names`. One that is not polled is read from the drive for anyone
+/// who may command it.
 pub(super) async fn points(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
@@ -66,7 +66,7 @@ async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) 
     points
 }
 
-/// What is asked for by a name.
+/// What a name requests.
 #[derive(Debug, Clone, Copy)]
 enum Wanted {
     /// A point, by its index.
@@ -122,7 +122,7 @@ fn wanted(profile: &Profile, names: &[&str]) -> Result<Vec<Wanted>, String> {
     names.iter().map(of).collect()
 }
 
-/// A point that is not polled: the drive is asked for it.
+/// A point that is not polled: it is read from the drive.
 async fn forwarded(drive: &DriveHandle, point: &Point, raw: &Raw, origin: Origin, deadline: Instant) -> PointValue {
     let pdu = RequestPdu::Read {
         table: raw.table,

@@ -12,7 +12,7 @@ use crate::plant::{BusHandle, DriveHandle, Plant};
 #[derive(Debug)]
 pub(super) struct Refused(Box<Response>);
 
-/// What a handler replies.
+/// The reply of a handler.
 pub(super) type Replied<T = Response> = Result<T, Refused>;
 
 impl From<Response> for Refused {

@@ -37,7 +37,7 @@ use crate::log_throttle::LogThrottle;
 use crate::plant::SharedPlant;
 use crate::stop_all::StopReport;
 
-/// What all handlers share.
+/// The state shared by all handlers.
 #[derive(Debug)]
 pub(super) struct AppState {
     pub(super) plant: SharedPlant,
@@ -65,19 +65,19 @@ impl AppState {
     }
 }
 
-/// Who asks.
+/// The client of a request.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Client {
     pub(super) address: IpAddr,
     pub(super) coverage: Coverage,
 }
 
-/// Who came over no network: whoever may open the local socket may do everything.
+/// A user of the local socket: anyone who may open it may do everything.
 #[derive(Debug, Clone)]
 pub(crate) struct LocalUser {
-    /// The way in, as the audit shows it.
+    /// The interface, as the audit shows it.
     pub(crate) kind: SourceKind,
-    /// Likewise, who.
+    /// Likewise, the user.
     pub(crate) who: Arc<str>,
     /// What the connection proves of it.
     pub(crate) proof: Proof,
@@ -85,7 +85,7 @@ pub(crate) struct LocalUser {
     pub(crate) control: Option<Control>,
 }
 
-/// How a request came, as an extension of it.
+/// How a request arrived, as its extension.
 #[derive(Debug, Clone)]
 pub(super) struct Reached {
     /// The address of this machine that the client connected to.
@@ -96,7 +96,7 @@ pub(super) struct Reached {
     pub(super) refusals: Arc<LogThrottle>,
     /// The connection has TLS.
     pub(super) tls: bool,
-    /// It came through the local socket; `None`: over TCP.
+    /// The user of the local socket; `None`: over TCP.
     pub(super) local: Option<LocalUser>,
     /// The place of the connection; `None` without a socket.
     pub(super) place: Option<Arc<Place>>,
@@ -156,7 +156,7 @@ pub(super) fn router(
         .layer(middleware::from_fn_with_state(app, guard))
 }
 
-/// What is served, with its description.
+/// The routes, with their description.
 fn described() -> Api {
     const TEXT: &str = "text/plain";
     const EVENTS: &str = "text/event-stream";
@@ -380,7 +380,7 @@ async fn guard(
     let is_local = reached.local.is_some();
     // Nobody logs in at the socket.
     let is_on = app.operating.is_on() || (is_local && !operating::is_session(path));
-    // A command of somebody who may give it is served on the last connection too.
+    // A command of someone who may give it is served on the last connection too.
     let is_urgent = ["/healthz", "/readyz"].contains(&path) || (is_on && operating::is_command(method, path));
     let access = match is_local {
         true => Ok(()),

@@ -1,4 +1,4 @@
-//! The HTTP API at the local socket. Whoever may open the socket may do everything: no login, no token, any `Host`.
+//! The HTTP API at the local socket. Anyone who may open the socket may do everything: no login, no token, any `Host`.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::pin::pin;
@@ -38,8 +38,8 @@ impl SocketDoor {
         }
     }
 
-    /// Answers the requests of a client until it leaves, falls silent or yields to another one; a reply that is being made
-    /// is finished.
+    /// Answers the requests of a client until it leaves, goes silent or yields to another one; a reply that is being
+    /// made is finished.
     pub(crate) async fn serve(&self, stream: impl AsyncRead + AsyncWrite + Unpin, user: LocalUser, place: &Arc<Place>) {
         let reached = Reached::within(Some(user), Some(place.clone()));
         let client = Client {
@@ -93,7 +93,7 @@ impl InProcess {
         let user = LocalUser {
             kind: SourceKind::CommandLine,
             who: who.into(),
-            // Whoever may open the port holds it as whoever opens the socket does.
+            // Anyone who may open the port holds it as anyone who opens the socket does.
             proof: Proof::Uid(rustix::process::geteuid().as_raw()),
             control: None,
         };

@@ -1,4 +1,4 @@
-//! What the connections of a listener have in common: access, certificates, and the end of both.
+//! The terms shared by the connections of a listener: access, certificates, and the end of both.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use super::access::Access;
 use super::hosts::Hosts;
 use crate::{ServerError, ServerKind};
 
-/// What the connections are served by; a reload can replace it.
+/// The present terms; a reload can replace them.
 #[derive(Debug)]
 pub(super) struct Terms {
     pub(super) access: Arc<Access>,

@@ -1,4 +1,4 @@
-//! Access tokens of the HTTP server: what a token file says, and whom it admits.
+//! Access tokens of the HTTP server: the token file, and checking tokens.
 //!
 //! A token is 256 random bits, so its SHA-256 can be neither inverted nor guessed, and the file holds nothing secret.
 //! Argon2 and the like are for passwords, which people choose.
@@ -20,7 +20,7 @@ const ALGORITHM: &str = "sha256:";
 const FORM: CredentialError = CredentialError::Form("name scopes hash");
 const NOT_A_HASH: CredentialError = CredentialError::Hash("`sha256:` and 64 hexadecimal digits");
 
-/// What a token permits.
+/// A permission of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scope {
     /// The status page and the JSON interface.
@@ -53,7 +53,7 @@ impl FromStr for Scope {
     }
 }
 
-/// A line of the file: who may do what. Displayed as that line.
+/// A line of the file. Displayed as that line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Token {
     /// Unique in the file.

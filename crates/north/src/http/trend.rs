@@ -1,4 +1,4 @@
-//! `GET /api/v1/drives/{drive}/trend`: what the values of a drive were.
+//! `GET /api/v1/drives/{drive}/trend`: past values of a drive.
 
 use std::fmt::Write as _;
 use std::sync::Arc;
@@ -20,7 +20,7 @@ use crate::history::{Clock, DriveHistory};
 /// Shown without `from`.
 const SHOWN: Duration = Duration::from_secs(600);
 
-/// What a client wants to see.
+/// The request of a client.
 #[derive(Debug, PartialEq)]
 struct Wanted {
     /// None: only which points there are.

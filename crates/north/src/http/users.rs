@@ -1,4 +1,4 @@
-//! The users who may command over HTTP: what a users file says, and whose password is right.
+//! The users who may command over HTTP: the users file, and checking passwords.
 //!
 //! Passwords are chosen by people, so the file holds Argon2id hashes: each guess costs time and memory.
 
@@ -15,13 +15,13 @@ use super::credentials::{Credential, CredentialError, Credentials, checked_name}
 const MEMORY: u32 = 12 * 1024;
 /// Passes over it. With this memory, the least that OWASP recommends for Argon2id.
 const PASSES: u32 = 3;
-/// What the file may ask for at most: memory in KiB, passes and lanes. More would let a file stall the gateway.
+/// Most that a hash in the file may cost: memory in KiB, passes and lanes. More would let a file stall the gateway.
 const MOST_COST: (u32, u32, u32) = (64 * 1024, 16, 4);
 /// Bytes of a salt.
 const SALT: usize = 16;
 /// How the hashes of a new user begin.
 const COST: &str = "$argon2id$v=19$m=12288,t=3,p=1$";
-/// Salt and hash of nobody, behind the cost: no password is known for it, it only takes its time.
+/// Salt and hash verified for unknown users, so timing reveals nothing.
 const NOBODY: &str = "bm9ib2R5bm9ib2R5bm9ibw$0000000000000000000000000000000000000000000";
 /// Least number of characters of a password.
 pub const MIN_PASSWORD: usize = 10;
@@ -70,7 +70,7 @@ impl User {
     }
 }
 
-/// Whether this is the password behind that hash. Takes as long as the hash asks for, whatever the password.
+/// Whether this is the password of that hash. Takes as long for any password.
 pub(super) fn is_password(hash: &str, password: &str) -> bool {
     let Ok(hash) = PasswordHash::new(hash) else {
         return false;

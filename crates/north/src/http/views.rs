@@ -1,4 +1,4 @@
-//! What the routes show that have no file of their own.
+//! Handlers of the routes without their own file.
 
 use std::fmt::Write as _;
 use std::sync::Arc;
@@ -125,7 +125,7 @@ pub(super) async fn why(State(app): State<Arc<AppState>>, Path(name): Path<Strin
     }))
 }
 
-/// The last reading of the parameters of a drive, and the one that goes on.
+/// The last reading of a drive's parameters, and the one in progress.
 pub(super) async fn params(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Replied {
     let plant = app.plant.load_full();
     let drive = plant.drive(&name).ok_or_else(|| no_drive(&plant, &name))?;
@@ -159,7 +159,7 @@ pub(super) async fn buses(State(app): State<Arc<AppState>>) -> Response {
     Json(all).into_response()
 }
 
-/// What is wrong with the line of a bus.
+/// The diagnosis of the line of a bus.
 pub(super) async fn diagnosis(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Replied {
     let plant = app.plant.load();
     let diagnosis = find_bus(&plant, &name)?.image.diagnosis.load();

@@ -1,4 +1,4 @@
-//! Orders of local clients to the gateway itself rather than to a drive.
+//! Commands of local clients to the gateway itself rather than to a drive.
 
 use std::path::{Path, PathBuf};
 
@@ -6,10 +6,10 @@ use tokio::sync::{mpsc, oneshot};
 
 use crate::http::messages::ReloadOutcome;
 
-/// Orders that wait; there are no more clients than that.
+/// Most waiting commands; there are no more clients than that.
 const WAITING: usize = super::MAX_CLIENTS;
 
-/// Somebody wants the gateway to read its configuration again.
+/// Someone wants the gateway to read its configuration again.
 #[derive(Debug)]
 pub struct ReloadOrder {
     pub who: String,
@@ -31,7 +31,7 @@ impl PartialEq for Control {
 }
 
 impl Control {
-    /// For a gateway that runs with the configuration file `config`, and where its orders arrive.
+    /// For a gateway that runs with the configuration file `config`, and where its commands arrive.
     pub fn new(config: &Path) -> (Control, mpsc::Receiver<ReloadOrder>) {
         let (orders, arrive) = mpsc::channel(WAITING);
         let config = absolute(config);

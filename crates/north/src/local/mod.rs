@@ -1,9 +1,9 @@
 //! The local socket: the HTTP API for commands on the machine of the gateway (`http/socket_door.rs`).
 //!
-//! Who may connect is decided by the permissions of the socket's file, and whoever may connect may command, as far as the
-//! drives allow it. Commands go the way of all others ([`crate::plant::DriveHandle::place`]) and are audited with the user
-//! id of the client's process. Connections and times are bounded; when there are too many connections, one that waits
-//! for no response is closed in favour of the newcomer.
+//! Who may connect is decided by the permissions of the socket's file, and anyone who may connect may command, as far
+//! as the drives allow it. Commands go the way of all others ([`crate::plant::DriveHandle::place`]) and are audited
+//! with the user id of the client's process. Connections and times are bounded; when there are too many connections,
+//! one that waits for no response is closed in favour of the newcomer.
 
 pub(crate) mod control;
 mod path;
@@ -42,7 +42,7 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// How the server is configured.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// Where it listens.
+    /// The path of the socket.
     pub socket: SocketPath,
     /// The gateway that it belongs to, where that has a configuration file.
     pub control: Option<Control>,
@@ -63,7 +63,7 @@ pub struct Local {
 }
 
 impl Local {
-    /// Where it listens.
+    /// The path of the socket.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -136,11 +136,11 @@ fn turn_away(stream: &UnixStream) {
     let _ = stream.try_write(format!("{head}\r\ncontent-length: {}\r\n\r\n{body}", body.len()).as_bytes());
 }
 
-/// What a client is told that does not speak HTTP.
+/// The reply to a client that does not use HTTP.
 const NOT_HTTP: &str =
     "{\"error\":\"this socket serves HTTP; try curl --unix-socket PATH http://gateway/api/v1/drives\"}\n";
 
-/// Serves one client until it leaves, falls silent or yields to another one.
+/// Serves one client until it leaves, goes silent or yields to another one.
 async fn serve(stream: UnixStream, door: Arc<Door>, permit: ConnectionPermit) {
     // Without a user id there is nobody to hold the command against.
     let Ok(peer) = stream.peer_cred() else { return };

@@ -106,7 +106,7 @@ pub(super) struct Bound {
 
 impl Drop for Bound {
     fn drop(&mut self) {
-        // It still listens, so no other gateway has put its own file there; somebody else may have.
+        // It still listens, so no other gateway has put its own file there; someone else may have.
         if std::fs::symlink_metadata(&self.path).is_ok_and(|file| (file.dev(), file.ino()) == self.id) {
             let _ = std::fs::remove_file(&self.path);
         }
@@ -129,8 +129,8 @@ pub(super) async fn bind_first(paths: &[PathBuf]) -> io::Result<Bound> {
     Err(error)
 }
 
-/// Listens on `path`. The file of a gateway that was killed is replaced, that of one that runs is not. Whoever looks at it
-/// and replaces it holds a lock on the directory, so two gateways that start together do not both replace it.
+/// Listens on `path`. The file of a gateway that was killed is replaced, that of one that runs is not. Anyone who looks
+/// at it and replaces it holds a lock on the directory, so two gateways that start together do not both replace it.
 async fn bind(path: &Path) -> io::Result<Bound> {
     let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     let directory = directory.unwrap_or(Path::new("."));
@@ -241,7 +241,7 @@ mod tests {
         assert!(!path.exists() && paths[1].exists(), "each removes its own");
         let third = bind_first(&paths).await.unwrap();
         assert_eq!(&third.path, path);
-        // Somebody put another file in its place.
+        // Someone put another file in its place.
         std::fs::remove_file(path).unwrap();
         std::fs::write(path, "mine").unwrap();
         drop(third);

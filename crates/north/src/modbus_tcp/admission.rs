@@ -29,7 +29,7 @@ const KEEPALIVE_IDLE: Duration = Duration::from_secs(60);
 const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(10);
 const KEEPALIVE_PROBES: u32 = 3;
 
-/// What the rights of a client depend on.
+/// How the rights of a client are determined.
 #[derive(Debug, Clone)]
 pub(super) enum WriteAccess {
     /// Its address: these networks may write.
@@ -46,7 +46,7 @@ pub(super) struct Policy {
 }
 
 impl Policy {
-    /// Lets nobody in.
+    /// Admits no client.
     pub(super) fn nobody() -> (Policy, Option<Vec<String>>) {
         let write = WriteAccess::ByAddress(Vec::new());
         (
@@ -193,7 +193,7 @@ impl Admission {
         let refused = pin!(client.certificate.refused());
         let served = pin!(self.serve_client(stream, peer, Some(&client.name), &permit));
         if let Either::Left(((), served)) = select(refused, served).await {
-            // Commands that are under way are answered.
+            // Commands that are in progress are answered.
             permit.place().close(CloseReason::CertificateRefused);
             served.await;
         }

@@ -1,4 +1,4 @@
-//! Who a client is and what it may do.
+//! The identity and rights of a client.
 
 use std::net::SocketAddr;
 use std::sync::Arc;

@@ -280,7 +280,7 @@ enum Reading {
     Paused,
 }
 
-/// What a connection waited for.
+/// An event of a connection.
 enum Event {
     /// The bus has answered.
     Answer(AnsweredRequest),

@@ -21,8 +21,7 @@ pub(super) type Crls = Vec<CertificateRevocationListDer<'static>>;
 
 /// Reads the lists of a file, in PEM or DER, for the CAs `client_ca`; returns warnings with them.
 ///
-/// # Errors
-/// What is wrong with the file.
+/// # Errors The fault in the file.
 pub(super) fn load(
     file: &Path,
     client_ca: &[CertificateDer<'_>],

@@ -22,7 +22,7 @@ pub(super) const MOST_WAITING: usize = 16;
 /// Number of requests processed before other clients are served.
 const TURN: usize = 128;
 
-/// What one call of [`Dialogue::process`] consumed.
+/// The input consumed by one call of [`Dialogue::process`].
 #[derive(Debug, Default, Clone, Copy)]
 pub(super) struct Consumed {
     pub(super) bytes: usize,
@@ -36,9 +36,9 @@ pub(super) struct Dialogue {
     input: Vec<u8>,
     /// Bytes in `input` that are not processed yet.
     filled: usize,
-    /// Whether any frame came.
+    /// Whether any frame arrived.
     begun: bool,
-    /// When they came.
+    /// Their arrival times.
     arrivals: Arrivals,
     pub(super) output: Vec<u8>,
 }
@@ -89,7 +89,8 @@ impl Dialogue {
     }
 
     /// Processes the frames in the input, [`TURN`] at most, while there is room for their results. Input that is not
-    /// Modbus ends it: the requests before that are answered or wait for the bus, and nothing behind it can be processed.
+    /// Modbus ends it: the requests before that are answered or wait for the bus, and nothing after it can be
+    /// processed.
     pub(super) fn process(&mut self, now: Instant) -> (Consumed, Option<NotModbus>) {
         let mut consumed = Consumed::default();
         self.session.refresh();

@@ -26,7 +26,7 @@ pub(super) struct ForwardedRequest {
     read: Option<PartialRead>,
 }
 
-/// What a forwarded request asks the bus for.
+/// The work that a forwarded request gives the bus.
 #[derive(Debug)]
 pub(super) enum BusWork {
     Order(Order),

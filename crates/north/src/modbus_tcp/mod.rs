@@ -2,7 +2,7 @@
 //! in [`super::register_map`].
 //!
 //! Requests may be pipelined. Answers from the process image are sent in one write. A request that needs the bus does
-//! not delay the ones behind it, so replies can overtake one another; each has its transaction id.
+//! not delay the ones after it, so replies can overtake one another; each has its transaction id.
 
 mod admission;
 mod client;
@@ -169,7 +169,7 @@ pub struct Server {
     tasks: TaskTracker,
 }
 
-/// What [`Server::commit`] needs to apply new options: all that can fail is done.
+/// A prepared change of options for [`Server::commit`]: everything that can fail is done.
 #[derive(Debug)]
 pub struct Change {
     options: Options,
@@ -321,7 +321,7 @@ impl Reconfigure for Server {
     }
 }
 
-/// What all connections share.
+/// The state shared by all connections.
 #[derive(Debug)]
 struct ServerState {
     options: ArcSwap<Options>,

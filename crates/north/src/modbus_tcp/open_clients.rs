@@ -1,5 +1,5 @@
 //! The certificates of the connected TLS clients. A client stays connected only while its certificate would admit it
-//! anew with the same rights: after a reload, and when one of its certificates expires.
+//! again with the same rights: after a reload, and when one of its certificates expires.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -15,7 +15,7 @@ use crate::identity::seconds;
 /// Longest time between two looks at the calendar, which can be set at any time.
 const LOOK: Duration = Duration::from_secs(60);
 
-/// The connected clients, and what their certificates are held against.
+/// The connected clients, and the requirements for their certificates.
 #[derive(Debug)]
 pub(super) struct OpenClients(Mutex<State>);
 
@@ -62,7 +62,7 @@ impl OpenClients {
         })))
     }
 
-    /// What new clients are held against.
+    /// The requirements for new clients.
     pub(super) fn requirements(&self) -> Arc<Requirements> {
         self.lock().requirements.clone()
     }
@@ -172,14 +172,14 @@ impl Drop for CertificateGuard {
     }
 }
 
-/// Time until the next of `ends` is over, at most [`LOOK`]. A certificate is valid through its last second.
+/// Time until the next of `ends` has ended, at most [`LOOK`]. A certificate is valid through its last second.
 fn time_to_next(ends: &[u64], now: SystemTime) -> Duration {
     let now = seconds(now);
     let left = ends.iter().filter(|end| **end >= now).min().map(|end| end + 1 - now);
     left.map_or(LOOK, Duration::from_secs).min(LOOK)
 }
 
-/// Whether one of `ends` was valid at `before` and is over at `now`.
+/// Whether one of `ends` was valid at `before` and has ended at `now`.
 fn any_between(ends: &[u64], before: SystemTime, now: SystemTime) -> bool {
     let (before, now) = (seconds(before), seconds(now));
     ends.iter().any(|end| (before..now).contains(end))

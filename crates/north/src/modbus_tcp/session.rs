@@ -1,4 +1,4 @@
-//! Decides what the requests of one client mean and how they are answered.
+//! Interprets the requests of one client and builds the replies.
 
 use std::sync::Arc;
 use std::time::Instant;

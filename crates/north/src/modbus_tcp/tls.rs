@@ -135,7 +135,7 @@ impl Identity {
     }
 }
 
-/// What the certificates of clients are held against.
+/// The requirements for client certificates.
 #[derive(Debug)]
 pub(super) struct Requirements {
     config: Arc<ServerConfig>,

@@ -1,4 +1,4 @@
-//! Which broker comes next, and the wait before the attempt.
+//! Chooses the next broker, and the wait before the attempt.
 
 use std::hash::{BuildHasher, RandomState};
 use std::time::Duration;
@@ -13,7 +13,7 @@ const STABLE: Duration = Duration::from_secs(5);
 pub(super) struct Rotation {
     count: usize,
     current: usize,
-    /// Brokers tried since the last wait that doubled.
+    /// Brokers tried since the last wait that duplicate.
     tried: usize,
     /// How often the turn came back to the first one.
     round: usize,

@@ -1,11 +1,11 @@
-//! What the broker can do: by its CONNACK, and by what it refused. No I/O.
+//! The broker's capabilities, from its CONNACK and its refusals. No I/O.
 
 use rumqttc::mqttbytes::QoS;
 use rumqttc::{ConnAck, LastWill};
 
 use super::connection::INFLIGHT;
 
-/// What the broker can do.
+/// The broker's capabilities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct BrokerLimits {
     /// Number of unacknowledged messages.
@@ -20,7 +20,7 @@ pub(super) struct BrokerLimits {
     pub(super) wildcards: bool,
     /// Number of topic aliases.
     pub(super) aliases: u16,
-    /// The keep-alive interval that it set in place of ours, s.
+    /// The keep-alive interval that it set instead of ours, s.
     pub(super) keep_alive: Option<u16>,
 }
 
@@ -63,7 +63,7 @@ impl BrokerLimits {
     }
 }
 
-/// For what a broker refuses a last will.
+/// Why a broker refuses a last will.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Lack {
     /// It has no QoS 1.
@@ -72,7 +72,8 @@ pub(super) enum Lack {
     Retained,
 }
 
-/// In which form the broker takes the last will: it is part of the CONNECT, before the broker tells what it can do.
+/// The form of the last will that the broker accepts: it is part of the CONNECT, before the broker reports its
+/// capabilities.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct WillForm {
     unacknowledged: bool,

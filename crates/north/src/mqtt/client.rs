@@ -44,7 +44,8 @@ const CHECK: Duration = Duration::from_millis(25);
 const DISCONNECT_TIMEOUT: Duration = Duration::from_millis(500);
 /// Part of it for the results of pending commands.
 const LAST_RESULTS: Duration = Duration::from_millis(250);
-/// Time for the commands that are under way when a reload ends the client. When the gateway stops they have ended before.
+/// Time for the commands that are in progress when a reload ends the client. When the gateway stops they have ended
+/// before.
 const LAST_COMMANDS: Duration = Duration::from_secs(3);
 /// Time for the disk to take the last messages.
 const LAST_WRITE: Duration = Duration::from_secs(1);
@@ -53,7 +54,7 @@ const HISTORY_PACE: Duration = Duration::from_millis(50);
 /// Minimum time between two log lines about messages that the broker refused.
 const REFUSED_LOGGED: Duration = Duration::from_secs(60);
 
-/// What expires after a time is renewed after this part of it.
+/// Expiring messages are renewed after this fraction of their time.
 const RENEWED: u32 = 2;
 
 /// An expiry in whole seconds: 0 would mean at once.
@@ -101,7 +102,7 @@ struct Client {
     announcer: Option<Announcer>,
     /// Whether discovery messages of an earlier run were asked for, or need not be.
     leftovers_known: bool,
-    /// What the present connection subscribed to.
+    /// The subscriptions of the present connection.
     subscriptions: Vec<Subscription>,
     /// Woken when a drive was updated.
     fresh: Arc<Notify>,
@@ -265,8 +266,8 @@ impl Client {
             .put_first(self.topics.status().into(), b"online".to_vec(), expiry.map(seconds));
     }
 
-    /// Ends the connection for this reason, and tells the broker. Once the status is `online`, the last will is true: whoever
-    /// waits for the gateway learns that it is away.
+    /// Ends the connection for this reason, and tells the broker. Once the status is `online`, the last will is true:
+    /// anyone who waits for the gateway learns that it is away.
     fn give_up(&mut self, why: &str) {
         let true_now = self.is_ready();
         self.link.give_up(why, true_now);
@@ -303,7 +304,7 @@ impl Client {
         }
     }
 
-    /// Somebody else published a status in the gateway's name, such as the will of its last connection.
+    /// Someone else published a status in the gateway's name, such as the will of its last connection.
     fn on_status(&mut self, payload: &[u8]) {
         if payload != b"online" {
             self.repair.ask();
@@ -311,7 +312,7 @@ impl Client {
         }
     }
 
-    /// Publishes `online` again: somebody published another status, or it would expire.
+    /// Publishes `online` again: someone published another status, or it would expire.
     fn repair_status(&mut self, now: Instant) {
         let renews = self.renew_at.is_some_and(|at| now >= at);
         if self.is_ready() && (self.repair.take(now) || renews) {
@@ -395,7 +396,7 @@ impl Client {
         if !events.same_channel(&self.events) {
             self.events = events;
         }
-        // The publisher begins anew.
+        // The publisher starts again.
         self.keep_recorded();
         let discovery = discovery_topics(self.announcer.as_mut(), &plant);
         self.publisher.adopt(&plant, discovery);
@@ -456,8 +457,8 @@ impl Client {
         }
     }
 
-    /// Sends what is waiting, publishes `offline` and disconnects, all within half a second once the commands that are under way have
-    /// ended. Whoever is owed a result then has it from the client that comes after.
+    /// Sends what is waiting, publishes `offline` and disconnects, all within half a second once the commands that are
+    /// in progress have ended. Anyone who is owed a result then has it from the client that comes after.
     async fn shut_down(mut self) {
         self.take_pending_events();
         self.announcer = None;
@@ -484,7 +485,7 @@ impl Client {
         self.stats.mqtt.keep_orders(Some(orders));
     }
 
-    /// Waits for the commands that are under way; what comes in meanwhile is taken as ever.
+    /// Waits for the commands that are in progress; what comes in meanwhile is taken as usual.
     async fn end_commands(&mut self, until: tokio::time::Instant) {
         while self.is_ready() && !self.commands.is_idle() {
             self.publish_waiting();
@@ -521,7 +522,7 @@ impl Client {
             }
         }
         if self.link.disconnect() {
-            // The broker counts what is still under way from it as delivered.
+            // The broker counts what is still in progress from it as delivered.
             loop {
                 match self.link.next().await {
                     ConnectionEvent::Lost(_) => break,

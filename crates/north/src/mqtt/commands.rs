@@ -45,7 +45,7 @@ pub(super) struct Commands {
     rules: Rules,
 }
 
-/// What the configuration says about commands.
+/// The configuration of commands.
 #[derive(Debug, Clone)]
 pub(super) struct Rules {
     /// Where results may go.
@@ -54,7 +54,7 @@ pub(super) struct Rules {
     pub(super) require_id: bool,
 }
 
-/// What a client leaves to its successor: who is owed a result has it from that.
+/// Pending results that a client hands over to its successor.
 #[derive(Debug, Default)]
 pub(crate) struct OrdersLeft {
     waiting: PendingCommands,
@@ -80,7 +80,7 @@ struct PendingStop {
     report: oneshot::Receiver<StopReport>,
 }
 
-/// What is finished.
+/// A finished command.
 #[derive(Debug)]
 pub(super) enum Finished {
     Command(FinishedCommand),
@@ -105,7 +105,7 @@ impl Commands {
         Commands::after(topics, rules, memory, OrdersLeft::default())
     }
 
-    /// Goes on with the commands that the client before has left.
+    /// Continues with the commands handed over by the previous client.
     pub(super) fn after(topics: Topics, rules: Rules, memory: SharedMemory, left: OrdersLeft) -> Commands {
         Commands {
             topics,
@@ -118,7 +118,7 @@ impl Commands {
         }
     }
 
-    /// What the client that comes after goes on with, beside these results.
+    /// What the client that comes after goes on with, besides these results.
     pub(super) fn leave(self, results: Vec<Message>) -> OrdersLeft {
         OrdersLeft {
             waiting: self.waiting,
@@ -221,7 +221,7 @@ impl Commands {
         self.follow(pending, time)
     }
 
-    /// Who sent a message: by its topic, which the broker's rules secure, and for the audit by what it says of itself.
+    /// The sender of a message: by its topic, which the broker's rules secure, and for the audit by its user property.
     fn origin(&self, incoming: &Incoming, as_whom: Option<&str>) -> Origin {
         let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
         let who = who
@@ -351,7 +351,7 @@ impl Commands {
         }
     }
 
-    /// There are no more of them than orders that the gateway keeps.
+    /// There are no more of them than commands that the gateway keeps.
     fn poll_stopped(&mut self, cx: &mut Context<'_>) -> Poll<(Reply, StopReport)> {
         for (index, stop) in self.stopping.iter_mut().enumerate() {
             if let Poll::Ready(report) = Pin::new(&mut stop.report).poll(cx) {

@@ -1,4 +1,4 @@
-//! Reaches a broker by TCP: by all addresses of its name in turn, and no more often than it should be tried.
+//! Connects to a broker by TCP: tries all addresses of its name in turn, at a limited rate.
 
 use std::collections::VecDeque;
 use std::io;

@@ -18,7 +18,7 @@ const COMPLETE: Duration = Duration::from_secs(10);
 pub(super) struct Recorder {
     topic: Arc<str>,
     last: Option<(StateContent, Instant)>,
-    /// Entries of the array that is being filled, and when it was begun.
+    /// Entries of the array that is being filled, and when it was started.
     entries: usize,
     array: Vec<u8>,
     begun: Option<Instant>,

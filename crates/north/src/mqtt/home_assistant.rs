@@ -22,7 +22,7 @@ const UNDER_WAY: usize = 8;
 /// Minimum time between two announcements of everything because Home Assistant was started.
 const BIRTHS: Duration = Duration::from_secs(10);
 
-/// What the entities rest on.
+/// The sources of the entities.
 #[derive(Debug, Clone)]
 pub(super) struct Sources {
     pub(super) topics: Topics,
@@ -116,7 +116,7 @@ impl Announcer {
         format!("{}/device/{}/+/config", self.prefix, self.gateway)
     }
 
-    /// What the broker has to let the gateway publish.
+    /// The topics that the broker must let the gateway publish.
     pub(super) fn own_topics(&self) -> String {
         format!("{}/device/{}/#", self.prefix, self.gateway)
     }

@@ -223,7 +223,7 @@ impl Journal {
         self.counted
     }
 
-    /// Number of messages that are not acknowledged and are on no disk: whoever ends now loses them.
+    /// Number of messages that are not acknowledged and are on no disk: anyone who ends now loses them.
     pub(super) fn unkept(&self) -> u64 {
         match self.place {
             Some(_) => self
@@ -471,7 +471,7 @@ impl Journal {
         Ok(true)
     }
 
-    /// Writes the files again if somebody deleted them: what they held is still there as long as they are open.
+    /// Writes the files again if someone deleted them: what they held is still there as long as they are open.
     fn restore_wiped(&mut self) -> io::Result<()> {
         let Some(place) = &mut self.place else { return Ok(()) };
         let files = self.segments.iter().map(|s| &s.file).chain([&place.lock]);
@@ -521,7 +521,7 @@ impl Journal {
         {
             segment.file.set_len(0)?;
             (segment.end, segment.read, segment.numbers) = (0, 0, None);
-            // The numbers begin anew after a restart, and an old mark would be above them.
+            // The numbers begin again after a restart, and an old mark would be above them.
             self.marked = acknowledged;
         }
         Ok(())

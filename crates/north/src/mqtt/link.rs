@@ -17,7 +17,7 @@ use super::request::Incoming;
 use super::takeover::Takeovers;
 use super::{Broker, Options, tls};
 
-/// What an event of the connection means for the client.
+/// The meaning of a connection event for the client.
 #[derive(Debug)]
 pub(super) enum Step {
     /// The broker accepted the connection: the client subscribes.
@@ -43,7 +43,7 @@ pub(super) enum Step {
     Nothing,
 }
 
-/// What is due at the link.
+/// The next action of the link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Due {
     Nothing,
@@ -69,7 +69,7 @@ enum Phase {
 }
 
 impl Phase {
-    /// What the broker can do, once it is known.
+    /// The broker's capabilities, once known.
     fn limits(&self) -> Option<&BrokerLimits> {
         match self {
             Phase::Connecting => None,
@@ -83,7 +83,7 @@ impl Phase {
 pub(super) struct BrokerLink {
     options: Arc<Options>,
     client_id: String,
-    /// What its lines in the log begin with.
+    /// Prefix of its log lines.
     prefix: &'static str,
     state: State,
     rotation: Rotation,
@@ -183,7 +183,7 @@ impl BrokerLink {
         }
     }
 
-    /// What is due now.
+    /// The action due now.
     pub(super) fn due(&mut self, now: Instant) -> Due {
         match &mut self.state {
             State::Down { retry_at } if now >= *retry_at => Due::Connect,

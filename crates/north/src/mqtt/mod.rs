@@ -214,7 +214,7 @@ impl Mqtt {
 
 impl server::Server for Mqtt {
     const NAME: &'static str = "MQTT";
-    // Orders that are under way come first: its successor would be another client at the broker.
+    // Commands that are in progress come first: its successor would be another client at the broker.
     const STOP_TIMEOUT: Duration = Duration::from_secs(6);
     type Options = Options;
 

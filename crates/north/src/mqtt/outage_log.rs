@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 /// Minimum time between two lines with the same reason for having no connection.
 const SAME_REASON: Duration = Duration::from_secs(3600);
-/// Number of reasons that are told apart.
+/// Number of reasons that are distinguished.
 const REASONS: usize = 16;
 
 /// Why there is no connection: each reason once, and again after an hour or a connection.

@@ -1,4 +1,4 @@
-//! Decides what is sent next, and tracks what waits for its acknowledgement.
+//! Decides what is sent next, and tracks pending acknowledgements.
 //!
 //! Telemetry: only the latest value of a topic waits. Results, events and history: bounded queues in order, whose entries
 //! leave when they are acknowledged (PUBACK). Results, events and telemetry take turns, so that none starves another;
@@ -351,7 +351,7 @@ impl Outbox {
         self.latest.contains_key(topic)
     }
 
-    /// What was lost since the last call.
+    /// The messages lost since the last call.
     pub(super) fn take_lost(&mut self) -> Lost {
         std::mem::take(&mut self.lost)
     }
@@ -476,7 +476,7 @@ impl Outbox {
         Some(topic)
     }
 
-    /// What was put back may be published again.
+    /// Postponed messages may be published again.
     pub(super) fn retry(&mut self) {
         self.latest.values_mut().for_each(|slot| slot.put_back = false);
         for queue in [&mut self.results, &mut self.events, &mut self.history] {

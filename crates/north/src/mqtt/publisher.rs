@@ -33,7 +33,7 @@ pub(super) struct Update {
     pub(super) payload: Vec<u8>,
 }
 
-/// Observes the process image and returns what is to be published.
+/// Observes the process image and returns the messages to publish.
 #[derive(Debug)]
 pub(super) struct Publisher {
     topics: Topics,
@@ -140,8 +140,8 @@ impl Publisher {
         }
     }
 
-    /// Observes this plant from now on; publishes everything again and clears the topics that no longer exist. `besides`
-    /// are retained topics that somebody else publishes.
+    /// Observes this plant from now on; publishes everything again and clears the topics that no longer exist.
+    /// `besides` are retained topics that someone else publishes.
     pub(super) fn adopt(&mut self, plant: &Plant, besides: Vec<Arc<str>>) {
         let old: Vec<Arc<str>> = self.all_topics().cloned().collect();
         self.drives = plant
@@ -163,13 +163,13 @@ impl Publisher {
         self.clear(old);
     }
 
-    /// Somebody else publishes these retained topics from now on.
+    /// Someone else publishes these retained topics from now on.
     pub(super) fn publish_besides(&mut self, besides: Vec<Arc<str>>) {
         let old = std::mem::replace(&mut self.besides, besides);
         self.clear(old);
     }
 
-    /// Clears those of these topics that are not published any more.
+    /// Clears those of these topics that are no longer published.
     pub(super) fn clear(&mut self, old: impl IntoIterator<Item = Arc<str>>) {
         let present: BTreeSet<Arc<str>> = self.all_topics().cloned().collect();
         self.vanished.extend(old);

@@ -14,7 +14,7 @@ const LONGEST: usize = 1 << 20;
 const MESSAGE: u8 = b'M';
 const ACKNOWLEDGED: u8 = b'A';
 
-/// What a record says.
+/// The content of a record.
 #[derive(Debug, PartialEq)]
 pub(super) enum Entry {
     /// A message and its number.

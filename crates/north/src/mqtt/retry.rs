@@ -40,7 +40,7 @@ impl Retry {
         at
     }
 
-    /// Whether the wait is over.
+    /// Whether the wait has ended.
     pub(super) fn is_due(&mut self, now: Instant) -> bool {
         self.at.take_if(|at| *at <= now).is_some()
     }

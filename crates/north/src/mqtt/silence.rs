@@ -2,19 +2,19 @@
 
 use std::time::{Duration, Instant};
 
-/// Keep-alive interval that the gateway asks for, s.
+/// Keep-alive interval that the gateway requests, s.
 pub(super) const KEEP_ALIVE_S: u16 = 10;
 /// Keep-alive interval.
 const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
 /// Without a packet from the broker for this long, the connection is considered lost.
 const LOST: Duration = KEEP_ALIVE.saturating_mul(3);
 
-/// What is to be done about a broker that may be silent.
+/// The decision about a broker that may be silent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Verdict {
     /// Nothing.
     Fine,
-    /// It is to be asked something that it has to answer.
+    /// Send it a request that it must answer.
     Ask,
     /// The connection is lost.
     Lost,
@@ -52,8 +52,8 @@ impl Silence {
         std::mem::take(&mut self.asked)
     }
 
-    /// `interval` is the one that the broker set in place of ours, 0: no keep-alive. A broker that is pinged less often than we
-    /// want, or never, has no reason to speak, and is asked.
+    /// `interval` is the one that the broker set instead of ours, 0: no keep-alive. A broker that is pinged less often
+    /// than we want, or never, has no reason to speak, and is asked.
     pub(super) fn judge(&self, interval: Option<u16>, now: Instant) -> Verdict {
         let silent = now.saturating_duration_since(self.heard);
         let pinged = interval.is_none_or(|seconds| (1..=KEEP_ALIVE_S).contains(&seconds));

@@ -54,7 +54,7 @@ enum Job {
     Topics(Vec<String>),
 }
 
-/// What the disk reports.
+/// A report from the disk thread.
 #[derive(Debug)]
 pub(super) enum Loaded {
     /// Messages of earlier runs, and the topics published then.
@@ -66,7 +66,7 @@ pub(super) enum Loaded {
     },
 }
 
-/// What keeps the messages of one kind.
+/// The store of one kind of message.
 #[derive(Debug, Default)]
 pub(super) struct Store {
     disk: Option<Disk>,
@@ -97,7 +97,7 @@ struct Disk {
 struct Gone {
     /// Up to this message nothing is kept.
     through: AtomicI64,
-    /// Number of lost messages among those behind it.
+    /// Number of lost messages among those after it.
     missing: AtomicU64,
 }
 
@@ -170,7 +170,7 @@ impl Store {
         now.then_some((Some(self.pushed), message))
     }
 
-    /// Asks for messages on disk, if there are any that are not under way.
+    /// Asks for messages on disk, if there are any that are not in progress.
     pub(super) fn load(&mut self, room: usize) {
         let Some(disk) = &self.disk else { return };
         if room > 0 && self.opened && !self.loading && self.through < self.pushed {
@@ -395,7 +395,7 @@ impl Thread {
     }
 
     fn tell(&self, loaded: Loaded) {
-        // At most two reports are under way; the client may be gone.
+        // At most two reports are in progress; the client may be gone.
         let _ = self.report.try_send(loaded);
     }
 

@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-/// So many of them within so long are told.
+/// Number of closed connections that is reported, within this time.
 const CLOSED: usize = 3;
 const WITHIN: Duration = Duration::from_secs(60);
 /// Minimum time between two lines about it.
@@ -31,7 +31,7 @@ impl Takeovers {
         true
     }
 
-    /// What it looks like, and the remedy.
+    /// The message and its remedy.
     pub(super) fn words(client_id: &str) -> String {
         format!(
             "the broker closed {CLOSED} connections within a minute without giving a reason; this usually means that \

@@ -8,7 +8,7 @@ use super::Options;
 use crate::identity::{self, IdentityFault, RootsError};
 use crate::pem::{self, PemError};
 
-/// Why TLS towards the broker cannot be set up, and what to do.
+/// Why TLS to the broker cannot be set up, and the remedy.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum TlsConfigError {
     #[error(transparent)]
@@ -21,8 +21,7 @@ pub(super) enum TlsConfigError {
 
 /// Reads the certificates and keys of `options`; `None` without TLS. Blocking: it reads files.
 ///
-/// # Errors
-/// Which file is at fault, and what to do.
+/// # Errors The faulty file, and the remedy.
 pub(super) fn client_config(options: &Options) -> Result<Option<Arc<ClientConfig>>, TlsConfigError> {
     if !options.tls {
         return Ok(None);

@@ -1,4 +1,5 @@
-//! Parameters of drives: read by background exchanges, on demand of a client and every so often, and restored (`restore`).
+//! Parameters of drives: read by background transactions, on demand of a client and every so often, and restored
+//! (`restore`).
 
 mod restore;
 mod unfinished;
@@ -18,7 +19,7 @@ use crate::parameters::{
 use crate::plant::{DriveHandle, SharedPlant};
 use crate::process_image::{Access, Machine};
 
-/// A request waits no longer than that for its turn; then it is asked anew.
+/// A request waits no longer than that for its turn; then it is asked again.
 const EXPIRY: Duration = Duration::from_secs(60);
 /// A drive that does not answer for that long ends its reading.
 const AWAY: Duration = Duration::from_secs(3600);
@@ -28,7 +29,7 @@ const NAMED_CHANGES: usize = 5;
 /// How a drive is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct How {
-    /// The drive is asked for every address, whatever earlier readings found.
+    /// Reads every address, regardless of what earlier readings found.
     pub afresh: bool,
     /// How much of a busy line that takes.
     pub pace: Pace,
@@ -147,7 +148,7 @@ async fn read(
     Ok(reading.file(&spec.name, &identification(drive), &time, names))
 }
 
-/// Tells what changed since the last reading, what the gateway wrote itself apart.
+/// Reports changes since the last reading, except the gateway's own writes.
 fn compare(vault: &Vault, drive: &DriveHandle, last: &ParameterFile, file: &ParameterFile, begun: Instant) {
     let spec = &drive.image.spec;
     if last.family != file.family {
@@ -198,7 +199,7 @@ fn remaining((done, all): (usize, usize), worked: Duration) -> Option<Duration> 
     Some(worked.checked_div(done)?.saturating_mul(left))
 }
 
-/// What the drive says of itself, by the points that its profile names for that.
+/// The drive's identification, from the points that its profile names for that.
 fn identification(drive: &DriveHandle) -> String {
     let reading = drive.reading(Instant::now());
     let profile = &drive.image.spec.profile;

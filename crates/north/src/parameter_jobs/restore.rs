@@ -1,9 +1,8 @@
-//! Restores of parameters: prepared, carried out, and where they were cut off taken up again or set aside.
+//! Restores of parameters: preparing, executing, and resuming or setting aside interrupted ones.
 //!
-//! What the machine in `parameters::restoration` wants is done here: files by threads that may block, orders by the queue of the
-//! bus, one behind the other. While parameters are written the drive takes no commands but stops, and it takes none
-//! either while
-//! the journal of a restore that did not end is on disk.
+//! What the machine in `parameters::restoration` wants is done here: files by threads that may block, commands by the
+//! queue of the bus, one behind the other. While parameters are written the drive takes no commands but stops, and it
+//! takes none either while the journal of a restore that did not end is on disk.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -21,21 +20,21 @@ use crate::parameters::{
 use crate::plant::{DriveHandle, Plant, SharedPlant};
 use crate::process_image::Machine;
 
-/// An order of a restore waits no longer than that for its turn; then it is given anew.
+/// A command of a restore waits no longer than that for its turn; then it is given again.
 const EXPIRY: Duration = Duration::from_secs(30);
 /// Share of the time of a line that the writes of a restore take at most: one part in so many.
 const SHARE: u32 = 5;
 
-/// What is done with a restore that was cut off.
+/// What to do with an interrupted restore.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Again {
-    /// It goes on.
+    /// Resume it.
     Resume,
     /// The former values are written.
     Undo,
 }
 
-/// Begins to find out what a restore of `wanted` would write; its number.
+/// Starts preparing a restore of `wanted`. Returns its number.
 ///
 /// # Errors
 /// Why nothing can be restored to the drive now.
@@ -112,7 +111,7 @@ fn passes(drive: &DriveHandle, plan: &Plan) -> Vec<String> {
     limits_passed(&drive.reading(Instant::now()), writes)
 }
 
-/// Begins to write what the restore of that number found out.
+/// Starts writing the prepared restore of that number.
 ///
 /// # Errors
 /// Why not; nothing was written.
@@ -211,8 +210,8 @@ pub async fn take_up(plant: &SharedPlant, drive: &DriveHandle, again: Again, ori
     Ok(())
 }
 
-/// Sets the journal of a restore that was cut off aside: the drive stays as it is, and takes all orders. One that goes on
-/// ends before its next parameter, and is to be released then.
+/// Sets the journal of a restore that was cut off aside: the drive stays as it is, and takes all commands. One that
+/// goes on ends before its next parameter, and is to be released then.
 ///
 /// # Errors
 /// Why not.
@@ -294,7 +293,7 @@ fn identified(drive: &DriveHandle, of: &Owner) -> Identified {
     }
 }
 
-/// Why the drive takes no orders while parameters are written.
+/// Why the drive takes no commands while parameters are written.
 fn held_while_written(name: &str) -> String {
     format!("the parameters of `{name}` are being restored: until then the drive accepts only stops")
 }
@@ -323,7 +322,7 @@ fn start(
 
 /// A restore that is carried out.
 struct Run {
-    /// What the machine is called now.
+    /// The present name of the machine.
     name: String,
     machine: Machine,
     file: JournalFile,
@@ -401,7 +400,7 @@ impl Run {
         Ok(drive)
     }
 
-    /// Gives an order to the drive as it is configured now.
+    /// Gives a command to the drive as it is configured now.
     async fn set(&mut self, order: ParameterOrder) {
         let plant = self.plant.load_full();
         let drive = match self.bound(&plant) {
@@ -446,7 +445,7 @@ impl Run {
         tokio::time::sleep(pause).await;
     }
 
-    /// It is over: the drive takes orders again, or is held for what was left half done.
+    /// It has ended: the drive accepts commands again, or is held because it is half restored.
     fn over(self) {
         let (done, all) = self.restoration.progress();
         // A reload may have given the drive another name, by which it is resumed.
@@ -490,7 +489,7 @@ impl Run {
             _ => {}
         }
         if let Some(why) = &held {
-            // Where it is not configured any more, an event told whose journal is left.
+            // Where it is no longer configured, an event told whose journal is left.
             if let Some(drive) = &drive {
                 let spec = &drive.image.spec;
                 drive.publish(unfinished_event(&spec.bus, Some(&spec.name), why.clone()));
@@ -510,7 +509,7 @@ fn note_written(drive: &DriveHandle, write: &RequestPdu, now: Instant) {
     }
 }
 
-/// The pause that leaves the line to the others: an order takes four exchanges.
+/// The pause that leaves the line to the others: a command takes four transactions.
 fn pause_after(drive: &DriveHandle, order: &ParameterOrder) -> Duration {
     let line = &drive.bus.image.spec;
     let silence = line.protocol.silence(Default::default(), &line.format);

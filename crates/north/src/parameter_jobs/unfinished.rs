@@ -1,5 +1,5 @@
 //! Restores that did not come to their end: whose journal is on disk. The machine of such a journal takes no commands
-//! but stops. A journal whose machine is not configured any more is told of by an event, and by `drivegate check`.
+//! but stops. A journal whose machine is no longer configured is told of by an event, and by `drivegate check`.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -148,7 +148,8 @@ pub(super) fn held_unfinished(name: &str, why: &str) -> String {
     )
 }
 
-/// Why a drive is held by a journal that belongs to a machine which is not configured any more, and why it is not taken up.
+/// Why a drive is held by a journal that belongs to a machine which is no longer configured, and why it is not taken
+/// up.
 fn belongs_elsewhere(name: &str, profile: &str, claim: Claim, owner: &Owner) -> String {
     let but = match claim {
         Claim::Own | Claim::Name => "where no drive is configured now".to_string(),

@@ -6,7 +6,7 @@ use crate::drive::{ModelPoint, Profile, Value};
 
 const FAULT_RESET: u16 = 1 << 2;
 
-/// What a write to the command block means.
+/// The meaning of a write to the command block.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct CommandWrite {
     /// Points to set as one command: index in the profile, value in engineering units. May be empty when
@@ -20,7 +20,7 @@ pub(crate) struct CommandWrite {
     pub(crate) refused: Option<Refusal>,
 }
 
-/// What decides whether a write of 0x8100 resets a fault.
+/// The state that decides whether a write of 0x8100 resets a fault.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct CommandContext {
     /// The word last written there; `None` if none was written since the server started.

@@ -21,9 +21,9 @@ pub struct BusFigures {
     pub(crate) load: Option<f64>,
     /// Achieved cycle of the fast poll class.
     pub(crate) cycle: Option<Duration>,
-    /// Exchanges so far.
+    /// Transactions so far.
     pub(crate) transactions: u64,
-    /// Exchanges that failed so far.
+    /// Transactions that failed so far.
     pub(crate) errors: u64,
     /// Writes in the queue.
     pub(crate) queued: usize,

@@ -1,4 +1,4 @@
-//! What one tool says and is answered, bytes in and out, with the time as an argument.
+//! The dialogue with one tool, bytes in and out, with the time as an argument.
 //!
 //! A line has one request at a time: a tool that asks again has given the request before up, whose answer is dropped, however it
 //! ends. What was accepted for the bus is done all the same.
@@ -54,7 +54,7 @@ pub(super) struct Dialogue {
     asked: Option<Instant>,
     /// When more of the tool is read, while that is not now.
     reads_at: Option<Instant>,
-    /// What the tool is answered.
+    /// The reply to the tool.
     pub(super) output: Vec<u8>,
 }
 
@@ -130,7 +130,7 @@ impl Dialogue {
             .min()
     }
 
-    /// Waits until nothing is due any more: the answer to what was asked last is in the output, or its time is over.
+    /// Waits until nothing is due any more: the answer to what was asked last is in the output, or its time has ended.
     pub(super) async fn finished(&mut self) {
         while self.is_waiting() {
             let wake_at = self.wake_at().map(tokio::time::Instant::from_std);
@@ -148,12 +148,12 @@ impl Dialogue {
         }
     }
 
-    /// The tool is not there any more.
+    /// The tool is no longer there.
     pub(super) fn ended(&mut self) {
         self.give_up(SlotOutcome::Abandoned);
     }
 
-    /// What was asked before is not wanted any more.
+    /// What was asked before is no longer wanted.
     fn give_up(&mut self, outcome: SlotOutcome) {
         if self.is_waiting() {
             (self.pending, self.held) = (None, None);
@@ -269,8 +269,8 @@ impl Dialogue {
     }
 }
 
-/// The frame of an answer whose bytes were not kept: to a command that may have taken several exchanges. An acknowledgement is
-/// the same whoever makes it.
+/// The frame of an answer whose bytes were not kept: to a command that may have taken several transactions. An
+/// acknowledgement is the same anyone who makes it.
 fn frame_of(protocol: Protocol, pending: &Pending, outcome: &Outcome) -> Option<Vec<u8>> {
     let request = &pending.request;
     match outcome {

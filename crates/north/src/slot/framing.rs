@@ -11,11 +11,11 @@ use crate::arrivals::Arrivals;
 use crate::codec::frames::Frames;
 use crate::codec::{LineFormat, Protocol};
 
-/// Silence behind half a frame after which the rest is not expected any more: longer than the pauses of serial programs and the
-/// delayed acknowledgements of TCP, shorter than tools wait before they ask again.
+/// Silence behind half a frame after which the rest is no longer expected: longer than the pauses of serial programs
+/// and the delayed acknowledgements of TCP, shorter than tools wait before they ask again.
 const HALF_FRAME: Duration = Duration::from_millis(250);
 
-/// What a tool said.
+/// A request of a tool.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Said {
     /// A sound request.
@@ -44,7 +44,7 @@ impl Framing {
         }
     }
 
-    /// Bytes came in at `now`.
+    /// Bytes were received at `now`.
     pub(super) fn add(&mut self, bytes: &[u8], now: Instant) {
         self.frames.add(bytes, now);
         self.arrivals.came(bytes.len(), now);
@@ -80,7 +80,7 @@ impl Framing {
         self.frames.patience()
     }
 
-    /// Whether a request has begun.
+    /// Whether a request has started.
     pub(super) fn has_begun(&self) -> bool {
         let rest = self.frames.rest();
         !rest.is_empty() && !self.is_blank(rest)
@@ -251,7 +251,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever comes in whatever pieces: nothing is kept without bound, and a sound request behind it is found.
+        /// Whatever comes in whatever pieces: nothing is kept without bound, and a sound request after it is found.
         #[test]
         fn any_bytes_are_borne(
             bytes in prop::collection::vec(any::<u8>(), 0..600),

@@ -15,7 +15,7 @@ use crate::line::ServedPort;
 use crate::listener::ConnectionHandler;
 use crate::refusals::Refusals;
 
-/// What an address serves.
+/// The tools of an address.
 #[derive(Debug, Clone)]
 pub(super) struct Served {
     pub(super) terms: Arc<Terms>,

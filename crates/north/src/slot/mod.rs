@@ -38,12 +38,12 @@ pub use self::offline::Offline;
 /// Tools that one address of a slot serves at one time, in turns.
 pub const MAX_TOOLS: usize = 4;
 
-/// What the tools of a slot may do.
+/// The rights of the tools of a slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum SlotAccess {
     #[default]
     Read,
-    /// Write what a client of Modbus TCP could write, too.
+    /// Also write like a Modbus TCP client that may write.
     Write,
     /// Also what cannot be checked: broadcasts, functions that are not decoded, addresses of no configured drive.
     Raw,
@@ -65,7 +65,7 @@ impl SlotAccess {
 pub struct Slot {
     /// Name of the bus.
     pub bus: String,
-    /// What its line speaks.
+    /// The protocol of its line.
     pub protocol: Protocol,
     /// Its characters.
     pub format: LineFormat,
@@ -75,7 +75,7 @@ pub struct Slot {
     pub rfc2217: Option<SocketAddr>,
     /// Link to a pseudo-terminal.
     pub pty: Option<PathBuf>,
-    /// What its tools may do.
+    /// The rights of its tools.
     pub access: SlotAccess,
     /// Who may connect.
     pub allow: Vec<IpNet>,
@@ -156,7 +156,7 @@ struct RunningPty {
     cancel: CancellationToken,
 }
 
-/// What [`Server::commit`] needs to apply new options: all that can fail is done.
+/// A prepared change of options for [`Server::commit`]: everything that can fail is done.
 #[derive(Debug)]
 pub struct Change {
     options: Options,
@@ -292,7 +292,7 @@ impl Reconfigure for Server {
         self.commit_ptys(&all);
     }
 
-    /// Closes all slots; what tools have asked is answered.
+    /// Closes all slots; pending requests of tools complete.
     async fn retire(&mut self) {
         self.listeners.close().await;
         self.ptys.drain(..).for_each(|pty| pty.cancel.cancel());

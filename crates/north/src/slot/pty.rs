@@ -133,7 +133,7 @@ impl Port {
         self.write();
     }
 
-    /// A serial port does not wait for whoever does not read: what finds no room is lost.
+    /// A serial port does not wait for anyone who does not read: what finds no room is lost.
     fn write(&mut self) {
         let answer = std::mem::take(&mut self.dialogue.output);
         if answer.is_empty() {

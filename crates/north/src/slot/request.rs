@@ -1,4 +1,4 @@
-//! What a frame of a tool asks for: a read, a write, or something that may write. Pure.
+//! The meaning of a tool's frame: a read, a write, or something that may write. Pure.
 
 use crate::codec::n2::{self, Command};
 use crate::codec::{Exception, Protocol, RequestPdu, ascii, rtu};
@@ -17,7 +17,7 @@ pub(super) struct ToolRequest {
     pub(super) meaning: Meaning,
 }
 
-/// What a tool asks for.
+/// The meaning of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Meaning {
     /// Reads and nothing else.

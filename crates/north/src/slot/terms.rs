@@ -1,4 +1,4 @@
-//! What a slot lets its tools do, and the way of their requests to the bus.
+//! What a slot permits its tools, and how their requests reach the bus.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -19,7 +19,7 @@ const SHARE_OF_WRITES: f64 = 0.1;
 /// A command of a tool is not sent later than that.
 const EXPIRY: Duration = super::dialogue::ANSWER_WITHIN;
 
-/// What becomes of a request.
+/// The decision about a request.
 #[derive(Debug)]
 pub(super) enum Decision {
     Refuse(Refused),
@@ -29,7 +29,7 @@ pub(super) enum Decision {
     Wait(Work),
 }
 
-/// What the bus was given.
+/// The work given to the bus.
 #[derive(Debug)]
 pub(super) enum Work {
     Exchange(Exchange),
@@ -72,7 +72,7 @@ impl WritePaces {
     }
 }
 
-/// A slot as it is configured now, with the plant behind it.
+/// A slot as it is configured now, with the plant after it.
 #[derive(Debug)]
 pub(super) struct Terms {
     pub(super) slot: Slot,
@@ -309,7 +309,7 @@ impl Tool {
     }
 }
 
-/// What a decision rests on.
+/// The basis of a decision.
 struct Case<'c> {
     plant: &'c Plant,
     bus: &'c BusHandle,

@@ -1,24 +1,24 @@
-//! What was received in an exchange, split into its parts: echo, reply, foreign frames, garbage.
+//! What was received in a transaction, split into its parts: echo, reply, foreign frames, garbage.
 
 use std::ops::Range;
 
 use super::n2_words;
 use crate::{Decoded, Protocol, Reply, Request, RequestPdu};
 
-/// What some bytes of an exchange are.
+/// What some bytes of a transaction are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// The request, sent back by an adapter that hears itself.
     Echo,
     /// The reply to the request, perhaps an exception.
     Reply,
-    /// A sound frame of somebody else.
+    /// A sound frame of someone else.
     Foreign,
     /// No sound frame.
     Garbage,
 }
 
-/// A part of what was received in an exchange.
+/// A part of what was received in a transaction.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Part {
     /// What it is.
@@ -28,7 +28,7 @@ pub struct Part {
 }
 
 /// Splits what came after `request`, whose frame was `frame`, into its parts, in the order of arrival. `answered`: the
-/// exchange ended with a reply, which distinguishes the reply to a write from its echo.
+/// transaction ended with a reply, which distinguishes the reply to a write from its echo.
 pub fn parts(protocol: Protocol, request: &Request, frame: &[u8], bytes: &[u8], answered: bool) -> Vec<Part> {
     let mut parts = Vec::new();
     let mut at = 0;

@@ -34,7 +34,7 @@ pub struct N2Options {
     pub unreliable_bit: Option<u8>,
     /// Digits of the region in override and release.
     pub region_width: RegionWidth,
-    /// Drives are identified before they are asked anything else, and after an exchange that failed.
+    /// Drives are identified before they are asked anything else, and after a transaction that failed.
     pub identify: bool,
     /// Device type that a drive is expected to report.
     pub device_type: u8,

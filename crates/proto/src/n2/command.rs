@@ -3,7 +3,7 @@
 use super::assumptions::RegionWidth;
 use super::object::{Object, Region};
 
-/// The drive has started anew and waits for Identify.
+/// The drive has restarted and waits for Identify.
 pub const RESTARTED: u8 = 0x00;
 /// The command is not known.
 pub const UNKNOWN: u8 = 0x01;
@@ -126,7 +126,7 @@ impl Command {
         seal(b'>', &body, out);
     }
 
-    /// The command in a frame, from its lead to its CR, as a drive reads it. A new lead begins the frame anew. `None`
+    /// The command in a frame, from its lead to its CR, as a drive reads it. A new lead begins the frame again. `None`
     /// for what a drive does not answer: no lead, no CR, no address, or not hexadecimal.
     pub fn decode(frame: &[u8]) -> Option<Heard> {
         let line = frame.strip_suffix(b"\r")?;
@@ -196,7 +196,7 @@ fn write(region: u8, rest: &[u8]) -> Result<Command, u8> {
     })
 }
 
-/// The object of 7/2 and 7/3 and what stands behind it. A region never begins with 0, so a 0 shows the form of two
+/// The object of 7/2 and 7/3 and what stands after it. A region never begins with 0, so a 0 shows the form of two
 /// characters.
 fn commanded(rest: &[u8]) -> Result<(Object, Vec<u8>), u8> {
     let rest = rest.strip_prefix(b"0").unwrap_or(rest);

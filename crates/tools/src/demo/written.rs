@@ -52,7 +52,7 @@ impl Written {
         self.dir.join("drivegate.sock")
     }
 
-    /// The users who may operate the demo from the page, if somebody made that file.
+    /// The users who may operate the demo from the page, if someone made that file.
     pub(super) fn users(&self) -> Option<PathBuf> {
         Some(self.dir.join("users")).filter(|users| users.exists())
     }

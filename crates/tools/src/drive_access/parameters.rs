@@ -1,4 +1,5 @@
-//! Readings and restores of parameters: begun, then asked for until they are over, through the gateway or on a bus of its own.
+//! Readings and restores of parameters: started, then asked for until they have ended, through the gateway or on a bus
+//! of its own.
 
 use std::time::Duration;
 
@@ -54,11 +55,11 @@ impl Target {
         text
     }
 
-    /// Does that with a restore of the drive, or only looks at it, and waits until it is over; a restore that is prepared is carried out if `agreed`
-    /// says so. `progress` gets how far it is. The last that is known of it.
+    /// Does that with a restore of the drive, or only looks at it, and waits until it has ended; a restore that is
+    /// prepared is carried out if `agreed` says so. `progress` gets how far it is. The last that is known of it.
     ///
     /// # Errors
-    /// Why it could not be begun, or is not known any more, as a message.
+    /// Why it could not be started, or is no longer known, as a message.
     pub(crate) fn restore_parameters(
         &self,
         act: Option<RestoreAct>,

@@ -16,7 +16,7 @@ use crate::printable;
 
 /// Shortest time between two lines of one kind that a library logs.
 const INTERVAL: Duration = Duration::from_secs(60);
-/// Kinds that are told apart; they are places in sources, so this is never reached.
+/// Kinds that are distinguished; they are places in sources, so this is never reached.
 const KINDS: usize = 1024;
 /// Own targets begin with this.
 const OWN: &str = "drivegate";
@@ -28,7 +28,7 @@ pub(super) enum Form {
     Entry,
     /// A line with the priority before it, which the journal reads.
     Priority,
-    /// A line for people.
+    /// A line as text.
     Text,
     /// A JSON object.
     Json,

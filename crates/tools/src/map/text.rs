@@ -1,4 +1,4 @@
-//! The map as text: tables for people.
+//! The map as text: tables as text.
 
 use std::fmt::Write as _;
 

@@ -96,7 +96,7 @@ fn write(gateway: &Gateway, file: &ParameterFile, drive: &str, how: &How) -> Res
     carry(gateway, drive, Some(act), how)
 }
 
-/// The file without what is for people, which the gateway has itself.
+/// The file without what is as text, which the gateway has itself.
 fn without_notes(file: &ParameterFile) -> ParameterFile {
     let bare = |(id, entry): (&Id, &Entry)| {
         let value = entry.value.clone().map_err(|_| String::new());

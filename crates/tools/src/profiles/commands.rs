@@ -1,4 +1,4 @@
-//! `[control]` of a profile for people.
+//! `[control]` of a profile as text.
 
 use super::name_of;
 use crate::document::format_duration;

@@ -107,7 +107,7 @@ fn rows(text: &str) -> impl Iterator<Item = (usize, Vec<String>)> {
     lines.map(move |(place, line)| (place + 1, cells(line, separator)))
 }
 
-/// Cells of a line; one in quotes may have separators, and doubled quotes in it.
+/// Cells of a line; one in quotes may have separators, and duplicate quotes in it.
 fn cells(line: &str, separator: char) -> Vec<String> {
     let mut cells = vec![String::new()];
     let (mut quoted, mut chars) = (false, line.chars().peekable());

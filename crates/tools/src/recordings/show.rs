@@ -1,4 +1,4 @@
-//! A recording for people: what happened in its order, and the samples around the trigger.
+//! A recording as text: what happened in its order, and the samples around the trigger.
 
 use std::fmt::Write as _;
 
@@ -46,7 +46,7 @@ pub(super) fn text(recording: &Recording) -> String {
     text + &timeline(recording) + &samples(recording)
 }
 
-/// Events, commands and failed exchanges in their order.
+/// Events, commands and failed transactions in their order.
 fn timeline(recording: &Recording) -> String {
     let mut lines: Vec<(f64, String)> = Vec::new();
     let drives = &recording.header.bus.drives;

@@ -1,4 +1,4 @@
-//! Reloads: one at a time, each answered to whoever asked for it.
+//! Reloads: one at a time, each answered to the requester for it.
 
 use std::path::Path;
 
@@ -17,7 +17,7 @@ use super::watch::Watch;
 pub(super) struct Reloads<'p> {
     path: &'p Path,
     loads: Loads,
-    /// Who waits for the one that is under way, and for the one after it.
+    /// Who waits for the one that is in progress, and for the one after it.
     waiting: [Vec<ReloadOrder>; 2],
 }
 
@@ -53,7 +53,7 @@ impl Reloads<'_> {
         self.loads.loaded().await
     }
 
-    /// The one that was under way is over.
+    /// The one that was in progress has ended.
     pub(super) fn ended(&mut self, outcome: ReloadOutcome, watch: &mut Watch<'_>) {
         watch.reloaded(&outcome);
         let [current, next] = &mut self.waiting;

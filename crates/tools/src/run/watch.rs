@@ -71,7 +71,7 @@ impl Watch<'_> {
         notify(&states);
     }
 
-    /// A reload is over.
+    /// A reload has ended.
     pub(super) fn reloaded(&mut self, outcome: &ReloadOutcome) {
         let now = SystemTime::now();
         let why = summary(&outcome.errors);

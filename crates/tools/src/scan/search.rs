@@ -17,12 +17,12 @@ use crate::drive::profile::{Profile, Profiles};
 use crate::drive::{Probe, identify};
 use crate::line::{Line, LineOptions};
 
-/// What came from the line, beside replies.
+/// What came from the line, besides replies.
 #[derive(Debug, Default)]
 pub(crate) struct Heard {
     /// Settings and addresses that were answered with invalid frames.
     pub(crate) garbage: Vec<(Setting, u8)>,
-    /// Bytes that came in exchanges, echoes of requests aside.
+    /// Bytes that came in transactions, echoes of requests aside.
     pub(crate) bytes: usize,
     /// Bytes that came while nothing was asked for.
     pub(crate) unasked: usize,
@@ -73,7 +73,7 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Listens for `time` before anything is sent: whether somebody else speaks on the line.
+    /// Listens for `time` before anything is sent: whether someone else speaks on the line.
     ///
     /// # Errors
     /// The port cannot be opened, or was lost.

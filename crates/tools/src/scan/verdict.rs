@@ -1,4 +1,4 @@
-//! What the line is likely to lack when no drive answered, by what was heard. Pure.
+//! What the line is likely to lack when no drive answered, by what was received. Pure.
 
 use std::collections::BTreeSet;
 use std::time::Duration;

@@ -10,7 +10,7 @@ use super::Stop;
 use crate::adapters::{Adapter, adapters};
 use crate::{printable, report};
 
-/// Whether there is somebody to ask.
+/// Whether there is someone to ask.
 pub(super) fn is_terminal() -> bool {
     io::stdin().is_terminal() && io::stderr().is_terminal()
 }

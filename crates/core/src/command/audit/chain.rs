@@ -129,7 +129,7 @@ impl Chain {
     }
 }
 
-/// What a reader needs of a line.
+/// The fields of a line that a reader needs.
 #[derive(Debug, Deserialize)]
 struct Head {
     seq: u64,
@@ -209,7 +209,7 @@ pub fn fragment(rest: &[u8]) -> (Option<(u64, Hash)>, bool) {
 pub struct Fault {
     /// Whether the line before is meant.
     pub before: bool,
-    /// What is wrong with it.
+    /// The fault.
     pub why: String,
 }
 
@@ -246,8 +246,7 @@ impl Verifier {
 
     /// Takes the next line, without its line end.
     ///
-    /// # Errors
-    /// What is wrong; the next line can be taken nevertheless.
+    /// # Errors The fault; the next line can still be checked.
     pub fn line(&mut self, line: &[u8]) -> Result<(), Fault> {
         let Some(head) = Head::read(line) else {
             let (bytes, hash) = self.fragment.get_or_insert_with(|| (0, Context::new(&SHA256)));
@@ -287,8 +286,7 @@ impl Verifier {
 
     /// All lines were read.
     ///
-    /// # Errors
-    /// What is wrong with the end.
+    /// # Errors The fault at the end.
     pub fn finish(&self) -> Result<(), String> {
         if self.fragment.is_some() {
             return Err("the last line is incomplete: truncated by a crash or by someone".to_string());

@@ -46,7 +46,7 @@ impl AuditFileOptions {
     }
 }
 
-/// The way to the thread that writes.
+/// Handle of the writing thread.
 #[derive(Debug)]
 pub struct AuditFile {
     options: AuditFileOptions,
@@ -154,7 +154,7 @@ impl AuditFile {
         Ok(AuditFile { options, shared, ended })
     }
 
-    /// Where it writes.
+    /// Its options.
     pub fn options(&self) -> &AuditFileOptions {
         &self.options
     }

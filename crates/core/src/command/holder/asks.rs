@@ -1,24 +1,24 @@
-//! What an order asks of the hold of a drive. Pure.
+//! What a command requires of the hold of a drive. Pure.
 
 use crate::command::{Command, Effect, Order, Urgency};
 
-/// What an order asks of the hold of a drive.
+/// What a command requires of the hold of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Asks {
     /// It may start the motor: needs the hold, takes a free drive.
     Run,
     /// A reference or a direction: the same, but starts nothing.
     Steer,
-    /// A fault reset, a parameter, a raw write of something else: passes while nobody holds, and takes nothing.
+    /// A fault reset, a parameter, any other raw write: passes if the drive is free, and takes no hold.
     Other,
     /// Takes the run command away: always passes.
     Stop,
-    /// Nothing: a read, or a write of a restore that has begun and is not to be left half done.
+    /// Nothing: a read, or a write of a restore that has started and is not to be left half done.
     Nothing,
 }
 
 impl Asks {
-    /// What a command asks of that drive.
+    /// What a command requires of that drive's hold.
     pub fn of(command: &Command, drive: usize) -> Asks {
         match command.stops(drive) {
             true => Asks::Stop,
@@ -26,7 +26,7 @@ impl Asks {
         }
     }
 
-    /// What an order of that rank with that effect asks.
+    /// What a command of that rank with that effect requires.
     pub fn by(order: &Order, urgency: Urgency, effect: Effect) -> Asks {
         match (urgency, order) {
             (Urgency::Stop, _) => Asks::Stop,

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::{Claim, Rules};
 use crate::command::{Holder, Refusal};
 
-/// Why an order, or an act upon the hold, is refused.
+/// Why a command, or an act upon the hold, is refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Denial {
     /// The client is no principal.
@@ -20,7 +20,7 @@ pub enum Denial {
     Local,
     /// It repeats its last stop while another one holds the drive.
     Repeats(Claim, Duration),
-    /// It renews what it does not hold.
+    /// It renews a hold it does not have.
     NotHeld,
 }
 

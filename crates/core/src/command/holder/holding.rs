@@ -1,4 +1,4 @@
-//! The hold of one drive: who has it, for how long, and what a stop left behind. Pure: time is an argument.
+//! The hold of one drive: holder, remaining time, and reservations after a stop. Pure: time is an argument.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -6,14 +6,14 @@ use std::time::{Duration, Instant};
 use super::denial::seconds;
 use super::{Asks, Claim, Denial, Mode, Rules};
 
-/// Leases without a run after which a client that was refused behind a stop is forgotten.
+/// Leases without a run command after which a client refused after a stop is forgotten.
 const FORGOTTEN_AFTER: u32 = 10;
-/// The name of the gateway's own stop of a drive whose client fell silent.
+/// The name of the gateway's own stop after a client went silent.
 const SUPERVISION: &str = "supervision";
-/// Clients whose last word is remembered.
+/// Most clients whose last command word is remembered.
 const MOST_STOOD: usize = 256;
 
-/// What a client does with the hold of a drive.
+/// An action on the hold of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verb {
     /// Takes a free drive, or renews.
@@ -71,7 +71,7 @@ impl HoldState {
     }
 }
 
-/// What is told of the hold of a drive.
+/// The published state of a hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HoldView {
     /// Who has it.
@@ -80,20 +80,20 @@ pub struct HoldView {
     pub holder: Option<Arc<str>>,
     /// The name of its rank.
     pub rank: Option<Arc<str>>,
-    /// Seconds left, rounded up; 0 while nobody has it, none of the local control place.
+    /// Seconds left, rounded up; 0 if free, none for local control.
     pub left_s: Option<u64>,
 }
 
-/// What happened to a hold, for an event.
+/// A change of a hold, for an event.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Told {
-    /// Whose hold.
+    /// The holder.
     pub who: Claim,
-    /// What happened to it.
+    /// The change.
     pub what: What,
 }
 
-/// What happened to a hold.
+/// A change of a hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum What {
     /// It began.
@@ -112,7 +112,7 @@ enum State {
     Reserved(Claim, Instant),
 }
 
-/// A client whose run was refused behind a stop.
+/// A client whose run command was refused after a stop.
 #[derive(Debug, Clone)]
 struct Waiting {
     who: Claim,
@@ -131,14 +131,14 @@ pub struct Holding {
     last: Option<Claim>,
     /// No more of them than principals.
     waiting: Vec<Waiting>,
-    /// The clients whose last word was a stop.
+    /// The clients whose last command word was a stop.
     stood: Vec<Arc<str>>,
     /// One that is not cyclic and ended the hold of another by a stop that repeated its last one.
     repeater: Option<Arc<str>>,
 }
 
 impl Holding {
-    /// Ends what its time has ended.
+    /// Ends what has expired.
     pub fn settle(&mut self, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
         match &self.state {
             State::Held(_, until) if *until <= now => self.ends("its lease ended", told),
@@ -175,7 +175,7 @@ impl Holding {
         }
     }
 
-    /// Whether an order of that client passes. Being a principal grants nothing; it was admitted before.
+    /// Whether a command of that client passes. Being a principal grants nothing; it was admitted before.
     ///
     /// # Errors
     /// Why it does not; in advisory mode, why it would not.
@@ -214,7 +214,7 @@ impl Holding {
         }
     }
 
-    /// An order was refused: of a run behind a stop that is kept.
+    /// A command was refused; a run command after a stop is remembered.
     pub fn refused(&mut self, who: Option<&Claim>, asks: Asks, denial: &Denial, rules: &Rules, now: Instant) {
         self.note_word(who, asks);
         let Some(who) = who.filter(|_| asks == Asks::Run && rules.mode == Mode::Exclusive) else {
@@ -233,7 +233,7 @@ impl Holding {
         }
     }
 
-    /// An order was accepted.
+    /// A command was accepted.
     pub fn accepted(&mut self, who: Option<&Claim>, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
         self.settle(rules, now, told);
         let repeats = asks == Asks::Stop && who.is_some_and(|who| self.repeats(who));
@@ -264,8 +264,8 @@ impl Holding {
         self.state = State::Reserved(who.clone(), now + rules.lease);
     }
 
-    /// Supervision stops the drive with the rank of the client that fell silent. Any other stop of the gateway's own reserves
-    /// nothing.
+    /// Supervision stops the drive with the rank of the client that went silent. Any other stop of the gateway's own
+    /// reserves nothing.
     pub fn stopped_by_gateway(&mut self, supervision: bool, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
         self.settle(rules, now, told);
         self.ends("the gateway stopped the drive", told);
@@ -316,7 +316,7 @@ impl Holding {
         self.state = State::Held(who.clone(), now + rules.lease);
     }
 
-    /// The turn of an accepted order came, and it passes: it holds the drive again if the hold has ended since.
+    /// An accepted command has its turn and passes: it takes the hold again if that has ended since.
     pub fn turn_came(&mut self, who: &Claim, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
         self.settle(rules, now, told);
         if asks.takes() && rules.mode == Mode::Exclusive && !self.is_held_by(who, now) {
@@ -324,7 +324,7 @@ impl Holding {
         }
     }
 
-    /// An order of that client was carried out, or its heartbeat came: its hold runs anew. A lease is never shortened.
+    /// A command of that client was executed, or its heartbeat arrived: renews its hold. A lease is never shortened.
     pub fn renew(&mut self, who: &Claim, rules: &Rules, now: Instant) {
         if let State::Held(by, until) = &mut self.state
             && by.is(who)
@@ -334,7 +334,7 @@ impl Holding {
         }
     }
 
-    /// What a client does with the hold itself.
+    /// Applies a client's action to the hold.
     ///
     /// # Errors
     /// Why it may not.
@@ -376,7 +376,7 @@ impl Holding {
         self.waiting.retain(|waiting| !waiting.stopper.is(who));
     }
 
-    /// Whether the drive's local control place has it. When that begins the hold ends; a reservation goes on.
+    /// Sets whether the drive is under local control. That ends a hold, but not a reservation.
     pub fn set_local(&mut self, local: bool, told: &mut Vec<Told>) {
         if local && !self.local {
             self.ends("the drive was switched to its local control place", told);
@@ -440,7 +440,7 @@ impl Holding {
         self.repeater.as_ref()
     }
 
-    /// The reservation that stands: for whom, and until when.
+    /// The present reservation: for whom, and until when.
     pub fn reservation(&self) -> Option<(&Claim, Instant)> {
         match &self.state {
             State::Reserved(by, until) => Some((by, *until)),
@@ -460,7 +460,7 @@ impl Holding {
         self.held(now).is_some_and(|(by, _)| by.is(who))
     }
 
-    /// What is told of it.
+    /// Its published state.
     pub fn view(&self, rules: &Rules, now: Instant) -> HoldView {
         let of = |state: HoldState, (by, left): (&Claim, Duration)| HoldView {
             state,

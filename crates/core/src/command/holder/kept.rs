@@ -1,4 +1,4 @@
-//! What outlives the process: the reservation that a stop left behind. Pure: both clocks are arguments.
+//! What survives the process: the reservation after a stop. Pure: both clocks are arguments.
 
 use std::time::{Duration, Instant, SystemTime};
 
@@ -51,8 +51,8 @@ impl KeptReservation {
         }
     }
 
-    /// Who it is for, and until when it goes on after a start at `now`, which is `time` on the calendar; nothing where it is over,
-    /// or its rank is no more. Where the clock stands before the stop, all of it is left.
+    /// Who it is for, and until when it goes on after a start at `now`, which is `time` on the calendar; nothing where
+    /// it has ended, or its rank is no more. Where the clock stands before the stop, all of it is left.
     pub fn goes_on(&self, rules: &Rules, now: Instant, time: SystemTime) -> Option<(Claim, Instant)> {
         let rank = rules.ranks.iter().position(|rank| **rank == *self.rank)?;
         let passed = milliseconds(time).saturating_sub(self.stopped_ms);

@@ -1,8 +1,9 @@
-//! Who holds a drive: principals and their ranks, the hold of one drive, and what an order asks of it. Pure: time is an argument.
+//! Who holds a drive: principals and their ranks, the hold of one drive, and what a command asks of it. Pure: time is
+//! an argument.
 //!
-//! Who a client is, is found by what its connection proves ([`Proof`], made by the north sides); [`Rules`] turn that into a
-//! [`Claim`]. A [`Holding`] judges the orders of clients to one drive. The holdings are part of the queue of the bus, as the priority
-//! arrays are, so that they and the orders have one order of acceptance.
+//! Who a client is, is found by what its connection proves ([`Proof`], made by the north sides); [`Rules`] turn that
+//! into a [`Claim`]. A [`Holding`] judges the commands of clients to one drive. The holdings are part of the queue of
+//! the bus, as the priority arrays are, so that they and the commands have one order of acceptance.
 
 mod asks;
 mod denial;

@@ -8,7 +8,7 @@ use ipnet::IpNet;
 
 use crate::command::Origin;
 
-/// What the connection of a client proves of it.
+/// What a client's connection proves about it.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Proof {
     /// Nothing.
@@ -32,12 +32,12 @@ pub enum Proof {
     Pty(Arc<str>),
 }
 
-/// What is done with the orders of those who do not hold a drive.
+/// How commands of non-holders are treated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mode {
-    /// They are counted and told, and carried out.
+    /// They are counted, reported and executed.
     Advisory,
-    /// They are refused, stops apart.
+    /// They are refused, except stops.
     Exclusive,
 }
 
@@ -84,7 +84,7 @@ impl Principal {
     }
 }
 
-/// Who a client is when it orders.
+/// Who a client is when it commands.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Claim {
     /// Its name: two claims of one name are one principal.
@@ -93,7 +93,7 @@ pub struct Claim {
     pub rank: usize,
     /// See [`Principal::cyclic`].
     pub cyclic: bool,
-    /// Its orders break the hold of a lower rank by themselves: in BACnet the priority is the act.
+    /// Its commands break the hold of a lower rank by themselves: in BACnet the priority is the act.
     pub breaks: bool,
 }
 
@@ -109,23 +109,23 @@ impl Claim {
     }
 }
 
-/// `[authority]` of the configuration, where it is on.
+/// `[authority]` of the configuration, if on.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Rules {
-    /// What becomes of orders of others.
+    /// How commands of non-holders are treated.
     pub mode: Mode,
     /// Names of the ranks, the highest first; never empty.
     pub ranks: Vec<Arc<str>>,
     /// How long a hold lasts without renewal, and a reservation.
     pub lease: Duration,
-    /// Whether a stop is written when the local control place takes over a drive whose word stands at run.
+    /// Whether a stop is written when a drive with its run command set is switched to local control.
     pub stop_at_local: bool,
     /// Those who are known by name.
     pub principals: Vec<Principal>,
 }
 
 impl Rules {
-    /// Who ordered; none: nobody.
+    /// The principal that sent a command; none if unknown.
     pub fn claim_of(&self, origin: &Origin) -> Option<Claim> {
         let claim = self.claim(&origin.proof)?;
         Some(Claim {
@@ -134,7 +134,7 @@ impl Rules {
         })
     }
 
-    /// Who a client is; none: nobody.
+    /// The principal of a client; none if unknown.
     pub fn claim(&self, proof: &Proof) -> Option<Claim> {
         let named = |is: &dyn Fn(&Principal) -> bool| self.principals.iter().find(|p| is(p)).map(claim_of);
         let matches = |field: &Option<String>, name: &str| field.as_deref() == Some(name);
@@ -204,7 +204,7 @@ fn claim_of(principal: &Principal) -> Claim {
     }
 }
 
-/// Whoever may open a socket or a pseudo-terminal without being named: the mode of the file is the authority.
+/// Anyone who may open a socket or a pseudo-terminal without being named: the mode of the file is the authority.
 fn first(name: String) -> Claim {
     Claim {
         name: name.into(),

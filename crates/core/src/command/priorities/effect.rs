@@ -1,10 +1,10 @@
-//! What an order means for the priority arrays of a drive. Pure.
+//! The effect of a command on the priority arrays of a drive. Pure.
 
 use crate::codec::Table;
 use crate::command::{Order, written};
 use crate::drive::{ModelPoint, Profile, Source};
 
-/// What an order sets of what can be commanded by priorities.
+/// What a command sets of what can be commanded by priorities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Effect {
     /// The run command.
@@ -18,7 +18,7 @@ pub struct Effect {
 }
 
 impl Effect {
-    /// Nobody knows what it sets: it may start the motor, and set a reference.
+    /// Unknown effect: it may start the motor, and set a reference.
     pub const UNKNOWN: Effect = Effect {
         run: Some(true),
         reverse: None,
@@ -26,7 +26,7 @@ impl Effect {
         word: true,
     };
 
-    /// What an order does to a drive of that profile.
+    /// The effect of a command on a drive of that profile.
     pub fn of(order: &Order, profile: &Profile) -> Effect {
         match order {
             Order::Points(values) => {
@@ -56,7 +56,7 @@ impl Effect {
     }
 }
 
-/// The point whose register takes the commands to a point.
+/// The point whose register accepts the commands for a point.
 fn behind(profile: &Profile, index: usize) -> usize {
     let mut at = index;
     // A point rests on one with a register, over one that takes its commands.

@@ -13,7 +13,7 @@ impl Pending {
         self.ending
     }
 
-    /// A stop that the bus had begun when it ended: the bus that takes its place sends it.
+    /// A stop that the bus had started when it ended: the bus that takes its place sends it.
     ///
     /// # Errors
     /// None takes its place.
@@ -41,7 +41,7 @@ impl Pending {
 }
 
 impl CommandQueue {
-    /// The bus is about to end and another one takes its place: stops wait for that, everything else is answered.
+    /// The bus is about to be replaced: stops wait for the next bus, everything else ends.
     pub fn begin_handover(&self, now: Instant) {
         let outcome = Outcome::ShuttingDown;
         self.background().close(&outcome, now);

@@ -1,4 +1,4 @@
-//! Who holds the drives of the bus: `[authority]`, judged where orders are accepted, and again at their turn.
+//! Who holds the drives of the bus: `[authority]`, judged where commands are accepted, and again at their turn.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,9 +9,10 @@ use crate::command::{
     Asks, Claim, Command, Denial, HoldView, Holder, Holding, Mode, Origin, Outcome, Refusal, Rules, Told, Urgency, Verb,
 };
 
-/// What is told of holds waits for the gateway, which asks several times a second; beyond that the oldest is dropped.
+/// Most changes of holds waiting to be published, which happens several times a second; beyond that the oldest is
+/// dropped.
 const MOST_TOLD: usize = 256;
-/// An order of a client that does not hold its drive is logged once in this time.
+/// A command of a client that does not hold its drive is logged once in this time.
 const UNHELD_LOGGED: Duration = Duration::from_secs(60);
 
 /// The holds of the drives of a bus.
@@ -20,9 +21,9 @@ pub(super) struct Holds {
     rules: Option<Arc<Rules>>,
     drives: BTreeMap<usize, Holding>,
     told: Vec<(usize, Told)>,
-    /// Drives that a client took since the bus last asked.
+    /// Drives that a client took since the bus last checked.
     taken: Vec<usize>,
-    /// Orders that were carried out, or would have been refused, though another client held the drive.
+    /// Commands that were carried out, or would have been refused, though another client held the drive.
     unheld: BTreeMap<usize, u64>,
     /// The same, to be logged.
     unheld_told: Vec<(usize, Unheld)>,
@@ -30,7 +31,7 @@ pub(super) struct Holds {
     unheld_logged: BTreeMap<Arc<str>, Instant>,
 }
 
-/// An order that advisory mode carried out.
+/// A command that advisory mode carried out.
 #[derive(Debug, Clone)]
 pub struct Unheld {
     /// Who gave it.
@@ -57,7 +58,7 @@ impl Holds {
         Some(changed)
     }
 
-    /// Counts an order that exclusive mode would have refused, and logs it once a client and minute.
+    /// Counts a command that exclusive mode would have refused, and logs it once a client and minute.
     fn count_unheld(&mut self, drive: usize, origin: &Origin, denial: &Denial, now: Instant) {
         *self.unheld.entry(drive).or_default() += 1;
         let Some(rules) = &self.rules else { return };
@@ -80,7 +81,7 @@ impl Holds {
         self.rules.as_ref()?.claim_of(origin)
     }
 
-    /// Why an order of a client does not pass, in exclusive mode. A run that is refused behind a stop is kept.
+    /// Why a client's command is refused, in exclusive mode. A run command refused after a stop is remembered.
     fn refuses(&mut self, drive: usize, origin: &Origin, asks: Asks, now: Instant) -> Option<Refusal> {
         let rules = self.rules.clone().filter(|_| origin.kind.is_client())?;
         let who = rules.claim_of(origin);
@@ -92,7 +93,7 @@ impl Holds {
 }
 
 impl Pending {
-    /// From now on these rules hold; none: `[authority]` is off, and nobody holds anything.
+    /// Applies new rules; none: `[authority]` is off, and all holds end.
     pub(super) fn set_rules(&mut self, rules: Option<Arc<Rules>>) {
         if self.holds.rules == rules {
             return;
@@ -121,8 +122,8 @@ impl Pending {
         self.holds.with(drive, |holding, _, told| holding.end(why, told));
     }
 
-    /// Why an order of that client is not accepted, where the hold of the drive keeps it. A run that is refused behind a stop is
-    /// kept.
+    /// Why a command of that client is not accepted, where the hold of the drive keeps it. A run that is refused behind
+    /// a stop is kept.
     pub fn hold_refuses(&mut self, drive: usize, origin: &Origin, asks: Asks, now: Instant) -> Option<Refusal> {
         self.holds.refuses(drive, origin, asks, now)
     }
@@ -206,7 +207,7 @@ impl Pending {
         }
     }
 
-    /// A client was heard of: its heartbeat came, or its order was carried out.
+    /// A client was received from: its heartbeat came, or its order was carried out.
     pub fn hold_renewed(&mut self, drive: usize, origin: &Origin, now: Instant) {
         let Some(who) = self.holds.claim(origin) else { return };
         self.holds
@@ -222,7 +223,7 @@ impl Pending {
         holding.is_whose_silence_counts(self.holds.claim(origin).as_ref())
     }
 
-    /// What a client does with the hold of a drive. What another client has waiting there is answered.
+    /// Applies a client's action to a hold. Waiting commands of other clients end.
     ///
     /// # Errors
     /// Why it may not; none while `[authority]` is off.
@@ -238,7 +239,7 @@ impl Pending {
         Some(acted.map_err(|denial: Denial| denial.refusal(&rules)))
     }
 
-    /// What waits for a drive and is not its holder's any more is not sent.
+    /// Drops waiting commands that are no longer the holder's.
     fn drop_of_others(&mut self, drive: usize, now: Instant) {
         let mut index = 0;
         while let Some(command) = self.waiting.get(index) {
@@ -253,12 +254,12 @@ impl Pending {
         }
     }
 
-    /// Drives that have another holder since the last call: nothing that was begun for others goes on.
+    /// Drives with a new holder since the last call: started commands of others end.
     pub fn take_taken(&mut self) -> Vec<usize> {
         std::mem::take(&mut self.holds.taken)
     }
 
-    /// Why what the client began is not continued, where another one has taken the drive since.
+    /// Why a client's started command ends, if another client has taken the drive since.
     pub fn hold_ends_run(&self, drive: usize, origin: &Origin, now: Instant) -> Option<Refusal> {
         let rules = self.holds.rules.as_ref().filter(|_| origin.kind.is_client())?;
         let who = rules.claim_of(origin).filter(|_| rules.mode == Mode::Exclusive);
@@ -280,7 +281,7 @@ impl Pending {
             .with(drive, |holding, _, told| holding.set_local(local, told));
     }
 
-    /// Ends what its time has ended, and tells what happened since the last call.
+    /// Ends what has expired, and returns the changes since the last call.
     pub fn take_told(&mut self, now: Instant) -> Vec<(usize, Told)> {
         let drives: Vec<usize> = self.holds.drives.keys().copied().collect();
         for drive in drives {
@@ -290,7 +291,7 @@ impl Pending {
         std::mem::take(&mut self.holds.told)
     }
 
-    /// Orders of clients that did not hold their drive, to be logged.
+    /// Commands of clients that did not hold their drive, to be logged.
     pub fn take_unheld(&mut self) -> Vec<(usize, Unheld)> {
         std::mem::take(&mut self.holds.unheld_told)
     }
@@ -300,7 +301,7 @@ impl Pending {
         self.holds.claim(origin).is_some_and(|who| who.cyclic)
     }
 
-    /// What is told of the hold of a drive, and whether that client holds it.
+    /// The published state of a hold, and whether that client has it.
     pub fn hold_view(&self, drive: usize, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
         let rules = self.holds.rules.as_ref()?;
         let free = Holding::default();
@@ -315,7 +316,7 @@ impl Pending {
         self.holds.drives.get(&drive)?.repeater().cloned()
     }
 
-    /// Orders that were carried out in advisory mode though another client held the drive.
+    /// Commands that were carried out in advisory mode though another client held the drive.
     pub fn unheld(&self, drive: usize) -> u64 {
         self.holds.unheld.get(&drive).copied().unwrap_or_default()
     }
@@ -343,9 +344,9 @@ impl Pending {
         self.holds.drives.get(&drive).cloned()
     }
 
-    /// Goes on with the hold of the same machine before a reload.
+    /// Continues the hold of the same machine after a reload.
     pub fn take_over_holding(&mut self, drive: usize, mut holding: Holding) {
-        // The next reading says it anew.
+        // The next reading says it again.
         holding.set_local(false, &mut Vec::new());
         self.holds.drives.insert(drive, holding);
     }

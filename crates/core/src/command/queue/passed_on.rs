@@ -1,4 +1,4 @@
-//! What is passed on for a tool to several drives, or unchecked to one: its place among the other orders of each.
+//! What is passed on for a tool to several drives, or unchecked to one: its place among the other commands of each.
 
 use std::time::Instant;
 
@@ -25,7 +25,7 @@ impl Pending {
         all
     }
 
-    /// What is passed on and goes as a command, since a command waits behind it.
+    /// What is passed on and goes as a command, since a command waits after it.
     pub(super) fn pressed(&self) -> Vec<u64> {
         let mut waits: Vec<usize> = Vec::new();
         let mut pressed = Vec::new();
@@ -62,7 +62,8 @@ impl Pending {
         self.waiting.iter().find(|c| c.number == chosen.number)
     }
 
-    /// A command that was taken and not sent waits again, before all others, unless a stop came in for a drive that it reaches.
+    /// A command that was taken but not sent waits again, ahead of all others, unless a stop arrived for a drive that
+    /// it reaches.
     pub fn put_back(&mut self, command: Command, now: Instant) {
         let outcome = match &self.closed {
             Some(outcome) => Some(outcome.clone()),
@@ -78,15 +79,15 @@ impl Pending {
         }
     }
 
-    /// Whether a stop came in for that drive since the bus last asked.
+    /// Whether a stop arrived for that drive since the bus last checked.
     pub fn was_stopped(&self, drive: usize) -> bool {
         self.stopped.contains(&drive)
     }
 }
 
 impl CommandQueue {
-    /// Takes in what is passed on for a tool, asked for at `asked`, and wakes the bus: an order to drives of the bus has its place
-    /// among their other orders, anything else waits with the background requests.
+    /// Takes in what is passed on for a tool, asked for at `asked`, and wakes the bus: a command to drives of the bus
+    /// has its place among their other commands, anything else waits with the background requests.
     pub fn submit_passed_on(&self, request: BackgroundRequest, touched: Touched, asked: Instant, now: Instant) {
         if request.passed_on.as_ref().is_some_and(PassedOn::is_order) {
             let mut command = request.into_command(touched);

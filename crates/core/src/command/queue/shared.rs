@@ -1,4 +1,5 @@
-//! The command queue of a bus as the north sides and the bus share it: behind a lock, with the descriptor that wakes the bus.
+//! The command queue of a bus, shared by the servers and the bus: behind a lock, with the descriptor that wakes the
+//! bus.
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -44,7 +45,7 @@ impl CommandQueue {
         })
     }
 
-    /// The same with what keeps the motors of its drives from being started.
+    /// The same with the start guards of its drives.
     #[must_use]
     pub fn guarded(mut self, guards: Option<Arc<BusGuards>>) -> CommandQueue {
         self.lock().guards.clone_from(&guards);
@@ -52,7 +53,7 @@ impl CommandQueue {
         self
     }
 
-    /// What keeps the motors of its drives from being started; none where nothing does.
+    /// The start guards of its drives, if any.
     pub fn guards(&self) -> Option<&Arc<BusGuards>> {
         self.guards.as_ref()
     }
@@ -63,7 +64,7 @@ impl CommandQueue {
         self.wake();
     }
 
-    /// Takes the stop of an order and its rest in, with nothing between them, and wakes the bus.
+    /// Takes the stop of a command and its rest in, with nothing between them, and wakes the bus.
     pub fn submit_parts(&self, stop: Command, mut rest: Command, now: Instant) {
         let mut pending = self.lock();
         let outdated = pending.is_behind_its_stop(&rest);
@@ -95,7 +96,7 @@ impl CommandQueue {
         self.pending.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Answers everything that waits, and all that comes from now on, with `outcome`.
+    /// Ends everything that waits, and everything submitted from now on, with `outcome`.
     pub fn close(&self, outcome: Outcome, now: Instant) {
         self.background().close(&outcome, now);
         let mut pending = self.lock();
@@ -106,8 +107,8 @@ impl CommandQueue {
         pending.closed = Some(outcome);
     }
 
-    /// The gateway is about to end: from now on only stops get in, since nothing may start a drive again. What waits
-    /// is answered, stops apart. The bus stops its drives until `deadline`, and reports those that were not stopped.
+    /// The gateway is shutting down: from now on only stops are accepted. Waiting commands end, except stops. The bus
+    /// stops its drives until `deadline`, and reports those that were not stopped.
     pub fn begin_shutdown(&self, deadline: Instant, now: Instant) -> oneshot::Receiver<Vec<NotStopped>> {
         let (report, missing) = oneshot::channel();
         self.background().close(&Outcome::ShuttingDown, now);
@@ -158,7 +159,7 @@ impl CommandQueue {
         pending.set_rules(rules);
     }
 
-    /// Whether `[authority]` is on: without it, nobody need ask.
+    /// Whether `[authority]` is on.
     pub fn is_guarded(&self) -> bool {
         self.guarded.load(Ordering::Acquire)
     }

@@ -20,7 +20,7 @@ pub struct Stopping {
 pub struct NotStopped {
     /// Its name.
     pub drive: String,
-    /// What became of the stop, in words.
+    /// The result of the stop, in words.
     pub why: String,
 }
 
@@ -36,7 +36,7 @@ impl Stopping {
         self.deadline
     }
 
-    /// The bus has done what it can; `missing` are the drives that were not stopped.
+    /// The bus has finished; `missing` are the drives that were not stopped.
     pub fn report(self, missing: Vec<NotStopped>) {
         // The gateway may have given up waiting.
         let _ = self.report.send(missing);
@@ -83,7 +83,7 @@ impl Pending {
         *at = now.max(*at);
     }
 
-    /// Whether a stop came in since a command was asked for, which takes longer than to say so: its head came before.
+    /// Whether a stop arrived after a command's request began to arrive.
     pub(super) fn is_behind_its_stop(&self, command: &Command) -> bool {
         let stopped = |drive: &usize| {
             let at = self.stopped_at.get(drive).zip(command.asked);
@@ -125,13 +125,13 @@ impl Pending {
         self.waiting.push_back(stop);
     }
 
-    /// Drives for which a stop came in since the last call: nothing that was begun for them goes on, whatever becomes of
-    /// the stop itself.
+    /// Drives for which a stop arrived since the last call: their started commands end, whatever the result of the
+    /// stop.
     pub fn take_stopped(&mut self) -> Vec<usize> {
         std::mem::take(&mut self.stopped)
     }
 
-    /// Takes away what supervision wants of a drive and has not begun: a client commands the drive again.
+    /// Withdraws a supervision action that has not started: a client commands the drive again.
     pub fn withdraw_supervision(&mut self, drive: usize, now: Instant) {
         self.remove(now, &Outcome::Withdrawn, |c| {
             c.drive == drive && c.joined.is_empty() && c.ticket.origin().is_lease()

@@ -94,7 +94,7 @@ impl JournalFile {
         Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
     }
 
-    /// The restore is over: there is no journal of it any more. That of another machine is left.
+    /// The restore has ended: there is no journal of it any more. That of another machine is left.
     ///
     /// # Errors
     /// It may still be there.

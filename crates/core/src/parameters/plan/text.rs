@@ -1,4 +1,4 @@
-//! A plan for people: what a dry run shows.
+//! A plan as text: what a dry run shows.
 
 use std::fmt::{self, Display};
 

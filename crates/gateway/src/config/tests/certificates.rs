@@ -72,13 +72,13 @@ fn a_file_that_holds_something_else_is_told_with_what_it_holds() {
         (
             "good.crt",
             "encrypted.key",
-            "it is encrypted, and nobody",
+            "it is encrypted, and there is nobody",
             "openssl pkey -in",
         ),
         (
             "good.crt",
             "encrypted-old.key",
-            "it is encrypted, and nobody",
+            "it is encrypted, and there is nobody",
             "openssl pkey -in",
         ),
         (

@@ -639,7 +639,7 @@ fn each_mistake_of_a_value() {
         ),
         (
             "type = \"string:2\"\ninvalid = [0]",
-            "only a register with a number; m:14",
+            "only a numeric register; m:14, point[0].invalid",
         ),
         ("scale_from = \"b\"", "there is no point `b`; m:13, point[0].scale_from"),
         (
@@ -653,7 +653,7 @@ fn each_mistake_of_a_value() {
         ("equals = 1\nwrite = true", "there is no way back; m:14, point[0].write"),
         (
             "unlisted = true\nwrite = true",
-            "only an enumeration that is written; m:13, point[0].unlisted",
+            "only a writable enumeration; m:13, point[0].unlisted",
         ),
         (
             "type = \"string:2\"\n[point.texts]\n1 = \"on\"",

@@ -39,13 +39,13 @@ pub(crate) type SharedReply = watch::Receiver<Option<CommandReply>>;
 enum Progress {
     /// Its reply is known.
     Known(CommandReply),
-    /// It repeats another one, whose reply is its own.
+    /// It repeats another command and gets the same reply.
     Repeated(SharedReply),
     /// It is in the queue of the bus.
     Placed(Waiting),
 }
 
-/// A command whose result is to come.
+/// A command whose result is pending.
 struct Waiting {
     placed: Placed,
     id: Option<Id>,
@@ -93,7 +93,8 @@ fn status(outcome: &Outcome) -> StatusCode {
     }
 }
 
-/// When a request came, as the first argument of its handler: passwords are compared, and the body is waited for, behind that.
+/// When a request came, as the first argument of its handler: passwords are compared, and the body is waited for, after
+/// that.
 pub(in crate::http) struct Asked(Instant);
 
 impl<S: Sync> FromRequestParts<S> for Asked {
@@ -125,7 +126,7 @@ pub(in crate::http) async fn command(
         Progress::Repeated(reply) => shared(reply).await,
         Progress::Placed(mut waiting) => match waiting.shared.take() {
             None => Ok(waiting.finished().await),
-            // The result is kept for whoever repeats the command, also if this client has gone.
+            // The result is kept for anyone who repeats the command, also if this client has gone.
             Some((sender, permit)) => {
                 let reply = sender.subscribe();
                 tokio::spawn(async move {
@@ -309,7 +310,7 @@ enum Known {
     Refused(String),
 }
 
-/// `GET /api/v1/drives/{name}/commands`: what can be commanded, and within which limits.
+/// `GET /api/v1/drives/{name}/commands`: the points that can be commanded, and their limits.
 pub(in crate::http) async fn commands_of(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
@@ -319,7 +320,7 @@ pub(in crate::http) async fn commands_of(
     Ok(Json(description(&drive, &operator)).into_response())
 }
 
-/// What can be commanded of a drive.
+/// The points of a drive that can be commanded.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(in crate::http) struct Commandable<'d> {
     drive: &'d str,

@@ -135,7 +135,7 @@ impl Operating {
     }
 }
 
-/// `GET /api/v1/session`: who is logged in; `user` is null if nobody is.
+/// `GET /api/v1/session`: the logged-in user; `user` is null without one.
 pub(in crate::http) async fn session(
     State(app): State<Arc<AppState>>,
     Extension(reached): Extension<Reached>,

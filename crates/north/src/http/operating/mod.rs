@@ -53,11 +53,11 @@ pub(super) use self::login::{SessionReply, log_in, log_out, session};
 pub(super) use self::record::record;
 pub(super) use self::stop_all::stop;
 
-/// A password that a program sends with each request is not hashed anew for that long.
+/// A password that a program sends with each request is not hashed again for that long.
 const VERIFIED: Duration = Duration::from_secs(300);
-/// Most of them, and most addresses that are known to belong to somebody who may command.
+/// Most of them, and most addresses that are known to belong to someone who may command.
 const MOST: usize = 256;
-/// Most commands whose results are awaited, stops apart.
+/// Most commands with pending results, except stops.
 const IN_PROGRESS: usize = 256;
 
 /// Header with the token of a session.
@@ -97,7 +97,7 @@ pub(super) struct Operator {
     /// See [`crate::command::Origin::with_login`].
     login: Arc<str>,
     address: IpAddr,
-    /// The way in.
+    /// The interface.
     kind: SourceKind,
     proof: Proof,
     /// The cookie of its session; `None` for a program.
@@ -105,7 +105,7 @@ pub(super) struct Operator {
 }
 
 impl Operator {
-    /// Who came through the local socket.
+    /// A user of the local socket.
     fn local(local: &LocalUser, address: IpAddr) -> Operator {
         Operator {
             login: format!("{} {}", local.kind.name(), local.who).into(),
@@ -136,7 +136,7 @@ pub(super) enum Denied {
     /// Too many at once.
     #[error("too many logins at once; try again")]
     Busy,
-    /// A page of somebody else.
+    /// A page of someone else.
     #[error("the request comes from another origin")]
     OtherOrigin,
     /// The token of the session is missing or wrong.
@@ -256,8 +256,7 @@ impl Operating {
 
     /// Who may give the request that changes something.
     ///
-    /// # Errors
-    /// Nobody, or it does not come from this gateway's own page.
+    /// # Errors No user, or the request does not come from this gateway's own page.
     pub(super) async fn commander(
         &self,
         headers: &HeaderMap,
@@ -307,7 +306,7 @@ impl Operating {
         operators.insert(operator.address, (operator.user.clone(), now));
     }
 
-    /// The user whose password this is. A password that was right a short while ago is not hashed anew.
+    /// The user whose password this is. A password that was right a short while ago is not hashed again.
     async fn verified(&self, given: &Credentials, address: IpAddr, source: Source) -> Result<Arc<str>, Denied> {
         let Some(users) = self.users.load_full() else {
             return Err(Denied::NotLoggedIn);
@@ -316,7 +315,7 @@ impl Operating {
         let known = mark.and_then(|mark| Some((mark, self.state().verified.get(&mark).cloned()?)));
         let source = match known {
             Some((_, (user, until))) if Instant::now() < until => return Ok(user),
-            // It was right before: whoever else fails at this address does not hold it up.
+            // It was right before: anyone who else fails at this address does not hold it up.
             Some((mark, _)) => Source::Known(self.hasher.hash_one(mark)),
             None => source,
         };
@@ -402,7 +401,7 @@ impl State {
 /// nothing.
 ///
 /// # Errors
-/// It comes from a page of somebody else.
+/// It comes from a page of someone else.
 fn is_own_origin(headers: &HeaderMap) -> Result<(), Denied> {
     let text = |name| headers.get_all(name).iter().map(|value| value.to_str().unwrap_or("\0"));
     let host = text(header::HOST).next().unwrap_or_default();

@@ -1,4 +1,4 @@
-//! Parameters of a drive, read and restored: begun by a POST, looked at by a GET.
+//! Parameters of a drive, read and restored: started by a POST, looked at by a GET.
 
 use std::sync::Arc;
 
@@ -38,7 +38,7 @@ pub(in crate::http) async fn read(
     reading(&app, &drive)
 }
 
-/// `GET …/params/reading`: how far it is, and the file once it is over.
+/// `GET …/params/reading`: how far it is, and the file once it has ended.
 pub(in crate::http) async fn progress(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,

@@ -14,10 +14,10 @@ use crate::process_image::Access;
 const BACK: Duration = Duration::from_secs(12);
 const LOOK: Duration = Duration::from_millis(50);
 
-/// What to do where the drive does not answer.
+/// The message for a silent drive.
 const NO_ANSWER: &str = "the drive does not reply: check its power supply, wiring and address";
 
-/// Sends it, and waits until the drive answers again. Nothing is told as done that was not seen.
+/// Sends it, and waits until the drive replies again. Success is reported only if it was observed.
 pub(super) async fn communication(drive: &DriveHandle, origin: Origin, asked: Instant) -> (Answer, Shown) {
     let (spec, now) = (&drive.image.spec, Instant::now());
     if spec.access != Access::Control {

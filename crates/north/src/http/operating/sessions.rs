@@ -22,13 +22,13 @@ pub(super) struct Secrets {
     pub(super) csrf: [u8; 32],
 }
 
-/// A session that was begun by a login.
+/// A session that was started by a login.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Session {
     pub(super) user: Arc<str>,
     /// The user and a number that no other login has.
     pub(super) login: Arc<str>,
-    /// What every request that changes something has to repeat.
+    /// The token that every POST request must repeat.
     pub(super) csrf: String,
     begun: Instant,
     used: Instant,

@@ -17,7 +17,7 @@ const FREE_OF_USER: u32 = 20;
 const PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 /// Failures are forgotten when there was none for that long.
 const FORGOTTEN: Duration = Duration::from_secs(15 * 60);
-/// Most addresses and browsers, and most users, that are told apart; beyond it the oldest is forgotten.
+/// Most addresses and browsers, and most users, that are distinguished; beyond it the oldest is forgotten.
 const MOST: usize = 4096;
 
 /// Where an attempt comes from.

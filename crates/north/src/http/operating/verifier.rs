@@ -24,14 +24,14 @@ struct Waiting {
     address: IpAddr,
     /// That of the user, if there is one.
     hash: Option<String>,
-    /// Hashes of nobody, which only take their time.
+    /// Dummy hashes, computed only so that the time is the same.
     others: Vec<String>,
     password: String,
     answer: oneshot::Sender<bool>,
 }
 
 impl Waiting {
-    /// Takes the time of all hashes, whatever comes of them.
+    /// Computes all hashes, whatever their result.
     fn is_right(&self) -> bool {
         for other in &self.others {
             let _ = std::hint::black_box(is_password(other, &self.password));

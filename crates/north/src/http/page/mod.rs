@@ -63,7 +63,7 @@ pub(in crate::http) fn render(plant: &Plant, operating: bool, now: Instant) -> S
     document(plant, operating, &tables)
 }
 
-/// The document without any value, for somebody who has to log in first.
+/// The document without any value, for someone who has to log in first.
 pub(in crate::http) fn render_login(plant: &Plant) -> String {
     document(plant, true, "<p>Log in to see the drives; this requires scripts.</p>")
 }

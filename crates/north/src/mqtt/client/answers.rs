@@ -1,4 +1,4 @@
-//! What is subscribed to, and messages that the broker refuses.
+//! Subscriptions, and messages that the broker refuses.
 
 use rumqttc::PubAckReason;
 

@@ -105,7 +105,7 @@ impl Client {
         }
     }
 
-    /// Clears the topics of earlier runs that are not published any more: drives that were removed, another base.
+    /// Clears the topics of earlier runs that are no longer published: drives that were removed, another base.
     pub(super) fn clear_old(&mut self, topics: Vec<String>) {
         let status = self.topics.status();
         let sound = |topic: &String| !topic.is_empty() && !topic.contains(['+', '#', '\0']) && *topic != status;

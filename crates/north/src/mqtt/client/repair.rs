@@ -1,11 +1,11 @@
-//! When the status is published again because somebody else published another one. Time is an argument.
+//! When the status is published again because someone else published another one. Time is an argument.
 
 use std::time::{Duration, Instant};
 
 /// Minimum time between two repairs of the status.
 const PACE: Duration = Duration::from_secs(1);
 
-/// Asked for by every status of somebody else, due at most once in [`PACE`]; what comes too early waits.
+/// Asked for by every status of someone else, due at most once in [`PACE`]; what comes too early waits.
 #[derive(Debug, Default)]
 pub(super) struct Repair {
     wanted: bool,
@@ -13,7 +13,7 @@ pub(super) struct Repair {
 }
 
 impl Repair {
-    /// Somebody else published a status.
+    /// Someone else published a status.
     pub(super) fn ask(&mut self) {
         self.wanted = true;
     }

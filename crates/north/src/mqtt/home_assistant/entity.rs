@@ -135,7 +135,7 @@ pub(super) fn of_gateway(sources: &Sources, id: &str, buses: &[String]) -> Entit
     buses.iter().flat_map(bus_entities).collect()
 }
 
-/// The entities of a drive: one for each published point, and those beside them.
+/// The entities of a drive: one for each published point, and those besides them.
 pub(super) fn of_drive(sources: &Sources, id: &str, spec: &DriveSpec) -> Entities {
     let drive = DriveEntities { sources, id, spec };
     let published = payload::published_points(&spec.profile);
@@ -293,7 +293,7 @@ impl DriveEntities<'_> {
         ("sensor_state".to_string(), entity.into())
     }
 
-    /// The state has its text beside it even if the code is zero; a topic of its own is then empty.
+    /// The state has its text besides it even if the code is zero; a topic of its own is then empty.
     fn fault_text(&self) -> (String, Value) {
         let mut entity = self.entity(Platform::Sensor, "fault_text");
         let topics = &self.sources.topics;
@@ -413,7 +413,7 @@ fn quantity(entity: &mut Map<String, Value>, point: &Point) {
     entity.insert("stat_cla".into(), class.into());
 }
 
-/// Whether a count may go down, as a balance does: Home Assistant would take that for a meter that begins anew.
+/// Whether a count may go down, as a balance does: Home Assistant would take that for a meter that starts again.
 fn may_fall(point: &Point) -> bool {
     match point.raw().map(|raw| raw.form) {
         Some(Form::I16 | Form::I32 | Form::I64) => true,
@@ -452,7 +452,7 @@ fn extend(entity: &mut Map<String, Value>, more: Value) {
     }
 }
 
-/// A name for people: `dc_link_voltage` is `DC link voltage`.
+/// A name as text: `dc_link_voltage` is `DC link voltage`.
 pub(super) fn title(name: &str) -> String {
     let word = |(place, word): (usize, &str)| {
         let mut letters = word.chars();

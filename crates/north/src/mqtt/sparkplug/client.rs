@@ -1,4 +1,4 @@
-//! The task that owns session, orders and connection. It never waits for the broker: what finds no room is kept, and
+//! The task that owns session, commands and connection. It never waits for the broker: what finds no room is kept, and
 //! the session is not asked for more until there is room.
 
 mod answers;
@@ -39,7 +39,8 @@ const DRIVES: usize = 32;
 const MESSAGES: usize = 64;
 /// Time for the orderly end of a connection.
 const END: Duration = Duration::from_millis(500);
-/// Time for the orders that are under way when a reload ends the node. When the gateway stops they have ended before.
+/// Time for the commands that are in progress when a reload ends the node. When the gateway stops they have ended
+/// before.
 const LAST_ORDERS: Duration = Duration::from_secs(3);
 /// Longest wait for the file with the number of the session.
 const FILE: Duration = Duration::from_secs(1);
@@ -408,7 +409,7 @@ impl Client {
         }
     }
 
-    /// The result of an order becomes metrics of the drive; what it was to change is published as it is.
+    /// The result of a command becomes metrics of the drive; what it was to change is published as it is.
     fn on_finished(&mut self, finished: Finished) {
         let drive_of = |drive: &Drive| drive.metrics.drive.image.spec.name == finished.drive;
         let Some(place) = self.drives.iter().position(drive_of) else {
@@ -546,8 +547,8 @@ impl Client {
         false
     }
 
-    /// Publishes the results of pending orders and the death of the node. What is still to come is published by the node that comes
-    /// after.
+    /// Publishes the results of pending commands and the death of the node. What is still to come is published by the
+    /// node that comes after.
     async fn shut_down(mut self) {
         let until = tokio::time::Instant::now() + LAST_ORDERS;
         while !self.orders.is_idle() && self.session.is_alive() && tokio::time::Instant::now() < until {

@@ -21,7 +21,7 @@ pub(super) struct Host {
 }
 
 impl Host {
-    /// Its state is told anew.
+    /// Its state will be reported again.
     pub(super) fn forget(&mut self) {
         self.state = None;
     }

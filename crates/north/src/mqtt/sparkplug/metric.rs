@@ -35,7 +35,7 @@ pub(super) enum Pace {
     Figure,
 }
 
-/// What is fixed of a metric: it is in the birth.
+/// The constant part of a metric, sent in the birth.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Definition {
     pub(super) name: String,
@@ -47,7 +47,7 @@ pub(super) struct Definition {
     pub(super) pace: Pace,
 }
 
-/// What changes.
+/// The changing part.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Sample {
     /// `None` unless the quality is good.

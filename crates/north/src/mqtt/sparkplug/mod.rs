@@ -4,13 +4,13 @@
 //! process image ──▶ model ──▶ ┌─────────┐      client       ┌────────┐
 //!                             │ session │ ──▶ (a connection │ broker │
 //! STATE, NCMD ──────────────▶ └─────────┘     of its own)──▶└────────┘
-//!                 orders ◀──────────────────────────── DCMD ◀───┘
+//!                 commands ◀──────────────────────────── DCMD ◀───┘
 //! ```
 //!
-//! `topics`, `wire`, `metric`, `host`, `history` and `session` are pure: the session is told what the drives are and what the
-//! broker says, and is asked for the next message. `model` makes metrics of drives and buses, `orders` makes orders of
-//! commands. `bd_seq` keeps the number of the session on disk. `client` is the task that owns them and the connection, which
-//! is apart from that of the MQTT topics, because its last will is the death of the node.
+//! `topics`, `wire`, `metric`, `host`, `history` and `session` are pure: the session is told what the drives are and
+//! what the broker says, and is asked for the next message. `model` makes metrics of drives and buses, `orders` makes
+//! commands of commands. `bd_seq` keeps the number of the session on disk. `client` is the task that owns them and the
+//! connection, which is apart from that of the MQTT topics, because its last will is the death of the node.
 
 mod bd_seq;
 mod client;

@@ -124,7 +124,7 @@ impl DriveMetrics {
         self.result = Some((code.to_string(), error));
     }
 
-    /// The result of the last command, when the metrics are made anew.
+    /// The result of the last command, when the metrics are remade.
     pub(super) fn keep_result_of(&mut self, before: &DriveMetrics) {
         self.result = before.result.clone();
     }

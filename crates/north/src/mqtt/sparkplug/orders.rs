@@ -23,12 +23,13 @@ use crate::plant::{Placed, Plant};
 /// Points with their values, and why another one is refused.
 type Understood = (Vec<(usize, Value)>, Option<Refusal>);
 
-/// Orders whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit only.
+/// Commands whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit
+/// only.
 const AWAITED: usize = 4096;
 /// Metrics in a command.
 const METRICS: usize = 64;
 
-/// The orders over Sparkplug.
+/// The commands over Sparkplug.
 #[derive(Debug)]
 pub(super) struct Orders {
     /// Everything from the connection to the broker counts as one client.
@@ -37,7 +38,7 @@ pub(super) struct Orders {
     memory: SharedMemory,
 }
 
-/// Orders whose results a node leaves to its successor.
+/// Commands whose results a node leaves to its successor.
 #[derive(Debug)]
 pub(crate) struct NodeOrdersLeft(VecDeque<Awaited>);
 
@@ -48,7 +49,7 @@ struct Awaited {
     placed: Placed,
 }
 
-/// The result of an order.
+/// The result of a command.
 #[derive(Debug, PartialEq)]
 pub(super) struct Finished {
     /// The drive by its name: a reload may have moved it.
@@ -77,7 +78,8 @@ impl Finished {
 }
 
 impl Orders {
-    /// `memory` outlives this client, so that an order is recognised after a reload; `left` are those of the client before.
+    /// `memory` outlives this client, so that a command is recognised after a reload; `left` are those of the client
+    /// before.
     pub(super) fn new(memory: SharedMemory, left: Option<NodeOrdersLeft>) -> Orders {
         Orders {
             client: SourceKind::Sparkplug.name().into(),
@@ -251,7 +253,7 @@ impl Request {
             return refused(Refusal::BadValue(why));
         }
         let placed = |mut metric: Metric| {
-            // Some hosts send the field empty beside an alias.
+            // Some hosts send the field empty besides an alias.
             metric.name = metric.name.filter(|name| !name.is_empty());
             let place = place(&metric);
             (metric, place)
@@ -266,7 +268,7 @@ impl Request {
         self.metrics.iter().flatten().filter_map(|(_, place)| *place).collect()
     }
 
-    /// For the audit, if it is refused before it becomes an order.
+    /// For the audit, if it is refused before it becomes a command.
     fn what(&self) -> String {
         let Ok(metrics) = &self.metrics else {
             return "a Sparkplug command".to_string();

@@ -27,7 +27,7 @@ pub(super) const FIXED_METRICS: usize = 2;
 /// The metric by which a host asks for a birth.
 pub(super) const REBIRTH_METRIC: &str = "Node Control/Rebirth";
 
-/// What is configured of the session.
+/// The configuration of the session.
 #[derive(Debug, Clone)]
 pub(super) struct Rules {
     pub(super) topics: Topics,
@@ -283,8 +283,8 @@ impl Session {
         death(bd_seq, millis)
     }
 
-    /// The broker accepted the connection with this number and takes packets of so many bytes; the state of the host is told
-    /// anew.
+    /// The broker accepted the connection with this number and takes packets of so many bytes; the state of the host is
+    /// told again.
     pub(super) fn opened(&mut self, bd_seq: u8, max_packet: usize) {
         self.bd_seq = bd_seq;
         self.host.forget();
@@ -330,7 +330,7 @@ impl Session {
         self.rules.topics.state().is_none() || self.host.is_online()
     }
 
-    /// Whether the node is born, or its birth is under way.
+    /// Whether the node is born, or its birth is in progress.
     pub(super) fn is_alive(&self) -> bool {
         matches!(self.phase, Phase::DeviceBirths(_) | Phase::Live)
     }
@@ -360,7 +360,7 @@ impl Session {
         self.rebirth = self.is_alive();
     }
 
-    /// What the node is now.
+    /// The present values of the node.
     pub(super) fn tell_node(&mut self, samples: Vec<Sample>) {
         self.node.changed = true;
         self.node.now_is = samples;
@@ -385,7 +385,7 @@ impl Session {
         (device.present, device.now_is, device.changed) = (present, samples, true);
     }
 
-    /// Publishes these metrics of a device even if they do not change: somebody tried to change them.
+    /// Publishes these metrics of a device even if they do not change: someone tried to change them.
     pub(super) fn repeat(&mut self, device: usize, metrics: impl IntoIterator<Item = usize>) {
         if let Some(device) = self.devices.get_mut(device) {
             device.repeat.extend(metrics);

@@ -27,7 +27,7 @@ impl Kind {
     }
 }
 
-/// What a message from the broker is about.
+/// The subject of a message from the broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Received<'t> {
     /// The primary host is online or offline.
@@ -36,7 +36,7 @@ pub(super) enum Received<'t> {
     DeviceCommand(&'t str),
 }
 
-/// The version of Sparkplug in which the primary host tells its state.
+/// The version of Sparkplug in which the primary host reports its state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum StateForm {
     /// 3.0: `spBv1.0/STATE/{host}`, an object with the time.
