@@ -86,7 +86,8 @@ class Mosquitto(Broker):
 
 
 class Rmqtt(Broker):
-    """rmqttd with its plugins for Raft, retained messages and shared subscriptions."""
+    """rmqttd with its plugins for Raft, retained messages and shared subscriptions. Started one after the other: two that look for a
+    leader at the same time both become one, and never meet."""
 
     name = "rmqttd"
 
@@ -121,16 +122,6 @@ plugins.default_startups = ["rmqtt-cluster-raft", "rmqtt-retainer", "rmqtt-share
 {listener}.max_mqueue_len = 100000
 """)
         return [self.program, "-f", node.directory / "rmqtt.toml", "--id", node.number], {}
-
-    def start(self):
-        # They wait for one another.
-        import threading
-
-        starts = [threading.Thread(target=node.start) for node in self.nodes]
-        for each in starts:
-            each.start()
-        for each in starts:
-            each.join()
 
 
 class Ejabberd(Broker):
