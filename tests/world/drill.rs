@@ -29,6 +29,17 @@ const OPTIONS: DrillOptions = DrillOptions {
     every: Duration::from_secs(3600),
 };
 
+/// Families whose standstill is seen.
+const FAMILIES: [(&str, Protocol); 7] = [
+    ("vacon-nx", Protocol::ModbusRtu),
+    ("eaton-svx", Protocol::ModbusRtu),
+    ("eaton-hvx", Protocol::ModbusRtu),
+    ("vacon-cx", Protocol::ModbusRtu),
+    ("teco-7300pa", Protocol::ModbusAscii),
+    ("schneider-altivar", Protocol::ModbusRtu),
+    ("danfoss-fc", Protocol::ModbusRtu),
+];
+
 fn works(family: &'static str, protocol: Protocol) -> Line {
     Line {
         supervision: Some(Supervision {
@@ -114,16 +125,7 @@ fn is_at(report: &DrillReport, text: &str) -> bool {
 
 #[test]
 fn drives_that_stop_pass() {
-    for (family, protocol) in [
-        ("vacon-nx", Protocol::ModbusRtu),
-        ("eaton-svx", Protocol::ModbusRtu),
-        ("eaton-hvx", Protocol::ModbusRtu),
-        ("vacon-cx", Protocol::ModbusRtu),
-        ("teco-7300pa", Protocol::ModbusAscii),
-        ("schneider-altivar", Protocol::ModbusRtu),
-        ("danfoss-fc", Protocol::ModbusRtu),
-        ("siemens-g120", Protocol::ModbusRtu),
-    ] {
+    for (family, protocol) in FAMILIES.into_iter().chain([("siemens-g120", Protocol::ModbusRtu)]) {
         let mut play = Play::of(&works(family, protocol), 5);
         let report = play.drill(&[Kind::Order, Kind::Client], |_, _| {});
         if family == "siemens-g120" {
@@ -258,6 +260,150 @@ fn what_does_not_stop_is_named() {
     );
     play.rig.set_alive(1, true);
     play.healed();
+}
+
+/// What goes wrong in a drill.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Trouble {
+    /// Another master keeps it running.
+    IgnoresStops,
+    /// The same for three seconds, which is in time.
+    StopsLate,
+    Local,
+    Fault,
+    PowerLoss,
+    StopOfAnother,
+    CommandOfAnother,
+    /// The commands reach the motor of another drive.
+    WrongMotor,
+    /// Whatever the drive does by itself when its master is silent.
+    SilentGateway,
+}
+
+impl Trouble {
+    const ALL: [Trouble; 9] = [
+        Trouble::IgnoresStops,
+        Trouble::StopsLate,
+        Trouble::Local,
+        Trouble::Fault,
+        Trouble::PowerLoss,
+        Trouble::StopOfAnother,
+        Trouble::CommandOfAnother,
+        Trouble::WrongMotor,
+        Trouble::SilentGateway,
+    ];
+
+    fn kind(self) -> Kind {
+        match self {
+            Trouble::SilentGateway => Kind::Gateway,
+            _ => Kind::Order,
+        }
+    }
+
+    /// Makes it happen at the look at which `report` is said.
+    fn look(self, rig: &mut Rig, report: &DrillReport, happened: &mut Option<Instant>) {
+        let steady = is_at(report, "the motor turns at");
+        let stopping = is_at(report, "an order to stop");
+        let runs = |rig: &mut Rig, address: u8, run: bool| {
+            let command = Command {
+                run,
+                reverse: false,
+                reference: 1000,
+            };
+            rig.with_drive(address, |drive, _| drive.command(command));
+        };
+        let began = match self {
+            Trouble::IgnoresStops | Trouble::StopsLate => stopping,
+            Trouble::WrongMotor => is_at(report, "waiting until the motor turns"),
+            Trouble::SilentGateway => is_at(report, "nothing is sent"),
+            _ => steady,
+        };
+        if !began {
+            return;
+        }
+        let first = happened.is_none();
+        let since = *happened.get_or_insert(rig.now);
+        match self {
+            Trouble::IgnoresStops if !turns(rig) => runs(rig, 1, true),
+            Trouble::StopsLate if rig.now < since + 3 * SECOND && !turns(rig) => runs(rig, 1, true),
+            Trouble::WrongMotor if turns(rig) => {
+                runs(rig, 1, false);
+                runs(rig, 2, true);
+            }
+            Trouble::Local if first => rig.with_drive(1, |drive, _| drive.set_remote(false)),
+            Trouble::Fault if first => rig.with_drive(1, |drive, _| drive.trip(9)),
+            Trouble::PowerLoss if first => rig.with_drive(1, |drive, _| drive.power_off()),
+            Trouble::StopOfAnother | Trouble::CommandOfAnother if first => {
+                let points: &[(&str, f64)] = match self {
+                    Trouble::StopOfAnother => &[("run", 0.0)],
+                    _ => &[("speed_reference", 15.0)],
+                };
+                let order = rig.points(1, points);
+                let bob = Origin::new(SourceKind::Mqtt, "bob");
+                drop(
+                    rig.drive(1)
+                        .place(order, bob, Authority::Write, DEFAULT_EXPIRY, rig.now),
+                );
+                rig.bus.command_came(rig.now);
+            }
+            _ => {}
+        }
+    }
+
+    /// What the drill has to say.
+    fn expected(self) -> (DrillState, &'static str) {
+        match self {
+            Trouble::IgnoresStops => (DrillState::Failed, "the motor still turns"),
+            Trouble::StopsLate => (DrillState::Passed, "in time"),
+            Trouble::Local => (DrillState::Aborted, "local control place"),
+            Trouble::Fault => (DrillState::Aborted, "the drive has a fault"),
+            Trouble::PowerLoss => (DrillState::Aborted, "the drive went offline"),
+            Trouble::StopOfAnother => (DrillState::Aborted, "mqtt bob stopped the drive"),
+            Trouble::CommandOfAnother => (DrillState::Aborted, "mqtt bob gave an order"),
+            Trouble::WrongMotor => (DrillState::NotProven, "turn"),
+            Trouble::SilentGateway => (DrillState::Failed, "after a silence of 25 s the motor still turns"),
+        }
+    }
+}
+
+#[test]
+fn whatever_goes_wrong_is_named_with_every_family() {
+    for (number, (family, protocol)) in FAMILIES.into_iter().enumerate() {
+        for trouble in Trouble::ALL {
+            let mut play = Play::of(&works(family, protocol), number as u64);
+            let has_remote = play.rig.good(1, ModelPoint::Remote).is_some();
+            if trouble == Trouble::Local && !has_remote {
+                // It does not say who commands it, and stops or not.
+                continue;
+            }
+            let (mut happened, mut turned) = (None, false);
+            let report = play.drill(&[trouble.kind()], |rig, report| {
+                trouble.look(rig, report, &mut happened);
+                if is_at(report, "nothing is sent") {
+                    turned = turns(rig);
+                }
+            });
+            let about = format!("{family}, {trouble:?}: {report:#?}");
+            assert!(happened.is_some(), "it did not happen: {about}");
+            if trouble == Trouble::SilentGateway && !turned {
+                assert_eq!(report.state, DrillState::Passed, "it stood: {about}");
+            } else {
+                let (state, text) = trouble.expected();
+                assert_eq!(report.state, state, "{about}");
+                assert!(report.text.contains(text), "{text}: {about}");
+            }
+            if trouble == Trouble::StopsLate {
+                assert!(report.steps[0].took_ms.is_some_and(|took| took >= 3_000), "{about}");
+            }
+            play.rig.with_drive(1, |drive, at| {
+                drive.set_remote(true);
+                if trouble == Trouble::PowerLoss {
+                    drive.power_on(at);
+                }
+            });
+            play.healed();
+        }
+    }
 }
 
 /// On a line that loses and damages frames a drill may end in any way but wrongly: what passed was seen to stand, and all ends with a
