@@ -1,4 +1,4 @@
-//! `drivegate backup`: what a gateway needs to be set up again, in one file.
+//! `drivegate backup`: everything needed to set a gateway up again, in one file.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
