@@ -56,7 +56,7 @@ impl Question {
     }
 }
 
-/// a transaction that was asked for. Dropping it takes it back while it was not sent.
+/// A requested transaction. Dropping it withdraws it if it was not sent yet.
 #[derive(Debug)]
 pub struct Exchange {
     answer: oneshot::Receiver<Answer>,
