@@ -203,7 +203,7 @@ fn manifest(config: &Path, settings: &Settings, sources: &Sources) -> Manifest {
     }
 }
 
-/// Writes the archive besides its name and renames it, so that there are only whole ones.
+/// Writes the archive under a temporary name and renames it, so that only complete ones exist.
 fn save(file: &Path, manifest: &Manifest, sources: &Sources) -> io::Result<()> {
     if fs::symlink_metadata(file).is_ok() {
         return Err(io::Error::other("the file exists already: name another, or remove it"));

@@ -282,7 +282,7 @@ fn read_counters(bytes: &[u8]) -> Result<BTreeMap<String, Totals>, String> {
     }
 }
 
-/// A name besides that path that is free.
+/// A free name next to that path.
 fn kept_aside(path: &Path) -> PathBuf {
     let named = |ending: String| path.with_extension(ending);
     let mut names = (1..1000).map(|number| named(format!("damaged-{number}")));
