@@ -86,7 +86,7 @@ fn a_drill_proves_stops_and_is_kept() {
         let said = String::from_utf8(output.stderr).unwrap();
         let line = said
             .lines()
-            .find(|line| line.contains("no drill has proven"))
+            .find(|line| line.contains("not proven by a drill"))
             .unwrap_or_default();
         assert!(line.contains(wanted), "{wanted}: {said}");
     };

@@ -309,8 +309,7 @@ fn a_gateway_with_another_configuration_is_reported_and_not_commanded() {
     sound();
     let refused = |what: &str| {
         let wanted = format!(
-            "error: {what}; {}; the gateway there runs with another configuration: reload it, or name its file by \
-             --config\n",
+            "error: {what}; {}; the gateway there runs with another configuration: reload it, or name its file with --config\n",
             line.socket().display()
         );
         for arguments in [&["read", "pump-1"][..], &["write", "pump-1", "run=true"]] {

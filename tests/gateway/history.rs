@@ -98,7 +98,7 @@ fn a_state_directory_that_cannot_be_written_costs_the_history_only() {
     fs::write(site.file("state"), "in the way").unwrap();
     let _line = site.line(&[1]);
     let gateway = site.run_ready();
-    gateway.until_printed("cannot keep events and counters");
+    gateway.until_printed("cannot save events and counters");
     start_and_stop(&site, 1);
     assert_eq!(log(&site, "?kind=started").len(), 1, "they are in memory");
     fs::remove_file(site.file("state")).unwrap();

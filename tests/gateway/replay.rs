@@ -112,7 +112,7 @@ fn what_is_no_capture_is_refused_with_its_place() {
             "foreign",
             b"id,time\n1,2\n",
             65,
-            "begins neither as pcap nor as pcapng, at byte 0",
+            "is neither pcap nor pcapng, at byte 0",
         ),
     ] {
         let path = folder.path().join(name);

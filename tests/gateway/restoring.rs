@@ -215,7 +215,7 @@ fn a_gateway_that_was_killed_in_the_middle_holds_the_drive_until_that_is_settled
     fs::write(&journal, "# drivegate restore 7\n").unwrap();
     let _gateway = plant.site.run_ready();
     let (code, _, said) = settle(&plant, &["write", "pump-1", "run=true"]);
-    assert_eq!((code, said.contains("is not understood")), (Some(1), true), "{said}");
+    assert_eq!((code, said.contains("cannot be read")), (Some(1), true), "{said}");
     let (code, _, said) = plant.ran(&["restore", "--resume", "pump-1"]);
     assert_eq!((code, said.contains("--release pump-1")), (Some(1), true), "{said}");
     let (_, said) = plant.well(&["restore", "--release", "pump-1"]);
@@ -282,7 +282,7 @@ fn without_a_gateway_the_command_restores_by_itself() {
         assert_eq!(plant.differences(&wanted, "pump-1"), Vec::<String>::new());
     }
     let (code, _, said) = plant.ran(&["restore", "--resume", "pump-1"]);
-    assert_eq!((code, said.contains("nothing to take up")), (Some(1), true), "{said}");
+    assert_eq!((code, said.contains("nothing to resume")), (Some(1), true), "{said}");
 }
 
 /// A reload that gives the names of two drives to each other ends the restore; the drive that is half restored is held under its new

@@ -165,7 +165,7 @@ fn on_a_terminal_it_ends_with_values_and_a_configuration() {
     let taken = bench.path("taken.toml");
     std::fs::write(&taken, "mine").unwrap();
     let mut trial = OnTerminal::start(&words(&bench.arguments(&[])));
-    let shown = trial.until_shown("Write this as a configuration?");
+    let shown = trial.until_shown("Save this as a configuration?");
     assert!(
         shown.contains("found modbus-rtu 38400 8N1, address 7: vacon-nx"),
         "{shown}"
@@ -208,7 +208,7 @@ fn ctrl_c_ends_it_at_any_moment() {
     }
     // At the question.
     let mut trial = OnTerminal::start(&words(&bench.arguments(&[])));
-    trial.until_shown("Write this as a configuration?");
+    trial.until_shown("Save this as a configuration?");
     trial.press("\x03");
     assert!(trial.ended().success(), "{}", trial.screen());
 }
@@ -282,7 +282,7 @@ fn another_master_is_not_disturbed() {
     assert!(
         ended
             .err
-            .contains("before anything was sent, so nothing was sent: another master speaks"),
+            .contains("before anything was sent, so nothing was sent: another master sends"),
         "{}",
         ended.err
     );

@@ -7,7 +7,7 @@ use std::process::Command;
 use crate::support::tools::root;
 
 /// What no page and no message says, and what to say instead.
-const INSTEAD: [(&str, &str); 19] = [
+const INSTEAD: [(&str, &str); 31] = [
     ("told", "reported, shown"),
     ("tells", "reports, shows, says"),
     ("tell apart", "distinguish"),
@@ -27,6 +27,18 @@ const INSTEAD: [(&str, &str); 19] = [
     ("as ever", "as usual"),
     ("exchange", "transaction"),
     ("exchanges", "transactions"),
+    ("fell silent", "went silent"),
+    ("all the same", "still, anyway"),
+    ("taken for", "mistaken for"),
+    ("in vain", "without success"),
+    ("trying again", "retrying"),
+    ("asked again", "retried"),
+    ("believed", "valid, accepted"),
+    ("ran out", "expired"),
+    ("runs out", "expires"),
+    ("somebody", "someone"),
+    ("everybody", "everyone"),
+    ("lately", "recently"),
 ];
 
 /// Of README and docs, without decisions.

@@ -468,7 +468,7 @@ fn a_drive_that_counts_tells_which_direction_is_bad() {
     };
     let back = evidence("corrupt=0.2");
     assert!(
-        back.contains("the way from the drive to the gateway is disturbed"),
+        back.contains("the direction from the drive to the gateway is disturbed"),
         "{back}"
     );
 }

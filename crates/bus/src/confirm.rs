@@ -30,7 +30,7 @@ pub enum Effect {
 }
 
 impl Effect {
-    /// Two effects of which the newer one makes the older one pointless.
+    /// Whether the newer effect supersedes the older one.
     fn same_subject(self, other: Effect) -> bool {
         match (self, other) {
             (Effect::Runs | Effect::Stops, Effect::Runs | Effect::Stops) | (Effect::NoFault, Effect::NoFault) => true,
@@ -164,7 +164,7 @@ struct Watch {
     /// Least speed since the acknowledgement, and when it last fell.
     slowest: Option<f64>,
     fell_at: Instant,
-    /// What it was, as text.
+    /// The command, as text.
     what: String,
     /// Why its effect cannot be seen, as it was last.
     unseen: Option<String>,

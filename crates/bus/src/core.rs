@@ -62,7 +62,7 @@ struct Connection {
 /// is off, or close after one request, but one that never replies does not reach the drives.
 const MOST_IN_VAIN: u32 = 3;
 
-/// What was chosen to go out when the line is clear.
+/// The request to send when the line is clear.
 #[derive(Debug)]
 struct Chosen {
     turn: Turn,
@@ -196,7 +196,7 @@ impl BusCore {
         }
     }
 
-    /// What is to be done now.
+    /// The action due now.
     pub fn poll(&mut self, now: Instant) -> Action {
         loop {
             if self.line.is_underway() {
@@ -273,7 +273,7 @@ impl BusCore {
         None
     }
 
-    /// What is left of faults and commands.
+    /// The remains of faults and commands.
     pub fn remains(&self, now: Instant) -> Remains {
         self.master.remains(now)
     }

@@ -54,7 +54,7 @@ impl LineDiagnosis {
         }
     }
 
-    /// The figures, to be told of the port, of drives that run and of bytes that nobody asked for.
+    /// The figures, to be updated about the port, running drives and unrequested bytes.
     pub(super) fn figures(&mut self) -> &mut Figures {
         &mut self.figures
     }

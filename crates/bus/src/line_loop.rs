@@ -114,8 +114,8 @@ impl BusTask {
         self.halt();
     }
 
-    /// The same of a bus whose place another one takes: stops wait for that, to be handed over by [`BusHandle::take_over`].
-    /// What it has to know.
+    /// The same for a bus that another one replaces: stops wait for it, handed over by [`BusHandle::take_over`].
+    /// Returns the handover.
     pub fn make_room(mut self) -> Handover {
         self.handle.queue.begin_handover(Instant::now());
         self.halt()
@@ -404,7 +404,7 @@ impl Worker {
     }
 }
 
-/// What a core does with its port.
+/// An opened port with its warnings.
 type Opened<L> = Result<(L, Vec<String>), OpenError>;
 
 /// A bus without its thread, and the kind of line that it needs.

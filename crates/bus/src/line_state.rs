@@ -145,8 +145,8 @@ impl LineState {
         }
     }
 
-    /// The connection was closed. A request that was given to it may be on the wire behind the server, and its reply
-    /// comes by the next connection, if it does: the transaction goes on until its deadline.
+    /// The connection was closed. A request that was sent over it may still be on the wire behind the server, and its
+    /// reply may arrive over the next connection: the transaction continues until its deadline.
     pub fn cut(&mut self) {
         if let Some(underway) = &mut self.underway {
             underway.cut = true;

@@ -30,7 +30,7 @@ pub struct N2LateReplies(Vec<Late>);
 pub struct Asked<'r> {
     /// The address of the drive.
     pub address: u8,
-    /// What it was asked.
+    /// The request.
     pub pdu: &'r RequestPdu,
     /// The device type by which it identifies itself.
     pub device: u8,
@@ -50,11 +50,11 @@ struct Late {
     until: Instant,
     /// Replies that may still come: the request was sent so often without success.
     count: u32,
-    /// The same request was answered since: by which of the replies, nobody knows.
+    /// The same request was answered since, by an unknown one of the replies.
     answered: bool,
 }
 
-/// What a sound frame is in a transaction.
+/// The meaning of a valid frame in a transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Taken {
     /// As far as late replies are concerned it may be the reply.
@@ -146,8 +146,8 @@ impl N2LateReplies {
         self.0.iter().filter(alike)
     }
 
-    /// What the whole frame at the beginning of `bytes` is, received at `now` in the transaction of `pdu` with the
-    /// drive of that address.
+    /// The meaning of the complete frame at the start of `bytes`, received at `now` in the transaction of `pdu` with
+    /// the drive at that address.
     pub fn take(&mut self, address: u8, pdu: &RequestPdu, bytes: &[u8], now: Instant) -> Taken {
         self.0.retain(|late| late.until > now);
         let Some((used, answer)) = frame(bytes).filter(|_| !self.0.is_empty()) else {

@@ -18,7 +18,7 @@ pub enum News {
     Read {
         /// Which drive.
         drive: usize,
-        /// What was read.
+        /// The read.
         read: PlannedRead,
         /// The reply, a word for each item.
         words: Vec<u16>,

@@ -30,7 +30,7 @@ pub struct Answer {
     pub echoed: bool,
     /// Received bytes, without such an echo.
     pub bytes: usize,
-    /// What they look like.
+    /// Their shape.
     pub shape: Shape,
     /// A gateway in between reported that nothing answers at the address, which counts as silence.
     pub no_way: bool,
@@ -81,7 +81,7 @@ impl Prober<'_> {
         }
     }
 
-    /// What a transaction without an answer takes.
+    /// Duration of a transaction without a reply.
     pub fn patience(&self, request: &Request) -> Duration {
         self.state.patience(request, self.timeout)
     }

@@ -36,7 +36,7 @@ pub struct Proof {
 /// A case in which a command does what it must not.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Counterexample {
-    /// What is wrong.
+    /// The fault.
     pub what: String,
     /// The drive before.
     pub state: String,

@@ -41,11 +41,11 @@ pub(super) struct Report {
     faults: Vec<Option<i64>>,
     /// The other reported states of each drive, in the order of [`WATCHED`].
     watched: Vec<[Watched; WATCHED.len()]>,
-    /// What is known of each drive's own response to a silent master.
+    /// The known response of each drive to a silent master.
     responses: Vec<Response>,
     /// Whether process data matches the profiles.
     selections: Selections,
-    /// What is wrong with the line.
+    /// The diagnosis of the line.
     pub(super) diagnosis: LineDiagnosis,
     up: bool,
     /// It was reported that the bus is down, and it is still.
@@ -61,7 +61,7 @@ pub(super) struct Wanted {
     pub(super) monitors: Vec<(usize, usize, Instant)>,
 }
 
-/// What is known of a drive's own response to a silent master.
+/// The known response of a drive to a silent master.
 #[derive(Debug, Clone, Copy, Default)]
 struct Response {
     /// Since it came online.
@@ -374,8 +374,8 @@ impl Report {
         });
     }
 
-    /// A request was given to the line, which had been silent since `quiet_since`, at `began`: for the recorder, and
-    /// for anyone who listens to the frames; `None` while nobody does.
+    /// A request was sent at `began`, on a line that had been silent since `quiet_since`: for the recorder, and for
+    /// trace subscribers; `None` without any.
     pub(super) fn tape_request(
         &self,
         index: Option<usize>,

@@ -33,8 +33,8 @@ const MOST_SLOW_SHARE: f64 = 1.0 / 3.0;
 /// Share of what commands leave that slow polls get while something was never read: what is not known yet is worth more than what is known.
 const FIRST_SHARE: f64 = 0.5;
 
-/// Share of a saturated line that slow polls get, of which their cadence asks for `demand`: with many requests (one for
-/// each object on N2) they get more than the least, and come round in six times their cadence.
+/// Share of a saturated line for slow polls whose cycle would need `demand`: with many requests (one per object on N2)
+/// they get more than the minimum, and finish a round in six times their cycle.
 pub fn slow_share(demand: f64) -> f64 {
     (demand / 6.0).clamp(SLOW_SHARE, MOST_SLOW_SHARE)
 }
@@ -47,7 +47,7 @@ const MOST_CREDIT: f64 = 1.5;
 pub struct Poll {
     /// Index of the drive on the bus.
     pub drive: usize,
-    /// What is read.
+    /// The read.
     pub read: PlannedRead,
     /// Sent to find out whether the drive replies (again).
     pub probe: bool,
@@ -126,7 +126,7 @@ pub struct Schedule {
     cadence: Cadence,
     drives: Vec<DriveSchedule>,
     round: VecDeque<(usize, PlannedRead)>,
-    /// Of the round, what decides the state of a drive of which nothing is known: no slow poll goes before it.
+    /// Reads of the round that decide the state of a drive that is still unknown: no slow poll goes before them.
     state_first: Vec<(usize, PlannedRead)>,
     round_due: Instant,
     round_started: Option<Instant>,
@@ -237,8 +237,8 @@ impl Schedule {
         }
     }
 
-    /// What comes next where `waiting` has its turn before `highest`, which also waits: a stop yields to a command, not to
-    /// the polls that the command has to wait for.
+    /// The next action if `waiting` has its turn before `highest`, which also waits: a stop yields to a command, but
+    /// not to the polls that the command must wait for.
     pub fn next_of(&mut self, now: Instant, waiting: Option<Urgency>, highest: Option<Urgency>) -> Decision {
         match self.next(now, waiting) {
             Decision::Poll(_) if self.turn != Turn::Asked => self.next(now, highest),

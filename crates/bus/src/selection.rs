@@ -71,7 +71,7 @@ pub(super) struct Findings {
     pub(super) wanted: Vec<(usize, Instant)>,
     /// The points whose value comes from their monitoring register from now on, if that changed.
     pub(super) monitored: Option<Vec<usize>>,
-    /// Points of which it is now known that they hold something else, with both values: the first ones of the drive.
+    /// Points now known to differ, with both values: the first ones of the drive.
     pub(super) differ: Vec<(usize, f64, f64)>,
     /// Points that match the profile again.
     pub(super) restored: Vec<usize>,

@@ -80,7 +80,7 @@ impl StartGate {
         })
     }
 
-    /// Whether a command that could be started may start what it starts; a stop, whether it waits for nothing.
+    /// Whether a command that could start now may start its motor; for a stop, whether it need not wait.
     ///
     /// # Errors
     /// When, if it must wait.
@@ -203,7 +203,7 @@ impl StartGate {
         !self.cleared.is_empty()
     }
 
-    /// What is known of a drive now.
+    /// Updates the state of a drive.
     pub(super) fn look(&self, index: usize, drive: &mut DriveState, reading: &Reading<'_>) {
         if let Some(run) = drive.acknowledged.take() {
             self.guards.acknowledged(index, run, reading.now);

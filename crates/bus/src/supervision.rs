@@ -1,7 +1,6 @@
-//! Supervision: a gateway that polls keeps a drive's own watchdog content even when nobody commands the drive any more.
-//! So a drive can have a lease, renewed by the commands and heartbeats of a commanding client; when it expires while
-//! the drive runs, or its run command is set, the configured action is written once. Not a safety function. Pure: time
-//! is an argument.
+//! Supervision: polling keeps a drive's own watchdog satisfied even when no client commands it. So a drive can have a
+//! lease, renewed by the commands and heartbeats of a commanding client; when it expires while the drive runs, or its
+//! run command is set, the configured action is written. Not a safety function. Pure: time is an argument.
 //!
 //! A lease begins when a command reached the wire, and again when that order ended. A command that waits holds the
 //! lease, no longer than until the order expires; one that was refused, expired or replaced renews nothing. A client
@@ -103,7 +102,7 @@ pub(super) struct Supervision {
     /// For how long the drive answered since the lease expired without showing what is to be done, and until when that
     /// is calculated.
     waited: Option<(Duration, Instant)>,
-    /// An action failed so, which is not told yet.
+    /// A failure of the action that is not reported yet.
     failure: Option<Outcome>,
     /// Failed attempts of the present action, and the reported reasons.
     failures: u32,
@@ -203,9 +202,8 @@ impl Supervision {
         }
     }
 
-    /// The time of the lease, which ran since `since`, has ended. Of a drive that does not answer, or was not read
-    /// since, nobody knows whether it runs: its lease stays until it is. One that answers and does not say so is not
-    /// waited for without end, whatever it says instead.
+    /// The lease, which ran since `since`, has expired. Whether a silent drive, or one not read since, runs is unknown:
+    /// its lease stays until it is read. A drive that replies without reporting it is not waited for indefinitely.
     fn runs_out(
         &mut self,
         since: Instant,

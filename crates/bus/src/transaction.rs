@@ -83,8 +83,8 @@ pub struct Transaction {
 }
 
 impl Transaction {
-    /// The request whose `frame` was given to the line. The deadline is set once: end of transmission, time
-    /// for the first byte, wire time of the reply. `echo`: the adapter is known to send back what it is given.
+    /// A transaction for the request whose `frame` was sent. The deadline is set once: end of transmission, time for
+    /// the first byte, wire time of the reply. `echo`: the adapter is known to echo.
     pub fn new(
         protocol: Protocol,
         request: Request,
@@ -124,7 +124,7 @@ impl Transaction {
         self.doubted_before = Some(earliest);
     }
 
-    /// The request is on the wire until `end`: what comes before is nobody's answer, the echo apart.
+    /// The request is on the wire until `end`: bytes before that, except for the echo, are not a reply.
     pub fn ignore_before(&mut self, end: Instant) {
         self.ignored_before = Some(end);
     }
@@ -379,9 +379,9 @@ impl Transaction {
         true
     }
 
-    /// Whether the adapter sends back what it is given, as far as this transaction, which ended so, shows it. Only an
-    /// answered request whose reply looks otherwise shows it: a reply without an echo before it means that an earlier
-    /// echo was a freak, and believing in it would swallow the acknowledgements of all writes.
+    /// Whether the adapter echoes, as far as this transaction shows. Only an answered request with a different reply
+    /// shows it: a reply without an echo before it means that an earlier echo was spurious, and relying on it would
+    /// swallow the acknowledgements of all writes.
     pub fn echoes(&self, ended: &Ended) -> Option<bool> {
         let answered = matches!(ended, Ended::Reply(_));
         (is_unlike_its_reply(&self.request.pdu) && (self.echo_seen || answered)).then_some(self.echo_seen)

@@ -1,4 +1,4 @@
-//! What is at the other end of a connection that should be a raw serial port, by the first bytes that come.
+//! Recognises the server behind a connection that should be a raw serial port, by its first bytes.
 
 use super::rfc2217::is_greeting;
 use crate::codec::checksum::crc16;
@@ -8,7 +8,7 @@ const ENOUGH: usize = 9;
 /// Most requests of which the beginning is remembered.
 const ASKED: usize = 32;
 
-/// What is at the other end.
+/// The kind of server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Server {
     /// A serial port, or nothing that is known.
@@ -58,12 +58,12 @@ impl FirstBytes {
         self.came.first().copied().unwrap_or_default()
     }
 
-    /// Whether nothing came yet.
+    /// Whether nothing was received yet.
     pub(super) fn is_empty(&self) -> bool {
         self.came.is_empty()
     }
 
-    /// Bytes came; `None` while it is open what they are.
+    /// Bytes were received; `None` while their kind is open.
     pub(super) fn came(&mut self, bytes: &[u8]) -> Option<Server> {
         let room = ENOUGH - self.came.len().min(ENOUGH);
         self.came.extend(bytes.iter().take(room));

@@ -56,7 +56,7 @@ pub enum OpenError {
     Serial {
         /// Path.
         port: String,
-        /// What the system says, and what to do.
+        /// The system's error, and the remedy.
         reason: String,
     },
     /// The device server cannot be reached.
@@ -64,7 +64,7 @@ pub enum OpenError {
     Tcp {
         /// Address.
         port: String,
-        /// What the system says.
+        /// The system's error.
         reason: io::Error,
     },
     /// The device server is there, but cannot set up its port.
@@ -72,7 +72,7 @@ pub enum OpenError {
     Remote {
         /// Address.
         port: String,
-        /// Why, and what to do.
+        /// The reason and the remedy.
         reason: String,
     },
     /// The kernel cannot switch the direction of this port.
@@ -80,7 +80,7 @@ pub enum OpenError {
     Rs485 {
         /// Path.
         port: String,
-        /// What the system says.
+        /// The system's error.
         reason: io::Error,
     },
 }
@@ -94,11 +94,11 @@ impl OpenError {
     }
 }
 
-/// The port is gone: the bus closes it and opens it again.
+/// The port is lost: the bus closes it and opens it again.
 #[derive(Debug, thiserror::Error)]
 #[error("the port is lost: {why}")]
 pub struct Lost {
-    /// What the system says.
+    /// The system's error.
     pub why: String,
     /// A device server closed its connection, which some do after each reply or after a pause.
     pub closed: bool,
@@ -129,7 +129,7 @@ impl Lost {
 pub enum Woken {
     /// Bytes can be read (or the port is gone, which reading shows).
     Readable,
-    /// A command came in.
+    /// A command arrived.
     Command,
     /// The time is there.
     Time,
@@ -163,8 +163,7 @@ pub struct Line {
 impl Line {
     /// Opens the port exclusively; the texts are warnings.
     ///
-    /// # Errors
-    /// When the port cannot be opened or cannot do what is asked of it.
+    /// # Errors When the port cannot be opened or does not support the settings.
     pub fn open(port: &str, format: &LineFormat, options: &LineOptions) -> Result<(Line, Vec<String>), OpenError> {
         Line::open_by(&mut Names::default(), port, format, options, &|| true)
     }
@@ -234,7 +233,7 @@ impl Line {
         }
     }
 
-    /// Reads what is there, without waiting; 0 is nothing.
+    /// Reads the available bytes, without waiting; 0 if there are none.
     ///
     /// # Errors
     /// When the port is gone (an unplugged adapter reads end of file or EIO), or turns out to be no raw port.
@@ -325,7 +324,7 @@ fn write_all(port: BorrowedFd<'_>, mut bytes: &[u8]) -> Result<(), Lost> {
     Ok(())
 }
 
-/// Reads what is there; 0 is nothing.
+/// Reads the available bytes; 0 if there are none.
 fn read(port: BorrowedFd<'_>, buffer: &mut [u8]) -> Result<usize, Lost> {
     match rustix::io::read(port, buffer) {
         Ok(0) => Err(Lost {

@@ -62,7 +62,7 @@ impl Pty {
         Ok(())
     }
 
-    /// Reads what is there, without waiting.
+    /// Reads the available bytes, without waiting.
     ///
     /// # Errors
     /// Nothing is there, or the system reports something else.
@@ -78,7 +78,7 @@ impl Pty {
         Ok(rustix::io::write(&self.master, bytes)?)
     }
 
-    /// What the other program opens: the link when there is one.
+    /// The path that the other program opens: the link if there is one.
     pub fn path(&self) -> &Path {
         self.link.as_deref().unwrap_or(&self.path)
     }

@@ -47,10 +47,9 @@ impl Receiver {
         Ok((Receiver(line), warnings))
     }
 
-    /// Reads what is there, without waiting; 0 is nothing.
+    /// Reads the available bytes, without waiting; 0 if there are none.
     ///
-    /// # Errors
-    /// When the port is gone.
+    /// # Errors When the port is lost.
     pub fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         self.0.receive(buffer)
     }

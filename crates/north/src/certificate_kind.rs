@@ -1,5 +1,5 @@
-//! What decides whether a certificate is accepted, besides its signature: version, key, names, uses. For checks before
-//! a connection and for words about those that failed.
+//! The properties that decide whether a certificate is accepted, besides its signature: version, key, names, usages.
+//! For checks before a connection and messages after failed ones.
 
 use rustls_pki_types::{IpAddr, ServerName};
 use x509_cert::certificate::{Certificate, TbsCertificate, Version};
@@ -15,14 +15,14 @@ use super::certificate::{common_name, printable, subject_name};
 /// Keys of RSA, in bits: what signatures are verified with, and what the gateway can sign with.
 const RSA_VERIFY: std::ops::RangeInclusive<usize> = 2048..=8192;
 const RSA_SIGN: std::ops::RangeInclusive<usize> = 2048..=4096;
-/// What to use instead of a key that is not supported.
+/// Supported keys, for messages.
 pub(super) const SUPPORTED_KEYS: &str = "P-256, P-384, Ed25519 or RSA with 2048 to 4096 bits";
 const SERVER_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.1");
 const ANY_USAGE: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.37.0");
 const EC_KEY: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.10045.2.1");
 const RSA_KEY: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.113549.1.1.1");
 
-/// What is said of keys and signatures in words, by object identifier; the last tells whether such a key is supported.
+/// Names of keys and signatures, by object identifier, and whether such a key is supported.
 const ALGORITHMS: [(&str, &str, bool); 17] = [
     ("1.2.840.10045.3.1.7", "P-256", true),
     ("1.3.132.0.34", "P-384", true),
@@ -122,7 +122,7 @@ impl Kind {
         self.is_commonly_named(&host_name) || self.names.iter().any(fits)
     }
 
-    /// What it is for, in words.
+    /// The names it is valid for, as text.
     pub(super) fn shown_names(&self) -> String {
         match (self.names.as_slice(), &self.common_name) {
             ([], Some(common)) => format!("only the common name `{}`", printable(common)),

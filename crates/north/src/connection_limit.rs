@@ -26,7 +26,7 @@ pub(super) struct Limits {
 }
 
 impl Limits {
-    /// `total` connections, of which one address may have `per_address`.
+    /// `total` connections, at most `per_address` from one address.
     pub(super) fn new(total: usize, per_address: usize) -> Limits {
         Limits {
             total,

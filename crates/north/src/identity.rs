@@ -254,7 +254,7 @@ pub(super) fn trusted_servers(ca: Option<&Path>) -> Result<ServerTrust, RootsErr
     ServerTrust::new(store, named).map_err(|_| RootsError::NoSystemRoots)
 }
 
-/// What to build the TLS of a client from, which trusts such servers.
+/// A builder for the TLS of a client that trusts such servers.
 pub(super) fn client_builder(ca: Option<&Path>) -> Result<ConfigBuilder<ClientConfig, WantsClientCert>, RootsError> {
     let builder = ClientConfig::builder_with_provider(provider())
         .with_safe_default_protocol_versions()

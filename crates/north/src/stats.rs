@@ -236,7 +236,7 @@ pub struct BacnetFigures {
 }
 
 impl BacnetStats {
-    /// What the server says of itself; none when it ends.
+    /// Sets the server's figures; none when it ends.
     pub(crate) fn set(&self, figures: Option<BacnetFigures>) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = figures;
     }
@@ -424,7 +424,7 @@ impl MqttStats {
             .and_then(|kept| std::mem::replace(kept, broker))
     }
 
-    /// There is no client that goes on with what the last one left.
+    /// Discards what the last client handed over, if no client takes it.
     pub fn forget_what_is_left(&self) {
         drop((
             self.keep_unread(None),

@@ -16,7 +16,7 @@ pub enum Peer {
     Server {
         /// The setting with the certificates that it is verified by.
         ca: &'static str,
-        /// What to do so that it is shown a certificate; empty where there is no such setting.
+        /// The setting for a client certificate; empty if there is none.
         own: &'static str,
     },
     /// A client of the gateway.

@@ -107,7 +107,7 @@ pub fn reply(protocol: Protocol, asked: &Request, bytes: &[u8]) -> String {
     }
 }
 
-/// Bytes that nobody asked for: a sound frame of someone else, or noise.
+/// Unrequested bytes: another device's valid frame, or noise.
 pub fn stray(protocol: Protocol, bytes: &[u8]) -> String {
     if protocol == Protocol::N2 {
         return n2_words::stray(bytes);

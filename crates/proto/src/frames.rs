@@ -1,4 +1,4 @@
-//! Cuts what is received on a line into requests, replies and what is neither. Pure: time is an argument.
+//! Splits the bytes on a line into requests, replies and others. Pure: time is an argument.
 //!
 //! Drivers and adapters hand bytes over late and in lumps, so silence decides little. A frame is known by its content: a
 //! request by function, length and check code; a reply by the request before it. Only what stays incomplete is given up by
@@ -21,14 +21,14 @@ pub const GLITCH: usize = 2;
 pub enum Cut {
     /// A request of the other master; the PDU is `None` where the codec has none for it.
     Request {
-        /// Who is asked; 0 is the broadcast.
+        /// The address; 0 is the broadcast.
         address: u8,
-        /// What is asked.
+        /// The request.
         pdu: Option<RequestPdu>,
     },
     /// The reply to the request that is open.
     Reply {
-        /// What it says.
+        /// The reply.
         reply: Reply,
         /// It could be a request as well.
         ambiguous: bool,
@@ -37,7 +37,7 @@ pub enum Cut {
     Garbage,
 }
 
-/// A piece of what was received.
+/// A piece of the received bytes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Piece {
     pub cut: Cut,

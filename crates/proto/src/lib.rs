@@ -19,19 +19,19 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-/// One request to one drive: who is asked, and what.
+/// One request to one drive: address and PDU.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Request {
     /// Address of the drive on its bus, 1..=247, with N2 to 255 (0 is broadcast: no reply follows).
     pub address: u8,
-    /// What is asked.
+    /// The request PDU.
     pub pdu: RequestPdu,
-    /// What is known of the drive's N2; other protocols do not look at it.
+    /// The drive's N2 options; ignored by other protocols.
     pub n2: N2Options,
 }
 
 impl Request {
-    /// Asks the drive at `address`, of which nothing else is known.
+    /// A request to the drive at `address`, with default options.
     pub fn new(address: u8, pdu: RequestPdu) -> Request {
         Request {
             address,
@@ -41,7 +41,7 @@ impl Request {
     }
 }
 
-/// What the bytes received so far are, seen against the outstanding request.
+/// The bytes received so far, decoded against the outstanding request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Decoded {
     /// Not yet a whole frame; read on until the deadline.
@@ -50,7 +50,7 @@ pub enum Decoded {
     Reply {
         /// Bytes of the buffer that the frame takes.
         used: usize,
-        /// What the drive said.
+        /// The reply.
         reply: Reply,
     },
     /// A sound frame of someone else (other address, function or length): drop `used` bytes and

@@ -1,4 +1,4 @@
-//! Modbus PDUs: what RTU, ASCII and TCP share, from both ends.
+//! Modbus PDUs, shared by RTU, ASCII and TCP, for both ends.
 //!
 //! A master encodes requests and decodes replies; the Modbus TCP server and the simulated drives
 //! do it the other way round with the same types.

@@ -43,12 +43,12 @@ pub const RESPONSE_TIMEOUT: Duration = Duration::from_millis(250);
 /// Tries after the first (n2.md 4: three tries).
 pub const RETRIES: u32 = 2;
 
-/// What the bus itself says to a drive, besides reads and writes.
+/// Session messages to a drive, besides reads and writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Session {
     /// Who is there? A drive that has restarted answers nothing else.
     Identify,
-    /// What has changed?
+    /// Poll for changes.
     Poll {
         /// Acknowledges the report before.
         again: bool,

@@ -19,7 +19,7 @@ const MOST_MEMBERS: usize = 100_000;
 /// Most bytes of all members together.
 const MOST_BYTES: u64 = 8 << 30;
 
-/// What an archive has.
+/// The manifest of an archive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Manifest {
     /// [`FORMAT`].
@@ -252,7 +252,7 @@ fn parse(json: &[u8]) -> Result<Manifest, String> {
     }
 }
 
-/// Counts and hashes what is read.
+/// Counts and hashes the bytes read.
 pub(super) struct Hashed<R> {
     reader: R,
     bytes: u64,

@@ -58,7 +58,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 impl Verify {
-    /// What was found when all is well.
+    /// Verifies the files. Returns the summary if they are intact.
     fn run(&self) -> Result<String, Vec<String>> {
         let ordered = in_order(&self.files).map_err(|error| vec![error])?;
         let (mut verifier, mut faults, mut lines) = (Verifier::new(self.last), Vec::new(), 0);

@@ -1,4 +1,4 @@
-//! `drivegate backup`: what a gateway needs to be set up again, in one file.
+//! `drivegate backup`: everything needed to set a gateway up again, in one file.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
@@ -203,7 +203,7 @@ fn manifest(config: &Path, settings: &Settings, sources: &Sources) -> Manifest {
     }
 }
 
-/// Writes the archive besides its name and renames it, so that there are only whole ones.
+/// Writes the archive under a temporary name and renames it, so that only complete ones exist.
 fn save(file: &Path, manifest: &Manifest, sources: &Sources) -> io::Result<()> {
     if fs::symlink_metadata(file).is_ok() {
         return Err(io::Error::other("the file exists already: name another, or remove it"));

@@ -1,4 +1,4 @@
-//! `drivegate check`: what is wrong with a configuration, and what its buses will do.
+//! `drivegate check`: reports errors in a configuration and predicts the load of its buses.
 
 mod as_service;
 
@@ -62,7 +62,7 @@ struct Bus<'a> {
     load_ratio: f64,
     fast_cycle_ms: Option<f64>,
     slow_cycle_ms: Option<f64>,
-    /// What the stops take at shutdown when all drives answer, and when none does.
+    /// Duration of the stops at shutdown if all drives reply, and if none does.
     shutdown_ms: f64,
     shutdown_worst_ms: f64,
     /// Memory that the recorder takes at most.

@@ -27,18 +27,16 @@ pub(super) struct CredentialsFile<'p> {
 impl CredentialsFile<'_> {
     /// Its text.
     ///
-    /// # Errors
-    /// What is wrong with it, for the user.
+    /// # Errors The fault, as a message.
     fn read(&self) -> Result<String, String> {
         let (what, shown) = (self.what, self.path.display());
         read_to_string(self.path)
             .map_err(|error| format!("cannot read the {what} file: {error}; {shown}; check the path"))
     }
 
-    /// What it holds.
+    /// Its content.
     ///
-    /// # Errors
-    /// What is wrong with it, for the user.
+    /// # Errors The fault, as a message.
     pub(super) fn list<C: Credential>(&self) -> Result<Credentials<C>, String> {
         parsed(self.path, &self.read()?)
     }

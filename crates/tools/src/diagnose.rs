@@ -1,4 +1,4 @@
-//! `drivegate diagnose`: what is wrong with a line.
+//! `drivegate diagnose`: shows the verdicts about a line.
 
 use std::fmt::Write;
 use std::process::ExitCode;
@@ -28,7 +28,7 @@ pub(super) struct Args {
     json: bool,
 }
 
-/// The diagnosis of a bus, as the gateway tells it.
+/// The diagnosis of a bus, from the gateway.
 #[derive(Debug, Deserialize)]
 struct Diagnosis {
     bus: String,

@@ -1,4 +1,4 @@
-//! What commands about one drive share: the drive, and the way to it.
+//! The common part of commands about one drive: finding the drive and its gateway.
 //!
 //! A running gateway owns the line, so a command asks it, at its local socket or by `--url`; only where none runs does the
 //! command start the gateway's own bus in this process, and ask that. Either way the same routes answer, so the answers are

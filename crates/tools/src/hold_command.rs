@@ -25,7 +25,7 @@ pub(super) struct Args {
     action: Option<String>,
 }
 
-/// What the gateway says.
+/// The gateway's reply.
 #[derive(Debug, Deserialize)]
 struct Hold {
     #[serde(default)]

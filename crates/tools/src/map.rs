@@ -174,7 +174,7 @@ fn render(plant: &Plant, listeners: &[Listener], shown: Option<&[String]>, forma
     }
 }
 
-/// What is printed.
+/// The printed map.
 struct Map<'a> {
     plant: &'a Plant,
     drives: Vec<DriveHandle>,

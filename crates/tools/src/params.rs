@@ -59,9 +59,9 @@ Exit code 0: nothing differs; 1: something does, or it could not be found out.")
   drivegate params restore pump-1.params pump-1 --only 102 --yes
   drivegate params restore --resume pump-1
 
-Shows first what would be written, and asks. The drive needs access = \"control\" and params = \"write\". While parameters are written
-the drive takes no commands but stops; a restore that was cut off keeps it so until it is resumed, undone or released. A gateway
-goes on with the restore when the command is interrupted.")]
+Shows the plan first, and asks. The drive needs access = \"control\" and params = \"write\". While parameters are written
+the drive accepts only stops; after an interrupted restore it does so until that is resumed, undone or released. A running gateway
+continues the restore if the command is interrupted.")]
     Restore(restore::RestoreArgs),
     /// Copies the parameters of a drive to another of the same kind.
     #[command(after_help = "Example:\n  drivegate params clone pump-1 pump-2 --dry-run")]

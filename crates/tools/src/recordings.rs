@@ -1,4 +1,4 @@
-//! `drivegate recordings`: what the recorder has kept.
+//! `drivegate recordings`: lists, shows and exports recordings.
 
 mod show;
 

@@ -1,4 +1,4 @@
-//! What commands print. A pipe that is closed early ends the output without an error.
+//! Output of commands. A pipe that is closed early ends the output without an error.
 
 use std::io::{self, Write};
 use std::process::ExitCode;

@@ -103,7 +103,7 @@ fn notify(states: &[NotifyState<'_>]) {
     }
 }
 
-/// What signals have asked for.
+/// The requests of signals.
 #[derive(Debug, Default)]
 struct Wanted {
     stop: bool,

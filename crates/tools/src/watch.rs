@@ -180,7 +180,7 @@ fn holder(drive: &Value) -> String {
     }
 }
 
-/// The state, with the warning that the drive reports besides it.
+/// The state, with the warning that the drive reports with it.
 fn state(drive: &Value) -> String {
     let state = at(drive, "/state").as_str().unwrap_or("unknown");
     let warning = at(drive, "/points/warning");

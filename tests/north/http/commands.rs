@@ -428,7 +428,7 @@ async fn a_repeated_command_is_executed_once_and_has_one_result() {
     let outdated = rig.command(&alice, body).await;
     assert_eq!(outdated.status, 403);
     assert!(
-        outdated.body.contains("the drive was stopped since"),
+        outdated.body.contains("the drive has been stopped since"),
         "{}",
         outdated.body
     );

@@ -27,7 +27,7 @@ fn reading() -> ParameterFile {
         family: "vacon-nx".to_string(),
         identification: "none".to_string(),
         time: "2026-03-02T07:40:12Z".to_string(),
-        counters: "812 messages received, 3 damaged ones".to_string(),
+        counters: "812 messages received, 3 damaged".to_string(),
         values: [(Id::new("102"), good), (Id::new("103"), bad)].into(),
     }
 }
@@ -56,7 +56,7 @@ async fn the_last_reading_and_the_present_one_are_served() {
     store.keep(&file).unwrap();
     let last = json!({
         "family": "vacon-nx", "identification": "none", "application": file.application(),
-        "time": "2026-03-02T07:40:12Z", "counters": "812 messages received, 3 damaged ones", "checksum": file.checksum(), "missing": 1,
+        "time": "2026-03-02T07:40:12Z", "counters": "812 messages received, 3 damaged", "checksum": file.checksum(), "missing": 1,
         "parameters": [
             {"id": "102", "raw": 5000.0, "text": "50.00 Hz, Maximum frequency"},
             {"id": "103", "raw": null, "text": "Acceleration time 1", "why": "exception 04"},

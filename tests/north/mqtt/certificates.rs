@@ -131,7 +131,7 @@ fn a_refused_certificate_is_told_with_cause_and_remedy() {
             "first",
             "ca",
             true,
-            "X.509 version 1, which has no names and no uses; have it reissued as version 3",
+            "X.509 version 1, which has no names and usages; have it reissued as version 3",
         ),
         (
             "nameless",
@@ -140,7 +140,7 @@ fn a_refused_certificate_is_told_with_cause_and_remedy() {
             "does not name the host `127.0.0.1` (it has no subjectAltName); have it reissued with subjectAltName = \
              IP:127.0.0.1",
         ),
-        ("authority", "ca", true, "one of a CA (basicConstraints CA:TRUE)"),
+        ("authority", "ca", true, "a CA certificate (basicConstraints CA:TRUE)"),
         ("large", "large", true, "such as P-521"),
         (
             "signed521",
@@ -159,7 +159,7 @@ fn a_refused_certificate_is_told_with_cause_and_remedy() {
             "client",
             "client",
             false,
-            "must not be used by a server; have it reissued with extendedKeyUsage = serverAuth",
+            "is not valid for use by a server; have it reissued with extendedKeyUsage = serverAuth",
         ),
         (
             "ordinary",
@@ -221,7 +221,7 @@ fn a_server_without_the_key_of_the_named_certificate_is_refused() {
                 }
             });
             let gateway = site.gateway(port, server);
-            wait_log(port, "was not signed by the key");
+            wait_log(port, "was not signed with the key");
             gateway.stop();
             serving.abort();
         }

@@ -45,14 +45,14 @@ impl Word {
     }
 }
 
-/// What a word needs.
+/// The result of making a word.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Made {
     /// This request.
     Send(Step),
     /// Nothing: the drive has it.
     Nothing,
-    /// It cannot be said what it would do.
+    /// Its effect would be unknown.
     Refused(Refusal),
 }
 
@@ -69,7 +69,7 @@ pub(super) struct AwaitedState {
     step: String,
     /// When the wait began.
     pub(super) since: Option<Instant>,
-    /// What was read last.
+    /// The last reading.
     seen: Option<u64>,
 }
 
@@ -129,7 +129,7 @@ impl AwaitedState {
     }
 }
 
-/// What a command says of points that follow from `[control]`.
+/// The values in a command for points that follow from `[control]`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Ordered {
     run: Option<bool>,

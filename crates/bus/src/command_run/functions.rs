@@ -3,7 +3,7 @@
 use crate::codec::{Protocol, RequestPdu};
 use crate::drive::Profile;
 
-/// What a drive has shown of the functions that it takes; none where it has shown nothing.
+/// The functions that a drive has shown to accept, if any.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct TakenFunctions {
     /// One register is written by function 16, not 06.

@@ -1,4 +1,4 @@
-//! What is known of a drive's own command words.
+//! The known command words of a drive.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -1,6 +1,6 @@
-//! One parameter set as one command: what the drive has, whether its motor runs, the write, what it has then. Pure.
+//! One parameter set as one command: read the value, check that the motor is stopped, write, read back. Pure.
 //!
-//! A write that was not answered is not repeated before the drive was asked what it made of it.
+//! A write without a reply is not repeated before its effect has been read.
 
 use super::steps::{Step, StepPurpose};
 use crate::codec::n2::Session;
@@ -22,13 +22,13 @@ enum Stage {
     Running,
     /// The motor stands: the write goes next on the line.
     Write,
-    /// What N2 overrides is given back to the drive's own control.
+    /// Releases the N2 override.
     Release,
     /// The drive is asked for its value again.
     ReadBack,
 }
 
-/// What comes after an answer.
+/// The next step after a reply.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Then {
     /// The next step.
@@ -129,12 +129,12 @@ impl ParameterRun {
         self.in_doubt
     }
 
-    /// What was overridden is the drive's own again, or stays overridden.
+    /// The override was released, or stays.
     pub(super) fn released(&mut self) {
         self.stage = Stage::ReadBack;
     }
 
-    /// The drive answered the present step; `unanswered` is the outcome of a write of which nothing is known.
+    /// The drive replied to the present step; `unanswered` is the outcome of a write with an unknown result.
     pub(super) fn answered(&mut self, reply: &Reply, unanswered: &Outcome) -> Then {
         match (self.stage, reply) {
             (Stage::Release, _) => {

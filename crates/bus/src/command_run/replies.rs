@@ -1,4 +1,4 @@
-//! What the drive's reply to a step of a command means, and what it means that none came. Pure.
+//! Applies the drive's reply to a step of a command, or its absence. Pure.
 
 use std::time::Duration;
 
@@ -101,9 +101,8 @@ impl CommandRun {
         None
     }
 
-    /// Whether the drive is too busy for the step, which is tried again: of a command as long as its time is not over.
-    /// Nobody waits for it at a read that a stop can do without, or that only spares a write; anyone who reads waits as
-    /// he likes.
+    /// Whether the drive is too busy for the step, which is then retried, for a command until it expires. A read that a
+    /// stop can do without, or that only saves a write, is not retried.
     fn waits_while_busy(&mut self, step: &Step, reply: &Reply) -> bool {
         let waits = match step.purpose {
             StepPurpose::Execute => self.urgency != Urgency::Read,
@@ -240,7 +239,7 @@ impl CommandRun {
         self.cut.clone().unwrap_or_else(|| self.tries.unanswered.clone())
     }
 
-    /// What was sent was acknowledged, perhaps by a late reply to something else.
+    /// The step was acknowledged, perhaps by a late reply to another request.
     pub fn doubted(&mut self) {
         self.ask_before_repeating();
         self.tries.in_doubt = true;
@@ -276,7 +275,7 @@ impl CommandRun {
     }
 }
 
-/// What the drive has, as it says.
+/// Stores the drive's words from a reply.
 fn learn(step: &Step, reply: &Reply, words: &mut KnownWords) -> Check {
     let (RequestPdu::Read { table, start, count }, Some(read)) = (&step.pdu, reply.words()) else {
         return Check::InVain;

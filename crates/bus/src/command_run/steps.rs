@@ -47,7 +47,7 @@ pub(super) enum Action {
     Parameter(Box<ParameterRun>),
 }
 
-/// What a request of a command is for.
+/// The purpose of a request of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StepPurpose {
     /// Reads the drive's own word, whose other bits are to stay as they are.
@@ -69,9 +69,9 @@ pub enum StepPurpose {
 /// One request of a command.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Step {
-    /// What it is for.
+    /// Its purpose.
     pub purpose: StepPurpose,
-    /// What is sent.
+    /// The request.
     pub pdu: RequestPdu,
 }
 
@@ -98,7 +98,7 @@ impl Step {
     }
 }
 
-/// Whether the drive was asked for what it has before it is written.
+/// Whether the present value was read before the write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Check {
     NotYet,
@@ -115,7 +115,7 @@ pub(super) struct Known {
     pub(super) blind: bool,
     /// The command says whether the motor is to run.
     pub(super) names_run: bool,
-    /// What the drive last said of its motor.
+    /// Whether the motor runs, as last reported.
     pub(super) running: bool,
     /// The drive changes bits of a register by itself.
     pub(super) masks: bool,

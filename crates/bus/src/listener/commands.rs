@@ -12,7 +12,7 @@ use crate::drive::model::Kind;
 use crate::process_image::DriveSpec;
 use crate::transaction::Ended;
 
-/// Least time between two references of a drive that are told.
+/// Shortest time between two reported references of a drive.
 const PAUSE: Duration = Duration::from_secs(1);
 /// Registers of one drive whose last written values are known.
 const KEPT: usize = 256;
@@ -22,7 +22,7 @@ const KEPT: usize = 256;
 pub struct Commanded {
     /// The command in one line.
     pub what: String,
-    /// What it sets.
+    /// The changed values.
     pub changes: Vec<Change>,
     /// The result.
     pub outcome: Outcome,
@@ -32,7 +32,7 @@ pub struct Commanded {
     pub at: Instant,
 }
 
-/// What the other master wrote to one drive.
+/// The other master's writes to one drive.
 #[derive(Debug, Default)]
 pub struct Commands {
     words: BTreeMap<(Table, u16), u16>,
@@ -88,7 +88,7 @@ impl Commands {
         None
     }
 
-    /// What waited and is due.
+    /// The pending report, if due.
     pub fn due(&mut self, now: Instant) -> Option<Commanded> {
         let told = self.told.filter(|told| now >= *told + PAUSE)?;
         let waiting = self.waiting.take()?;

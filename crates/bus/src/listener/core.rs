@@ -19,12 +19,12 @@ use crate::process_image::{Cadence, Outcome as Counted};
 use crate::report::Report;
 use crate::transaction::Ended;
 
-/// A drive of which nothing was received for that long, and for three of its usual pauses, is offline.
+/// A drive that has not replied for that long, and for three of its usual pauses, is offline.
 const SILENT: Duration = Duration::from_secs(5);
 /// Longest pause between two looks at the time.
 const LOOK: Duration = Duration::from_millis(100);
 
-/// What is known of one drive besides its image.
+/// The state of one drive besides its image.
 #[derive(Debug)]
 struct Known {
     address: u8,
@@ -343,7 +343,7 @@ impl ListenCore {
         }
     }
 
-    /// Tells of a write of the other master.
+    /// Reports a write of the other master.
     fn commanded(&mut self, index: usize, exchange: &Exchange) {
         let Some(request) = exchange.request.as_ref().filter(|request| request.pdu.is_write()) else {
             return;

@@ -1,4 +1,5 @@
-//! What another master and its drives say, transaction by transaction. Pure: bytes and time are arguments.
+//! Decodes the traffic of another master and its drives, transaction by transaction. Pure: bytes and time are
+//! arguments.
 //!
 //! A reply is believed only where it is sure which request it answers:
 //!
@@ -56,7 +57,7 @@ pub enum Heard {
 pub struct Exchange {
     /// Who was asked; 0 is the broadcast.
     pub address: u8,
-    /// What was asked; `None` for a command that the codec has no request for.
+    /// The request; `None` for a command without a request in the codec.
     pub request: Option<Request>,
     /// The frame of the request.
     pub frame: Vec<u8>,
@@ -72,16 +73,16 @@ pub struct Exchange {
     pub replied: Option<Instant>,
     /// When the transaction was over.
     pub at: Instant,
-    /// When the drive was asked at the latest for what it said: earlier than `at`, where an earlier try may have been answered.
+    /// The latest time the replied request was sent: earlier than `at`, if the reply may belong to an earlier attempt.
     pub asked_by: Instant,
-    /// How it ended; `None` for a broadcast, which nobody answers.
+    /// How it ended; `None` for a broadcast, which gets no reply.
     pub ended: Option<Ended>,
     /// Why a reply is not believed.
     pub doubt: Option<&'static str>,
 }
 
 impl Exchange {
-    /// What the drive said, where it is sure that it answered this request.
+    /// The reply, if it certainly belongs to this request.
     pub fn believed(&self) -> Option<(&Request, &Reply)> {
         match (&self.request, &self.ended, self.doubt) {
             (Some(request), Some(Ended::Reply(reply)), None) => Some((request, reply)),
@@ -99,7 +100,7 @@ struct Open {
     quiet_since: Instant,
     began: Instant,
     sent: Instant,
-    /// What came after it and is no frame.
+    /// Bytes after it that are not a frame.
     garbage: Vec<u8>,
     /// The request could be a reply: in which case the next request looks like its reply.
     ambiguous: bool,
@@ -110,7 +111,7 @@ struct Open {
 pub struct Decoder {
     protocol: Protocol,
     frames: Frames,
-    /// What is known of the N2 of a drive, by address.
+    /// The N2 options of the drives, by address.
     n2: BTreeMap<u8, N2Options>,
     open: Option<Open>,
     /// Garbage since the last sound frame, while no request is open.
@@ -123,7 +124,7 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// A line of which nothing was received so far. `n2` is what is known of its drives, by address.
+    /// A line without any bytes so far. `n2` has the options of its drives, by address.
     pub fn new(protocol: Protocol, format: LineFormat, n2: BTreeMap<u8, N2Options>) -> Decoder {
         Decoder {
             protocol,

@@ -14,7 +14,7 @@ const MOST: usize = 16;
 /// How often each of some values was seen.
 type Seen = BTreeMap<String, u64>;
 
-/// What was seen on an N2 line.
+/// Observations on an N2 line.
 #[derive(Debug, Default)]
 pub struct N2Survey {
     /// Lines of master and drives by whether their checksum is the sum of their characters.

@@ -15,7 +15,7 @@ const MOST_REQUESTS: usize = 256;
 /// One request, each time it was received.
 #[derive(Debug, Clone)]
 pub struct Asked {
-    /// What is asked, in words.
+    /// The request, as text.
     pub what: String,
     /// Table, first address and count of a read.
     pub read: Option<(Table, u16, u16)>,
@@ -37,16 +37,16 @@ impl Asked {
     }
 }
 
-/// What was received from one address.
+/// The traffic of one address.
 #[derive(Debug, Clone, Default)]
 pub struct Address {
-    /// Each request, by what it is.
+    /// Each request, by its text.
     pub requests: BTreeMap<String, Asked>,
     /// Requests that got an answer, perhaps a refusal.
     pub answered: u64,
     /// Requests without an answer.
     pub silent: u64,
-    /// Answers that were damaged, or of which it is not sure what they answer.
+    /// Damaged replies, or replies to an uncertain request.
     pub doubtful: u64,
     /// Sum of the times from request to answer.
     turnaround: Duration,
@@ -91,12 +91,12 @@ impl Address {
     }
 }
 
-/// What was received on a line.
+/// The traffic of a line.
 #[derive(Debug, Default)]
 pub struct Survey {
     /// By address; 0 is the broadcast.
     pub addresses: BTreeMap<u8, Address>,
-    /// Requests heard.
+    /// Requests received.
     pub requests: u64,
     /// Bytes that belong to no transaction.
     pub stray: u64,

@@ -37,7 +37,7 @@ pub(super) struct Begun {
     ordered: Option<Touched>,
     /// Its transaction is on the line, or was.
     sent: bool,
-    /// Its number among the commands, and what it means for each drive that it reaches.
+    /// Its number among the commands, and its effect on each drive that it reaches.
     number: u64,
     effects: Vec<(usize, Effect)>,
 }
@@ -133,7 +133,7 @@ impl Late<'_> {
     }
 }
 
-/// What is passed on and cannot be sent any more is answered: nobody wants it, or it may not go.
+/// Ends passed-on requests that can no longer be sent: unwanted, or not permitted.
 pub(super) fn drop_in_vain(pending: &mut Pending, drives: &[Arc<DriveImage>], now: Instant) {
     let unwanted = |passed_on: &PassedOn| passed_on.frame.is_closed();
     pending.remove(now, &Outcome::Replaced, |c| c.passed_on.as_ref().is_some_and(unwanted));
@@ -172,7 +172,7 @@ impl Master {
         Err(again)
     }
 
-    /// What was chosen and not sent is chosen again.
+    /// Returns a chosen request that was not sent to the choice.
     pub(super) fn put_back_background(&mut self, now: Instant) {
         let Some(begun) = self.background.take_if(|begun| !begun.sent) else {
             return;
@@ -211,7 +211,7 @@ impl Master {
         self.begin_passed_on(command, Some(admission), now).ok_or(None)
     }
 
-    /// What is passed on next, and when to look again where something must wait.
+    /// The next request to pass on, and when to check again if one must wait.
     fn next_passed_on(&mut self, pending: &mut Pending, now: Instant) -> (Option<Chosen>, Option<Instant>) {
         let mut blocked: Option<Instant> = None;
         let Master {
@@ -335,7 +335,7 @@ impl Master {
         Some(begun.turn())
     }
 
-    /// What cannot be sent any more is answered: expired, or its drive is away.
+    /// Ends requests that can no longer be sent: expired, or their drive is offline.
     fn drop_background_in_vain(&mut self, now: Instant) {
         let Master { bus, schedule, .. } = self;
         let mut queue = bus.queue.background();
@@ -403,7 +403,7 @@ impl Master {
         Ok(begun.turn())
     }
 
-    /// What the transaction takes, as far as the profile tells.
+    /// Duration of the transaction, as far as the profile gives it.
     fn exchange_cost(&self, drive: usize, pdu: &RequestPdu) -> Duration {
         let spec = &self.bus.image.spec;
         let turnaround = self.bus.image.drives.get(drive);
@@ -520,8 +520,8 @@ impl Master {
         begun.request.answer_with(outcome, frame, now);
     }
 
-    /// What was read fills the process image, too. A drive that was identified, or asked for its changes, may have
-    /// restarted or told what the gateway has not heard: it is read again.
+    /// Stores read values in the process image, too. A drive that was identified, or polled for changes, may have
+    /// restarted or reported changes to the tool: it is read again.
     fn note_background_read(&mut self, turn: &Turn, reply: &Reply, now: Instant, news: &mut Vec<News>) {
         match (&turn.pdu, reply) {
             (RequestPdu::Read { table, start, count }, reply) => {
@@ -547,7 +547,7 @@ impl Master {
         }
     }
 
-    /// What may have written anything: nothing that is known of the command words of those who heard it holds.
+    /// A request that may have written anything: the command words of all drives that received it are unknown.
     fn unchecked_write(&mut self, request: &BackgroundRequest, outcome: &Outcome, now: Instant) {
         let reach = request.passed_on.as_ref().map_or(&[][..], |passed_on| &passed_on.reach);
         let writes = written(&request.pdu);
@@ -579,7 +579,7 @@ impl Master {
         (turn.drive == NO_DRIVE).then_some(passed_on.address)
     }
 
-    /// Whether a turn asks everybody, and nobody answers.
+    /// Whether a turn is a broadcast, without a reply.
     pub(super) fn is_broadcast(&self, turn: &Turn) -> bool {
         self.stranger(turn) == Some(0) && self.sessions.is_empty()
     }
@@ -628,7 +628,7 @@ impl Master {
         }
     }
 
-    /// What was written is read back soon where it is polled, and the drive's command words are what it made of them.
+    /// Written registers are read back soon if polled, and the drive's command words are updated.
     fn note_background_write(&mut self, turn: &Turn, outcome: &Outcome, now: Instant) {
         if let Some(drive) = self.drives.get_mut(turn.drive) {
             match outcome {

@@ -1,4 +1,4 @@
-//! What goes on the line next: stops, other commands, forwarded reads, polls, background transactions.
+//! Chooses the next transaction: stops, other commands, forwarded reads, polls, background transactions.
 
 use std::time::{Duration, Instant};
 
@@ -182,7 +182,7 @@ impl Master {
         }
     }
 
-    /// Nothing that was started for a drive goes on behind a stop.
+    /// Ends the started commands of a drive after a stop.
     fn purge(&mut self, now: Instant) {
         let stopped = self.bus.queue.lock().take_stopped();
         for index in stopped {
@@ -195,7 +195,7 @@ impl Master {
         }
     }
 
-    /// Nothing that was started for one client goes on when another one took the drive.
+    /// Ends the started commands of a client when another one took the drive.
     fn end_what_was_taken(&mut self, now: Instant) {
         let pending = self.bus.queue.lock().take_taken();
         for index in pending {

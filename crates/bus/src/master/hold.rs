@@ -10,7 +10,7 @@ use crate::plant::BusHandle;
 use crate::process_image::{DriveImage, Reading};
 use crate::supervision::written_run;
 
-/// Tells the queue whose commands were carried out, and whether the drive's local control place has it.
+/// Reports to the queue whose commands were executed, and whether the drive is under local control.
 pub(super) fn look_at_hold(
     bus: &BusHandle,
     index: usize,

@@ -1,4 +1,4 @@
-//! What is left of faults and commands on a bus: nothing, on a line that has been sound for a while. Pure.
+//! The remains of faults and commands on a bus: none, on a line that has been fault-free for a while. Pure.
 
 use std::time::Instant;
 
@@ -30,7 +30,7 @@ pub struct Remains {
 }
 
 impl Master {
-    /// What is left at `now`.
+    /// The remains at `now`.
     pub fn remains(&self, now: Instant) -> Remains {
         let (away, held_reads) = self.schedule.held(now);
         let late = self.drives.iter().map(|drive| drive.late.owed(now));

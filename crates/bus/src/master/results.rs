@@ -187,7 +187,7 @@ impl Master {
         news.push(News::Restarted(drive));
     }
 
-    /// What a poll that has ended says of the drive.
+    /// Applies the result of a poll.
     fn polled(&mut self, poll: &Poll, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         // Of a step before the poll this is known already.
         let heard = self.sessions.heard(poll.drive, &end.ended);
@@ -278,7 +278,7 @@ impl Master {
         }
     }
 
-    /// What the drive has at the addresses of a read, as of `at`.
+    /// Stores the drive's values at the addresses of a read, as of `at`.
     pub(super) fn learn(
         &mut self,
         index: usize,
@@ -309,7 +309,7 @@ impl Master {
         });
     }
 
-    /// What a transaction of a command means for the command.
+    /// Applies the result of a transaction to its command.
     #[allow(clippy::too_many_arguments, reason = "all that a turn of a command is")]
     fn commanded(
         &mut self,
@@ -443,7 +443,7 @@ impl Master {
         self.schedule.refresh(index, covers, now);
     }
 
-    /// What was written is read back soon.
+    /// Schedules reading back written registers.
     fn read_back(&mut self, index: usize, step: &Step, now: Instant) {
         if let RequestPdu::MaskWrite { address, or_mask, .. } = step.pdu {
             self.note_write(index, Table::Holding, &[(address, or_mask)], now);

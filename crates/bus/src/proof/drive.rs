@@ -1,5 +1,5 @@
-//! The drive of a proof: the least that every drive with such a profile does, at its worst. It starts whenever a run command
-//! stands and nothing keeps it, and goes on turning until a stop comes. Pure.
+//! The drive of a proof: the worst behaviour of a drive with such a profile. It starts whenever a run command is set
+//! and nothing prevents it, and keeps turning until a stop arrives. Pure.
 
 use std::collections::BTreeMap;
 
@@ -156,7 +156,7 @@ impl<'p> Drive<'p> {
         reset.is_some_and(|reset| !reset.setting.once && reset.setting.holds(self.word_of(&reset.setting)))
     }
 
-    /// What it answers, and does.
+    /// Processes a request and returns the reply.
     pub(super) fn receives(&mut self, pdu: &RequestPdu) -> Reply {
         if let RequestPdu::Read { table, start, count } = pdu {
             let word = |address| self.read(Place { table: *table, address });

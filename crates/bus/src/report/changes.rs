@@ -39,7 +39,7 @@ const BURST: u32 = 10;
 /// Time after which one more is.
 const EVERY: Duration = Duration::from_secs(10);
 
-/// A bit of which changes are reported.
+/// A bit whose changes are reported.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Watched {
     /// As last reported; `None` before the first read.
@@ -55,7 +55,7 @@ pub(super) struct Watched {
 /// A change to be reported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Change {
-    /// What it is now.
+    /// Its present value.
     pub(super) value: bool,
     /// When it changed before, if it was seen to.
     pub(super) before: Option<Instant>,

@@ -57,7 +57,7 @@ impl Report {
         self.events.publish_refusal(refused, now);
     }
 
-    /// An action of supervision failed: counted, and told where `text` has words for it.
+    /// An action of supervision failed: counted, and reported if there is a `text`.
     pub(super) fn action_failed(&self, index: usize, text: impl FnOnce(&str) -> Option<String>) {
         let Some(drive) = self.image.drives.get(index) else {
             return;

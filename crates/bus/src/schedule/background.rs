@@ -1,4 +1,4 @@
-//! What background transactions may take of the line: the time that is left over, and else a small share of wire time.
+//! The line share of background transactions: idle time, and otherwise a small share of wire time.
 
 use std::time::{Duration, Instant};
 
@@ -19,7 +19,7 @@ pub(super) struct BackgroundShare {
 /// Whether a background transaction may go now.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Admission {
-    /// In time that is left over: its share pays for what it takes beyond what was calculated.
+    /// In idle time: its share pays for any excess over the calculated time.
     InIdleTime(Duration),
     /// Instead of a poll that is due: its share pays for it.
     InShare,

@@ -1,4 +1,4 @@
-//! What a schedule keeps of each drive: its reads, whether it answers, and blocks that it refuses in part.
+//! The schedule's state of each drive: its reads, whether it replies, and blocks that it refuses in part.
 
 use std::time::{Duration, Instant};
 

@@ -1,5 +1,5 @@
-//! What a poll that has ended changes: presence, retries, back-off. The pauses between probes of a silent drive and
-//! between tries of a refused block are in `drives`; commands are tried again by `command_run`.
+//! Applies the result of a poll: presence, retries, back-off. The pauses between probes of a silent drive and between
+//! attempts of a refused block are in `drives`; commands are retried by `command_run`.
 
 use std::time::{Duration, Instant};
 

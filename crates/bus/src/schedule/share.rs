@@ -1,4 +1,4 @@
-//! What commands may take of a line that is busy with polls: as much time as process data at most.
+//! The share of commands on a busy line: at most as much time as process data.
 //!
 //! The share holds everything that a command causes: its steps, reads of the drive's own control word, forwarded reads, and
 //! the reads that confirm it. Without that a client that writes often would slow the polls twice.

@@ -311,7 +311,7 @@ impl Figures {
         self.wrong.sum(0)
     }
 
-    /// a transaction has ended.
+    /// A transaction has ended.
     pub fn exchange(&mut self, exchange: &Exchange<'_>) {
         self.settle_idle(exchange.began);
         let protocol = self.line.protocol;

@@ -30,13 +30,13 @@ impl Keeper {
         Ok(Keeper { dir, end, ended })
     }
 
-    /// Where it keeps what it keeps.
+    /// The directory it writes to.
     pub fn dir(&self) -> &Path {
         &self.dir
     }
 
-    /// Writes what there is, as far as the disk takes it, and ends the thread. A disk that hangs holds it up for good: wait with
-    /// a limit.
+    /// Writes pending data, as far as the disk accepts it, and ends the thread. A hanging disk blocks it for good: wait
+    /// with a limit.
     pub async fn stop(self) {
         let Keeper { end, mut ended, .. } = self;
         drop(end);

@@ -1,6 +1,6 @@
 //! Files that the gateway writes while it runs: lines that are appended, and small files that are replaced.
 //!
-//! - [`rotated`]: a file of lines with older ones besides it, bounded together.
+//! - [`rotated`]: a file of lines with older ones next to it, bounded together.
 //! - [`Keeper`]: the thread that writes some of them.
 //! - [`names`]: what the gateway calls its files.
 //! - [`replace`]: a new content in the place of the old one, never a half of either.

@@ -1,4 +1,4 @@
-//! The names of what the gateway keeps in its state directory and in that of the MQTT buffer.
+//! The file names in the state directory and in that of the MQTT buffer.
 
 /// Events, and the older ones after it.
 pub const EVENTS: &str = "events.jsonl";

@@ -1,4 +1,4 @@
-//! A file of lines that only grows, until it becomes the first of the older ones besides it.
+//! A file of lines that only grows, until it becomes the first of the older ones next to it.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};

@@ -1,4 +1,4 @@
-//! Makes a recording of what the rings held: raw words become points by the profile of the drive. Pure.
+//! Assembles a recording from the rings: converts raw words to points with the drive's profile. Pure.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -115,7 +115,7 @@ fn value(reading: &Reading<'_>, point: usize) -> Json {
     value_or_null(reading.sample(point).good())
 }
 
-/// The points that a read shows: those whose registers it has, and those that are made of one of them.
+/// The points that a read covers: those whose registers it has, and those derived from one of them.
 fn read_of(profile: &Profile, taped: &TapedRead) -> Read {
     let end = usize::from(taped.start) + taped.words.len();
     let has = |point: usize| {

@@ -19,7 +19,7 @@ const RESOLUTION: u16 = 9;
 /// Longest block or packet that is believed.
 const LONGEST: usize = 1 << 20;
 
-/// Bytes of a line that came together.
+/// Bytes of a line that arrived together.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Packet {
     /// Since 1970.
@@ -45,12 +45,12 @@ fn error(offset: usize, what: impl Into<String>) -> CaptureError {
     }
 }
 
-/// What a capture holds.
+/// The content of a capture.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LineCapture {
     /// The packets with bytes, in the order of the file.
     pub packets: Vec<Packet>,
-    /// Where the file ends early or is broken; what stands before is read.
+    /// Where the file is truncated or broken; everything before is read.
     pub broken: Option<CaptureError>,
 }
 
@@ -152,7 +152,7 @@ fn check_link(link: u32, offset: usize) -> Result<(), CaptureError> {
     ))
 }
 
-/// What a packet holds; nothing where it has no bytes.
+/// The content of a packet; none if it has no bytes.
 fn packet(link: u32, at: Duration, data: &[u8], offset: usize) -> Result<Option<Packet>, CaptureError> {
     let (sent, bytes) = if link == RTAC_SERIAL {
         let event = data

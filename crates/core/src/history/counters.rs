@@ -1,6 +1,7 @@
 //! Starts, run time and energy of a drive, as the gateway sees them. Pure: time is an argument.
 //!
-//! What nobody saw is not counted: while a drive is away, or its running bit is not good, no time passes and no start happens.
+//! Only observed time is counted: while a drive is offline, or its running bit is not good, neither time nor starts are
+//! counted.
 
 use std::time::{Duration, Instant};
 
@@ -9,11 +10,11 @@ use serde::{Deserialize, Serialize};
 use crate::drive::{ModelPoint, Value};
 use crate::process_image::Reading;
 
-/// What was counted of a drive since it was first seen.
+/// The counters of a drive since it was first seen.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Totals {
-    /// Starts: the running bit came while the gateway looked.
+    /// Starts: the running bit was seen to become set.
     pub starts: u64,
     /// Time that the motor was seen running, s.
     pub running_seconds: f64,
@@ -54,12 +55,12 @@ impl Counters {
         Counters { totals, ran: None }
     }
 
-    /// Adds what was counted before.
+    /// Adds earlier counts.
     pub fn add(&mut self, before: Totals) {
         self.totals = self.totals.after(before);
     }
 
-    /// What was counted.
+    /// The counters.
     pub fn totals(&self) -> Totals {
         self.totals
     }
@@ -99,7 +100,7 @@ impl Counters {
         self.ran = Some((at, running));
     }
 
-    /// The drive was away: what it did meanwhile is not known.
+    /// The drive was offline: its state meanwhile is unknown.
     pub fn interrupt(&mut self) {
         self.ran = None;
     }

@@ -1,5 +1,5 @@
-//! What is kept of the past of drives and buses: trends, counters, the last hour of each line. One writer, the recorder's
-//! thread; any number of readers, which hold up nobody but that thread.
+//! The stored history of drives and buses: trends, counters, the last hour of each line. One writer, the recorder's
+//! thread; any number of readers, which can delay only that thread.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -11,7 +11,7 @@ use super::trend::{DriveTrend, Reach};
 use crate::drive::Profile;
 use crate::process_image::{BusImage, DriveSpec, Reading, TapedRead};
 
-/// Drives without an entry in the configuration whose counters are kept, in case they return.
+/// Most unconfigured drives whose counters are kept, in case they return.
 const MOST_ABSENT: usize = 4096;
 
 /// The past of all drives and buses.
@@ -31,7 +31,7 @@ struct Known {
 /// The past of a drive.
 #[derive(Debug)]
 pub struct DriveHistory {
-    /// What it was made for: another drive of that name has other trends.
+    /// The machine it belongs to: another drive of that name has other trends.
     bus: String,
     address: u8,
     profile: Arc<Profile>,
@@ -54,14 +54,14 @@ impl History {
         lock(&self.known).lines.get(bus).cloned()
     }
 
-    /// What was counted of a drive.
+    /// The counters of a drive.
     pub fn totals(&self, drive: &str) -> Totals {
         let known = lock(&self.known);
         let counted = known.drives.get(drive).map(|drive| drive.totals());
         counted.or_else(|| known.absent.get(drive).copied()).unwrap_or_default()
     }
 
-    /// What was counted of all drives, also of those that are not there.
+    /// The counters of all drives, including absent ones.
     pub fn all_totals(&self) -> BTreeMap<String, Totals> {
         let known = lock(&self.known);
         let mut all = known.absent.clone();
@@ -69,7 +69,7 @@ impl History {
         all
     }
 
-    /// Adds what was counted before, in earlier runs.
+    /// Adds the counts of earlier runs.
     pub fn count_on(&self, totals: BTreeMap<String, Totals>) {
         let known = &mut *lock(&self.known);
         for (name, before) in totals {
@@ -137,7 +137,7 @@ impl DriveHistory {
         lock(&self.trend)
     }
 
-    /// What was counted.
+    /// The counters.
     pub fn totals(&self) -> Totals {
         lock(&self.counters).totals()
     }

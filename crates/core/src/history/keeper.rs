@@ -1,5 +1,6 @@
-//! Keeps events and counters on disk: a thread that hears every event and looks at the counters. Nobody waits for it: while the
-//! disk is slow, full or gone, events wait, those beyond are missing in the file, and everything else goes on.
+//! Saves events and counters: a thread that receives every event and reads the counters. Nothing waits for it: while
+//! the disk is slow, full or missing, events are queued, further ones are missing in the file, and everything else
+//! continues.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs;
@@ -62,9 +63,9 @@ struct Writer {
     lost: u64,
     counters: PathBuf,
     history: Arc<History>,
-    /// What earlier runs counted is in memory.
+    /// The counts of earlier runs are in memory.
     counted_on: bool,
-    /// What the file of counters has.
+    /// The content of the counter file.
     written: Option<BTreeMap<String, Totals>>,
     /// Logged once, until a write succeeds.
     failing: bool,
@@ -136,7 +137,7 @@ impl Writer {
         earlier
     }
 
-    /// Writes what waits, and the counters where they are due.
+    /// Writes pending events, and the counters if due.
     fn work(&mut self, counters: bool) -> io::Result<()> {
         self.hear();
         if self.events.is_replaced() {
@@ -281,7 +282,7 @@ fn read_counters(bytes: &[u8]) -> Result<BTreeMap<String, Totals>, String> {
     }
 }
 
-/// A name besides that path that is free.
+/// A free name next to that path.
 fn kept_aside(path: &Path) -> PathBuf {
     let named = |ending: String| path.with_extension(ending);
     let mut names = (1..1000).map(|number| named(format!("damaged-{number}")));

@@ -1,4 +1,4 @@
-//! The last hour of a line, minute by minute: load and cycle, and what failed with which drive. Pure: time is an argument, the
+//! The last hour of a line, minute by minute: load, cycle, and failures by drive. Pure: time is an argument, the
 //! figures are the counters of the image.
 
 use std::time::{Duration, Instant, SystemTime};

@@ -1,5 +1,5 @@
-//! The past of the drives. Trends: what their values were over the last day, in memory. The trip recorder: what a drive said, what it was told and what was on its line, from some time before a trigger until some
-//! time after it; one file a recording.
+//! The history of the drives. Trends: their values over the last day, in memory. The trip recorder: samples, commands
+//! and frames from some time before a trigger until some time after it; one file per recording.
 //!
 //! - [`trigger`]: what makes a recording, seen in the samples of a drive and on its line.
 //! - [`trend`]: least, greatest and last values in steps of time; [`counters`]: starts and run time; [`line`]: the last hour of a
@@ -46,7 +46,7 @@ pub use store::{Entry, Store};
 pub use task::{NotRecorded, RecorderTask, Recordings};
 pub use trigger::{Trigger, TriggerKind};
 
-/// What the recorder keeps.
+/// The settings of the recorder.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecorderOptions {
     /// Directory of the recordings.

@@ -20,10 +20,10 @@ use crate::process_image::{
 
 /// Triggers of a recording that are noted besides the first.
 const MOST_TRIGGERS: usize = 32;
-/// Age at which a value is still good here: a recording shows what was read, whenever that was.
+/// Age at which a value is still good here: a recording shows readings of any age.
 const ANY_AGE: Duration = Duration::from_secs(10 * 365 * 86_400);
 
-/// What happened to a drive besides its samples.
+/// An entry for a drive, besides its samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Note {
     /// When.
@@ -32,7 +32,7 @@ pub struct Note {
     pub body: NoteBody,
 }
 
-/// What happened.
+/// The content of a note.
 #[derive(Debug, Clone, PartialEq)]
 pub enum NoteBody {
     /// An event of the drive or of its bus.
@@ -109,19 +109,19 @@ pub struct Capture {
     pub drive: Arc<DriveImage>,
     /// Why it was made.
     pub trigger: Trigger,
-    /// What else happened meanwhile that would have made one.
+    /// Further triggers meanwhile.
     pub more: Vec<Trigger>,
     /// Its beginning and end.
     pub span: (Instant, Instant),
-    /// What was known of the drive before the first sample.
+    /// The state of the drive before the first sample.
     pub base: Arc<Snapshot>,
-    /// What was read, oldest first; from before the span too.
+    /// The samples, oldest first; also from before the span.
     pub samples: Vec<TapedRead>,
     /// Events and commands, oldest first.
     pub notes: Vec<Note>,
     /// Frames of the line, oldest first.
     pub frames: Vec<TapedFrame>,
-    /// Entries that were taped and lost since the gateway started, because nobody took them in time.
+    /// Entries lost since the gateway started, because they were not taken from the tape in time.
     pub lost: u64,
 }
 
@@ -133,7 +133,7 @@ struct DriveRing {
     link: Link,
     samples: PackedRing<TapedRead>,
     notes: Ring<Note>,
-    /// What was known before the oldest sample, and what is known now.
+    /// The state before the oldest sample, and the present one.
     base: Arc<Snapshot>,
     now: Arc<Snapshot>,
     watch: Watch,
@@ -243,8 +243,8 @@ impl Recorder {
         })
     }
 
-    /// Begins a recording of a drive, or notes the trigger in the one that goes on. Its id; none where there is no such drive,
-    /// or where the drive had one of that kind a moment ago.
+    /// Starts a recording of a drive, or notes the trigger in the one in progress. Returns its id; none if there is no
+    /// such drive, or it had one of that kind a moment ago.
     pub fn trigger(&mut self, drive: &str, trigger: Trigger, clock: Clock) -> Option<String> {
         let mut drives = self.lines.iter_mut().flat_map(|line| &mut line.drives);
         drives
@@ -383,7 +383,7 @@ impl LineRing {
 }
 
 impl DriveRing {
-    /// Whatever a drive does while it is away, nobody sees. To be called when all is taken in that was read before.
+    /// Handles drives that went offline. Call it once all earlier readings were taken in.
     fn look_at_link(&mut self) {
         let link = self.image.snapshot().link;
         let before = std::mem::replace(&mut self.link, link);

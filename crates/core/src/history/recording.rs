@@ -19,10 +19,10 @@ pub const VERSION: u32 = 1;
 /// Ending of the files.
 pub const ENDING: &str = "dgrec";
 
-/// What a recording is of, and what it shows in short.
+/// The subject of a recording, and its summary.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Header {
-    /// [`VERSION`]; its presence tells that the file is a recording.
+    /// [`VERSION`]; its presence marks the file as a recording.
     pub drivegate_recording: u32,
     /// Its id: time of the trigger and the drive.
     pub id: String,
@@ -34,7 +34,7 @@ pub struct Header {
     pub summary: String,
     /// It is among the first of a storm of recordings, which are kept longer.
     pub first: bool,
-    /// What else happened meanwhile that would have made a recording.
+    /// Further triggers meanwhile.
     pub more: Vec<Further>,
     pub drive: Drive,
     pub bus: Bus,
@@ -44,7 +44,7 @@ pub struct Header {
     pub to: f64,
     /// The points, in the order of `values` here.
     pub points: Vec<Column>,
-    /// What was known at the trigger, whenever it was read.
+    /// The values known at the trigger, of any age.
     pub values: Vec<Json>,
     /// The reads that the samples are of.
     pub reads: Vec<Read>,
@@ -204,9 +204,9 @@ struct End {
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recording {
-    /// What it is of.
+    /// Its header.
     pub header: Header,
-    /// What was read, oldest first.
+    /// The samples, oldest first.
     pub samples: Vec<Sample>,
     /// The values of all samples: in one list, as a recording has thousands of samples.
     values: Vec<Json>,
@@ -323,8 +323,7 @@ impl Recording {
 
     /// Reads the bytes of a file.
     ///
-    /// # Errors
-    /// They are no whole, sound recording of this version: what is wrong, and where.
+    /// # Errors They are not an intact recording of this version: the fault and its position.
     pub fn parse(bytes: &[u8]) -> Result<Recording, RecordingError> {
         let (header, mut offset) = Header::parse(bytes)?;
         let mut recording = Recording::new(header);

@@ -1,4 +1,5 @@
-//! The directory of the recordings. A file is written aside, synced and renamed, so that there are only whole ones.
+//! The directory of the recordings. A file is written under another name, synced and renamed, so that only complete
+//! ones exist.
 
 use std::fs::{self, File};
 use std::io::{self, Read as _};
@@ -30,10 +31,10 @@ pub struct Entry {
     pub drive: String,
     /// Its bus.
     pub bus: String,
-    /// What made it.
+    /// Its trigger.
     #[schema(value_type = String)]
     pub trigger: TriggerKind,
-    /// What it shows.
+    /// Its summary.
     pub summary: String,
     /// Size of its file.
     pub bytes: u64,
@@ -95,10 +96,9 @@ pub fn read(path: &Path) -> Result<Recording, ReadError> {
     })
 }
 
-/// The recordings of a directory, oldest first, and what is wrong with the others.
+/// The recordings of a directory, oldest first, and the faults of the others.
 ///
-/// # Errors
-/// The directory cannot be read; one that there is not has no recordings.
+/// # Errors The directory cannot be read; a missing one has no recordings.
 pub fn list(dir: &Path) -> io::Result<(Vec<Entry>, Vec<ReadError>)> {
     let files = match fs::read_dir(dir) {
         Ok(files) => files,
@@ -141,7 +141,7 @@ pub fn path_of(dir: &Path, id: &str) -> PathBuf {
     dir.join(format!("{id}.{ENDING}"))
 }
 
-/// The directory with what is in it.
+/// The directory with its content.
 #[derive(Debug)]
 pub struct Store {
     dir: PathBuf,
@@ -152,7 +152,7 @@ pub struct Store {
 }
 
 impl Store {
-    /// Looks at the directory, and removes what was not written to its end.
+    /// Reads the directory, and removes incomplete files.
     pub fn open(options: &RecorderOptions) -> Store {
         let (entries, faults) = list(&options.dir).unwrap_or_default();
         for fault in faults {
@@ -185,7 +185,7 @@ impl Store {
         &self.dir
     }
 
-    /// What is there, oldest first.
+    /// The recordings, oldest first.
     pub fn entries(&self) -> &[Arc<Entry>] {
         &self.entries
     }

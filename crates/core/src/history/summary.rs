@@ -1,5 +1,5 @@
-//! What a recording shows, in one sentence: "fault 53: fieldbus fault; 1.2 s before: 3 timeouts; speed 82 %, current 114 A,
-//! DC 655 V falling". Pure.
+//! The summary of a recording, in one sentence: "fault 53: fieldbus fault; 1.2 s before: 3 timeouts; speed 82 %,
+//! current 114 A, DC 655 V falling". Pure.
 
 use serde_json::Value as Json;
 
@@ -8,14 +8,14 @@ use super::trigger::TriggerKind;
 use crate::drive::Profile;
 use crate::process_image::Verdict;
 
-/// Errors on the line are told of as long before the trigger.
+/// How long before the trigger errors on the line are mentioned.
 const ERRORS_BEFORE: f64 = 5.0;
 /// Time over which a value is seen to rise or fall.
 const TREND: f64 = 2.0;
 /// Change, as a share of the greater value, that is worth telling.
 const TREND_SHARE: f64 = 0.05;
 
-/// Points that are told of, the first of each that the drive has, and their short names.
+/// Points that are mentioned, the first of each group that the drive has, and their short names.
 const TOLD: [(&[&str], &str); 3] = [
     (&["actual_speed", "output_frequency"], "speed"),
     (&["motor_current"], "current"),

@@ -1,5 +1,5 @@
-//! The recorder at work: a thread that takes what the buses taped, for recordings and trends, and one that writes files. A slow
-//! disk holds up neither the buses nor the rings.
+//! The running recorder: one thread takes the tapes of the buses, for recordings and trends, and one writes files. A
+//! slow disk delays neither the buses nor the rings.
 
 use std::collections::BTreeMap;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, TrySendError, channel, sync_channel};
@@ -19,7 +19,7 @@ use crate::command::{AuditRecord, WriteStats};
 use crate::event::{Event, EventKind, Events, RecordingMade};
 use crate::process_image::BusImage;
 
-/// What the buses taped is taken at this interval.
+/// Interval at which the tapes of the buses are taken.
 const TICK: Duration = Duration::from_millis(100);
 /// Recordings that wait for the disk at most.
 const WAITING: usize = 64;
@@ -62,7 +62,7 @@ impl Recordings {
         self.shared.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What is on disk, oldest first.
+    /// The recordings on disk, oldest first.
     pub fn list(&self) -> Vec<Arc<Entry>> {
         self.shared().entries.clone()
     }
@@ -76,7 +76,7 @@ impl Recordings {
             .map_or_else(Default::default, |options| (options.before, options.after))
     }
 
-    /// Recordings made since the gateway started, by what made them.
+    /// Recordings made since the gateway started, by trigger.
     pub fn made(&self) -> BTreeMap<TriggerKind, u64> {
         self.shared().made.clone()
     }
@@ -98,7 +98,7 @@ impl Recordings {
         path.map(|path| store::read(&path))
     }
 
-    /// Begins a recording of a drive because `who` asks for it. Its id, and the time after which it is complete.
+    /// Starts a recording of a drive, requested by `who`. Returns its id, and the time after which it is complete.
     ///
     /// # Errors
     /// The recorder is off, or there is no such drive.
@@ -182,7 +182,7 @@ impl RecorderTask {
         let _ = self.control.send(Control::Buses(buses, stale_after));
     }
 
-    /// Ends what is being recorded, and waits until it is on disk.
+    /// Ends the recordings in progress, and waits until they are on disk.
     pub fn stop(self) {
         let _ = self.control.send(Control::Stop);
         for thread in self.threads {
@@ -195,7 +195,7 @@ impl RecorderTask {
     }
 }
 
-/// Takes what the buses taped.
+/// Takes the tapes of the buses.
 struct Taker {
     recorder: Recorder,
     events: Events,

@@ -37,7 +37,7 @@ impl Range {
 /// The ranges, finest first.
 pub const RANGES: [Range; 3] = [Range::new(600, 1), Range::new(3600, 5), Range::new(24 * 3600, 120)];
 
-/// Points of which a trend is kept, as far as a profile has them.
+/// Points with a trend, as far as a profile has them.
 pub const POINTS: [ModelPoint; 9] = [
     ModelPoint::ActualSpeed,
     ModelPoint::OutputFrequency,
@@ -109,7 +109,7 @@ fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, usize)> {
     POINTS.into_iter().filter_map(index)
 }
 
-/// What the values of one step were; no numbers while there were none.
+/// The values of one step; empty if there were none.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Bucket {
     pub(super) min: f32,
@@ -137,7 +137,7 @@ impl Bucket {
     }
 }
 
-/// What the values of one step were.
+/// The values of one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Step {
     /// Its beginning, ms since 1970.

@@ -52,7 +52,7 @@ impl TriggerKind {
         TriggerKind::Command,
     ];
 
-    /// Whether what it records is an event of its own, which tells the cause.
+    /// Whether it has its own event, which gives the cause.
     pub fn has_event(self) -> bool {
         match self {
             TriggerKind::Fault
@@ -105,7 +105,7 @@ pub struct Trigger {
     pub kind: TriggerKind,
     /// When.
     pub at: Instant,
-    /// What it was, as text.
+    /// Its text.
     pub text: String,
 }
 
@@ -137,7 +137,7 @@ pub(super) fn is_refused_stop(record: &AuditRecord, profile: &Profile) -> bool {
     !TAKEN.contains(&record.result) && record.points.iter().any(stops)
 }
 
-/// What a drive showed last, as far as a change of it makes a recording.
+/// The last values of a drive whose changes trigger recordings.
 #[derive(Debug, Default)]
 pub(super) struct Watch {
     fault: Option<bool>,

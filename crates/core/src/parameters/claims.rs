@@ -1,6 +1,5 @@
-//! To which of the configured drives the journals of restores that were cut off belong. A journal belongs to a machine; where the
-//! configuration has that no more, nobody knows whether a drive in its place, or of its name, is the one that is half restored.
-//! Pure.
+//! Assigns the journals of interrupted restores to the configured drives. A journal belongs to a machine; if that is no
+//! longer configured, it is unknown whether a drive in its place, or with its name, is the half-restored one. Pure.
 
 use super::journal::{JournalFile, Owner};
 use crate::process_image::Machine;
@@ -16,7 +15,7 @@ pub enum Claim {
     Name,
 }
 
-/// What the journals say of the configured drives.
+/// The claims of the journals on the configured drives.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Claims {
     /// Of each drive, in order: the journal that concerns it, if there is one, and why.

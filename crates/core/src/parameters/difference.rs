@@ -1,4 +1,4 @@
-//! What differs between two files of parameters. Pure.
+//! Differences between two parameter files. Pure.
 
 use super::file::{Entry, Id, ParameterFile};
 use crate::drive::parameters::RawValue;
@@ -57,7 +57,7 @@ fn begins_with_number(text: &str) -> bool {
     text.starts_with(|c: char| c.is_ascii_digit() || c == '-')
 }
 
-/// What differs, by name. A parameter that one side could not read differs unless neither could.
+/// The differences, by name. A parameter that one side could not read differs unless neither could.
 pub fn differences(before: &ParameterFile, after: &ParameterFile) -> Vec<Difference> {
     let ids: std::collections::BTreeSet<&Id> = before.values.keys().chain(after.values.keys()).collect();
     let value = |entry: Option<&Entry>| entry.and_then(|entry| entry.value.clone().ok());

@@ -97,11 +97,11 @@ pub struct ParameterFile {
     pub drive: String,
     /// Name of its profile.
     pub family: String,
-    /// What the drive says of itself.
+    /// The drive's identification.
     pub identification: String,
     /// When it was read, RFC 3339.
     pub time: String,
-    /// What the drive counted of its line by then; empty where its family does not count.
+    /// The drive's own counters of its line; empty if its family has none.
     pub counters: String,
     /// By name.
     pub values: BTreeMap<Id, Entry>,
@@ -192,8 +192,7 @@ impl ParameterFile {
 
     /// Reads a file; `checked` whether its checksum fits.
     ///
-    /// # Errors
-    /// What is wrong, with the line.
+    /// # Errors The fault, with the line.
     pub fn parse(text: &str) -> Result<ParameterFile, FileError> {
         let mut lines = (1..).zip(text.lines());
         if lines.next().is_none_or(|(_, line)| line.trim_end() != HEAD) {

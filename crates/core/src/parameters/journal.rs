@@ -45,7 +45,7 @@ const NAME: &str = "restore.journal";
 /// Name of one that was set aside.
 const RELEASED: &str = "restore.released";
 
-/// What a restore is doing.
+/// The phase of a restore.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
     /// It writes the new values.
@@ -86,7 +86,7 @@ pub struct Owner {
     pub family: String,
     /// The machine; none in journals of earlier versions, which know a name only.
     pub machine: Option<Machine>,
-    /// What the machine said of itself.
+    /// The machine's identification.
     pub identification: String,
 }
 
@@ -125,7 +125,7 @@ fn body_of(text: &str) -> Result<String, String> {
     Ok(body)
 }
 
-/// What the next line says of `key`.
+/// The value of `key` in the next line.
 fn header<'a>(lines: &mut impl Iterator<Item = &'a str>, key: &str) -> Result<String, String> {
     let line = lines.next().unwrap_or_default();
     let value = line.strip_prefix(key).and_then(|rest| rest.strip_prefix(": "));
@@ -173,13 +173,13 @@ pub struct Journal {
     pub begun: String,
     /// Who began it.
     pub by: String,
-    /// What it is doing.
+    /// Its phase.
     pub phase: Phase,
     /// Parameters of this phase that were done when the journal was written; perhaps more were.
     pub done: usize,
     /// The drive may have been told to keep values of this restore.
     pub saved: bool,
-    /// What is written in the first phase.
+    /// The plan of the first phase.
     pub plan: Plan,
 }
 

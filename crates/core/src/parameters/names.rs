@@ -16,8 +16,7 @@ impl Names {
     /// Reads a list: comma or semicolon between fields, double quotes around fields that have one in them, the first row
     /// may be the names of the columns. `scale` is the value of one count; unit and scale may be empty.
     ///
-    /// # Errors
-    /// What is wrong, with its line.
+    /// # Errors The fault, with its line.
     pub fn parse(text: &str) -> Result<Names, String> {
         let mut names = BTreeMap::new();
         for (number, line) in (1..).zip(text.trim_start_matches('\u{feff}').lines()) {

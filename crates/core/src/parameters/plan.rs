@@ -1,4 +1,4 @@
-//! What a restore would write to a drive, in which order, and why it may not. Pure.
+//! The plan of a restore: the writes to a drive, their order, and reasons against it. Pure.
 
 mod making;
 mod order;
@@ -18,9 +18,9 @@ pub struct ParameterWrite {
     pub id: Id,
     /// PDU address of its (first) holding register.
     pub address: u16,
-    /// What the drive holds now.
+    /// The present value.
     pub from: RawValue,
-    /// What it shall hold.
+    /// The value to write.
     pub to: RawValue,
     /// For people, with the counts on the bus: `102 Maximum frequency: 50.00 Hz → 100.00 Hz (5000 → 10000)`.
     pub line: String,
@@ -28,30 +28,30 @@ pub struct ParameterWrite {
     pub volatile: bool,
 }
 
-/// What must hold before the drive takes some of the writes.
+/// A condition that the drive requires for some of the writes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Need {
     /// Point of the profile (index) that shows it.
     pub point: usize,
-    /// What the point must read. It is no proof: the drive may refuse all the same.
+    /// The required reading of the point. It is no guarantee: the drive may still refuse.
     pub value: bool,
     /// Exception code by which the drive refuses a write otherwise, N2 codes with 0x80 added; none where no manual says.
     pub exception: Option<u8>,
-    /// What to do: `switch the operator to PRGM`.
+    /// The remedy: `switch the operator to PRGM`.
     pub remedy: String,
 }
 
 /// How the drive takes and keeps parameters, from the profile.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Handling {
-    /// What must hold before the first write; nothing where none of the writes needs it.
+    /// The condition for the first write; none if no write needs one.
     pub needs: Option<Need>,
     /// Register written once at the end so that the drive keeps the values: (PDU address, value). None where every write is
     /// kept at once, or where nothing of what is written can be kept.
     pub save: Option<(u16, u16)>,
 }
 
-/// What a restore does.
+/// The plan of a restore.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Plan {
     /// The writes, in a command in which every step keeps the limits between parameters.
@@ -60,16 +60,16 @@ pub struct Plan {
     pub handling: Handling,
     /// Parameters that differ and are left out; how they differ and why they are left out, as text.
     pub left_out: Vec<(Id, String)>,
-    /// What people should know: parameters that only one side has, were not read, are not kept.
+    /// Notes: parameters that only one side has, were not read, are not kept.
     pub notes: Vec<String>,
 }
 
-/// What the user named singly, and whether he accepts the risks.
+/// The parameters the user named, and whether the risks are accepted.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Wishes {
     /// These alone; also those that are never restored otherwise. Empty: all.
     pub only: Vec<Id>,
-    /// What can be forced is a risk, not a refusal.
+    /// Treat refusals that can be forced as risks.
     pub force: bool,
 }
 
@@ -77,12 +77,11 @@ pub struct Wishes {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Risk(pub String);
 
-/// What would be written so that the drive, which holds `present`, comes to hold `wanted`.
+/// Plans the writes that change the drive from `present` to `wanted`.
 ///
 /// The notes of both files go into [`ParameterWrite::line`]; [`ParameterFile::named`] makes them again.
 ///
-/// # Errors
-/// Every reason why it may not be done, each saying what differs and what to do.
+/// # Errors Every reason against it, each with the difference and the remedy.
 pub fn plan(
     profile: &Profile,
     wanted: &ParameterFile,

@@ -50,7 +50,7 @@ pub struct Reading {
     profile: Arc<Profile>,
     todo: VecDeque<Block>,
     found: BTreeMap<u16, Result<RawValue, String>>,
-    /// What an earlier reading found; empty once the drive is asked for everything.
+    /// The addresses found by an earlier reading; empty once everything is read.
     known: BTreeSet<u16>,
     total: usize,
     counters: Counters,
@@ -277,7 +277,7 @@ impl Reading {
         Next::Go
     }
 
-    /// What was found, as a file; `names` go before those of the family.
+    /// The result as a file; `names` take precedence over those of the family.
     pub fn file(&self, drive: &str, identification: &str, time: &str, names: &Names) -> ParameterFile {
         let list = &self.profile.parameters;
         let values = self.found.iter().filter_map(|(address, value)| {

@@ -19,7 +19,7 @@ const MOST_WAIT: Duration = Duration::from_secs(3600);
 const BUSY_PAUSE: Duration = Duration::from_millis(200);
 /// Pause before the next try where someone has to do something: the motor runs, the drive is away.
 const PAUSE: Duration = Duration::from_secs(1);
-/// How often the journal is told how far the restore is.
+/// How often progress is noted in the journal.
 const NOTED: Duration = Duration::from_secs(1);
 /// Saves of one restore, at most: a drive that loses what was written before it was saved is written and saved again.
 const MOST_SAVES: u32 = 3;
@@ -281,7 +281,7 @@ impl Restoration {
         Then::Go
     }
 
-    /// The drive was told to keep the values. If it was without power before that, it lost some: all are looked at once more.
+    /// The drive was made to save the values. If it lost power before that, some are lost: all are checked again.
     fn saved(&mut self) -> Then {
         self.saves += 1;
         self.wrote = false;
@@ -292,7 +292,7 @@ impl Restoration {
         Then::Go
     }
 
-    /// Whether the drive is told to keep the values. Taking back what it was not told to keep needs no save: it wears its memory.
+    /// Whether the drive is made to save the values. Undoing unsaved values needs no save, which would wear its memory.
     fn saves(&self) -> bool {
         let leaves_out = self.journal.phase == Phase::TakingBack && !self.journal.saved;
         self.journal.plan.handling.save.is_some() && !leaves_out

@@ -135,8 +135,7 @@ fn name_after(newest: &str, own: String) -> String {
 
 /// Reads a file of parameters.
 ///
-/// # Errors
-/// Which file, and what is wrong with it.
+/// # Errors The file and its fault.
 pub fn read(path: &Path) -> Result<ParameterFile, String> {
     let shown = path.display();
     let mut text = String::new();

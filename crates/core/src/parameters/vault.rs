@@ -1,4 +1,4 @@
-//! What readings and restores go on, one of each a drive at a time, and the result of the last ones.
+//! The readings and restores in progress, one of each per drive, and the results of the last ones.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -19,7 +19,7 @@ pub struct Status {
     pub number: u64,
     /// Addresses that were asked, and all.
     pub progress: (usize, usize),
-    /// Time that it will still take, by what it took so far.
+    /// Estimated remaining time.
     pub remaining: Option<Duration>,
     /// Why it waits.
     pub waits: Option<String>,
@@ -27,7 +27,7 @@ pub struct Status {
     pub result: Option<Result<Arc<ParameterFile>, String>>,
 }
 
-/// What a restore is at.
+/// The stage of a restore.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum RestoreStage {
     /// The drive is read.
@@ -38,18 +38,18 @@ pub enum RestoreStage {
     Refused(Vec<String>),
     /// Parameters are written.
     Working,
-    /// It has ended: what the drive has now.
+    /// It has ended, with a summary.
     Ended(String),
-    /// It was given up: why, and what to do.
+    /// It was given up: the reason and the remedy.
     Failed(String),
 }
 
-/// What a restore would write.
+/// The plan of a restore.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Prepared {
     /// The writes.
     pub plan: Plan,
-    /// What the user takes upon himself.
+    /// The risks the user accepts.
     pub risks: Vec<String>,
 }
 
@@ -58,13 +58,13 @@ pub struct Prepared {
 pub struct RestoreStatus {
     /// Its number: a later one has a higher one.
     pub number: u64,
-    /// What it is at.
+    /// Its stage.
     pub stage: RestoreStage,
     /// Addresses that were read, or parameters that were written, and all.
     pub progress: (usize, usize),
     /// Why it waits.
     pub waits: Option<String>,
-    /// What it writes, once that is known.
+    /// Its plan, once known.
     pub prepared: Arc<Prepared>,
     /// Someone wants it to end before the next parameter.
     pub is_unwanted: bool,
@@ -82,7 +82,7 @@ struct State {
     numbered: u64,
     restores: BTreeMap<Machine, RestoreStatus>,
     holds: BTreeMap<Machine, Arc<Hold>>,
-    /// Machines whose journal was looked for.
+    /// Machines whose journal was searched for.
     looked_for: BTreeSet<Machine>,
     /// Journals that belong to no drive, of which an event told.
     orphans: BTreeSet<PathBuf>,
@@ -155,7 +155,7 @@ impl Vault {
         self.lock().last.get(drive).cloned()
     }
 
-    /// Whether a reading goes on.
+    /// Whether a reading is in progress.
     pub fn is_reading(&self, drive: &Machine) -> bool {
         self.lock()
             .readings
@@ -234,8 +234,7 @@ impl Vault {
 
     /// A restore of that drive begins, at that stage; its number.
     ///
-    /// # Errors
-    /// Another one goes on.
+    /// # Errors Another one is in progress.
     pub fn begin_restore(&self, drive: &Machine, name: &str, stage: RestoreStage) -> Result<u64, String> {
         let mut state = self.lock();
         if state.restores.get(drive).is_some_and(RestoreStatus::goes_on) {

@@ -1,4 +1,4 @@
-//! A request that is passed on to the line for a tool: what is asked, and where the answer arrives.
+//! A request passed on to the line for a tool, and the receiver of its reply.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -25,7 +25,7 @@ pub enum Target {
     Address(u8),
 }
 
-/// What a tool asks. Anyone who passes on what may write has checked that it is allowed.
+/// A tool's request. The caller has checked that a write is allowed.
 #[derive(Debug, Clone)]
 pub struct Question {
     /// Who is asked.
@@ -34,16 +34,16 @@ pub struct Question {
     pub pdu: RequestPdu,
     /// Whether it may change anything: then it is counted and audited as a command.
     pub may_write: bool,
-    /// When its head came.
+    /// When it began to arrive.
     pub asked: Instant,
     /// Not sent after this.
     pub expires: Instant,
-    /// Who asks.
+    /// Its origin.
     pub origin: Origin,
 }
 
 impl Question {
-    /// A broadcast of the gateway's own or of a client, which nobody answers.
+    /// A broadcast by the gateway itself or a client; it gets no reply.
     pub fn broadcast(pdu: RequestPdu, origin: Origin, asked: Instant, within: Duration) -> Question {
         Question {
             target: Target::Address(0),
@@ -56,7 +56,7 @@ impl Question {
     }
 }
 
-/// a transaction that was asked for. Dropping it takes it back while it was not sent.
+/// A requested transaction. Dropping it withdraws it if it was not sent yet.
 #[derive(Debug)]
 pub struct Exchange {
     answer: oneshot::Receiver<Answer>,

@@ -17,7 +17,7 @@ impl BusHandle {
         !self.queue.is_guarded() || self.queue.lock().hold_renews(drive, origin)
     }
 
-    /// Publishes what happened to the holds of its drives.
+    /// Publishes the changes of the holds of its drives.
     pub fn tell_holds(&self, events: &Events, now: Instant, time: SystemTime) {
         if !self.queue.is_guarded() {
             return;
@@ -112,8 +112,8 @@ impl DriveHandle {
         self.bus.queue.is_guarded()
     }
 
-    /// What a client does with the hold; what is told of it then. A refusal is audited, counted and published like that of a
-    /// command.
+    /// Applies a client's action to the hold and returns its published state. A refusal is audited, counted and
+    /// published like that of a command.
     ///
     /// # Errors
     /// The refusal.
@@ -150,7 +150,7 @@ impl DriveHandle {
             .ok_or_else(|| Refusal::NotAllowed("[authority] was turned off".to_string()))
     }
 
-    /// What is told of the hold, and whether that client holds the drive; nothing while `[authority]` is off.
+    /// The published state of the hold, and whether that client has it; none while `[authority]` is off.
     pub fn hold_view(&self, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
         match self.bus.queue.is_guarded() {
             true => self.bus.queue.lock().hold_view(self.index, origin, now),
@@ -184,7 +184,7 @@ impl DriveHandle {
         }
     }
 
-    /// With the stop behind which the drive is reserved.
+    /// Adds the reservation after a stop.
     pub(super) fn with_reservation(&self, mut why: Explanation, now: Instant) -> Explanation {
         let view = self.hold_view(None, now).map(|(view, _)| view);
         let Some(view) = view.filter(|view| view.state == HoldState::Reserved && why.runs == Some(false)) else {
@@ -239,7 +239,7 @@ impl Plant {
         guarded.flat_map(of_bus).collect()
     }
 
-    /// Goes on with reservations of before the start.
+    /// Restores reservations from before the start.
     pub fn restore_reservations(&self, kept: &[KeptReservation], now: Instant, time: SystemTime) {
         for one in kept {
             let machine = Machine {
@@ -266,7 +266,7 @@ impl Plant {
     }
 }
 
-/// The event of what happened to a hold.
+/// The event for a change of a hold.
 fn words(told: &Told, rules: &Rules) -> (EventKind, String) {
     let named = |claim: &command::Claim| format!("{} ({})", claim.name, rules.rank(claim.rank));
     let who = named(&told.who);

@@ -25,7 +25,7 @@ struct Terms {
     now: Instant,
 }
 
-/// What a command sets, with the values that are known before it.
+/// The points a command sets, with their previous values.
 pub(super) fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
     let is = |point: ModelPoint, index: usize| reading.spec.profile.model_index(point) == Some(index);
     match order {
@@ -311,7 +311,7 @@ impl DriveHandle {
         (ticket.with_changes(sets), answer)
     }
 
-    /// What becomes of a command at once: why it is not sent, or that it may be.
+    /// Decides whether a command may be sent, or why not.
     fn judge(
         &self,
         order: Order,

@@ -9,7 +9,7 @@ use tokio::sync::oneshot;
 
 use crate::command::{Answer, Outcome, joined};
 
-/// What reads showed of a command that was acknowledged; nothing of any other.
+/// What reads showed about an acknowledged command; empty for any other.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Shown {
     /// Time from acceptance to the read that showed its effect.
@@ -30,7 +30,7 @@ pub struct Placed {
     rest: Option<Box<Rest>>,
 }
 
-/// What arrives of the rest of a command.
+/// The pending results of the rest of a command.
 #[derive(Debug)]
 struct Rest {
     answer: Arriving<Answer>,
@@ -113,7 +113,7 @@ impl Placed {
         now(|cx| self.poll_confirmation(cx))
     }
 
-    /// What is known of the effect by now.
+    /// The effect known so far.
     pub fn shown(&mut self) -> Shown {
         let stop = now(|cx| self.confirmation.poll(cx)).flatten();
         let seen = match &mut self.rest {

@@ -1,4 +1,4 @@
-//! Gathers what is known of a drive besides its points, for the causes why it does not run.
+//! Collects the state of a drive besides its points, for the causes why it does not run.
 
 use std::time::Duration;
 
@@ -74,7 +74,7 @@ fn run_order(record: &AuditRecord, age: Duration) -> Option<RunOrder> {
     })
 }
 
-/// What a result code says of the order.
+/// The fate of a command, by its result code.
 fn fate(result: &str) -> Fate {
     match result {
         "acknowledged" | CONFIRMED => Fate::Taken,

@@ -51,7 +51,7 @@ pub struct BusHealth {
     pub tried: bool,
     /// When `up` last changed.
     pub since: Option<SystemTime>,
-    /// Why the port is not open; what the bus does next.
+    /// Why the port is not open, and the bus's next action.
     pub reason: Option<String>,
     /// Share of the last second that the line was in use (frames, turnaround, silence), 0..=1; `None` until the port was
     /// open for a second.
@@ -60,7 +60,7 @@ pub struct BusHealth {
     pub fast: PollCycle,
     /// Rounds of the slow class.
     pub slow: PollCycle,
-    /// Frames that were nobody's answer.
+    /// Foreign frames.
     pub foreign: u64,
     /// Times the port was opened.
     pub opened: u64,

@@ -1,4 +1,4 @@
-//! Why a drive takes no commands but stops.
+//! Why a drive accepts only stops.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ impl Hold {
         self.0.store(why.map(Arc::new));
     }
 
-    /// Why it takes no commands but stops, and what ends that; nothing where it takes all.
+    /// Why it accepts only stops, and what ends that; none if it accepts all commands.
     pub fn why(&self) -> Option<Arc<String>> {
         self.0.load_full()
     }

@@ -1,4 +1,4 @@
-//! The process image: what is known of every drive and bus. One writer a bus, any number of readers.
+//! The process image: the latest state of every drive and bus. One writer per bus, any number of readers.
 //!
 //! The writer replaces a drive's [`Snapshot`] as a whole after each transaction, so a reader always sees the
 //! registers of one poll together: a torn 32-bit value is impossible, and nobody waits for anybody.
@@ -43,7 +43,7 @@ pub enum Access {
     Listen,
 }
 
-/// What may be done with the parameters of a drive.
+/// The permitted access to a drive's parameters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ParamsAccess {
     #[default]
@@ -52,7 +52,7 @@ pub enum ParamsAccess {
     Write,
 }
 
-/// What is done when a drive's lease expires.
+/// The action when a drive's lease expires.
 #[derive(Debug, Clone, PartialEq)]
 pub enum LeaseAction {
     /// Stop the drive.
@@ -68,13 +68,13 @@ pub enum LeaseAction {
 pub struct Supervision {
     /// Time without renewal after which the lease expires.
     pub timeout: Duration,
-    /// What is done then, once.
+    /// The action then.
     pub action: LeaseAction,
     /// A drive that runs when the gateway starts gets its lease started: the clock only, nothing is written.
     pub adopt: bool,
 }
 
-/// What is done with a drive when the gateway stops.
+/// The action for a drive at shutdown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum OnShutdown {
     /// Nothing is written.
@@ -101,7 +101,7 @@ pub struct DriveSpec {
     pub group: Option<String>,
     /// How often and how soon it may be started.
     pub guard: Option<Guard>,
-    /// What must hold before it is started.
+    /// The interlocks of its starts.
     pub interlocks: Vec<Interlock>,
     /// A drive of its group starts at a distance from the others, so that its own starts count.
     pub staggers: bool,
@@ -111,7 +111,7 @@ pub struct DriveSpec {
     pub limits: BTreeMap<String, RangeInclusive<f64>>,
     /// Lease, if there is one.
     pub supervision: Option<Supervision>,
-    /// What happens when the gateway stops.
+    /// The action at shutdown.
     pub on_shutdown: OnShutdown,
     /// Time the drive takes to begin its answer, for the prediction.
     pub turnaround: Duration,
@@ -119,9 +119,9 @@ pub struct DriveSpec {
     pub frequency_range: Option<RangeInclusive<f64>>,
     /// Values besides faults at which a recording is made.
     pub triggers: Vec<PointTrigger>,
-    /// What raw writes may set besides writable points.
+    /// The permitted raw writes besides writable points.
     pub raw_writes: RawWrites,
-    /// What may be done with its parameters.
+    /// The permitted access to its parameters.
     pub params: ParamsAccess,
 }
 
@@ -196,7 +196,7 @@ pub struct DriveImage {
     pub spec: DriveSpec,
     /// The requests that read it.
     pub plan: Plan,
-    /// Why it takes no commands but stops, if that is so.
+    /// Why it accepts only stops, if so.
     pub hold: Arc<Hold>,
     /// Cadence of the slow class, which the staleness of slow points depends on.
     slow_cycle: Duration,
@@ -220,7 +220,7 @@ pub struct DriveImage {
 }
 
 impl DriveImage {
-    /// An image of which nothing is known yet.
+    /// An empty image.
     pub fn new(spec: DriveSpec, slow_cycle: Duration) -> DriveImage {
         let plan = Plan::of(&spec.profile);
         let snapshot = ArcSwap::from_pointee(Snapshot::empty(&plan));
@@ -289,7 +289,7 @@ impl DriveImage {
         self.stale_floor.store(nanos, Ordering::Relaxed);
     }
 
-    /// What is known now; stays as it is while the caller holds it.
+    /// The present snapshot; it does not change while the caller holds it.
     pub fn snapshot(&self) -> Arc<Snapshot> {
         self.snapshot.load_full()
     }
@@ -381,7 +381,7 @@ impl DriveImage {
         self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
-    /// Whether a heartbeat came since the bus took note of the last one.
+    /// Whether a heartbeat arrived since the bus processed the last one.
     pub fn has_heartbeat(&self) -> bool {
         self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).is_some()
     }
@@ -432,9 +432,9 @@ pub struct BusImage {
     pub slow_cycles: Histogram,
     /// The frames on the line, for anyone who listens.
     pub trace: Trace,
-    /// What is read and what is on the line, for recorder, trends and counters.
+    /// Readings and frames, for recorder, trends and counters.
     pub tape: Tape,
-    /// What is wrong with the line. Only the bus itself may store one.
+    /// The diagnosis of the line. Only the bus itself may store one.
     pub diagnosis: ArcSwap<Diagnosis>,
     health: Mutex<BusHealth>,
 }

@@ -1,4 +1,4 @@
-//! What is known of a drive at one time: raw words with their times, and how they read as points.
+//! The state of a drive at one time: raw words with their times, and their conversion to points.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -96,7 +96,7 @@ impl Span {
     }
 }
 
-/// What is known of a drive.
+/// The state of a drive.
 #[derive(Debug, Clone)]
 pub struct Snapshot {
     /// Whether it answers.
@@ -243,9 +243,9 @@ impl Snapshot {
 pub struct Reading<'d> {
     /// As configured.
     pub spec: &'d DriveSpec,
-    /// Why it takes no commands but stops, if that is so; none of a past in which nobody gives commands.
+    /// Why it accepts only stops, if so; none for a past state.
     pub hold: Option<&'d Hold>,
-    /// What is known.
+    /// The snapshot.
     pub snapshot: Arc<Snapshot>,
     /// When the reader looks.
     pub now: Instant,

@@ -1,5 +1,4 @@
-//! What a bus read and what was on its line, on the way to recorder, trends and counters; costs nothing while there is nobody
-//! who takes it.
+//! Readings and frames of a bus, on the way to recorder, trends and counters; costs nothing while unused.
 //!
 //! The bus only appends and the recorder takes all there is at once, so the bus never waits longer than for the swap of two
 //! lists.
@@ -23,9 +22,9 @@ pub enum Verdict {
     Ok,
     /// The drive answered with an exception.
     Exception,
-    /// Nothing, or nothing that belongs to the request, came in time.
+    /// No reply arrived in time.
     Timeout,
-    /// What came cannot be believed.
+    /// An invalid reply.
     Corrupt,
     /// Bytes between two transactions.
     Foreign,
@@ -67,9 +66,9 @@ pub struct TapedFrame {
     pub at: Instant,
     /// Place of the drive that was asked; none for bytes between two transactions.
     pub drive: Option<usize>,
-    /// What it was.
+    /// Its verdict.
     pub verdict: Verdict,
-    /// The bytes; none where nothing came.
+    /// The bytes; empty if nothing arrived.
     pub bytes: Arc<[u8]>,
 }
 
@@ -116,15 +115,15 @@ struct Waiting {
     lost: u64,
 }
 
-/// What a tape takes.
+/// What a tape records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u8)]
 pub enum Taping {
     /// Nothing.
     Off,
-    /// What is read: for trends and counters.
+    /// Readings: for trends and counters.
     Reads,
-    /// What is read and what is on the line: for the recorder, too.
+    /// Readings and frames: also for the recorder.
     Everything,
 }
 
@@ -137,7 +136,7 @@ pub struct Tape {
 }
 
 impl Tape {
-    /// What is taken from now on; without anything the tape is cleared.
+    /// Sets what is recorded from now on; if nothing, the tape is cleared.
     pub fn switch(&self, taping: Taping) {
         self.taping.store(taping as u8, Ordering::Relaxed);
         if taping == Taping::Off {

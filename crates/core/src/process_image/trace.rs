@@ -1,4 +1,4 @@
-//! The frames on a line, for anyone who listens; costs nothing while nobody does.
+//! The frames on a line, for subscribers; costs nothing without any.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -31,7 +31,7 @@ pub struct FrameRecord {
     pub direction: Direction,
     /// The drive that was asked; none for bytes that came between two transactions.
     pub drive: Option<String>,
-    /// The bytes on the wire; empty where nothing came.
+    /// The bytes on the wire; empty if nothing arrived.
     pub bytes: Vec<u8>,
     /// The bytes in plain words ([`crate::codec::describe`]).
     pub decode: String,

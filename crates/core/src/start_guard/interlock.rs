@@ -13,7 +13,7 @@ pub struct Unmet {
     drive: String,
     point: String,
     is: bool,
-    /// What is known of the point instead.
+    /// The actual state of the point.
     but: String,
     was_read: bool,
 }
@@ -35,7 +35,7 @@ impl fmt::Display for Unmet {
 }
 
 impl Interlock {
-    /// Whether it does not hold. Only a good sample holds.
+    /// Returns it if not satisfied. Only a good sample satisfies it.
     pub(super) fn unmet(&self, around: &Around, now: Instant) -> Option<Unmet> {
         let (but, was_read) = self.differs(around, now)?;
         Some(Unmet {

@@ -57,7 +57,7 @@ fn report(path: &Path, done: &io::Result<()>, failing: &mut bool) {
     }
 }
 
-/// What earlier runs left. What cannot be used is kept aside.
+/// Loads the starts of earlier runs. An unusable file is renamed.
 fn load(path: &Path) -> Saved {
     let read = || {
         let length = fs::metadata(path)?.len();

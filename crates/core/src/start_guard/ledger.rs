@@ -1,4 +1,4 @@
-//! The motors of all buses, their groups, and what of them is on disk. Pure: time is an argument.
+//! The motors of all buses, their groups, and what is saved of them. Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -22,7 +22,7 @@ pub struct Guards {
     around: ArcSwap<Around>,
 }
 
-/// What interlocks look at.
+/// The images that interlocks check.
 #[derive(Debug, Default)]
 pub(super) struct Around {
     pub(super) images: BTreeMap<String, Arc<DriveImage>>,
@@ -70,7 +70,7 @@ enum Disk {
     },
 }
 
-/// How far a start that is decided came.
+/// The progress of a decided start.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Kept {
     Yes,
@@ -121,7 +121,7 @@ impl Guards {
         self.tell_change();
     }
 
-    /// What belongs on disk, with its generation; none where that is there already, or failed.
+    /// The state to save, with its generation; none if already saved, or failed.
     pub fn to_write(&self, now: Instant, time: SystemTime) -> Option<(u64, Saved)> {
         self.lock().to_write(now, time)
     }

@@ -1,4 +1,4 @@
-//! Guards of starts: how often, how soon and how close together motors may be started, and what must hold before.
+//! Start guards: how often, how soon and how close together motors may be started, and under which conditions.
 //!
 //! A start is the passage of a motor from standing to running, by whomever. One [`Guards`] for the whole gateway counts
 //! them, since drives of several buses can belong to one group; every bus has its view of it, [`BusGuards`]. A command
@@ -42,14 +42,14 @@ pub struct Guard {
     pub stagger: Duration,
 }
 
-/// What must hold before a motor is started.
+/// A condition for starting a motor.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Interlock {
     /// The drive that shows it.
     pub drive: String,
     /// A point of it that is true or false.
     pub point: String,
-    /// What that must be.
+    /// Its required value.
     pub is: bool,
     /// Whether the running motor is stopped where it does not hold.
     pub trip: bool,

@@ -1,4 +1,4 @@
-//! What is known of one motor, and when it may be started. Pure: time is an argument.
+//! The state of one motor, and when it may be started. Pure: time is an argument.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -15,7 +15,7 @@ const SETTLES: Duration = Duration::from_secs(1);
 /// For so long after its start a motor counts as running though it was not read since.
 const UNREAD: Duration = Duration::from_secs(2);
 
-/// What a reading shows of a motor.
+/// The motor's state in a reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Seen {
     /// It runs, and has no fault.
@@ -44,7 +44,7 @@ pub(super) struct Reserved {
 #[derive(Debug, Clone)]
 struct Started {
     at: Instant,
-    /// The client whose order it was.
+    /// The client that commanded it.
     by: Option<Arc<str>>,
 }
 
@@ -208,7 +208,7 @@ impl Motor {
         self.stands_since.get_or_insert(now);
     }
 
-    /// It was read. Whether a start was seen that nobody ordered here.
+    /// It was read. Returns whether a start was seen that was not commanded here.
     pub(super) fn seen(&mut self, seen: Seen) -> bool {
         let Seen {
             running,
@@ -251,7 +251,7 @@ impl Motor {
         true
     }
 
-    /// It cannot be read: what it does meanwhile is not known.
+    /// It cannot be read: its state meanwhile is unknown.
     pub(super) fn unseen(&mut self) {
         self.running = None;
     }

@@ -22,7 +22,7 @@ pub struct BusGuards {
     drives: Vec<Option<Guarding>>,
 }
 
-/// What is configured of one drive.
+/// The guards of one drive.
 #[derive(Debug)]
 struct Guarding {
     machine: Machine,
@@ -104,7 +104,7 @@ impl BusGuards {
         Some(refusal(refused))
     }
 
-    /// What keeps the motor from being started now, as text; not counted.
+    /// Why the motor may not be started now, as text; not counted.
     pub fn hindrance(&self, drive: usize, now: Instant) -> Option<Guarded> {
         let of = self.of_drive(drive)?;
         let interlocked = self.interlocked(of, now);
@@ -318,7 +318,7 @@ impl BusGuards {
         }
     }
 
-    /// What is known of the drive now.
+    /// Updates the state of the drive.
     pub fn look(&self, drive: usize, reading: &Reading<'_>) {
         let Some(of) = self.of_drive(drive) else { return };
         let seen = seen(reading);

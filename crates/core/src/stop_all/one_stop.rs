@@ -145,7 +145,7 @@ impl OneStop {
         }
     }
 
-    /// What is known of the drive.
+    /// The outcome for the drive.
     pub(crate) fn outcome(&self, plant: &Plant, now: Instant) -> StoppedDrive {
         let (outcome, reason) = match (&self.step, plant.drive_at(&self.machine)) {
             (Step::Acknowledged(_), Some(drive)) if self.stood && drive.reading(now).may_turn().is_none() => {

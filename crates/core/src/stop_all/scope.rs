@@ -24,9 +24,9 @@ pub enum NothingToStop {
     Unknown {
         /// `bus` or `group`.
         kind: &'static str,
-        /// What was asked for.
+        /// The requested name.
         name: String,
-        /// What there is.
+        /// The known names.
         known: Vec<String>,
     },
     /// No drive of it is controlled.

@@ -11,12 +11,12 @@ const FED_OTHERWISE: [&str; 2] = ["bypass", "fire_mode"];
 /// Output frequency in Hz up to which a motor that does not run stands.
 const STANDS: f64 = 0.5;
 
-/// What reads show of a motor.
+/// The state of a motor in readings.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Standstill {
     /// It stands.
     Stands,
-    /// It turns; what shows it.
+    /// It turns, with the evidence.
     Turns(String),
     /// Neither is known; why.
     Unknown(String),

@@ -608,7 +608,7 @@ keys! {
 
     /// HTTP server for metrics, health and the status page; not started without this section.
     HTTP: Http {
-        /// Status page, metrics, health and JSON interface. Read-only without `commands`; open to everybody who can connect
+        /// Status page, metrics, health and JSON interface. Read-only without `commands`; open to everyone who can connect
         /// unless there is a `tokens_file`.
         listen: SocketAddr = SOCKET, default "127.0.0.1:9488";
         /// Names and addresses, without a port, by which the server is reached besides `localhost`, the host name of

@@ -1,8 +1,8 @@
-//! What people write instead of TOML, and what to write instead. Pure.
+//! Common mistakes in TOML, and their corrections. Pure.
 
 use super::Finding;
 
-/// What the mistake in that line of `source` is, if it is one that is often made.
+/// The mistake in that line of `source`, if it is a common one.
 pub(super) fn named(source: &str, line: Option<usize>) -> Option<Finding> {
     other_format(source).or_else(|| in_line(source.lines().nth(line?.checked_sub(1)?)?))
 }

@@ -24,12 +24,12 @@ pub use reader::{Reader, candidates, nearest};
 pub use tree::{Entry, Node, Raw};
 pub use value::{FromNode, ValueError, parse_duration, parse_size};
 
-/// What is wrong and what to do about it.
+/// A fault and its remedy.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
-    /// What is wrong.
+    /// The fault.
     pub what: String,
-    /// What to do; empty where there is nothing to add.
+    /// The remedy; empty if there is nothing to add.
     pub remedy: String,
 }
 
@@ -65,7 +65,7 @@ pub struct Problem {
     pub line: Option<usize>,
     /// Dotted path of the key, such as `bus[0].drive[1].address`.
     pub key: String,
-    /// What is wrong and what to do.
+    /// The fault and its remedy.
     #[serde(rename = "message", serialize_with = "as_text")]
     pub finding: Finding,
 }
@@ -117,7 +117,7 @@ pub struct Place {
 pub struct Document {
     file: String,
     root: Node,
-    /// What is not TOML. Whatever else is found then may come of that alone.
+    /// Syntax errors. Any other finding may be a consequence of these.
     syntax: Vec<Problem>,
     problems: RefCell<Vec<Problem>>,
     warnings: RefCell<Vec<Problem>>,
@@ -221,7 +221,7 @@ impl Document {
         }
     }
 
-    /// Every key that a reader of this document asked for, as a path without the numbers of array elements:
+    /// Every key that a reader of this document requested, as a path without the numbers of array elements:
     /// `bus[].drive[].address`.
     pub fn known_keys(&self) -> BTreeSet<String> {
         self.known.borrow().clone()

@@ -49,7 +49,7 @@ impl<'d> Reader<'d> {
         self.document.problem(&self.place_of(key), what, remedy);
     }
 
-    /// Adds what is wrong with the value of `key`.
+    /// Adds a finding about the value of `key`.
     pub(crate) fn finding(&self, key: &str, finding: impl Into<Finding>) {
         let Finding { what, remedy } = finding.into();
         self.problem(key, what, remedy);
@@ -152,7 +152,7 @@ impl<'d> Reader<'d> {
         self.lenient.set(true);
     }
 
-    /// Reports the keys that were never asked for, each with the nearest known key.
+    /// Reports the keys that were never requested, each with the nearest known key.
     pub fn finish(&self) {
         if self.lenient.get() {
             return;

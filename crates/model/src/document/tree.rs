@@ -77,7 +77,7 @@ pub enum Raw {
     Table(Vec<Entry>),
     /// Text of an environment variable, read as any type.
     Env(String),
-    /// What no key accepts: `a date`.
+    /// A value that no key accepts: `a date`.
     Other(&'static str),
 }
 
@@ -209,7 +209,7 @@ pub(super) enum OverrideError {
 }
 
 impl OverrideError {
-    /// What to do about it.
+    /// The remedy.
     pub(super) fn remedy(&self) -> &'static str {
         match self {
             OverrideError::NoSection(_) => "add the section to the file first",

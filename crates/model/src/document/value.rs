@@ -7,7 +7,7 @@ use crate::codec::duration;
 
 use super::{Finding, Node, Raw};
 
-/// Why a value cannot be read: the value or its type, then what to write.
+/// Why a value cannot be read: the value or its type, then the correction.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ValueError {
     #[error("`\"{0}\"` is a string")]
@@ -48,7 +48,7 @@ impl From<ValueError> for Finding {
 
 /// A type that a value can be read as.
 pub trait FromNode: Sized {
-    /// What to write, for messages: `a string`.
+    /// The expected type, for messages: `a string`.
     const WANTED: &'static str;
 
     /// Reads the value.
@@ -184,7 +184,7 @@ impl<T: FromNode> FromNode for Vec<T> {
     }
 }
 
-/// What to write for a list.
+/// The expected list, for messages.
 fn each<T: FromNode>() -> String {
     format!("{}, each {}", Vec::<T>::WANTED, T::WANTED)
 }

@@ -1,4 +1,4 @@
-//! What an engineer does and sees at the cabinet, as lines of the profile: one source for pages, `profiles show`, `scan`
+//! The steps for the engineer at the cabinet, as lines of the profile: one source for pages, `profiles show`, `scan`
 //! and the verdicts of the diagnosis.
 
 use super::profile::Profile;
@@ -12,9 +12,9 @@ pub enum Step {
     Terminate,
     /// Protocol, address, baud rate, parity, timeout: where, and their factory settings.
     Settings,
-    /// What makes the drive obey the bus.
+    /// How to make the drive obey the bus.
     ControlPlace,
-    /// What lamps and panel show.
+    /// Lamps and panel.
     Lamps,
     /// How to test it.
     Test,
@@ -56,7 +56,7 @@ impl Step {
     }
 }
 
-/// The lines of each step; none where no manual says anything.
+/// The lines of each step; none without a manual.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Commissioning {
     pub(super) connect: Vec<String>,

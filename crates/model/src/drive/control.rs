@@ -10,19 +10,19 @@ use crate::codec::Table;
 pub struct Control {
     /// The control word, or a coil.
     pub at: Place,
-    /// What it reads as.
+    /// How the word reads back.
     pub own_word: OwnWord,
     /// Bits that every word carries.
     pub always: Always,
-    /// What starts the motor.
+    /// How the motor is started.
     pub run: Run,
-    /// What stops it, and by which a stop is known.
+    /// How it is stopped, and how a stop is recognised.
     pub stop: Setting,
-    /// What turns it round, where that is not part of `run`.
+    /// How it is reversed, unless that is part of `run`.
     pub reverse: Option<Setting>,
-    /// What resets a fault.
+    /// How a fault is reset.
     pub fault_reset: Option<Reset>,
-    /// A reset while a run command stands starts the motor.
+    /// A reset while a run command is set starts the motor.
     pub restarts_on_reset: bool,
 }
 
@@ -45,7 +45,7 @@ impl Place {
     }
 }
 
-/// Whose word the control word is.
+/// How the control word reads back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum OwnWord {
     /// The register reads as the word written last.
@@ -79,7 +79,7 @@ impl Always {
     }
 }
 
-/// Some bits of a word and what they are.
+/// Some bits of a word and their values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Setting {
     /// Where; none is the control word.
@@ -125,7 +125,7 @@ impl Setting {
     }
 }
 
-/// What starts the motor.
+/// How the motor is started.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Run {
     /// One setting, forward or as `reverse` says.
@@ -144,15 +144,15 @@ pub enum Run {
 /// One word of a sequence.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Step {
-    /// The word; the bits of `reverse` stand in it as commanded.
+    /// The word; the bits of `reverse` are set in it as commanded.
     pub write: Setting,
-    /// What ends it.
+    /// The condition that ends it.
     pub until: Until,
     /// After which the command fails.
     pub timeout: Duration,
 }
 
-/// What ends a step.
+/// The condition that ends a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Until {
     /// The word was acknowledged.
@@ -170,7 +170,7 @@ pub struct Mask {
     pub point: usize,
     /// Bits of it that count.
     pub mask: u64,
-    /// What they are.
+    /// Their value.
     pub is: u64,
 }
 
@@ -181,10 +181,10 @@ impl Mask {
     }
 }
 
-/// What resets a fault: a pulse.
+/// A fault reset: a pulse.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Reset {
-    /// What is set, and the other way afterwards.
+    /// The bits to set, and to invert afterwards.
     pub setting: Setting,
     /// For how long.
     pub hold: Duration,
@@ -261,7 +261,7 @@ impl Control {
         }
     }
 
-    /// The direction that the word says; none where it says none.
+    /// The direction in the word, if any.
     pub fn direction_of(&self, word: u16) -> Option<bool> {
         if let Some(reverse) = self.reverse.filter(|setting| setting.place.is_none()) {
             return Some(reverse.holds(word));
@@ -273,7 +273,7 @@ impl Control {
         }
     }
 
-    /// What contradicts something else: the key, what is wrong, and what to do.
+    /// Contradictions: the key, the fault and the remedy.
     pub fn contradictions(&self) -> Vec<(&'static str, String, &'static str)> {
         let always = self.always;
         let mut found = Vec::new();
@@ -333,7 +333,7 @@ impl Control {
         first.unwrap_or(self.at)
     }
 
-    /// The word of a stop, made of the word that stands.
+    /// The word of a stop, made from the present word.
     pub fn stop_word(&self, own: u16) -> u16 {
         match self.stop.place {
             None => self.stop.applied(self.always.applied(own)),

@@ -1,4 +1,4 @@
-//! What a drive is: points, profiles and the requests that read them. Pure.
+//! Drives as data: points, profiles and the requests that read them. Pure.
 
 pub mod commissioning;
 pub mod control;

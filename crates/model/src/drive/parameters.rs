@@ -1,4 +1,4 @@
-//! Parameters of a family as data: which there are, and what they are called.
+//! Parameters of a family as data: their addresses and names.
 
 mod rules;
 
@@ -14,11 +14,11 @@ pub use rules::{Addresses, Limit, Lock, WriteRules, has};
 pub struct ParameterList {
     /// Those that are known by name, by ascending address.
     pub named: Vec<Parameter>,
-    /// Where others may lie; which of them a drive has, it is asked.
+    /// Where others may lie; the drive is read to find which of them it has.
     pub spans: Vec<Span>,
     /// Points that identify the drive in a file: indices in the profile.
     pub identification: Vec<usize>,
-    /// What holds when they are written back.
+    /// The rules for writing them back.
     pub rules: WriteRules,
 }
 
@@ -80,9 +80,9 @@ pub struct Parameter {
     pub id: String,
     /// PDU address of its (first) holding register.
     pub address: u16,
-    /// What it is called, and its unit.
+    /// Its name and unit.
     pub label: Label,
-    /// What the drive takes, in its unit; counts where the value of a count is not known. None where no manual says.
+    /// The accepted range, in its unit; in counts if the scale is unknown. None without a manual.
     pub range: Option<RangeInclusive<f64>>,
 }
 
@@ -104,7 +104,7 @@ impl Parameter {
     }
 }
 
-/// What a parameter is called, and what its counts mean.
+/// Name, unit and scale of a parameter.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Label {
     /// Name; empty where none is known.
@@ -228,7 +228,7 @@ impl ParameterList {
         index.ok().and_then(|index| self.named.get(index))
     }
 
-    /// What the parameter at an address is called in files.
+    /// The id in files of the parameter at an address.
     pub fn id(&self, address: u16) -> Option<String> {
         if let Some(parameter) = self.at(address) {
             return Some(parameter.id.clone());

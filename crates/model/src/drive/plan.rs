@@ -45,9 +45,10 @@ impl PlannedRead {
 pub struct Plan {
     /// In the order class, table, address.
     pub reads: Vec<PlannedRead>,
-    /// What a drive with a new fault is asked for, as far as no fast read has it: once a fault, among its slow reads.
+    /// Reads after a new fault that no fast read covers: once per fault, among the slow reads.
     pub on_fault: Vec<PlannedRead>,
-    /// What process data is compared with, as far as no other read has it: see [`super::profile::Point::monitor`].
+    /// Reads of monitoring registers for process data that no other read covers: see
+    /// [`super::profile::Point::monitor`].
     pub monitors: Vec<PlannedRead>,
     /// Those of `reads` that are longer than a manual states: bits that are read singly until a reply proves the whole.
     pub trials: Vec<PlannedRead>,

@@ -63,7 +63,7 @@ pub struct Profile {
     /// Points that a drive with a new fault is asked for at once.
     /// The drive counts what it receives, damaged or not, and tells it by function 08 (subfunctions 0B to 0F).
     pub counts_messages: bool,
-    /// The drive may stop by itself when its master goes silent, and nothing that can be read tells whether it does.
+    /// The drive may stop by itself when its master goes silent, and no readable point shows whether it does.
     pub may_stop_by_itself: bool,
     /// A broadcast that clears the whole control word stops every drive of the family on the line.
     pub broadcast_stop: bool,
@@ -78,7 +78,7 @@ pub struct Profile {
     pub faults: BTreeMap<u16, FaultText>,
     /// Lines for the engineer at the cabinet.
     pub commissioning: Commissioning,
-    /// What it means that the reads of `identify` match; empty where they prove the family.
+    /// The meaning of a match of the `identify` reads; empty if they prove the family.
     pub identified: String,
     /// Index of each model point in `points`.
     pub(super) model: Vec<Option<usize>>,
@@ -87,20 +87,20 @@ pub struct Profile {
     /// The file merged with its base, for profiles based on this one. None for built-in ones: their texts say it all, in a
     /// fifth of the memory.
     pub(super) tree: Option<Node>,
-    /// What its author may not have meant; of built-in ones nothing.
+    /// Warnings about probable mistakes; none for built-in profiles.
     pub warnings: Vec<Problem>,
 }
 
 /// Text of a fault code.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FaultText {
-    /// What the fault is.
+    /// The text of the fault.
     pub text: String,
-    /// What the panel shows; empty where no available manual says.
+    /// The panel's display; empty if no available manual gives it.
     pub panel: String,
-    /// What causes it; empty where no available manual says.
+    /// Its cause; empty if no available manual gives it.
     pub cause: String,
-    /// What to do; empty likewise.
+    /// Its remedy; likewise.
     pub remedy: String,
     /// Whether an available manual confirms it.
     pub verified: bool,
@@ -161,7 +161,7 @@ impl WriteFunctions {
         }
     }
 
-    /// What differs from the usual, in words; empty where nothing does.
+    /// Differences from the usual, as text; empty if none.
     pub fn notes(self) -> Vec<&'static str> {
         let notes = [
             (self.registers_by_16, "one register is written by function 16"),
@@ -215,7 +215,7 @@ pub enum PollClass {
     Slow,
     /// When the drive comes online.
     Once,
-    /// Once after a fault came up: see [`Profile::on_fault`].
+    /// Once after a new fault: see [`Profile::on_fault`].
     Fault,
     /// When the drive comes online and when a comparison needs it: see [`Point::monitor`].
     Monitor,
@@ -269,7 +269,7 @@ pub struct Point {
     pub texts: BTreeMap<i64, String>,
     /// It takes other values than those of `texts`, too.
     pub unlisted: bool,
-    /// A helper of other points that no north side shows and nobody commands.
+    /// A helper for other points that no server shows and that cannot be commanded.
     pub hidden: bool,
     /// A state of the point that keeps the motor from running.
     pub blocks: Option<Blocks>,
@@ -286,7 +286,7 @@ pub struct Blocks {
     pub cause: String,
     /// The state in which it does: true or not zero, or false.
     pub when: bool,
-    /// What to do.
+    /// The remedy.
     pub remedy: String,
 }
 
@@ -344,7 +344,7 @@ impl Point {
         }
     }
 
-    /// What a value of an enumeration, or a bit with texts, means.
+    /// The text of an enumeration's value, or of a bit with texts.
     pub fn text_of(&self, value: Value) -> Option<&str> {
         let code = match value {
             Value::Integer(code) => code,
@@ -426,7 +426,7 @@ impl Profile {
         }
     }
 
-    /// Its title as it is shown, with what is doubtful of it.
+    /// Its title as shown, with any doubt about it.
     pub fn described(&self) -> Cow<'_, str> {
         match self.verified {
             true => Cow::Borrowed(&self.title),
@@ -503,7 +503,7 @@ impl Profile {
         control.or_else(|| self.model_point(ModelPoint::Run)?.raw().map(Place::of))
     }
 
-    /// Whether that word, written there, is a run command or a stop; `None` where it is neither.
+    /// Whether that word, written there, is a run command or a stop; `None` if neither.
     pub fn runs_by(&self, table: Table, address: u16, word: u16) -> Option<bool> {
         let (control, place) = (self.control.as_ref()?, Place { table, address });
         let run = control.is_run(place, word).then_some(true);

@@ -8,7 +8,7 @@ use std::ops::RangeInclusive;
 use super::Profile;
 use crate::codec::Table;
 
-/// What a drive's configuration admits of raw writes beyond its writable points.
+/// The raw writes that a drive's configuration allows beyond its writable points.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum RawWrites {
     /// Nothing.

@@ -1,8 +1,8 @@
-//! Why a drive does not run: causes from its points, from what its profile says of them and from the last order. Pure: what
-//! is known and the time are arguments.
+//! Why a drive does not run: causes from its points, its profile and the last command. Pure: state and time are
+//! arguments.
 //!
-//! A profile names the bits of its family that keep a motor from running (`blocks` of a point); the rest follows from the
-//! common model. What a family does not tell is said to be not told, rather than taken for granted.
+//! A profile names the bits of its family that keep a motor from running (`blocks` of a point); the rest follows from
+//! the common model. States that a family does not report are listed as such, rather than taken for granted.
 
 use std::time::{Duration, Instant};
 
@@ -26,11 +26,11 @@ const INTERLOCKED: &str = "interlocked";
 pub struct Cause {
     /// The reason in one word, for programs.
     pub cause: String,
-    /// What shows it.
+    /// The evidence.
     pub evidence: String,
-    /// How old that is, ms; absent where it is no reading.
+    /// Its age, ms; absent if it is not a reading.
     pub age_ms: Option<u64>,
-    /// What to do.
+    /// The remedy.
     pub remedy: String,
 }
 
@@ -41,12 +41,12 @@ pub struct Explanation {
     pub runs: Option<bool>,
     /// Why it does not, the most significant first; empty while it runs.
     pub causes: Vec<Cause>,
-    /// What the family does not tell, so that it can be a cause nobody sees.
+    /// States that the family does not report, so that they cannot be ruled out.
     pub not_told: Vec<String>,
 }
 
 impl Explanation {
-    /// The causes with what shows them, in one line; none where none is known.
+    /// The causes with their evidence, in one line, if any.
     pub fn blocked_by(&self) -> Option<String> {
         let cause = |Cause { cause, evidence, .. }: &Cause| match evidence.starts_with(cause.as_str()) {
             true => evidence.clone(),
@@ -74,7 +74,7 @@ impl Explanation {
     }
 }
 
-/// Whether the drive can be asked.
+/// Whether the drive can be reached.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Contact {
     /// Its process data is fresh.
@@ -83,7 +83,7 @@ pub enum Contact {
     Stale,
     /// It does not answer.
     Silent,
-    /// It was not asked yet.
+    /// It has not been polled yet.
     Untried,
     /// The port is not open, and why.
     BusDown(Option<String>),
@@ -92,7 +92,7 @@ pub enum Contact {
 /// The last order that concerns the run command.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RunOrder {
-    /// What it wanted of the motor.
+    /// Its purpose for the motor.
     pub run: RunWish,
     /// The result.
     pub fate: Fate,
@@ -106,7 +106,7 @@ pub struct RunOrder {
     pub age: Duration,
 }
 
-/// What a command wants of the motor.
+/// The purpose of a command for the motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RunWish {
     /// To run.
@@ -145,17 +145,17 @@ pub enum Giver {
     LocalControl,
 }
 
-/// What is known besides the points.
+/// The situation besides the points.
 pub struct Situation<'s> {
     /// When the reader looks.
     pub now: Instant,
-    /// Whether the drive can be asked.
+    /// Whether the drive can be reached.
     pub contact: Contact,
     /// When its process data was last read.
     pub read_at: Option<Instant>,
     /// Whether this gateway may command it.
     pub is_commandable: bool,
-    /// Why it takes no commands but stops, if that is so, and what ends that.
+    /// Why it accepts only stops, if so, and what ends that.
     pub held: Option<String>,
     /// The last order that concerns the run command; asked for only while the motor does not run.
     pub order: &'s dyn Fn() -> Option<RunOrder>,
@@ -244,7 +244,7 @@ impl Look<'_> {
         known.map(|(value, _)| value.as_f64() != 0.0).reduce(|a, b| a || b)
     }
 
-    /// The drive cannot be asked.
+    /// The drive cannot be reached.
     fn unreachable(&self) -> Option<Cause> {
         let read_at = self.situation.read_at;
         let (cause, evidence, remedy) = match &self.situation.contact {
@@ -386,7 +386,7 @@ impl Look<'_> {
         held.map(|why| self.cause("held", why, None, remedy))
     }
 
-    /// What is wrong with the commands.
+    /// Causes in the commands.
     fn command(&self, found: &[Cause]) -> Vec<Cause> {
         let order = (self.situation.order)();
         let reads = self.bit(ModelPoint::Run);
@@ -555,7 +555,7 @@ fn stopped(fate: Fate, text: &str) -> String {
     }
 }
 
-/// What a point reads, in words.
+/// The reading of a point, as text.
 fn reads(point: &Point, value: Value) -> String {
     let name = &point.name;
     match (point.text_of(value), value) {

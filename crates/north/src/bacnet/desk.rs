@@ -41,7 +41,7 @@ impl Ended {
     }
 }
 
-/// The protocol, what it shows, and what it waits for.
+/// The protocol, its objects and its pending requests.
 #[derive(Debug)]
 pub(super) struct Desk {
     plant: SharedPlant,

@@ -1,5 +1,5 @@
 //! Engineering Data Transaction, version 2: the table of all objects for the tool of an integrator, with the tables of
-//! states and units besides it. Pure.
+//! states and units next to it. Pure.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -15,7 +15,7 @@ pub struct Line {
     /// As it is usually written, such as `AI 2`.
     pub object: String,
     pub name: String,
-    /// What its values are.
+    /// The kind of its values.
     pub kind: String,
     /// The unit; empty without one.
     pub unit: String,

@@ -38,7 +38,7 @@ impl Offline {
         self.take_up(now);
     }
 
-    /// Tells the clients the result of their writes by now.
+    /// Sends the clients the results of their writes so far.
     pub fn collect(&mut self, now: Instant) {
         let mut place = 0;
         while let Some((_, waiting)) = self.waiting.get_mut(place) {

@@ -60,7 +60,7 @@ pub(super) struct Task {
     writes: FuturesUnordered<Ending>,
     /// Woken by every update of a drive.
     news: Arc<Notify>,
-    /// What was seen of each drive to which someone subscribes.
+    /// The last snapshot of each drive with subscriptions.
     seen: HashMap<u32, Arc<Snapshot>>,
     kept: Vec<KeptSlot>,
     /// Devices with a slot of before the restart against which the motor may run.
@@ -282,7 +282,7 @@ impl Task {
         let _ = tokio::task::spawn_blocking(move || kept::save(&path, &slots)).await;
     }
 
-    /// An event tells if a motor runs against a slot of before the restart.
+    /// Raises an event if a motor runs against a slot from before the restart.
     fn watch_kept(&mut self) {
         let view = &self.desk.view;
         self.watched.retain(|device| {

@@ -199,7 +199,7 @@ fn possible(handle: &DriveHandle, index: usize, value: Value, now: Instant) -> R
     }
 }
 
-/// How an outcome is told.
+/// The BACnet result of an outcome.
 pub(super) fn error(outcome: &Outcome) -> Result<(), Error> {
     Err(match outcome {
         Outcome::Acknowledged(_) => return Ok(()),

@@ -22,7 +22,8 @@ pub(crate) struct HoldReply<'r> {
     own: Option<bool>,
 }
 
-/// The fields of the hold wherever a drive is told. They are equal whatever time is left, which changes by itself.
+/// The fields of the hold in the JSON of a drive. They compare equal regardless of the time left, which changes by
+/// itself.
 #[derive(Debug, Clone, Default, Serialize, utoipa::ToSchema)]
 pub(crate) struct HoldFields {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -51,7 +52,7 @@ impl From<HoldView> for HoldFields {
 }
 
 impl<'r> HoldReply<'r> {
-    /// What is told of a drive.
+    /// The published state of a drive's hold.
     pub(crate) fn of(drive: &'r str, view: HoldView) -> HoldReply<'r> {
         HoldReply {
             drive,
@@ -63,7 +64,7 @@ impl<'r> HoldReply<'r> {
         }
     }
 
-    /// The result of an act; `seen` is what is told of the hold where it was refused.
+    /// The result of an action; `seen` is the hold's state if it was refused.
     pub(crate) fn new(drive: &'r str, done: Result<HoldView, Refusal>, seen: Option<HoldView>) -> HoldReply<'r> {
         let (hold, refusal) = match done {
             Ok(view) => (Some(view), None),

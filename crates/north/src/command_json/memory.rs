@@ -19,7 +19,7 @@ const MOST: usize = 1 << 18;
 pub(crate) struct Taken<'t> {
     /// Where it came in: its topic, or the user and the drive.
     pub(crate) topic: &'t str,
-    /// What it says.
+    /// Its payload.
     pub(crate) payload: &'t [u8],
     /// Where its result goes: response topic and correlation data.
     pub(crate) answer_to: (Option<&'t str>, Option<&'t [u8]>),
@@ -108,7 +108,7 @@ struct Known {
     answer_to: u64,
 }
 
-/// What is known of a message.
+/// The fingerprint of a message.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Fingerprint {
     /// Of everything but the packet id.
@@ -118,7 +118,7 @@ pub(crate) struct Fingerprint {
     answer_to: u64,
 }
 
-/// What a message repeats.
+/// Whether and what a message repeats.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Repetition<R> {
     /// A command whose result is the same now.

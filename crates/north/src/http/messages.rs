@@ -61,7 +61,7 @@ pub struct ExpectedDrive {
 }
 
 impl ExpectedDrive {
-    /// What a configuration says.
+    /// The expectation of a configuration.
     pub fn new(gateway: &str, bus: &BusSpec, drive: &DriveSpec) -> ExpectedDrive {
         ExpectedDrive {
             drive: drive.name.clone(),
@@ -116,7 +116,7 @@ pub enum RestoreAct {
         /// These alone; empty: all.
         #[serde(default)]
         only: Vec<String>,
-        /// What can be forced is a risk, not a refusal.
+        /// Treat refusals that can be forced as risks.
         #[serde(default)]
         force: bool,
     },
@@ -174,7 +174,7 @@ pub struct ParameterReading {
     pub done: usize,
     /// Addresses to ask in all.
     pub total: usize,
-    /// Time that it will still take, s, by what it took so far.
+    /// Estimated remaining time, s.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub remaining_s: Option<f64>,
     /// Why it waits.

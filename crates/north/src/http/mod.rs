@@ -303,7 +303,7 @@ struct HttpConnections {
     stopping: CancellationToken,
 }
 
-/// The place of a connection, and what it is for.
+/// The place of a connection, and its coverage.
 struct HttpPermit {
     permit: ConnectionPermit,
     coverage: Coverage,

@@ -39,7 +39,7 @@ pub(super) async fn points(
     Ok(Json(read(&drive, wanted, origin).await))
 }
 
-/// What is known of the points; those that are not polled are read as `origin`.
+/// Reads the points; those that are not polled are read from the drive as `origin`.
 async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) -> Vec<PointValue> {
     let profile = &drive.image.spec.profile;
     let now = Instant::now();

@@ -79,7 +79,7 @@ pub(crate) struct LocalUser {
     pub(crate) kind: SourceKind,
     /// Likewise, the user.
     pub(crate) who: Arc<str>,
-    /// What the connection proves of it.
+    /// The proof from its connection.
     pub(crate) proof: Proof,
     /// The gateway itself, where that has a configuration file.
     pub(crate) control: Option<Control>,

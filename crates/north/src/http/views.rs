@@ -77,7 +77,7 @@ pub(super) async fn health(State(app): State<Arc<AppState>>) -> Response {
     Json(Health { ready, reasons }).into_response()
 }
 
-/// The gateway reads its configuration again: 200 with what changed, 422 with the errors, and it goes on as before.
+/// Reloads the configuration: 200 with the changes, or 422 with the errors and nothing changed.
 pub(super) async fn reload(Extension(reached): Extension<Reached>, uri: Uri, request: Request) -> Response {
     let Some(local) = reached.local else {
         return unknown(uri).await;

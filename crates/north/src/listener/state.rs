@@ -32,7 +32,7 @@ pub(crate) struct ListenerState {
 }
 
 impl ListenerStates {
-    /// A listener that there is from now on.
+    /// Adds a listener.
     pub(crate) fn add(self: &Arc<Self>, server: ServerKind, address: SocketAddr) -> ListenerState {
         let mut all = self.lock();
         all.added += 1;

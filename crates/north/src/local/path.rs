@@ -165,7 +165,7 @@ async fn lock(directory: &Path) -> io::Result<File> {
     Err(io::Error::other("another program keeps its directory locked"))
 }
 
-/// Removes the socket that nobody listens on.
+/// Removes a stale socket.
 async fn remove_if_dead(path: &Path) -> io::Result<()> {
     let in_use = |why| Err(io::Error::new(io::ErrorKind::AddrInUse, why));
     match std::fs::symlink_metadata(path) {

@@ -158,7 +158,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
     }
 }
 
-/// What was counted of the drives that say whether they run.
+/// Counters of the drives that report whether they run.
 fn runs(plant: &Plant, all: &mut Families) {
     let starts = all.counter(
         "drivegate_drive_starts_total",

@@ -100,7 +100,7 @@ impl From<bool> for SeriesValue {
     }
 }
 
-/// What the series of one name have in common.
+/// The common part of the series of one name.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Family {
     pub(super) name: &'static str,

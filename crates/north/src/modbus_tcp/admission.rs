@@ -58,7 +58,7 @@ impl Policy {
         )
     }
 
-    /// What a client at this address may do if it shows no certificate; `None` if it may not connect.
+    /// The rights of a client at this address without a certificate; `None` if it may not connect.
     fn by_address(&self, address: IpAddr) -> Option<Authority> {
         contains(&self.allow, address).then(|| match &self.write {
             WriteAccess::ByAddress(write) if contains(write, address) => Authority::Write,
@@ -66,8 +66,8 @@ impl Policy {
         })
     }
 
-    /// What a client with TLS may do whose role grants `authority`; `None` if it may not connect. Its certificate and
-    /// its role are watched by the authenticator.
+    /// The rights of a TLS client whose role grants `authority`; `None` if it may not connect. The authenticator
+    /// watches its certificate and role.
     fn by_certificate(&self, address: IpAddr, authority: Authority) -> Option<Authority> {
         contains(&self.allow, address).then_some(authority)
     }

@@ -66,7 +66,7 @@ pub(super) enum Progress {
     Stopped(Header, RequestPdu, bool),
 }
 
-/// A request whose command is in the queue; nothing is left to do but wait. What it was is `None` once it is answered.
+/// A request whose command is in the queue and only waits for its result. Its content is `None` once it is answered.
 #[derive(Debug)]
 pub(super) enum PendingRequest {
     Forwarded(Option<Box<ForwardedRequest>>, Placed),
@@ -74,7 +74,7 @@ pub(super) enum PendingRequest {
     StopAll(Option<(Header, RequestPdu)>, oneshot::Receiver<bool>),
 }
 
-/// A request of which the bus has answered a command.
+/// A request with the result of a command.
 #[derive(Debug)]
 pub(super) enum AnsweredRequest {
     Forwarded(Box<ForwardedRequest>, Outcome),

@@ -46,7 +46,7 @@ pub(crate) enum NotModbus {
     Serial(&'static str),
 }
 
-/// What a connection begins with that never sent a frame of Modbus TCP, if it is a whole request of a serial line.
+/// The first bytes of a connection that never sent a Modbus TCP frame, if they are a complete serial request.
 pub(crate) fn of_serial_line(bytes: &[u8]) -> Option<NotModbus> {
     if bytes.first() == Some(&b':') {
         let whole = bytes.get(..ascii::request_len(bytes)?)?;

@@ -41,7 +41,7 @@ impl BrokerLimits {
         }
     }
 
-    /// What is lost with a broker that lacks something; each is the rest of a sentence about it.
+    /// What is lost with a broker that lacks a feature; each completes a sentence about it.
     pub(super) fn losses(&self) -> Vec<&'static str> {
         let all = [
             (

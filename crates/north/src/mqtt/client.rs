@@ -98,7 +98,7 @@ struct Client {
     events: Receiver<Arc<Event>>,
     topics: Topics,
     publisher: Publisher,
-    /// Of Home Assistant, if it is told.
+    /// The announcer for Home Assistant, if on.
     announcer: Option<Announcer>,
     /// Whether discovery messages of an earlier run were asked for, or need not be.
     leftovers_known: bool,
@@ -266,8 +266,8 @@ impl Client {
             .put_first(self.topics.status().into(), b"online".to_vec(), expiry.map(seconds));
     }
 
-    /// Ends the connection for this reason, and tells the broker. Once the status is `online`, the last will is true:
-    /// anyone who waits for the gateway learns that it is away.
+    /// Ends the connection for this reason, with notice to the broker. Once the status was `online`, the last will is
+    /// true: subscribers learn that the gateway is offline.
     fn give_up(&mut self, why: &str) {
         let true_now = self.is_ready();
         self.link.give_up(why, true_now);

@@ -118,7 +118,7 @@ impl Commands {
         }
     }
 
-    /// What the client that comes after goes on with, besides these results.
+    /// The state handed over to the next client, besides these results.
     pub(super) fn leave(self, results: Vec<Message>) -> OrdersLeft {
         OrdersLeft {
             waiting: self.waiting,

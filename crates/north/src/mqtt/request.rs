@@ -258,7 +258,7 @@ mod tests {
             (r#"{"run": false, "id": {}}"#, "`id` is a number or a string"),
             (
                 r#"{"run": false, "speed_reference": 1, "speed_reference": 2}"#,
-                "twice; name each point once",
+                "twice; set each point once",
             ),
         ] {
             let asked = set(payload).order.expect(payload);

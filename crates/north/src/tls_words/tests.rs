@@ -45,7 +45,7 @@ fn every_refusal_has_a_cause_and_a_remedy() {
         ),
         (
             of_webpki(webpki::Error::CaUsedAsEndEntity),
-            "one of a CA",
+            "a CA certificate",
             "name the certificate itself in mqtt.ca",
         ),
         (
@@ -65,10 +65,10 @@ fn every_refusal_has_a_cause_and_a_remedy() {
         ),
         (
             CertificateError::InvalidPurpose,
-            "must not be used by a server",
+            "is not valid for use by a server",
             "serverAuth",
         ),
-        (CertificateError::BadSignature, "not signed by the key", "mqtt.ca"),
+        (CertificateError::BadSignature, "not signed with the key", "mqtt.ca"),
         (CertificateError::UnknownIssuer, "not in mqtt.ca", "add"),
     ] {
         let text = refused(cause);

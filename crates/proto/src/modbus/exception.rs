@@ -21,7 +21,7 @@ impl Exception {
     pub const BUSY: Exception = Exception(0x06);
     /// 0x0A: the gateway has no way to that unit.
     pub const GATEWAY_PATH: Exception = Exception(0x0A);
-    /// 0x0B: the device behind the gateway does not answer.
+    /// 0x0B: the device behind the gateway does not reply.
     pub const GATEWAY_TARGET: Exception = Exception(0x0B);
 
     /// N2 error 00: the drive has restarted and waits for Identify.

@@ -1,4 +1,4 @@
-//! What no manual says of N2, in one place. Nothing here was verified on hardware.
+//! Assumptions about N2 that no manual confirms, in one place. Nothing here was verified on hardware.
 //!
 //! Johnson Controls' own specification is not public, and the manuals of the drives print no frame. What the frames
 //! rest on, and what may turn out otherwise with a real drive, is listed in [`ASSUMPTIONS`]; whatever matters to the
@@ -25,7 +25,7 @@ impl RegionWidth {
     }
 }
 
-/// What a profile says of its drives' N2.
+/// The N2 options of a profile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct N2Options {
     /// Bit of the status byte of BI and BO that is the state, 0..=7.
@@ -45,7 +45,7 @@ pub struct N2Options {
 }
 
 impl N2Options {
-    /// What holds where a profile says nothing.
+    /// The defaults.
     pub const DEFAULT: N2Options = N2Options {
         state_bit: 6,
         unreliable_bit: None,
@@ -75,9 +75,9 @@ pub const INVALID_FLOAT: u32 = 0x7FC0_0000;
 pub struct Assumption {
     /// Key of `[n2]` in a profile that changes it; `None` where nothing needs to be changed.
     pub key: Option<&'static str>,
-    /// What is assumed.
+    /// The assumption.
     pub what: &'static str,
-    /// What it rests on.
+    /// Its basis.
     pub why: &'static str,
     value: fn(&N2Options) -> String,
 }

@@ -215,7 +215,7 @@ fn bytes(digits: &[u8]) -> Result<Vec<u8>, u8> {
     super::bytes_of(digits).ok_or(SIZE)
 }
 
-/// What a drive answers.
+/// The reply of a drive.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Answer {
     /// Done; to a poll: nothing new.

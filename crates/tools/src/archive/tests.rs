@@ -136,7 +136,7 @@ fn what_a_backup_never_has_is_refused() {
     );
     refused(&sound, &[(CONFIG.0, b"[gatewax]\n", Regular)], "damaged");
     refused(&sound, &[(CONFIG.0, b"[gateway]", Regular)], "the manifest says 10");
-    refused(&sound, &[], "the archive was cut");
+    refused(&sound, &[], "the archive is truncated");
     let config = (CONFIG.0, CONFIG.1, Regular);
     refused(
         &sound,

@@ -34,9 +34,9 @@ pub(crate) struct Asked {
     path: String,
     body: String,
     pub(super) within: Duration,
-    /// What to do where the reply is lost.
+    /// The remedy if the reply is lost.
     lost: &'static str,
-    /// What to do where it is refused, unless the status says that.
+    /// The remedy if it is refused, unless the status gives it.
     refused: &'static str,
 }
 
@@ -76,12 +76,12 @@ impl Asked {
         }
     }
 
-    /// What to do where the reply is lost.
+    /// The remedy if the reply is lost.
     pub(crate) fn if_lost(self, lost: &'static str) -> Asked {
         Asked { lost, ..self }
     }
 
-    /// What to do where it is refused, unless the status says that.
+    /// The remedy if it is refused, unless the status gives it.
     pub(crate) fn if_refused(self, refused: &'static str) -> Asked {
         Asked { refused, ..self }
     }
@@ -92,7 +92,7 @@ impl Asked {
     }
 }
 
-/// A reply whose head has come.
+/// A reply whose head was received.
 pub(super) struct Opened {
     pub(super) status: StatusCode,
     pub(super) headers: HeaderMap,

@@ -1,4 +1,4 @@
-//! Which gateway is asked.
+//! Choosing the gateway.
 
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use crate::north::local::{RuntimeDirectories, SocketPath, absolute};
 /// Where `[http]` listens unless it says otherwise.
 const USUAL: &str = "http://127.0.0.1:9488";
 
-/// The options that say which gateway is asked, and how.
+/// The options that select the gateway and how to reach it.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct Gateway {
     /// Configuration file of the gateway, to use its local socket [default: /etc/drivegate/drivegate.toml].
@@ -36,7 +36,7 @@ impl Gateway {
         self.config.as_deref().unwrap_or(Path::new(DEFAULT_CONFIG))
     }
 
-    /// The HTTP server, if that is asked.
+    /// The HTTP server, if selected.
     pub(crate) fn network(&self) -> Option<Client> {
         let network = Network {
             url: self.url.clone()?,
@@ -48,8 +48,7 @@ impl Gateway {
 
     /// A client of the gateway that runs with the configuration, which may be invalid.
     ///
-    /// # Errors
-    /// It can be asked by no way.
+    /// # Errors It cannot be reached in any way.
     pub(crate) fn client(&self) -> Result<Client, String> {
         match self.network() {
             Some(client) => Ok(client),
@@ -59,8 +58,7 @@ impl Gateway {
 
     /// A client that only looks: of whichever gateway is found, unless one is named.
     ///
-    /// # Errors
-    /// It can be asked by no way.
+    /// # Errors It cannot be reached in any way.
     pub(crate) fn viewer(&self) -> Result<Client, String> {
         let mut client = self.client()?;
         if self.config.is_none() && self.url.is_none() {
@@ -79,8 +77,7 @@ impl Gateway {
 impl Client {
     /// Of the gateway that runs with that configuration: through its local socket, or where that is off by HTTP.
     ///
-    /// # Errors
-    /// It can be asked by no way.
+    /// # Errors It cannot be reached in any way.
     pub(crate) fn of_configuration(config: &Path) -> Result<Client, String> {
         let socket = Settings::socket_of(config, environment());
         let mut client = Client::at(&socket, Expected::Configuration(absolute(config)));

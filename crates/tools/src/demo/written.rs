@@ -92,6 +92,10 @@ mod tests {
         written.write("[gateway]\n").unwrap();
         assert!(Written::prepare(&place).is_ok());
         std::fs::write(written.config(), "[gateway]\n").unwrap();
-        assert!(Written::prepare(&place).unwrap_err().contains("is not of a demo"));
+        assert!(
+            Written::prepare(&place)
+                .unwrap_err()
+                .contains("does not belong to a demo")
+        );
     }
 }

@@ -116,7 +116,7 @@ mod tests {
         );
         assert!(page.contains("http &quot;alice&quot; &amp; co"), "{page}");
         assert!(page.contains("at most 8.00 s"), "{page}");
-        assert_eq!(page.matches("not tried").count(), 2, "{page}");
+        assert_eq!(page.matches("not tested").count(), 2, "{page}");
         assert!(
             !page.contains("http://") && !page.contains("https://"),
             "nothing is loaded"

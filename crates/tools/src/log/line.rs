@@ -21,7 +21,7 @@ const KINDS: usize = 1024;
 /// Own targets begin with this.
 const OWN: &str = "drivegate";
 
-/// What is made of an event.
+/// The form of a log line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Form {
     /// An entry of the journal, with fields.

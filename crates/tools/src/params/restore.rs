@@ -1,4 +1,4 @@
-//! `drivegate params restore` and `clone`: what would be written, then that written.
+//! `drivegate params restore` and `clone`: show the plan, then write it.
 
 use std::io::{BufRead as _, IsTerminal as _, Write as _};
 use std::path::PathBuf;
@@ -168,7 +168,7 @@ fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> 
     }
 }
 
-/// What would be written.
+/// The plan, as text.
 fn told(prepared: &Restore) -> String {
     let plan = prepared.plan.clone().unwrap_or_default();
     let risks = prepared

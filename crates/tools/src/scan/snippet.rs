@@ -289,7 +289,7 @@ mod tests {
         ] {
             assert!(text.contains(wanted), "{wanted} is not in\n{text}");
         }
-        assert!(text_of("tcp://server:4001", &drives).contains("write what is set there"));
+        assert!(text_of("tcp://server:4001", &drives).contains("enter its settings here"));
     }
 
     #[test]

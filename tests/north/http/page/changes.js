@@ -166,7 +166,7 @@ async function connectionIsLostAndFound(gateway, page) {
   const seen = await page.eval(() => [document.getElementById("link-text").textContent, document.getElementById("banner").textContent, getComputedStyle(document.querySelector(".rows .row .state")).filter,
     getComputedStyle(document.querySelector(".rows .value")).textDecorationLine]);
   assert.equal(seen[0], "Connection lost");
-  assert.match(seen[1], /^No connection to the gateway since .*\. What is shown below is old/);
+  assert.match(seen[1], /^No connection to the gateway since .*\. The data below is out of date/);
   assert.deepEqual(seen.slice(2), ["grayscale(1)", "line-through"]);
   gateway.silent = false;
   await page.until(() => !document.body.classList.contains("lost"));

@@ -245,7 +245,7 @@ impl Holding {
         match (asks, who) {
             (Asks::Nothing, _) => {}
             (Asks::Stop, _) if repeats => {}
-            (Asks::Stop, None) => self.ends("somebody stopped the drive", told),
+            (Asks::Stop, None) => self.ends("someone stopped the drive", told),
             (Asks::Stop, Some(who)) => self.stopped(who, rules, now, told),
             (Asks::Run | Asks::Steer, Some(who)) => self.taken(who, rules, now, told),
             (Asks::Other, Some(who)) => self.renew(who, rules, now),

@@ -1,4 +1,4 @@
-//! How a plan is made: what differs between two drives, what is left out, what speaks against it.
+//! Making a plan: differences between two drives, exceptions, reasons against it.
 
 use std::collections::BTreeSet;
 
@@ -144,7 +144,7 @@ impl<'a> Making<'a> {
         }
     }
 
-    /// What the user named has to be there on both sides.
+    /// Parameters named by the user must exist on both sides.
     fn look_for_named(&mut self) {
         let missing = |id: &Id| {
             let side = [(self.wanted, "the file"), (self.present, "the drive")];
@@ -159,7 +159,7 @@ impl<'a> Making<'a> {
         self.refused.extend(missing);
     }
 
-    /// What differs: written, left out, or refused.
+    /// Sorts the differences: written, left out, or refused.
     fn collect(&mut self) {
         let (profile, wanted) = (self.profile, self.wanted);
         let all = wanted.read_values();

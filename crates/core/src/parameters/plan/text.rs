@@ -1,4 +1,4 @@
-//! A plan as text: what a dry run shows.
+//! A plan as text, as shown by a dry run.
 
 use std::fmt::{self, Display};
 
@@ -31,7 +31,7 @@ pub(super) fn list(ids: &[Id]) -> String {
     }
 }
 
-/// What would be done, a line each; ends with a line feed.
+/// The steps, one line each; ends with a line feed.
 impl Display for Plan {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.writes.len() {

@@ -1,4 +1,4 @@
-//! What a family says about writing its parameters back: what is left alone, in which order, how the drive keeps them.
+//! A family's rules for writing parameters back: exceptions, order, saving.
 
 use std::ops::RangeInclusive;
 
@@ -23,7 +23,7 @@ pub struct WriteRules {
     pub save: Option<(u16, u16)>,
     /// Parameters that the drive takes in one mode only.
     pub lock: Option<Lock>,
-    /// What people should know before they write; empty if nothing.
+    /// A note to read before writing; empty if none.
     pub note: String,
 }
 
@@ -46,7 +46,7 @@ pub struct Lock {
     pub point: usize,
     /// Exception code of the refusal; N2 codes with 0x80 added. None where no manual says.
     pub exception: Option<u8>,
-    /// What to do.
+    /// The remedy.
     pub remedy: String,
 }
 

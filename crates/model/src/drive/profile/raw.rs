@@ -28,11 +28,11 @@ pub struct Raw {
     pub form: Form,
     /// Order of the bytes over all registers of the value.
     pub order: Order,
-    /// Bits taken as they stand, shifted down to bit 0.
+    /// Selected bits, shifted down to bit 0.
     pub mask: Option<u64>,
     /// The count that means true; the point is true or false then.
     pub equals: Option<Equals>,
-    /// What the registers hold, before `mask`, while there is no value.
+    /// Register contents, before `mask`, that mean "no value".
     pub invalid: Vec<u64>,
     /// Engineering value of one count.
     pub scale: f64,
@@ -57,7 +57,7 @@ pub enum Unwritable {
     /// The value does not fit the type of the register.
     #[error("{value} does not fit the register, which holds {least} to {most}")]
     Type {
-        /// Value asked for.
+        /// The requested value.
         value: f64,
         /// Least value of the register in engineering units.
         least: f64,
@@ -67,21 +67,21 @@ pub enum Unwritable {
     /// A whole number that a command does not carry to the last digit.
     #[error("{value} is beyond 2^53, where a number of a command is no longer exact")]
     Rounded {
-        /// Value asked for.
+        /// The requested value.
         value: f64,
     },
     /// The drive would take it for no value.
     #[error("{value} is a raw value that means \"not available\"")]
     Invalid {
-        /// Value asked for.
+        /// The requested value.
         value: f64,
     },
-    /// There is no way back from the value to its registers.
+    /// The value cannot be converted back to its registers.
     #[error("the point is read-only")]
     ReadOnly,
 }
 
-/// What the registers hold.
+/// The content of the registers.
 enum Count {
     Whole(i128),
     Real(f64),

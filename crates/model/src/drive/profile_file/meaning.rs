@@ -1,4 +1,4 @@
-//! What is made of a raw value: `mask`, `equals`, `invalid`, `scale_from`.
+//! The interpretation of a raw value: `mask`, `equals`, `invalid`, `scale_from`.
 
 use super::super::profile::{Equals, Form, Raw};
 use super::derived::point_of;

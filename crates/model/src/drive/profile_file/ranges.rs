@@ -1,4 +1,5 @@
-//! `[[range]]`, `[ranges]` and `address_offset`: what may be read and written together, and by which functions.
+//! `[[range]]`, `[ranges]` and `address_offset`: addresses that may be read and written together, and with which
+//! functions.
 
 use std::collections::BTreeMap;
 

@@ -648,9 +648,12 @@ fn each_mistake_of_a_value() {
         ),
         (
             "type = \"string:2\"\nwrite = true",
-            "there is no way back; m:14, point[0].write",
+            "cannot be converted back; m:14, point[0].write",
         ),
-        ("equals = 1\nwrite = true", "there is no way back; m:14, point[0].write"),
+        (
+            "equals = 1\nwrite = true",
+            "cannot be converted back; m:14, point[0].write",
+        ),
         (
             "unlisted = true\nwrite = true",
             "only a writable enumeration; m:13, point[0].unlisted",

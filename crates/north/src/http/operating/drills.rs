@@ -15,7 +15,7 @@ use super::super::routes::AppState;
 use super::Commander;
 use crate::drill::{DrillRefusal, DrillReport, Kind};
 
-/// What is to be tried.
+/// The requested drill.
 #[derive(Debug, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct DrillWish {

@@ -182,8 +182,8 @@ impl Operating {
         self.users.load().is_some()
     }
 
-    /// From now on these users may command; `None`: nobody. Sessions of users who were removed, or have another password,
-    /// end.
+    /// Sets the users who may command; `None`: commands are off. Sessions of users who were removed, or have a new
+    /// password, end.
     pub(super) fn set_users(&self, users: Option<Users>) {
         let before = self.users.swap(users.map(Arc::new));
         let after = self.users.load_full();
@@ -198,8 +198,8 @@ impl Operating {
         state.operators.retain(|_, (user, _)| stays(user));
     }
 
-    /// What connections from an address may be relied on for: those of addresses from which a user did something of late do
-    /// not yield to others, and have places of their own.
+    /// The authority of connections from an address: those from addresses where a user was recently active do not yield
+    /// to others, and have reserved places.
     pub(super) fn authority_at(&self, address: IpAddr, now: Instant) -> Authority {
         if !self.is_on() {
             return Authority::ReadOnly;
@@ -354,7 +354,7 @@ impl Operating {
             .is_some_and(|users| users.named(&user.name) == Some(user))
     }
 
-    /// What is kept of a user and a password that were right.
+    /// The stored mark of a verified user and password.
     fn mark(&self, given: &Credentials) -> Option<[u8; 32]> {
         // A name has no zero byte: a user would not be found.
         let text = format!("{}\0{}", given.user, given.password);

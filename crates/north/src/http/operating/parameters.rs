@@ -20,7 +20,7 @@ use crate::plant::DriveHandle;
 /// Most bytes of a request: a file of some thousand parameters.
 const MAX_BODY: usize = 256 * 1024;
 
-/// `POST …/params/reading`: begins to read, unless that goes on.
+/// `POST …/params/reading`: starts a reading, unless one is in progress.
 pub(in crate::http) async fn read(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,

@@ -455,7 +455,7 @@ fn a_refusal_of_the_queue_has_its_reason() {
     assert_eq!(results.len(), 2);
     assert_eq!(results[0]["error"]["code"], "queue_full");
     let text = results[0]["error"]["message"].as_str().unwrap();
-    assert!(text.starts_with("64 commands wait already"), "{text}");
+    assert!(text.starts_with("64 commands are already waiting"), "{text}");
     assert_eq!(bench.queued(), crate::command::CAPACITY);
 }
 

@@ -293,7 +293,7 @@ impl DriveEntities<'_> {
         ("sensor_state".to_string(), entity.into())
     }
 
-    /// The state has its text besides it even if the code is zero; a topic of its own is then empty.
+    /// The state has its text next to it even if the code is zero; a topic of its own is then empty.
     fn fault_text(&self) -> (String, Value) {
         let mut entity = self.entity(Platform::Sensor, "fault_text");
         let topics = &self.sources.topics;

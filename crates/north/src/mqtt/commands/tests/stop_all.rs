@@ -60,7 +60,7 @@ fn a_drive_that_is_not_proven_to_stand_is_named() {
     assert!(
         answer["drives"][0]["reason"]
             .as_str()
-            .is_some_and(|why| why.contains("not read since"))
+            .is_some_and(|why| why.contains("not been read since"))
     );
 }
 
