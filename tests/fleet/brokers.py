@@ -19,11 +19,22 @@ class Node:
         self.process = None
 
     def start(self):
+        self.spawn()
+        until(f"{self.broker.name} {self.number}", self.is_up, 60)
+
+    def spawn(self):
         command, environment = self.broker.command(self)
         with open(self.directory / "log", "ab") as log:
             self.process = subprocess.Popen([str(each) for each in command], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                                             cwd=self.directory, env=os.environ | environment, start_new_session=True)
-        until(f"{self.broker.name} {self.number}", lambda: listens(self.port), 60)
+
+    def is_up(self):
+        """As systemd does it: a node that ends by itself is started again after a second."""
+        if self.process.poll() is not None:
+            print(f"    {self.broker.name} {self.number} ended by itself", flush=True)
+            time.sleep(1)
+            self.spawn()
+        return listens(self.port)
 
     def send(self, number):
         os.killpg(self.process.pid, number)

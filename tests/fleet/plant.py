@@ -197,9 +197,9 @@ class Gateway:
 
         certificates = self.plant.certificates
         return {
-            "gateway": {"name": self.name, "socket": "socket", "state_dir": "state", "stale_after": "5s"},
+            "gateway": {"name": self.name, "socket": "socket", "state_dir": "state"},
             "bus": [bus("a", [drive("a1", 1), drive("a2", 2)]), bus("b", [drive("b1", 1) | {"unit": 11}])],
-            "modbus_tcp": {"listen": [f"127.0.0.1:{self.modbus}"], "write": ["127.0.0.1/32"]},
+            "modbus_tcp": {"listen": [f"127.0.0.1:{self.modbus}"], "write": ["127.0.0.1/32"], "stale_after": "5s"},
             "mqtt": {"url": f"mqtts://localhost:{self.plant.broker_tls}", "ca": certificates.path("authority.crt"),
                      "certificate": certificates.path("client.crt"), "key": certificates.path("client.key"),
                      "topics": ["state"]},
@@ -296,9 +296,11 @@ password_file {passwords}
             (gateway.directory / "state").mkdir()
             gateway.start()
         for gateway in self.gateways:
-            until(f"the start of {gateway.name}", lambda: gateway.socket.exists() and self.is_whole(gateway), 120)
+            until(f"the start of {gateway.name}", lambda: self.is_whole(gateway) and gateway.socket.exists(), 120)
 
     def is_whole(self, gateway):
+        if gateway.process.poll() is not None:
+            raise SystemExit(f"{gateway.name} ended; {gateway.directory}.log says why")
         try:
             drives = gateway.drive_states()
             return all(each["online"] for each in drives.values()) and gateway.metric("drivegate_mqtt_connected") == 1
