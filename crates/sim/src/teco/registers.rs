@@ -8,7 +8,7 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 /// Functions that the card knows.
 const FUNCTIONS: [u8; 4] = [0x03, 0x06, 0x08, 0x10];
 /// Registers per message.
-const MOST: u16 = 16;
+const MOST_REGISTERS: u16 = 16;
 /// 00H: wrong check code.
 pub(super) const CHECK_ERROR: Exception = Exception(0x00);
 /// 21H: value out of range, or a parameter that may not be written over the bus.
@@ -33,7 +33,7 @@ enum Register {
 }
 
 fn span(start: u16, count: u16) -> Result<std::ops::Range<u16>, Exception> {
-    if !(1..=MOST).contains(&count) {
+    if !(1..=MOST_REGISTERS).contains(&count) {
         return Err(Exception::VALUE);
     }
     start.checked_add(count).map(|end| start..end).ok_or(Exception::ADDRESS)
@@ -69,7 +69,7 @@ pub(super) fn refusal(pdu: &[u8], exception: Exception) -> Option<Exception> {
     };
     match function {
         _ if !whole => None,
-        0x03 | 0x10 if !count().is_some_and(|count| (1..=MOST).contains(&count)) => Some(Exception::VALUE),
+        0x03 | 0x10 if !count().is_some_and(|count| (1..=MOST_REGISTERS).contains(&count)) => Some(Exception::VALUE),
         _ => Some(exception),
     }
 }
