@@ -12,7 +12,7 @@ use self::drive::{Drive, Start};
 use super::command_run::{CommandRun, KnownWords, Next, Step};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Admitted, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats, written};
-use crate::drive::control::{Control, OwnWord, Place, Run, Setting};
+use crate::drive::control::{Control, ControlItem, OwnWord, Run, Setting};
 use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, Profile, Raw, Value};
 
@@ -440,7 +440,7 @@ impl<'p> Case<'p> {
             return Ok(());
         };
         for (address, word) in items {
-            let place = Place { table, address };
+            let place = ControlItem { table, address };
             if place == self.control.at && !is_coil(place) && !self.keeps_always(word) {
                 return Err(self.wrong("a word lacks a bit of `always`", progress));
             }
@@ -461,7 +461,7 @@ impl<'p> Case<'p> {
         self.control.always.holds(word) || wholes.any(|setting| setting.mask == u16::MAX && setting.value == word)
     }
 
-    fn says_both(&self, place: Place, word: u16) -> bool {
+    fn says_both(&self, place: ControlItem, word: u16) -> bool {
         let Run::Pair { forward, reverse } = &self.control.run else {
             return false;
         };
@@ -551,7 +551,7 @@ fn different(frames: &[String]) -> Vec<usize> {
         .collect()
 }
 
-fn is_coil(place: Place) -> bool {
+fn is_coil(place: ControlItem) -> bool {
     matches!(place.table, Table::Coil | Table::DiscreteInput)
 }
 

@@ -15,7 +15,7 @@ use tokio::sync::oneshot::error::TryRecvError;
 use super::command_run::KnownWords;
 use super::news::{Adopted, News};
 use crate::command::{Answer, Outcome, Refusal};
-use crate::drive::control::Place;
+use crate::drive::control::ControlItem;
 use crate::drive::{
     COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Value,
 };
@@ -387,7 +387,7 @@ fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_va
         return Some(run.as_bool());
     }
     let run = reading.spec.profile.run_place();
-    let is_read = |place: Place| {
+    let is_read = |place: ControlItem| {
         let word = reading.words(place.table, place.address, 1);
         matches!(word, Ok(_) | Err(Unavailable::Stale))
     };

@@ -6,7 +6,7 @@ use super::standing::keeps_limits;
 use super::{Authority, Order, ParameterOrder, Refusal, Urgency};
 use crate::codec::n2::Object;
 use crate::codec::{Protocol, RequestPdu, Table};
-use crate::drive::control::Place;
+use crate::drive::control::ControlItem;
 use crate::drive::model::Kind;
 use crate::drive::profile::AddressRange;
 use crate::drive::{Derived, ModelPoint, Point, Source, Value};
@@ -502,7 +502,7 @@ fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Res
     };
     let refused = |(address, word): &&(u16, u16)| {
         !control.admits(
-            Place {
+            ControlItem {
                 table,
                 address: *address,
             },

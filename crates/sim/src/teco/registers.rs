@@ -1,7 +1,7 @@
-//! The registers of the simulated TECO 7300PA and the order of its refusals (drives.md 5.2 to 5.6).
+//! The registers of the simulated TECO 7300PA and the order of its refusals (reference/drives.md 5.2 to 5.6).
 
 use super::super::model::{Model, unsigned};
-use super::parameters::{self, Place};
+use super::parameters::{self, RegisterKind};
 use super::{Mode, TecoDrive, TecoOptions};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 
@@ -27,7 +27,7 @@ const VERSION: u16 = 10;
 enum Register {
     Control,
     Monitor,
-    Parameter(Place),
+    Parameter(RegisterKind),
     Save,
     Trip,
 }
@@ -39,7 +39,7 @@ fn span(start: u16, count: u16) -> Result<std::ops::Range<u16>, Exception> {
     start.checked_add(count).map(|end| start..end).ok_or(Exception::ADDRESS)
 }
 
-/// Broadcasts write the operation signals and the frequency reference only (drives.md 9.9).
+/// Broadcasts write the operation signals and the frequency reference only (reference/drives.md 9.9).
 pub(super) fn allows_broadcast(request: &RequestPdu) -> bool {
     let allowed = 1..=2u16;
     match request {
@@ -53,7 +53,7 @@ pub(super) fn allows_broadcast(request: &RequestPdu) -> bool {
 }
 
 /// The reply to a PDU that is not a valid request, for which a plain slave returns `exception`. Incomplete messages get
-/// none, nor do those whose byte count does not match the bytes (drives.md 5.6, 9.8).
+/// none, nor do those whose byte count does not match the bytes (reference/drives.md 5.6, 9.8).
 pub(super) fn refusal(pdu: &[u8], exception: Exception) -> Option<Exception> {
     let (&function, body) = pdu.split_first()?;
     if !FUNCTIONS.contains(&function) {
