@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use super::confirm::Unconfirmed;
 use crate::codec::Exception;
 use crate::command::{Origin, Refusal};
-use crate::drive::PlannedRead;
+use crate::drive::{DriveIndex, PlannedRead};
 
 /// One piece of news. Drives are named by their place on the bus.
 #[derive(Debug, Clone, PartialEq)]
@@ -17,7 +17,7 @@ pub enum News {
     /// The drive answered a read of the plan.
     Read {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// What was read.
         read: PlannedRead,
         /// What it said, a word for each item.
@@ -26,23 +26,23 @@ pub enum News {
         at: Instant,
     },
     /// The drive answers (again).
-    Online(usize),
+    Online(DriveIndex),
     /// The drive does not answer any more.
-    Offline(usize),
+    Offline(DriveIndex),
     /// The drive has started anew: nothing that is known of it holds.
-    Restarted(usize),
+    Restarted(DriveIndex),
     /// The drive says that it is a device of that N2 type, not the one that its profile expects.
-    Unlike(usize, u8),
+    Unlike(DriveIndex, u8),
     /// The drive refuses these addresses.
-    Unavailable(usize, PlannedRead, Exception),
+    Unavailable(DriveIndex, PlannedRead, Exception),
     /// An acknowledged command showed no effect in time.
-    NotConfirmed(usize, Unconfirmed),
+    NotConfirmed(DriveIndex, Unconfirmed),
     /// The lease of a drive that runs ran out.
-    LeaseRanOut(usize),
+    LeaseRanOut(DriveIndex),
     /// The action of a lease that ran out cannot be written.
     ActionRefused {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// The command in one line.
         what: String,
         /// Why not.
@@ -51,23 +51,23 @@ pub enum News {
     /// The action of a lease that ran out was tried, and failed; why, unless that was told before.
     ActionFailed {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// Why, for people.
         why: Option<String>,
     },
     /// The action of a lease that ran out was acknowledged after so many tries that failed.
     ActionTaken {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// How many.
         failures: u32,
     },
     /// A drive whose lease ran out does not say whether it runs.
-    RunningUnknown(usize),
+    RunningUnknown(DriveIndex),
     /// A command that waited, or was begun, is refused: it may not start its motor.
     StartRefused {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// Who gave it.
         origin: Origin,
         /// The command in one line.
@@ -78,12 +78,12 @@ pub enum News {
     /// An interlock does not hold, and the motor is stopped by that.
     Tripped {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// Which interlock, and why it does not hold.
         why: String,
     },
     /// A supervised drive runs, and no client is known to have commanded it; whether its lease starts by that.
-    RunsUnsupervised(usize, Adopted),
+    RunsUnsupervised(DriveIndex, Adopted),
 }
 
 /// Whether a drive that ran when the gateway started got its lease started.

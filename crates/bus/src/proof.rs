@@ -14,7 +14,7 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Admitted, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats, written};
 use crate::drive::control::{Control, ControlItem, OwnWord, Run, Setting};
 use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Profile, Raw, Value};
+use crate::drive::{DriveIndex, ModelPoint, Profile, Raw, Value};
 
 /// Requests after which a command should have ended, reads of a state for which it waits among them.
 const MOST_FRAMES: usize = 1000;
@@ -258,7 +258,10 @@ impl<'p> Case<'p> {
             reference_only: false,
             ranges: Vec::new(),
         };
-        CommandRun::new(Command::new(0, admitted, expires, ticket), self.profile)
+        CommandRun::new(
+            Command::new(DriveIndex::new(0), admitted, expires, ticket),
+            self.profile,
+        )
     }
 
     /// Runs the command to its end with that event; its requests.

@@ -12,6 +12,7 @@ use tokio::sync::oneshot;
 
 use super::{Command, Effect, Order, Outcome, SourceKind, Ticket, Touched, Urgency};
 use crate::codec::RequestPdu;
+use crate::drive::DriveIndex;
 
 /// Background requests that may wait on one bus.
 pub const BACKGROUND_CAPACITY: usize = 32;
@@ -42,13 +43,13 @@ impl Pace {
 }
 
 /// The index of no drive: that of a request to an address of the line at which none is configured.
-pub const NO_DRIVE: usize = usize::MAX;
+pub const NO_DRIVE: DriveIndex = DriveIndex::new(usize::MAX);
 
 /// A request of the lowest rank: one exchange with one drive.
 #[derive(Debug)]
 pub struct BackgroundRequest {
     /// Index of the drive on its bus, or [`NO_DRIVE`].
-    pub drive: usize,
+    pub drive: DriveIndex,
     /// What is asked. Whoever submits a write has checked that it is allowed.
     pub pdu: RequestPdu,
     /// How much of a busy line it may take.
@@ -69,11 +70,11 @@ pub struct PassedOn {
     /// It may change anything in whoever hears it.
     pub may_write: bool,
     /// The drives of the bus that hear it.
-    pub reach: Vec<usize>,
+    pub reach: Vec<DriveIndex>,
     /// Those of them whose run command it takes away.
-    pub stops: Vec<usize>,
+    pub stops: Vec<DriveIndex>,
     /// What it means for the priority arrays of those that hear it.
-    pub effects: Vec<(usize, Effect)>,
+    pub effects: Vec<(DriveIndex, Effect)>,
     /// It stops all that hear it, and goes before all that waits.
     pub first: bool,
     /// Where the frame of the reply goes, as the drive sent it.

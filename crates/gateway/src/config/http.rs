@@ -101,7 +101,7 @@ fn credentials<C: Credential>(
             Some(all)
         }
         Err((line, error)) => {
-            let remedy = format!("remove the line, and make another with `drivegate {kind} add`");
+            let remedy = format!("remove the line, and create another with `drivegate {kind} add`");
             reader.problem(key, format!("{path}:{line}: {error}"), remedy);
             None
         }
