@@ -12,7 +12,7 @@
 //!
 //! This package holds `main` and gives every crate of `crates/` the name of its room; Cargo enforces which may use which.
 //! From the bottom: [`codec`] (`drivegate-proto`), [`bacnet`] (`-bacnet`), [`drive`] and [`document`] (`-model`), [`command`], [`process_image`],
-//! [`history`], [`parameters`], [`diagnosis`], [`event`], [`files`], [`plant`], [`start_guard`], [`stop_all`], [`version`] (`-core`), [`mod@line`], [`bus`],
+//! [`history`], [`parameters`], [`diagnosis`], [`event`], [`files`], [`plant`], [`spec`], [`start_guard`], [`stop_all`], [`version`] (`-core`), [`mod@line`], [`bus`],
 //! [`north`], [`sim`], [`config`] and [`daemon`] (`-gateway`), [`cli`] (`-tools`).
 //!
 //! Deliberately absent:
@@ -37,6 +37,7 @@ pub use drivegate_core::history;
 pub use drivegate_core::parameters;
 pub use drivegate_core::plant;
 pub use drivegate_core::process_image;
+pub use drivegate_core::spec;
 pub use drivegate_core::start_guard;
 pub use drivegate_core::stop_all;
 pub use drivegate_core::version;

@@ -11,7 +11,7 @@ use drivegate::codec::wire::Silence;
 use drivegate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
 use drivegate::command::{CommandQueue, NO_DRIVE, WriteStats};
 use drivegate::drive::profile::Profiles;
-use drivegate::drive::{PollClass, Profile};
+use drivegate::drive::{DriveIndex, PollClass, Profile};
 use drivegate::event::Events;
 use drivegate::line::LineOptions;
 use drivegate::plant::BusHandle;
@@ -339,7 +339,7 @@ impl WorldBus {
         self.exchanges += 1;
         let turn = self.core.asked().expect("a turn is on the line");
         let asked = Asked {
-            drive: turn.drive,
+            drive: turn.drive.place(),
             pdu: turn.pdu().clone(),
             at: now,
             is_poll: matches!(turn.purpose, Purpose::Poll(_)),
@@ -355,7 +355,7 @@ impl WorldBus {
             acted: 0,
         };
         seen.push(Seen::Sent(asked.clone()));
-        if asked.drive == NO_DRIVE {
+        if NO_DRIVE == asked.drive {
             self.broadcast = Some(asked.clone());
         }
         self.asked = Some(asked);
@@ -392,7 +392,7 @@ impl WorldBus {
                 .handle
                 .image
                 .drives
-                .get(asked.drive)
+                .get(DriveIndex::new(asked.drive))
                 .is_none_or(|image| image.spec.address == act.address);
             if let Some(broadcast) = self.broadcast.as_mut().filter(|_| !is_asked) {
                 // A drive may carry a broadcast out when another one is asked already.
@@ -400,7 +400,7 @@ impl WorldBus {
                 seen.push(Seen::Acted(broadcast.clone()));
                 continue;
             }
-            let Some(image) = self.handle.image.drives.get(asked.drive) else {
+            let Some(image) = self.handle.image.drives.get(DriveIndex::new(asked.drive)) else {
                 // None is configured at that address.
                 seen.push(Seen::Acted(asked.clone()));
                 continue;

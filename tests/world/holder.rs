@@ -19,6 +19,7 @@ use drivegate::start_guard::Guard;
 use super::bus::{Parts, Seen};
 use super::rig::{PATIENCE, Rig, line};
 use super::scenario::Line;
+use drivegate::drive::DriveIndex;
 
 const SECOND: Duration = Duration::from_secs(1);
 const LEASE: Duration = Duration::from_secs(3);
@@ -127,7 +128,7 @@ impl Play {
 
     fn holder(&self, drive: usize) -> (HoldState, String) {
         let queue = self.rig.bus.handle.queue.lock();
-        let (view, _) = queue.hold_view(drive, None, self.rig.now).unwrap();
+        let (view, _) = queue.hold_view(DriveIndex::new(drive), None, self.rig.now).unwrap();
         (
             view.state,
             view.holder.map(|holder| holder.to_string()).unwrap_or_default(),

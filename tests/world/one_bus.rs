@@ -53,7 +53,7 @@ fn the_frames_on_the_line_are_those_of_the_reference() {
     assert!(rig.set(1, &[("fault_reset", 1.0)]).is_ok());
     let requests = rig.requests();
     let last = |frame: &str| requests.iter().rev().find(|request| hex(request) == frame);
-    // drives.md 7.1 and 7.4, misprints corrected.
+    // reference/drives.md 7.1 and 7.4, misprints corrected.
     for (meaning, frame) in [
         ("read 2101..2111", "01 03 08 34 00 0B 47 A3"),
         ("read 42001..42003", "01 03 07 D0 00 03 05 46"),

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use drivegate::codec::{Protocol, RequestPdu, Table};
 use drivegate::command::{BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket};
-use drivegate::drive::ModelPoint;
+use drivegate::drive::{DriveIndex, ModelPoint};
 use drivegate::parameters::{Entry, Names, Next, ParameterFile, Reading, differences};
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::random::Random;
@@ -26,7 +26,7 @@ impl Rig {
         let writes = self.plant.writes.clone();
         let (ticket, mut answer) = Ticket::new(origin, "d0-1", String::new(), false, self.now, writes);
         let request = BackgroundRequest {
-            drive: 0,
+            drive: DriveIndex::new(0),
             pdu,
             pace: Pace::Slow,
             expires: self.now + PATIENCE,

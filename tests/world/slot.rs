@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use drivegate::codec::{LineFormat, Protocol, RequestPdu, Table};
 use drivegate::command::Urgency;
-use drivegate::drive::ModelPoint;
+use drivegate::drive::{DriveIndex, ModelPoint};
 use drivegate::north::slot::{Offline, Slot, SlotAccess};
 use drivegate::north::{NorthStats, SlotOutcome};
 use drivegate::process_image::Access;
@@ -167,7 +167,7 @@ impl ToolRig {
             .handle
             .image
             .drives
-            .get(asked.drive)
+            .get(DriveIndex::new(asked.drive))
             .map(|drive| drive.spec.address);
         let Some(question) = &mut self.question else { return };
         let same = address.is_none_or(|address| address == question.address) && asked.pdu == question.pdu;

@@ -24,7 +24,7 @@ use crate::codec::{Exception, Reply, Table};
 use crate::command::{
     Command, Interruption, Order, Origin, Outcome, Receipt, Refusal, SourceKind, Ticket, Touched, Urgency,
 };
-use crate::drive::Profile;
+use crate::drive::{DriveIndex, Profile};
 
 /// Most stops to a drive that are sent before the end of a started pulse.
 const MOST_STOPS: u32 = 8;
@@ -204,7 +204,7 @@ impl CommandRun {
     ///
     /// # Errors
     /// It is none.
-    pub fn into_stop(mut self, drive: usize) -> Result<Command, Box<CommandRun>> {
+    pub fn into_stop(mut self, drive: DriveIndex) -> Result<Command, Box<CommandRun>> {
         let Some(order) = self.stop.clone().filter(|_| self.is_of_client()) else {
             return Err(Box::new(self));
         };

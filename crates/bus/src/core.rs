@@ -14,6 +14,7 @@ use super::tap::Tap;
 use super::transaction::Ended;
 use crate::codec::{Exception, Reply, Request};
 use crate::command::{Outcome, Urgency, WriteStats};
+use crate::drive::DriveIndex;
 use crate::event::Events;
 use crate::plant::BusHandle;
 use crate::process_image::Taping;
@@ -377,8 +378,8 @@ impl BusCore {
     }
 
     /// The drive of a turn, unless no entry names it.
-    fn known(&self, turn: &Turn) -> Option<usize> {
-        Some(turn.drive).filter(|drive| *drive < self.bus.image.drives.len())
+    fn known(&self, turn: &Turn) -> Option<DriveIndex> {
+        Some(turn.drive).filter(|drive| self.bus.image.drives.get(*drive).is_some())
     }
 
     fn report_all(&mut self, mut news: Vec<News>, now: Instant) {

@@ -10,6 +10,7 @@ use tokio::sync::oneshot::error::TryRecvError;
 use crate::codec::Reply;
 use crate::command::{Answer, BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket, WriteStats};
 use crate::diagnosis::CountedByDrive;
+use crate::drive::DriveIndex;
 use crate::line_diagnosis::LineDiagnosis;
 use crate::plant::BusHandle;
 
@@ -23,7 +24,7 @@ const EXPIRY: Duration = Duration::from_secs(20);
 /// The readings of all drives of a bus.
 #[derive(Debug)]
 pub(super) struct DriveCounters {
-    drives: Vec<(usize, State)>,
+    drives: Vec<(DriveIndex, State)>,
     /// When a drive is looked at next.
     due: Instant,
 }
@@ -39,7 +40,7 @@ enum State {
 impl DriveCounters {
     /// Of the drives of a bus that count.
     pub(super) fn new(bus: &BusHandle, now: Instant) -> DriveCounters {
-        let drives = bus.image.drives.iter().enumerate();
+        let drives = bus.image.drives.enumerate();
         let counting = drives.filter(|(_, drive)| drive.spec.profile.counts_messages);
         DriveCounters {
             drives: counting
@@ -111,7 +112,7 @@ impl DriveCounters {
 }
 
 /// Asks for the counter behind those that were read.
-fn ask(bus: &BusHandle, drive: usize, so_far: &[u16], writes: &Arc<WriteStats>, now: Instant) -> Receiver<Answer> {
+fn ask(bus: &BusHandle, drive: DriveIndex, so_far: &[u16], writes: &Arc<WriteStats>, now: Instant) -> Receiver<Answer> {
     let name = bus.image.drives.get(drive).map_or("", |drive| drive.spec.name.as_str());
     let origin = Origin::new(SourceKind::Schedule, "diagnosis");
     let (ticket, answer) = Ticket::new(

@@ -10,7 +10,7 @@ use super::supervision::Supervision;
 use super::vain_stops::VainStops;
 use crate::codec::Reply;
 use crate::command::{Command, Interruption, LastWritten, Origin, Outcome, Refusal, Urgency};
-use crate::drive::ModelPoint;
+use crate::drive::{DriveIndex, ModelPoint};
 use crate::process_image::{DriveImage, Reading};
 
 /// A status older than this, or than three rounds of the line, does not show whether the motor runs.
@@ -310,7 +310,7 @@ impl DriveState {
     }
 
     /// A client's started stop, for the bus that replaces this one.
-    pub(super) fn take_stop(&mut self, drive: usize, now: Instant) -> Option<Command> {
+    pub(super) fn take_stop(&mut self, drive: DriveIndex, now: Instant) -> Option<Command> {
         let run = self.runs.get_mut(slot(Urgency::Stop))?.take()?;
         if run.is_heard() && run.reached_the_wire() {
             self.supervision.renew(now);

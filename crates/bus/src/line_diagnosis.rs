@@ -13,20 +13,21 @@ use crate::diagnosis::hold::{Change, Hold};
 use crate::diagnosis::{
     Cause, Counted, CountedByDrive, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, rules,
 };
+use crate::drive::{DriveIndex, PerDrive};
 use crate::process_image::BusImage;
 
 #[derive(Debug)]
 pub(super) struct LineDiagnosis {
     image: Arc<BusImage>,
-    names: Vec<String>,
+    names: PerDrive<String>,
     figures: Figures,
     hold: Hold,
     /// Silence before the request that is on the line.
     gap: Duration,
     /// Each drive's own counters: since the first reading of this series of errors, and the last reading.
-    by_drive: Vec<Option<(CountedByDrive, CountedByDrive)>>,
+    by_drive: PerDrive<Option<(CountedByDrive, CountedByDrive)>>,
     /// Since when each current verdict holds.
-    since: Vec<(Cause, Option<usize>, SystemTime)>,
+    since: Vec<(Cause, Option<DriveIndex>, SystemTime)>,
 }
 
 impl LineDiagnosis {
@@ -47,7 +48,7 @@ impl LineDiagnosis {
             names: image.drives.iter().map(|drive| drive.spec.name.clone()).collect(),
             figures: Figures::new(line, image.drives.iter().map(|drive| drive.spec.address), now),
             hold: Hold::default(),
-            by_drive: vec![None; image.drives.len()],
+            by_drive: vec![None; image.drives.len()].into(),
             gap: Duration::ZERO,
             since: Vec::new(),
             image,
@@ -60,14 +61,14 @@ impl LineDiagnosis {
     }
 
     /// Whether transactions with that drive failed in the last minute.
-    pub(super) fn has_errors(&self, drive: usize) -> bool {
+    pub(super) fn has_errors(&self, drive: DriveIndex) -> bool {
         let failed = [Sign::Damaged, Sign::StartLost, Sign::CutEcho, Sign::Silent];
         let drive = self.figures.drives.get(drive);
         drive.is_some_and(|drive| failed.iter().any(|sign| drive.sum(*sign) > 0))
     }
 
     /// The drive's own counters were read.
-    pub(super) fn counted_by_drive(&mut self, drive: usize, counted: CountedByDrive) {
+    pub(super) fn counted_by_drive(&mut self, drive: DriveIndex, counted: CountedByDrive) {
         if let Some(known) = self.by_drive.get_mut(drive) {
             // A drive that was switched off counts from 0 again.
             let goes_on = |before: &CountedByDrive| counted.since(before).messages < u16::MAX / 2;
@@ -78,9 +79,9 @@ impl LineDiagnosis {
 
     /// What the counters of the drives of a finding show about the disturbed direction.
     fn directions(&self, finding: &Finding) -> String {
-        let about = (0..).zip(self.figures.drives.iter().zip(&self.names).zip(&self.by_drive));
-        let about = about.filter(|(place, _)| finding.drive.is_none_or(|drive| drive == *place));
-        let directions = about.filter_map(|(_, ((drive, name), counted))| {
+        let about = self.figures.drives.enumerate().zip(&self.names).zip(&self.by_drive);
+        let about = about.filter(|(((index, _), _), _)| finding.drive.is_none_or(|drive| drive == *index));
+        let directions = about.filter_map(|(((_, drive), name), counted)| {
             let (before, last) = counted.as_ref()?;
             let here = drive.sum(Sign::Damaged) + drive.sum(Sign::StartLost);
             last.since(before).direction(name, here)
@@ -94,7 +95,13 @@ impl LineDiagnosis {
     }
 
     /// A transaction of the gateway has ended.
-    pub(super) fn exchanged(&mut self, drive: usize, exchanged: &Exchanged, turnaround: Option<Duration>, at: Instant) {
+    pub(super) fn exchanged(
+        &mut self,
+        drive: DriveIndex,
+        exchanged: &Exchanged,
+        turnaround: Option<Duration>,
+        at: Instant,
+    ) {
         let transaction = &exchanged.transaction;
         // A drive may well ignore what a tool asks of it that no codec knows.
         if matches!(transaction.request().pdu, RequestPdu::Other(_)) {
@@ -124,7 +131,7 @@ impl LineDiagnosis {
     }
 
     /// A transaction of another master has ended.
-    pub(super) fn overheard(&mut self, drive: usize, exchange: &Overheard) {
+    pub(super) fn overheard(&mut self, drive: DriveIndex, exchange: &Overheard) {
         let (Some(request), Some(ended)) = (&exchange.request, &exchange.ended) else {
             return;
         };
@@ -152,7 +159,7 @@ impl LineDiagnosis {
     }
 
     /// Applies the rules when a step has passed. Returns the changes, as text.
-    pub(super) fn tick(&mut self, now: Instant) -> Vec<(Option<usize>, String)> {
+    pub(super) fn tick(&mut self, now: Instant) -> Vec<(Option<DriveIndex>, String)> {
         if !self.figures.is_step_over(now) {
             return Vec::new();
         }
@@ -170,7 +177,7 @@ impl LineDiagnosis {
     fn show(&mut self) {
         let now = SystemTime::now();
         let shown: Vec<Finding> = self.hold.shown().cloned().collect();
-        let is = |finding: &Finding, (cause, drive, _): &(Cause, Option<usize>, SystemTime)| {
+        let is = |finding: &Finding, (cause, drive, _): &(Cause, Option<DriveIndex>, SystemTime)| {
             finding.cause == *cause && finding.drive == *drive
         };
         self.since.retain(|one| shown.iter().any(|finding| is(finding, one)));

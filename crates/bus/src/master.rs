@@ -8,6 +8,7 @@
 mod background;
 mod choose;
 mod hold;
+mod passed_on;
 mod remains;
 mod results;
 mod shutdown;
@@ -38,7 +39,7 @@ use crate::codec::n2::Session;
 use crate::codec::{Protocol, RequestPdu};
 use crate::command::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Urgency, WriteStats};
 use crate::drive::plan::WireTime;
-use crate::drive::{Plan, PlannedRead, PollClass};
+use crate::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
 use crate::plant::{BusHandle, turn_away};
 use crate::process_image::DriveImage;
 
@@ -58,7 +59,7 @@ const PATIENT_PROBES: u32 = 6;
 #[derive(Debug, Clone, PartialEq)]
 pub struct Turn {
     /// Place of the drive on the bus.
-    pub drive: usize,
+    pub drive: DriveIndex,
     /// Its purpose.
     pub purpose: Purpose,
     pdu: RequestPdu,
@@ -150,12 +151,12 @@ pub struct Master {
     /// Kept before each request.
     silence: Duration,
     schedule: Schedule,
-    drives: Vec<DriveState>,
+    drives: PerDrive<DriveState>,
     /// The N2 sessions of the drives.
     sessions: N2Sessions,
     n2_late: N2LateReplies,
     /// The last reply on the line, valid or damaged: it may be repeated.
-    last_answered: Option<(usize, RequestPdu)>,
+    last_answered: Option<(DriveIndex, RequestPdu)>,
     turns: Turns,
     /// The background request that has its turn, or is on the line.
     background: Option<Begun>,
@@ -168,13 +169,13 @@ pub struct Master {
     successor: bool,
     writes: Arc<WriteStats>,
     /// Consecutive probes without a reply, by drive.
-    probes: Vec<u32>,
+    probes: PerDrive<u32>,
     /// A reply may have come late since before the transaction that is on the line.
     late_before: bool,
     /// Which starts may be written; none where nothing is guarded.
     starts: Option<StartGate>,
     /// A drive to which a drill sends nothing but stops, and until when.
-    quiet: Option<(usize, Instant)>,
+    quiet: Option<(DriveIndex, Instant)>,
 }
 
 impl Master {
@@ -194,18 +195,18 @@ impl Master {
             slow: spec.slow_cycle,
             retries: options.retries,
         };
-        let plans: Vec<&Plan> = images.iter().map(|d| &d.plan).collect();
-        let cost = |index: usize, read: &PlannedRead| {
+        let plans: PerDrive<&Plan> = images.iter().map(|d| &d.plan).collect();
+        let cost = |index: DriveIndex, read: &PlannedRead| {
             let turnaround = images.get(index).map_or(Duration::ZERO, |d| d.spec.turnaround);
             WireTime::of(spec.protocol, &spec.format, &read.pdu()).total(turnaround, silence)
         };
-        let fast = |(index, plan): (usize, &&Plan)| -> Duration {
+        let fast = |(index, plan): (DriveIndex, &&Plan)| -> Duration {
             let reads = plan.reads.iter().filter(|read| read.class == PollClass::Fast);
             reads.map(|read| cost(index, read)).sum()
         };
-        let round = spec.cycle.max(plans.iter().enumerate().map(fast).sum());
+        let round = spec.cycle.max(plans.enumerate().map(fast).sum());
         let schedule = Schedule::new(cadence, &plans, cost, now);
-        let mut drives: Vec<DriveState> = images.iter().map(|_| DriveState::new(round)).collect();
+        let mut drives: PerDrive<DriveState> = images.iter().map(|_| DriveState::new(round)).collect();
         for (drive, lease) in drives.iter_mut().zip(&before.leases) {
             drive.supervision.take_over(*lease);
         }
@@ -218,7 +219,7 @@ impl Master {
             response_timeout: options.response_timeout,
             silence,
             schedule,
-            probes: vec![0; drives.len()],
+            probes: vec![0; drives.len()].into(),
             drives,
             sessions,
             n2_late: N2LateReplies::default(),
@@ -261,7 +262,7 @@ impl Master {
             shutdown.end(&self.bus);
         }
         let mut queue = self.bus.queue.lock();
-        for (index, drive) in self.drives.iter_mut().enumerate() {
+        for (index, drive) in self.drives.enumerate_mut() {
             if queue.is_ending()
                 && let Some(stop) = drive.take_stop(index, now)
                 && let Err(stop) = queue.give_back(stop)
@@ -320,7 +321,7 @@ impl Master {
             bus, drives, writes, ..
         } = self;
         let guarded = bus.queue.is_guarded();
-        for (index, (drive, image)) in drives.iter_mut().zip(&bus.image.drives).enumerate() {
+        for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if !drive.confirmations.is_empty() {
                 if std::mem::take(&mut drive.was_read) {
                     drive.confirmations.look(&image.reading(now, drive.fresh), now);
@@ -353,7 +354,7 @@ impl Master {
             ..
         } = self;
         let Some(starts) = starts else { return };
-        for (index, (drive, image)) in drives.iter_mut().zip(&bus.image.drives).enumerate() {
+        for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if starts.guards(index) {
                 let reading = image.reading(now, drive.fresh);
                 starts.look(index, drive, &reading);
@@ -395,7 +396,7 @@ impl Master {
                 ..
             }
         );
-        for (index, drive) in self.drives.iter_mut().enumerate() {
+        for (index, drive) in self.drives.enumerate_mut() {
             if !(is_command && index == turn.drive)
                 && let Some(run) = drive.run(Urgency::Command)
             {
@@ -457,7 +458,7 @@ impl Master {
 /// Looks at the lease of a drive.
 pub(super) fn supervise(
     bus: &BusHandle,
-    index: usize,
+    index: DriveIndex,
     image: &Arc<DriveImage>,
     drive: &mut DriveState,
     writes: &Arc<WriteStats>,

@@ -1,4 +1,4 @@
-//! What an N2 bus sends to a drive besides reads and commands (n2.md 2 and 4). Pure: time is an argument.
+//! What an N2 bus sends to a drive besides reads and commands (reference/n2.md 2 and 4). Pure: time is an argument.
 //!
 //! A drive that has restarted answers nothing before it is identified; then it reports, to polls, all it has. So a
 //! drive is identified first, its report is taken (and thrown away: the layout is not known, values are read), then it
@@ -12,6 +12,7 @@ use super::transaction::Ended;
 use crate::codec::n2::{N2Options, Session};
 use crate::codec::{Exception, Reply};
 use crate::command::Urgency;
+use crate::drive::{DriveIndex, PerDrive};
 
 /// Polls in which a drive has to report all its changes.
 pub const MOST_POLLS: u8 = 16;
@@ -57,7 +58,7 @@ pub enum Progress {
 /// The sessions with the drives of a bus; none on a bus of another protocol.
 #[derive(Debug, Default)]
 pub struct N2Sessions {
-    drives: Vec<Drive>,
+    drives: PerDrive<Drive>,
 }
 
 impl N2Sessions {
@@ -81,7 +82,7 @@ impl N2Sessions {
     }
 
     /// The step needed before the drive is read (`None`) or commanded.
-    pub fn before(&mut self, drive: usize, command: Option<Urgency>, now: Instant) -> Option<Session> {
+    pub fn before(&mut self, drive: DriveIndex, command: Option<Urgency>, now: Instant) -> Option<Session> {
         let drive = self.drives.get_mut(drive)?;
         if matches!(drive.phase, Phase::Unknown | Phase::Waiting) {
             return Some(Session::Identify);
@@ -99,7 +100,7 @@ impl N2Sessions {
     }
 
     /// A step returned by [`N2Sessions::before`] has ended.
-    pub fn done(&mut self, drive: usize, step: Session, ended: &Ended, now: Instant) -> Progress {
+    pub fn done(&mut self, drive: DriveIndex, step: Session, ended: &Ended, now: Instant) -> Progress {
         let heard = self.heard(drive, ended);
         let (Progress::Going, Ended::Reply(reply)) = (heard, ended) else {
             return if step == Session::Identify {
@@ -120,7 +121,7 @@ impl N2Sessions {
     }
 
     /// Any transaction with the drive has ended; [`Progress::Failed`] if it was refused although just identified.
-    pub fn heard(&mut self, drive: usize, ended: &Ended) -> Progress {
+    pub fn heard(&mut self, drive: DriveIndex, ended: &Ended) -> Progress {
         if matches!(ended, Ended::Silent | Ended::Corrupt(_)) {
             return match self.drives.is_empty() {
                 true => Progress::Going,
@@ -146,14 +147,14 @@ impl N2Sessions {
     }
 
     /// Drives that are due for a poll and would not be asked otherwise, because nothing of them is read so often.
-    pub fn neglected(&self, now: Instant) -> impl Iterator<Item = usize> {
+    pub fn neglected(&self, now: Instant) -> impl Iterator<Item = DriveIndex> {
         let due = move |drive: &Drive| drive.phase == Phase::Ready && drive.polled.is_some() && drive.is_due(now);
-        let drives = self.drives.iter().enumerate();
+        let drives = self.drives.enumerate();
         drives.filter(move |(_, drive)| due(drive)).map(|(index, _)| index)
     }
 
     /// The drive no longer replies: it is identified again.
-    pub fn gone(&mut self, drive: usize) {
+    pub fn gone(&mut self, drive: DriveIndex) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.phase = first(&drive.options);
             drive.proved = false;
@@ -162,14 +163,14 @@ impl N2Sessions {
     }
 
     /// The device type by which a drive identifies itself, or is expected to.
-    pub fn device(&self, drive: usize) -> u8 {
+    pub fn device(&self, drive: DriveIndex) -> u8 {
         let drive = self.drives.get(drive);
         drive.map_or(0, |drive| drive.device.unwrap_or(drive.options.device_type))
     }
 
     /// The port was lost: all drives must be found again.
     pub fn reset(&mut self) {
-        (0..self.drives.len()).for_each(|drive| self.gone(drive));
+        self.drives.indexes().for_each(|drive| self.gone(drive));
     }
 }
 

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use super::confirm::Unconfirmed;
 use crate::codec::Exception;
 use crate::command::{Origin, Refusal};
-use crate::drive::PlannedRead;
+use crate::drive::{DriveIndex, PlannedRead};
 
 /// One piece of news. Drives are named by their place on the bus.
 #[derive(Debug, Clone, PartialEq)]
@@ -17,7 +17,7 @@ pub enum News {
     /// The drive replied to a read of the plan.
     Read {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// The read.
         read: PlannedRead,
         /// The reply, a word for each item.
@@ -26,23 +26,23 @@ pub enum News {
         at: Instant,
     },
     /// The drive replies (again).
-    Online(usize),
+    Online(DriveIndex),
     /// The drive no longer replies.
-    Offline(usize),
+    Offline(DriveIndex),
     /// The drive has restarted: everything known about it is void.
-    Restarted(usize),
+    Restarted(DriveIndex),
     /// The drive reports an N2 device type other than its profile expects.
-    Unlike(usize, u8),
+    Unlike(DriveIndex, u8),
     /// The drive refuses these addresses.
-    Unavailable(usize, PlannedRead, Exception),
+    Unavailable(DriveIndex, PlannedRead, Exception),
     /// An acknowledged command showed no effect in time.
-    NotConfirmed(usize, Unconfirmed),
+    NotConfirmed(DriveIndex, Unconfirmed),
     /// The lease of a drive that runs expired.
-    LeaseRanOut(usize),
+    LeaseRanOut(DriveIndex),
     /// The action of a lease that expired cannot be written.
     ActionRefused {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// The command in one line.
         what: String,
         /// Why not.
@@ -51,23 +51,23 @@ pub enum News {
     /// An attempt at the action of an expired lease failed; with the reason, unless reported before.
     ActionFailed {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// Why, as text.
         why: Option<String>,
     },
     /// The action of a lease that expired was acknowledged after so many tries that failed.
     ActionTaken {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// How many.
         failures: u32,
     },
     /// A drive whose lease expired does not report whether it runs.
-    RunningUnknown(usize),
+    RunningUnknown(DriveIndex),
     /// A waiting or started command is refused: it may not start its motor.
     StartRefused {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// Who gave it.
         origin: Origin,
         /// The command in one line.
@@ -78,12 +78,12 @@ pub enum News {
     /// An interlock does not hold, and the motor is stopped by that.
     Tripped {
         /// Which drive.
-        drive: usize,
+        drive: DriveIndex,
         /// Which interlock, and why it does not hold.
         why: String,
     },
     /// A supervised drive runs, and no client is known to have commanded it; whether its lease starts by that.
-    RunsUnsupervised(usize, Adopted),
+    RunsUnsupervised(DriveIndex, Adopted),
 }
 
 /// Whether a drive that ran when the gateway started got its lease started.

@@ -18,7 +18,7 @@ use crate::codec::LineFormat;
 use crate::codec::wire::Silence;
 use crate::document::{Finding, format_duration};
 use crate::drive::plan::WireTime;
-use crate::drive::{Plan, PlannedRead, PollClass};
+use crate::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
 use crate::process_image::{BusSpec, DriveSpec};
 
 /// Baud rates that are proposed when no profile of the bus lists any.
@@ -35,7 +35,7 @@ const TOLERANCE: f64 = 0.001;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PredictedRequest {
     /// Index of the drive on the bus.
-    pub drive: usize,
+    pub drive: DriveIndex,
     /// The request.
     pub read: PlannedRead,
     /// Whole transaction: request, its recognition by the drive, turnaround, reply, silence.
@@ -162,7 +162,7 @@ impl Rounds {
 struct Line<'a> {
     spec: &'a BusSpec,
     silence: Silence,
-    drives: Vec<(&'a DriveSpec, Plan)>,
+    drives: PerDrive<(&'a DriveSpec, Plan)>,
 }
 
 impl<'a> Line<'a> {
@@ -181,7 +181,7 @@ impl<'a> Line<'a> {
 
     fn requests(&self) -> Vec<PredictedRequest> {
         let mut requests = Vec::new();
-        for (index, (drive, plan)) in self.drives.iter().enumerate() {
+        for (index, (drive, plan)) in self.drives.enumerate() {
             requests.extend(plan.reads.iter().map(|read| PredictedRequest {
                 drive: index,
                 read: *read,

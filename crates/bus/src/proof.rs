@@ -12,9 +12,9 @@ use self::drive::{Drive, Start};
 use super::command_run::{CommandRun, KnownWords, Next, Step};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Admitted, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats, written};
-use crate::drive::control::{Control, OwnWord, Place, Run, Setting};
+use crate::drive::control::{Control, ControlItem, OwnWord, Run, Setting};
 use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Profile, Raw, Value};
+use crate::drive::{DriveIndex, ModelPoint, Profile, Raw, Value};
 
 /// Requests after which a command should have ended, reads of a state for which it waits among them.
 const MOST_FRAMES: usize = 1000;
@@ -258,7 +258,10 @@ impl<'p> Case<'p> {
             reference_only: false,
             ranges: Vec::new(),
         };
-        CommandRun::new(Command::new(0, admitted, expires, ticket), self.profile)
+        CommandRun::new(
+            Command::new(DriveIndex::new(0), admitted, expires, ticket),
+            self.profile,
+        )
     }
 
     /// Runs the command to its end with that event; its requests.
@@ -440,7 +443,7 @@ impl<'p> Case<'p> {
             return Ok(());
         };
         for (address, word) in items {
-            let place = Place { table, address };
+            let place = ControlItem { table, address };
             if place == self.control.at && !is_coil(place) && !self.keeps_always(word) {
                 return Err(self.wrong("a word lacks a bit of `always`", progress));
             }
@@ -461,7 +464,7 @@ impl<'p> Case<'p> {
         self.control.always.holds(word) || wholes.any(|setting| setting.mask == u16::MAX && setting.value == word)
     }
 
-    fn says_both(&self, place: Place, word: u16) -> bool {
+    fn says_both(&self, place: ControlItem, word: u16) -> bool {
         let Run::Pair { forward, reverse } = &self.control.run else {
             return false;
         };
@@ -551,7 +554,7 @@ fn different(frames: &[String]) -> Vec<usize> {
         .collect()
 }
 
-fn is_coil(place: Place) -> bool {
+fn is_coil(place: ControlItem) -> bool {
     matches!(place.table, Table::Coil | Table::DiscreteInput)
 }
 

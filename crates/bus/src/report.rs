@@ -18,7 +18,7 @@ use super::tap::{self, Tap};
 use super::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::{Exception, Reply, Request, Table};
 use crate::command::WriteStats;
-use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
+use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, PollClass, Value};
 use crate::event::{EventKind, Events};
 use crate::process_image::{
     Access, BusImage, DriveImage, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Verdict,
@@ -38,11 +38,11 @@ pub(super) struct Report {
     window: Instant,
     busy: Duration,
     /// Fault code of each drive as last reported; `None` is no fault.
-    faults: Vec<Option<i64>>,
+    faults: PerDrive<Option<i64>>,
     /// The other reported states of each drive, in the order of [`WATCHED`].
-    watched: Vec<[Watched; WATCHED.len()]>,
+    watched: PerDrive<[Watched; WATCHED.len()]>,
     /// The known response of each drive to a silent master.
-    responses: Vec<Response>,
+    responses: PerDrive<Response>,
     /// Whether process data matches the profiles.
     selections: Selections,
     /// The diagnosis of the line.
@@ -56,9 +56,9 @@ pub(super) struct Report {
 #[derive(Debug, Default)]
 pub(super) struct Wanted {
     /// The drive with a new fault.
-    pub(super) fault: Option<usize>,
+    pub(super) fault: Option<DriveIndex>,
     /// Drive, monitoring point and time.
-    pub(super) monitors: Vec<(usize, usize, Instant)>,
+    pub(super) monitors: Vec<(DriveIndex, usize, Instant)>,
 }
 
 /// The known response of a drive to a silent master.
@@ -78,7 +78,7 @@ impl Report {
         writes: Arc<WriteStats>,
         now: Instant,
     ) -> Report {
-        let faults = vec![None; image.drives.len()];
+        let drives = image.drives.len();
         let silence = image.spec.protocol.silence(options.silence, &image.spec.format);
         let points = image.drives.iter().map(|drive| &*drive.spec.profile.points);
         Report {
@@ -89,9 +89,9 @@ impl Report {
             writes,
             window: now,
             busy: Duration::ZERO,
-            responses: vec![Response::default(); faults.len()],
-            watched: vec![[Watched::default(); WATCHED.len()]; faults.len()],
-            faults,
+            responses: vec![Response::default(); drives].into(),
+            watched: vec![[Watched::default(); WATCHED.len()]; drives].into(),
+            faults: vec![None; drives].into(),
             up: false,
             down_reported: false,
         }
@@ -166,11 +166,11 @@ impl Report {
         }
     }
 
-    fn drive(&self, index: usize) -> Option<Arc<DriveImage>> {
+    fn drive(&self, index: DriveIndex) -> Option<Arc<DriveImage>> {
         self.image.drives.get(index).cloned()
     }
 
-    fn read(&self, index: usize, read: &PlannedRead, words: &[u16], at: Instant) {
+    fn read(&self, index: DriveIndex, read: &PlannedRead, words: &[u16], at: Instant) {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
@@ -220,8 +220,8 @@ impl Report {
     pub(super) fn bus_down(&mut self, why: &str, now: Instant) {
         self.diagnosis.figures().port_lost(now);
         let news = self.up || !self.down_reported;
-        let drives = self.image.drives.iter().enumerate();
-        let gone: Vec<usize> = drives
+        let drives = self.image.drives.enumerate();
+        let gone: Vec<DriveIndex> = drives
             .filter(|(_, drive)| goes_offline(drive))
             .map(|(i, _)| i)
             .collect();
@@ -250,7 +250,7 @@ impl Report {
         }
     }
 
-    fn online(&mut self, index: usize) {
+    fn online(&mut self, index: DriveIndex) {
         let Some(drive) = self.drive(index) else { return };
         drive.update(|s| s.link = Link::Online(SystemTime::now()));
         if let Some(response) = self.responses.get_mut(index) {
@@ -259,14 +259,14 @@ impl Report {
         self.drive_event(index, EventKind::Online, None, |name| format!("drive {name} is online"));
     }
 
-    fn offline(&mut self, index: usize) {
+    fn offline(&mut self, index: DriveIndex) {
         self.selections.interrupted(index);
         if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
             self.offline_event(index, "it does not reply");
         }
     }
 
-    fn unavailable(&mut self, index: usize, read: &PlannedRead, exception: Exception, now: Instant) {
+    fn unavailable(&mut self, index: DriveIndex, read: &PlannedRead, exception: Exception, now: Instant) {
         let Some(drive) = self.drive(index) else { return };
         drive.update(|s| s.refuse(read.table, read.start, read.count, exception));
         if read.class == PollClass::Monitor {
@@ -280,7 +280,7 @@ impl Report {
     }
 
     /// Reports a controlled drive that does not respond to a silent master: once, and again only if it did in between.
-    fn look_at_own_response(&mut self, index: usize, now: Instant) {
+    fn look_at_own_response(&mut self, index: DriveIndex, now: Instant) {
         let (Some(drive), Some(known)) = (self.image.drives.get(index), self.responses.get_mut(index)) else {
             return;
         };
@@ -313,7 +313,7 @@ impl Report {
     }
 
     /// Reports faults that appeared or cleared with the last poll. Returns whether one appeared.
-    fn look_at_fault(&mut self, index: usize, now: Instant) -> bool {
+    fn look_at_fault(&mut self, index: DriveIndex, now: Instant) -> bool {
         let Some(drive) = self.drive(index) else { return false };
         let reading = drive.reading(now, RECENT);
         let Some(fault) = reading.model(ModelPoint::Fault).good() else {
@@ -378,7 +378,7 @@ impl Report {
     /// trace subscribers; `None` without any.
     pub(super) fn tape_request(
         &self,
-        index: Option<usize>,
+        index: Option<DriveIndex>,
         request: &Request,
         frame: &[u8],
         quiet_since: Instant,
@@ -394,7 +394,7 @@ impl Report {
     }
 
     /// Gives the recorder the reply to a request, which may be empty.
-    pub(super) fn tape_reply(&self, index: Option<usize>, heard: &[u8], ended: &Ended, now: Instant) {
+    pub(super) fn tape_reply(&self, index: Option<DriveIndex>, heard: &[u8], ended: &Ended, now: Instant) {
         tap::tape(&self.image, index, heard, tap::taped(ended), now);
     }
 
@@ -418,7 +418,7 @@ impl Report {
     /// Another master read a drive.
     pub(super) fn heard(
         &mut self,
-        index: usize,
+        index: DriveIndex,
         (table, start): (Table, u16),
         words: &[u16],
         at: Instant,
@@ -441,7 +441,7 @@ impl Report {
     }
 
     /// A transaction has ended: updates counters, turnaround, load.
-    pub(super) fn exchanged(&mut self, index: usize, exchanged: &Exchanged, now: Instant) {
+    pub(super) fn exchanged(&mut self, index: DriveIndex, exchanged: &Exchanged, now: Instant) {
         let transaction = &exchanged.transaction;
         self.busy += exchanged.took;
         self.image.transactions.observe(exchanged.took);

@@ -22,7 +22,7 @@ use self::drives::{DriveSchedule, Item, Presence, singles};
 use self::share::CommandShare;
 use crate::codec::Exception;
 use crate::command::Urgency;
-use crate::drive::{Plan, PlannedRead, PollClass};
+use crate::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
 
 /// Commands in a row before a due poll goes first.
 pub const COMMANDS_IN_A_ROW: u32 = 8;
@@ -46,7 +46,7 @@ const MOST_CREDIT: f64 = 1.5;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Poll {
     /// Index of the drive on the bus.
-    pub drive: usize,
+    pub drive: DriveIndex,
     /// The read.
     pub read: PlannedRead,
     /// Sent to find out whether the drive replies (again).
@@ -124,10 +124,10 @@ enum Turn {
 #[derive(Debug)]
 pub struct Schedule {
     cadence: Cadence,
-    drives: Vec<DriveSchedule>,
-    round: VecDeque<(usize, PlannedRead)>,
+    drives: PerDrive<DriveSchedule>,
+    round: VecDeque<(DriveIndex, PlannedRead)>,
     /// Reads of the round that decide the state of a drive that is still unknown: no slow poll goes before them.
-    state_first: Vec<(usize, PlannedRead)>,
+    state_first: Vec<(DriveIndex, PlannedRead)>,
     round_due: Instant,
     round_started: Option<Instant>,
     new_round: Option<RoundStart>,
@@ -159,10 +159,11 @@ impl Schedule {
     pub fn new(
         cadence: Cadence,
         plans: &[&Plan],
-        cost: impl Fn(usize, &PlannedRead) -> Duration,
+        cost: impl Fn(DriveIndex, &PlannedRead) -> Duration,
         now: Instant,
     ) -> Self {
-        let drives = plans.iter().enumerate().map(|(index, plan)| {
+        let drives = plans.iter().enumerate().map(|(place, plan)| {
+            let index = DriveIndex::new(place);
             let items = plan.all().flat_map(|read| {
                 let parts = if plan.trials.contains(read) {
                     singles(*read)
@@ -178,7 +179,7 @@ impl Schedule {
             let items = items.collect();
             DriveSchedule::new(items, plan.behind_state.clone(), plan.trials.clone(), now)
         });
-        let drives: Vec<DriveSchedule> = drives.collect();
+        let drives: PerDrive<DriveSchedule> = drives.collect();
         let slow = drives.iter().flat_map(|drive| &drive.items);
         let slow = slow.filter(|item| item.read.class != PollClass::Fast);
         let longest = slow.map(|item| item.cost).max().unwrap_or_default();
@@ -312,7 +313,7 @@ impl Schedule {
     }
 
     /// The drive replied to a command: it is alive, and probed at once if it was offline.
-    pub fn seen(&mut self, drive: usize, now: Instant) {
+    pub fn seen(&mut self, drive: DriveIndex, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive) {
             (drive.failures, drive.doubted) = (0, false);
             if let Presence::Away(at, pause) = drive.presence {
@@ -322,7 +323,7 @@ impl Schedule {
     }
 
     /// An offline drive did not reply to a command, which counts as a probe: the next one does not follow immediately.
-    pub fn probed_in_vain(&mut self, drive: usize, took: Duration, now: Instant) {
+    pub fn probed_in_vain(&mut self, drive: DriveIndex, took: Duration, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive)
             && let Presence::Away(at, pause) = drive.presence
         {
@@ -332,7 +333,7 @@ impl Schedule {
 
     /// An online drive did not reply to a command: its process data is read next, to find out whether it is still there
     /// before more is sent.
-    pub fn doubted(&mut self, index: usize) {
+    pub fn doubted(&mut self, index: DriveIndex) {
         let online = |drive: &&mut DriveSchedule| drive.presence == Presence::Online;
         let Some(drive) = self.drives.get_mut(index).filter(online) else {
             return;
@@ -349,19 +350,19 @@ impl Schedule {
     }
 
     /// Whether that read is longer than a manual states, and no reply has proved it.
-    pub fn is_trial(&self, drive: usize, read: &PlannedRead) -> bool {
+    pub fn is_trial(&self, drive: DriveIndex, read: &PlannedRead) -> bool {
         self.drives.get(drive).is_some_and(|drive| drive.is_trial(read))
     }
 
     /// A reply to that read showed more than its first item.
-    pub fn proved(&mut self, drive: usize, read: &PlannedRead) {
+    pub fn proved(&mut self, drive: DriveIndex, read: &PlannedRead) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.unproved.retain(|block| !block.covers(read.table, read.start));
         }
     }
 
     /// No reply to that read proved it: its items are read singly, and it is tried again later.
-    pub fn not_proved(&mut self, drive: usize, read: &PlannedRead, pause: Duration, now: Instant) {
+    pub fn not_proved(&mut self, drive: DriveIndex, read: &PlannedRead, pause: Duration, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.take_apart(read, now, pause);
         }
@@ -385,8 +386,8 @@ impl Schedule {
     }
 
     /// Polls that were postponed are due again, as far as they may go now.
-    pub fn recall(&mut self, now: Instant, may_go: impl Fn(usize, &PlannedRead) -> bool) {
-        for (index, drive) in self.drives.iter_mut().enumerate() {
+    pub fn recall(&mut self, now: Instant, may_go: impl Fn(DriveIndex, &PlannedRead) -> bool) {
+        for (index, drive) in self.drives.enumerate_mut() {
             let postponed = drive.items.iter_mut().filter(|item| item.postponed);
             for item in postponed.filter(|item| may_go(index, &item.read)) {
                 item.due = item.due.min(now);
@@ -400,7 +401,7 @@ impl Schedule {
         if self.round.is_empty() {
             return;
         }
-        for (index, drive) in self.drives.iter_mut().enumerate() {
+        for (index, drive) in self.drives.enumerate_mut() {
             let online = drive.presence == Presence::Online;
             for item in drive.items.iter_mut().filter(|item| item.postponed && item.due <= now) {
                 item.postponed = false;
@@ -412,7 +413,7 @@ impl Schedule {
     }
 
     /// Reads that cover an address are due at once: a command changed it.
-    pub fn refresh(&mut self, drive: usize, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
+    pub fn refresh(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
         let Some(drive) = self.drives.get_mut(drive) else {
             return;
         };
@@ -426,7 +427,7 @@ impl Schedule {
     }
 
     /// Everything is read again from a drive, including points read once.
-    pub fn read_again(&mut self, index: usize, now: Instant) {
+    pub fn read_again(&mut self, index: DriveIndex, now: Instant) {
         let Some(drive) = self.drives.get_mut(index) else {
             return;
         };
@@ -439,7 +440,7 @@ impl Schedule {
     }
 
     /// Puts the reads that decide a drive's state in front of the round, apart from the one that was just answered.
-    fn state_first(&mut self, index: usize, just_read: Option<PlannedRead>) {
+    fn state_first(&mut self, index: DriveIndex, just_read: Option<PlannedRead>) {
         let Some(drive) = self
             .drives
             .get(index)
@@ -466,7 +467,7 @@ impl Schedule {
 
     /// A fault came up in a drive: what its profile names for that, and the slow reads that cover more of it, are due at
     /// once. They take no more of the line than slow reads have anyway.
-    pub fn fault_came(&mut self, drive: usize, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
+    pub fn fault_came(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
         let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
         for item in items.into_iter().flatten() {
             match item.read.class {
@@ -485,7 +486,7 @@ impl Schedule {
     }
 
     /// Monitoring registers are to be read again at `due`, as far as the drive has them.
-    pub fn monitor(&mut self, drive: usize, covers: impl Fn(&PlannedRead) -> bool, due: Instant) {
+    pub fn monitor(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, due: Instant) {
         let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
         let monitors = items
             .into_iter()
@@ -497,7 +498,7 @@ impl Schedule {
     }
 
     /// Requests a read from a drive, also of points read once.
-    pub fn ask(&mut self, drive: usize, now: Instant) {
+    pub fn ask(&mut self, drive: DriveIndex, now: Instant) {
         let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
         let mut sound = items
             .into_iter()
@@ -512,7 +513,7 @@ impl Schedule {
     }
 
     /// A session step was needed before a drive's poll, which is still due: the others have their turn in between.
-    pub fn session_done(&mut self, drive: usize) {
+    pub fn session_done(&mut self, drive: DriveIndex) {
         if let Some(drive) = self.drives.get_mut(drive) {
             (drive.heard, drive.failures) = (true, 0);
         }
@@ -521,8 +522,8 @@ impl Schedule {
     }
 
     /// That drive is not polled until then; none: all drives are polled.
-    pub fn keep_quiet(&mut self, quiet: Option<(usize, Instant)>) {
-        for (index, drive) in self.drives.iter_mut().enumerate() {
+    pub fn keep_quiet(&mut self, quiet: Option<(DriveIndex, Instant)>) {
+        for (index, drive) in self.drives.enumerate_mut() {
             drive.quiet_until = quiet.filter(|(quiet, _)| *quiet == index).map(|(_, until)| until);
         }
         if let Some((quiet, _)) = quiet {
@@ -532,7 +533,7 @@ impl Schedule {
     }
 
     /// Whether the drive replies.
-    pub fn is_online(&self, drive: usize) -> bool {
+    pub fn is_online(&self, drive: DriveIndex) -> bool {
         self.drives.get(drive).is_some_and(|d| d.presence == Presence::Online)
     }
 

@@ -7,7 +7,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::drive::{ModelPoint, PlannedRead, Point, Raw};
+use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, Point, Raw};
 use crate::process_image::Reading;
 
 /// Comparisons that differ, of one and the same selection, until it counts as changed.
@@ -23,7 +23,7 @@ const COUNTS: f64 = 50.0;
 /// The comparisons of all drives of a bus.
 #[derive(Debug, Default)]
 pub(super) struct Selections {
-    drives: Vec<DriveSelections>,
+    drives: PerDrive<DriveSelections>,
 }
 
 #[derive(Debug)]
@@ -101,7 +101,7 @@ impl Selections {
     }
 
     /// The drive was offline: earlier readings are not compared with new ones.
-    pub(super) fn interrupted(&mut self, drive: usize) {
+    pub(super) fn interrupted(&mut self, drive: DriveIndex) {
         for compared in self.points(drive) {
             compared.open = None;
         }
@@ -110,7 +110,7 @@ impl Selections {
     /// The drive refuses that read: a monitoring register that it does not have proves nothing.
     pub(super) fn refused(
         &mut self,
-        drive: usize,
+        drive: DriveIndex,
         read: &PlannedRead,
         reading: &Reading<'_>,
         now: Instant,
@@ -129,7 +129,7 @@ impl Selections {
     }
 
     /// The drive answered that read, and reads as `reading` right after it.
-    pub(super) fn read(&mut self, drive: usize, read: &PlannedRead, reading: &Reading<'_>) -> Findings {
+    pub(super) fn read(&mut self, drive: DriveIndex, read: &PlannedRead, reading: &Reading<'_>) -> Findings {
         let now = reading.now;
         let profile = &reading.spec.profile;
         let runs = || {
@@ -176,7 +176,7 @@ impl Selections {
 
     fn findings(
         &mut self,
-        drive: usize,
+        drive: DriveIndex,
         reading: &Reading<'_>,
         wanted: Vec<(usize, Instant)>,
         differ: Vec<(usize, f64, f64)>,
@@ -193,12 +193,12 @@ impl Selections {
     }
 
     /// Whether this is the first report of a drive since the gateway started.
-    pub(super) fn report_first(&mut self, drive: usize) -> bool {
+    pub(super) fn report_first(&mut self, drive: DriveIndex) -> bool {
         let drive = self.drives.get_mut(drive);
         drive.is_some_and(|drive| !std::mem::replace(&mut drive.reported, true))
     }
 
-    fn points(&mut self, drive: usize) -> impl Iterator<Item = &mut Compared> {
+    fn points(&mut self, drive: DriveIndex) -> impl Iterator<Item = &mut Compared> {
         self.drives
             .get_mut(drive)
             .into_iter()

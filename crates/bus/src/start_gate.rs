@@ -15,7 +15,7 @@ use crate::codec::RequestPdu;
 use crate::command::{
     Answer, Command, DEFAULT_EXPIRY, Origin, Outcome, Pending, Refusal, SourceKind, Urgency, WriteStats, written,
 };
-use crate::drive::{ModelPoint, Profile, Value};
+use crate::drive::{DriveIndex, ModelPoint, PerDrive, Profile, Value};
 use crate::plant::{BusHandle, turn_away};
 use crate::process_image::{DriveImage, Reading};
 use crate::start_guard::{BusGuards, Clearance};
@@ -31,12 +31,12 @@ pub(super) struct StartGate {
     guards: Arc<BusGuards>,
     began: Instant,
     /// Commands that were cleared and are not over, with the drives that they start.
-    cleared: Vec<(u64, Vec<usize>)>,
+    cleared: Vec<(u64, Vec<DriveIndex>)>,
     /// Commands that wait and are to be refused.
-    refused: Vec<(u64, usize, Refusal)>,
+    refused: Vec<(u64, DriveIndex, Refusal)>,
     /// News to report.
     told: Vec<News>,
-    trips: Vec<Trip>,
+    trips: PerDrive<Trip>,
 }
 
 /// The start that a command causes.
@@ -72,7 +72,7 @@ impl StartGate {
     }
 
     /// The start of that drive that a command causes, if its starts are counted.
-    pub(super) fn start_of(&self, command: &Command, drive: usize) -> Option<Start> {
+    pub(super) fn start_of(&self, command: &Command, drive: DriveIndex) -> Option<Start> {
         let starts = self.guards.guards(drive) && command.effect(drive).run == Some(true);
         starts.then(|| Start {
             number: command.number,
@@ -94,7 +94,7 @@ impl StartGate {
             Urgency::Command => {}
         }
         let reach = command.reach().iter().copied();
-        let started: Vec<usize> = reach.filter(|drive| self.start_of(command, *drive).is_some()).collect();
+        let started: Vec<DriveIndex> = reach.filter(|drive| self.start_of(command, *drive).is_some()).collect();
         let Some(first) = started.first().copied() else {
             return Ok(true);
         };
@@ -130,7 +130,7 @@ impl StartGate {
     }
 
     /// A started command is about to write: if it would start the motor and may no longer do so, it ends.
-    pub(super) fn forbids(&mut self, index: usize, drive: &mut DriveState, wanted: &Wanted, now: Instant) -> bool {
+    pub(super) fn forbids(&mut self, index: DriveIndex, drive: &mut DriveState, wanted: &Wanted, now: Instant) -> bool {
         let Wanted::Step(Urgency::Command, step) = wanted else {
             return false;
         };
@@ -155,7 +155,7 @@ impl StartGate {
     /// Why a started command may not write.
     pub(super) fn may_not_write(
         &self,
-        index: usize,
+        index: DriveIndex,
         drive: &mut DriveState,
         pdu: &RequestPdu,
         now: Instant,
@@ -166,14 +166,14 @@ impl StartGate {
     }
 
     /// Whether a command that was not started here may still start that drive.
-    pub(super) fn may_still_write(&self, drive: usize, number: u64, now: Instant) -> bool {
+    pub(super) fn may_still_write(&self, drive: DriveIndex, number: u64, now: Instant) -> bool {
         self.guards.may_write(drive, number, now).is_ok()
     }
 
     /// A write goes onto the line, of a command that starts the motor or of another one.
     pub(super) fn written(
         &self,
-        index: usize,
+        index: DriveIndex,
         profile: &Profile,
         pdu: &RequestPdu,
         start: Option<&Start>,
@@ -204,7 +204,7 @@ impl StartGate {
     }
 
     /// Updates the state of a drive.
-    pub(super) fn look(&self, index: usize, drive: &mut DriveState, reading: &Reading<'_>) {
+    pub(super) fn look(&self, index: DriveIndex, drive: &mut DriveState, reading: &Reading<'_>) {
         if let Some(run) = drive.acknowledged.take() {
             self.guards.acknowledged(index, run, reading.now);
         }
@@ -212,7 +212,7 @@ impl StartGate {
     }
 
     /// Whether a drive has to be looked at.
-    pub(super) fn guards(&self, index: usize) -> bool {
+    pub(super) fn guards(&self, index: DriveIndex) -> bool {
         self.guards.guards(index)
     }
 
@@ -225,7 +225,7 @@ impl StartGate {
     pub(super) fn look_at_interlocks(
         &mut self,
         bus: &BusHandle,
-        (index, image): (usize, &Arc<DriveImage>),
+        (index, image): (DriveIndex, &Arc<DriveImage>),
         words: &KnownWords,
         reading: &Reading<'_>,
         writes: &Arc<WriteStats>,

@@ -15,9 +15,10 @@ use tokio::sync::oneshot::error::TryRecvError;
 use super::command_run::KnownWords;
 use super::news::{Adopted, News};
 use crate::command::{Answer, Outcome, Refusal};
-use crate::drive::control::Place;
+use crate::drive::control::ControlItem;
 use crate::drive::{
-    COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Value,
+    COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, DriveIndex, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass,
+    Quality, Value,
 };
 use crate::process_image::{LeaseAction, Reading, Unavailable};
 
@@ -154,7 +155,7 @@ impl Supervision {
         orders: Orders,
         now: Instant,
         news: &mut Vec<News>,
-        drive: usize,
+        drive: DriveIndex,
     ) -> Demand {
         let Some(spec) = &reading.spec.supervision else {
             return Demand::None;
@@ -211,7 +212,7 @@ impl Supervision {
         words: &KnownWords,
         now: Instant,
         news: &mut Vec<News>,
-        drive: usize,
+        drive: DriveIndex,
     ) {
         let in_vain = self.waits_in_vain(reading, now);
         let Some(running) = self.running(reading, words, in_vain, news, drive) else {
@@ -261,7 +262,7 @@ impl Supervision {
         words: &KnownWords,
         in_vain: bool,
         news: &mut Vec<News>,
-        drive: usize,
+        drive: DriveIndex,
     ) -> Option<bool> {
         if let Some(running) = reading.model(ModelPoint::Running).good() {
             return Some(running.as_bool());
@@ -294,7 +295,7 @@ impl Supervision {
     }
 
     /// Reports a failed action, and one that succeeded after that.
-    fn tell_failure(&mut self, news: &mut Vec<News>, drive: usize) {
+    fn tell_failure(&mut self, news: &mut Vec<News>, drive: DriveIndex) {
         if let Some(outcome) = self.failure.take() {
             self.failures = self.failures.saturating_add(1);
             let why = outcome.to_string();
@@ -387,7 +388,7 @@ fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_va
         return Some(run.as_bool());
     }
     let run = reading.spec.profile.run_place();
-    let is_read = |place: Place| {
+    let is_read = |place: ControlItem| {
         let word = reading.words(place.table, place.address, 1);
         matches!(word, Ok(_) | Err(Unavailable::Stale))
     };

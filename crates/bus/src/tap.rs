@@ -9,6 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use super::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::describe::{self, Kind, Part};
 use crate::codec::{LineFormat, Reply, Request};
+use crate::drive::DriveIndex;
 use crate::process_image::{BusImage, Direction, FrameRecord, TapedFrame, Verdict};
 
 /// Bytes kept of one transaction; of a longer one the start is shown.
@@ -28,7 +29,7 @@ impl Tap {
     /// The transaction whose request was given to the line at `began`.
     pub(super) fn new(
         image: Arc<BusImage>,
-        index: Option<usize>,
+        index: Option<DriveIndex>,
         request: Request,
         frame: Vec<u8>,
         began: Instant,
@@ -102,7 +103,7 @@ impl Tap {
 }
 
 /// Gives the recorder a request, or all bytes that came until its transaction was over.
-pub(super) fn tape(image: &BusImage, drive: Option<usize>, bytes: &[u8], verdict: Verdict, at: Instant) {
+pub(super) fn tape(image: &BusImage, drive: Option<DriveIndex>, bytes: &[u8], verdict: Verdict, at: Instant) {
     image.tape.frame(|| TapedFrame {
         at,
         drive,

@@ -9,6 +9,7 @@ pub mod history;
 pub mod parameters;
 pub mod plant;
 pub mod process_image;
+pub mod spec;
 pub mod start_guard;
 pub mod stop_all;
 pub mod version;

@@ -14,6 +14,7 @@ use arc_swap::ArcSwap;
 
 use crate::command::{Answer, CommandQueue, Origin, Outcome, Priorities, Refusal, WriteStats};
 use crate::drill::Drills;
+use crate::drive::DriveIndex;
 use crate::drive::why::Explanation;
 use crate::event::{Event, Events};
 use crate::history::{History, Recordings};
@@ -49,11 +50,11 @@ impl BusHandle {
     /// The stops of one that is added are counted from a number that no drive had before: what was remembered of a drive by
     /// that name is outdated.
     pub fn take_over(&self, before: &[BusHandle], now: Instant) {
-        for (index, drive) in self.image.drives.iter().enumerate() {
+        for (index, drive) in self.image.drives.enumerate() {
             let machine = self.image.spec.machine(&drive.spec);
             let known = before.iter().find_map(|bus| {
                 let same = |image: &Arc<DriveImage>| bus.image.spec.machine(&image.spec) == machine;
-                Some((bus, bus.image.drives.iter().position(same)?))
+                Some((bus, bus.image.drives.position(same)?))
             });
             let holding = known.and_then(|(bus, place)| bus.queue.lock().holding(place));
             let (commander, stops, priorities) = match known {
@@ -115,7 +116,7 @@ pub struct Plant {
 pub struct DriveHandle {
     pub bus: BusHandle,
     /// Index on the bus.
-    pub index: usize,
+    pub index: DriveIndex,
     /// The process image.
     pub image: Arc<DriveImage>,
     stale_after: Duration,
@@ -171,7 +172,6 @@ impl Plant {
         self.buses.iter().flat_map(move |bus| {
             bus.image
                 .drives
-                .iter()
                 .enumerate()
                 .map(move |(index, image)| self.handle(bus, index, image))
         })
@@ -179,7 +179,7 @@ impl Plant {
 
     pub fn drive(&self, name: &str) -> Option<DriveHandle> {
         self.buses.iter().find_map(|bus| {
-            let index = bus.image.drives.iter().position(|drive| drive.spec.name == name)?;
+            let index = bus.image.drives.position(|drive| drive.spec.name == name)?;
             Some(self.handle(bus, index, bus.image.drives.get(index)?))
         })
     }
@@ -188,7 +188,7 @@ impl Plant {
         self.drives().find(|drive| drive.machine() == *machine)
     }
 
-    fn handle(&self, bus: &BusHandle, index: usize, image: &Arc<DriveImage>) -> DriveHandle {
+    fn handle(&self, bus: &BusHandle, index: DriveIndex, image: &Arc<DriveImage>) -> DriveHandle {
         DriveHandle {
             bus: bus.clone(),
             index,

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::time::Instant;
 
 /// Most chunks with separate times; later ones count as the last.
-const MOST: usize = 64;
+const MOST_PIECES: usize = 64;
 
 /// The times of the bytes, the first ones first.
 #[derive(Debug, Default)]
@@ -16,7 +16,7 @@ impl Arrivals {
         if count == 0 {
             return;
         }
-        let full = self.0.len() >= MOST;
+        let full = self.0.len() >= MOST_PIECES;
         match self.0.back_mut() {
             Some((last, since)) if full || *since == at => *last += count,
             _ => self.0.push_back((count, at)),
@@ -75,7 +75,7 @@ mod tests {
         for ms in 0..1000 {
             arrivals.came(1, began + Duration::from_millis(ms));
         }
-        assert_eq!(arrivals.0.len(), MOST);
+        assert_eq!(arrivals.0.len(), MOST_PIECES);
         for ms in 0..1000 {
             assert!(arrivals.first().unwrap() <= began + Duration::from_millis(ms));
             arrivals.taken(1);

@@ -57,7 +57,7 @@ impl Limits {
 struct Open {
     address: IpAddr,
     authority: Authority,
-    /// It does not yield to another connection of the same address. See [`Place::use_at`].
+    /// It does not yield to another connection of the same address. See [`ConnectionPlace::use_at`].
     in_use: bool,
     /// Time of its last use, ms.
     used: u64,
@@ -172,7 +172,7 @@ pub(super) enum CloseReason {
 
 /// The place of one connection under a limit.
 #[derive(Debug)]
-pub(super) struct Place {
+pub(super) struct ConnectionPlace {
     address: IpAddr,
     /// The listener that accepted it.
     listener: usize,
@@ -185,7 +185,7 @@ pub(super) struct Place {
     why: OnceLock<CloseReason>,
 }
 
-impl Place {
+impl ConnectionPlace {
     /// Address of the client.
     pub(super) fn address(&self) -> IpAddr {
         self.address
@@ -196,7 +196,7 @@ impl Place {
         &self.rights
     }
 
-    /// Cancelled when the connection must end: its place is taken, [`Place::close`] was called, or its server stops.
+    /// Cancelled when the connection must end: its place is taken, [`ConnectionPlace::close`] was called, or its server stops.
     pub(super) fn closing(&self) -> &CancellationToken {
         &self.closing
     }
@@ -225,7 +225,7 @@ impl Place {
         self.in_use.load(Ordering::Relaxed)
     }
 
-    fn open(self: &Arc<Place>) -> Open {
+    fn open(self: &Arc<ConnectionPlace>) -> Open {
         Open {
             address: self.address,
             authority: self.rights.authority(),
@@ -245,7 +245,7 @@ pub(super) struct ConnectionLimit {
 #[derive(Debug)]
 struct Table {
     limits: Limits,
-    open: Vec<Arc<Place>>,
+    open: Vec<Arc<ConnectionPlace>>,
     /// Displaced connections that are not closed yet.
     closing: usize,
 }
@@ -254,11 +254,11 @@ struct Table {
 #[derive(Debug)]
 pub(super) struct ConnectionPermit {
     limit: Arc<ConnectionLimit>,
-    place: Arc<Place>,
+    place: Arc<ConnectionPlace>,
 }
 
 impl ConnectionPermit {
-    pub(super) fn place(&self) -> &Arc<Place> {
+    pub(super) fn place(&self) -> &Arc<ConnectionPlace> {
         &self.place
     }
 }
@@ -314,7 +314,7 @@ impl ConnectionLimit {
     ) -> Result<(ConnectionPermit, Option<IpAddr>), NoPlace> {
         let mut table = self.lock();
         let authority = judge().ok_or(NoPlace::NotAllowed)?;
-        let open = table.open.iter().map(Place::open);
+        let open = table.open.iter().map(ConnectionPlace::open);
         let displaced = match decide(&table.limits, open, newcomer.address, authority) {
             Decision::Admit => None,
             Decision::Refuse(limit) => return Err(NoPlace::Limit(limit)),
@@ -328,7 +328,7 @@ impl ConnectionLimit {
                 Some(displaced.address)
             }
         };
-        let place = Arc::new(Place {
+        let place = Arc::new(ConnectionPlace {
             address: newcomer.address,
             listener: newcomer.listener,
             rights: authority.into(),
@@ -345,7 +345,7 @@ impl ConnectionLimit {
     }
 
     /// Judges the open connections of one listener again: what they may do from now on, or `None` to close them.
-    pub(super) fn review(&self, listener: usize, judge: impl Fn(&Place) -> Option<Authority>) {
+    pub(super) fn review(&self, listener: usize, judge: impl Fn(&ConnectionPlace) -> Option<Authority>) {
         let table = self.lock();
         for place in table.open.iter().filter(|place| place.listener == listener) {
             match judge(place) {

@@ -50,7 +50,7 @@ const CERTIFICATE: &str = "certificate";
 const PRIVATE_KEY: &str = "private key";
 const CRL: &str = "CRL";
 /// Largest file of certificates or revocation lists, bytes: some hundred thousand entries.
-const MOST: u64 = 16 << 20;
+const MOST_BYTES: u64 = 16 << 20;
 
 impl Found {
     /// By the first lines of the sections, in the order in which they tell most about the mistake.
@@ -166,7 +166,7 @@ pub(super) fn revocation_lists(file: &Path) -> Result<Vec<CertificateRevocationL
 
 fn content(file: &Path) -> Result<Vec<u8>, PemError> {
     let mut bytes = Vec::new();
-    let read = File::open(file).and_then(|open| open.take(MOST).read_to_end(&mut bytes));
+    let read = File::open(file).and_then(|open| open.take(MOST_BYTES).read_to_end(&mut bytes));
     match read {
         Ok(_) => Ok(bytes),
         Err(error) => {

@@ -1,4 +1,4 @@
-//! Modbus ASCII frames: colon, hexadecimal digits, LRC, CR LF (drives.md 5.1, worked frames section 7.3).
+//! Modbus ASCII frames: colon, hexadecimal digits, LRC, CR LF (reference/drives.md 5.1, worked frames section 7.3).
 //!
 //! A frame has a definite beginning and end, so anything outside it is recognised at once: characters before a colon
 //! are noise, and a colon in the middle begins the frame again. Digits are sent in upper case and taken in either. Of

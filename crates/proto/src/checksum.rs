@@ -1,7 +1,7 @@
 //! Check codes of the three protocols.
 
 /// CRC-16 of Modbus RTU: start 0xFFFF, reflected polynomial 0xA001. On the wire the low-order
-/// byte goes first (drives.md, 1.2).
+/// byte goes first (reference/drives.md, 1.2).
 #[allow(clippy::indexing_slicing)] // a byte is a valid index of 256 entries
 pub fn crc16(bytes: &[u8]) -> u16 {
     bytes
@@ -28,7 +28,7 @@ const fn table() -> [u16; 256] {
     table
 }
 
-/// LRC of Modbus ASCII: two's complement of the sum of the bytes (drives.md 1.2).
+/// LRC of Modbus ASCII: two's complement of the sum of the bytes (reference/drives.md 1.2).
 pub fn lrc(bytes: &[u8]) -> u8 {
     bytes
         .iter()
@@ -42,7 +42,7 @@ mod tests {
 
     #[test]
     fn crc_of_the_reference() {
-        // drives.md 1.2: "0546" printed for bytes 05 46, register holds 0x4605.
+        // reference/drives.md 1.2: "0546" printed for bytes 05 46, register holds 0x4605.
         assert_eq!(crc16(&[0x01, 0x03, 0x07, 0xD0, 0x00, 0x03]), 0x4605);
         // The catalogue's check value of CRC-16/MODBUS.
         assert_eq!(crc16(b"123456789"), 0x4B37);

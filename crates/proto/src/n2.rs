@@ -1,4 +1,4 @@
-//! Metasys N2 (n2.md): frames of both sides, and the objects of a drive mapped onto the tables of Modbus.
+//! Metasys N2 (reference/n2.md): frames of both sides, and the objects of a drive mapped onto the tables of Modbus.
 //!
 //! | object | table | addresses | function |
 //! |---|---|---|---|
@@ -28,19 +28,19 @@ use super::modbus::{Reply, RequestPdu, Table};
 use super::{Decoded, Exception, Request};
 use command::hex_value;
 
-/// Least pause between two requests to the same drive (n2.md 4).
+/// Least pause between two requests to the same drive (reference/n2.md 4).
 pub const GAP: Duration = Duration::from_millis(5);
 
-/// Longest message, lead and CR included (n2.md 4).
+/// Longest message, lead and CR included (reference/n2.md 4).
 pub const LONGEST: usize = 256;
 
-/// Baud rate and character format, always (n2.md 1).
+/// Baud rate and character format, always (reference/n2.md 1).
 pub const BAUD: u32 = 9600;
 /// Character format, always.
 pub const FORMAT: &str = "8N1";
-/// Time for the first byte of a reply (n2.md 4).
+/// Time for the first byte of a reply (reference/n2.md 4).
 pub const RESPONSE_TIMEOUT: Duration = Duration::from_millis(250);
-/// Tries after the first (n2.md 4: three tries).
+/// Tries after the first (reference/n2.md 4: three tries).
 pub const RETRIES: u32 = 2;
 
 /// Session messages to a drive, besides reads and writes.

@@ -1,4 +1,4 @@
-//! Modbus RTU frames: address, PDU, CRC-16 low byte first (drives.md 1.2, worked frames section 7).
+//! Modbus RTU frames: address, PDU, CRC-16 low byte first (reference/drives.md 1.2, worked frames section 7).
 
 use super::checksum::crc16;
 use super::modbus::{MAX_PDU, Reply, RequestPdu};
@@ -200,7 +200,7 @@ mod tests {
         out
     }
 
-    /// Worked requests of drives.md, section 7 (misprints corrected there) and 7.4.
+    /// Worked requests of reference/drives.md, section 7 (misprints corrected there) and 7.4.
     #[test]
     fn requests_of_the_reference() {
         let coil = |address, on| Request {
@@ -265,7 +265,7 @@ mod tests {
         }
     }
 
-    /// Worked replies of drives.md, section 7.
+    /// Worked replies of reference/drives.md, section 7.
     #[test]
     fn replies_of_the_reference() {
         let status = vec![0x0023, 0x2000, 5000, 2500, 750, 12, 105, 53, 2000, 560, 0];
@@ -359,7 +359,7 @@ mod tests {
         }
     }
 
-    /// The misprinted frames whose CRC is valid must not be believed (drives.md, section 7, 8).
+    /// The misprinted frames whose CRC is valid must not be believed (reference/drives.md, section 7, 8).
     #[test]
     fn misprints_are_not_believed() {
         let cases = [

@@ -168,7 +168,7 @@ mod tests {
 
     #[test]
     fn silences_of_the_reference() {
-        // drives.md, section 2, RTU timing, 11-bit characters.
+        // reference/drives.md, section 2, RTU timing, 11-bit characters.
         for (baud, tenths) in [
             (300, 1283),
             (600, 642),

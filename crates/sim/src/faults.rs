@@ -73,59 +73,66 @@ pub enum Fault {
     Mains(u8),
 }
 
+/// Every fault by its name, as an argument names it; one that takes a value stands with its usual one.
+const NAMED: [(&str, Fault); 27] = [
+    ("deaf", Fault::Deaf),
+    ("drop", Fault::Drop),
+    ("truncate", Fault::Truncate),
+    ("corrupt", Fault::Corrupt),
+    ("double", Fault::Double),
+    ("late:50ms", Fault::Late(Duration::from_millis(50))),
+    ("foreign-address", Fault::Foreign(Foreign::Address)),
+    ("foreign-function", Fault::Foreign(Foreign::Function)),
+    ("foreign-length", Fault::Foreign(Foreign::Length)),
+    ("stray-address", Fault::Stray(Foreign::Address)),
+    ("stray-function", Fault::Stray(Foreign::Function)),
+    ("stray-length", Fault::Stray(Foreign::Length)),
+    ("echo", Fault::Echo),
+    ("deaf-echo", Fault::DeafEcho),
+    ("noise-before", Fault::NoiseBefore),
+    ("noise-after", Fault::NoiseAfter),
+    ("split", Fault::Split),
+    ("exception:4", Fault::Exception(4)),
+    ("busy", Fault::Exception(6)),
+    ("reply-start", Fault::ReplyStart),
+    ("cut-request", Fault::CutRequest),
+    ("cut-echo", Fault::CutEcho),
+    ("zero-before", Fault::ZeroBefore),
+    ("idle-noise", Fault::IdleNoise),
+    ("twin", Fault::Twin),
+    ("needs-pause:10ms", Fault::NeedsPause(Duration::from_millis(10))),
+    ("mains:50", Fault::Mains(50)),
+];
+
 /// Every name that a fault has in text, for messages.
-pub const NAMES: &str = "deaf, drop, truncate, corrupt, double, late:50ms, foreign-address, foreign-function, \
-    foreign-length, stray-address, stray-function, stray-length, echo, deaf-echo, noise-before, noise-after, split, exception:4, busy, reply-start, cut-request, cut-echo, zero-before, \
-    idle-noise, twin, needs-pause:10ms, mains:50";
+pub fn names() -> String {
+    NAMED.map(|(name, _)| name).join(", ")
+}
 
 impl FromStr for Fault {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let (name, argument) = text
-            .split_once(':')
-            .map_or((text, None), |(name, argument)| (name, Some(argument)));
-        let fault = match (name, argument) {
-            ("late", argument) => Fault::Late(
-                parse_duration(argument.unwrap_or("50ms")).map_err(|error| Finding::from(error).to_string())?,
-            ),
-            ("needs-pause", argument) => Fault::NeedsPause(
-                parse_duration(argument.unwrap_or("10ms")).map_err(|error| Finding::from(error).to_string())?,
-            ),
-            ("mains", argument) => Fault::Mains(mains(argument.unwrap_or("50"))?),
-            ("exception", Some(code)) => Fault::Exception(exception_code(code)?),
-            (_, Some(_)) => {
-                return Err(format!(
-                    "`{name}` is not a fault that takes a value; valid faults: {NAMES}"
-                ));
-            }
-            ("deaf", None) => Fault::Deaf,
-            ("drop", None) => Fault::Drop,
-            ("truncate", None) => Fault::Truncate,
-            ("corrupt", None) => Fault::Corrupt,
-            ("double", None) => Fault::Double,
-            ("foreign-address", None) => Fault::Foreign(Foreign::Address),
-            ("foreign-function", None) => Fault::Foreign(Foreign::Function),
-            ("foreign-length", None) => Fault::Foreign(Foreign::Length),
-            ("stray-address", None) => Fault::Stray(Foreign::Address),
-            ("stray-function", None) => Fault::Stray(Foreign::Function),
-            ("stray-length", None) => Fault::Stray(Foreign::Length),
-            ("echo", None) => Fault::Echo,
-            ("deaf-echo", None) => Fault::DeafEcho,
-            ("noise-before", None) => Fault::NoiseBefore,
-            ("noise-after", None) => Fault::NoiseAfter,
-            ("split", None) => Fault::Split,
-            ("exception", None) => Fault::Exception(4),
-            ("busy", None) => Fault::Exception(6),
-            ("reply-start", None) => Fault::ReplyStart,
-            ("cut-request", None) => Fault::CutRequest,
-            ("cut-echo", None) => Fault::CutEcho,
-            ("zero-before", None) => Fault::ZeroBefore,
-            ("idle-noise", None) => Fault::IdleNoise,
-            ("twin", None) => Fault::Twin,
-            _ => return Err(format!("`{text}` is not a fault; valid faults: {NAMES}")),
+        let (name, value) = match text.split_once(':') {
+            Some((name, value)) => (name, Some(value)),
+            None => (text, None),
         };
-        Ok(fault)
+        let is_meant = |(known, _): &&(&str, Fault)| known.split(':').next() == Some(name);
+        let Some((_, usual)) = NAMED.iter().find(is_meant) else {
+            return Err(format!("`{text}` is not a fault; valid faults: {}", names()));
+        };
+        let Some(value) = value else { return Ok(*usual) };
+        let duration = || parse_duration(value).map_err(|error| Finding::from(error).to_string());
+        match (name, usual) {
+            (_, Fault::Late(_)) => duration().map(Fault::Late),
+            (_, Fault::NeedsPause(_)) => duration().map(Fault::NeedsPause),
+            (_, Fault::Mains(_)) => mains(value).map(Fault::Mains),
+            ("exception", _) => exception_code(value).map(Fault::Exception),
+            _ => Err(format!(
+                "`{name}` is not a fault that takes a value; valid faults: {}",
+                names()
+            )),
+        }
     }
 }
 
@@ -327,8 +334,9 @@ mod tests {
 
     #[test]
     fn names_are_read_and_complete() {
-        for name in NAMES.split(", ") {
-            let fault: Fault = name.trim().parse().unwrap();
+        for (name, known) in NAMED {
+            let fault: Fault = name.parse().unwrap();
+            assert_eq!(fault, known);
             let (_, asked, reply) = exchange();
             FaultPlan::default().shape(Some(fault), RTU, &asked, reply, SILENCE);
         }

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::time::Duration;
 
-/// A drive lives in steps of that length: the update period of the Vacon boards (drives.md 3.3).
+/// A drive lives in steps of that length: the update period of the Vacon boards (reference/drives.md 3.3).
 pub const UPDATE_PERIOD: Duration = Duration::from_millis(10);
 
 /// A drive that was not advanced for longer skips the rest of the time.
@@ -281,7 +281,7 @@ impl Steps {
 }
 
 /// The fault of a drive and what it takes to run again: the run command has to be seen off without a fault before it
-/// is obeyed (drives.md 9.24).
+/// is obeyed (reference/drives.md 9.24).
 #[derive(Debug, Clone)]
 pub(super) struct Latch {
     fault: u16,

@@ -1,4 +1,4 @@
-//! The motor behind every simulated drive: ramps, shaft, load, heat (drives.md, section 10).
+//! The motor behind every simulated drive: ramps, shaft, load, heat (reference/drives.md, section 10).
 
 /// The motor's plate and the drive's ramps, from the parameters of whichever drive it is.
 #[derive(Debug, Clone, Copy)]
@@ -22,7 +22,7 @@ pub struct Ratings {
 
 /// The load and the mains of one drive.
 ///
-/// The defaults make the worked status frame of drives.md 7.4: at 25 Hz 750 rpm, 1.2 A, torque 10.5 %, power 5.3 %,
+/// The defaults make the worked status frame of reference/drives.md 7.4: at 25 Hz 750 rpm, 1.2 A, torque 10.5 %, power 5.3 %,
 /// 200.0 V on the motor and 560 V in the DC link.
 #[derive(Debug, Clone, Copy)]
 pub struct Load {

@@ -331,14 +331,6 @@ impl SimulatedDrive {
             _ => None,
         }
     }
-
-    /// The TECO 7300PA that it is, if it is one.
-    pub fn as_teco(&mut self) -> Option<&mut TecoDrive> {
-        match &mut self.model {
-            AnyModel::Teco(drive) => Some(drive),
-            _ => None,
-        }
-    }
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! The drives of one line: whole frames in, replies out.
 //!
 //! A frame with a wrong check code gets no reply, unless a drive answers such frames; nor does a frame for another address
-//! or a broadcast, which acts on all drives (drives.md 3.10). When a frame begins and ends is the wire's business, see [`half_duplex`](super::half_duplex).
+//! or a broadcast, which acts on all drives (reference/drives.md 3.10). When a frame begins and ends is the wire's business, see [`half_duplex`](super::half_duplex).
 
 use super::SimTime;
 use super::framing;
@@ -274,7 +274,7 @@ mod tests {
         out.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" ")
     }
 
-    /// Worked frames of drives.md 7.1 and 7.4, in an order in which the drive comes to their states.
+    /// Worked frames of reference/drives.md 7.1 and 7.4, in an order in which the drive comes to their states.
     #[test]
     fn worked_frames() {
         let mut line = line();
@@ -358,7 +358,7 @@ mod tests {
         framing::pdu(protocol, &out).unwrap_or_default()
     }
 
-    /// drives.md 4.6: the counters of a CX know of frames for others and of bad ones.
+    /// reference/drives.md 4.6: the counters of a CX know of frames for others and of bad ones.
     #[test]
     fn every_drive_hears_the_line() {
         let mut line = cx_and_teco();
@@ -379,7 +379,7 @@ mod tests {
         );
     }
 
-    /// drives.md 9.8: silence, or error 00H with the option.
+    /// reference/drives.md 9.8: silence, or error 00H with the option.
     #[test]
     fn a_wrong_check_code_is_answered_by_none_but_a_teco_made_so() {
         let teco = |address, answer_check_error| {
@@ -415,7 +415,7 @@ mod tests {
             let heard = line.hear(protocol, &damaged(protocol, address, &read), SimTime::ZERO);
             assert_eq!(heard, Heard::BadFrame, "{protocol:?} {address}");
         }
-        // The check code is verified first (drives.md 5.6): a message that lacks a byte fails there. What is not a frame
+        // The check code is verified first (reference/drives.md 5.6): a message that lacks a byte fails there. What is not a frame
         // gets no reply.
         let whole = damaged(ascii, 1, &read);
         let [short, odd] = [4, 5].map(|less| [&whole[..whole.len() - less], b"\r\n"].concat());

@@ -282,7 +282,7 @@ fn unverified(settings: &Settings) -> BTreeSet<&str> {
 }
 
 fn drive_name<'a>(bus: &'a BusSettings, request: &PredictedRequest) -> &'a str {
-    bus.drives.get(request.drive).map_or("", |drive| &drive.name)
+    bus.drives.get(request.drive.place()).map_or("", |drive| &drive.name)
 }
 
 fn milliseconds(time: Duration) -> f64 {

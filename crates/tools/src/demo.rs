@@ -135,7 +135,7 @@ async fn demo(args: &Args) -> Result<(), String> {
     let written = args.write_config.as_deref().map(Written::prepare).transpose()?;
     let lines =
         start_lines(args.speed, written.as_ref()).map_err(|e| format!("cannot create a simulated line: {e}"))?;
-    let place = Place {
+    let place = DemoPlace {
         ports: lines.iter().map(|line| line.address()).collect(),
         written,
     };
@@ -172,14 +172,14 @@ async fn demo(args: &Args) -> Result<(), String> {
 }
 
 /// Where the demo is on this machine.
-struct Place {
+struct DemoPlace {
     /// Ports of the lines.
     ports: Vec<String>,
     /// The directory of `--write-config`.
     written: Option<Written>,
 }
 
-impl Place {
+impl DemoPlace {
     /// Where the recordings of this demo are.
     fn state_dir(&self) -> PathBuf {
         match &self.written {
@@ -213,7 +213,7 @@ impl Sides {
     }
 }
 
-async fn start(place: &Place, cancel: &CancellationToken) -> Result<(Daemon, Broker, Sides), String> {
+async fn start(place: &DemoPlace, cancel: &CancellationToken) -> Result<(Daemon, Broker, Sides), String> {
     let mqtt = free_port("the MQTT broker", MQTT)?;
     let broker = Broker::start(mqtt, cancel.child_token());
     let broker = broker
@@ -280,7 +280,7 @@ pub(super) fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
     ))
 }
 
-fn configuration(place: &Place, sides: &Sides) -> String {
+fn configuration(place: &DemoPlace, sides: &Sides) -> String {
     let Sides { mqtt, modbus, http } = sides;
     let mut text = format!(
         "[gateway]\nname = \"demo\"\nsocket = {:?}\nstate_dir = {:?}\n",
@@ -325,7 +325,7 @@ mod tests {
     /// What newcomers read first has nothing to be warned of, and its drives outlast a busy machine.
     #[test]
     fn the_configuration_of_the_demo_has_no_warnings() {
-        let place = Place {
+        let place = DemoPlace {
             ports: LINES.iter().map(|line| format!("/dev/{}", line.name)).collect(),
             written: None,
         };

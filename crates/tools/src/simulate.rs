@@ -14,7 +14,7 @@ use crate::process_image::DriveSpec;
 use crate::sim::by_profile::Given;
 use crate::sim::cx::AddressOffset;
 use crate::sim::endpoint::EndpointOptions;
-use crate::sim::faults::{FaultPlan, NAMES, Rates};
+use crate::sim::faults::{FaultPlan, Rates, names};
 use crate::sim::half_duplex::{Delivery, LineRules, Wire};
 use crate::sim::simulated_drive::{DriveOptions, ModelOptions};
 use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
@@ -38,12 +38,12 @@ use std::time::Duration;
   drivegate simulate --config \
                                 drivegate.toml
 
-Faults: {NAMES}.
+Faults: {}.
 
 A simulated drive obeys the bus. Writing a fault \
                                 code to a holding register that no real drive has trips it; PDU address by the key \
                                 `simulator` of the profile: {}; others 9998. The signal USR1 trips all drives of the \
-                                process; USR2 gives them to their panels, or back to the bus.", trip_registers()))]
+                                process; USR2 gives them to their panels, or back to the bus.", names(), trip_registers()))]
 pub(super) struct Args {
     /// Simulate every bus of a gateway configuration, each under its own `port`
     #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "protocol", "baud", "format"])]

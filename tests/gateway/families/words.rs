@@ -1,7 +1,7 @@
 //! What every word does, by hand from the figures of the manuals, against what the profiles take it for.
 
 use drivegate::codec::Table;
-use drivegate::drive::control::Place;
+use drivegate::drive::control::ControlItem;
 use drivegate::drive::profile::Profiles;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -204,7 +204,7 @@ fn every_word_is_taken_for_what_it_does() {
     }
     // Coils.
     let hitachi = profiles.get("hitachi-wj200").unwrap();
-    let coil = |address| Place {
+    let coil = |address| ControlItem {
         table: Table::Coil,
         address,
     };

@@ -108,7 +108,9 @@ impl FakeBus {
                     let Some(command) = take_next(&queue, Instant::now()) else {
                         break;
                     };
-                    seen.lock().unwrap().push((command.drive, command.order.clone()));
+                    seen.lock()
+                        .unwrap()
+                        .push((command.drive.place(), command.order.clone()));
                     match (script.lock().unwrap())(&command) {
                         Some(outcome) => command.answer(&outcome, Instant::now()),
                         None => kept.push(command),

@@ -9,7 +9,7 @@ use crate::services::PropertyRef;
 use crate::types::{Address, ObjectId};
 
 /// Subscriptions in all, of one host, and of one host to one device.
-const MOST: usize = 4096;
+const MOST_SUBSCRIPTIONS: usize = 4096;
 const MOST_OF_HOST: usize = 2048;
 const MOST_OF_DEVICE: usize = 128;
 /// How long an acknowledgement is awaited, and how often.
@@ -128,7 +128,7 @@ impl Cov {
             .filter(|s| s.key.subscriber.ip() == key.subscriber.ip())
             .count();
         let of_host = self.hosts.entry(key.subscriber.ip()).or_default();
-        if all >= MOST || *of_host >= MOST_OF_HOST || own >= MOST_OF_DEVICE {
+        if all >= MOST_SUBSCRIPTIONS || *of_host >= MOST_OF_HOST || own >= MOST_OF_DEVICE {
             self.tidy();
             return false;
         }
@@ -349,11 +349,14 @@ mod tests {
         };
         assert_eq!(more(1), MOST_OF_HOST - MOST_OF_DEVICE);
         assert_eq!((more(2), more(3)), (MOST_OF_HOST, 0));
-        assert_eq!(cov.len(), MOST);
+        assert_eq!(cov.len(), MOST_SUBSCRIPTIONS);
         cov.cancel(1, &key(1, 0));
-        assert_eq!((cov.len(), cov.of(1).len()), (MOST - 1, MOST_OF_DEVICE - 1));
+        assert_eq!(
+            (cov.len(), cov.of(1).len()),
+            (MOST_SUBSCRIPTIONS - 1, MOST_OF_DEVICE - 1)
+        );
         cov.poll(now + Duration::from_secs(99));
-        assert_eq!(cov.len(), MOST - 1);
+        assert_eq!(cov.len(), MOST_SUBSCRIPTIONS - 1);
     }
 
     #[test]

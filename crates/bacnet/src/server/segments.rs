@@ -10,7 +10,7 @@ const WINDOW: u8 = 4;
 const WAIT: Duration = Duration::from_secs(3);
 const TRIES: u8 = 3;
 /// Answers under way: in all, and to one host.
-const MOST: usize = 32;
+const MOST_ANSWERS: usize = 32;
 const MOST_OF_ONE: usize = 8;
 
 /// One answer under way.
@@ -78,7 +78,7 @@ impl Segments {
     ) -> bool {
         self.end(to, device, invoke);
         let own = self.sending.iter().filter(|sending| sending.to.ip() == to.ip()).count();
-        if self.sending.len() >= MOST || own >= MOST_OF_ONE {
+        if self.sending.len() >= MOST_ANSWERS || own >= MOST_OF_ONE {
             return false;
         }
         let mut sending = Sending {
@@ -229,6 +229,6 @@ mod tests {
             |host: u8, invoke: u8| segments.begin((client(host), 5), (invoke, 14), vec![0; 450], 50, now, &mut out);
         assert_eq!((0..100).filter(|n| begin(1, *n)).count(), MOST_OF_ONE);
         assert!(begin(1, 0), "the same question again");
-        assert_eq!((0..200).filter(|n| begin(*n, 200)).count(), MOST - MOST_OF_ONE);
+        assert_eq!((0..200).filter(|n| begin(*n, 200)).count(), MOST_ANSWERS - MOST_OF_ONE);
     }
 }

@@ -19,7 +19,7 @@ use crate::types::{Address, Data, Error, ObjectId, ObjectType, PropertyId, WILDC
 const REMEMBERED: Duration = Duration::from_secs(10);
 /// Requests under way or remembered: of one host, and in all. Stops find room beyond that.
 const MOST_OF_HOST: usize = 64;
-const MOST: usize = 1024;
+const MOST_REQUESTS: usize = 1024;
 /// So many more.
 const FOR_STOPS: usize = 256;
 
@@ -114,10 +114,10 @@ impl Exchanges {
                 None => return false,
             }
         }
-        if self.all.len() >= MOST {
+        if self.all.len() >= MOST_REQUESTS {
             match self.all.iter().position(is_done) {
                 Some(oldest) => drop(self.all.remove(oldest)),
-                None => return stops && self.all.len() < MOST + FOR_STOPS,
+                None => return stops && self.all.len() < MOST_REQUESTS + FOR_STOPS,
             }
         }
         true

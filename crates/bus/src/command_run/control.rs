@@ -10,7 +10,7 @@ use super::known_words::KnownWords;
 use super::steps::{Action, Check, Known, Step, StepPurpose};
 use crate::codec::{Reply, RequestPdu, Table};
 use crate::command::Refusal;
-use crate::drive::control::{self, Control, Mask, OwnWord, Place, Run, Setting, Until};
+use crate::drive::control::{self, Control, ControlItem, Mask, OwnWord, Run, Setting, Until};
 use crate::drive::model::Kind;
 use crate::drive::{ModelPoint, Profile, Raw, Value};
 
@@ -208,7 +208,7 @@ fn stops(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Act
     }
     // What lets it run elsewhere goes, too.
     let stands = |setting: &Setting| !setting.once && setting.place != control.stop.place;
-    let mut done: Vec<Place> = Vec::new();
+    let mut done: Vec<ControlItem> = Vec::new();
     for setting in control.runs().iter().filter(|setting| stands(setting)) {
         let place = setting.place.unwrap_or(control.at);
         if !done.contains(&place) {
@@ -220,7 +220,7 @@ fn stops(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Act
 }
 
 /// The control word where it is a coil, which has no other bits.
-fn coil_of(control: &Control) -> Option<Place> {
+fn coil_of(control: &Control) -> Option<ControlItem> {
     Some(control.at).filter(|at| at.table == Table::Coil)
 }
 
@@ -308,7 +308,7 @@ fn runs(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Acti
     }
 }
 
-fn write(place: Place, word: u16, profile: &Profile) -> RequestPdu {
+fn write(place: ControlItem, word: u16, profile: &Profile) -> RequestPdu {
     match place.table {
         Table::Coil | Table::DiscreteInput => profile.functions.write_coil(place.address, word != 0),
         Table::Holding | Table::Input => profile.functions.write_register(place.address, word),
@@ -460,7 +460,7 @@ fn reset_low(
     }
 }
 
-fn read_of(place: Place) -> Step {
+fn read_of(place: ControlItem) -> Step {
     let (start, count) = (place.address, 1);
     let table = place.table;
     Step::new(StepPurpose::ReadWord, RequestPdu::Read { table, start, count })
@@ -473,7 +473,7 @@ pub(super) fn is_last(profile: &Profile, number: usize) -> bool {
 }
 
 /// The place of `[control]` whose word is learned as the drive reports it; none where it reports something else.
-pub fn read_place(profile: &Profile) -> Option<Place> {
+pub fn read_place(profile: &Profile) -> Option<ControlItem> {
     let control = profile.control.as_ref()?;
     (control.own_word == OwnWord::Read).then_some(control.at)
 }

@@ -8,8 +8,8 @@ use super::*;
 use crate::codec::RequestPdu;
 use crate::codec::Table;
 use crate::command::{Admitted, Answer, Origin, SourceKind, WriteStats};
-use crate::drive::Value;
 use crate::drive::profile::Profiles;
+use crate::drive::{DriveIndex, Value};
 
 mod elsewhere;
 mod functions;
@@ -62,7 +62,7 @@ impl Bench {
             reference_only: false,
             ranges: Vec::new(),
         };
-        let command = Command::new(0, admitted, expires, ticket);
+        let command = Command::new(DriveIndex::new(0), admitted, expires, ticket);
         (CommandRun::new(command, &self.profile), receiver)
     }
 

@@ -11,7 +11,7 @@ use crate::BusOptions;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table};
 use crate::command::{Origin, Outcome, Refusal, SourceKind, Ticket, WriteStats};
 use crate::core::Closed;
-use crate::drive::Profile;
+use crate::drive::{DriveIndex, PerDrive, Profile};
 use crate::event::{EventKind, Events};
 use crate::news::News;
 use crate::plant::BusHandle;
@@ -46,11 +46,11 @@ pub struct ListenCore {
     decoder: Decoder,
     report: Report,
     writes: Arc<WriteStats>,
-    drives: Vec<Known>,
+    drives: PerDrive<Known>,
     /// Tries of the other master, after the first, before a drive is offline.
     retries: u32,
     /// Reads of process data in this round of the other master, and when it began.
-    round: (Vec<(usize, Table, u16)>, Option<Instant>),
+    round: (Vec<(DriveIndex, Table, u16)>, Option<Instant>),
     heard: Vec<Heard>,
     /// Something was received since the port was opened or reconnected.
     heard_any: bool,
@@ -148,7 +148,7 @@ impl ListenCore {
         self.decoder.on_time(now, &mut heard);
         self.take(&mut heard, now);
         self.heard = heard;
-        for index in 0..self.drives.len() {
+        for index in self.drives.indexes() {
             let Some(known) = self.drives.get_mut(index) else { break };
             let silent = SILENT.max(known.pause * 3);
             let is_silent = now.saturating_duration_since(known.heard) > silent;
@@ -180,12 +180,12 @@ impl ListenCore {
     }
 
     fn exchange(&mut self, exchange: &Exchange, now: Instant) {
-        let index = self.drives.iter().position(|known| known.address == exchange.address);
+        let index = self.drives.position(|known| known.address == exchange.address);
         self.show(index, exchange);
         self.report
             .in_use(exchange.at.saturating_duration_since(exchange.began).min(LOOK * 10));
         if exchange.address == 0 {
-            (0..self.drives.len()).for_each(|drive| self.commanded(drive, exchange));
+            self.drives.indexes().for_each(|drive| self.commanded(drive, exchange));
             return;
         }
         match index {
@@ -196,7 +196,7 @@ impl ListenCore {
     }
 
     /// The frames, for the trace and the recorder.
-    fn show(&self, index: Option<usize>, exchange: &Exchange) {
+    fn show(&self, index: Option<DriveIndex>, exchange: &Exchange) {
         let Some(request) = &exchange.request else {
             self.report.noise(&exchange.frame, exchange.quiet_since, exchange.sent);
             if !exchange.heard.is_empty() {
@@ -239,7 +239,7 @@ impl ListenCore {
         }
     }
 
-    fn of_drive(&mut self, index: usize, exchange: &Exchange, now: Instant) {
+    fn of_drive(&mut self, index: DriveIndex, exchange: &Exchange, now: Instant) {
         let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get_mut(index)) else {
             return;
         };
@@ -289,7 +289,7 @@ impl ListenCore {
         self.commanded(index, exchange);
     }
 
-    fn believed(&mut self, index: usize, pdu: &RequestPdu, reply: &Reply, exchange: &Exchange, now: Instant) {
+    fn believed(&mut self, index: DriveIndex, pdu: &RequestPdu, reply: &Reply, exchange: &Exchange, now: Instant) {
         let (table, start) = match pdu {
             RequestPdu::Read { table, start, .. } => (*table, *start),
             RequestPdu::ReadWrite { read_start, .. } => (Table::Holding, *read_start),
@@ -308,7 +308,7 @@ impl ListenCore {
     }
 
     /// Stores what was read, whole values only.
-    fn read(&mut self, index: usize, (table, start): (Table, u16), words: &[u16], at: Instant, now: Instant) {
+    fn read(&mut self, index: DriveIndex, (table, start): (Table, u16), words: &[u16], at: Instant, now: Instant) {
         let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get(index)) else {
             return;
         };
@@ -344,7 +344,7 @@ impl ListenCore {
     }
 
     /// Reports a write of the other master.
-    fn commanded(&mut self, index: usize, exchange: &Exchange) {
+    fn commanded(&mut self, index: DriveIndex, exchange: &Exchange) {
         let Some(request) = exchange.request.as_ref().filter(|request| request.pdu.is_write()) else {
             return;
         };
@@ -361,7 +361,7 @@ impl ListenCore {
         }
     }
 
-    fn tell(&self, index: usize, commanded: Commanded) {
+    fn tell(&self, index: DriveIndex, commanded: Commanded) {
         let Some(image) = self.bus.image.drives.get(index) else {
             return;
         };

@@ -9,7 +9,7 @@ use crate::codec::n2::command::checksum;
 use crate::codec::n2::{Answer, Command, Object, Region};
 
 /// Different values of one kind that are counted apart.
-const MOST: usize = 16;
+const MOST_VALUES: usize = 16;
 
 /// How often each of some values was seen.
 type Seen = BTreeMap<String, u64>;
@@ -51,7 +51,7 @@ pub struct N2Survey {
 
 fn count(seen: &mut Seen, what: impl Into<String>) {
     let what = what.into();
-    if seen.len() < MOST || seen.contains_key(&what) {
+    if seen.len() < MOST_VALUES || seen.contains_key(&what) {
         *seen.entry(what).or_default() += 1;
     }
 }

@@ -1,26 +1,20 @@
 //! Background transactions: when one goes on the line, and the result.
 
-use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use super::passed_on::Late;
 use super::{Master, Purpose, Turn, TurnEnd};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{
-    BackgroundRequest, Chosen, Command, Effect, Interruption, NO_DRIVE, Order, Outcome, Pace, PassedOn, Pending,
-    Refusal, SourceKind, Touched, Urgency, written,
+    BackgroundRequest, Effect, Interruption, NO_DRIVE, Outcome, Pace, SourceKind, Touched, Urgency, written,
 };
 use crate::drive::plan::WireTime;
-use crate::drive::{PlannedRead, PollClass};
-use crate::drive_state::DriveState;
-use crate::late_replies::LateReplies;
-use crate::n2_late_replies::N2LateReplies;
-use crate::n2_session::{N2Sessions, Progress};
+use crate::drive::{DriveIndex, PlannedRead, PollClass};
+use crate::n2_session::Progress;
 use crate::news::News;
-use crate::process_image::DriveImage;
 use crate::schedule::Admission;
-use crate::start_gate::{Start, StartGate};
+use crate::start_gate::Start;
 use crate::stop_of_line::BROADCAST_PAUSE;
 use crate::transaction::{CONNECTION_CLOSED, Ended};
 
@@ -30,16 +24,16 @@ const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);
 /// A background request that has its turn.
 #[derive(Debug)]
 pub(super) struct Begun {
-    request: BackgroundRequest,
+    pub(super) request: BackgroundRequest,
     /// Whose time it takes; none where it goes as a command.
-    admission: Option<Admission>,
+    pub(super) admission: Option<Admission>,
     /// It is a command to drives of the bus, and waited among their others; the registers that it sets.
-    ordered: Option<Touched>,
+    pub(super) ordered: Option<Touched>,
     /// Its transaction is on the line, or was.
-    sent: bool,
+    pub(super) sent: bool,
     /// Its number among the commands, and its effect on each drive that it reaches.
-    number: u64,
-    effects: Vec<(usize, Effect)>,
+    pub(super) number: u64,
+    pub(super) effects: Vec<(DriveIndex, Effect)>,
 }
 
 impl Begun {
@@ -48,99 +42,12 @@ impl Begun {
         self.number
     }
 
-    fn turn(&self) -> Turn {
+    pub(super) fn turn(&self) -> Turn {
         Turn {
             drive: self.request.drive,
             purpose: Purpose::Background,
             pdu: self.request.pdu.clone(),
         }
-    }
-}
-
-/// Why what is passed on may not go: a drive that it reaches takes no commands but stops.
-fn held(passed_on: &PassedOn, drives: &[Arc<DriveImage>]) -> Option<Outcome> {
-    let reached = passed_on
-        .reach
-        .iter()
-        .filter(|drive| passed_on.may_write && !passed_on.stops.contains(*drive));
-    let why = reached
-        .filter_map(|drive| drives.get(*drive))
-        .find_map(|image| image.hold.why());
-    why.map(|why| Outcome::Refused(Refusal::NotAllowed(why.to_string())))
-}
-
-/// Replies that may still come, to whatever was asked.
-pub(super) struct Late<'m> {
-    pub(super) sessions: &'m mut N2Sessions,
-    pub(super) n2_late: &'m N2LateReplies,
-    pub(super) strangers: &'m mut BTreeMap<u8, LateReplies>,
-    /// Which starts may be written.
-    pub(super) starts: &'m mut Option<StartGate>,
-    /// A drive to which nothing but stops is sent, and until when.
-    pub(super) quiet: Option<(usize, Instant)>,
-}
-
-impl Late<'_> {
-    /// Until when the transaction cannot go, if it cannot now.
-    fn blocks(
-        &mut self,
-        (drive, pdu): (usize, &RequestPdu),
-        passed_on: Option<&PassedOn>,
-        drives: &mut [DriveState],
-        now: Instant,
-    ) -> Option<Instant> {
-        // A poll identifies the drive.
-        if self.sessions.before(drive, Some(Urgency::Read), now).is_some() {
-            return Some(now + super::LOOK_ROUND);
-        }
-        let late = match (passed_on, drives.get_mut(drive)) {
-            (_, Some(drive)) => Some(&mut drive.late),
-            (Some(passed_on), None) => self.strangers.get_mut(&passed_on.address),
-            (None, None) => None,
-        };
-        let late = late.and_then(|late| late.blocks(pdu, now));
-        late.max(self.n2_late.blocks(pdu, now))
-    }
-
-    /// Until when a request has to wait, since it would reach a drive that a drill sends nothing.
-    fn quiet_until(&self, request: &BackgroundRequest) -> Option<Instant> {
-        let (quiet, until) = self.quiet?;
-        let reach = request.passed_on.as_ref().map_or(&[][..], |passed_on| &passed_on.reach);
-        (request.drive == quiet || reach.contains(&quiet)).then_some(until)
-    }
-
-    /// Whether what is passed on to drives of the bus can go: nothing has started for any of them.
-    ///
-    /// # Errors
-    /// When it can, if it must wait.
-    pub(super) fn may_pass_on(
-        &mut self,
-        command: &Command,
-        drives: &mut [DriveState],
-        now: Instant,
-    ) -> Result<bool, Instant> {
-        let busy = |drive: &DriveState| drive.is_busy(Urgency::Stop) || drive.is_busy(Urgency::Command);
-        if command.reach().iter().filter_map(|drive| drives.get(*drive)).any(busy) {
-            return Ok(false);
-        }
-        let Order::Write(pdu) = &command.order else {
-            return Ok(true);
-        };
-        match self.blocks((command.drive, pdu), command.passed_on.as_ref(), drives, now) {
-            Some(until) => Err(until),
-            None => Ok(true),
-        }
-    }
-}
-
-/// Ends passed-on requests that can no longer be sent: unwanted, or not permitted.
-pub(super) fn drop_in_vain(pending: &mut Pending, drives: &[Arc<DriveImage>], now: Instant) {
-    let unwanted = |passed_on: &PassedOn| passed_on.frame.is_closed();
-    pending.remove(now, &Outcome::Replaced, |c| c.passed_on.as_ref().is_some_and(unwanted));
-    for why in drives.iter().filter_map(|image| image.hold.why()) {
-        let outcome = Outcome::Refused(Refusal::NotAllowed(why.to_string()));
-        let is_held = |passed_on: &PassedOn| held(passed_on, drives).as_ref() == Some(&outcome);
-        pending.remove(now, &outcome, |c| c.passed_on.as_ref().is_some_and(is_held));
     }
 }
 
@@ -185,154 +92,6 @@ impl Master {
             }
             None => self.bus.queue.background().put_back(begun.request, now),
         }
-    }
-
-    /// The order that is passed on next to drives of the bus, if it may go where nothing is in a hurry.
-    fn pass_on(&mut self, idle: bool, now: Instant) -> Result<Turn, Option<Instant>> {
-        let queue = self.bus.queue.clone();
-        let mut pending = queue.lock();
-        if pending.is_empty() {
-            return Err(None);
-        }
-        let (chosen, blocked) = self.next_passed_on(&mut pending, now);
-        let Some((chosen, command)) = chosen.and_then(|chosen| Some((chosen, pending.get(chosen)?))) else {
-            return Err(blocked);
-        };
-        let Order::Write(pdu) = &command.order else {
-            return Err(blocked);
-        };
-        let cost = self.exchange_cost(command.drive, pdu);
-        let admission = self.schedule.admits_background(Pace::Brisk, cost, idle, now);
-        if let Admission::NotBefore(at) = admission {
-            return Err(blocked.into_iter().chain([at]).min());
-        }
-        let command = pending.take(chosen).ok_or(blocked)?;
-        drop(pending);
-        self.begin_passed_on(command, Some(admission), now).ok_or(None)
-    }
-
-    /// The next request to pass on, and when to check again if one must wait.
-    fn next_passed_on(&mut self, pending: &mut Pending, now: Instant) -> (Option<Chosen>, Option<Instant>) {
-        let mut blocked: Option<Instant> = None;
-        let Master {
-            drives,
-            schedule,
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet,
-            ..
-        } = self;
-        let mut late = Late {
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet: *quiet,
-        };
-        let chosen = pending.next_passed_on(now, |command| {
-            let online = schedule.is_online(command.drive);
-            may_go(command, online, &mut late, drives, now).unwrap_or_else(|until| {
-                blocked = blocked.into_iter().chain([until]).min();
-                false
-            })
-        });
-        if let Some(starts) = starts {
-            starts.refuse(pending, now);
-        }
-        (chosen, blocked)
-    }
-
-    /// The broadcast of a stop of all drives, which goes before their own stops where it can go at once.
-    pub(super) fn broadcast_stop(&mut self, now: Instant) -> Option<Turn> {
-        let queue = self.bus.queue.clone();
-        let mut pending = queue.lock();
-        let chosen = pending.first_of_all(now)?;
-        let Master {
-            drives,
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet,
-            ..
-        } = self;
-        let mut late = Late {
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet: *quiet,
-        };
-        late.may_pass_on(pending.get(chosen)?, drives, now)
-            .is_ok_and(|may| may)
-            .then_some(())?;
-        let command = pending.take(chosen)?;
-        drop(pending);
-        self.begin_passed_on(command, None, now)
-    }
-
-    /// The broadcast of the shutdown, if it may go: the line is free for it.
-    ///
-    /// # Errors
-    /// When to look again; none where none waits.
-    pub(super) fn stop_the_line(&mut self, now: Instant) -> Result<Turn, Option<Instant>> {
-        let queue = self.bus.queue.clone();
-        let mut pending = queue.lock();
-        let (chosen, blocked) = self.next_passed_on(&mut pending, now);
-        let command = chosen.and_then(|chosen| pending.take(chosen)).ok_or(blocked)?;
-        drop(pending);
-        self.begin_passed_on(command, None, now).ok_or(None)
-    }
-
-    /// Begins what is passed on and was taken from the queue.
-    pub(super) fn begin_passed_on(
-        &mut self,
-        command: Command,
-        admission: Option<Admission>,
-        now: Instant,
-    ) -> Option<Turn> {
-        let held = command.passed_on.as_ref().and_then(|p| held(p, &self.bus.image.drives));
-        let away = command.drive != NO_DRIVE && !self.schedule.is_online(command.drive);
-        let lost = || self.bus.queue.lock().hold_at_turn(&command, now).map(Outcome::Refused);
-        let in_vain = held.or(away.then_some(Outcome::Offline)).or_else(lost);
-        if let Some(outcome) = in_vain {
-            command.answer(&outcome, now);
-            return None;
-        }
-        let Command {
-            drive,
-            order: Order::Write(pdu),
-            expires,
-            ticket,
-            touched,
-            passed_on,
-            number,
-            effects,
-            ..
-        } = command
-        else {
-            command.answer(&Outcome::Expired, now);
-            return None;
-        };
-        let request = BackgroundRequest {
-            drive,
-            pdu,
-            pace: Pace::Brisk,
-            expires,
-            ticket,
-            passed_on,
-        };
-        let begun = self.background.insert(Begun {
-            request,
-            admission,
-            ordered: Some(touched),
-            sent: false,
-            number,
-            effects,
-        });
-        Some(begun.turn())
     }
 
     /// Ends requests that can no longer be sent: expired, or their drive is offline.
@@ -404,7 +163,7 @@ impl Master {
     }
 
     /// Duration of the transaction, as far as the profile gives it.
-    fn exchange_cost(&self, drive: usize, pdu: &RequestPdu) -> Duration {
+    pub(super) fn exchange_cost(&self, drive: DriveIndex, pdu: &RequestPdu) -> Duration {
         let spec = &self.bus.image.spec;
         let turnaround = self.bus.image.drives.get(drive);
         let turnaround = turnaround.map_or(Duration::ZERO, |drive| drive.spec.turnaround);
@@ -644,34 +403,5 @@ impl Master {
             }
             self.note_write(turn.drive, table, &items, now);
         }
-    }
-}
-
-/// Whether what is passed on, or the stop before it, can go. One drive that is away answers for itself.
-pub(super) fn may_go(
-    command: &Command,
-    online: bool,
-    late: &mut Late<'_>,
-    drives: &mut [DriveState],
-    now: Instant,
-) -> Result<bool, Instant> {
-    if let Some((quiet, until)) = late.quiet
-        && command.reaches(quiet)
-        && !command.stops(quiet)
-    {
-        return Err(until);
-    }
-    let may = match &command.passed_on {
-        Some(_) => late.may_pass_on(command, drives, now)?,
-        None => match drives.get_mut(command.drive) {
-            Some(drive) => super::choose::may_begin(drive, command, online, now)?,
-            None => true,
-        },
-    };
-    // What goes to a drive that is away is answered, and starts nothing.
-    let goes = may && (online || command.passed_on.is_some());
-    match late.starts.as_mut().filter(|_| goes) {
-        Some(starts) => starts.may_go(command, now),
-        None => Ok(may),
     }
 }

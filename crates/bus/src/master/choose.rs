@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::background::{Late, drop_in_vain, may_go};
+use super::passed_on::{Late, drop_in_vain, may_go};
 use super::{Before, Master, Purpose, Turn};
 use crate::codec::RequestPdu;
 use crate::command::{
@@ -10,6 +10,7 @@ use crate::command::{
     still_keeps_limits,
 };
 use crate::command_run::{CommandRun, Step};
+use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::{DriveState, Wanted};
 use crate::schedule::{Decision, Poll};
 
@@ -56,7 +57,7 @@ impl Turns {
 
 /// A step of a started command that can go.
 struct Ready {
-    drive: usize,
+    drive: DriveIndex,
     slot: Urgency,
     rank: Urgency,
     step: Step,
@@ -163,8 +164,7 @@ impl Master {
         } = self;
         let is_checked = |drive: &mut DriveState| drive.run(slot).is_some_and(CommandRun::is_checked);
         let (drive, state) = drives
-            .iter_mut()
-            .enumerate()
+            .enumerate_mut()
             .find_map(|(index, drive)| is_checked(drive).then_some((index, drive)))?;
         let image = bus.image.drives.get(drive)?;
         match state.wanted(image, n2_late, now) {
@@ -217,7 +217,7 @@ impl Master {
             quiet,
             ..
         } = self;
-        for (index, (drive, image)) in drives.iter_mut().zip(&bus.image.drives).enumerate() {
+        for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if !drive.has_runs() {
                 continue;
             }
@@ -286,12 +286,12 @@ impl Master {
             starts,
             quiet: *quiet,
         };
-        let stands: Vec<bool> = drives
+        let stands: PerDrive<bool> = drives
             .iter()
             .zip(&bus.image.drives)
             .map(|(drive, image)| drive.was_stopped() && drive.stands_by_stop(&image.reading(now, drive.fresh)))
             .collect();
-        let redundant = |drive: usize| stands.get(drive).copied().unwrap_or(false);
+        let redundant = |drive: DriveIndex| stands.get(drive).copied().unwrap_or(false);
         for rank in RANKS {
             let mut until: Option<Instant> = None;
             let chosen = pending.next(

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use crate::command::{DEFAULT_EXPIRY, Origin, SourceKind, WriteStats};
-use crate::drive::{ModelPoint, Value};
+use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::drive_state::DriveState;
 use crate::plant::BusHandle;
 use crate::process_image::{DriveImage, Reading};
@@ -13,7 +13,7 @@ use crate::supervision::written_run;
 /// Reports to the queue whose commands were executed, and whether the drive is under local control.
 pub(super) fn look_at_hold(
     bus: &BusHandle,
-    index: usize,
+    index: DriveIndex,
     image: &Arc<DriveImage>,
     drive: &mut DriveState,
     (guarded, writes): (bool, &Arc<WriteStats>),
@@ -45,7 +45,13 @@ pub(super) fn look_at_hold(
 
 /// The run command that stands is taken away, so that nothing starts when the local control place gives the drive back. Whether that
 /// was so at a start of the gateway is not known: then nothing is written.
-fn stop_at_local(bus: &BusHandle, index: usize, drive: &DriveState, reading: &Reading<'_>, writes: &Arc<WriteStats>) {
+fn stop_at_local(
+    bus: &BusHandle,
+    index: DriveIndex,
+    drive: &DriveState,
+    reading: &Reading<'_>,
+    writes: &Arc<WriteStats>,
+) {
     let run = reading.model(ModelPoint::Run).good().map(|run| run.as_bool());
     if !run.or_else(|| written_run(reading, &drive.words)).unwrap_or(false) {
         return;

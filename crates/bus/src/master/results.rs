@@ -7,7 +7,7 @@ use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, is_reference, written};
 use crate::command_run::{Step, StepPurpose, read_place};
-use crate::drive::{PlannedRead, Point, Raw};
+use crate::drive::{DriveIndex, PlannedRead, Point, Raw};
 use crate::n2_late_replies::Asked;
 use crate::n2_session::Progress;
 use crate::news::News;
@@ -27,13 +27,14 @@ impl Master {
                     purpose: *step,
                     pdu: turn.pdu.clone(),
                 };
-                self.commanded(turn.drive, *slot, *rank, &step, end, now, news);
+                self.schedule.command_done(*rank, end.took);
+                self.commanded(turn.drive, *slot, &step, end, now, news);
             }
         }
     }
 
     /// A fault came up in a drive: it is asked for what its profile names for that.
-    pub fn fault_came(&mut self, drive: usize, now: Instant) {
+    pub fn fault_came(&mut self, drive: DriveIndex, now: Instant) {
         let Some(image) = self.bus.image.drives.get(drive) else {
             return;
         };
@@ -48,7 +49,7 @@ impl Master {
     }
 
     /// Monitoring points are to be read then.
-    pub fn monitor(&mut self, drive: usize, point: usize, at: Instant) {
+    pub fn monitor(&mut self, drive: DriveIndex, point: usize, at: Instant) {
         let Some(image) = self.bus.image.drives.get(drive) else {
             return;
         };
@@ -145,7 +146,7 @@ impl Master {
     /// A step that N2 needs before a poll or a command has ended: that is chosen again, or has failed with it.
     fn session_went_on(
         &mut self,
-        drive: usize,
+        drive: DriveIndex,
         step: Session,
         before: &Before,
         end: TurnEnd,
@@ -179,7 +180,7 @@ impl Master {
     }
 
     /// The drive has restarted: nothing that is known of it holds.
-    pub(super) fn restarted(&mut self, drive: usize, now: Instant, news: &mut Vec<News>) {
+    pub(super) fn restarted(&mut self, drive: DriveIndex, now: Instant, news: &mut Vec<News>) {
         if let Some(state) = self.drives.get_mut(drive) {
             state.restarted();
         }
@@ -245,7 +246,7 @@ impl Master {
     }
 
     /// The drive no longer replies: anyone who waits for it is answered, but for the stop, which is its probe.
-    fn went_offline(&mut self, index: usize, now: Instant, news: &mut Vec<News>) {
+    fn went_offline(&mut self, index: DriveIndex, now: Instant, news: &mut Vec<News>) {
         if let Some(drive) = self.drives.get_mut(index) {
             drive.went_offline(now);
         }
@@ -258,7 +259,7 @@ impl Master {
     /// The drive answered a read that was sent at `sent`.
     fn read(
         &mut self,
-        index: usize,
+        index: DriveIndex,
         read: PlannedRead,
         reply: Reply,
         sent: Instant,
@@ -281,7 +282,7 @@ impl Master {
     /// Stores the drive's values at the addresses of a read, as of `at`.
     pub(super) fn learn(
         &mut self,
-        index: usize,
+        index: DriveIndex,
         read: PlannedRead,
         words: Vec<u16>,
         at: Instant,
@@ -310,18 +311,15 @@ impl Master {
     }
 
     /// Applies the result of a transaction to its command.
-    #[allow(clippy::too_many_arguments, reason = "all that a turn of a command is")]
     fn commanded(
         &mut self,
-        index: usize,
+        index: DriveIndex,
         slot: Urgency,
-        rank: Urgency,
         step: &Step,
         end: TurnEnd,
         now: Instant,
         news: &mut Vec<News>,
     ) {
-        self.schedule.command_done(rank, end.took);
         let of_tool = self
             .drives
             .get_mut(index)
@@ -377,7 +375,15 @@ impl Master {
 
     /// A step got no valid reply. The next stop to a drive that does not answer waits a little, so that repeated
     /// stops do not take the line from the others.
-    fn step_failed(&mut self, index: usize, slot: Urgency, step: &Step, ended: &Ended, took: Duration, now: Instant) {
+    fn step_failed(
+        &mut self,
+        index: DriveIndex,
+        slot: Urgency,
+        step: &Step,
+        ended: &Ended,
+        took: Duration,
+        now: Instant,
+    ) {
         let online = self.schedule.is_online(index);
         let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) else {
             return;
@@ -421,7 +427,7 @@ impl Master {
 
     /// Registers were written, or may be: they are read back soon. What was read of the frequency range before says
     /// nothing where an end of it was among them, and both ends are read again.
-    pub(super) fn note_write(&mut self, index: usize, table: Table, items: &[(u16, u16)], now: Instant) {
+    pub(super) fn note_write(&mut self, index: DriveIndex, table: Table, items: &[(u16, u16)], now: Instant) {
         let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
             return;
         };
@@ -444,7 +450,7 @@ impl Master {
     }
 
     /// Schedules reading back written registers.
-    fn read_back(&mut self, index: usize, step: &Step, now: Instant) {
+    fn read_back(&mut self, index: DriveIndex, step: &Step, now: Instant) {
         if let RequestPdu::MaskWrite { address, or_mask, .. } = step.pdu {
             self.note_write(index, Table::Holding, &[(address, or_mask)], now);
         }

@@ -9,7 +9,7 @@ use tokio::sync::oneshot::error::TryRecvError;
 
 use super::Master;
 use crate::command::{Answer, NotStopped, Origin, Outcome, SourceKind, Stopping, WriteStats};
-use crate::drive::{ModelPoint, Value};
+use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::drive_state::FRESH;
 use crate::plant::{BusHandle, Exchange, Question};
 use crate::process_image::{Access, OnShutdown};
@@ -33,7 +33,7 @@ pub(super) struct Shutdown {
 
 #[derive(Debug)]
 struct Stop {
-    drive: usize,
+    drive: DriveIndex,
     state: State,
     /// It was ordered, and not acknowledged.
     in_vain: bool,
@@ -82,7 +82,7 @@ impl Stop {
 
 impl Shutdown {
     fn new(stopping: Stopping, bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Shutdown {
-        let drives = bus.image.drives.iter().enumerate();
+        let drives = bus.image.drives.enumerate();
         let wanted = drives
             .filter(|(_, image)| image.spec.on_shutdown == OnShutdown::Stop && image.spec.access == Access::Control);
         let stop = |(drive, _)| Stop {
@@ -114,7 +114,7 @@ impl Shutdown {
     /// Reports the drives that were not stopped, in words.
     pub(super) fn end(&mut self, bus: &BusHandle) {
         let Some(stopping) = self.stopping.take() else { return };
-        let name = |index: usize| bus.image.drives.get(index).map_or("?", |d| d.spec.name.as_str());
+        let name = |index: DriveIndex| bus.image.drives.get(index).map_or("?", |d| d.spec.name.as_str());
         let missing = self.stops.iter().filter_map(|stop| {
             let why = match (&stop.state, &stop.last) {
                 (State::Acknowledged, _) => return None,
@@ -183,7 +183,7 @@ fn broadcast(bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Option<
     Some(bus.ask(question, writes, now))
 }
 
-fn order(bus: &BusHandle, drive: usize, deadline: Instant, writes: &Arc<WriteStats>, now: Instant) -> State {
+fn order(bus: &BusHandle, drive: DriveIndex, deadline: Instant, writes: &Arc<WriteStats>, now: Instant) -> State {
     let Some(image) = bus.image.drives.get(drive) else {
         return State::Acknowledged;
     };

@@ -10,7 +10,7 @@ use crate::codec::wire::Silence;
 use crate::codec::{Exception, LineFormat, Reply, Table};
 use crate::command::{Answer, Authority, Command, CommandQueue, NO_DRIVE, Order, Ticket, admit};
 use crate::drive::profile::Profiles;
-use crate::drive::{ModelPoint, PollClass, Value};
+use crate::drive::{DriveIndex, ModelPoint, PollClass, Value};
 use crate::line::LineOptions;
 use crate::process_image::{
     Access, BusImage, BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings,
@@ -194,7 +194,7 @@ impl Rig {
                         }
                         Ended::Silent
                     }
-                    _ => self.drives[turn.drive].answer(turn.pdu()),
+                    _ => self.drives[turn.drive.place()].answer(turn.pdu()),
                 };
                 let took = if ended == Ended::Silent { TIMEOUT } else { COST };
                 self.now += took;
@@ -218,16 +218,16 @@ impl Rig {
 
     /// What is stored in the process image.
     fn apply(&self, news: &News) {
-        let image = |drive: usize| self.bus.image.drives[drive].clone();
+        let image = |drive: &DriveIndex| self.bus.image.drives[drive.place()].clone();
         match news {
-            News::Read { drive, read, words, at } => image(*drive).update(|s| {
+            News::Read { drive, read, words, at } => image(drive).update(|s| {
                 s.store(read.table, read.start, words, *at);
                 if read.class == PollClass::Fast {
                     s.fast_at = Some(*at);
                 }
             }),
-            News::Online(drive) => image(*drive).update(|s| s.link = Link::Online(SystemTime::now())),
-            News::Offline(drive) => image(*drive).update(|s| s.link = Link::Offline(SystemTime::now())),
+            News::Online(drive) => image(drive).update(|s| s.link = Link::Online(SystemTime::now())),
+            News::Offline(drive) => image(drive).update(|s| s.link = Link::Offline(SystemTime::now())),
             _ => {}
         }
     }
@@ -247,7 +247,7 @@ impl Rig {
         let admitted = admit(order, &image.reading(self.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, who);
         let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
-        let command = Command::new(drive, admitted, self.now + DEFAULT_EXPIRY, ticket);
+        let command = Command::new(DriveIndex::new(drive), admitted, self.now + DEFAULT_EXPIRY, ticket);
         self.bus.queue.submit(command, self.now);
         answer
     }
@@ -296,7 +296,7 @@ fn a_lease_ends_with_the_action_though_its_order_waited_longer_than_it() {
         );
     }
     assert!(rig.now >= started + Duration::from_millis(450), "it came too soon");
-    assert!(rig.news.contains(&News::LeaseRanOut(0)));
+    assert!(rig.news.contains(&News::LeaseRanOut(DriveIndex::new(0))));
 }
 
 #[test]
@@ -304,7 +304,7 @@ fn a_stop_is_the_probe_of_a_drive_that_does_not_answer() {
     let mut rig = Rig::new(2);
     rig.drives[0].silent = true;
     rig.run(Duration::from_secs(20));
-    assert!(rig.news.contains(&News::Offline(0)));
+    assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))));
     let mut run = rig.switch(0, "a", true);
     rig.run(Duration::from_millis(50));
     assert_eq!(outcome(&mut run), Some(Outcome::Offline), "at once, and unsent");
@@ -316,12 +316,12 @@ fn a_stop_is_the_probe_of_a_drive_that_does_not_answer() {
     assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
     assert!(!rig.runs(0));
     rig.run(Duration::from_millis(200));
-    assert!(matches!(
+    assert_eq!(
         rig.news
             .iter()
-            .rfind(|n| **n == News::Online(0) || **n == News::Offline(0)),
-        Some(News::Online(0))
-    ));
+            .rfind(|n| **n == News::Online(DriveIndex::new(0)) || **n == News::Offline(DriveIndex::new(0))),
+        Some(&News::Online(DriveIndex::new(0)))
+    );
 }
 
 #[test]
@@ -449,7 +449,7 @@ fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
         if turn.pdu().is_write() {
             break;
         }
-        let ended = rig.drives[turn.drive].answer(turn.pdu());
+        let ended = rig.drives[turn.drive.place()].answer(turn.pdu());
         let end = TurnEnd {
             ended,
             began: rig.now,
@@ -563,7 +563,7 @@ fn a_drive_that_fell_silent_with_the_shutdown_keeps_no_stop_from_those_that_are_
     let mut rig = Rig::new(3);
     rig.drives[1].silent = true;
     rig.run(Duration::from_secs(2));
-    assert!(!rig.master.schedule.is_online(1));
+    assert!(!rig.master.schedule.is_online(DriveIndex::new(1)));
     rig.drives[1].silent = false;
     rig.drives[1].holding.insert(2000, 1);
     rig.drives[0].silent = true;
@@ -589,7 +589,7 @@ fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_li
     let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
     rig.drives[0].silent = true;
     rig.run(Duration::from_secs(10));
-    assert!(rig.news.contains(&News::Offline(0)));
+    assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))));
     let from = rig.wire.len();
     let mut stop = rig.switch(0, "a", false);
     rig.run(Duration::from_millis(1500));
@@ -658,7 +658,7 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
         assert!(!rig.master.sending(&turn, rig.now).could_be_doubled);
         rig.now += COST;
         rig.master.done(&turn, garbled, rig.now, &mut Vec::new());
-        turn.drive = 1 - turn.drive;
+        turn.drive = DriveIndex::new(1 - turn.drive.place());
         assert_eq!(rig.master.sending(&turn, rig.now).could_be_doubled, expected);
     }
 }
@@ -747,12 +747,15 @@ fn what_a_gateway_in_between_answers_is_no_sign_of_the_drive() {
         let mut rig = Rig::new(2);
         rig.drives[0].to_reads = Some(exception);
         rig.run(Duration::from_secs(1));
-        assert!(rig.news.contains(&News::Offline(0)), "{exception}");
-        assert!(!rig.master.schedule.is_online(0), "{exception}");
-        assert!(rig.master.schedule.is_online(1));
+        assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))), "{exception}");
+        assert!(!rig.master.schedule.is_online(DriveIndex::new(0)), "{exception}");
+        assert!(rig.master.schedule.is_online(DriveIndex::new(1)));
         rig.drives[0].to_reads = None;
         rig.run(Duration::from_secs(3));
-        assert!(rig.master.schedule.is_online(0), "{exception}: it is back");
+        assert!(
+            rig.master.schedule.is_online(DriveIndex::new(0)),
+            "{exception}: it is back"
+        );
     }
     // Whatever else it answers shows that it is there, and only what is about the request splits what is read.
     for code in (1..=9).map(Exception) {
@@ -760,7 +763,7 @@ fn what_a_gateway_in_between_answers_is_no_sign_of_the_drive() {
         rig.drives[0].to_reads = Some(code);
         rig.news.clear();
         rig.run(Duration::from_secs(3));
-        assert!(rig.master.schedule.is_online(0), "{code}");
+        assert!(rig.master.schedule.is_online(DriveIndex::new(0)), "{code}");
         let unavailable = rig.news.iter().any(|news| matches!(news, News::Unavailable(..)));
         assert_eq!(unavailable, matches!(code.0, 1..=3), "{code}");
     }

@@ -1,6 +1,7 @@
 use std::time::Duration;
 
 use super::*;
+use crate::drive::DriveIndex;
 
 const IDENTIFY: Session = Session::Identify;
 const POLL: Session = Session::Poll { again: false };
@@ -36,11 +37,11 @@ fn restarted() -> Ended {
 
 impl Bench {
     fn before(&mut self, command: Option<Urgency>) -> Option<Session> {
-        self.sessions.before(0, command, self.now)
+        self.sessions.before(DriveIndex::new(0), command, self.now)
     }
 
     fn done(&mut self, step: Session, ended: &Ended) -> Progress {
-        self.sessions.done(0, step, ended, self.now)
+        self.sessions.done(DriveIndex::new(0), step, ended, self.now)
     }
 
     /// Identified, its report taken, and read once.
@@ -48,7 +49,7 @@ impl Bench {
         let mut bench = bench();
         bench.done(IDENTIFY, &identity());
         bench.done(POLL, &changes(b""));
-        bench.sessions.heard(0, &value());
+        bench.sessions.heard(DriveIndex::new(0), &value());
         assert_eq!(bench.before(None), None);
         bench
     }
@@ -93,7 +94,7 @@ fn a_report_that_never_ends() {
 fn two() -> N2Sessions {
     let now = Instant::now();
     let mut sessions = N2Sessions::new([N2Options::DEFAULT, N2Options::DEFAULT]);
-    for drive in 0..2 {
+    for drive in [0, 1].map(DriveIndex::new) {
         sessions.done(drive, IDENTIFY, &identity(), now);
         sessions.done(drive, POLL, &changes(b""), now);
         sessions.heard(drive, &value());
@@ -108,14 +109,17 @@ fn who_is_not_asked_is_polled_all_the_same() {
     let mut sessions = two();
     assert_eq!(sessions.neglected(now).count(), 0);
     let later = now + N2Options::DEFAULT.poll + Duration::from_secs(1);
-    sessions.gone(0);
+    sessions.gone(DriveIndex::new(0));
     assert_eq!(sessions.neglected(later).collect::<Vec<_>>(), [1]);
 }
 
 #[test]
 fn a_restart_begins_anew() {
     let mut bench = Bench::ready();
-    assert_eq!(bench.sessions.heard(0, &restarted()), Progress::Restarted);
+    assert_eq!(
+        bench.sessions.heard(DriveIndex::new(0), &restarted()),
+        Progress::Restarted
+    );
     assert_eq!(bench.before(Some(Urgency::Stop)), Some(IDENTIFY));
     assert_eq!(bench.done(IDENTIFY, &identity()), Progress::Going);
     assert_eq!(bench.before(None), Some(POLL));
@@ -144,10 +148,10 @@ fn drives_that_are_not_to_be_identified() {
     };
     assert_eq!(bench.before(None), Some(POLL));
     bench.done(POLL, &changes(b""));
-    bench.sessions.heard(0, &Ended::Silent);
+    bench.sessions.heard(DriveIndex::new(0), &Ended::Silent);
     assert_eq!(bench.before(None), None);
-    bench.sessions.heard(0, &value());
-    bench.sessions.heard(0, &restarted());
+    bench.sessions.heard(DriveIndex::new(0), &value());
+    bench.sessions.heard(DriveIndex::new(0), &restarted());
     assert_eq!(bench.before(None), Some(IDENTIFY), "it asked for it");
 }
 
@@ -155,6 +159,6 @@ fn drives_that_are_not_to_be_identified() {
 fn other_buses_have_none() {
     let mut sessions = N2Sessions::default();
     assert!(sessions.is_empty());
-    assert_eq!(sessions.before(0, None, Instant::now()), None);
-    assert_eq!(sessions.heard(0, &Ended::Silent), Progress::Going);
+    assert_eq!(sessions.before(DriveIndex::new(0), None, Instant::now()), None);
+    assert_eq!(sessions.heard(DriveIndex::new(0), &Ended::Silent), Progress::Going);
 }

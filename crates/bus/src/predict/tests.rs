@@ -4,7 +4,7 @@ use std::time::Instant;
 use super::super::schedule::{Cadence, Decision, Polled, Schedule};
 use super::*;
 use crate::codec::Protocol;
-use crate::drive::Profile;
+use crate::drive::{DriveIndex, Profile};
 
 /// A family whose drives are read by one fast request of 11 registers, and by slow ones of 10 each.
 fn profile(bauds: &str, slow: usize) -> Arc<Profile> {
@@ -250,7 +250,7 @@ fn every_remedy_carries_the_cadences() {
 /// Fast and slow cycles, s, that the schedule itself achieves on a line in virtual time.
 fn scheduled(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> (f64, f64) {
     let requests = predict(spec, silence, drives).requests;
-    let cost = |drive: usize, read: &PlannedRead| {
+    let cost = |drive: DriveIndex, read: &PlannedRead| {
         let found = requests.iter().find(|r| r.drive == drive && r.read == *read);
         found.map_or(Duration::ZERO, |r| r.wire)
     };

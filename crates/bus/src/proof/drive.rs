@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use crate::codec::{Reply, RequestPdu};
 use crate::command::written;
 use crate::drive::Profile;
-use crate::drive::control::{Control, Place, Run, Setting, Step, Until};
+use crate::drive::control::{Control, ControlItem, Run, Setting, Step, Until};
 
 /// In which state a proof begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -70,7 +70,7 @@ pub(super) struct Drive<'p> {
     local: bool,
 }
 
-fn key(place: Place) -> (u8, u16) {
+fn key(place: ControlItem) -> (u8, u16) {
     (place.table as u8, place.address)
 }
 
@@ -121,7 +121,7 @@ impl<'p> Drive<'p> {
         }
     }
 
-    fn put(&mut self, place: Place, word: u16) {
+    fn put(&mut self, place: ControlItem, word: u16) {
         self.words.insert(key(place), word);
     }
 
@@ -143,7 +143,7 @@ impl<'p> Drive<'p> {
     }
 
     /// The word that stands there.
-    pub(super) fn word(&self, place: Place) -> u16 {
+    pub(super) fn word(&self, place: ControlItem) -> u16 {
         self.words.get(&key(place)).copied().unwrap_or(0)
     }
 
@@ -159,7 +159,7 @@ impl<'p> Drive<'p> {
     /// Processes a request and returns the reply.
     pub(super) fn receives(&mut self, pdu: &RequestPdu) -> Reply {
         if let RequestPdu::Read { table, start, count } = pdu {
-            let word = |address| self.read(Place { table: *table, address });
+            let word = |address| self.read(ControlItem { table: *table, address });
             let words: Vec<u64> = vec![word(*start)];
             let value = words.first().copied().unwrap_or(0);
             return match (table.is_bits(), count) {
@@ -170,13 +170,13 @@ impl<'p> Drive<'p> {
         }
         if let Some((table, items)) = written(pdu) {
             for (address, word) in items {
-                self.takes(Place { table, address }, word);
+                self.takes(ControlItem { table, address }, word);
             }
         }
         Reply::Written
     }
 
-    fn takes(&mut self, place: Place, word: u16) {
+    fn takes(&mut self, place: ControlItem, word: u16) {
         let before = self.word(place);
         self.put(place, word);
         let here = |setting: &Setting| setting.place.unwrap_or(self.control.at) == place;
@@ -200,7 +200,7 @@ impl<'p> Drive<'p> {
     }
 
     /// Takes a word of the sequence, if it is the next one or an earlier one.
-    fn step(&mut self, place: Place, word: u16) {
+    fn step(&mut self, place: ControlItem, word: u16) {
         let free = self
             .control
             .reverse
@@ -245,7 +245,7 @@ impl<'p> Drive<'p> {
     }
 
     /// A register: the control word, or a status word as its steps and its motor make it.
-    fn read(&self, place: Place) -> u64 {
+    fn read(&self, place: ControlItem) -> u64 {
         if let Some(word) = self.words.get(&key(place)) {
             return u64::from(*word);
         }

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::{RECENT, Report};
 use crate::command::Origin;
-use crate::drive::{ModelPoint, Value};
+use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::event::{Event, EventKind};
 
 /// Time from a command to the poll that shows the motor running, ramps and slow polls included.
@@ -120,7 +120,7 @@ fn cause(who: &str) -> String {
 impl Report {
     /// Starts, stops, warnings and control places that changed with the last poll. What holds at the first read is no
     /// event; what changed while the drive was offline is one.
-    pub(super) fn look_at_state(&mut self, index: usize, now: Instant) {
+    pub(super) fn look_at_state(&mut self, index: DriveIndex, now: Instant) {
         let Some(drive) = self.drive(index) else { return };
         let reading = drive.reading(now, RECENT);
         for (place, (point, changes)) in WATCHED.into_iter().enumerate() {

@@ -5,6 +5,7 @@ use std::time::{Instant, SystemTime};
 use super::{RECENT, Report, goes_offline};
 use crate::command::{Origin, Refusal};
 use crate::confirm::Unconfirmed;
+use crate::drive::DriveIndex;
 use crate::event::{Event, EventKind, RefusedCommand};
 use crate::news::Adopted;
 use crate::plant::explain;
@@ -14,7 +15,7 @@ impl Report {
     /// Reports an event of a drive; `text` makes the words from its name.
     pub(crate) fn drive_event(
         &self,
-        index: usize,
+        index: DriveIndex,
         kind: EventKind,
         fault_code: Option<i64>,
         text: impl FnOnce(&str) -> String,
@@ -43,7 +44,14 @@ impl Report {
     }
 
     /// A command was refused at its turn, as others are when they come.
-    pub(super) fn start_refused(&self, index: usize, origin: &Origin, what: &str, refusal: &Refusal, now: Instant) {
+    pub(super) fn start_refused(
+        &self,
+        index: DriveIndex,
+        origin: &Origin,
+        what: &str,
+        refusal: &Refusal,
+        now: Instant,
+    ) {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
@@ -58,7 +66,7 @@ impl Report {
     }
 
     /// An action of supervision failed: counted, and reported if there is a `text`.
-    pub(super) fn action_failed(&self, index: usize, text: impl FnOnce(&str) -> Option<String>) {
+    pub(super) fn action_failed(&self, index: DriveIndex, text: impl FnOnce(&str) -> Option<String>) {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
@@ -69,7 +77,7 @@ impl Report {
     }
 
     /// The action of the lease of a drive, in words.
-    pub(super) fn action_of(&self, index: usize) -> &'static str {
+    pub(super) fn action_of(&self, index: DriveIndex) -> &'static str {
         let drive = self.image.drives.get(index);
         match drive
             .and_then(|drive| drive.spec.supervision.as_ref())
@@ -81,7 +89,7 @@ impl Report {
     }
 
     /// A motor that was to run and does not: with the causes that are known.
-    pub(super) fn not_confirmed(&self, index: usize, late: &Unconfirmed, now: Instant) {
+    pub(super) fn not_confirmed(&self, index: DriveIndex, late: &Unconfirmed, now: Instant) {
         if late.own {
             self.action_failed(index, |name| {
                 Some(format!(
@@ -102,7 +110,7 @@ impl Report {
         });
     }
 
-    pub(super) fn lease_ran_out(&self, index: usize) {
+    pub(super) fn lease_ran_out(&self, index: DriveIndex) {
         let Some(drive) = self.drive(index) else { return };
         let Some(supervision) = &drive.spec.supervision else {
             return;
@@ -119,7 +127,7 @@ impl Report {
         });
     }
 
-    pub(super) fn runs_unsupervised(&self, index: usize, adopted: Adopted) {
+    pub(super) fn runs_unsupervised(&self, index: DriveIndex, adopted: Adopted) {
         let then = match adopted {
             Adopted::Yes => "its lease starts now (supervision.adopt)",
             Adopted::No => {
@@ -134,7 +142,7 @@ impl Report {
     }
 
     /// Shows a drive as offline for a reason of its own.
-    pub(crate) fn gone(&self, index: usize, why: &str) {
+    pub(crate) fn gone(&self, index: DriveIndex, why: &str) {
         if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
             self.drive_event(index, EventKind::Offline, None, |name| {
                 format!("drive {name} is offline: {why}")
@@ -142,13 +150,13 @@ impl Report {
         }
     }
 
-    pub(super) fn offline_event(&self, index: usize, why: &str) {
+    pub(super) fn offline_event(&self, index: DriveIndex, why: &str) {
         self.drive_event(index, EventKind::Offline, None, |name| {
             format!("drive {name} is offline: {why}; retrying at least every 10 s")
         });
     }
 
-    pub(super) fn restarted(&self, index: usize) {
+    pub(super) fn restarted(&self, index: DriveIndex) {
         let Some(drive) = self.drive(index) else { return };
         drive.update(Snapshot::outlive);
         self.drive_event(index, EventKind::Restarted, None, |name| {
@@ -157,7 +165,7 @@ impl Report {
     }
 
     /// A drive says that it is of another device type than its profile expects.
-    pub(super) fn unlike(&self, index: usize, device: u8) {
+    pub(super) fn unlike(&self, index: DriveIndex, device: u8) {
         let Some(drive) = self.drive(index) else { return };
         let profile = &drive.spec.profile;
         self.drive_event(index, EventKind::UnlikeProfile, None, |name| {

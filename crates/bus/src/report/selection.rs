@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use super::{Findings, RECENT, Report};
 use crate::codec::Exception;
-use crate::drive::PlannedRead;
+use crate::drive::{DriveIndex, PlannedRead};
 use crate::event::EventKind;
 use crate::process_image::DriveImage;
 
@@ -12,10 +12,10 @@ impl Report {
     /// Compares what was just read. The monitoring points to be read: drive, point and time.
     pub(super) fn compare_selection(
         &mut self,
-        index: usize,
+        index: DriveIndex,
         read: &PlannedRead,
         at: Instant,
-    ) -> Vec<(usize, usize, Instant)> {
+    ) -> Vec<(DriveIndex, usize, Instant)> {
         let Some(drive) = self.drive(index) else {
             return Vec::new();
         };
@@ -29,7 +29,7 @@ impl Report {
     /// The drive does not have a monitoring register: its process data is served as it is.
     pub(super) fn monitor_refused(
         &mut self,
-        (index, drive): (usize, &DriveImage),
+        (index, drive): (DriveIndex, &DriveImage),
         read: &PlannedRead,
         exception: Exception,
         now: Instant,
@@ -43,7 +43,7 @@ impl Report {
         self.selection_found(drive, index, &findings);
     }
 
-    fn selection_found(&mut self, drive: &DriveImage, index: usize, findings: &Findings) {
+    fn selection_found(&mut self, drive: &DriveImage, index: DriveIndex, findings: &Findings) {
         if let Some(monitored) = &findings.monitored {
             drive.update(|snapshot| snapshot.monitored.clone_from(monitored));
         }

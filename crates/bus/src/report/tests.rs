@@ -3,6 +3,7 @@
 use super::*;
 use crate::codec::{LineFormat, Protocol};
 use crate::confirm::Unconfirmed;
+use crate::drive::DriveIndex;
 use crate::drive::profile::Profiles;
 use crate::process_image::{BusSpec, DriveSpec, LeaseAction};
 
@@ -41,7 +42,7 @@ fn whoever_sees_the_bus_down_sees_every_drive_offline() {
     let mut report = Report::new(image.clone(), &options(), Events::default(), Default::default(), now);
     for _ in 0..20 {
         report.bus_up(now);
-        for index in 0..image.drives.len() {
+        for index in image.drives.indexes() {
             report.apply(&News::Online(index), now);
         }
         let looking = image.clone();
@@ -64,7 +65,7 @@ fn a_bus_that_goes_down_is_reported_before_its_drives_and_once() {
     let events = Events::default();
     let mut report = Report::new(image.clone(), &options(), events.clone(), Default::default(), now);
     report.bus_up(now);
-    report.apply(&News::Online(0), now);
+    report.apply(&News::Online(DriveIndex::new(0)), now);
     report.bus_down("unplugged", now);
     report.bus_down("cannot be opened", now);
     report.bus_down("no such device", now);
@@ -108,7 +109,7 @@ fn show_fault(report: &mut Report, image: &BusImage, (fault, code): (bool, u16),
             .unwrap_or_else(|_| vec![0; usize::from(read.count)]);
         words[usize::from(raw.address - read.start)] = word;
         let news = News::Read {
-            drive: 0,
+            drive: DriveIndex::new(0),
             read,
             words,
             at: now,
@@ -123,7 +124,7 @@ fn a_code_that_goes_before_its_bit_is_no_other_fault() {
     let mut now = Instant::now();
     let events = Events::default();
     let mut report = Report::new(image.clone(), &options(), events.clone(), Default::default(), now);
-    report.apply(&News::Online(0), now);
+    report.apply(&News::Online(DriveIndex::new(0)), now);
     for shown in [
         (false, 0),
         (true, 1),
@@ -171,7 +172,7 @@ fn supervision_tells_what_it_is_about_to_do_and_what_came_of_it() {
     let events = Events::default();
     let mut report = Report::new(image, &options(), events.clone(), Default::default(), now);
     let failed = |why: Option<&str>| News::ActionFailed {
-        drive: 0,
+        drive: DriveIndex::new(0),
         why: why.map(str::to_string),
     };
     let unseen = Unconfirmed {
@@ -180,11 +181,14 @@ fn supervision_tells_what_it_is_about_to_do_and_what_came_of_it() {
         own: true,
     };
     for news in [
-        News::LeaseRanOut(0),
+        News::LeaseRanOut(DriveIndex::new(0)),
         failed(Some("the drive refused it with exception 04 (device failure)")),
         failed(None),
-        News::ActionTaken { drive: 0, failures: 2 },
-        News::NotConfirmed(0, unseen),
+        News::ActionTaken {
+            drive: DriveIndex::new(0),
+            failures: 2,
+        },
+        News::NotConfirmed(DriveIndex::new(0), unseen),
     ] {
         report.apply(&news, now);
     }
@@ -224,7 +228,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
         .find(|read| read.table == Table::Holding && read.covers(Table::Holding, 2100))
         .copied()
         .unwrap();
-    report.apply(&News::Online(0), now);
+    report.apply(&News::Online(DriveIndex::new(0)), now);
     let order = |run: bool, outcome: Outcome, now: Instant| {
         let origin = Origin::new(SourceKind::Mqtt, "operator");
         let (ticket, _) = Ticket::new(origin, "d1", "run".to_string(), true, now, writes.clone());
@@ -242,7 +246,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
         words[usize::from(2100 - status.start)] = word;
         report.apply(
             &News::Read {
-                drive: 0,
+                drive: DriveIndex::new(0),
                 read: status,
                 words,
                 at: now,

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::drives::{DriveSchedule, Item, Presence};
 use super::{FIRST_SHARE, Poll, RoundStart, Schedule, Turn};
-use crate::drive::{PlannedRead, PollClass};
+use crate::drive::{DriveIndex, PlannedRead, PollClass};
 
 impl Schedule {
     /// Slow polls earn their share of all time, idle time too: on a line that is nearly full it helps them nothing that
@@ -29,10 +29,9 @@ impl Schedule {
         }
         self.join_again(now);
         // The first reads of all drives, then the second ones: a reply that comes twice meets another drive's request.
-        let mut reads: Vec<(usize, usize, PlannedRead)> = Vec::new();
+        let mut reads: Vec<(usize, DriveIndex, PlannedRead)> = Vec::new();
         for (index, drive) in self
             .drives
-            .iter()
             .enumerate()
             .filter(|(_, d)| d.presence == Presence::Online && !d.is_quiet(now))
         {
@@ -105,9 +104,8 @@ impl Schedule {
             Presence::Away(at, _) if at <= now && !drive.is_quiet(now) => Some(at),
             _ => None,
         };
-        let mut waiting: Vec<(Instant, usize)> = self
+        let mut waiting: Vec<(Instant, DriveIndex)> = self
             .drives
-            .iter()
             .enumerate()
             .filter_map(|(i, d)| Some((due(d)?, i)))
             .collect();
@@ -124,7 +122,7 @@ impl Schedule {
 
     /// The read that a command asked for, waiting longest.
     pub(super) fn due_asked(&self, now: Instant) -> Option<Poll> {
-        let online = self.drives.iter().enumerate();
+        let online = self.drives.enumerate();
         let online = online.filter(|(_, d)| d.presence == Presence::Online && !d.doubted && !d.is_quiet(now));
         let asked = online.flat_map(|(drive, d)| d.items.iter().map(move |item| (drive, item)));
         let due = asked.filter_map(|(drive, item)| Some((item.asked.filter(|since| *since <= now)?, drive, item.read)));
@@ -145,7 +143,6 @@ impl Schedule {
         let (mut least, mut best) = (None, None);
         for (index, drive) in self
             .drives
-            .iter()
             .enumerate()
             .filter(|(_, d)| d.presence == Presence::Online && !d.waits_for_fast() && !d.is_quiet(now))
         {

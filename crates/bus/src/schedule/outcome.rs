@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use super::drives::Presence;
 use super::{Change, Poll, Polled, Schedule};
-use crate::drive::PollClass;
+use crate::drive::{DriveIndex, PollClass};
 
 /// First and longest pause before a slow request that is not answered, while the drive answers others, is tried again.
 const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
@@ -114,7 +114,7 @@ impl Schedule {
 
     /// The process data of a drive that did not answer something else is read now, though its round is not due: slow reads
     /// wait for it.
-    fn ask_whether_it_answers(&mut self, index: usize, now: Instant) {
+    fn ask_whether_it_answers(&mut self, index: DriveIndex, now: Instant) {
         if !self.round.is_empty() {
             return;
         }

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use super::*;
 use crate::codec::Table;
+use crate::drive::DriveIndex;
 
 mod chance;
 mod commands;
@@ -75,12 +76,12 @@ impl Bench {
                 self.schedule.command_done(urgency, COST);
             }
             Decision::Poll(poll) => {
-                let dead = self.dead.contains(&poll.drive);
+                let dead = self.dead.contains(&poll.drive.place());
                 let took = if dead { COST * 10 } else { COST };
                 self.now += took;
                 let polled = if dead { Polled::Failed } else { Polled::Ok };
                 if self.schedule.poll_done(&poll, polled, took, self.now) == Change::Offline {
-                    self.offline.push(poll.drive);
+                    self.offline.push(poll.drive.place());
                 }
             }
         }
@@ -101,7 +102,7 @@ impl Bench {
                 && poll.read.class == class
                 && !poll.probe
             {
-                *counts.entry(poll.drive).or_default() += 1;
+                *counts.entry(poll.drive.place()).or_default() += 1;
             }
         }
         counts
@@ -249,7 +250,7 @@ fn what_a_fault_asks_for_is_read_once_a_fault_and_takes_no_more_than_the_slow_sh
                     at += COST;
                     *polls.entry(poll.read.class).or_insert(0) += 1;
                     if poll.read.class == PollClass::Fault {
-                        asked.push((poll.read.start, poll.drive));
+                        asked.push((poll.read.start, poll.drive.place()));
                     }
                     schedule.poll_done(&poll, Polled::Ok, COST, at);
                 }
@@ -260,7 +261,7 @@ fn what_a_fault_asks_for_is_read_once_a_fault_and_takes_no_more_than_the_slow_sh
     let (_, _, asked) = pass(&mut schedule, Duration::from_secs(60));
     assert_eq!(asked, [], "never without a fault");
     let (at, before, _) = pass(&mut schedule, Duration::from_secs(60));
-    (0..32).for_each(|drive| schedule.fault_came(drive, |read| read.start == 2000, at));
+    (0..32).for_each(|drive| schedule.fault_came(DriveIndex::new(drive), |read| read.start == 2000, at));
     let (at, after, mut asked) = pass(&mut schedule, Duration::from_secs(60));
     asked.sort_unstable();
     let each: Vec<(u16, usize)> = [98, 200]
@@ -273,8 +274,8 @@ fn what_a_fault_asks_for_is_read_once_a_fault_and_takes_no_more_than_the_slow_sh
         (fast(&before) - fast(&after)).abs() * 100 <= fast(&before),
         "{before:?} {after:?}"
     );
-    schedule.fault_came(5, |_| false, at);
-    schedule.read_again(5, at);
+    schedule.fault_came(DriveIndex::new(5), |_| false, at);
+    schedule.read_again(DriveIndex::new(5), at);
     let (_, _, asked) = pass(&mut schedule, Duration::from_secs(60));
     assert_eq!(asked.len(), 2, "the next fault asks again");
 }

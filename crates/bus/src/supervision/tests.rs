@@ -11,7 +11,7 @@ use crate::command::{
 };
 use crate::command_run::{CommandRun, Next, Step};
 use crate::drive::profile::Profiles;
-use crate::drive::{Derived, Profile, Source};
+use crate::drive::{Derived, DriveIndex, Profile, Source};
 use crate::drive_state::{DriveState, Wanted};
 use crate::master::supervise;
 use crate::n2_late_replies::N2LateReplies;
@@ -97,7 +97,7 @@ impl Bench {
         let (bus, now) = (self.bus.clone(), self.now);
         supervise(
             &bus,
-            0,
+            DriveIndex::new(0),
             &self.image(),
             &mut self.drive,
             &self.stats,
@@ -168,7 +168,7 @@ impl Bench {
 
     /// Leases that ran out while the drive ran.
     fn reported(&self) -> usize {
-        let ran_out = |news: &&News| matches!(news, News::LeaseRanOut(0));
+        let ran_out = |news: &&News| matches!(news, News::LeaseRanOut(_));
         self.news.iter().filter(ran_out).count()
     }
 
@@ -191,7 +191,7 @@ impl Bench {
         let admitted = admit(Order::Points(vec![(index, value)]), &reading, Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "client");
         let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
-        let command = Command::new(0, admitted, self.now + DEFAULT_EXPIRY, ticket);
+        let command = Command::new(DriveIndex::new(0), admitted, self.now + DEFAULT_EXPIRY, ticket);
         self.bus.queue.submit(command, self.now);
         answer
     }
@@ -359,12 +359,15 @@ fn an_action_that_fails_is_told_once_for_each_reason_and_counted_each_time() {
     command.answer(&acknowledged(), bench.now);
     bench.look(10, true);
     let failed = |why: Option<&Outcome>| News::ActionFailed {
-        drive: 0,
+        drive: DriveIndex::new(0),
         why: why.map(Outcome::to_string),
     };
-    let taken = News::ActionTaken { drive: 0, failures: 4 };
+    let taken = News::ActionTaken {
+        drive: DriveIndex::new(0),
+        failures: 4,
+    };
     let expected = [
-        News::LeaseRanOut(0),
+        News::LeaseRanOut(DriveIndex::new(0)),
         failed(Some(&refused)),
         failed(None),
         failed(Some(&Outcome::TimedOut)),
@@ -382,7 +385,7 @@ fn an_action_that_cannot_be_written_is_told_once_and_stays_due() {
     for _ in 0..10 {
         assert!(bench.after(5_000, true).is_none(), "the frequency range is not known");
     }
-    let [News::LeaseRanOut(0), News::ActionRefused { drive: 0, refusal, .. }] = &bench.news[..] else {
+    let [News::LeaseRanOut(_), News::ActionRefused { refusal, .. }] = &bench.news[..] else {
         panic!("{:?}", bench.news)
     };
     assert!(refusal.to_string().contains("frequency_range"), "{refusal}");
@@ -511,7 +514,7 @@ fn a_drive_that_runs_without_a_lease_is_told_once_and_adopted_where_that_is_want
     for _ in 0..100 {
         assert!(bench.after(1_000, true).is_none(), "nobody commanded it");
     }
-    assert_eq!(bench.news, [News::RunsUnsupervised(0, Adopted::No)]);
+    assert_eq!(bench.news, [News::RunsUnsupervised(DriveIndex::new(0), Adopted::No)]);
     assert!(bench.image().is_unsupervised());
     bench.reload(bench.spec());
     assert!(bench.after(1_000, true).is_none());
@@ -529,7 +532,7 @@ fn a_drive_that_runs_without_a_lease_is_told_once_and_adopted_where_that_is_want
     assert!(bench.after(10_000, false).is_none());
     assert!(bench.after(100, true).is_none(), "the clock only");
     assert!(bench.after(4_900, true).is_none());
-    assert_eq!(bench.news, [News::RunsUnsupervised(0, Adopted::Yes)]);
+    assert_eq!(bench.news, [News::RunsUnsupervised(DriveIndex::new(0), Adopted::Yes)]);
     assert_eq!(bench.after(100, true).expect("the stop").urgency, Urgency::Stop);
     // Whoever commands it before it is seen to run has his lease.
     let mut bench = Bench::new(LeaseAction::Stop);

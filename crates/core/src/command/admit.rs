@@ -6,7 +6,7 @@ use super::standing::keeps_limits;
 use super::{Authority, Order, ParameterOrder, Refusal, Urgency};
 use crate::codec::n2::Object;
 use crate::codec::{Protocol, RequestPdu, Table};
-use crate::drive::control::Place;
+use crate::drive::control::ControlItem;
 use crate::drive::model::Kind;
 use crate::drive::profile::AddressRange;
 use crate::drive::{Derived, ModelPoint, Point, Source, Value};
@@ -288,10 +288,12 @@ fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value)
         let Some(limits) = limits.filter(|_| other != asked && other != index) else {
             continue;
         };
-        let Some(figure) = becomes(drive, other, written) else {
-            continue;
+        let figure = match becomes(drive, other, written) {
+            Becomes::Untouched => continue,
+            Becomes::Known(value) => Some(value.as_f64()),
+            Becomes::Unknown => None,
         };
-        let Some(figure) = figure.map(Value::as_f64) else {
+        let Some(figure) = figure else {
             return Err(Refusal::NotKnown(format!(
                 "the limits of `{}` cannot be checked: the drive's frequency range is unknown, or was not read in the \
                  last {:.0} s; set frequency_range for the drive",
@@ -316,27 +318,50 @@ fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value)
 pub fn converted(drive: &Reading<'_>, (index, value): (usize, Value), to: usize) -> Option<Value> {
     let point = drive.spec.profile.points.get(index)?;
     let written = resolve(drive, index, point, value).ok()?;
-    becomes(drive, to, written).flatten()
+    match becomes(drive, to, written) {
+        Becomes::Known(value) => Some(value),
+        Becomes::Unknown | Becomes::Untouched => None,
+    }
+}
+
+/// What a point is once the register of another one is written.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Becomes {
+    /// The two have nothing to do with each other.
+    Untouched,
+    /// The band by which it is converted is not known.
+    Unknown,
+    Known(Value),
 }
 
 /// What a point is once the register of another one is written: itself, or by the point that takes its commands, or by
-/// conversion. `None` where the two have nothing to do with each other, `Some(None)` where the band is not known.
-pub(super) fn becomes(drive: &Reading<'_>, point: usize, written: (usize, Value)) -> Option<Option<Value>> {
+/// conversion.
+pub(super) fn becomes(drive: &Reading<'_>, point: usize, written: (usize, Value)) -> Becomes {
     let (index, value) = written;
     if point == index {
-        return Some(Some(value));
+        return Becomes::Known(value);
     }
-    let entry = drive.spec.profile.points.get(point)?;
+    let Some(entry) = drive.spec.profile.points.get(point) else {
+        return Becomes::Untouched;
+    };
     if let Some(target) = entry.write_to {
         return becomes(drive, target, written);
     }
     let Source::Derived(derived) = &entry.source else {
-        return None;
+        return Becomes::Untouched;
     };
-    let (of, minimum, maximum) = derived.band()?;
-    let of = becomes(drive, of, written)?;
+    let Some((of, minimum, maximum)) = derived.band() else {
+        return Becomes::Untouched;
+    };
+    let of = match becomes(drive, of, written) {
+        Becomes::Known(of) => of,
+        other => return other,
+    };
     let band = drive.band_for_commands(minimum, maximum);
-    Some(of.zip(band).and_then(|(of, band)| derived.value([of], Some(band))))
+    match band.and_then(|band| derived.value([of], Some(band))) {
+        Some(value) => Becomes::Known(value),
+        None => Becomes::Unknown,
+    }
 }
 
 /// A derived point becomes the point it rests on; the value must fit the register.
@@ -502,7 +527,7 @@ fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Res
     };
     let refused = |(address, word): &&(u16, u16)| {
         !control.admits(
-            Place {
+            ControlItem {
                 table,
                 address: *address,
             },

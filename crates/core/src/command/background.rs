@@ -13,6 +13,7 @@ use tokio::sync::oneshot;
 
 use super::{Command, Effect, Order, Outcome, SourceKind, Ticket, Touched, Urgency};
 use crate::codec::RequestPdu;
+use crate::drive::DriveIndex;
 
 /// Background requests that may wait on one bus.
 pub const BACKGROUND_CAPACITY: usize = 32;
@@ -43,13 +44,13 @@ impl Pace {
 }
 
 /// The index of no drive: that of a request to an address of the line at which none is configured.
-pub const NO_DRIVE: usize = usize::MAX;
+pub const NO_DRIVE: DriveIndex = DriveIndex::new(usize::MAX);
 
 /// A request of the lowest rank: one transaction with one drive.
 #[derive(Debug)]
 pub struct BackgroundRequest {
     /// Index of the drive on its bus, or [`NO_DRIVE`].
-    pub drive: usize,
+    pub drive: DriveIndex,
     /// The request. The submitter of a write has checked that it is allowed.
     pub pdu: RequestPdu,
     /// How much of a busy line it may take.
@@ -70,11 +71,11 @@ pub struct PassedOn {
     /// It may change anything in anyone who hears it.
     pub may_write: bool,
     /// The drives of the bus that hear it.
-    pub reach: Vec<usize>,
+    pub reach: Vec<DriveIndex>,
     /// Those of them whose run command it clears.
-    pub stops: Vec<usize>,
+    pub stops: Vec<DriveIndex>,
     /// What it means for the priority arrays of those that hear it.
-    pub effects: Vec<(usize, Effect)>,
+    pub effects: Vec<(DriveIndex, Effect)>,
     /// It stops all that hear it, and goes before all that waits.
     pub first: bool,
     /// Receives the reply frame, as the drive sent it.

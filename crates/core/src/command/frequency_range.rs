@@ -3,7 +3,7 @@
 
 use std::time::Instant;
 
-use super::admit::becomes;
+use super::admit::{Becomes, becomes};
 use crate::codec::Table;
 use crate::drive::{Bound, Profile, Source, Value};
 use crate::process_image::Reading;
@@ -45,7 +45,10 @@ pub(super) fn rests_on(drive: &Reading<'_>, asked: usize, written: (usize, Value
         let Some((minimum, maximum)) = matters.then(|| band(&drive.spec.profile, index)).flatten() else {
             continue;
         };
-        let Some(was) = becomes(drive, index, written).and_then(|_| drive.band_for_commands(minimum, maximum)) else {
+        if becomes(drive, index, written) == Becomes::Untouched {
+            continue;
+        }
+        let Some(was) = drive.band_for_commands(minimum, maximum) else {
             continue;
         };
         let range = FrequencyRange { minimum, maximum, was };

@@ -16,6 +16,7 @@ use std::time::Instant;
 
 use self::holds::Holds;
 use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal, Urgency};
+use crate::drive::DriveIndex;
 use crate::start_guard::BusGuards;
 
 /// Commands and forwarded reads that may wait on one bus, besides two stops for each drive.
@@ -36,27 +37,27 @@ pub struct Pending {
     /// The gateway is about to stop: only stops get in.
     stops_only: bool,
     /// Clients and their drives in the order in which they were served, the last one last.
-    served: VecDeque<(String, usize)>,
+    served: VecDeque<(String, DriveIndex)>,
     /// Drives for which a stop arrived since the bus last checked, each once.
-    stopped: Vec<usize>,
+    stopped: Vec<DriveIndex>,
     /// Commands taken in so far.
     numbered: u64,
     /// Stops taken in so far, by drive.
-    stops: BTreeMap<usize, u64>,
+    stops: BTreeMap<DriveIndex, u64>,
     /// When the last of them arrived.
-    stopped_at: BTreeMap<usize, Instant>,
+    stopped_at: BTreeMap<DriveIndex, Instant>,
     /// Who gave the last of them.
-    stopped_by: BTreeMap<usize, Origin>,
+    stopped_by: BTreeMap<DriveIndex, Origin>,
     /// A drive to which nothing but stops is sent until then.
-    quiet: Option<(usize, Instant)>,
+    quiet: Option<(DriveIndex, Instant)>,
     /// The bus ends and another one takes its place: stops wait for that one.
     ending: bool,
     /// The queues that took over the stops of drives, and their places there.
-    heirs: BTreeMap<usize, (Arc<CommandQueue>, usize)>,
+    heirs: BTreeMap<DriveIndex, (Arc<CommandQueue>, DriveIndex)>,
     /// The login of the last client command, by drive; no entry if there was none, or its client has no login.
-    commanders: BTreeMap<usize, Arc<str>>,
+    commanders: BTreeMap<DriveIndex, Arc<str>>,
     /// Who commands by priorities, by drive.
-    priorities: BTreeMap<usize, Priorities>,
+    priorities: BTreeMap<DriveIndex, Priorities>,
     /// Who holds the drives.
     holds: Holds,
     /// The stops that the gateway wants before it ends, until the bus takes note of it.
@@ -147,9 +148,9 @@ impl Pending {
     /// Who blocks a command that starts the motor or sets a reference.
     fn refuses(&self, command: &Command, now: Instant) -> Option<Refusal> {
         let (origin, reach) = (command.ticket.origin(), command.reach());
-        let waits = |drive: &usize| self.held_back(*drive, origin, command.effect(*drive));
+        let waits = |drive: &DriveIndex| self.held_back(*drive, origin, command.effect(*drive));
         let until = command.waits.then_some(command.expires);
-        let guarded = |drive: &usize| self.guarded(*drive, command.effect(*drive), until, now);
+        let guarded = |drive: &DriveIndex| self.guarded(*drive, command.effect(*drive), until, now);
         (command.urgency == Urgency::Command)
             .then(|| reach.iter().find_map(waits).or_else(|| reach.iter().find_map(guarded)))
             .flatten()
@@ -157,7 +158,7 @@ impl Pending {
 
     /// Why a command with that effect is refused, if it starts a motor that may not be started yet; it may wait until
     /// `until`.
-    pub fn guarded(&self, drive: usize, effect: Effect, until: Option<Instant>, now: Instant) -> Option<Refusal> {
+    pub fn guarded(&self, drive: DriveIndex, effect: Effect, until: Option<Instant>, now: Instant) -> Option<Refusal> {
         self.guards.as_ref()?.refuses(drive, effect, until, now)
     }
 
@@ -176,7 +177,7 @@ impl Pending {
     }
 
     /// Why a command of that client with that effect is refused, if another client's slot blocks it.
-    pub fn held_back(&self, drive: usize, origin: &Origin, effect: Effect) -> Option<Refusal> {
+    pub fn held_back(&self, drive: DriveIndex, origin: &Origin, effect: Effect) -> Option<Refusal> {
         let protects = self.priorities.get(&drive)?.refuses(origin, effect)?;
         let (what, priority) = (protects.what.name(), protects.priority);
         Some(Refusal::HeldByOther(Box::new(Holder {
@@ -188,7 +189,7 @@ impl Pending {
     }
 
     /// The priority arrays of a drive.
-    pub fn priorities(&mut self, drive: usize) -> &mut Priorities {
+    pub fn priorities(&mut self, drive: DriveIndex) -> &mut Priorities {
         self.priorities.entry(drive).or_default()
     }
 
@@ -210,18 +211,18 @@ impl Pending {
     }
 
     /// The login that commanded a drive last, unless another client did since.
-    pub fn commander(&self, drive: usize) -> Option<&Arc<str>> {
+    pub fn commander(&self, drive: DriveIndex) -> Option<&Arc<str>> {
         self.commanders.get(&drive)
     }
 
     /// Takes over a drive's state from the previous bus: last commander, number of stops, priority arrays.
-    pub fn take_over(&mut self, drive: usize, commander: Option<Arc<str>>, stops: u64, priorities: Priorities) {
+    pub fn take_over(&mut self, drive: DriveIndex, commander: Option<Arc<str>>, stops: u64, priorities: Priorities) {
         self.set_commander(drive, commander);
         self.priorities.insert(drive, priorities);
         self.stops.insert(drive, stops);
     }
 
-    fn set_commander(&mut self, drive: usize, login: Option<Arc<str>>) {
+    fn set_commander(&mut self, drive: DriveIndex, login: Option<Arc<str>>) {
         match login {
             Some(login) => self.commanders.insert(drive, login),
             None => self.commanders.remove(&drive),
@@ -269,7 +270,7 @@ impl Pending {
         rank: Urgency,
         now: Instant,
         mut may: impl FnMut(&Command) -> bool,
-        redundant: impl Fn(usize) -> bool,
+        redundant: impl Fn(DriveIndex) -> bool,
     ) -> Option<Chosen> {
         self.expire(now);
         let pressed = self.pressed();
@@ -278,8 +279,8 @@ impl Pending {
             false => self.passed_on(&mut may),
         };
         // Drives whose later commands wait: behind an older one, or behind a stop.
-        let mut behind: Vec<usize> = self.drives_of(Urgency::Stop);
-        let mut stopped: Vec<usize> = Vec::new();
+        let mut behind: Vec<DriveIndex> = self.drives_of(Urgency::Stop);
+        let mut stopped: Vec<DriveIndex> = Vec::new();
         let mut best = None;
         for (index, command) in self.waiting.iter().enumerate() {
             let drive = command.drive;
@@ -342,20 +343,20 @@ impl Pending {
         (last, of_drive)
     }
 
-    fn drives_of(&self, urgency: Urgency) -> Vec<usize> {
+    fn drives_of(&self, urgency: Urgency) -> Vec<DriveIndex> {
         let of_rank = self.waiting.iter().filter(|c| c.urgency == urgency);
         of_rank.map(|c| c.drive).collect()
     }
 
     /// Whether a command waits that may start the drive.
-    fn may_start(&self, drive: usize) -> bool {
+    fn may_start(&self, drive: DriveIndex) -> bool {
         let command = |c: &Command| c.urgency == Urgency::Command && !c.reference_only;
         let starts = |c: &Command| c.reaches(drive) && command(c) && !c.stops(drive);
         self.waiting.iter().any(starts)
     }
 
     /// The latest expiry of a client's waiting command or stop for that drive; none if none waits.
-    pub fn client_waits_until(&self, drive: usize) -> Option<Instant> {
+    pub fn client_waits_until(&self, drive: DriveIndex) -> Option<Instant> {
         let commands = self
             .waiting
             .iter()

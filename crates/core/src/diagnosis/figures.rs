@@ -1,13 +1,18 @@
 //! What is counted: for each drive and for the line, in steps of the last minute. All of it is bounded, and a
 //! transaction that goes well costs a few additions.
 
+mod drive;
+
 use std::time::{Duration, Instant};
+
+pub use self::drive::{Drive, Sign};
 
 use super::STEP;
 use super::counters::{Contrast, FADE, InPhase, LATENCY, LONGEST_AGE, MAINS, Running, STEPS, Window, lock};
-use super::signature::{self, Shape};
+use super::signature::{self, Answering, Shape};
 use crate::codec::describe::{self, Kind};
 use crate::codec::{LineFormat, Protocol, Request};
+use crate::drive::{DriveIndex, PerDrive};
 
 /// Memory of a drive, at most; a line has 2 KiB besides, at most.
 pub const BYTES_PER_DRIVE: usize = 512;
@@ -42,7 +47,7 @@ pub enum End {
 #[derive(Debug, Clone, Copy)]
 pub struct Exchange<'e> {
     /// Place of the drive on the bus.
-    pub drive: usize,
+    pub drive: DriveIndex,
     /// The request.
     pub request: &'e Request,
     pub frame: &'e [u8],
@@ -78,101 +83,12 @@ pub struct Line {
     pub response_timeout: Duration,
 }
 
-/// What is counted per drive in each step.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Sign {
-    /// Sound replies.
-    Answered,
-    /// Requests without a reply, of a drive that is there.
-    Silent,
-    /// Requests without a reply, all of them.
-    Tried,
-    /// Replies that are damaged anywhere.
-    Damaged,
-    /// Of those: longer than the reply could be.
-    Overlong,
-    /// Stray bytes directly before the reply.
-    Led,
-    /// Of those: zeros.
-    LedZero,
-    /// Replies without their beginning.
-    StartLost,
-    /// Requests that came back without their end.
-    CutEcho,
-    /// Stray bytes after a reply, while the line should be idle.
-    Idle,
-    /// Further valid replies.
-    Second,
-    /// Sound replies after the time limit.
-    Late,
-    /// Replies that used more than half of the time limit.
-    Slow,
-    /// Transactions that show whether the adapter hears itself.
-    EchoShown,
-    /// It does.
-    Echoed,
-}
-
-const SIGNS: usize = Sign::Echoed as usize + 1;
-
-/// The counters of one drive.
-#[derive(Debug, Clone)]
-pub struct Drive {
-    pub address: u8,
-    window: Window<SIGNS>,
-    /// Slowest beginning of a reply in each step, tenths of a millisecond.
-    slowest: Window<1>,
-    /// Requests without a reply in a row; those of them that followed a reply closely, and after a pause.
-    run: u16,
-    run_paused: [u16; 2],
-    silent_at: Option<Instant>,
-    mains: InPhase,
-    /// Requests to a drive of which nothing was ever heard; `None` once there was something.
-    in_vain: Option<u16>,
-}
-
-impl Drive {
-    fn add(&mut self, sign: Sign) {
-        self.window.add(sign as usize, 1);
-    }
-
-    /// In the last minute.
-    pub fn sum(&self, sign: Sign) -> u32 {
-        self.window.sum(sign as usize)
-    }
-
-    /// Steps of the last minute in which one of these was counted.
-    pub fn steps(&self, signs: &[Sign]) -> usize {
-        let has = |step: &&[u16; SIGNS]| {
-            signs
-                .iter()
-                .any(|sign| step.get(*sign as usize).is_some_and(|count| *count > 0))
-        };
-        self.window.steps.iter().filter(has).count()
-    }
-
-    /// Slowest beginning of a reply in the last minute, ms.
-    pub fn slowest_ms(&self) -> f64 {
-        f64::from(self.slowest.each(0).max().unwrap_or_default()) / 10.0
-    }
-
-    /// How often a drive was asked of which nothing was ever heard.
-    pub fn in_vain(&self) -> Option<u16> {
-        self.in_vain
-    }
-
-    fn was_silent(&self, at: Instant) -> bool {
-        self.silent_at
-            .is_some_and(|silent| at.saturating_duration_since(silent) <= LATE)
-    }
-}
-
 /// The counters of a line.
 #[derive(Debug, Clone)]
 pub struct Figures {
     /// How the line is set up.
     pub line: Line,
-    pub drives: Vec<Drive>,
+    pub drives: PerDrive<Drive>,
     /// Sound replies by the millisecond of their arrival, modulo the latency timer; requests after a pause likewise.
     arrivals: Window<LATENCY>,
     paced: Window<LATENCY>,
@@ -182,7 +98,7 @@ pub struct Figures {
     /// Sound replies of an address that was not asked, by step.
     wrong: Window<1>,
     idle: Vec<u8>,
-    last: Option<(usize, End)>,
+    last: Option<(DriveIndex, End)>,
     /// When the transaction before was over.
     last_at: Instant,
     epoch: Instant,
@@ -449,7 +365,7 @@ impl Figures {
     }
 
     /// The drive is received of: what it left unanswered before counts, unless it was absent.
-    fn is_there(&mut self, drive: usize, at: Instant) {
+    fn is_there(&mut self, drive: DriveIndex, at: Instant) {
         let Some(drive) = self.drives.get_mut(drive) else {
             return;
         };
@@ -520,15 +436,15 @@ impl Figures {
 
     /// A sound answer that was not believed, if it is one: a late one, a second one, or one of nobody who was asked.
     fn answer_of_another(&mut self, bytes: &[u8], at: Instant) -> bool {
-        let Some(address) = signature::answer(self.line.protocol, bytes) else {
+        let Some(answering) = signature::answer(self.line.protocol, bytes) else {
             return false;
         };
         let asked = self.last.map(|(drive, _)| drive);
-        let drive = match address {
-            Some(address) => self.drives.iter().position(|drive| drive.address == address),
+        let drive = match answering {
+            Answering::Address(address) => self.drives.position(|drive| drive.address == address),
             // A frame of N2 names nobody: it is late if anybody was silent lately.
-            None => {
-                let silent = self.drives.iter().enumerate().filter(|(_, drive)| drive.was_silent(at));
+            Answering::Anybody => {
+                let silent = self.drives.enumerate().filter(|(_, drive)| drive.was_silent(at));
                 silent
                     .max_by_key(|(_, drive)| drive.silent_at)
                     .map(|(place, _)| place)

@@ -5,7 +5,7 @@ use super::{Cause, Certainty, Finding};
 /// Steps of 5 s after which a verdict that no longer holds goes.
 const GOES_AFTER: u32 = 12;
 /// Most verdicts of a line that are held at a time.
-const MOST: usize = 24;
+const MOST_VERDICTS: usize = 24;
 
 /// A finding that is held.
 #[derive(Debug, Clone, PartialEq)]
@@ -74,7 +74,7 @@ impl Hold {
     fn found(&mut self, finding: Finding, changes: &mut Vec<Change>) {
         let same = |held: &&mut Held| held.finding.cause == finding.cause && held.finding.drive == finding.drive;
         let Some(held) = self.held.iter_mut().find(same) else {
-            if self.held.len() < MOST {
+            if self.held.len() < MOST_VERDICTS {
                 let shown = patience(finding.cause) <= 1;
                 if shown {
                     changes.push(Change::Came(finding.clone()));

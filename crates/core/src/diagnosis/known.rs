@@ -2,6 +2,7 @@
 
 use super::Drive;
 use super::figures::Sign;
+use crate::drive::DriveIndex;
 
 /// Transactions in the last minute from which on a drive is known.
 const KNOWN: u32 = 15;
@@ -19,7 +20,7 @@ const TIMES: f64 = 5.0;
 /// The known rates of one drive.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Known {
-    pub(super) place: usize,
+    pub(super) place: DriveIndex,
     pub(super) asked: u32,
     pub(super) failed: u32,
     pub(super) silent: u32,
@@ -67,7 +68,7 @@ pub(super) fn stand_out(known: &[Known], count: usize) -> bool {
 
 impl Known {
     /// What is known of the drive at that place, if it was asked often enough.
-    pub(super) fn of(place: usize, drive: &Drive) -> Option<Known> {
+    pub(super) fn of(place: DriveIndex, drive: &Drive) -> Option<Known> {
         let (silent, damaged) = (drive.sum(Sign::Silent), drive.sum(Sign::Damaged));
         let others = drive.sum(Sign::Answered) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho);
         let asked = others + silent + damaged;

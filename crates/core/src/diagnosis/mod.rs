@@ -23,6 +23,7 @@ use std::time::{Duration, SystemTime};
 use serde::Serialize;
 
 use crate::codec::RequestPdu;
+use crate::drive::DriveIndex;
 
 pub use figures::{Drive, End, Exchange, Figures, Line};
 
@@ -140,7 +141,7 @@ impl Certainty {
 pub struct Finding {
     pub cause: Cause,
     /// The drive, where it is about one.
-    pub drive: Option<usize>,
+    pub drive: Option<DriveIndex>,
     /// How far the evidence goes.
     pub certainty: Certainty,
     /// The evidence, as text.

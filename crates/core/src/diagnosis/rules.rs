@@ -8,6 +8,7 @@ use super::counters::{Contrast, MAINS, STEPS};
 use super::figures::{Figures, Sign};
 use super::known::{ENOUGH, FEW, Known, LASTING, SIGNIFICANT, share, stand_out, sums};
 use super::{Cause, Certainty, Finding};
+use crate::drive::DriveIndex;
 
 /// The same of what would be told of the whole line.
 const FEW_OF_LINE: u32 = 10;
@@ -36,7 +37,6 @@ pub struct Rules<'f> {
 pub fn find(figures: &Figures, names: &[String], now: Instant) -> Vec<Finding> {
     let known: Vec<Known> = figures
         .drives
-        .iter()
         .enumerate()
         .filter_map(|(place, drive)| Known::of(place, drive))
         .collect();
@@ -80,7 +80,7 @@ impl Rules<'_> {
         self.noise();
     }
 
-    fn add(&mut self, cause: Cause, drive: Option<usize>, certainty: Certainty, evidence: String) {
+    fn add(&mut self, cause: Cause, drive: Option<DriveIndex>, certainty: Certainty, evidence: String) {
         self.found.push(Finding {
             cause,
             drive,
@@ -93,15 +93,15 @@ impl Rules<'_> {
         self.found.iter().any(|found| found.cause == cause)
     }
 
-    fn is_told(&self, place: usize) -> bool {
+    fn is_told(&self, place: DriveIndex) -> bool {
         self.found.iter().any(|found| found.drive == Some(place))
     }
 
-    fn name(&self, place: usize) -> &str {
-        self.names.get(place).map_or("?", String::as_str)
+    fn name(&self, place: DriveIndex) -> &str {
+        self.names.get(place.place()).map_or("?", String::as_str)
     }
 
-    fn names_of(&self, places: impl IntoIterator<Item = usize>) -> String {
+    fn names_of(&self, places: impl IntoIterator<Item = DriveIndex>) -> String {
         let names: Vec<&str> = places.into_iter().map(|place| self.name(place)).collect();
         match names.as_slice() {
             [first, second, third, _, rest @ ..] => format!("{first}, {second}, {third} and {} more", rest.len() + 1),
@@ -109,7 +109,7 @@ impl Rules<'_> {
         }
     }
 
-    fn sum(&self, place: usize, sign: Sign) -> u32 {
+    fn sum(&self, place: DriveIndex, sign: Sign) -> u32 {
         self.figures.drives.get(place).map_or(0, |drive| drive.sum(sign))
     }
 
@@ -303,11 +303,11 @@ impl Rules<'_> {
 
     /// A drive that is configured and not there, or set up otherwise. It is asked every ten seconds, so it is not compared.
     fn never_answered(&mut self) {
-        let silent = |(place, drive): (usize, &super::Drive)| {
+        let silent = |(place, drive): (DriveIndex, &super::Drive)| {
             let asked = drive.in_vain().filter(|asked| *asked >= IN_VAIN)?;
             Some((place, asked, drive.address))
         };
-        let silent: Vec<_> = self.figures.drives.iter().enumerate().filter_map(silent).collect();
+        let silent: Vec<_> = self.figures.drives.enumerate().filter_map(silent).collect();
         let answering = self
             .figures
             .drives

@@ -144,13 +144,26 @@ fn is_sound(protocol: Protocol, request: &Request, bytes: &[u8]) -> bool {
     matches!(decoded, Decoded::Reply { used, reply } if used == bytes.len() && !matches!(reply, Reply::Exception(_)))
 }
 
-/// Whether bytes that nobody asked for are a sound answer, and the address that it names; N2 answers name none.
-pub fn answer(protocol: Protocol, bytes: &[u8]) -> Option<Option<u8>> {
+/// Whose answer bytes are that nobody asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Answering {
+    /// That of the drive at this address.
+    Address(u8),
+    /// On N2 an answer names nobody.
+    Anybody,
+}
+
+/// Whose sound answer the bytes are that nobody asked for, if they are one.
+pub fn answer(protocol: Protocol, bytes: &[u8]) -> Option<Answering> {
     match protocol {
-        Protocol::ModbusRtu | Protocol::ModbusAscii => protocol.open_frame(bytes).map(|(address, _)| Some(address)),
+        Protocol::ModbusRtu | Protocol::ModbusAscii => protocol
+            .open_frame(bytes)
+            .map(|(address, _)| Answering::Address(address)),
         Protocol::N2 => {
             let line = bytes.strip_suffix(b"\r")?;
-            crate::codec::n2::Answer::decode(line).is_ok().then_some(None)
+            crate::codec::n2::Answer::decode(line)
+                .is_ok()
+                .then_some(Answering::Anybody)
         }
     }
 }
@@ -212,7 +225,7 @@ mod tests {
                 true,
             );
             assert_eq!((echoed.echoed, echoed.shape), (Some(true), Shape::Sound));
-            assert_eq!(answer(protocol, &reply), Some(Some(5)));
+            assert_eq!(answer(protocol, &reply), Some(Answering::Address(5)));
             assert_eq!(answer(protocol, &reply[1..]), None);
         }
     }

@@ -9,7 +9,7 @@ use serde_json::Value as Json;
 use super::recorder::{Capture, Note, NoteBody, reading};
 use super::recording::{Bus, Column, CommandNote, Drive, EventNote, Frame, Further, Header, Read, Recording, VERSION};
 use super::summary;
-use crate::drive::{Profile, Source};
+use crate::drive::{DriveIndex, Profile, Source};
 use crate::process_image::{Reading, Snapshot, TapedRead, value_or_null};
 
 pub fn assemble(capture: &Capture) -> Recording {
@@ -55,7 +55,7 @@ pub fn assemble(capture: &Capture) -> Recording {
     }
     let frames = capture.frames.iter().map(|frame| Frame {
         t: seconds(frame.at),
-        drive: frame.drive,
+        drive: frame.drive.map(DriveIndex::place),
         verdict: frame.verdict,
         bytes: frame.bytes.clone(),
     });

@@ -7,6 +7,7 @@ use std::marker::PhantomData;
 use std::time::{Duration, Instant};
 
 use crate::codec::Table;
+use crate::drive::DriveIndex;
 use crate::process_image::{TapedFrame, TapedRead, Verdict};
 
 /// Bytes in front of each entry: its length, and its time.
@@ -66,7 +67,7 @@ impl Packed for TapedFrame {
     }
 
     fn pack(&self, bytes: &mut Vec<u8>) {
-        let drive = self.drive.and_then(|drive| u32::try_from(drive).ok());
+        let drive = self.drive.and_then(|drive| u32::try_from(drive.place()).ok());
         let verdict = Verdict::ALL.iter().position(|verdict| *verdict == self.verdict);
         bytes.extend(drive.unwrap_or(NO_DRIVE).to_le_bytes());
         bytes.push(verdict.and_then(|place| u8::try_from(place).ok()).unwrap_or(u8::MAX));
@@ -79,7 +80,10 @@ impl Packed for TapedFrame {
         let drive = u32::from_le_bytes(*drive);
         Some(TapedFrame {
             at,
-            drive: usize::try_from(drive).ok().filter(|_| drive != NO_DRIVE),
+            drive: usize::try_from(drive)
+                .ok()
+                .filter(|_| drive != NO_DRIVE)
+                .map(DriveIndex::new),
             verdict: *Verdict::ALL.get(usize::from(*verdict))?,
             bytes: bytes.into(),
         })
@@ -302,7 +306,7 @@ mod tests {
             let start = Instant::now() + Duration::from_secs(3600);
             let frames: Vec<TapedFrame> = frames.into_iter().map(|(drive, verdict, bytes, at)| TapedFrame {
                 at: instant(start, at * 1_000_003),
-                drive: drive.map(usize::from),
+                drive: drive.map(|drive| DriveIndex::new(usize::from(drive))),
                 verdict: Verdict::ALL[verdict],
                 bytes: bytes.into(),
             }).collect();

@@ -13,7 +13,7 @@ use super::ring::{Ring, Timed};
 use super::trend::Reach;
 use super::trigger::{LineErrors, Trigger, TriggerKind, Watch};
 use super::{Clock, RecorderOptions};
-use crate::drive::Plan;
+use crate::drive::{DriveIndex, PerDrive, Plan};
 use crate::process_image::{
     BusImage, DriveImage, DriveSpec, Link, Reading, Snapshot, Taped, TapedFrame, TapedRead, Taping,
 };
@@ -154,7 +154,7 @@ struct Pending {
 struct LineRing {
     bus: Arc<BusImage>,
     last_hour: Arc<Mutex<LineHistory>>,
-    drives: Vec<DriveRing>,
+    drives: PerDrive<DriveRing>,
     frames: PackedRing<TapedFrame>,
     /// Memory that the rings need so that nothing is left out.
     need: Budget,
@@ -347,7 +347,7 @@ impl LineRing {
         self.drives.iter_mut().for_each(DriveRing::look_at_link);
     }
 
-    fn answers(&self, drive: usize) -> bool {
+    fn answers(&self, drive: DriveIndex) -> bool {
         let ring = self.drives.get(drive);
         ring.is_some_and(|ring| ring.image.snapshot().link.is_online())
     }

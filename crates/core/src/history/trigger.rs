@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::codec::Table;
 use crate::command::AuditRecord;
-use crate::drive::{ModelPoint, Profile, Value};
+use crate::drive::{DriveIndex, ModelPoint, Profile, Value};
 use crate::event::EventKind;
 use crate::process_image::{Reading, TriggerLimit};
 
@@ -212,13 +212,13 @@ impl Watch {
 #[derive(Debug, Default)]
 pub(super) struct LineErrors {
     /// When, and with which drive.
-    recent: VecDeque<(Instant, usize)>,
+    recent: VecDeque<(Instant, DriveIndex)>,
 }
 
 impl LineErrors {
     /// Notes a failed transaction with a drive that answered before. The drive with most of them, when they are a
     /// burst.
-    pub(super) fn note(&mut self, at: Instant, drive: usize) -> Option<(usize, Trigger)> {
+    pub(super) fn note(&mut self, at: Instant, drive: DriveIndex) -> Option<(DriveIndex, Trigger)> {
         self.recent.push_back((at, drive));
         while let Some((oldest, _)) = self.recent.front() {
             if at.saturating_duration_since(*oldest) <= BURST_IN {
@@ -229,7 +229,7 @@ impl LineErrors {
         if self.recent.len() < BURST {
             return None;
         }
-        let of = |drive: usize| self.recent.iter().filter(|(_, other)| *other == drive).count();
+        let of = |drive: DriveIndex| self.recent.iter().filter(|(_, other)| *other == drive).count();
         let most = self
             .recent
             .iter()

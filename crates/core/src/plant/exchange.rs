@@ -14,13 +14,14 @@ use crate::command::{
     Answer, BackgroundRequest, Effect, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Ticket, Touched, WriteStats,
     written,
 };
+use crate::drive::DriveIndex;
 use crate::process_image::DriveImage;
 
 /// Who on the line is asked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Target {
     /// The configured drive at that place of the bus.
-    Drive(usize),
+    Drive(DriveIndex),
     /// An address at which no drive is configured; 0 is the broadcast, except on N2.
     Address(u8),
 }
@@ -103,9 +104,9 @@ impl BusHandle {
         };
         let what = describe::request_on(spec.protocol, &question.pdu);
         let may_write = question.may_write;
-        let reach: Vec<usize> = match question.target {
+        let reach: Vec<DriveIndex> = match question.target {
             Target::Drive(index) => vec![index],
-            Target::Address(0) if spec.protocol != Protocol::N2 => (0..drives.len()).collect(),
+            Target::Address(0) if spec.protocol != Protocol::N2 => drives.indexes().collect(),
             Target::Address(_) => Vec::new(),
         };
         let order = Order::Write(question.pdu.clone());

@@ -7,13 +7,14 @@ use crate::command::{
     self, Admitted, Asks, Authority, Command, Effect, HoldState, HoldView, KeptReservation, Origin, Refusal, Rules,
     Told, Unheld, Urgency, Verb, What,
 };
+use crate::drive::DriveIndex;
 use crate::drive::why::{Cause, Explanation};
 use crate::event::{Event, EventKind, Events};
 use crate::process_image::Machine;
 
 impl BusHandle {
     /// Whether a command of that client renews the lease of a drive.
-    pub fn renews(&self, drive: usize, origin: &Origin) -> bool {
+    pub fn renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
         !self.queue.is_guarded() || self.queue.lock().hold_renews(drive, origin)
     }
 
@@ -28,7 +29,7 @@ impl BusHandle {
         let rules = queue.rules().cloned();
         drop(queue);
         let Some(rules) = rules else { return };
-        let name_of = |drive: usize| self.image.drives.get(drive).map(|image| image.spec.name.as_str());
+        let name_of = |drive: DriveIndex| self.image.drives.get(drive).map(|image| image.spec.name.as_str());
         for (drive, Unheld { client, why }) in unheld {
             tracing::warn!(
                 target: "drivegate::command", drive = name_of(drive),
@@ -56,7 +57,7 @@ impl BusHandle {
         if !self.queue.is_guarded() {
             return;
         }
-        for (index, drive) in self.image.drives.iter().enumerate() {
+        for (index, drive) in self.image.drives.enumerate() {
             let machine = self.image.spec.machine(&drive.spec);
             let is_there = |bus: &&BusHandle| {
                 let mut drives = bus.image.drives.iter();
@@ -85,7 +86,7 @@ impl BusHandle {
 impl BusHandle {
     fn reservations(&self, now: Instant, time: SystemTime) -> Vec<(Instant, KeptReservation)> {
         let queue = self.queue.lock();
-        let drives = self.image.drives.iter().enumerate();
+        let drives = self.image.drives.enumerate();
         let kept = drives.filter_map(|(index, image)| {
             let (until, who, rank, lease) = queue.reservation(index, now)?;
             let machine = self.image.spec.machine(&image.spec);

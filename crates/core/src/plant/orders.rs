@@ -12,7 +12,7 @@ use crate::command::{
     Refusal, SlotWrite, StopEnd, Ticket, Urgency, WriteStats,
 };
 use crate::drive::parameters::RawValue;
-use crate::drive::{ModelPoint, Value};
+use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::event::RefusedCommand;
 use crate::process_image::Reading;
 
@@ -103,7 +103,7 @@ impl BusHandle {
     /// The refusal; it is neither audited nor counted.
     pub fn own_order(
         &self,
-        drive: usize,
+        drive: DriveIndex,
         reading: &Reading<'_>,
         (point, value): (ModelPoint, Value),
         origin: Origin,

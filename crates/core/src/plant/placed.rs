@@ -108,11 +108,6 @@ impl Placed {
         }
     }
 
-    /// Whether the effect was shown, once that is settled: as [`Placed::confirmed`].
-    pub fn confirmation(&mut self) -> Option<Option<Duration>> {
-        now(|cx| self.poll_confirmation(cx))
-    }
-
     /// The effect known so far.
     pub fn shown(&mut self) -> Shown {
         let stop = now(|cx| self.confirmation.poll(cx)).flatten();
@@ -137,7 +132,7 @@ impl Placed {
         }
     }
 
-    /// As [`Placed::confirmation`], for anyone who waits for several things.
+    /// As [`Placed::confirmed`], for anyone who waits for several things.
     pub fn poll_confirmation(&mut self, cx: &mut Context<'_>) -> Poll<Option<Duration>> {
         let stop = self.confirmation.poll(cx).map(|seen| seen.and_then(Result::ok));
         let Some(rest) = &mut self.rest else { return stop };
@@ -199,7 +194,8 @@ mod tests {
         let (sender, answer) = oneshot::channel();
         let (confirm, confirmation) = oneshot::channel();
         let mut placed = Placed::new(Instant::now(), answer, confirmation);
-        assert_eq!((placed.answer(), placed.confirmation()), (None, None));
+        let settled = |placed: &mut Placed| now(|cx| placed.poll_confirmation(cx));
+        assert_eq!((placed.answer(), settled(&mut placed)), (None, None));
         let acknowledged = Answer {
             outcome: Outcome::Acknowledged(Reply::Written),
             latency: Duration::from_millis(3),
@@ -207,15 +203,15 @@ mod tests {
         sender.send(acknowledged.clone()).unwrap();
         assert_eq!(placed.answer().as_ref(), Some(&acknowledged));
         assert_eq!(placed.answer(), Some(acknowledged));
-        assert_eq!(placed.confirmation(), None);
+        assert_eq!(settled(&mut placed), None);
         confirm.send(Ok(Duration::from_millis(9))).unwrap();
         let confirmed = Some(Some(Duration::from_millis(9)));
-        assert_eq!((placed.confirmation(), placed.confirmation()), (confirmed, confirmed));
+        assert_eq!((settled(&mut placed), settled(&mut placed)), (confirmed, confirmed));
         assert_eq!(placed.shown().after, Some(Duration::from_millis(9)));
         let (confirm, confirmation) = oneshot::channel();
         let mut placed = Placed::new(Instant::now(), oneshot::channel().1, confirmation);
         confirm.send(Err("the bypass is on".to_string())).unwrap();
-        assert_eq!(placed.confirmation(), Some(None));
+        assert_eq!(settled(&mut placed), Some(None));
         assert_eq!(placed.shown().unseen.as_deref(), Some("the bypass is on"));
     }
 
@@ -223,6 +219,6 @@ mod tests {
     fn a_sender_that_is_gone_is_an_answer_too() {
         let mut placed = Placed::new(Instant::now(), oneshot::channel().1, oneshot::channel().1);
         assert_eq!(placed.answer().unwrap().outcome, Outcome::ShuttingDown);
-        assert_eq!(placed.confirmation(), Some(None));
+        assert_eq!(now(|cx| placed.poll_confirmation(cx)), Some(None));
     }
 }

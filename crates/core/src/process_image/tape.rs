@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use crate::codec::Table;
+use crate::drive::DriveIndex;
 
 /// Bytes that wait for the recorder at most; what comes beyond is counted and dropped.
 pub const TAPE_BYTES: usize = 1 << 20;
@@ -65,7 +66,7 @@ pub struct TapedFrame {
     /// A request: when it was given to the port. Else when the last of it came, or the transaction was given up.
     pub at: Instant,
     /// Place of the drive that was asked; none for bytes between two transactions.
-    pub drive: Option<usize>,
+    pub drive: Option<DriveIndex>,
     /// Its verdict.
     pub verdict: Verdict,
     /// The bytes; empty if nothing arrived.
@@ -76,7 +77,7 @@ pub struct TapedFrame {
 #[derive(Debug, Clone, PartialEq)]
 pub enum Taped {
     /// The drive at that place was read.
-    Read(usize, TapedRead),
+    Read(DriveIndex, TapedRead),
     /// Something was on the line.
     Frame(TapedFrame),
 }
@@ -151,7 +152,7 @@ impl Tape {
 
     /// The drive at that place was read. `read` is only called while someone takes it. Only the bus itself may call
     /// this.
-    pub fn read(&self, drive: usize, read: impl FnOnce() -> TapedRead) {
+    pub fn read(&self, drive: DriveIndex, read: impl FnOnce() -> TapedRead) {
         if self.takes(Taping::Reads) {
             self.append(Taped::Read(drive, read()));
         }
@@ -202,7 +203,7 @@ mod tests {
             bytes: vec![0; bytes].into(),
         };
         tape.frame(|| unreachable!("it is off"));
-        tape.read(0, || unreachable!("it is off"));
+        tape.read(DriveIndex::new(0), || unreachable!("it is off"));
         tape.switch(Taping::Everything);
         for _ in 0..2000 {
             tape.frame(|| frame(1000));
@@ -214,7 +215,7 @@ mod tests {
         assert_eq!((tape.take().0.len(), tape.take().0.len()), (1, 0));
         tape.switch(Taping::Reads);
         tape.frame(|| unreachable!("nobody records"));
-        tape.read(0, || TapedRead {
+        tape.read(DriveIndex::new(0), || TapedRead {
             at: Instant::now(),
             table: Table::Holding,
             start: 1,

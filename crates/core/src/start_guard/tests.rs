@@ -6,6 +6,7 @@ use crate::codec::{LineFormat, Protocol, RequestPdu, Table};
 use crate::command::{
     BackgroundRequest, Effect, NO_DRIVE, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind, Ticket, Touched,
 };
+use crate::drive::DriveIndex;
 use crate::drive::profile::Profiles;
 use crate::process_image::{Access, BusSpec, DriveImage, DriveSpec, Link};
 
@@ -74,11 +75,13 @@ impl Bench {
             let words = if running { [0x03, 0, 0, 2500] } else { [0x41, 0, 0, 0] };
             snapshot.store(Table::Holding, 2100, &words, at);
         });
-        self.guards.look(drive, &image.reading(at, SECOND));
+        self.guards.look(DriveIndex::new(drive), &image.reading(at, SECOND));
     }
 
     fn refused(&self, drive: usize, seconds: f64) -> Option<&'static str> {
-        let refusal = self.guards.refuses(drive, RUN, None, self.at(seconds))?;
+        let refusal = self
+            .guards
+            .refuses(DriveIndex::new(drive), RUN, None, self.at(seconds))?;
         Some(match refusal {
             Refusal::Guarded(guarded) => guarded.reason.name(),
             Refusal::Interlocked(_) => "interlock",
@@ -107,9 +110,9 @@ impl Bench {
             passed_on: Some(PassedOn {
                 address: 0,
                 may_write: true,
-                reach: drives.to_vec(),
+                reach: drives.iter().copied().map(DriveIndex::new).collect(),
                 stops: Vec::new(),
-                effects: drives.iter().map(|drive| (*drive, RUN)).collect(),
+                effects: drives.iter().map(|drive| (DriveIndex::new(*drive), RUN)).collect(),
                 first: false,
                 frame: tokio::sync::oneshot::channel().0,
             }),
@@ -123,9 +126,9 @@ impl Bench {
     fn start_and_stop(&self, drive: usize, number: u64, seconds: f64) {
         assert_eq!(self.clear(&[drive], number, seconds), Clearance::Go, "at {seconds} s");
         self.guards
-            .start_written(drive, number, &Arc::from("c"), self.at(seconds));
+            .start_written(DriveIndex::new(drive), number, &Arc::from("c"), self.at(seconds));
         self.read(drive, true, seconds + 0.1);
-        self.guards.stop_written(drive, self.at(seconds + 0.5));
+        self.guards.stop_written(DriveIndex::new(drive), self.at(seconds + 0.5));
         self.read(drive, false, seconds + 1.0);
     }
 }
@@ -156,7 +159,7 @@ fn the_window_of_an_hour_slides() {
     }
     assert_eq!(bench.refused(0, 1300.0), Some("starts_per_hour"));
     assert_eq!(bench.refused(1, 1300.0), None, "each drive for itself");
-    let Some(Refusal::Guarded(wait)) = bench.guards.refuses(0, RUN, None, bench.at(1300.0)) else {
+    let Some(Refusal::Guarded(wait)) = bench.guards.refuses(DriveIndex::new(0), RUN, None, bench.at(1300.0)) else {
         unreachable!()
     };
     assert_eq!(
@@ -178,7 +181,7 @@ fn the_window_of_an_hour_slides() {
         "the second one counts until 4200 s"
     );
     assert_eq!(bench.refused(0, 4200.0), None);
-    let counted = bench.guards.refused(0);
+    let counted = bench.guards.refused(DriveIndex::new(0));
     assert_eq!(counted.get(&Reason::StartsPerHour), Some(&4), "{counted:?}");
 }
 
@@ -187,13 +190,17 @@ fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
     let bench = Bench::of(per_hour(1), Vec::new());
     bench.read(0, false, 0.0);
     assert_eq!(bench.clear(&[0], 1, 1.0), Clearance::Go);
-    bench.guards.start_written(0, 1, &Arc::from("c"), bench.at(1.0));
+    bench
+        .guards
+        .start_written(DriveIndex::new(0), 1, &Arc::from("c"), bench.at(1.0));
     assert_eq!(bench.refused(0, 1.05), Some("starts_per_hour"), "not seen to run yet");
     bench.read(0, true, 1.1);
     assert_eq!(bench.refused(0, 1.2), None, "it runs");
     assert_eq!(bench.clear(&[0], 2, 1.2), Clearance::Go);
-    bench.guards.start_written(0, 2, &Arc::from("c"), bench.at(1.2));
-    bench.guards.stop_written(0, bench.at(2.0));
+    bench
+        .guards
+        .start_written(DriveIndex::new(0), 2, &Arc::from("c"), bench.at(1.2));
+    bench.guards.stop_written(DriveIndex::new(0), bench.at(2.0));
     assert_eq!(
         bench.refused(0, 2.01),
         Some("starts_per_hour"),
@@ -209,8 +216,8 @@ fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
     bench.read(0, false, 3.0);
     assert_eq!(bench.refused(0, 3.1), Some("starts_per_hour"));
     // A run that was cleared while the motor ran does not start it when it has stopped since.
-    assert!(bench.guards.may_write(0, 2, bench.at(3.1)).is_err());
-    assert!(bench.guards.may_write(0, 1, bench.at(3.1)).is_ok());
+    assert!(bench.guards.may_write(DriveIndex::new(0), 2, bench.at(3.1)).is_err());
+    assert!(bench.guards.may_write(DriveIndex::new(0), 1, bench.at(3.1)).is_ok());
 }
 
 #[test]
@@ -250,9 +257,11 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     );
     // A start and a stop between two reads: it is to be seen to stand anew.
     assert_eq!(bench.clear(&[0], 2, 71.0), Clearance::Go);
-    bench.guards.start_written(0, 2, &Arc::from("c"), bench.at(71.0));
+    bench
+        .guards
+        .start_written(DriveIndex::new(0), 2, &Arc::from("c"), bench.at(71.0));
     bench.read(0, false, 71.0);
-    bench.guards.stop_written(0, bench.at(71.1));
+    bench.guards.stop_written(DriveIndex::new(0), bench.at(71.1));
     bench.read(0, false, 71.2);
     bench.read(0, false, 72.5);
     assert_eq!(
@@ -260,12 +269,14 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
         (Some("min_off"), None)
     );
     // Stops to a motor that stands change nothing.
-    bench.guards.stop_written(0, bench.at(102.6));
+    bench.guards.stop_written(DriveIndex::new(0), bench.at(102.6));
     bench.read(0, false, 102.7);
     assert_eq!(bench.refused(0, 102.8), None);
     // Away, it may have run meanwhile.
     bench.images[0].update(|snapshot| snapshot.link = Link::Offline(SystemTime::now()));
-    bench.guards.look(0, &bench.images[0].reading(bench.at(180.0), SECOND));
+    bench
+        .guards
+        .look(DriveIndex::new(0), &bench.images[0].reading(bench.at(180.0), SECOND));
     assert_eq!(bench.refused(0, 180.0), Some("min_off"));
     bench.read(0, false, 190.0);
     assert_eq!(
@@ -275,8 +286,18 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     // One that waits is taken in if it can go in time.
     bench.read(1, false, 200.0);
     let until = |seconds| Some(bench.at(seconds));
-    assert!(bench.guards.refuses(1, RUN, until(229.0), bench.at(220.0)).is_some());
-    assert_eq!(bench.guards.refuses(1, RUN, until(231.0), bench.at(220.0)), None);
+    assert!(
+        bench
+            .guards
+            .refuses(DriveIndex::new(1), RUN, until(229.0), bench.at(220.0))
+            .is_some()
+    );
+    assert_eq!(
+        bench
+            .guards
+            .refuses(DriveIndex::new(1), RUN, until(231.0), bench.at(220.0)),
+        None
+    );
     assert_eq!(
         bench.clear_waiting(&[1], 9, true, 229.0),
         Clearance::Wait(bench.at(230.0)),
@@ -301,20 +322,24 @@ fn drives_of_a_group_start_one_after_the_other() {
     assert_eq!(bench.clear(&[0], 2, 2.0), Clearance::Go);
     // Cleared and not written: it may be at any time.
     assert_eq!(reason(bench.clear(&[1], 3, 7.5)), "stagger");
-    bench.guards.start_written(0, 2, &Arc::from("c"), bench.at(8.0));
+    bench
+        .guards
+        .start_written(DriveIndex::new(0), 2, &Arc::from("c"), bench.at(8.0));
     assert_eq!(
         (reason(bench.clear(&[1], 3, 12.9)), bench.clear(&[1], 3, 13.0)),
         ("stagger", Clearance::Go)
     );
     // What was cleared and not written counts from when it was.
-    bench.guards.settle(1, 3);
+    bench.guards.settle(DriveIndex::new(1), 3);
     assert_eq!(
         (bench.refused(0, 17.9), bench.refused(0, 18.0)),
         (Some("stagger"), None)
     );
     // A drive without a guard is not held back, and its starts count for the others.
     assert_eq!(bench.clear(&[2], 4, 18.0), Clearance::Go);
-    bench.guards.start_written(2, 4, &Arc::from("c"), bench.at(18.0));
+    bench
+        .guards
+        .start_written(DriveIndex::new(2), 4, &Arc::from("c"), bench.at(18.0));
     assert_eq!(
         (bench.refused(0, 22.9), bench.refused(0, 23.0)),
         (Some("stagger"), None)
@@ -331,7 +356,7 @@ fn only_a_good_point_holds_an_interlock() {
     };
     let bench = Bench::of(Guard::default(), vec![interlock("d3", true)]);
     bench.read(0, false, 0.0);
-    let text = |seconds| match bench.guards.refuses(0, RUN, None, bench.at(seconds)) {
+    let text = |seconds| match bench.guards.refuses(DriveIndex::new(0), RUN, None, bench.at(seconds)) {
         Some(refusal @ Refusal::Interlocked(_)) => refusal.to_string(),
         other => format!("{other:?}"),
     };
@@ -348,9 +373,13 @@ fn only_a_good_point_holds_an_interlock() {
     bench.read(2, true, 4.0);
     assert_eq!(bench.clear(&[0], 1, 4.5), Clearance::Go);
     // It does not hold any more when the word is to be written.
-    assert!(bench.guards.may_write(0, 1, bench.at(4.9)).is_ok());
-    assert!(bench.guards.may_write(0, 1, bench.at(5.5)).is_err());
-    assert_eq!(bench.guards.unmet(0, true, bench.at(5.5)), [], "it stops no motor");
+    assert!(bench.guards.may_write(DriveIndex::new(0), 1, bench.at(4.9)).is_ok());
+    assert!(bench.guards.may_write(DriveIndex::new(0), 1, bench.at(5.5)).is_err());
+    assert_eq!(
+        bench.guards.unmet(DriveIndex::new(0), true, bench.at(5.5)),
+        [],
+        "it stops no motor"
+    );
     let bench = Bench::of(Guard::default(), vec![interlock("d9", true)]);
     bench.read(0, false, 0.0);
     assert_eq!(bench.refused(0, 0.0), Some("interlock"), "no such drive");
@@ -429,12 +458,12 @@ fn counters_belong_to_the_machine_over_a_reload() {
     specs[0].name = "other".to_string();
     specs.reverse();
     let after = BusGuards::of(&bench.shared, &bench.bus, &specs).unwrap();
-    assert!(after.refuses(2, RUN, None, bench.at(10.0)).is_some());
-    assert!(after.refuses(1, RUN, None, bench.at(10.0)).is_none());
+    assert!(after.refuses(DriveIndex::new(2), RUN, None, bench.at(10.0)).is_some());
+    assert!(after.refuses(DriveIndex::new(1), RUN, None, bench.at(10.0)).is_none());
     // Another machine at its address has none.
     specs[2].profile = Profiles::built_in().get("vacon-cx").unwrap().clone();
     let after = BusGuards::of(&bench.shared, &bench.bus, &specs).unwrap();
-    assert!(after.refuses(2, RUN, None, bench.at(10.0)).is_none());
+    assert!(after.refuses(DriveIndex::new(2), RUN, None, bench.at(10.0)).is_none());
     specs
         .iter_mut()
         .for_each(|spec| (spec.guard, spec.staggers) = (None, false));
@@ -452,29 +481,41 @@ fn min_run_delays_the_first_stop_of_the_client_that_started_the_motor() {
     };
     let bench = Bench::of(guard, Vec::new());
     bench.read(0, false, 0.0);
-    assert!(!bench.guards.is_ordinary_stop(0, "c", None), "it stands");
+    assert!(
+        !bench.guards.is_ordinary_stop(DriveIndex::new(0), "c", None),
+        "it stands"
+    );
     assert_eq!(bench.clear(&[0], 1, 1.0), Clearance::Go);
-    bench.guards.start_written(0, 1, &Arc::from("c"), bench.at(1.0));
-    let waits = |seconds| bench.guards.stop_waits(0, bench.at(seconds));
+    bench
+        .guards
+        .start_written(DriveIndex::new(0), 1, &Arc::from("c"), bench.at(1.0));
+    let waits = |seconds| bench.guards.stop_waits(DriveIndex::new(0), bench.at(seconds));
     assert_eq!(waits(1.5), Some(bench.at(21.0)), "not read since");
     bench.read(0, true, 2.0);
-    assert!(bench.guards.is_ordinary_stop(0, "c", None));
+    assert!(bench.guards.is_ordinary_stop(DriveIndex::new(0), "c", None));
     assert!(
-        bench.guards.is_ordinary_stop(0, "c", Some(bench.at(0.5))),
+        bench
+            .guards
+            .is_ordinary_stop(DriveIndex::new(0), "c", Some(bench.at(0.5))),
         "a stop before the start"
     );
     assert!(
-        !bench.guards.is_ordinary_stop(0, "c", Some(bench.at(2.0))),
+        !bench
+            .guards
+            .is_ordinary_stop(DriveIndex::new(0), "c", Some(bench.at(2.0))),
         "a second stop"
     );
-    assert!(!bench.guards.is_ordinary_stop(0, "another", None));
+    assert!(!bench.guards.is_ordinary_stop(DriveIndex::new(0), "another", None));
     assert_eq!((waits(10.0), waits(21.0)), (Some(bench.at(21.0)), None));
     // It is seen to stand, or not seen at all: nothing is waited for.
     bench.read(0, false, 12.0);
     assert_eq!(waits(12.1), None);
     bench.read(1, false, 0.0);
     bench.read(1, true, 5.0);
-    assert!(!bench.guards.is_ordinary_stop(1, "c", None), "the panel started it");
+    assert!(
+        !bench.guards.is_ordinary_stop(DriveIndex::new(1), "c", None),
+        "the panel started it"
+    );
 }
 
 #[test]

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::ledger::{Guards, Kept, Ledger};
 use super::{Guard, Guarded, Interlock, Reason, Seen, Unmet, shown};
 use crate::command::{Command, Effect, Refusal};
-use crate::drive::{ModelPoint, Plan, Value};
+use crate::drive::{DriveIndex, ModelPoint, PerDrive, Plan, Value};
 use crate::process_image::{BusSpec, DriveSpec, Link, Machine, Reading};
 use crate::stop_all::Standstill;
 
@@ -19,7 +19,7 @@ const LOOK: Duration = Duration::from_millis(2);
 pub struct BusGuards {
     shared: Arc<Guards>,
     /// By their place on the bus; none of one whose starts concern nobody.
-    drives: Vec<Option<Guarding>>,
+    drives: PerDrive<Option<Guarding>>,
 }
 
 /// The guards of one drive.
@@ -69,7 +69,7 @@ impl BusGuards {
                 tells_running: running.is_some_and(|index| Plan::of(profile).shows(profile, index)),
             })
         });
-        let drives: Vec<Option<Guarding>> = drives.collect();
+        let drives: PerDrive<Option<Guarding>> = drives.collect();
         let any = drives.iter().any(Option::is_some);
         drop(ledger);
         any.then(|| {
@@ -80,17 +80,23 @@ impl BusGuards {
         })
     }
 
-    fn of_drive(&self, drive: usize) -> Option<&Guarding> {
+    fn of_drive(&self, drive: DriveIndex) -> Option<&Guarding> {
         self.drives.get(drive)?.as_ref()
     }
 
     /// Whether the starts of that drive count.
-    pub fn guards(&self, drive: usize) -> bool {
+    pub fn guards(&self, drive: DriveIndex) -> bool {
         self.of_drive(drive).is_some()
     }
 
     /// Why a command with that effect is not accepted; counted. One that may wait does so until `waits_until`.
-    pub fn refuses(&self, drive: usize, effect: Effect, waits_until: Option<Instant>, now: Instant) -> Option<Refusal> {
+    pub fn refuses(
+        &self,
+        drive: DriveIndex,
+        effect: Effect,
+        waits_until: Option<Instant>,
+        now: Instant,
+    ) -> Option<Refusal> {
         let of = self.of_drive(drive).filter(|_| effect.run == Some(true))?;
         let mut ledger = self.shared.lock();
         if !ledger.motor(&of.machine)?.is_started_by_run() {
@@ -105,7 +111,7 @@ impl BusGuards {
     }
 
     /// Why the motor may not be started now, as text; not counted.
-    pub fn hindrance(&self, drive: usize, now: Instant) -> Option<Guarded> {
+    pub fn hindrance(&self, drive: DriveIndex, now: Instant) -> Option<Guarded> {
         let of = self.of_drive(drive)?;
         let interlocked = self.interlocked(of, now);
         interlocked.or_else(|| {
@@ -117,13 +123,13 @@ impl BusGuards {
     }
 
     /// The interlocks that do not hold, or of them those that stop the motor.
-    pub fn unmet(&self, drive: usize, trips_only: bool, now: Instant) -> Vec<Unmet> {
+    pub fn unmet(&self, drive: DriveIndex, trips_only: bool, now: Instant) -> Vec<Unmet> {
         let of = self.of_drive(drive);
         of.map_or_else(Vec::new, |of| self.unmet_of(of, trips_only, now))
     }
 
     /// Whether an interlock of that drive stops its motor.
-    pub fn trips(&self, drive: usize) -> bool {
+    pub fn trips(&self, drive: DriveIndex) -> bool {
         let of = self.of_drive(drive);
         of.is_some_and(|of| of.interlocks.iter().any(|interlock| interlock.trip))
     }
@@ -257,7 +263,7 @@ impl BusGuards {
     ///
     /// # Errors
     /// Why not: an interlock does not hold any more, or the motor, which ran when the order was judged, has stopped.
-    pub fn may_write(&self, drive: usize, number: u64, now: Instant) -> Result<(), Refusal> {
+    pub fn may_write(&self, drive: DriveIndex, number: u64, now: Instant) -> Result<(), Refusal> {
         let Some(of) = self.of_drive(drive) else { return Ok(()) };
         let ledger = self.shared.lock();
         let Some(motor) = ledger.motor(&of.machine).filter(|motor| motor.is_started_by_run()) else {
@@ -276,7 +282,7 @@ impl BusGuards {
     }
 
     /// A started command was refused so.
-    pub fn count_refused(&self, drive: usize, refusal: &Refusal) {
+    pub fn count_refused(&self, drive: DriveIndex, refusal: &Refusal) {
         let reason = match refusal {
             Refusal::Guarded(guarded) => guarded.reason,
             _ => Reason::Interlock,
@@ -287,7 +293,7 @@ impl BusGuards {
     }
 
     /// A word of a command of that client, which starts the motor, goes onto the line.
-    pub fn start_written(&self, drive: usize, number: u64, client: &Arc<str>, now: Instant) {
+    pub fn start_written(&self, drive: DriveIndex, number: u64, client: &Arc<str>, now: Instant) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().start_written(&of.machine, number, client, now);
             self.shared.tell_change();
@@ -295,14 +301,14 @@ impl BusGuards {
     }
 
     /// A command that was cleared has ended: what it did not write counts as made.
-    pub fn settle(&self, drive: usize, number: u64) {
+    pub fn settle(&self, drive: DriveIndex, number: u64) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().settle(&of.machine, Some(number));
         }
     }
 
     /// The drive acknowledged a start or a stop.
-    pub fn acknowledged(&self, drive: usize, run: bool, now: Instant) {
+    pub fn acknowledged(&self, drive: DriveIndex, run: bool, now: Instant) {
         if let Some(of) = self.of_drive(drive).filter(|of| !of.tells_running) {
             self.shared.lock().with(&of.machine, |motor| match run {
                 true => motor.start_acknowledged(now),
@@ -312,14 +318,14 @@ impl BusGuards {
     }
 
     /// A stop goes onto the line.
-    pub fn stop_written(&self, drive: usize, now: Instant) {
+    pub fn stop_written(&self, drive: DriveIndex, now: Instant) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().with(&of.machine, |motor| motor.stop_written(now));
         }
     }
 
     /// Updates the state of the drive.
-    pub fn look(&self, drive: usize, reading: &Reading<'_>) {
+    pub fn look(&self, drive: DriveIndex, reading: &Reading<'_>) {
         let Some(of) = self.of_drive(drive) else { return };
         let seen = seen(reading);
         let is_away = matches!(reading.snapshot.link, Link::Offline(_));
@@ -343,7 +349,7 @@ impl BusGuards {
 
     /// Whether a stop of that client is an ordinary one, which waits for `min_run`: the first since its own order started the
     /// motor.
-    pub fn is_ordinary_stop(&self, drive: usize, client: &str, last_stop: Option<Instant>) -> bool {
+    pub fn is_ordinary_stop(&self, drive: DriveIndex, client: &str, last_stop: Option<Instant>) -> bool {
         let of = self.of_drive(drive).filter(|of| !of.guard.min_run.is_zero());
         of.is_some_and(|of| {
             let ledger = self.shared.lock();
@@ -353,13 +359,13 @@ impl BusGuards {
     }
 
     /// Until when an ordinary stop of that drive waits.
-    pub fn stop_waits(&self, drive: usize, now: Instant) -> Option<Instant> {
+    pub fn stop_waits(&self, drive: DriveIndex, now: Instant) -> Option<Instant> {
         let of = self.of_drive(drive)?;
         self.shared.lock().motor(&of.machine)?.stop_waits(&of.guard, now)
     }
 
     /// Starts of that drive that were refused, by reason; none of one that is not guarded.
-    pub fn refused(&self, drive: usize) -> BTreeMap<Reason, u64> {
+    pub fn refused(&self, drive: DriveIndex) -> BTreeMap<Reason, u64> {
         let of = self.of_drive(drive);
         of.map_or_else(BTreeMap::new, |of| self.shared.lock().refused(&of.machine))
     }

@@ -8,6 +8,7 @@ use ipnet::IpNet;
 
 pub(super) use crate::command::Mode;
 
+use super::Unusable;
 use super::bus;
 use super::keys::{AUTHORITY, PRINCIPAL};
 use super::together::Clients;
@@ -19,8 +20,8 @@ const PASSWD: &str = "/etc/passwd";
 
 /// `[authority]` as read.
 pub(super) struct Authority {
-    /// Absent when a part cannot be used, which is reported; the inner is absent where it is off.
-    pub(super) rules: Option<Option<Arc<Rules>>>,
+    /// None where it is off.
+    pub(super) rules: Result<Option<Arc<Rules>>, Unusable>,
 }
 
 pub(super) fn parse_rank(text: &str) -> Result<String, Finding> {
@@ -55,15 +56,15 @@ pub(super) fn read(reader: &Reader<'_>) -> Authority {
     unique(&tables, &principals);
     reader.finish();
     let rules = match (mode, lease, principals.into_iter().collect::<Option<Vec<_>>>()) {
-        (Some(None), Some(_), Some(_)) => Some(None),
-        (Some(Some(mode)), Some(lease), Some(principals)) => Some(Some(Arc::new(Rules {
+        (Some(None), Some(_), Some(_)) => Ok(None),
+        (Some(Some(mode)), Some(lease), Some(principals)) => Ok(Some(Arc::new(Rules {
             mode,
             ranks: ranks.iter().map(|rank| rank.as_str().into()).collect(),
             lease,
             stop_at_local,
             principals,
         }))),
-        _ => None,
+        _ => Err(Unusable),
     };
     Authority { rules }
 }

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::path::Path;
 
+use super::Unusable;
 use super::bus::Found;
 use super::keys::{BACNET, DRIVE};
 use super::{files, mqtt, values};
@@ -59,7 +60,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, buses: &[
         keep_priorities,
         bbmd,
         vendor,
-        dcc_password: password.clone().flatten(),
+        dcc_password: password.as_ref().ok().cloned().flatten(),
         buses: buses.clone(),
         state_dir: state_dir.to_path_buf(),
     });
@@ -70,7 +71,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, buses: &[
     Bacnet {
         device: (device, BACNET.device.place(reader)),
         commands: commands && options.as_ref().is_none_or(|options| !options.write.is_empty()),
-        options: options.filter(|_| password.is_some()),
+        options: options.filter(|_| password.is_ok()),
         buses,
     }
 }
@@ -104,17 +105,16 @@ pub(super) fn parse_bbmd(text: &str) -> Result<Option<(String, u16)>, Finding> {
     bbmd.map(Some)
 }
 
-/// The password; none where there is no file. The outer is absent where the file cannot be read, which is reported.
-fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Option<Secret>> {
+/// The password; none where there is no file.
+fn read_password(reader: &Reader<'_>, base: &Path) -> Result<Option<Secret>, Unusable> {
     let key = &BACNET.dcc_password_file;
     let Some(file) = key.written(reader).filter(|file| !file.as_os_str().is_empty()) else {
-        return Some(None);
+        return Ok(None);
     };
     let path = values::resolved(base, file);
     files::warn_of_readers(reader, key.name, &path);
-    reader
-        .accept(key.name, mqtt::secret(&path))
-        .map(|text| Some(Secret::new(text)))
+    let text = reader.accept(key.name, mqtt::secret(&path)).ok_or(Unusable)?;
+    Ok(Some(Secret::new(text)))
 }
 
 /// The buses that are served; none: all.

@@ -261,7 +261,7 @@ fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
     Some(format)
 }
 
-/// N2 tries three times (n2.md 4).
+/// N2 tries three times (reference/n2.md 4).
 pub(super) fn default_retries(protocol: Protocol) -> u32 {
     match protocol {
         Protocol::ModbusRtu | Protocol::ModbusAscii => 1,
@@ -270,7 +270,7 @@ pub(super) fn default_retries(protocol: Protocol) -> u32 {
 }
 
 /// Character format of a bus without `format`. That of Modbus ASCII is that of TECO's card with all switches off
-/// (drives.md 2).
+/// (reference/drives.md 2).
 pub fn default_format(protocol: Protocol) -> &'static str {
     match protocol {
         Protocol::ModbusAscii => "7N2",

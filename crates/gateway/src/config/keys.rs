@@ -14,7 +14,7 @@ use super::key::{
 };
 use super::log::{self, LogFormat};
 use super::mqtt::TelemetryTopic;
-use super::{authority, bacnet, bus, modbus_tcp, mqtt, north, recordings, values};
+use super::{authority, bacnet, bus, http, modbus_tcp, mqtt, recordings, values};
 use crate::bus::Mode;
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
@@ -145,7 +145,7 @@ const SPARKPLUG_ID: Parsed<String> = Parsed {
 };
 
 const HOSTS: List<String> = List {
-    parse: north::parse_host,
+    parse: http::parse_host,
     empty: None,
     range: "host names or addresses, such as [\"gateway.example.com\"]",
 };

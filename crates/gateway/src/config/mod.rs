@@ -10,6 +10,7 @@ mod capped;
 mod drill;
 mod drive;
 mod files;
+mod http;
 mod key;
 mod keys;
 mod line;
@@ -18,7 +19,6 @@ pub mod memory;
 mod modbus_tcp;
 mod mqtt;
 pub mod named_files;
-mod north;
 mod params;
 mod raw_writes;
 mod recordings;
@@ -54,7 +54,8 @@ use crate::drive::profile::Profiles;
 use crate::history::RecorderOptions;
 use crate::north::local::SocketPath;
 use crate::north::{
-    bacnet as bacnet_server, http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client, slot as slot_server,
+    bacnet as bacnet_server, http as http_server, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client,
+    slot as slot_server,
 };
 use crate::process_image::{Access, BusSpec, DriveSpec};
 use keys::{GATEWAY, MODBUS_TCP, ROOT};
@@ -97,7 +98,7 @@ pub struct Settings {
     /// Absent: not started.
     pub mqtt: Option<mqtt_client::Options>,
     /// Absent: not started.
-    pub http: Option<http::Options>,
+    pub http: Option<http_server::Options>,
     /// Absent: not started.
     pub bacnet: Option<bacnet_server::Options>,
     /// Who holds drives; absent: off.
@@ -286,7 +287,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .mqtt
         .table(reader)
         .map(|table| mqtt::read(&table, base, name.as_deref(), &state_dir));
-    let http = ROOT.http.table(reader).map(|table| north::read_http(&table, base));
+    let http = ROOT.http.table(reader).map(|table| http::read_http(&table, base));
     let bacnet = ROOT.bacnet.table(reader);
     let bacnet = bacnet.map(|table| bacnet::read(&table, base, &state_dir, &names));
     let buffer = mqtt.as_ref().and_then(|mqtt| mqtt.as_ref()?.buffer.as_ref());
@@ -312,15 +313,16 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     judge(reader, &buses, &clients);
     if let Some((
         authority::Authority {
-            rules: Some(Some(rules)),
-            ..
+            rules: Ok(Some(rules)), ..
         },
         table,
     )) = &authority
     {
         authority::warn_of_nobody(table, rules, &authority::Sides::of(&clients, &buses));
     }
-    let authority = flipped(authority.map(|(authority, _)| authority.rules))?.flatten();
+    let authority = options_of(authority, |(authority, _)| authority.rules.ok())
+        .ok()?
+        .flatten();
     let mut mqtt = mqtt;
     if let (Some(Some(options)), Some(rules)) = (&mut mqtt, &authority) {
         let levels = rules.principals.iter().filter_map(|principal| principal.mqtt.clone());
@@ -347,23 +349,24 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         stale_after_written: modbus_tcp.as_ref().is_some_and(|m| m.stale_written),
         buses: settings,
         slots: (!slots.is_empty()).then_some(slot_server::Options { slots }),
-        modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
-        mqtt: flipped(mqtt)?,
-        http: flipped(http.map(|http| http.options))?,
-        bacnet: flipped(bacnet.map(|bacnet| bacnet.options))?,
+        modbus_tcp: options_of(modbus_tcp, |m| m.options).ok()?,
+        mqtt: options_of(mqtt, |mqtt| mqtt).ok()?,
+        http: options_of(http, |http| http.options).ok()?,
+        bacnet: options_of(bacnet, |bacnet| bacnet.options).ok()?,
         authority,
-        drill: flipped(drill)?,
+        drill: options_of(drill, |drill| drill).ok()?,
         audit,
         log: log?,
     })
 }
 
-/// An invalid section invalidates the whole; an absent one does not.
-fn flipped<T>(section: Option<Option<T>>) -> Option<Option<T>> {
-    match section {
-        None => Some(None),
-        Some(options) => options.map(Some),
-    }
+/// What cannot be used, which is reported.
+#[derive(Debug, Clone, Copy)]
+struct Unusable;
+
+/// The options of a section. An invalid section invalidates the whole; an absent one has none.
+fn options_of<S, T>(section: Option<S>, of: impl FnOnce(S) -> Option<T>) -> Result<Option<T>, Unusable> {
+    section.map(|section| of(section).ok_or(Unusable)).transpose()
 }
 
 struct Gateway {

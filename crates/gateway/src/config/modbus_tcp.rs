@@ -7,9 +7,9 @@ use std::time::{Duration, SystemTime};
 
 use ipnet::IpNet;
 
+use super::http::Listener as Address;
 use super::key::Key;
 use super::keys::{IDLE, LISTENER, MODBUS_TCP, ROLES, TLS};
-use super::north::Listener as Address;
 use super::{files, values};
 use crate::document::{Finding, Place, Reader, nearest, parse_duration};
 use crate::north::TlsFile;

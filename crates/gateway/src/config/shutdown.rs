@@ -6,7 +6,7 @@ use super::BusSettings;
 use crate::bus::stop_of_line::{BROADCAST_PAUSE, stop_of_line};
 use crate::codec::{RequestPdu, Table};
 use crate::document::Finding;
-use crate::drive::control::{OwnWord, Place};
+use crate::drive::control::{ControlItem, OwnWord};
 use crate::drive::plan::WireTime;
 use crate::process_image::{Access, DriveSpec, OnShutdown};
 
@@ -93,7 +93,7 @@ fn is_stopped(drive: &DriveSpec) -> bool {
 /// The requests of a stop: the read of the control word, if there is one, and the write.
 fn stop_of(drive: &DriveSpec) -> Option<(Option<RequestPdu>, RequestPdu)> {
     let control = drive.profile.control.as_ref()?;
-    let Place { table, address } = control.stop.place.unwrap_or(control.at);
+    let ControlItem { table, address } = control.stop.place.unwrap_or(control.at);
     let functions = drive.profile.functions;
     let word = control.stop_word(0);
     Some(match table {

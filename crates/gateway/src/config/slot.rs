@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use super::http::Listener;
 use super::keys::{BUS, SLOT};
-use super::north::Listener;
 use super::values;
 use crate::bus::Mode;
 use crate::codec::{LineFormat, Protocol};

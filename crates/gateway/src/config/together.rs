@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::keys::{DRIVE, ROOT};
-use super::{bacnet, bus, modbus_tcp, north, start_guard, unique};
+use super::{bacnet, bus, http, modbus_tcp, start_guard, unique};
 use crate::document::{Finding, Place, Reader};
 use crate::north::mqtt as mqtt_client;
 use crate::process_image::Access;
@@ -12,7 +12,7 @@ use crate::process_image::Access;
 pub(super) struct Clients<'c> {
     pub(super) modbus_tcp: Option<&'c modbus_tcp::ModbusTcp>,
     pub(super) mqtt: Option<&'c Option<mqtt_client::Options>>,
-    pub(super) http: Option<&'c north::Http>,
+    pub(super) http: Option<&'c http::Http>,
     pub(super) bacnet: Option<&'c bacnet::Bacnet>,
 }
 

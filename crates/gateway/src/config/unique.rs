@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use super::bus::Found;
-use super::north::Listener;
+use super::http::Listener;
 use crate::document::{Document, Place};
 
 pub(super) fn check(document: &Document, buses: &[Found]) {

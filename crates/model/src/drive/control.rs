@@ -9,7 +9,7 @@ use crate::codec::Table;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Control {
     /// The control word, or a coil.
-    pub at: Place,
+    pub at: ControlItem,
     /// How the word reads back.
     pub own_word: OwnWord,
     /// Bits that every word carries.
@@ -28,17 +28,17 @@ pub struct Control {
 
 /// A register or coil that takes commands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Place {
+pub struct ControlItem {
     /// Table.
     pub table: Table,
     /// PDU address.
     pub address: u16,
 }
 
-impl Place {
+impl ControlItem {
     /// The place of a raw point.
-    pub(super) fn of(raw: &Raw) -> Place {
-        Place {
+    pub(super) fn of(raw: &Raw) -> ControlItem {
+        ControlItem {
             table: raw.table,
             address: raw.address,
         }
@@ -83,7 +83,7 @@ impl Always {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Setting {
     /// Where; none is the control word.
-    pub place: Option<Place>,
+    pub place: Option<ControlItem>,
     /// The bits.
     pub mask: u16,
     /// Their values.
@@ -201,19 +201,19 @@ impl Control {
     }
 
     /// Whether that word, written there, stops the motor.
-    pub fn is_stop(&self, place: Place, word: u16) -> bool {
+    pub fn is_stop(&self, place: ControlItem, word: u16) -> bool {
         self.stop.place.unwrap_or(self.at) == place && self.stop.holds(word)
     }
 
     /// Whether that word, written there, starts it or lets it run.
-    pub fn is_run(&self, place: Place, word: u16) -> bool {
+    pub fn is_run(&self, place: ControlItem, word: u16) -> bool {
         let of = |setting: &Setting| setting.place.unwrap_or(self.at) == place && self.holds_run(setting, word);
         !self.is_stop(place, word) && self.runs().iter().any(of)
     }
 
     /// Whether a client may write that word there as it stands: in the control word only what clearly stops or runs, at other
     /// places only what they are for.
-    pub fn admits(&self, place: Place, word: u16) -> bool {
+    pub fn admits(&self, place: ControlItem, word: u16) -> bool {
         if self.own_word == OwnWord::Kept {
             return true;
         }
@@ -328,7 +328,7 @@ impl Control {
     }
 
     /// Where `run` is written.
-    pub fn run_place(&self) -> Place {
+    pub fn run_place(&self) -> ControlItem {
         let first = self.runs().first().and_then(|setting| setting.place);
         first.unwrap_or(self.at)
     }
@@ -358,7 +358,7 @@ mod tests {
         profile.control.unwrap()
     }
 
-    fn words(control: &Control, of: impl Fn(&Control, Place, u16) -> bool, all: &[u16]) -> Vec<u16> {
+    fn words(control: &Control, of: impl Fn(&Control, ControlItem, u16) -> bool, all: &[u16]) -> Vec<u16> {
         let place = control.at;
         all.iter().copied().filter(|word| of(control, place, *word)).collect()
     }

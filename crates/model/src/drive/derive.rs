@@ -205,7 +205,7 @@ impl Derived {
 }
 
 /// The value at `percent` of a band. A lower end above zero is the minimum of a drive that turns no slower in either
-/// direction, and a negative percentage turns it in reverse (drives.md 3.5). Any other band is a straight line.
+/// direction, and a negative percentage turns it in reverse (reference/drives.md 3.5). Any other band is a straight line.
 fn in_band(percent: f64, (low, high): (f64, f64)) -> f64 {
     if low > 0.0 && percent < 0.0 {
         -in_band(-percent, (low, high))
@@ -266,7 +266,7 @@ mod tests {
         assert_eq!(band.inverse(30.0, (5.0, 5.0)), None);
     }
 
-    /// drives.md 3.5: the sign of a reference turns the motor round, the magnitude counts from the minimum frequency.
+    /// reference/drives.md 3.5: the sign of a reference turns the motor round, the magnitude counts from the minimum frequency.
     #[test]
     fn a_minimum_above_zero_is_that_of_either_direction() {
         let ((minimum, maximum), range) = (ends(), (10.0, 50.0));

@@ -1,4 +1,4 @@
-//! The built-in profiles against the tables of the reference (drives.md 13.1, 13.2, 3 to 6), written from those tables
+//! The built-in profiles against the tables of the reference (reference/drives.md 13.1, 13.2, 3 to 6), written from those tables
 //! and not from the profiles; and worked replies of the manuals, decoded.
 
 use super::derive::{Bound, Derived};

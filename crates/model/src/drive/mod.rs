@@ -6,6 +6,7 @@ pub(crate) mod derive;
 #[cfg(test)]
 mod families_tests;
 pub mod identify;
+pub mod index;
 pub mod model;
 pub mod parameters;
 pub mod plan;
@@ -16,6 +17,7 @@ pub mod why;
 
 pub use commissioning::{Commissioning, Step};
 pub use derive::{Bound, Derived};
+pub use index::{DriveIndex, IndexVec, PerDrive};
 pub use model::tidy;
 pub use model::{ModelPoint, Quality, Sample, State, Value};
 pub use plan::{Plan, PlannedRead};

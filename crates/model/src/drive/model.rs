@@ -26,17 +26,17 @@ pub enum Value {
 /// A text of a drive: as much as a value may have, kept in place.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Text {
-    bytes: [u8; Text::MOST],
+    bytes: [u8; Text::MOST_BYTES],
     length: u8,
 }
 
 impl Text {
-    const MOST: usize = 2 * super::profile::MOST_REGISTERS;
+    const MOST_BYTES: usize = 2 * super::profile::MOST_REGISTERS;
 
     /// The text in these registers up to its first NUL; `None` if there are too many.
     pub(crate) fn of_registers(words: &[u16], order: Order) -> Option<Text> {
         let mut text = Text {
-            bytes: [0; Text::MOST],
+            bytes: [0; Text::MOST_BYTES],
             length: 0,
         };
         if words.len() > super::profile::MOST_REGISTERS {

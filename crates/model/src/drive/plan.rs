@@ -286,7 +286,7 @@ mod tests {
     use super::super::profile::Profiles;
     use super::*;
 
-    /// 17 and 75 characters of 10 bits (drives.md 5.2), 15 ms of a TECO drive, 3.5 characters of silence.
+    /// 17 and 75 characters of 10 bits (reference/drives.md 5.2), 15 ms of a TECO drive, 3.5 characters of silence.
     #[test]
     fn an_ascii_exchange_by_hand() {
         let format = LineFormat::new(9600, "7E1").unwrap();

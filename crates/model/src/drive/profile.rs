@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::commissioning::Commissioning;
-use super::control::{Always, Control, OwnWord, Place, Reset, Run, Setting};
+use super::control::{Always, Control, ControlItem, OwnWord, Reset, Run, Setting};
 use super::derive::Derived;
 use super::model::{Kind, ModelPoint, Value};
 use super::parameters::ParameterList;
@@ -60,13 +60,13 @@ pub struct Profile {
     pub functions: WriteFunctions,
     /// All points, in the order of the file.
     pub points: Vec<Point>,
-    /// Points that a drive with a new fault is asked for at once.
     /// The drive counts what it receives, damaged or not, and tells it by function 08 (subfunctions 0B to 0F).
     pub counts_messages: bool,
     /// The drive may stop by itself when its master goes silent, and no readable point shows whether it does.
     pub may_stop_by_itself: bool,
     /// A broadcast that clears the whole control word stops every drive of the family on the line.
     pub broadcast_stop: bool,
+    /// Points that a drive with a new fault is asked for at once.
     pub on_fault: Vec<usize>,
     /// How it is commanded, where its profile says so in `[control]`.
     pub control: Option<Control>,
@@ -468,7 +468,7 @@ impl Profile {
                 _ => return None,
             };
             Some(Setting {
-                place: Some(Place::of(raw)),
+                place: Some(ControlItem::of(raw)),
                 mask: 1 << bit,
                 value: u16::from(on != invert) << bit,
                 once: false,
@@ -498,14 +498,14 @@ impl Profile {
     }
 
     /// Where the run command is written, and read as the drive has it where it can be.
-    pub fn run_place(&self) -> Option<Place> {
+    pub fn run_place(&self) -> Option<ControlItem> {
         let control = self.control.as_ref().map(Control::run_place);
-        control.or_else(|| self.model_point(ModelPoint::Run)?.raw().map(Place::of))
+        control.or_else(|| self.model_point(ModelPoint::Run)?.raw().map(ControlItem::of))
     }
 
     /// Whether that word, written there, is a run command or a stop; `None` if neither.
     pub fn runs_by(&self, table: Table, address: u16, word: u16) -> Option<bool> {
-        let (control, place) = (self.control.as_ref()?, Place { table, address });
+        let (control, place) = (self.control.as_ref()?, ControlItem { table, address });
         let run = control.is_run(place, word).then_some(true);
         run.or(control.is_stop(place, word).then_some(false))
     }
@@ -528,7 +528,7 @@ impl Profile {
     /// Whether a register holds settings besides a bit: it is not that of the run command, whose other bits nobody else
     /// changes unnoticed.
     pub fn is_settings(&self, table: Table, address: u16) -> bool {
-        let is_run = self.run_place() == Some(Place { table, address });
+        let is_run = self.run_place() == Some(ControlItem { table, address });
         table == Table::Holding && !self.protocols.contains(&Protocol::N2) && !is_run
     }
 
@@ -551,7 +551,7 @@ impl Profile {
 
     /// Whether writing `value` to that register (or coil) clears the run command: a stop.
     pub fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
-        let place = Place { table, address };
+        let place = ControlItem { table, address };
         self.control
             .as_ref()
             .is_some_and(|control| control.is_stop(place, value))

@@ -12,7 +12,7 @@ pub(crate) const REMEMBERED: Duration = Duration::from_secs(600);
 /// Longest time, whatever the expiry of its message.
 const LONGEST: Duration = Duration::from_secs(86_400);
 /// Maximum number of commands with an `id` that are remembered.
-const MOST: usize = 1 << 18;
+const MOST_COMMANDS: usize = 1 << 18;
 
 /// A command, as far as its repetition is recognised by it.
 #[derive(Debug, Clone, Copy, Default)]
@@ -191,7 +191,7 @@ impl<R: Clone> Memory<R> {
     /// Whether another command with an `id` can be remembered.
     pub(crate) fn has_room(&mut self, now: Instant) -> bool {
         self.forget(now);
-        self.known.len() < MOST
+        self.known.len() < MOST_COMMANDS
     }
 
     fn forget(&mut self, now: Instant) {

@@ -201,7 +201,7 @@ proptest! {
         let mut permits: Vec<(ConnectionPermit, Authority)> = Vec::new();
         for (n, writes, then) in newcomers {
             let authority = if writes { Authority::Write } else { Authority::ReadOnly };
-            let count = |select: &dyn Fn(&Place, Authority) -> bool| {
+            let count = |select: &dyn Fn(&ConnectionPlace, Authority) -> bool| {
                 permits.iter().filter(|(permit, authority)| select(permit.place(), *authority)).count()
             };
             let own = count(&|place, _| place.address() == host(n));

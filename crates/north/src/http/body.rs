@@ -15,14 +15,14 @@ use crate::command_json::MAX_PAYLOAD;
 const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A body of at most so many bytes, as an argument of a handler.
-pub(super) struct Payload<const MOST: usize = MAX_PAYLOAD>(pub(super) Bytes);
+pub(super) struct Payload<const MOST_BYTES: usize = MAX_PAYLOAD>(pub(super) Bytes);
 
-impl<S: Sync, const MOST: usize> FromRequest<S> for Payload<MOST> {
+impl<S: Sync, const MOST_BYTES: usize> FromRequest<S> for Payload<MOST_BYTES> {
     type Rejection = Refused;
 
-    async fn from_request(request: Request, _: &S) -> Replied<Payload<MOST>> {
+    async fn from_request(request: Request, _: &S) -> Replied<Payload<MOST_BYTES>> {
         let (parts, body) = request.into_parts();
-        Ok(Payload(read(body, &Reached::of(&parts)?, MOST).await?))
+        Ok(Payload(read(body, &Reached::of(&parts)?, MOST_BYTES).await?))
     }
 }
 

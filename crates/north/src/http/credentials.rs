@@ -7,7 +7,7 @@ pub trait Credential: FromStr<Err = CredentialError> + std::fmt::Display {
     /// `token` or `user`.
     const KIND: &'static str;
     /// Most of a file: more than any plant needs.
-    const MOST: usize;
+    const MOST_ENTRIES: usize;
 
     /// Unique in the file.
     fn name(&self) -> &str;
@@ -69,8 +69,8 @@ impl<C: Credential> Credentials<C> {
             if all.named(one.name()).is_some() {
                 return Err((line, CredentialError::Repeated(C::KIND, one.name().to_string())));
             }
-            if all.0.len() >= C::MOST {
-                return Err((line, CredentialError::Many(C::KIND, C::MOST)));
+            if all.0.len() >= C::MOST_ENTRIES {
+                return Err((line, CredentialError::Many(C::KIND, C::MOST_ENTRIES)));
             }
             all.0.push(one);
         }

@@ -6,7 +6,7 @@ use std::net::IpAddr;
 /// Names that always mean this machine, besides those that end in `.localhost`.
 const LOOPBACK: [&str; 4] = ["localhost", "localhost.localdomain", "ip6-localhost", "ip6-loopback"];
 /// Longest name of a host.
-const MOST: usize = 255;
+const LONGEST_NAME: usize = 255;
 
 /// A host without its port.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -53,7 +53,7 @@ impl Host {
         let text = text.strip_suffix('.').unwrap_or(text);
         let sound = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
         let is_label = |label: &str| !label.is_empty() && label.chars().all(sound);
-        let is_name = text.len() <= MOST && text.split('.').all(is_label);
+        let is_name = text.len() <= LONGEST_NAME && text.split('.').all(is_label);
         is_name.then(|| Host::Name(text.to_ascii_lowercase()))
     }
 }
@@ -104,7 +104,7 @@ mod tests {
         ] {
             assert_eq!(Host::parse(text), host, "{text}");
         }
-        let long = "a".repeat(MOST + 1);
+        let long = "a".repeat(LONGEST_NAME + 1);
         for bad in [
             "",
             ".",

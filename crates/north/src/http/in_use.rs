@@ -8,14 +8,14 @@ use std::time::Instant;
 
 use hyper::body::{Body, Frame, SizeHint};
 
-use crate::connection_limit::Place;
+use crate::connection_limit::ConnectionPlace;
 
 /// Marks a connection as in use until this is dropped.
 #[derive(Debug)]
-pub(super) struct InUse(Arc<Place>);
+pub(super) struct InUse(Arc<ConnectionPlace>);
 
 impl InUse {
-    pub(super) fn new(place: Arc<Place>) -> InUse {
+    pub(super) fn new(place: Arc<ConnectionPlace>) -> InUse {
         place.use_at(Instant::now(), true);
         InUse(place)
     }

@@ -29,7 +29,7 @@ use super::{
 use crate::NorthStats;
 use crate::command::{Proof, SourceKind};
 use crate::command_json::{CommandResult, HoldReply, StopBody};
-use crate::connection_limit::{ConnectionLimit, Limits, Place};
+use crate::connection_limit::{ConnectionLimit, ConnectionPlace, Limits};
 use crate::drill::DrillReport;
 use crate::history::Entry;
 use crate::local::control::Control;
@@ -99,7 +99,7 @@ pub(super) struct Reached {
     /// The user of the local socket; `None`: over TCP.
     pub(super) local: Option<LocalUser>,
     /// The place of the connection; `None` without a socket.
-    pub(super) place: Option<Arc<Place>>,
+    pub(super) place: Option<Arc<ConnectionPlace>>,
 }
 
 /// Only at the socket.
@@ -116,7 +116,7 @@ impl Reached {
     }
 
     /// A request of this machine that came over no network: through the local socket, or from a test of the interface.
-    pub(super) fn within(local: Option<LocalUser>, place: Option<Arc<Place>>) -> Reached {
+    pub(super) fn within(local: Option<LocalUser>, place: Option<Arc<ConnectionPlace>>) -> Reached {
         let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
         Reached {
             address,

@@ -21,7 +21,7 @@ use super::routes::{self, Client, LocalUser, Reached};
 use super::{Coverage, GRACE, HEAD_TIMEOUT, MAX_HEAD};
 use crate::NorthStats;
 use crate::command::{Authority, Proof, SourceKind};
-use crate::connection_limit::{ConnectionLimit, Limits, Newcomer, Place};
+use crate::connection_limit::{ConnectionLimit, ConnectionPlace, Limits, Newcomer};
 use crate::plant::SharedPlant;
 
 /// Serves the connections of the local socket that speak HTTP.
@@ -40,7 +40,12 @@ impl SocketDoor {
 
     /// Answers the requests of a client until it leaves, goes silent or yields to another one; a reply that is being
     /// made is finished.
-    pub(crate) async fn serve(&self, stream: impl AsyncRead + AsyncWrite + Unpin, user: LocalUser, place: &Arc<Place>) {
+    pub(crate) async fn serve(
+        &self,
+        stream: impl AsyncRead + AsyncWrite + Unpin,
+        user: LocalUser,
+        place: &Arc<ConnectionPlace>,
+    ) {
         let reached = Reached::within(Some(user), Some(place.clone()));
         let client = Client {
             address: reached.address,

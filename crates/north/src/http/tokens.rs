@@ -109,7 +109,7 @@ impl FromStr for Token {
 
 impl Credential for Token {
     const KIND: &'static str = "token";
-    const MOST: usize = 1000;
+    const MOST_ENTRIES: usize = 1000;
 
     fn name(&self) -> &str {
         &self.name
@@ -215,11 +215,11 @@ mod tests {
         ] {
             assert_eq!(Tokens::parse(&text), Err((line, error)), "{text}");
         }
-        const MOST: usize = Token::MOST;
-        let many: String = (0..=MOST).map(|i| format!("t{i} read {hash}\n")).collect();
+        const MOST_ENTRIES: usize = Token::MOST_ENTRIES;
+        let many: String = (0..=MOST_ENTRIES).map(|i| format!("t{i} read {hash}\n")).collect();
         assert_eq!(
             Tokens::parse(&many),
-            Err((MOST + 1, CredentialError::Many("token", MOST)))
+            Err((MOST_ENTRIES + 1, CredentialError::Many("token", MOST_ENTRIES)))
         );
     }
 

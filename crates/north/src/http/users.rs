@@ -127,7 +127,7 @@ impl FromStr for User {
 
 impl Credential for User {
     const KIND: &'static str = "user";
-    const MOST: usize = 100;
+    const MOST_ENTRIES: usize = 100;
 
     fn name(&self) -> &str {
         &self.name
@@ -254,11 +254,11 @@ mod tests {
         ] {
             assert_eq!(Users::parse(&text), Err((line, error)), "{text}");
         }
-        const MOST: usize = User::MOST;
-        let many: String = (0..=MOST).map(|i| format!("u{i} {FOREIGN}\n")).collect();
+        const MOST_ENTRIES: usize = User::MOST_ENTRIES;
+        let many: String = (0..=MOST_ENTRIES).map(|i| format!("u{i} {FOREIGN}\n")).collect();
         assert_eq!(
             Users::parse(&many),
-            Err((MOST + 1, CredentialError::Many("user", MOST)))
+            Err((MOST_ENTRIES + 1, CredentialError::Many("user", MOST_ENTRIES)))
         );
     }
 

@@ -21,7 +21,9 @@ use super::tls::{AuthenticatedClient, Role, TlsAuthenticator};
 use super::{ServerState, connection};
 use crate::ConnectionRefusal;
 use crate::command::Authority;
-use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, LimitReached, Newcomer, Place};
+use crate::connection_limit::{
+    CloseReason, ConnectionLimit, ConnectionPermit, ConnectionPlace, LimitReached, Newcomer,
+};
 use crate::listener::ConnectionHandler;
 
 /// A peer that disappeared without closing is detected after 60 s + 3 * 10 s.
@@ -134,7 +136,7 @@ impl Admission {
         self.policy.store(Arc::new(policy.clone()));
         self.state
             .connections
-            .review(self.listener, |place: &Place| match &policy.write {
+            .review(self.listener, |place: &ConnectionPlace| match &policy.write {
                 WriteAccess::ByAddress(_) => policy.by_address(place.address()),
                 WriteAccess::ByCertificate(_) => policy.by_certificate(place.address(), place.rights().authority()),
             });

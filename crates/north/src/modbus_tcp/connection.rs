@@ -15,7 +15,7 @@ use super::dialogue::{Consumed, Dialogue};
 use super::forwarded_request::AnsweredRequest;
 use super::frame::NotModbus;
 use super::session::ClientSession;
-use crate::connection_limit::{CloseReason, Place};
+use crate::connection_limit::{CloseReason, ConnectionPlace};
 
 /// Time limit for the rest of a frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
@@ -57,7 +57,7 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
     session: ClientSession,
     idle_timeout: Option<Duration>,
-    place: &Place,
+    place: &ConnectionPlace,
     stopping: &CancellationToken,
 ) -> Option<NotModbus> {
     tracing::debug!(target: "drivegate::north::modbus_tcp", client = session.who(), "Modbus TCP: connected");
@@ -100,7 +100,7 @@ pub(super) async fn close<S: AsyncWrite + Unpin>(stream: &mut S) {
 struct Connection<'p, S> {
     stream: S,
     dialogue: Dialogue,
-    place: &'p Place,
+    place: &'p ConnectionPlace,
     /// The time as of the last wait; the clock is read once per request.
     now: Instant,
     /// When nothing was there to be read, last: what is found at once may have come since.

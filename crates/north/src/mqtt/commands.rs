@@ -146,8 +146,8 @@ impl Commands {
         now: Instant,
         time: SystemTime,
     ) -> Option<Message> {
-        if let Some(as_whom) = self.topics.parse_stop_all(&incoming.topic) {
-            return self.stop_all(&incoming, as_whom, plant, now);
+        if let Some(topic) = self.topics.parse_stop_all(&incoming.topic) {
+            return self.stop_all(&incoming, topic.who, plant, now);
         }
         if let Some(target) = self.topics.parse_hold(&incoming.topic) {
             return self.hold(&incoming, target, plant, now);

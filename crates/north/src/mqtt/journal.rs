@@ -49,7 +49,7 @@ struct Segment {
 #[derive(Debug)]
 pub(super) struct Journal {
     /// `None`: everything stays in memory.
-    place: Option<Place>,
+    place: Option<JournalDir>,
     segments: VecDeque<Segment>,
     next_segment: u64,
     /// Loaded from disk, not taken yet.
@@ -74,7 +74,7 @@ pub(super) struct Journal {
 }
 
 #[derive(Debug)]
-struct Place {
+struct JournalDir {
     dir: PathBuf,
     /// First part of the names of the files.
     name: &'static str,
@@ -115,7 +115,7 @@ impl Journal {
         fs::create_dir_all(dir)?;
         let lock = lock(dir, name)?;
         let mut journal = Journal {
-            place: Some(Place {
+            place: Some(JournalDir {
                 dir: dir.to_path_buf(),
                 name,
                 max_bytes,
@@ -540,7 +540,7 @@ impl Journal {
 
     /// Keeps a copy of bytes that are no records.
     fn quarantine(&self, segment: u64, offset: u64, bytes: &[u8]) -> io::Result<()> {
-        let Some(Place { dir, name, .. }) = &self.place else {
+        let Some(JournalDir { dir, name, .. }) = &self.place else {
             return Ok(());
         };
         let path = dir.join(format!("{name}-{segment:012}-{offset}{DAMAGED}"));

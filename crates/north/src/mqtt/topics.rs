@@ -26,6 +26,13 @@ pub(super) struct HoldTopic<'t> {
     pub(super) who: Option<&'t str>,
 }
 
+/// The topic at which all drives are stopped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct StopTopic<'t> {
+    /// WHO of `as/WHO`; without one it is nobody's.
+    pub(super) who: Option<&'t str>,
+}
+
 impl Topics {
     pub(super) fn new(base: &str, gateway: &str) -> Topics {
         Topics {
@@ -92,14 +99,14 @@ impl Topics {
         stops.chain(plant.drives().flat_map(of_drive)).collect()
     }
 
-    /// Who stops all drives by that topic, where it is one of these: WHO in `as/WHO`, if it has one.
-    pub(super) fn parse_stop_all<'t>(&self, topic: &'t str) -> Option<Option<&'t str>> {
+    /// Who stops all drives by that topic; `None` for any other topic.
+    pub(super) fn parse_stop_all<'t>(&self, topic: &'t str) -> Option<StopTopic<'t>> {
         let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix('/')?;
         if rest == "set/stop" {
-            return Some(None);
+            return Some(StopTopic { who: None });
         }
         let who = rest.strip_prefix("as/")?.strip_suffix("/stop")?;
-        (!who.contains('/')).then_some(Some(who))
+        (!who.contains('/')).then_some(StopTopic { who: Some(who) })
     }
 
     /// Whose hold of which drive a topic is about; `None` for any other topic.
@@ -170,8 +177,9 @@ mod tests {
         assert_eq!(hold("plant/a/hall/drive/p1/hold"), Some(("p1", None)));
         assert_eq!(hold("plant/a/hall/drive/p1/as/x/hold"), Some(("p1", Some("x"))));
         assert_eq!(hold("plant/a/hall/drive/p1/as/x/y/hold"), None);
-        assert_eq!(topics.parse_stop_all("plant/a/hall/set/stop"), Some(None));
-        assert_eq!(topics.parse_stop_all("plant/a/hall/as/x/stop"), Some(Some("x")));
+        let stop = |topic| topics.parse_stop_all(topic).map(|t| t.who);
+        assert_eq!(stop("plant/a/hall/set/stop"), Some(None));
+        assert_eq!(stop("plant/a/hall/as/x/stop"), Some(Some("x")));
         for other in [
             "plant/a/hall/as/x/y/stop",
             "plant/a/hall/as/stop",

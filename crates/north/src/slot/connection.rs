@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::dialogue::Dialogue;
 use super::terms::Tool;
-use crate::connection_limit::{CloseReason, Place};
+use crate::connection_limit::{CloseReason, ConnectionPlace};
 use crate::line::{ServedPort, telnet_escaped};
 
 /// Time for a tool to take an answer.
@@ -62,7 +62,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
 
     /// Serves the tool until it goes, is idle for `idle_timeout`, or must yield its `place`.
     /// What it has asked is answered then, unless the gateway is `stopping`.
-    pub(super) async fn serve(mut self, idle_timeout: Option<Duration>, place: &Place, stopping: &CancellationToken) {
+    pub(super) async fn serve(
+        mut self,
+        idle_timeout: Option<Duration>,
+        place: &ConnectionPlace,
+        stopping: &CancellationToken,
+    ) {
         tracing::info!(target: "drivegate::north::slot", tool = self.dialogue.who(), "tool slot: connected");
         let end = loop {
             if let Err(end) = self.turn(idle_timeout, place).await {
@@ -85,7 +90,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     }
 
     /// Waits for one thing and does it.
-    async fn turn(&mut self, idle_timeout: Option<Duration>, place: &Place) -> Result<(), End> {
+    async fn turn(&mut self, idle_timeout: Option<Duration>, place: &ConnectionPlace) -> Result<(), End> {
         let mut buffer = [0; 1024];
         self.flush().await?;
         place.use_at(Instant::now().into_std(), self.last_request.elapsed() < IN_USE);

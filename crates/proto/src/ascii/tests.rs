@@ -65,7 +65,7 @@ fn replied(request: &Request, reply: &Reply) -> Vec<u8> {
     framed(request.address, &pdu)
 }
 
-/// Worked requests of drives.md 7.3 and 7.4.
+/// Worked requests of reference/drives.md 7.3 and 7.4.
 #[test]
 fn requests_of_the_reference() {
     let broadcast = |address, value| to(0, RequestPdu::WriteRegister { address, value });
@@ -107,7 +107,7 @@ fn requests_of_the_reference() {
     }
 }
 
-/// Worked replies of drives.md 7.3 and 7.4.
+/// Worked replies of reference/drives.md 7.3 and 7.4.
 fn replies() -> Vec<(Request, &'static str, Reply)> {
     let refused = |code| Reply::Exception(Exception(code));
     let input = to(
@@ -148,14 +148,14 @@ fn replies_of_the_reference() {
                 let mut pdu = Vec::new();
                 encode_exception(request.pdu.function(), code, &mut pdu);
                 assert_eq!(framed(1, &pdu), line(text));
-                assert_eq!(used, 11, "drives.md 5.2: an error reply has 11 characters");
+                assert_eq!(used, 11, "reference/drives.md 5.2: an error reply has 11 characters");
             }
             reply => assert_eq!(replied(&request, &reply), line(text), "{text}"),
         }
     }
 }
 
-/// Lengths of drives.md 5.2.
+/// Lengths of reference/drives.md 5.2.
 #[test]
 fn lengths_of_the_reference() {
     for (request, asked, answered) in [

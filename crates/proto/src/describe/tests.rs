@@ -21,7 +21,7 @@ fn framed(address: u8, pdu: &str) -> Vec<u8> {
     out
 }
 
-/// Worked requests of drives.md, section 7, misprints corrected.
+/// Worked requests of reference/drives.md, section 7, misprints corrected.
 #[test]
 fn requests_of_the_reference() {
     for (frame, text) in [

@@ -57,7 +57,7 @@ impl Exception {
         self == Exception::ACKNOWLEDGE || self.is_no_answer()
     }
 
-    /// What the code means, by the Modbus specification and the TECO list (drives.md 5.6).
+    /// What the code means, by the Modbus specification and the TECO list (reference/drives.md 5.6).
     pub fn meaning(self) -> &'static str {
         match self.0 {
             0x01 => "illegal function",

@@ -84,7 +84,7 @@ impl Reply {
         let (&function, body) = pdu.split_first().ok_or(Misfit)?;
         if function == request.function() | 0x80 {
             return match body {
-                // No exception of Modbus. TECO's table has 00 for a wrong check code (drives.md 5.6 and 9.8): the line
+                // No exception of Modbus. TECO's table has 00 for a wrong check code (reference/drives.md 5.6 and 9.8): the line
                 // refuses, not the drive, and the request is repeated.
                 [0] => Err(Misfit),
                 [code] => Ok(Reply::Exception(Exception(*code))),

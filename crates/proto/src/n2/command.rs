@@ -1,4 +1,4 @@
-//! The frames: commands of a master and answers of a drive, each from both ends (n2.md 1 and 2).
+//! The frames: commands of a master and answers of a drive, each from both ends (reference/n2.md 1 and 2).
 
 use super::assumptions::RegionWidth;
 use super::object::{Object, Region};
@@ -18,7 +18,7 @@ pub const DATA: u8 = 0x10;
 /// The command is not allowed for that type of data.
 pub const TYPE: u8 = 0x11;
 
-/// Characters of the longest report of changes (n2.md 2).
+/// Characters of the longest report of changes (reference/n2.md 2).
 pub const LONGEST_REPORT: usize = 200;
 
 /// A command of a master.
@@ -281,7 +281,7 @@ fn open(text: &[u8]) -> Result<&[u8], &'static str> {
     }
 }
 
-/// Sum of the characters behind the lead, modulo 256 (n2.md 1).
+/// Sum of the characters behind the lead, modulo 256 (reference/n2.md 1).
 pub fn checksum(text: &[u8]) -> u8 {
     text.iter().fold(0, |sum: u8, byte| sum.wrapping_add(*byte))
 }

@@ -7,7 +7,7 @@ use crate::modbus::Table;
 /// First input register of the internal integers.
 pub const ADI_BASE: u16 = 0x4000;
 
-/// A type of object; the number is its region on the wire (drives.md 6.2).
+/// A type of object; the number is its region on the wire (reference/drives.md 6.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Region {
     /// Analog input, a float.
@@ -64,7 +64,7 @@ impl Region {
         }
     }
 
-    /// Internal objects are written without an attribute number (n2.md 2).
+    /// Internal objects are written without an attribute number (reference/n2.md 2).
     pub fn is_internal(self) -> bool {
         matches!(self, Region::Adf | Region::Adi | Region::Bd)
     }

@@ -29,7 +29,7 @@ fn set(object: Object, data: Vec<u8>) -> Command {
     Command::Override { object, data }
 }
 
-/// All requests of n2.md section 1 and drives.md 6.8, from both ends.
+/// All requests of reference/n2.md section 1 and reference/drives.md 6.8, from both ends.
 #[test]
 fn requests_of_the_reference() {
     use RegionWidth::{One, Two};
@@ -102,7 +102,7 @@ fn regular(text: &str, reply: Reply) -> Decoded {
     Decoded::Reply { used, reply }
 }
 
-/// All replies of n2.md section 1 and drives.md 6.8, as the master reads them.
+/// All replies of reference/n2.md section 1 and reference/drives.md 6.8, as the master reads them.
 #[test]
 fn replies_of_the_reference() {
     let words = |high, low| Reply::Registers(vec![high, low]);

@@ -21,7 +21,7 @@ use super::motor::{Feed, Load, Ratings};
 use super::parameter_set::Writes;
 use super::random::Random;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::drive::control::{Control, Place, Run, Until};
+use crate::drive::control::{Control, ControlItem, Run, Until};
 use crate::drive::{Bound, ModelPoint, Profile, Source, Value};
 
 /// Time that a drive takes to come to the next state of its start sequence.
@@ -167,7 +167,7 @@ impl ProfileDrive {
     }
 
     /// A value that was written to a place that may take commands.
-    fn told(&mut self, place: Place, word: u16, now: SimTime) {
+    fn told(&mut self, place: ControlItem, word: u16, now: SimTime) {
         let Some(control) = self.control.clone() else {
             return;
         };

@@ -8,7 +8,7 @@ use super::ProfileDrive;
 use super::said;
 use super::wishes::Key;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::drive::control::{Control, OwnWord, Place};
+use crate::drive::control::{Control, ControlItem, OwnWord};
 use crate::drive::profile::Part;
 use crate::drive::{Point, Profile, Value};
 
@@ -189,7 +189,7 @@ impl ProfileDrive {
             return Err(Exception::VALUE);
         }
         for (key, value) in items {
-            let place = Place {
+            let place = ControlItem {
                 table: key.0,
                 address: key.1,
             };

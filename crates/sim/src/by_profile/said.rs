@@ -1,14 +1,14 @@
 //! What a drive does with the words that it gets, as `[control]` of its profile says it: for drives that are not known by hand.
 
 use super::words::{Does, Known, Told};
-use crate::drive::control::{Control, Place, Run, Setting, Step};
+use crate::drive::control::{Control, ControlItem, Run, Setting, Step};
 
-fn place_of(setting: &Setting, control: &Control) -> Place {
+fn place_of(setting: &Setting, control: &Control) -> ControlItem {
     setting.place.unwrap_or(control.at)
 }
 
 /// What is written to one of the places of the profile's commands.
-pub(super) fn told(control: &Control, known: &Known<'_>, place: Place, word: u16) -> Told {
+pub(super) fn told(control: &Control, known: &Known<'_>, place: ControlItem, word: u16) -> Told {
     let own = place == control.at;
     let here = |setting: &Setting| place_of(setting, control) == place;
     let holds = |setting: &Setting| match place_of(setting, control) {
@@ -41,7 +41,7 @@ pub(super) fn told(control: &Control, known: &Known<'_>, place: Place, word: u16
 }
 
 /// The farthest step of the sequence whose word that is and whose turn it can be.
-fn next_step(control: &Control, position: usize, place: Place, word: u16) -> Option<usize> {
+fn next_step(control: &Control, position: usize, place: ControlItem, word: u16) -> Option<usize> {
     let Run::Steps(steps) = &control.run else {
         return None;
     };
@@ -60,13 +60,13 @@ fn next_step(control: &Control, position: usize, place: Place, word: u16) -> Opt
 }
 
 /// Whether a write there can start the motor or turn it round.
-fn concerns_run(control: &Control, place: Place) -> bool {
+fn concerns_run(control: &Control, place: ControlItem) -> bool {
     let mut of_run = control.runs().into_iter().chain(control.reverse);
     of_run.any(|setting| place_of(&setting, control) == place)
 }
 
 /// Every place that takes commands.
-pub(super) fn places(control: &Control) -> Vec<Place> {
+pub(super) fn places(control: &Control) -> Vec<ControlItem> {
     let steps: &[Step] = match &control.run {
         Run::Steps(steps) => steps,
         Run::One(_) | Run::Pair { .. } => &[],

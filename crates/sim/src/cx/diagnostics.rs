@@ -1,4 +1,4 @@
-//! Function 08 of the simulated CX: event counters and Listen Only Mode (drives.md 4.6).
+//! Function 08 of the simulated CX: event counters and Listen Only Mode (reference/drives.md 4.6).
 
 use crate::codec::{Exception, Reply};
 

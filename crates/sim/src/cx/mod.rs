@@ -1,4 +1,4 @@
-//! A Vacon CX, CXL or CXS drive with its Modbus board, as drives.md sections 4 and 10 describe it.
+//! A Vacon CX, CXL or CXS drive with its Modbus board, as reference/drives.md sections 4 and 10 describe it.
 //!
 //! Pure: the time is an argument. A lost master changes nothing, because the manual describes no supervision of the bus.
 
@@ -23,7 +23,7 @@ use super::parameter_set::Writes;
 use super::random::Random;
 use crate::codec::{Exception, Reply, RequestPdu};
 
-/// The control bits (drives.md 4.2).
+/// The control bits (reference/drives.md 4.2).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 struct Coils {
     run: bool,

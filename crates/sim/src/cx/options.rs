@@ -5,7 +5,7 @@ use super::super::motor::Load;
 use crate::codec::Table;
 use std::str::FromStr;
 
-/// Items per message; the manual states no limits and shows one item everywhere (drives.md 9.7).
+/// Items per message; the manual states no limits and shows one item everywhere (reference/drives.md 9.7).
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
     /// Coils or discrete inputs.
@@ -26,7 +26,7 @@ impl Default for Limits {
 }
 
 /// What is added to the addresses of the manual's tables. Its start-up test uses some that are one higher, so some
-/// boards may have an offset of 1 (drives.md 9.6).
+/// boards may have an offset of 1 (reference/drives.md 9.6).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct AddressOffset {
     pub coil: u16,

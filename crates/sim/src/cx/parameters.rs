@@ -1,4 +1,4 @@
-//! Parameters of the simulated CX by their address (drives.md 4.3).
+//! Parameters of the simulated CX by their address (reference/drives.md 4.3).
 //!
 //! The manual names Par 0.1, 1.1, 1.2 and 3.2 only. The others, their ranges and defaults are plausible values of the
 //! drive's applications, so that there is something to read and the motor has a plate.

@@ -1,4 +1,4 @@
-//! The four tables of the simulated CX (drives.md 4.1 to 4.5).
+//! The four tables of the simulated CX (reference/drives.md 4.1 to 4.5).
 
 use super::super::SimTime;
 use super::super::model::{Model, bit, signed, unsigned};
@@ -100,7 +100,7 @@ impl CxDrive {
         value.ok_or(Exception::ADDRESS)
     }
 
-    /// Monitoring variable n1 and following, by its item, which is one less (drives.md 4.4).
+    /// Monitoring variable n1 and following, by its item, which is one less (reference/drives.md 4.4).
     fn variable(&self, item: u16) -> Option<u16> {
         let (motor, ratings, totals) = (&self.body.motor, &self.ratings, &self.totals);
         let step = self.options.time_step;

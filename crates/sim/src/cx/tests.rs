@@ -1,4 +1,4 @@
-//! Behaviour of the simulated CX against drives.md, sections 4, 7.2 and 10, in virtual time.
+//! Behaviour of the simulated CX against reference/drives.md, sections 4, 7.2 and 10, in virtual time.
 
 use super::super::model::Beyond;
 use super::options::Limits;
@@ -116,7 +116,7 @@ fn exchange(drive: &mut CxDrive, frame: &str, now: SimTime) -> String {
     out.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" ")
 }
 
-/// Worked frames of drives.md 7.2 and 7.4, in an order in which a drive with a 29.6 A motor comes to their states.
+/// Worked frames of reference/drives.md 7.2 and 7.4, in an order in which a drive with a 29.6 A motor comes to their states.
 #[test]
 fn worked_frames() {
     let mut drive = CxDrive::new(
@@ -189,7 +189,7 @@ fn start_stop_and_direction() {
     assert_eq!((bench.status(), bench.variable(1)), (0b00011, 0));
 }
 
-/// drives.md 4.3: from Par 1.1 to Par 1.2.
+/// reference/drives.md 4.3: from Par 1.1 to Par 1.2.
 #[test]
 fn reference_range() {
     let mut bench = Bench::plain();
@@ -258,7 +258,7 @@ fn addresses_blocks_and_limits() {
     assert!(single.bits(Table::DiscreteInput, 4, 1).is_ok());
 }
 
-/// drives.md 9.6.
+/// reference/drives.md 9.6.
 #[test]
 fn an_address_offset_per_table() {
     let mut bench = Bench::new(CxOptions {
@@ -379,7 +379,7 @@ fn fault_reset_by_rising_edge_and_no_restart_by_itself() {
     assert_eq!(bench.status() & 0b10110, 0b00110);
 }
 
-/// drives.md 4.6.
+/// reference/drives.md 4.6.
 #[test]
 fn counters_of_the_board() {
     let mut bench = Bench::plain();

@@ -368,7 +368,7 @@ proptest! {
     }
 }
 
-/// drives.md 5.1: the card answers 15 ms after a message, whatever the line's rules have for others.
+/// reference/drives.md 5.1: the card answers 15 ms after a message, whatever the line's rules have for others.
 #[test]
 fn a_drive_takes_its_own_turnaround() {
     let format = LineFormat::new(19_200, "7N2").unwrap();

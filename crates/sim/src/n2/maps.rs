@@ -1,4 +1,4 @@
-//! Which register or bit of the simulated drive stands behind each object of its N2 board: drives.md 6.6 and 6.7.
+//! Which register or bit of the simulated drive stands behind each object of its N2 board: reference/drives.md 6.6 and 6.7.
 
 use crate::codec::Table;
 use crate::codec::n2::Region;
@@ -6,7 +6,7 @@ use crate::simulated_drive::ModelOptions;
 
 /// Where the value of an object comes from, and where an override goes.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Place {
+pub enum Backing {
     /// A signed register; the value of one count.
     Signed(Table, u16, f64),
     /// An unsigned register; the value of one count.
@@ -24,7 +24,7 @@ pub struct Entry {
     pub region: Region,
     pub number: u8,
     /// What stands behind it.
-    pub place: Place,
+    pub place: Backing,
     /// Limits of the drive's parameter; without them those of the register hold.
     pub limits: Option<(f64, f64)>,
 }
@@ -64,12 +64,12 @@ pub(crate) fn of(model: &ModelOptions) -> &'static Map {
     }
 }
 
-use Place::{Bit, Fixed, Signed, Unsigned};
+use Backing::{Bit, Fixed, Signed, Unsigned};
 use Region::{Adi, Ai, Ao, Bi, Bo};
 
 const HOLDING: Table = Table::Holding;
 
-const fn entry(region: Region, number: u8, place: Place) -> Entry {
+const fn entry(region: Region, number: u8, place: Backing) -> Entry {
     Entry {
         region,
         number,
@@ -78,7 +78,7 @@ const fn entry(region: Region, number: u8, place: Place) -> Entry {
     }
 }
 
-const fn limited(number: u8, place: Place, low: f64, high: f64) -> Entry {
+const fn limited(number: u8, place: Backing, low: f64, high: f64) -> Entry {
     Entry {
         region: Ao,
         number,

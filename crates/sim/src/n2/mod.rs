@@ -1,5 +1,5 @@
 //! The N2 board of a simulated drive: it waits for Identify, has objects with attributes, reports changes and takes
-//! overrides (n2.md; drives.md 6.2 to 6.7). Pure: the time is an argument.
+//! overrides (n2.md; reference/drives.md 6.2 to 6.7). Pure: the time is an argument.
 //!
 //! The drive behind it is asked through the same requests as by Modbus, see [`maps`]. What no manual says is an option
 //! or stands in [`crate::codec::n2::assumptions`].
@@ -13,14 +13,14 @@ use std::time::Duration;
 
 pub(crate) use maps::{Entry, Map};
 
-use self::maps::{Beyond, Place};
+use self::maps::{Backing, Beyond};
 use super::SimTime;
 use crate::codec::n2::assumptions::{CONFIG_REPORT_BIT, INVALID_FLOAT, N2Options, STATUS_OVERRIDE_BIT};
 use crate::codec::n2::command::{CHECKSUM, DATA, LONGEST_REPORT, RESTARTED, SIZE, TYPE, UNKNOWN, checksum};
 use crate::codec::n2::{Answer, Command, Object, Region};
 use crate::codec::{Exception, Reply, RequestPdu};
 
-/// Without a poll for that time a drive takes itself for alone (drives.md 6.5).
+/// Without a poll for that time a drive takes itself for alone (reference/drives.md 6.5).
 pub(crate) const ALONE: Duration = Duration::from_secs(600);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -265,7 +265,7 @@ impl Board {
             (Ai | Bi | Ao | Bo, 1) => 1,
             (Ai, 8..=12) if self.map.has_limits => 4,
             (Bo, 3..=5) => 2,
-            // A value or a status is changed by override only (n2.md 2).
+            // A value or a status is changed by override only (reference/n2.md 2).
             _ => return Err(TYPE),
         };
         if data.len() != size {
@@ -299,9 +299,9 @@ impl Board {
 
     fn set_register(&self, entry: &Entry, value: f64, model: Model<'_>) -> Result<(), u8> {
         let (table, address, scale, least, most) = match entry.place {
-            Place::Signed(table, address, scale) => (table, address, scale, f64::from(i16::MIN), f64::from(i16::MAX)),
-            Place::Unsigned(table, address, scale) => (table, address, scale, 0.0, f64::from(u16::MAX)),
-            Place::Bit(..) | Place::Fixed(_) => return Err(TYPE),
+            Backing::Signed(table, address, scale) => (table, address, scale, f64::from(i16::MIN), f64::from(i16::MAX)),
+            Backing::Unsigned(table, address, scale) => (table, address, scale, 0.0, f64::from(u16::MAX)),
+            Backing::Bit(..) | Backing::Fixed(_) => return Err(TYPE),
         };
         if !(least..=most).contains(&(value / scale).round()) {
             // Too large for the drive's variable, or no number.
@@ -363,7 +363,7 @@ impl Board {
     }
 }
 
-fn fetch(place: Place, model: Model<'_>) -> Option<f64> {
+fn fetch(place: Backing, model: Model<'_>) -> Option<f64> {
     let mut word = |table, address| {
         let (start, count) = (address, 1);
         match model(&RequestPdu::Read { table, start, count })? {
@@ -373,15 +373,15 @@ fn fetch(place: Place, model: Model<'_>) -> Option<f64> {
         }
     };
     Some(match place {
-        Place::Signed(table, address, scale) => f64::from(word(table, address)? as i16) * scale,
-        Place::Unsigned(table, address, scale) => f64::from(word(table, address)?) * scale,
-        Place::Bit(table, address, bit) => f64::from((word(table, address)? >> bit.min(15)) & 1),
-        Place::Fixed(value) => f64::from(value),
+        Backing::Signed(table, address, scale) => f64::from(word(table, address)? as i16) * scale,
+        Backing::Unsigned(table, address, scale) => f64::from(word(table, address)?) * scale,
+        Backing::Bit(table, address, bit) => f64::from((word(table, address)? >> bit.min(15)) & 1),
+        Backing::Fixed(value) => f64::from(value),
     })
 }
 
-fn set_bit(place: Place, on: bool, model: Model<'_>) -> Result<(), u8> {
-    let Place::Bit(table, address, bit) = place else {
+fn set_bit(place: Backing, on: bool, model: Model<'_>) -> Result<(), u8> {
+    let Backing::Bit(table, address, bit) = place else {
         return Err(TYPE);
     };
     let (start, count) = (address, 1);

@@ -56,7 +56,7 @@ impl Bench {
     }
 }
 
-/// The script of drives.md 6.8, in an order in which the drive comes to its states.
+/// The script of reference/drives.md 6.8, in an order in which the drive comes to its states.
 #[test]
 fn the_frames_of_the_reference() {
     let mut bench = Bench::new(&maps::NX);

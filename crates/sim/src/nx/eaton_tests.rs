@@ -1,4 +1,4 @@
-//! What the Eaton SVX and HVX do otherwise than the Vacon NX (drives.md 3 and 9).
+//! What the Eaton SVX and HVX do otherwise than the Vacon NX (reference/drives.md 3 and 9).
 
 use super::tests::Bench;
 use super::*;
@@ -34,7 +34,7 @@ fn one_register_a_message_but_for_process_data() {
     }
 }
 
-/// drives.md 9.2: unsigned percent of the maximum frequency.
+/// reference/drives.md 9.2: unsigned percent of the maximum frequency.
 #[test]
 fn reference_of_the_maximum_frequency() {
     let mut bench = Bench::new(NxOptions {
@@ -52,7 +52,7 @@ fn reference_of_the_maximum_frequency() {
     assert_eq!(bench.write(2002, &[(-1i16) as u16]), Err(Exception::VALUE));
 }
 
-/// drives.md 9.1 and 9.3.
+/// reference/drives.md 9.1 and 9.3.
 #[test]
 fn configurable_scales() {
     let mut bench = Bench::new(NxOptions {

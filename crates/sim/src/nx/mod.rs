@@ -1,4 +1,4 @@
-//! A Vacon NX, Eaton SVX or Eaton HVX drive with its OPTC2 or OPTC8 board, as drives.md section 3 and 10 describe it.
+//! A Vacon NX, Eaton SVX or Eaton HVX drive with its OPTC2 or OPTC8 board, as reference/drives.md section 3 and 10 describe it.
 //!
 //! Pure: the time is an argument, and the drive works in steps of 10 ms, its update period. At each step it takes over
 //! the process data in and refreshes the process data out, so a bit that a master sets and clears within one step is
@@ -32,7 +32,7 @@ use crate::codec::{Reply, RequestPdu};
 /// Registers of process data in and out, IDs 2001..=2011 and 2101..=2111.
 const PROCESS_DATA: usize = 11;
 
-/// Control word, ID 2001 (drives.md 3.4).
+/// Control word, ID 2001 (reference/drives.md 3.4).
 pub mod control_word {
     pub const RUN: u16 = 1 << 0;
     /// Counterclockwise.
@@ -51,7 +51,7 @@ pub mod control_word {
     pub const FIRE_MODE: u16 = 1 << 13;
 }
 
-/// Status word, ID 2101 (drives.md 3.6).
+/// Status word, ID 2101 (reference/drives.md 3.6).
 pub mod status_word {
     pub const READY: u16 = 1 << 0;
     /// Running.
@@ -79,7 +79,7 @@ pub mod status_word {
     pub const NOT_INTERLOCKED: u16 = 1 << 8;
 }
 
-/// Fault code: fieldbus fault (drives.md 3.11).
+/// Fault code: fieldbus fault (reference/drives.md 3.11).
 pub const FIELDBUS_FAULT: u16 = 53;
 
 /// Where a drive takes its commands from.
@@ -240,7 +240,7 @@ impl NxDrive {
         }
     }
 
-    /// The drive's own bus watchdog and P2.7.22 (drives.md 3.11). It starts with the first message: a board that never
+    /// The drive's own bus watchdog and P2.7.22 (reference/drives.md 3.11). It starts with the first message: a board that never
     /// heard a master waits for one.
     fn supervise(&mut self, now: SimTime) {
         let Some(heard) = self.heard else { return };
@@ -283,7 +283,7 @@ impl NxDrive {
         self.hvac(control_word::FIRE_MODE)
     }
 
-    /// The output frequency for a command, drives.md 3.5: the sign exclusive-or the direction bit.
+    /// The output frequency for a command, reference/drives.md 3.5: the sign exclusive-or the direction bit.
     fn frequency(&self, command: Command) -> f64 {
         let (minimum, maximum) = (self.settings.minimum, self.settings.motor.maximum);
         if self.fire_mode() {

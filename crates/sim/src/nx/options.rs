@@ -14,7 +14,7 @@ pub enum Values {
     Tagged(u8),
 }
 
-/// What 100 % of the speed reference is (drives.md 9.2).
+/// What 100 % of the speed reference is (reference/drives.md 9.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Base {
     /// The band from the minimum frequency (0 %) to the maximum frequency (100 %).
@@ -23,7 +23,7 @@ pub enum Base {
     Maximum,
 }
 
-/// What one count of the speed reference is (drives.md 9.3).
+/// What one count of the speed reference is (reference/drives.md 9.3).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
     /// 0.01 %.
@@ -60,7 +60,7 @@ pub struct NxOptions {
     pub status: StatusBits,
     /// How the speed reference is to be read.
     pub reference: SpeedReference,
-    /// Hz that one count of the output frequency is, 0.01 or 0.1 (drives.md 9.1).
+    /// Hz that one count of the output frequency is, 0.01 or 0.1 (reference/drives.md 9.1).
     pub frequency_step: f64,
     /// Whether the control word has the bits of the HVX: bypass (3), pass-through to RO1, RO2 and DO1 (10 to 12) and
     /// fire mode (13). The others only hand them on to the application.

@@ -1,6 +1,6 @@
 //! Parameters of the simulated Vacon NX, IDs 101 to 1999.
 //!
-//! The IDs are those of drives.md 3.11 and 11.1; ranges and defaults that no manual at hand prints are plausible values
+//! The IDs are those of reference/drives.md 3.11 and 11.1; ranges and defaults that no manual at hand prints are plausible values
 //! of the All in One applications.
 
 use std::collections::BTreeMap;
@@ -39,7 +39,7 @@ pub const FIELDBUS_FAULT_RESPONSE: u16 = 733;
 pub const SLOT_FAULT_RESPONSE: u16 = 734;
 /// First ID of the eight selectors of process data out.
 pub const OUT_SELECTION: u16 = 852;
-/// Items of process data out 1 to 8 by default (drives.md 3.8): IDs 1 to 7, then the active fault.
+/// Items of process data out 1 to 8 by default (reference/drives.md 3.8): IDs 1 to 7, then the active fault.
 const OUT_DEFAULTS: [u16; 8] = [1, 2, 3, 4, 5, 6, 7, 37];
 
 /// All parameters of one drive by ID. They survive a power cycle.
@@ -182,7 +182,11 @@ mod tests {
             p.0.iter().all(|p| p.min <= p.value && p.value <= p.max),
             "defaults lie in their ranges"
         );
-        assert_eq!(p.get(733), Some(0), "P2.7.22 is 0 out of the box (drives.md 3.11)");
+        assert_eq!(
+            p.get(733),
+            Some(0),
+            "P2.7.22 is 0 out of the box (reference/drives.md 3.11)"
+        );
         assert_eq!(p.set(733, 3), Ok(()));
         assert_eq!(p.get(733), Some(3));
         assert_eq!(p.set(733, 4), Err(Refused::Value));

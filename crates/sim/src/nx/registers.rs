@@ -1,4 +1,4 @@
-//! The registers of the simulated NX family: groups, limits, refusals (drives.md 3.2, 3.3, 3.10).
+//! The registers of the simulated NX family: groups, limits, refusals (reference/drives.md 3.2, 3.3, 3.10).
 
 use super::super::model::{Model, signed, unsigned};
 use super::parameters::{self, Parameters, Refused};
@@ -6,7 +6,7 @@ use super::{Base, Beyond, ControlPlace, NxDrive, NxOptions, PROCESS_DATA, Unit, 
 use crate::SimTime;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 
-/// Registers per message (drives.md 9.26) and the answer to more.
+/// Registers per message (reference/drives.md 9.26) and the answer to more.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
     /// Reading actual values, the fault code and parameters.
@@ -31,7 +31,7 @@ pub enum Hole {
 /// ID of the simulator's own register that trips a fault.
 const TRIP: u16 = NxOptions::TRIP_ADDRESS + 1;
 
-/// The groups of drives.md 3.2; a request may not cross their borders.
+/// The groups of reference/drives.md 3.2; a request may not cross their borders.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Group {
     Actual,
@@ -191,7 +191,7 @@ impl NxDrive {
         size <= most
     }
 
-    /// Actual values, IDs 1 to 98 (drives.md 11.1), as refreshed with the process data.
+    /// Actual values, IDs 1 to 98 (reference/drives.md 11.1), as refreshed with the process data.
     fn actual_value(&self, id: u16) -> Option<u16> {
         let (motor, settings, ratings) = (&self.body.motor, &self.settings, &self.settings.motor);
         let tenths_of_current = unsigned(motor.current(ratings) * 10.0);

@@ -33,15 +33,15 @@ enum Signal {
 /// Which status bits a drive shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StatusBits {
-    /// All bits of the Vacon NX: 0x0541 when idle and healthy (drives.md 3.6, 3.7).
+    /// All bits of the Vacon NX: 0x0541 when idle and healthy (reference/drives.md 3.6, 3.7).
     Full,
-    /// Of the status word only those bits that all drives of the family share, as the worked frames of drives.md print
+    /// Of the status word only those bits that all drives of the family share, as the worked frames of reference/drives.md print
     /// them.
     Common,
     /// Eaton SVX: the shared bits, and nothing in the general status word; 0x0001 when idle and healthy.
     Svx,
     /// Eaton HVX: bypass, fire mode and "not interlocked" too, and the bits of the general status word that its N2 map
-    /// names (drives.md 3.7, 9.16); 0x0101 when idle and healthy.
+    /// names (reference/drives.md 3.7, 9.16); 0x0101 when idle and healthy.
     Hvx,
 }
 

@@ -1,4 +1,4 @@
-//! Behaviour of the simulated NX against drives.md, sections 3 and 10, in virtual time.
+//! Behaviour of the simulated NX against reference/drives.md, sections 3 and 10, in virtual time.
 
 use super::*;
 use crate::codec::{Exception, Table};
@@ -49,7 +49,7 @@ impl Bench {
         let input = input.unwrap();
         assert_eq!(
             holding, input,
-            "every register answers to 03 and 04 alike (drives.md 3.1)"
+            "every register answers to 03 and 04 alike (reference/drives.md 3.1)"
         );
         match holding {
             Reply::Registers(values) => Ok(values),
@@ -93,11 +93,15 @@ impl Bench {
 
 const READ_ONLY: Result<(), Exception> = Err(Exception::ADDRESS);
 
-/// drives.md 3.12.
+/// reference/drives.md 3.12.
 #[test]
 fn start_up_test_of_the_manuals() {
     let mut bench = Bench::new(NxOptions::default());
-    assert_eq!(bench.status(), 0x0541, "healthy and idle (drives.md, section 10)");
+    assert_eq!(
+        bench.status(),
+        0x0541,
+        "healthy and idle (reference/drives.md, section 10)"
+    );
     assert_eq!(bench.one(2101), 0x2000, "fieldbus is the control place");
     bench.write(2000, &[1]).unwrap();
     bench.wait(20);
@@ -151,7 +155,7 @@ fn zero_speed_is_not_the_same_as_stopped() {
     assert_eq!(bench.status() & running_at_zero, running_at_zero);
 }
 
-/// drives.md 3.2 and 9.26.
+/// reference/drives.md 3.2 and 9.26.
 #[test]
 fn ranges_limits_and_holes() {
     let mut bench = Bench::new(NxOptions::default());

@@ -130,7 +130,7 @@ proptest! {
         }
     }
 
-    /// drives.md 9.24: after a fault the run command has to be seen off first.
+    /// reference/drives.md 9.24: after a fault the run command has to be seen off first.
     #[test]
     fn no_start_after_a_reset_without_a_new_run_command(
         name in name(),

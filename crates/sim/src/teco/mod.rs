@@ -1,4 +1,4 @@
-//! A TECO 7300PA drive with its PA-C card, as drives.md sections 5 and 10 describe it.
+//! A TECO 7300PA drive with its PA-C card, as reference/drives.md sections 5 and 10 describe it.
 //!
 //! Pure: the time is an argument. Cn-31 supervises the link between the drive and its card only, which never fails here,
 //! so a lost bus master changes nothing: the motor goes on as it was last commanded.
@@ -22,7 +22,7 @@ use super::parameter_set::Writes;
 use super::random::Random;
 use crate::codec::{Exception, Reply, RequestPdu};
 
-/// Bits of the operation signals, register 0001H (drives.md 5.3).
+/// Bits of the operation signals, register 0001H (reference/drives.md 5.3).
 pub(crate) mod operation {
     pub(crate) const RUN: u16 = 1 << 0;
     pub(crate) const REVERSE: u16 = 1 << 1;
@@ -33,7 +33,7 @@ pub(crate) mod operation {
     pub(crate) const MULTIFUNCTION_1: u16 = 1 << 4;
 }
 
-/// Bits of the fault contents, register 0021H (drives.md 5.4).
+/// Bits of the fault contents, register 0021H (reference/drives.md 5.4).
 pub(crate) mod fault {
     /// Overcurrent or ground fault.
     pub(crate) const OVERCURRENT: u16 = 1 << 0;
@@ -76,7 +76,7 @@ struct Control {
 
 /// A simulated TECO 7300PA.
 #[derive(Debug, Clone)]
-pub struct TecoDrive {
+pub(crate) struct TecoDrive {
     options: TecoOptions,
     parameters: Parameters,
     ratings: Ratings,
@@ -93,7 +93,7 @@ pub struct TecoDrive {
 
 impl TecoDrive {
     /// A drive that is switched on at `now`, with the motor at rest.
-    pub fn new(options: TecoOptions, now: SimTime) -> TecoDrive {
+    pub(crate) fn new(options: TecoOptions, now: SimTime) -> TecoDrive {
         let parameters = Parameters::new(options.digits, &options.parameters);
         TecoDrive {
             ratings: parameters.ratings(),
@@ -109,14 +109,15 @@ impl TecoDrive {
     }
 
     /// Switches the operator between PRGM and DRIVE. A running motor is brought down; it needs a new run command then.
-    pub fn set_mode(&mut self, mode: Mode) {
+    pub(crate) fn set_mode(&mut self, mode: Mode) {
         self.mode = mode;
         self.body.latch.disarm();
         self.take_over();
     }
 
     /// Closes and opens terminals 1 to 8, bit 0 terminal 1.
-    pub fn set_terminals(&mut self, closed: u8) {
+    #[cfg(test)]
+    fn set_terminals(&mut self, closed: u8) {
         self.terminals = u16::from(closed);
         self.take_over();
     }

@@ -13,7 +13,7 @@ pub enum Mode {
     Drive,
 }
 
-/// How a register holds the four digits of an Sn value such as 1100; the manual does not say (drives.md 5.8).
+/// How a register holds the four digits of an Sn value such as 1100; the manual does not say (reference/drives.md 5.8).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Digits {
     /// As bits of a number, the first digit the most significant: 1100 is 0x000C.
@@ -56,7 +56,7 @@ impl Digits {
     }
 }
 
-/// The levels of frequency detection 1 and 2, bits 4 and 5 of 002CH (drives.md 9.10).
+/// The levels of frequency detection 1 and 2, bits 4 and 5 of 002CH (reference/drives.md 9.10).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DetectionLevels {
     /// Cn-21 for both, as the bits are explained.
@@ -86,7 +86,7 @@ pub struct TecoOptions {
     /// Time between a message and its answer; `None` leaves it to the line.
     pub turnaround: Option<Duration>,
     /// Whether a request with a wrong check code is answered by error 00H. Its error table has that code; what stands
-    /// beside it, and everything else about messages, says that there is no answer (drives.md 9.8).
+    /// beside it, and everything else about messages, says that there is no answer (reference/drives.md 9.8).
     pub answer_check_error: bool,
     /// Makes 09FFH a register of the simulator: writing a fault mask as 0021H shows it trips the drive. No real drive has
     /// it.
@@ -96,7 +96,7 @@ pub struct TecoOptions {
 impl TecoOptions {
     /// Address of the simulator's own trip register.
     pub const TRIP_ADDRESS: u16 = 0x09FF;
-    /// Time between a message and its answer (drives.md 5.1).
+    /// Time between a message and its answer (reference/drives.md 5.1).
     pub const TURNAROUND: Duration = Duration::from_millis(15);
 }
 

@@ -1,6 +1,6 @@
-//! Parameters of the simulated TECO 7300PA by register (drives.md 5.8): which exist, and their images in RAM and EEPROM.
+//! Parameters of the simulated TECO 7300PA by register (reference/drives.md 5.8): which exist, and their images in RAM and EEPROM.
 //!
-//! Ranges are those of the N2 map (drives.md 6.7), where it has one. Defaults that the manual does not state are plausible
+//! Ranges are those of the N2 map (reference/drives.md 6.7), where it has one. Defaults that the manual does not state are plausible
 //! values for a small 440 V drive.
 
 use std::collections::BTreeMap;
@@ -160,7 +160,7 @@ const COS_PHI: f64 = 0.85;
 
 /// What a register of the parameters is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Place {
+pub(super) struct RegisterKind {
     /// Written in PRGM mode only.
     pub(super) program_only: bool,
     /// No parameter: reads as 0, a write is acknowledged and forgotten.
@@ -168,11 +168,11 @@ pub(super) struct Place {
 }
 
 /// What the register is, if it belongs to the parameters.
-pub(super) fn place(register: u16) -> Option<Place> {
+pub(super) fn place(register: u16) -> Option<RegisterKind> {
     GROUPS
         .iter()
         .find(|group| (group.first..=group.last).contains(&register))
-        .map(|group| Place {
+        .map(|group| RegisterKind {
             program_only: group.program_only,
             reserved: group.reserved.contains(&register),
         })
@@ -298,7 +298,7 @@ mod tests {
             .iter()
             .map(|group| usize::from(group.last - group.first) + 1)
             .sum();
-        assert_eq!(rows, 160, "as drives.md 5.8 lists them");
+        assert_eq!(rows, 160, "as reference/drives.md 5.8 lists them");
         assert!(
             KNOWN
                 .iter()

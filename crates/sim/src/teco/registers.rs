@@ -1,14 +1,14 @@
-//! The registers of the simulated TECO 7300PA and the order of its refusals (drives.md 5.2 to 5.6).
+//! The registers of the simulated TECO 7300PA and the order of its refusals (reference/drives.md 5.2 to 5.6).
 
 use super::super::model::{Model, unsigned};
-use super::parameters::{self, Place};
+use super::parameters::{self, RegisterKind};
 use super::{Mode, TecoDrive, TecoOptions};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 
 /// Functions that the card knows.
 const FUNCTIONS: [u8; 4] = [0x03, 0x06, 0x08, 0x10];
 /// Registers per message.
-const MOST: u16 = 16;
+const MOST_REGISTERS: u16 = 16;
 /// 00H: wrong check code.
 pub(super) const CHECK_ERROR: Exception = Exception(0x00);
 /// 21H: value out of range, or a parameter that may not be written over the bus.
@@ -27,19 +27,19 @@ const VERSION: u16 = 10;
 enum Register {
     Control,
     Monitor,
-    Parameter(Place),
+    Parameter(RegisterKind),
     Save,
     Trip,
 }
 
 fn span(start: u16, count: u16) -> Result<std::ops::Range<u16>, Exception> {
-    if !(1..=MOST).contains(&count) {
+    if !(1..=MOST_REGISTERS).contains(&count) {
         return Err(Exception::VALUE);
     }
     start.checked_add(count).map(|end| start..end).ok_or(Exception::ADDRESS)
 }
 
-/// Broadcasts write the operation signals and the frequency reference only (drives.md 9.9).
+/// Broadcasts write the operation signals and the frequency reference only (reference/drives.md 9.9).
 pub(super) fn allows_broadcast(request: &RequestPdu) -> bool {
     let allowed = 1..=2u16;
     match request {
@@ -53,7 +53,7 @@ pub(super) fn allows_broadcast(request: &RequestPdu) -> bool {
 }
 
 /// The reply to a PDU that is not a valid request, for which a plain slave returns `exception`. Incomplete messages get
-/// none, nor do those whose byte count does not match the bytes (drives.md 5.6, 9.8).
+/// none, nor do those whose byte count does not match the bytes (reference/drives.md 5.6, 9.8).
 pub(super) fn refusal(pdu: &[u8], exception: Exception) -> Option<Exception> {
     let (&function, body) = pdu.split_first()?;
     if !FUNCTIONS.contains(&function) {
@@ -69,7 +69,7 @@ pub(super) fn refusal(pdu: &[u8], exception: Exception) -> Option<Exception> {
     };
     match function {
         _ if !whole => None,
-        0x03 | 0x10 if !count().is_some_and(|count| (1..=MOST).contains(&count)) => Some(Exception::VALUE),
+        0x03 | 0x10 if !count().is_some_and(|count| (1..=MOST_REGISTERS).contains(&count)) => Some(Exception::VALUE),
         _ => Some(exception),
     }
 }

@@ -1,4 +1,4 @@
-//! Status registers and outputs of the simulated TECO 7300PA (drives.md 5.4).
+//! Status registers and outputs of the simulated TECO 7300PA (reference/drives.md 5.4).
 
 use super::super::model::{AT_REFERENCE_BAND, Model, bit};
 use super::options::DetectionLevels;

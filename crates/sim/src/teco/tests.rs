@@ -1,4 +1,4 @@
-//! Behaviour of the simulated TECO 7300PA against drives.md, sections 5, 7.3 and 10, in virtual time.
+//! Behaviour of the simulated TECO 7300PA against reference/drives.md, sections 5, 7.3 and 10, in virtual time.
 
 use super::super::model::ReadOnly;
 use super::super::motor::Load;
@@ -120,7 +120,7 @@ fn exchange(drive: &mut TecoDrive, frame: &str, now: SimTime) -> String {
     format!(":{}", digits.concat())
 }
 
-/// Worked frames of drives.md 7.3 and 7.4, in an order in which the drive comes to their states. The outputs are in the
+/// Worked frames of reference/drives.md 7.3 and 7.4, in an order in which the drive comes to their states. The outputs are in the
 /// hands of 0009H, as the status reply of the reference shows them off.
 #[test]
 fn worked_frames() {
@@ -234,7 +234,7 @@ fn order_of_refusals() {
     assert_eq!(lenient.write(0x0501, &[100]), Err(VALUE), "not over the bus");
 }
 
-/// drives.md 5.6 and 9.8: silence, function, count, in that order.
+/// reference/drives.md 5.6 and 9.8: silence, function, count, in that order.
 #[test]
 fn messages_that_are_none() {
     let mut bench = Bench::plain();
@@ -465,7 +465,7 @@ fn outputs_by_register() {
     assert_eq!(bench.read(0x0009, 3), Ok(vec![0xFFFA, 255, 128]));
 }
 
-/// drives.md 9.9.
+/// reference/drives.md 9.9.
 #[test]
 fn broadcasts_reach_two_registers_only() {
     let mut bench = Bench::plain();

@@ -1,9 +1,9 @@
 //! What the demo prints: its lines, and commands that can be copied whole. Pure, but for the path of the program.
 
-use super::{DemoLine, LINES, Place, Sides};
+use super::{DemoLine, DemoPlace, LINES, Sides};
 
 /// The text. Every line that begins with exactly two blanks is a command, or a comment of the shell.
-pub(super) fn text(place: &Place, sides: &Sides) -> String {
+pub(super) fn text(place: &DemoPlace, sides: &Sides) -> String {
     let program = std::env::current_exe().map_or_else(|_| "drivegate".to_string(), |path| path.display().to_string());
     let configured = match &place.written {
         Some(written) => with_configuration(&program, &quoted(&written.config().display().to_string())),

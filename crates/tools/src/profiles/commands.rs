@@ -3,7 +3,7 @@
 use super::name_of;
 use crate::document::format_duration;
 use crate::drive::Profile;
-use crate::drive::control::{Control, Mask, OwnWord, Place, Run, Setting, Step, Until};
+use crate::drive::control::{Control, ControlItem, Mask, OwnWord, Run, Setting, Step, Until};
 
 /// A line for each command, with its words in hex.
 pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, String)> {
@@ -45,7 +45,7 @@ pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, 
     lines
 }
 
-fn place(place: Place) -> String {
+fn place(place: ControlItem) -> String {
     format!("{} {}", place.table, place.address)
 }
 

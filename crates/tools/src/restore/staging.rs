@@ -13,8 +13,8 @@ pub(crate) const UNPACKED: &str = ".restore-";
 /// The unpacked files.
 #[derive(Debug)]
 pub(super) struct Staging {
-    config: Place,
-    state: Place,
+    config: Destination,
+    state: Destination,
     /// In the order of the archive; the configuration is the first.
     files: Vec<(Root, PathBuf)>,
     /// Below the directory of the configuration.
@@ -22,7 +22,7 @@ pub(super) struct Staging {
 }
 
 #[derive(Debug)]
-struct Place {
+struct Destination {
     /// The destination.
     to: PathBuf,
     /// Where it is unpacked, in the destination or what there is of it.
@@ -31,8 +31,8 @@ struct Place {
     is_new: bool,
 }
 
-impl Place {
-    fn new(to: &Path) -> Result<Place, String> {
+impl Destination {
+    fn new(to: &Path) -> Result<Destination, String> {
         let made = |dir: &Path, mode| fs::DirBuilder::new().mode(mode).recursive(true).create(dir);
         let failed = |dir: &Path, error: io::Error| format!("cannot write to {}: {error}", dir.display());
         let is_new = !to.exists();
@@ -42,7 +42,7 @@ impl Place {
             .mode(0o700)
             .create(&aside)
             .map_err(|error| failed(&aside, error))?;
-        Ok(Place {
+        Ok(Destination {
             to: to.to_path_buf(),
             aside,
             is_new,
@@ -50,7 +50,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for Destination {
     fn drop(&mut self) {
         // What is left of it is found by its name.
         let _ = fs::remove_dir_all(&self.aside);
@@ -68,14 +68,14 @@ impl Staging {
     /// They cannot be written to.
     pub(super) fn new(config: &Path, state: &Path) -> Result<Staging, String> {
         Ok(Staging {
-            config: Place::new(config)?,
-            state: Place::new(state)?,
+            config: Destination::new(config)?,
+            state: Destination::new(state)?,
             files: Vec::new(),
             directories: Vec::new(),
         })
     }
 
-    fn place_of(&self, root: Root) -> &Place {
+    fn place_of(&self, root: Root) -> &Destination {
         match root {
             Root::Config => &self.config,
             Root::State => &self.state,
@@ -152,7 +152,7 @@ impl Staging {
         }
         let mut placed = Vec::new();
         for (root, path) in self.files.iter().skip(1).chain(self.files.first()) {
-            let Place { to, aside, .. } = self.place_of(*root);
+            let Destination { to, aside, .. } = self.place_of(*root);
             let failed = |error: io::Error| {
                 let done = placed.iter().map(|path: &PathBuf| path.display().to_string());
                 let done: Vec<String> = done.collect();

@@ -15,6 +15,7 @@ use drivegate::plant::{BusHandle, Plant};
 use drivegate::process_image::{BusImage, DriveImage, Outcome, TapedFrame, TapedRead, Verdict};
 
 use super::super::plant::{self, STALE_AFTER};
+use drivegate::drive::DriveIndex;
 
 /// The past that it has.
 const PAST: Duration = Duration::from_secs(3900);
@@ -162,7 +163,7 @@ impl Lively {
         buses.iter().for_each(plant::open);
         let mut plant = plant::plant(buses);
         plant.gateway = "demo".to_string();
-        let images = plant.buses.iter().flat_map(|bus| bus.image.drives.clone());
+        let images = plant.buses.iter().flat_map(|bus| bus.image.drives.to_vec());
         let cast: Cast = images.zip(DRIVES).map(|(image, (.., play))| (image, play)).collect();
         let dir = tempfile::tempdir().expect("a directory");
         let options = RecorderOptions {
@@ -305,7 +306,7 @@ fn live_through(plant: &Plant, cast: &Cast, options: &RecorderOptions) -> Record
 /// A round of a line: all reads of each drive, the exchanges of the last two minutes with their frames.
 fn poll(bus: &BusImage, cast: &Cast, t: Duration, clock: Clock) {
     let slowly = t.subsec_millis() == 0;
-    for (place, image) in bus.drives.iter().enumerate() {
+    for (place, image) in bus.drives.enumerate() {
         let play = cast
             .iter()
             .find(|(other, _)| Arc::ptr_eq(other, image))
@@ -327,7 +328,8 @@ fn poll(bus: &BusImage, cast: &Cast, t: Duration, clock: Clock) {
             };
             bus.tape.read(place, taken);
             image.count(Outcome::Ok);
-            let chance = (t.as_millis() as u64 / 200 * 7919 + place as u64 * 104_729 + u64::from(read.start)) % 1000;
+            let chance =
+                (t.as_millis() as u64 / 200 * 7919 + place.place() as u64 * 104_729 + u64::from(read.start)) % 1000;
             image.set_turnaround(Duration::from_micros(
                 900 + u64::from(read.count) * 60 + chance.pow(4) / 150_000_000,
             ));
@@ -337,7 +339,8 @@ fn poll(bus: &BusImage, cast: &Cast, t: Duration, clock: Clock) {
         }
         // A line that is disturbed now and then, one drive of it more.
         let minute = t.as_secs() / 60;
-        let troubled = (minute * 7919 + 31 * place as u64) % 13 < place as u64 && t.as_secs() % 20 < 1 + minute % 3;
+        let troubled = (minute * 7919 + 31 * place.place() as u64) % 13 < place.place() as u64
+            && t.as_secs() % 20 < 1 + minute % 3;
         if slowly && troubled {
             image.count(Outcome::Corrupt);
         }
@@ -351,7 +354,7 @@ fn poll(bus: &BusImage, cast: &Cast, t: Duration, clock: Clock) {
     }
 }
 
-fn frames(bus: &BusImage, place: usize, address: u8, (start, words): (u16, &[u16]), at: Instant) {
+fn frames(bus: &BusImage, place: DriveIndex, address: u8, (start, words): (u16, &[u16]), at: Instant) {
     let request = [
         &[address, 3],
         &start.to_be_bytes()[..],

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::command::{BackgroundRequest, Pace};
+use crate::drive::DriveIndex;
 
 /// A register that no poll reads.
 const REGISTER: u16 = 700;
@@ -15,7 +16,7 @@ impl Rig {
         let origin = Origin::new(SourceKind::LocalSocket, who);
         let (ticket, answer) = Ticket::new(origin, "d", String::new(), false, self.now, self.stats.clone());
         let request = BackgroundRequest {
-            drive,
+            drive: DriveIndex::new(drive),
             pdu: RequestPdu::Read {
                 table: Table::Holding,
                 start: REGISTER,
@@ -140,7 +141,10 @@ fn a_drive_that_is_silent_to_a_request_delays_no_more_than_the_share() {
         rig.step();
     }
     assert!(silent >= 5, "{silent}");
-    assert!(!rig.news.contains(&News::Offline(0)), "its process data comes");
+    assert!(
+        !rig.news.contains(&News::Offline(DriveIndex::new(0))),
+        "its process data comes"
+    );
     assert!(rig.count(from, is_fast) >= 588, "98 % of 600 rounds");
 }
 

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::command::{Mode, Principal, Proof, Refusal, Rules, Verb};
+use crate::drive::DriveIndex;
 use crate::plant::{DriveHandle, Plant};
 use std::time::Duration as Time;
 
@@ -107,7 +108,7 @@ fn advisory_sends_all_and_counts() {
         rig.run(Time::from_millis(200));
         assert_eq!(code(&mut reference), "acknowledged", "{name}");
     }
-    assert_eq!(rig.bus.queue.lock().unheld(0), 2);
+    assert_eq!(rig.bus.queue.lock().unheld(DriveIndex::new(0)), 2);
     let clients = |rig: &Rig| {
         let unheld = rig.bus.queue.lock().take_unheld();
         let clients = unheld.iter().map(|(_, unheld)| unheld.client.to_string());

@@ -96,7 +96,7 @@ const FAULTS: [(&str, Fault); 14] = [
         (forward.mask.count_ones() < 16).then_some(())
     }),
     ("a stop at another register than the run command", |control| {
-        let place = Place {
+        let place = ControlItem {
             table: Table::Holding,
             address: 9999,
         };

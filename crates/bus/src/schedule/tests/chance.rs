@@ -75,7 +75,7 @@ struct Seen {
 impl Seen {
     /// A poll of a drive that is alive, `gap` after the one before.
     fn read(&mut self, poll: &Poll, took: Duration, gap: Duration) {
-        let key = (poll.drive, poll.read.start);
+        let key = (poll.drive.place(), poll.read.start);
         match poll.read.class {
             PollClass::Fast => {
                 *self.fast_counts.entry(key).or_default() += 1;
@@ -204,15 +204,15 @@ fn simulate(case: &Case) -> Result<Seen, TestCaseError> {
                 passed = 0;
             }
             Decision::Poll(poll) => {
-                let dead = case.dead[poll.drive];
+                let dead = case.dead[poll.drive.place()];
                 let took = if dead { DEADLINE } else { cost(&poll.read) };
                 now += took;
                 schedule.poll_done(&poll, if dead { Polled::Failed } else { Polled::Ok }, took, now);
                 (row, stops) = (0, 0);
-                let before = last.insert((poll.drive, poll.read), now);
+                let before = last.insert((poll.drive.place(), poll.read), now);
                 match (counted, dead) {
                     (false, _) => {}
-                    (true, true) => *seen.dead_time.entry(poll.drive).or_default() += took,
+                    (true, true) => *seen.dead_time.entry(poll.drive.place()).or_default() += took,
                     (true, false) => seen.read(&poll, took, now - before.unwrap_or(settled)),
                 }
             }

@@ -1,6 +1,7 @@
 //! Commands and polls share the line.
 
 use super::*;
+use crate::drive::DriveIndex;
 
 #[test]
 fn eight_commands_then_a_poll() {
@@ -44,9 +45,11 @@ fn flooded(again: Option<Urgency>) -> ([Duration; 4], Duration) {
                 taken[3] += command;
                 bench.schedule.command_done(urgency, command);
                 drive = 1 - drive;
-                bench
-                    .schedule
-                    .refresh(drive, |read| read.covers(Table::Holding, 2002), bench.now);
+                bench.schedule.refresh(
+                    DriveIndex::new(drive),
+                    |read| read.covers(Table::Holding, 2002),
+                    bench.now,
+                );
             }
             Decision::Poll(poll) => {
                 let took = if poll.read.class == PollClass::Fast { fast } else { slow };
@@ -96,13 +99,15 @@ fn a_single_command_is_confirmed_before_the_round_goes_on() {
             Decision::Command(Urgency::Command),
             "to drive {drive}"
         );
-        bench
-            .schedule
-            .refresh(drive, |read| read.covers(Table::Holding, 2002), bench.now);
+        bench.schedule.refresh(
+            DriveIndex::new(drive),
+            |read| read.covers(Table::Holding, 2002),
+            bench.now,
+        );
         let Decision::Poll(poll) = bench.step(None) else {
             panic!("nothing is read");
         };
-        assert_eq!((poll.drive, poll.read.start), (drive, 2000));
+        assert_eq!((poll.drive.place(), poll.read.start), (drive, 2000));
         bench.run(COST * 2);
     }
 }
@@ -163,7 +168,7 @@ fn a_stop_goes_before_the_due_poll_even_after_eight_commands() {
 #[test]
 fn what_was_never_read_and_a_flood_of_stops_leave_process_data_its_share() {
     let mut bench = Bench::new(60, Duration::from_millis(10));
-    while !(0..60).all(|drive| bench.schedule.is_online(drive)) {
+    while !(0..60).all(|drive| bench.schedule.is_online(DriveIndex::new(drive))) {
         bench.step(None);
     }
     bench.log.clear();

@@ -1,6 +1,7 @@
 //! Drives that are away, refuse or cannot be understood.
 
 use super::*;
+use crate::drive::DriveIndex;
 
 impl Bench {
     /// Lets the schedule ask for `time`; every poll takes `COST` and is answered by `answer`. What changed.
@@ -66,7 +67,7 @@ fn a_drive_that_dies_is_offline_after_the_retries() {
         bench.step(None);
     }
     assert!(bench.now - died <= COST * 10 * 2 + COST * 3, "two tries");
-    assert!(!bench.schedule.is_online(1) && bench.schedule.is_online(0));
+    assert!(!bench.schedule.is_online(DriveIndex::new(1)) && bench.schedule.is_online(DriveIndex::new(0)));
 }
 
 #[test]
@@ -79,7 +80,7 @@ fn a_drive_that_was_silent_for_a_moment_is_back_after_half_a_second() {
     }
     let away = bench.now;
     bench.dead.clear();
-    while !bench.schedule.is_online(1) {
+    while !bench.schedule.is_online(DriveIndex::new(1)) {
         bench.step(None);
     }
     assert!(
@@ -114,7 +115,7 @@ fn refused_blocks_are_split_joined_and_retried_slowly() {
         tail.iter().all(|read| **read == (2100, 5) || **read == (2106, 5)),
         "{tail:?}"
     );
-    assert!(bench.schedule.is_online(0));
+    assert!(bench.schedule.is_online(DriveIndex::new(0)));
 }
 
 #[test]
@@ -245,10 +246,10 @@ fn a_drive_that_answers_a_command_is_probed_at_once() {
     bench.run(Duration::from_secs(30));
     bench.dead.clear();
     bench.log.clear();
-    bench.schedule.seen(1, bench.now);
+    bench.schedule.seen(DriveIndex::new(1), bench.now);
     let answered = bench.now;
     bench.run(COST * 3);
-    assert!(bench.schedule.is_online(1));
+    assert!(bench.schedule.is_online(DriveIndex::new(1)));
     let probe = |d: &Decision| matches!(d, Decision::Poll(poll) if poll.drive == 1 && poll.probe);
     let probed = bench.log.iter().find(|(_, d)| probe(d)).map(|(at, _)| *at - answered);
     assert!(probed.is_some_and(|after| after <= COST), "{probed:?}");
@@ -267,7 +268,7 @@ fn a_command_in_vain_is_as_good_as_a_probe() {
         bench.now += Duration::from_millis(400);
         let from = bench.now;
         if in_vain {
-            bench.schedule.probed_in_vain(1, COST * 10, bench.now);
+            bench.schedule.probed_in_vain(DriveIndex::new(1), COST * 10, bench.now);
         }
         bench.run(Duration::from_secs(15));
         let probe = |d: &Decision| matches!(d, Decision::Poll(poll) if poll.drive == 1);
@@ -279,8 +280,8 @@ fn a_command_in_vain_is_as_good_as_a_probe() {
     // A drive that answers is not sent away by it.
     let mut bench = Bench::new(1, Duration::from_millis(10));
     bench.run(Duration::from_secs(1));
-    bench.schedule.probed_in_vain(0, COST * 10, bench.now);
-    assert!(bench.schedule.is_online(0));
+    bench.schedule.probed_in_vain(DriveIndex::new(0), COST * 10, bench.now);
+    assert!(bench.schedule.is_online(DriveIndex::new(0)));
 }
 
 /// Times after the first failure at which a drive that stays away is probed, each probe taking `took`.

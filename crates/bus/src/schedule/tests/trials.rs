@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use super::super::*;
 use crate::codec::Table;
+use crate::drive::DriveIndex;
 use crate::drive::profile::Profiles;
 
 /// What a drive does with a read of several bits.
@@ -41,7 +42,7 @@ fn half_a_minute(does: Does) -> (Vec<u16>, u32) {
                     _ => Polled::Ok,
                 };
                 if many && does == Does::Answers {
-                    schedule.proved(0, &poll.read);
+                    schedule.proved(DriveIndex::new(0), &poll.read);
                 }
                 gone += u32::from(schedule.poll_done(&poll, polled, cost, now) == Change::Offline);
                 if poll.read.table == Table::DiscreteInput && now > begin + Duration::from_secs(29) {

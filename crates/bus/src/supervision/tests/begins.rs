@@ -1,6 +1,7 @@
 //! When a lease begins, and what holds it.
 
 use super::*;
+use crate::drive::DriveIndex;
 
 #[test]
 fn an_order_that_waits_holds_the_lease_no_longer_than_it_may_wait() {
@@ -26,7 +27,7 @@ fn a_lease_that_nobody_held_does_not_begin_by_an_order_that_waits() {
     assert_eq!(bench.drive.supervision.lease(), Lease::default());
     assert_eq!(bench.news, [], "the client is there, its order only waits");
     bench.look(1_000, true);
-    assert_eq!(bench.news, [News::RunsUnsupervised(0, Adopted::No)]);
+    assert_eq!(bench.news, [News::RunsUnsupervised(DriveIndex::new(0), Adopted::No)]);
 }
 
 #[test]
@@ -120,7 +121,7 @@ fn a_read_renews_nothing_and_holds_nothing() {
     .unwrap();
     let origin = Origin::new(SourceKind::ModbusTcp, "10.0.0.1:1");
     let (ticket, _answer) = Ticket::new(origin, "d", String::new(), false, bench.now, bench.stats.clone());
-    let command = Command::new(0, admitted, bench.now + DEFAULT_EXPIRY, ticket);
+    let command = Command::new(DriveIndex::new(0), admitted, bench.now + DEFAULT_EXPIRY, ticket);
     bench.bus.queue.submit(command, bench.now);
     bench.look(50, true);
     bench.begin();

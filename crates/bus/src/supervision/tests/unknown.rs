@@ -1,6 +1,7 @@
 //! Drives that do not say whether they run, and what their registers say of a response of their own.
 
 use super::*;
+use crate::drive::DriveIndex;
 
 fn cx() -> Bench {
     let bench = Bench::of(Profiles::built_in().get("vacon-cx").unwrap(), LeaseAction::Stop);
@@ -47,7 +48,10 @@ fn where_the_drive_refuses_to_tell_its_run_command_stands_for_it() {
         }
         let action = bench.later(100);
         assert_eq!(action.map(|a| a.urgency), acts.then_some(Urgency::Stop), "{run:?}");
-        let unknown = bench.news.iter().filter(|n| **n == News::RunningUnknown(0));
+        let unknown = bench
+            .news
+            .iter()
+            .filter(|n| **n == News::RunningUnknown(DriveIndex::new(0)));
         assert_eq!((unknown.count(), bench.reported()), (1, usize::from(acts)), "{run:?}");
     }
 }
@@ -77,7 +81,13 @@ fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
     let action = (0..100).find_map(|_| bench.later(100));
     assert!(action.is_some(), "the stop");
     assert!(bench.now - bench.heard() <= Duration::from_millis(7_200));
-    assert_eq!(bench.news, [News::RunningUnknown(0), News::LeaseRanOut(0)]);
+    assert_eq!(
+        bench.news,
+        [
+            News::RunningUnknown(DriveIndex::new(0)),
+            News::LeaseRanOut(DriveIndex::new(0))
+        ]
+    );
     // The time in which it answers is what counts: it may come and go.
     let mut bench = cx();
     bench.look(0, true);

@@ -1,6 +1,7 @@
 //! What a command requires of the hold of a drive. Pure.
 
 use crate::command::{Command, Effect, Order, Urgency};
+use crate::drive::DriveIndex;
 
 /// What a command requires of the hold of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,7 +20,7 @@ pub enum Asks {
 
 impl Asks {
     /// What a command requires of that drive's hold.
-    pub fn of(command: &Command, drive: usize) -> Asks {
+    pub fn of(command: &Command, drive: DriveIndex) -> Asks {
         match command.stops(drive) {
             true => Asks::Stop,
             false => Asks::by(&command.order, command.urgency, command.effect(drive)),

@@ -8,6 +8,7 @@ use super::Pending;
 use crate::command::{
     Asks, Claim, Command, Denial, HoldView, Holder, Holding, Mode, Origin, Outcome, Refusal, Rules, Told, Urgency, Verb,
 };
+use crate::drive::DriveIndex;
 
 /// Most changes of holds waiting to be published, which happens several times a second; beyond that the oldest is
 /// dropped.
@@ -19,14 +20,14 @@ const UNHELD_LOGGED: Duration = Duration::from_secs(60);
 #[derive(Debug, Default)]
 pub(super) struct Holds {
     rules: Option<Arc<Rules>>,
-    drives: BTreeMap<usize, Holding>,
-    told: Vec<(usize, Told)>,
+    drives: BTreeMap<DriveIndex, Holding>,
+    told: Vec<(DriveIndex, Told)>,
     /// Drives that a client took since the bus last checked.
-    taken: Vec<usize>,
+    taken: Vec<DriveIndex>,
     /// Commands that were carried out, or would have been refused, though another client held the drive.
-    unheld: BTreeMap<usize, u64>,
+    unheld: BTreeMap<DriveIndex, u64>,
     /// The same, to be logged.
-    unheld_told: Vec<(usize, Unheld)>,
+    unheld_told: Vec<(DriveIndex, Unheld)>,
     /// When it was last logged of a client.
     unheld_logged: BTreeMap<Arc<str>, Instant>,
 }
@@ -42,7 +43,11 @@ pub struct Unheld {
 
 impl Holds {
     /// The rules and the holding of a drive, and where it is told what happened; nothing while `[authority]` is off.
-    fn with<T>(&mut self, drive: usize, change: impl FnOnce(&mut Holding, &Rules, &mut Vec<Told>) -> T) -> Option<T> {
+    fn with<T>(
+        &mut self,
+        drive: DriveIndex,
+        change: impl FnOnce(&mut Holding, &Rules, &mut Vec<Told>) -> T,
+    ) -> Option<T> {
         let rules = self.rules.as_ref()?;
         let mut told = Vec::new();
         let holding = self.drives.entry(drive).or_default();
@@ -59,7 +64,7 @@ impl Holds {
     }
 
     /// Counts a command that exclusive mode would have refused, and logs it once a client and minute.
-    fn count_unheld(&mut self, drive: usize, origin: &Origin, denial: &Denial, now: Instant) {
+    fn count_unheld(&mut self, drive: DriveIndex, origin: &Origin, denial: &Denial, now: Instant) {
         *self.unheld.entry(drive).or_default() += 1;
         let Some(rules) = &self.rules else { return };
         let client = rules
@@ -82,7 +87,7 @@ impl Holds {
     }
 
     /// Why a client's command is refused, in exclusive mode. A run command refused after a stop is remembered.
-    fn refuses(&mut self, drive: usize, origin: &Origin, asks: Asks, now: Instant) -> Option<Refusal> {
+    fn refuses(&mut self, drive: DriveIndex, origin: &Origin, asks: Asks, now: Instant) -> Option<Refusal> {
         let rules = self.rules.clone().filter(|_| origin.kind.is_client())?;
         let who = rules.claim_of(origin);
         let holding = self.drives.entry(drive).or_default();
@@ -98,7 +103,7 @@ impl Pending {
         if self.holds.rules == rules {
             return;
         }
-        let drives: Vec<usize> = self.holds.drives.keys().copied().collect();
+        let drives: Vec<DriveIndex> = self.holds.drives.keys().copied().collect();
         match rules {
             Some(_) => {
                 self.holds.rules = rules;
@@ -118,13 +123,13 @@ impl Pending {
     }
 
     /// The hold of a drive ends, for that reason.
-    pub fn hold_ends(&mut self, drive: usize, why: &str) {
+    pub fn hold_ends(&mut self, drive: DriveIndex, why: &str) {
         self.holds.with(drive, |holding, _, told| holding.end(why, told));
     }
 
     /// Why a command of that client is not accepted, where the hold of the drive keeps it. A run that is refused behind
     /// a stop is kept.
-    pub fn hold_refuses(&mut self, drive: usize, origin: &Origin, asks: Asks, now: Instant) -> Option<Refusal> {
+    pub fn hold_refuses(&mut self, drive: DriveIndex, origin: &Origin, asks: Asks, now: Instant) -> Option<Refusal> {
         self.holds.refuses(drive, origin, asks, now)
     }
 
@@ -208,7 +213,7 @@ impl Pending {
     }
 
     /// A client was received from: its heartbeat came, or its order was carried out.
-    pub fn hold_renewed(&mut self, drive: usize, origin: &Origin, now: Instant) {
+    pub fn hold_renewed(&mut self, drive: DriveIndex, origin: &Origin, now: Instant) {
         let Some(who) = self.holds.claim(origin) else { return };
         self.holds
             .with(drive, |holding, rules, _| holding.renew(&who, rules, now));
@@ -216,7 +221,7 @@ impl Pending {
 
     /// Whether the silence of that client is the one that counts for supervision: it holds the drive, or did last, or nobody
     /// ever did.
-    pub fn hold_renews(&self, drive: usize, origin: &Origin) -> bool {
+    pub fn hold_renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
         let Some(holding) = self.holds.rules.as_ref().and_then(|_| self.holds.drives.get(&drive)) else {
             return true;
         };
@@ -227,7 +232,13 @@ impl Pending {
     ///
     /// # Errors
     /// Why it may not; none while `[authority]` is off.
-    pub fn hold_act(&mut self, drive: usize, origin: &Origin, verb: Verb, now: Instant) -> Option<Result<(), Refusal>> {
+    pub fn hold_act(
+        &mut self,
+        drive: DriveIndex,
+        origin: &Origin,
+        verb: Verb,
+        now: Instant,
+    ) -> Option<Result<(), Refusal>> {
         let rules = self.holds.rules.clone()?;
         let who = rules.claim_of(origin);
         let acted = self.holds.with(drive, |holding, rules, told| {
@@ -240,7 +251,7 @@ impl Pending {
     }
 
     /// Drops waiting commands that are no longer the holder's.
-    fn drop_of_others(&mut self, drive: usize, now: Instant) {
+    fn drop_of_others(&mut self, drive: DriveIndex, now: Instant) {
         let mut index = 0;
         while let Some(command) = self.waiting.get(index) {
             let refusal = match command.reaches(drive) {
@@ -255,12 +266,12 @@ impl Pending {
     }
 
     /// Drives with a new holder since the last call: started commands of others end.
-    pub fn take_taken(&mut self) -> Vec<usize> {
+    pub fn take_taken(&mut self) -> Vec<DriveIndex> {
         std::mem::take(&mut self.holds.taken)
     }
 
     /// Why a client's started command ends, if another client has taken the drive since.
-    pub fn hold_ends_run(&self, drive: usize, origin: &Origin, now: Instant) -> Option<Refusal> {
+    pub fn hold_ends_run(&self, drive: DriveIndex, origin: &Origin, now: Instant) -> Option<Refusal> {
         let rules = self.holds.rules.as_ref().filter(|_| origin.kind.is_client())?;
         let who = rules.claim_of(origin).filter(|_| rules.mode == Mode::Exclusive);
         who.as_ref()?;
@@ -270,20 +281,20 @@ impl Pending {
     }
 
     /// The client stopped, though nothing is sent for it.
-    pub fn hold_said_stop(&mut self, drive: usize, origin: &Origin) {
+    pub fn hold_said_stop(&mut self, drive: DriveIndex, origin: &Origin) {
         let Some(who) = self.holds.claim(origin) else { return };
         self.holds.with(drive, |holding, _, _| holding.said_stop(&who));
     }
 
     /// Whether the local control place of a drive has it now.
-    pub fn set_local(&mut self, drive: usize, local: bool) {
+    pub fn set_local(&mut self, drive: DriveIndex, local: bool) {
         self.holds
             .with(drive, |holding, _, told| holding.set_local(local, told));
     }
 
     /// Ends what has expired, and returns the changes since the last call.
-    pub fn take_told(&mut self, now: Instant) -> Vec<(usize, Told)> {
-        let drives: Vec<usize> = self.holds.drives.keys().copied().collect();
+    pub fn take_told(&mut self, now: Instant) -> Vec<(DriveIndex, Told)> {
+        let drives: Vec<DriveIndex> = self.holds.drives.keys().copied().collect();
         for drive in drives {
             self.holds
                 .with(drive, |holding, rules, told| holding.settle(rules, now, told));
@@ -292,7 +303,7 @@ impl Pending {
     }
 
     /// Commands of clients that did not hold their drive, to be logged.
-    pub fn take_unheld(&mut self) -> Vec<(usize, Unheld)> {
+    pub fn take_unheld(&mut self) -> Vec<(DriveIndex, Unheld)> {
         std::mem::take(&mut self.holds.unheld_told)
     }
 
@@ -302,7 +313,7 @@ impl Pending {
     }
 
     /// The published state of a hold, and whether that client has it.
-    pub fn hold_view(&self, drive: usize, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
+    pub fn hold_view(&self, drive: DriveIndex, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
         let rules = self.holds.rules.as_ref()?;
         let free = Holding::default();
         let holding = self.holds.drives.get(&drive).unwrap_or(&free);
@@ -312,12 +323,12 @@ impl Pending {
     }
 
     /// The client whose repeated stops end the holds of others.
-    pub fn repeater(&self, drive: usize) -> Option<Arc<str>> {
+    pub fn repeater(&self, drive: DriveIndex) -> Option<Arc<str>> {
         self.holds.drives.get(&drive)?.repeater().cloned()
     }
 
     /// Commands that were carried out in advisory mode though another client held the drive.
-    pub fn unheld(&self, drive: usize) -> u64 {
+    pub fn unheld(&self, drive: DriveIndex) -> u64 {
         self.holds.unheld.get(&drive).copied().unwrap_or_default()
     }
 
@@ -327,7 +338,7 @@ impl Pending {
     }
 
     /// The reservation of a drive: until when, for whom by name and rank, and for how long such a one lasts.
-    pub fn reservation(&self, drive: usize, now: Instant) -> Option<(Instant, String, String, Duration)> {
+    pub fn reservation(&self, drive: DriveIndex, now: Instant) -> Option<(Instant, String, String, Duration)> {
         let rules = self.holds.rules.as_ref()?;
         let (who, until) = self.holds.drives.get(&drive)?.reservation()?;
         let rank = rules.rank(who.rank).to_string();
@@ -335,17 +346,17 @@ impl Pending {
     }
 
     /// A stop before the start of the process reserved the drive.
-    pub fn reserve(&mut self, drive: usize, who: Claim, until: Instant) {
+    pub fn reserve(&mut self, drive: DriveIndex, who: Claim, until: Instant) {
         self.holds.with(drive, |holding, _, _| holding.reserve(who, until));
     }
 
     /// The hold of a drive, for the bus that takes the place of this one.
-    pub fn holding(&self, drive: usize) -> Option<Holding> {
+    pub fn holding(&self, drive: DriveIndex) -> Option<Holding> {
         self.holds.drives.get(&drive).cloned()
     }
 
     /// Continues the hold of the same machine after a reload.
-    pub fn take_over_holding(&mut self, drive: usize, mut holding: Holding) {
+    pub fn take_over_holding(&mut self, drive: DriveIndex, mut holding: Holding) {
         // The next reading says it again.
         holding.set_local(false, &mut Vec::new());
         self.holds.drives.insert(drive, holding);

@@ -4,6 +4,7 @@ use std::time::Instant;
 
 use super::{Chosen, CommandQueue, Pending};
 use crate::command::{BackgroundRequest, Command, Outcome, PassedOn, Touched, Urgency};
+use crate::drive::DriveIndex;
 
 impl Pending {
     /// What is passed on and may go, in its order: nothing older waits for any drive that it reaches. A stop that cannot go now,
@@ -13,7 +14,7 @@ impl Pending {
             return Vec::new();
         }
         let stops = self.waiting.iter().filter(|c| c.urgency == Urgency::Stop);
-        let mut first: Vec<usize> = stops.filter(|c| may(c)).map(|c| c.drive).collect();
+        let mut first: Vec<DriveIndex> = stops.filter(|c| may(c)).map(|c| c.drive).collect();
         let mut all = Vec::new();
         for command in self.waiting.iter().filter(|c| c.urgency == Urgency::Command) {
             let free = command.passed_on.is_some() && command.reach().iter().all(|drive| !first.contains(drive));
@@ -27,7 +28,7 @@ impl Pending {
 
     /// What is passed on and goes as a command, since a command waits after it.
     pub(super) fn pressed(&self) -> Vec<u64> {
-        let mut waits: Vec<usize> = Vec::new();
+        let mut waits: Vec<DriveIndex> = Vec::new();
         let mut pressed = Vec::new();
         for command in self.waiting.iter().rev().filter(|c| c.urgency == Urgency::Command) {
             let presses = command.reach().iter().any(|drive| waits.contains(drive));
@@ -69,7 +70,7 @@ impl Pending {
             Some(outcome) => Some(outcome.clone()),
             None if self.stops_only && !command.ends_the_gateway() => Some(Outcome::ShuttingDown),
             None => {
-                let stopped = |drive: &usize| self.was_stopped(*drive) && !command.stops(*drive);
+                let stopped = |drive: &DriveIndex| self.was_stopped(*drive) && !command.stops(*drive);
                 command.reach().iter().any(stopped).then_some(Outcome::Purged)
             }
         };
@@ -80,7 +81,7 @@ impl Pending {
     }
 
     /// Whether a stop arrived for that drive since the bus last checked.
-    pub fn was_stopped(&self, drive: usize) -> bool {
+    pub fn was_stopped(&self, drive: DriveIndex) -> bool {
         self.stopped.contains(&drive)
     }
 }

@@ -13,6 +13,7 @@ use tokio::sync::oneshot;
 use super::{NotStopped, Pending, Stopping};
 use crate::command::background::{Background, BackgroundRequest};
 use crate::command::{Command, Outcome, Rules, Urgency};
+use crate::drive::DriveIndex;
 use crate::start_guard::BusGuards;
 
 /// The queue between the north sides and one bus.
@@ -165,7 +166,7 @@ impl CommandQueue {
     }
 
     /// Nothing but stops is sent to that drive until then, so that its own supervision of the fieldbus acts; none: all again.
-    pub fn keep_quiet(&self, drive: usize, until: Option<Instant>) {
+    pub fn keep_quiet(&self, drive: DriveIndex, until: Option<Instant>) {
         let mut pending = self.lock();
         pending.quiet = until.map(|until| (drive, until));
         self.has_quiet.store(until.is_some(), Ordering::Release);
@@ -174,7 +175,7 @@ impl CommandQueue {
     }
 
     /// The drive to which nothing but stops is sent, and until when.
-    pub fn quiet(&self, now: Instant) -> Option<(usize, Instant)> {
+    pub fn quiet(&self, now: Instant) -> Option<(DriveIndex, Instant)> {
         if !self.has_quiet.load(Ordering::Acquire) {
             return None;
         }

@@ -7,6 +7,7 @@ use tokio::sync::oneshot;
 
 use super::Pending;
 use crate::command::{Command, Order, Origin, Outcome, SourceKind, Urgency};
+use crate::drive::DriveIndex;
 
 /// The wish of the gateway, which is about to end, that a bus stops its drives.
 #[derive(Debug)]
@@ -67,7 +68,7 @@ impl Pending {
     }
 
     /// Until when the stop that waits for that drive does so by `min_run`.
-    pub fn stop_waits(&self, drive: usize, now: Instant) -> Option<Instant> {
+    pub fn stop_waits(&self, drive: DriveIndex, now: Instant) -> Option<Instant> {
         let guards = self.guards.as_ref()?;
         let ordinary = |c: &Command| c.is_ordinary && c.drive == drive;
         self.waiting
@@ -76,7 +77,7 @@ impl Pending {
             .then(|| guards.stop_waits(drive, now))?
     }
 
-    pub(super) fn note_stop(&mut self, drive: usize, by: Origin, now: Instant) {
+    pub(super) fn note_stop(&mut self, drive: DriveIndex, by: Origin, now: Instant) {
         self.stopped_by.insert(drive, by);
         *self.stops.entry(drive).or_default() += 1;
         let at = self.stopped_at.entry(drive).or_insert(now);
@@ -85,7 +86,7 @@ impl Pending {
 
     /// Whether a stop arrived after a command's request began to arrive.
     pub(super) fn is_behind_its_stop(&self, command: &Command) -> bool {
-        let stopped = |drive: &usize| {
+        let stopped = |drive: &DriveIndex| {
             let at = self.stopped_at.get(drive).zip(command.asked);
             at.is_some_and(|(stopped, asked)| asked < *stopped) && !command.stops(*drive)
         };
@@ -127,24 +128,24 @@ impl Pending {
 
     /// Drives for which a stop arrived since the last call: their started commands end, whatever the result of the
     /// stop.
-    pub fn take_stopped(&mut self) -> Vec<usize> {
+    pub fn take_stopped(&mut self) -> Vec<DriveIndex> {
         std::mem::take(&mut self.stopped)
     }
 
     /// Withdraws a supervision action that has not started: a client commands the drive again.
-    pub fn withdraw_supervision(&mut self, drive: usize, now: Instant) {
+    pub fn withdraw_supervision(&mut self, drive: DriveIndex, now: Instant) {
         self.remove(now, &Outcome::Withdrawn, |c| {
             c.drive == drive && c.joined.is_empty() && c.ticket.origin().is_lease()
         });
     }
 
     /// Stops of that drive that were taken in so far, also by the bus before a reload.
-    pub fn stops(&self, drive: usize) -> u64 {
+    pub fn stops(&self, drive: DriveIndex) -> u64 {
         self.stops.get(&drive).copied().unwrap_or_default()
     }
 
     /// Who gave the last stop of that drive that was taken in.
-    pub fn last_stop_by(&self, drive: usize) -> Option<&Origin> {
+    pub fn last_stop_by(&self, drive: DriveIndex) -> Option<&Origin> {
         self.stopped_by.get(&drive)
     }
 

@@ -7,7 +7,7 @@ use super::super::ticket::tests::ticket;
 use super::super::{Admitted, Answer, Origin, SourceKind, Ticket, Touched, WriteStats};
 use super::*;
 use crate::codec::Table;
-use crate::drive::Value;
+use crate::drive::{DriveIndex, Value};
 
 mod order;
 mod slots;
@@ -77,7 +77,7 @@ impl Bench {
             reference_only,
             ranges: Vec::new(),
         };
-        let mut command = Command::new(drive, admitted, self.now + EXPIRY, ticket);
+        let mut command = Command::new(DriveIndex::new(drive), admitted, self.now + EXPIRY, ticket);
         command.touched = touched(&command.order);
         self.pending.push(command, self.now);
         receiver
@@ -96,7 +96,7 @@ impl Bench {
     }
 
     fn pop(&mut self) -> Option<(usize, Urgency)> {
-        self.take().map(|c| (c.drive, c.urgency))
+        self.take().map(|c| (c.drive.place(), c.urgency))
     }
 
     /// All that waits, in the order in which it has its turn: client, drive and first point.
@@ -106,7 +106,7 @@ impl Bench {
             let Order::Points(values) = &command.order else {
                 panic!("{command:?}")
             };
-            all.push((command.ticket.origin().who.clone(), command.drive, values[0].0));
+            all.push((command.ticket.origin().who.clone(), command.drive.place(), values[0].0));
         }
         all
     }
@@ -197,7 +197,7 @@ fn later_commands_wait_behind_the_oldest_of_their_drive_that_cannot_begin() {
         bench.now,
         |command| {
             asked.push(command.order.clone());
-            command.drive != 1
+            command.drive != DriveIndex::new(1)
         },
         |_| false,
     );
@@ -304,7 +304,7 @@ fn nobody_is_overtaken_without_a_bound() {
     let mut turns = 0;
     loop {
         let _new = bench.push_from(&format!("new {turns}"), 2, &[2]);
-        if bench.take().unwrap().drive == 1 {
+        if bench.take().unwrap().drive == DriveIndex::new(1) {
             break;
         }
         turns += 1;
@@ -367,7 +367,14 @@ fn a_closed_queue_answers_at_once() {
         reference_only: false,
         ranges: Vec::new(),
     };
-    let command = |urgency, ticket| Command::new(0, admitted(urgency), bench.now + Duration::from_secs(1), ticket);
+    let command = |urgency, ticket| {
+        Command::new(
+            DriveIndex::new(0),
+            admitted(urgency),
+            bench.now + Duration::from_secs(1),
+            ticket,
+        )
+    };
     queue.submit(command(Urgency::Command, ticket_a), bench.now);
     queue.close(Outcome::BusDown, bench.now);
     assert_eq!(outcome(&mut a), Some(Outcome::BusDown));
@@ -389,12 +396,23 @@ fn supervision_is_withdrawn_and_nothing_else() {
     let own = (SourceKind::Supervision, "supervision");
     let mut action = bench.give(own, 1, Urgency::Command, points(&[7]), false);
     let mut elsewhere = bench.give(own, 2, Urgency::Stop, points(&[1]), false);
-    assert_eq!(bench.pending.client_waits_until(1), None, "no client is behind it");
+    assert_eq!(
+        bench.pending.client_waits_until(DriveIndex::new(1)),
+        None,
+        "no client is behind it"
+    );
     let mut client = bench.push(1, Urgency::Command, &[1], false);
     let _read = bench.push(2, Urgency::Read, &[], false);
-    assert_eq!(bench.pending.client_waits_until(1), Some(bench.now + EXPIRY));
-    assert_eq!(bench.pending.client_waits_until(2), None, "a read is no command");
-    bench.pending.withdraw_supervision(1, bench.now);
+    assert_eq!(
+        bench.pending.client_waits_until(DriveIndex::new(1)),
+        Some(bench.now + EXPIRY)
+    );
+    assert_eq!(
+        bench.pending.client_waits_until(DriveIndex::new(2)),
+        None,
+        "a read is no command"
+    );
+    bench.pending.withdraw_supervision(DriveIndex::new(1), bench.now);
     assert_eq!(outcome(&mut action), Some(Outcome::Withdrawn));
     assert_eq!((outcome(&mut elsewhere), outcome(&mut client)), (None, None));
     // A stop that a client has joined is the client's too.
@@ -402,11 +420,11 @@ fn supervision_is_withdrawn_and_nothing_else() {
     bench.now += EXPIRY / 2;
     let mut joined = bench.push(3, Urgency::Stop, &[1], false);
     assert_eq!(
-        bench.pending.client_waits_until(3),
+        bench.pending.client_waits_until(DriveIndex::new(3)),
         Some(bench.now + EXPIRY),
         "as long as the client's own time"
     );
-    bench.pending.withdraw_supervision(3, bench.now);
+    bench.pending.withdraw_supervision(DriveIndex::new(3), bench.now);
     assert_eq!((outcome(&mut stop), outcome(&mut joined)), (None, None));
 }
 
@@ -424,31 +442,31 @@ fn the_login_that_commanded_last_is_kept_until_another_client_commands() {
             reference_only,
             ranges: Vec::new(),
         };
-        let command = Command::new(1, admitted, bench.now + EXPIRY, ticket);
+        let command = Command::new(DriveIndex::new(1), admitted, bench.now + EXPIRY, ticket);
         bench.pending.push(command, bench.now);
     };
     use SourceKind::{Http, ModbusTcp, Shutdown, Supervision};
     use Urgency::{Read, Stop};
     let order = Urgency::Command;
     push(&mut bench, Http, Some("alice#1"), order, true);
-    assert_eq!(commander(&bench, 1).as_deref(), Some("alice#1"));
-    assert_eq!(commander(&bench, 2), None);
+    assert_eq!(commander(&bench, DriveIndex::new(1)).as_deref(), Some("alice#1"));
+    assert_eq!(commander(&bench, DriveIndex::new(2)), None);
     // What is no command of a client.
     push(&mut bench, ModbusTcp, None, Read, false);
     push(&mut bench, Supervision, None, Stop, false);
     push(&mut bench, Shutdown, None, Stop, false);
-    assert_eq!(commander(&bench, 1).as_deref(), Some("alice#1"));
+    assert_eq!(commander(&bench, DriveIndex::new(1)).as_deref(), Some("alice#1"));
     // Whether it waits, takes the place of an older one, or joins another one.
     push(&mut bench, Http, Some("bob#2"), order, true);
     push(&mut bench, Http, Some("carol#3"), order, true);
-    assert_eq!(commander(&bench, 1).as_deref(), Some("carol#3"));
+    assert_eq!(commander(&bench, DriveIndex::new(1)).as_deref(), Some("carol#3"));
     push(&mut bench, Http, Some("bob#2"), Stop, false);
     push(&mut bench, Http, Some("alice#1"), Stop, false);
-    assert_eq!(commander(&bench, 1).as_deref(), Some("alice#1"));
+    assert_eq!(commander(&bench, DriveIndex::new(1)).as_deref(), Some("alice#1"));
     push(&mut bench, ModbusTcp, None, Stop, false);
-    assert_eq!(commander(&bench, 1), None);
+    assert_eq!(commander(&bench, DriveIndex::new(1)), None);
     // What is not taken in.
     bench.pending.closed = Some(Outcome::BusDown);
     push(&mut bench, Http, Some("alice#1"), Stop, false);
-    assert_eq!(commander(&bench, 1), None);
+    assert_eq!(commander(&bench, DriveIndex::new(1)), None);
 }

@@ -10,13 +10,10 @@ impl Rules<'_> {
     /// A drive whose replies come after the time limit was seen to do so, whatever the others do.
     pub(super) fn answers_late(&mut self) {
         let late = self.figures.sum(Sign::Late);
-        for place in 0..self.figures.drives.len() {
+        let figures = self.figures;
+        for (place, drive) in figures.drives.enumerate() {
             let own = self.sum(place, Sign::Late);
-            let lasts = self
-                .figures
-                .drives
-                .get(place)
-                .is_some_and(|drive| drive.steps(&[Sign::Late]) >= LASTING);
+            let lasts = drive.steps(&[Sign::Late]) >= LASTING;
             if own < FEW || !lasts || self.is_told(place) || own * 2 <= late {
                 continue;
             }
@@ -104,7 +101,6 @@ impl Rules<'_> {
         let with = self
             .figures
             .drives
-            .iter()
             .enumerate()
             .filter(|(_, drive)| drive.sum(Sign::StartLost) > 0);
         let evidence = format!(

@@ -11,8 +11,8 @@ use super::recorder::{Note, NoteBody};
 use super::recording::Recording;
 use super::*;
 use crate::codec::{LineFormat, Protocol, Table};
-use crate::drive::ModelPoint;
 use crate::drive::profile::Profiles;
+use crate::drive::{DriveIndex, ModelPoint};
 use crate::process_image::{
     BusImage, BusSpec, DriveImage, DriveSpec, Link, Outcome, PointTrigger, TapedFrame, TapedRead, Taping, TriggerLimit,
     Verdict,
@@ -97,7 +97,7 @@ impl Rig {
     pub(super) fn poll(&mut self, drive: usize, status: u16, current: u16, code: u16) {
         let at = self.clock.now;
         let words = [status, 0, 8200, 4100, 1200, current, 0, 0, 0, 655, code];
-        self.bus.tape.read(drive, || TapedRead {
+        self.bus.tape.read(DriveIndex::new(drive), || TapedRead {
             at,
             table: Table::Holding,
             start: 2100,
@@ -109,7 +109,7 @@ impl Rig {
         let at = self.clock.now;
         self.bus.tape.frame(|| TapedFrame {
             at,
-            drive: Some(drive),
+            drive: Some(DriveIndex::new(drive)),
             verdict: Verdict::Timeout,
             bytes: [].into(),
         });

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::super::control::{Always, Control, Mask, OwnWord, Place, Reset, Run, Setting, Step, Until};
+use super::super::control::{Always, Control, ControlItem, Mask, OwnWord, Reset, Run, Setting, Step, Until};
 use super::super::derive::Derived;
 use super::super::model::ModelPoint;
 use super::super::profile::{AddressRange, Form, Point, PollClass, Raw, Source};
@@ -68,10 +68,10 @@ pub(super) fn read(reader: &Reader<'_>, around: &Around<'_>) -> Option<Control> 
     Some(control)
 }
 
-fn read_at(table: &Reader<'_>, around: &Around<'_>) -> Option<Place> {
+fn read_at(table: &Reader<'_>, around: &Around<'_>) -> Option<ControlItem> {
     let text: String = table.required("at")?;
     let place = parse_place(&text).filter(|place| matches!(place.table, Table::Holding | Table::Coil));
-    let Some(Place { table: kind, address }) = place else {
+    let Some(ControlItem { table: kind, address }) = place else {
         table.problem(
             "at",
             format!("`{text}` is not a register or coil that can be written"),
@@ -88,7 +88,7 @@ fn read_at(table: &Reader<'_>, around: &Around<'_>) -> Option<Place> {
             "add the range, or set `write` in it",
         );
     }
-    Some(Place { table: kind, address })
+    Some(ControlItem { table: kind, address })
 }
 
 fn read_always(table: &Reader<'_>) -> Always {
@@ -125,7 +125,7 @@ fn read_always(table: &Reader<'_>) -> Always {
 
 /// `{ bit = 0, is = 1 }` or `{ mask = 0x0F, value = 0x02 }`, with `point` and `once`.
 fn read_setting(form: &Reader<'_>, around: &Around<'_>) -> Option<Setting> {
-    let place = read_place(form, around)?;
+    let place = read_place(form, around).ok()?;
     let once = form.or("once", false);
     let bits = match (form.optional::<u8>("bit"), form.optional::<u16>("mask")) {
         (Some(bit), None) if bit < 16 => {
@@ -169,26 +169,29 @@ fn read_setting(form: &Reader<'_>, around: &Around<'_>) -> Option<Setting> {
     })
 }
 
-/// `point` of a form; `Some(None)` is the control word.
-fn read_place(form: &Reader<'_>, around: &Around<'_>) -> Option<Option<Place>> {
+/// `point` of a form cannot be written to, which is reported.
+struct Unusable;
+
+/// `point` of a form; none is the control word.
+fn read_place(form: &Reader<'_>, around: &Around<'_>) -> Result<Option<ControlItem>, Unusable> {
     let Some(name) = form.optional::<String>("point") else {
-        return Some(None);
+        return Ok(None);
     };
-    let index = point_of(form, "point", &name, around.names)?;
-    let point = around.points.get(index)?;
+    let index = point_of(form, "point", &name, around.names).ok_or(Unusable)?;
+    let point = around.points.get(index).ok_or(Unusable)?;
     let raw = point.raw().filter(|raw| {
         let one = matches!(raw.form, Form::U16 | Form::Bit { bit: 0, invert: false });
         point.write && one && raw.is_unscaled()
     });
     match raw {
-        Some(raw) => Some(Some(Place::of(raw))),
+        Some(raw) => Ok(Some(ControlItem::of(raw))),
         None => {
             form.problem(
                 "point",
                 format!("`{name}` is not a register or coil that is written as it is"),
                 "name a point with `write = true`, type u16 and no scale, or a coil",
             );
-            None
+            Err(Unusable)
         }
     }
 }
@@ -208,10 +211,10 @@ fn read_run(table: &Reader<'_>, around: &Around<'_>) -> Option<Run> {
         read_steps(&form, around).map(Run::Steps)
     } else if form.has("forward_bit") || form.has("reverse_bit") {
         let bits = (form.required::<u8>("forward_bit"), form.required::<u8>("reverse_bit"));
-        pair_of_bits(&form, bits, read_place(&form, around)?)
+        pair_of_bits(&form, bits, read_place(&form, around).ok()?)
     } else if form.has("forward") || form.has("reverse") {
         let (forward, reverse) = (form.required("forward"), form.required("reverse"));
-        let (place, once) = (read_place(&form, around)?, form.or("once", false));
+        let (place, once) = (read_place(&form, around).ok()?, form.or("once", false));
         let setting = |value| Setting {
             place,
             once,
@@ -228,7 +231,7 @@ fn read_run(table: &Reader<'_>, around: &Around<'_>) -> Option<Run> {
     run
 }
 
-fn pair_of_bits(form: &Reader<'_>, bits: (Option<u8>, Option<u8>), place: Option<Place>) -> Option<Run> {
+fn pair_of_bits(form: &Reader<'_>, bits: (Option<u8>, Option<u8>), place: Option<ControlItem>) -> Option<Run> {
     let (forward, reverse) = (bits.0?, bits.1?);
     if forward > 15 || reverse > 15 || forward == reverse {
         form.problem(
@@ -299,7 +302,7 @@ fn read_step(table: &Reader<'_>, around: &Around<'_>) -> Option<Step> {
     }
     Some(Step {
         write: Setting {
-            place: place?,
+            place: place.ok()?,
             mask,
             ..whole(write)
         },
@@ -373,7 +376,7 @@ fn read_reset(table: &Reader<'_>, around: &Around<'_>) -> Option<Reset> {
 /// before them.
 pub(super) fn made_points(control: &Control, points: &[Point], before: usize) -> Vec<Point> {
     let mut helpers: Vec<Point> = Vec::new();
-    let mut index_of = |place: Place| {
+    let mut index_of = |place: ControlItem| {
         let is_plain = |point: &Point| {
             point.raw().is_some_and(|raw| {
                 let whole = matches!(raw.form, Form::U16 | Form::Bit { bit: 0, invert: false }) && raw.is_unscaled();
@@ -421,7 +424,7 @@ pub(super) fn made_points(control: &Control, points: &[Point], before: usize) ->
 }
 
 /// The control word, for the points that rest on it.
-fn helper(control: &Control, place: Place) -> Point {
+fn helper(control: &Control, place: ControlItem) -> Point {
     let form = match place.table {
         Table::Coil | Table::DiscreteInput => Form::Bit { bit: 0, invert: false },
         Table::Holding | Table::Input => Form::U16,

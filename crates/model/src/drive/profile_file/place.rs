@@ -1,6 +1,6 @@
 //! Address and format of a value: `at` and the keys of its form; those that change what is made of it are in `meaning`.
 
-use super::super::control::Place;
+use super::super::control::ControlItem;
 use super::super::profile::{AddressRange, Form, MOST_REGISTERS, Order, Raw, Source};
 use super::meaning;
 use super::ranges::{Offsets, read_table};
@@ -30,9 +30,9 @@ pub(super) fn parse_address(text: &str) -> Option<u16> {
 }
 
 /// `holding 2100`: table and PDU address.
-pub(super) fn parse_place(text: &str) -> Option<Place> {
+pub(super) fn parse_place(text: &str) -> Option<ControlItem> {
     let (table, address) = text.split_once(' ')?;
-    Some(Place {
+    Some(ControlItem {
         table: Table::from_name(table)?,
         address: parse_address(address)?,
     })

@@ -1,4 +1,4 @@
-//! `[speed_reference]`: meaning of the speed reference register of the family (drives.md 9.2, 9.3).
+//! `[speed_reference]`: meaning of the speed reference register of the family (reference/drives.md 9.2, 9.3).
 
 use super::super::derive::{Bound, Derived};
 use super::super::profile::{Form, Point, PollClass, Source};

@@ -56,7 +56,7 @@ pub(super) use self::stop_all::stop;
 /// A password that a program sends with each request is not hashed again for that long.
 const VERIFIED: Duration = Duration::from_secs(300);
 /// Most of them, and most addresses that are known to belong to someone who may command.
-const MOST: usize = 256;
+const MOST_REMEMBERED: usize = 256;
 /// Most commands with pending results, except stops.
 const IN_PROGRESS: usize = 256;
 
@@ -294,7 +294,7 @@ impl Operating {
         }
         let operators = &mut state.operators;
         operators.retain(|_, (_, used)| now.saturating_duration_since(*used) < IDLE);
-        if operators.len() >= MOST
+        if operators.len() >= MOST_REMEMBERED
             && !operators.contains_key(&operator.address)
             && let Some(oldest) = operators
                 .iter()
@@ -391,7 +391,7 @@ impl Operating {
 impl State {
     fn remember(&mut self, mark: [u8; 32], user: &Arc<str>, now: Instant) {
         // There are no more of them than users, each of which has one password.
-        if self.verified.len() < MOST {
+        if self.verified.len() < MOST_REMEMBERED {
             self.verified.insert(mark, (user.clone(), now + VERIFIED));
         }
     }

@@ -13,7 +13,7 @@ const LONGEST: Duration = Duration::from_secs(12 * 3600);
 /// Most sessions of one user; another login ends the one that was used the longest time ago.
 const MOST_OF_USER: usize = 8;
 /// Most sessions; another login ends the one that was used the longest time ago.
-const MOST: usize = 128;
+const MOST_SESSIONS: usize = 128;
 
 /// Random numbers for one session.
 #[derive(Debug, Clone, Copy)]
@@ -58,7 +58,7 @@ impl Sessions {
     pub(super) fn begin(&mut self, user: &Arc<str>, secrets: Secrets, now: Instant) -> (Session, String) {
         self.open.retain(|_, session| now < session.ends());
         self.make_room(MOST_OF_USER, |session| session.user == *user);
-        self.make_room(MOST, |_| true);
+        self.make_room(MOST_SESSIONS, |_| true);
         self.logins += 1;
         let session = Session {
             user: user.clone(),
@@ -170,6 +170,6 @@ mod tests {
         for number in 0..=u8::MAX {
             sessions.begin(&format!("u{number}").into(), secrets(number), now);
         }
-        assert_eq!(sessions.open.len(), MOST);
+        assert_eq!(sessions.open.len(), MOST_SESSIONS);
     }
 }

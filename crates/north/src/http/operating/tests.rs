@@ -192,7 +192,7 @@ fn who_did_something_keeps_its_places() {
         operating.begin(&"alice".into(), [10, 0, 0, last].into(), now).unwrap();
         operating.begin(&"alice".into(), [10, 0, 1, last].into(), now).unwrap();
     }
-    assert_eq!(operating.state().operators.len(), MOST);
+    assert_eq!(operating.state().operators.len(), MOST_REMEMBERED);
     operating.set_users(None);
     operating.set_users(Some(users));
     assert!(operating.state().operators.is_empty());

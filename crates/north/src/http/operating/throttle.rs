@@ -18,7 +18,7 @@ const PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs
 /// Failures are forgotten when there was none for that long.
 const FORGOTTEN: Duration = Duration::from_secs(15 * 60);
 /// Most addresses and browsers, and most users, that are distinguished; beyond it the oldest is forgotten.
-const MOST: usize = 4096;
+const MOST_SOURCES: usize = 4096;
 
 /// Where an attempt comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -107,7 +107,7 @@ fn wait(failures: Option<Failures>, free: u32, now: Instant) -> Duration {
 
 fn count<K: Eq + Hash + Copy>(all: &mut HashMap<K, Failures>, key: K, now: Instant) {
     let count = current(all, &key, now).map_or(0, |failures| failures.count);
-    if all.len() >= MOST && !all.contains_key(&key) {
+    if all.len() >= MOST_SOURCES && !all.contains_key(&key) {
         let oldest = all
             .iter()
             .min_by_key(|(_, failures)| failures.last)
@@ -202,11 +202,14 @@ mod tests {
         assert_eq!(source("2001:db8::1"), source("2001:db8::ffff:1"));
         assert_ne!(source("2001:db8::1"), source("2001:db8:0:1::1"));
         let (mut throttle, now) = (Throttle::default(), Instant::now());
-        for number in 0..2 * MOST as u32 {
+        for number in 0..2 * MOST_SOURCES as u32 {
             let address = Source::Address(IpAddr::V4(number.into()));
             let begun = throttle.begin(address, number.into(), now + Duration::from_millis(number.into()));
             assert_eq!(begun, Ok(0));
         }
-        assert_eq!((throttle.sources.len(), throttle.users.len()), (MOST, MOST));
+        assert_eq!(
+            (throttle.sources.len(), throttle.users.len()),
+            (MOST_SOURCES, MOST_SOURCES)
+        );
     }
 }

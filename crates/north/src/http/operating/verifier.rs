@@ -9,7 +9,7 @@ use tokio::sync::oneshot;
 use super::super::users::is_password;
 
 /// Most passwords that wait for their turn.
-const MOST: usize = 16;
+const MOST_WAITING: usize = 16;
 /// Most of them from one address.
 const MOST_OF_ADDRESS: usize = 4;
 /// Niceness of the thread.
@@ -55,7 +55,7 @@ impl Queue {
         self.numbered += 1;
         new.number = self.numbered;
         let of_address = self.waiting.iter().filter(|waiting| waiting.address == new.address);
-        let full = self.waiting.len() >= MOST;
+        let full = self.waiting.len() >= MOST_WAITING;
         if full || of_address.count() >= MOST_OF_ADDRESS {
             let worst = (0..self.waiting.len())
                 .filter_map(|index| Some((index, self.waiting.get(index)?)))
@@ -174,10 +174,10 @@ mod tests {
                 kept.push(answered);
             }
         }
-        assert_eq!(queue.waiting.len(), MOST);
+        assert_eq!(queue.waiting.len(), MOST_WAITING);
         let (operator, mut answered) = waiting(200, 0);
         assert!(queue.push(operator), "a full queue does not keep the operator out");
-        assert_eq!(queue.waiting.len(), MOST);
+        assert_eq!(queue.waiting.len(), MOST_WAITING);
         let next = queue.next().unwrap();
         assert_eq!(
             (next.failures, next.address),

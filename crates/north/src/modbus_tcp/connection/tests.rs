@@ -23,7 +23,7 @@ struct Bench {
     server: JoinHandle<()>,
     stats: Arc<NorthStats>,
     cancel: CancellationToken,
-    place: Arc<Place>,
+    place: Arc<ConnectionPlace>,
 }
 
 /// A connection over a pipe that holds `pipe` bytes each way.

@@ -159,7 +159,7 @@ fn reload(client: &Client) {
         name: "line2".to_string(),
         ..bus.image.spec.clone()
     };
-    bus.image = Arc::new(BusImage::new(spec, bus.image.drives.clone()));
+    bus.image = Arc::new(BusImage::new(spec, bus.image.drives.to_vec()));
     client.plant.store(Arc::new(plant));
 }
 

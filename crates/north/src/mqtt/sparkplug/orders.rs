@@ -209,7 +209,7 @@ impl Orders {
         let place = self.awaited.iter_mut().position(ready);
         let ended = place.and_then(|place| self.awaited.remove(place));
         let finished = ended.and_then(|mut awaited| {
-            let (answer, confirmed) = (awaited.placed.answer()?, awaited.placed.confirmation().flatten());
+            let (answer, confirmed) = (awaited.placed.answer()?, awaited.placed.shown().after);
             Some(Finished::of(&awaited.drive, awaited.metrics, &answer, confirmed))
         });
         finished.map_or(Poll::Pending, Poll::Ready)

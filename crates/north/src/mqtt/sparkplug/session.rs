@@ -1,10 +1,12 @@
 //! The session of the edge node: births before data, sequence numbers without gaps, deaths before new births. No I/O and
 //! no clock: it is told what happens, and asked for the next message.
 
+mod device;
+
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use super::history::Recorder;
+use self::device::{Device, name};
 use super::host::Host;
 use super::metric::{Datum, Definition, Naming, Pace, Sample};
 use super::topics::{Kind, StateForm, Topics};
@@ -13,8 +15,6 @@ use crate::drive::Quality;
 
 /// Least time between two births of the node on one connection: requests in between are served together.
 const REBIRTH: Duration = Duration::from_millis(250);
-/// Least time between two messages because of figures alone.
-const FIGURES: Duration = Duration::from_secs(1);
 /// Values in one message of the history, and least time between two of them, so that live values have the connection.
 const HISTORY_VALUES: usize = 250;
 const HISTORY_PACE: Duration = Duration::from_millis(25);
@@ -89,132 +89,6 @@ pub(super) struct Session {
     /// Values in one message of the history.
     history_values: usize,
     lost: u64,
-}
-
-/// The node itself, or a drive.
-#[derive(Debug)]
-struct Device {
-    name: String,
-    definitions: Vec<Definition>,
-    namings: Vec<Naming>,
-    /// Number of metrics that are published, the first ones: all, unless the broker takes only smaller packets.
-    most: usize,
-    present: bool,
-    born: bool,
-    /// It went away since its birth, even if it is back.
-    gone: bool,
-    now_is: Vec<Sample>,
-    /// As last published or recorded.
-    sent: Vec<Option<Sample>>,
-    /// Metrics to be published although they did not change.
-    repeat: Vec<usize>,
-    sent_at: Option<Instant>,
-    /// What was told may differ from what was sent.
-    changed: bool,
-    history: Recorder,
-}
-
-impl Device {
-    fn new(name: String, definitions: Vec<Definition>) -> Device {
-        Device {
-            name,
-            namings: vec![Naming::Name; definitions.len()],
-            sent: vec![None; definitions.len()],
-            most: usize::MAX,
-            definitions,
-            present: false,
-            born: false,
-            gone: false,
-            now_is: Vec::new(),
-            repeat: Vec::new(),
-            sent_at: None,
-            changed: false,
-            history: Recorder::default(),
-        }
-    }
-
-    fn aliases(&self) -> BTreeMap<&str, Naming> {
-        let names = self.definitions.iter().map(|d| d.name.as_str());
-        names.zip(self.namings.iter().copied()).collect()
-    }
-
-    /// All metrics, those that nothing is known of too; they count as published at `now`.
-    fn birth(&mut self, tick: Tick) -> Vec<Metric> {
-        let unknown = Sample {
-            value: None,
-            quality: Quality::Bad,
-            time: tick.millis,
-        };
-        let samples = self.now_is.iter().chain(std::iter::repeat(&unknown));
-        let all = self.definitions.iter().zip(&self.namings).zip(samples);
-        let metrics = all.map(|((d, naming), sample)| d.birth(*naming, sample));
-        let metrics = metrics.take(self.most).collect();
-        let sent = (0..self.definitions.len()).map(|place| self.now_is.get(place).cloned());
-        self.sent = sent.collect();
-        (self.born, self.gone, self.changed, self.sent_at) = (true, false, false, Some(tick.now));
-        self.repeat.clear();
-        metrics
-    }
-
-    /// What changed and is due. The second is when to ask again.
-    fn data(&mut self, least: Duration, now: Instant) -> (Vec<Metric>, Option<Instant>) {
-        if !self.changed {
-            return (Vec::new(), None);
-        }
-        let differs = |place: usize| match (self.now_is.get(place), self.sent.get(place)) {
-            (Some(sample), Some(Some(sent))) => !sent.is_same(sample),
-            _ => true,
-        };
-        let published = self.now_is.len().min(self.most);
-        let mut places: Vec<usize> = (0..published).filter(|place| differs(*place)).collect();
-        let figures = |place: &usize| self.definitions.get(*place).is_some_and(|d| d.pace == Pace::Figure);
-        let least = match places.iter().all(figures) && self.repeat.is_empty() {
-            true => least.max(FIGURES),
-            false => least,
-        };
-        places.extend(self.repeat.iter().copied().filter(|place| *place < published));
-        places.sort_unstable();
-        places.dedup();
-        if places.is_empty() {
-            self.changed = false;
-            return (Vec::new(), None);
-        }
-        let due = self.sent_at.map_or(now, |at| at + least);
-        if due > now {
-            return (Vec::new(), Some(due));
-        }
-        let metrics = places.iter().filter_map(|place| self.publish(*place)).collect();
-        (self.changed, self.sent_at) = (false, Some(now));
-        self.repeat.clear();
-        (metrics, None)
-    }
-
-    /// One metric as it is now.
-    fn publish(&mut self, place: usize) -> Option<Metric> {
-        let (definition, naming) = (self.definitions.get(place)?, *self.namings.get(place)?);
-        let sample = self.now_is.get(place)?;
-        let sent = self.sent.get_mut(place)?;
-        let before = sent.as_ref().map(|sent| sent.quality);
-        let metric = definition.data(naming, sample, before);
-        *sent = Some(sample.clone());
-        Some(metric)
-    }
-
-    fn history(&mut self, most: usize) -> Vec<Metric> {
-        let published = self.most;
-        let metric = |(place, sample): (usize, Sample)| {
-            if place >= published {
-                return None;
-            }
-            let mut metric = self
-                .definitions
-                .get(place)?
-                .data(*self.namings.get(place)?, &sample, None);
-            metric.is_historical = Some(true);
-            Some(metric)
-        };
-        self.history.take(most).into_iter().filter_map(metric).collect()
-    }
 }
 
 impl Session {
@@ -567,21 +441,6 @@ impl Session {
                 seq: Some(self.seq.into()),
             },
         }
-    }
-}
-
-/// Gives each metric of `device` its alias: the one it had `before`, else one that no metric ever had.
-fn name(device: &mut Device, before: Option<&Device>, alias: bool, last: &mut u64) {
-    let known = before.map(Device::aliases).unwrap_or_default();
-    if alias {
-        let names = device.definitions.iter().map(|d| d.name.as_str());
-        let mut fresh = || {
-            *last += 1;
-            Naming::Alias(*last)
-        };
-        device.namings = names
-            .map(|name| known.get(name).copied().unwrap_or_else(&mut fresh))
-            .collect();
     }
 }
 

@@ -3,6 +3,7 @@
 use super::*;
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{BackgroundRequest, NO_DRIVE, Pace, PassedOn};
+use crate::drive::DriveIndex;
 
 const START: u16 = 1;
 const STOP: u16 = 0;
@@ -23,9 +24,13 @@ impl Bench {
             passed_on: Some(PassedOn {
                 address: 0,
                 may_write: true,
-                reach: vec![1, 2],
+                reach: [1, 2].map(DriveIndex::new).to_vec(),
                 effects: Vec::new(),
-                stops: if value == STOP { vec![1, 2] } else { Vec::new() },
+                stops: if value == STOP {
+                    [1, 2].map(DriveIndex::new).to_vec()
+                } else {
+                    Vec::new()
+                },
                 first: false,
                 frame,
             }),
@@ -44,7 +49,7 @@ impl Bench {
             reference_only: false,
             ranges: Vec::new(),
         };
-        let mut command = Command::new(drive, admitted, self.now + EXPIRY, ticket);
+        let mut command = Command::new(DriveIndex::new(drive), admitted, self.now + EXPIRY, ticket);
         command.asked = Some(asked);
         self.pending.push(command, self.now);
         receiver
@@ -122,9 +127,12 @@ fn a_broadcast_has_its_place_among_the_orders_of_each_drive() {
     assert!(!bench.passes_on(), "an older order waits for drive 1");
     let _behind = bench.push_from("a", 2, &[2]);
     let _beside = bench.push_from("a", 3, &[3]);
-    let order: Vec<usize> = std::iter::from_fn(|| bench.take()).map(|c| c.drive).collect();
+    let order: Vec<usize> = std::iter::from_fn(|| bench.take()).map(|c| c.drive.place()).collect();
     let place = |drive| order.iter().position(|d| *d == drive);
-    assert!(place(1) < place(NO_DRIVE) && place(NO_DRIVE) < place(2), "{order:?}");
+    assert!(
+        place(1) < place(NO_DRIVE.place()) && place(NO_DRIVE.place()) < place(2),
+        "{order:?}"
+    );
     assert_eq!(order.len(), 4);
     // Where nothing waits behind it, it waits for time that is left over.
     let _broadcast = bench.broadcast(STOP);
@@ -173,7 +181,10 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
             reference_only: false,
             ranges: Vec::new(),
         };
-        queue.submit(Command::new(drive, admitted, now + EXPIRY, ticket), now);
+        queue.submit(
+            Command::new(DriveIndex::new(drive), admitted, now + EXPIRY, ticket),
+            now,
+        );
         receiver
     };
     let (old, new) = (CommandQueue::new().unwrap(), Arc::new(CommandQueue::new().unwrap()));
@@ -185,8 +196,8 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
     // The port may go, and come, in its last moments.
     old.close(Outcome::BusDown, now);
     old.open();
-    old.hand_over(3, &new, 0, now);
-    old.hand_over(2, &new, 1, now);
+    old.hand_over(DriveIndex::new(3), &new, DriveIndex::new(0), now);
+    old.hand_over(DriveIndex::new(2), &new, DriveIndex::new(1), now);
     let mut last = give(&old, 2, Urgency::Stop);
     let mut refused = give(&old, 2, Urgency::Command);
     assert!(outcome(&mut refused).is_some());

@@ -3,6 +3,7 @@
 use super::*;
 use crate::codec::RequestPdu;
 use crate::command::{BackgroundRequest, Commanded, Effect, Entry, NO_DRIVE, Pace, PassedOn, Settled, SlotWrite};
+use crate::drive::DriveIndex;
 
 fn effect(run: bool) -> Effect {
     Effect {
@@ -19,13 +20,13 @@ fn stand(pending: &mut Pending, drive: usize, priority: u8, run: bool, now: Inst
         priority,
         Some(Entry::new(Value::Bool(run), origin, now)),
     );
-    let all = pending.priorities(drive);
+    let all = pending.priorities(DriveIndex::new(drive));
     all.ask(&write);
     all.settle(write.id, Settled::Done, now);
 }
 
 fn stands(pending: &mut Pending, drive: usize) -> Vec<u8> {
-    let all = pending.priorities(drive);
+    let all = pending.priorities(DriveIndex::new(drive));
     (1..=16)
         .filter(|priority| all.stands(Commanded::Run, *priority).is_some())
         .collect()
@@ -40,8 +41,8 @@ fn order(kind: SourceKind, drive: usize, run: bool, now: Instant) -> (Command, R
         reference_only: false,
         ranges: Vec::new(),
     };
-    let mut command = Command::new(drive, admitted, now + EXPIRY, ticket);
-    command.effects = vec![(drive, effect(run))];
+    let mut command = Command::new(DriveIndex::new(drive), admitted, now + EXPIRY, ticket);
+    command.effects = vec![(DriveIndex::new(drive), effect(run))];
     (command, receiver)
 }
 
@@ -63,7 +64,11 @@ fn a_start_is_judged_when_it_is_accepted_and_a_stop_passes() {
         bench.pending.push(stop, now);
         assert_eq!(outcome(&mut answer), None);
     }
-    assert_eq!(bench.pending.priorities(1).orders(), 2, "what was refused is no order");
+    assert_eq!(
+        bench.pending.priorities(DriveIndex::new(1)).orders(),
+        2,
+        "what was refused is no order"
+    );
 }
 
 #[test]
@@ -83,9 +88,13 @@ fn what_a_tool_sends_to_all_is_refused_for_one_and_its_stop_withdraws() {
             passed_on: Some(PassedOn {
                 address: 0,
                 may_write: true,
-                reach: vec![1, 2],
-                stops: if run { Vec::new() } else { vec![1, 2] },
-                effects: vec![(1, effect(run)), (2, effect(run))],
+                reach: [1, 2].map(DriveIndex::new).to_vec(),
+                stops: if run {
+                    Vec::new()
+                } else {
+                    [1, 2].map(DriveIndex::new).to_vec()
+                },
+                effects: vec![(DriveIndex::new(1), effect(run)), (DriveIndex::new(2), effect(run))],
                 first: false,
                 frame: tokio::sync::oneshot::channel().0,
             }),
@@ -111,9 +120,9 @@ fn a_stop_that_another_bus_takes_over_withdraws_there() {
     let (old, new) = (CommandQueue::new().unwrap(), Arc::new(CommandQueue::new().unwrap()));
     stand(&mut old.lock(), 3, 8, true, now);
     old.begin_handover(now);
-    let priorities = old.lock().priorities(3).clone();
-    new.lock().take_over(0, None, 0, priorities);
-    old.hand_over(3, &new, 0, now);
+    let priorities = old.lock().priorities(DriveIndex::new(3)).clone();
+    new.lock().take_over(DriveIndex::new(0), None, 0, priorities);
+    old.hand_over(DriveIndex::new(3), &new, DriveIndex::new(0), now);
     assert_eq!(stands(&mut new.lock(), 0), [8]);
     let (stop, mut answer) = order(SourceKind::Mqtt, 3, false, now);
     old.submit(stop, now);

@@ -24,10 +24,10 @@ impl Bench {
     fn next(&mut self, rank: Urgency, redundant: &[usize]) -> Option<(usize, Urgency)> {
         let chosen = self
             .pending
-            .next(rank, self.now, |_| true, |drive| redundant.contains(&drive))?;
+            .next(rank, self.now, |_| true, |drive| redundant.contains(&drive.place()))?;
         assert_eq!(chosen.rank, rank);
         let command = self.pending.take(chosen)?;
-        Some((command.drive, command.urgency))
+        Some((command.drive.place(), command.urgency))
     }
 }
 

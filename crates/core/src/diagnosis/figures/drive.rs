@@ -1,0 +1,95 @@
+//! What is counted of one drive.
+
+use std::time::Instant;
+
+use super::LATE;
+use crate::diagnosis::counters::{InPhase, Window};
+
+/// What is counted per drive in each step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sign {
+    /// Sound replies.
+    Answered,
+    /// Requests without a reply, of a drive that is there.
+    Silent,
+    /// Requests without a reply, all of them.
+    Tried,
+    /// Replies that are damaged anywhere.
+    Damaged,
+    /// Of those: longer than the reply could be.
+    Overlong,
+    /// Stray bytes directly before the reply.
+    Led,
+    /// Of those: zeros.
+    LedZero,
+    /// Replies without their beginning.
+    StartLost,
+    /// Requests that came back without their end.
+    CutEcho,
+    /// Stray bytes after a reply, while the line should be idle.
+    Idle,
+    /// Further valid replies.
+    Second,
+    /// Sound replies after the time limit.
+    Late,
+    /// Replies that used more than half of the time limit.
+    Slow,
+    /// Transactions that show whether the adapter hears itself.
+    EchoShown,
+    /// It does.
+    Echoed,
+}
+
+const SIGNS: usize = Sign::Echoed as usize + 1;
+
+/// The counters of one drive.
+#[derive(Debug, Clone)]
+pub struct Drive {
+    pub address: u8,
+    pub(super) window: Window<SIGNS>,
+    /// Slowest beginning of a reply in each step, tenths of a millisecond.
+    pub(super) slowest: Window<1>,
+    /// Requests without a reply in a row; those of them that followed a reply closely, and after a pause.
+    pub(super) run: u16,
+    pub(super) run_paused: [u16; 2],
+    pub(super) silent_at: Option<Instant>,
+    pub(super) mains: InPhase,
+    /// Requests to a drive of which nothing was ever heard; `None` once there was something.
+    pub(super) in_vain: Option<u16>,
+}
+
+impl Drive {
+    pub(super) fn add(&mut self, sign: Sign) {
+        self.window.add(sign as usize, 1);
+    }
+
+    /// In the last minute.
+    pub fn sum(&self, sign: Sign) -> u32 {
+        self.window.sum(sign as usize)
+    }
+
+    /// Steps of the last minute in which one of these was counted.
+    pub fn steps(&self, signs: &[Sign]) -> usize {
+        let has = |step: &&[u16; SIGNS]| {
+            signs
+                .iter()
+                .any(|sign| step.get(*sign as usize).is_some_and(|count| *count > 0))
+        };
+        self.window.steps.iter().filter(has).count()
+    }
+
+    /// Slowest beginning of a reply in the last minute, ms.
+    pub fn slowest_ms(&self) -> f64 {
+        f64::from(self.slowest.each(0).max().unwrap_or_default()) / 10.0
+    }
+
+    /// How often a drive was asked of which nothing was ever heard.
+    pub fn in_vain(&self) -> Option<u16> {
+        self.in_vain
+    }
+
+    pub(super) fn was_silent(&self, at: Instant) -> bool {
+        self.silent_at
+            .is_some_and(|silent| at.saturating_duration_since(silent) <= LATE)
+    }
+}
