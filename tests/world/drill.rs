@@ -326,6 +326,7 @@ impl Trouble {
         match self {
             Trouble::IgnoresStops if !turns(rig) => runs(rig, 1, true),
             Trouble::StopsLate if rig.now < since + 3 * SECOND && !turns(rig) => runs(rig, 1, true),
+            Trouble::StopsLate if rig.now >= since + 3 * SECOND && turns(rig) => runs(rig, 1, false),
             Trouble::WrongMotor if turns(rig) => {
                 runs(rig, 1, false);
                 runs(rig, 2, true);
