@@ -217,7 +217,7 @@ pub struct Event {
     #[serde(serialize_with = "rfc3339")]
     #[schema(value_type = String)]
     pub time: SystemTime,
-    /// What happened.
+    /// The kind of event.
     #[serde(rename = "event")]
     #[schema(value_type = String)]
     pub kind: EventKind,

@@ -169,7 +169,7 @@ impl BusSpec {
 }
 
 impl DriveSpec {
-    /// A drive with nothing configured but where it is and what it is: only monitored, its unit is its address.
+    /// A drive with only place and profile configured: monitored, its unit is its address.
     pub fn new(name: &str, bus: &str, address: u8, profile: Arc<Profile>) -> DriveSpec {
         DriveSpec {
             name: name.to_string(),

@@ -2,7 +2,7 @@
 
 use std::sync::OnceLock;
 
-/// The version of the packages, all of which have the same.
+/// The version of the packages, the same for all.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 static COMMIT: OnceLock<&'static str> = OnceLock::new();

@@ -399,7 +399,7 @@ def annotations(selector, most=None):
             "orange",
             some(f"changes(drivegate_supervision_actions_total{{{selector}}}[30s])") + " > 0",
             "{{drive}}: action of supervision",
-            "its client fell silent while the motor ran",
+            "its client went silent while the motor ran",
         ),
         annotation(
             "Starts of the gateway",

@@ -74,7 +74,7 @@ pub struct PassedOn {
     pub reach: Vec<DriveIndex>,
     /// Those of them whose run command it clears.
     pub stops: Vec<DriveIndex>,
-    /// What it means for the priority arrays of those that hear it.
+    /// Its effects on the priority arrays of the drives that receive it.
     pub effects: Vec<(DriveIndex, Effect)>,
     /// It stops all that hear it, and goes before all that waits.
     pub first: bool,

@@ -32,7 +32,7 @@ pub enum Outcome {
     Acknowledged(Reply),
     /// The drive refused it.
     Exception(Exception),
-    /// What was answered leaves open the result: 05, or a gateway's 0A or 0B.
+    /// The reply leaves the outcome open: 05, or a gateway's 0A or 0B.
     Unknown(Exception),
     /// Refused before it reached the bus.
     Refused(Refusal),

@@ -3,9 +3,9 @@
 use crate::codec::{RequestPdu, Table};
 use crate::drive::parameters::RawValue;
 
-/// One parameter to set. The bus asks the drive for its value and whether its motor runs, writes, and reads the value back; nothing else
-/// goes on the line between the answer that the motor stands and the write. A drive that has the value already is not written,
-/// since what it keeps wears its memory: the reply is then that of the read.
+/// One parameter to set. The bus reads the value and whether the motor runs, writes, and reads the value back; nothing
+/// else is sent between the reply that the motor is stopped and the write. A drive that already has the value is not
+/// written, to save its memory: the reply is then that of the read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterOrder {
     /// Its id in the family.

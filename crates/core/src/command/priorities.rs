@@ -21,7 +21,7 @@ pub const PRIORITIES: usize = 16;
 /// The priorities that protect people: they refuse commands from other interfaces.
 pub const PROTECTING: u8 = 5;
 
-/// What is commanded by priorities.
+/// A point that is commanded by priorities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Commanded {
     /// The run command.

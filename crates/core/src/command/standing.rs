@@ -1,5 +1,5 @@
-//! The reference that stands while a command changes the frequency range on which a limit of it rests: 80 % that were
-//! 40 Hz are 80 Hz once the maximum frequency is twice what it was. Pure.
+//! Checks the present reference when a command changes the frequency range that its limits depend on: 80 % that were 40
+//! Hz become 80 Hz if the maximum frequency is doubled. Pure.
 
 use std::time::Instant;
 

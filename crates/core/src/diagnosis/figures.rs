@@ -1,5 +1,5 @@
-//! What is counted: for each drive and for the line, in steps of the last minute. All of it is bounded, and a
-//! transaction that goes well costs a few additions.
+//! The counters: for each drive and for the line, in steps of the last minute. Bounded; a successful transaction costs
+//! a few additions.
 
 mod drive;
 
@@ -364,7 +364,7 @@ impl Figures {
         }
     }
 
-    /// The drive is received of: what it left unanswered before counts, unless it was absent.
+    /// The drive replied: earlier requests without a reply count, unless it was absent.
     fn is_there(&mut self, drive: DriveIndex, at: Instant) {
         let Some(drive) = self.drives.get_mut(drive) else {
             return;
@@ -419,7 +419,7 @@ impl Figures {
         self.idle.extend(bytes.iter().take(room));
     }
 
-    /// What came since the last transaction is whole.
+    /// The bytes since the last transaction are complete.
     fn settle_idle(&mut self, now: Instant) {
         if self.idle.is_empty() {
             return;
@@ -434,7 +434,7 @@ impl Figures {
         }
     }
 
-    /// A sound answer that was not believed, if it is one: a late one, a second one, or one of nobody who was asked.
+    /// Counts a valid but unexpected reply: a late one, a second one, or one from an address that was not polled.
     fn answer_of_another(&mut self, bytes: &[u8], at: Instant) -> bool {
         let Some(answering) = signature::answer(self.line.protocol, bytes) else {
             return false;

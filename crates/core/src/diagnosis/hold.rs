@@ -18,7 +18,7 @@ struct Held {
     shown: bool,
 }
 
-/// What changed.
+/// A change of a verdict.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Change {
     /// It holds from now on.
@@ -105,7 +105,7 @@ impl Hold {
         }
     }
 
-    /// What is shown, the surest first.
+    /// The present verdicts, most certain first.
     pub fn shown(&self) -> impl Iterator<Item = &Finding> {
         let mut shown: Vec<&Finding> = self
             .held

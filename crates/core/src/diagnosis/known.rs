@@ -67,7 +67,7 @@ pub(super) fn stand_out(known: &[Known], count: usize) -> bool {
 }
 
 impl Known {
-    /// What is known of the drive at that place, if it was asked often enough.
+    /// The known rates of the drive at that place, if it was polled often enough.
     pub(super) fn of(place: DriveIndex, drive: &Drive) -> Option<Known> {
         let (silent, damaged) = (drive.sum(Sign::Silent), drive.sum(Sign::Damaged));
         let others = drive.sum(Sign::Answered) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho);

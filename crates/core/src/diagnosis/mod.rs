@@ -212,7 +212,7 @@ pub struct Counted {
     pub by_drive: Option<CountedByDrive>,
 }
 
-/// What a drive counted since its counters were cleared (function 08, subfunctions 0B to 0F); they wrap at 65536.
+/// A drive's own counters since they were cleared (function 08, subfunctions 0B to 0F); they wrap at 65536.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct CountedByDrive {
     /// Sound messages on the line, to whatever address.
@@ -266,8 +266,8 @@ impl CountedByDrive {
         }
     }
 
-    /// Which direction of the line is bad, in words: what the drive received damaged between two readings, while so many of its
-    /// replies were damaged here. None where neither tells anything.
+    /// The disturbed direction of the line, as text: from the messages the drive received damaged between two readings,
+    /// and the number of its replies damaged here. None if neither shows anything.
     pub fn direction(&self, name: &str, damaged_here: u32) -> Option<String> {
         let CountedByDrive { messages, damaged, .. } = self;
         match (*damaged, damaged_here) {

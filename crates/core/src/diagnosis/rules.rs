@@ -10,11 +10,11 @@ use super::known::{ENOUGH, FEW, Known, LASTING, SIGNIFICANT, share, stand_out, s
 use super::{Cause, Certainty, Finding};
 use crate::drive::DriveIndex;
 
-/// The same of what would be told of the whole line.
+/// The same for verdicts about the whole line.
 const FEW_OF_LINE: u32 = 10;
-/// Requests after which a drive that never answered is told.
+/// Requests after which a drive that never replied is reported.
 const IN_VAIN: u16 = 6;
-/// Most such drives that are told one by one.
+/// Most such drives that are reported one by one.
 const NAMED: usize = 6;
 /// Share of transactions below which a drive is good.
 const GOOD: f64 = 0.003;
@@ -33,7 +33,7 @@ pub struct Rules<'f> {
     found: Vec<Finding>,
 }
 
-/// What holds at `now`, most significant first; `names` are those of the drives.
+/// The findings at `now`, most significant first; `names` are those of the drives.
 pub fn find(figures: &Figures, names: &[String], now: Instant) -> Vec<Finding> {
     let known: Vec<Known> = figures
         .drives

@@ -1,4 +1,4 @@
-//! What the bytes of one transaction show of the line.
+//! What the bytes of one transaction show about the line.
 
 use crate::codec::{Decoded, Protocol, Reply, Request, RequestPdu};
 
@@ -31,7 +31,7 @@ pub enum Shape {
 /// The findings of a transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Signature {
-    /// The request came back before the reply; `None` where it cannot be told.
+    /// The request was echoed before the reply; `None` if unclear.
     pub echoed: Option<bool>,
     /// The shape of the other bytes.
     pub shape: Shape,
@@ -144,16 +144,16 @@ fn is_sound(protocol: Protocol, request: &Request, bytes: &[u8]) -> bool {
     matches!(decoded, Decoded::Reply { used, reply } if used == bytes.len() && !matches!(reply, Reply::Exception(_)))
 }
 
-/// Whose answer bytes are that nobody asked for.
+/// The drive that unrequested bytes are a reply of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Answering {
-    /// That of the drive at this address.
+    /// The drive at this address.
     Address(u8),
-    /// On N2 an answer names nobody.
+    /// Any drive: N2 replies have no address.
     Anybody,
 }
 
-/// Whose sound answer the bytes are that nobody asked for, if they are one.
+/// The drive that unrequested bytes are a valid reply of, if they are one.
 pub fn answer(protocol: Protocol, bytes: &[u8]) -> Option<Answering> {
     match protocol {
         Protocol::ModbusRtu | Protocol::ModbusAscii => protocol

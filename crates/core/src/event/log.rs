@@ -14,7 +14,7 @@ pub enum Before {
     Event(Boot, u64),
 }
 
-/// What is searched for.
+/// A search.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Search {
     /// Any of these kinds; none: all kinds.

@@ -17,7 +17,7 @@ const INTERVAL: Duration = Duration::from_secs(1);
 /// A client is forgotten when it was refused nothing for so long.
 const FORGOTTEN: Duration = Duration::from_secs(60);
 
-/// Which refusals of which client pass.
+/// Limits the refusals per client.
 #[derive(Debug)]
 pub struct RefusalLimit<T> {
     clients: BTreeMap<Arc<str>, Client<T>>,
@@ -79,7 +79,7 @@ impl<T> RefusalLimit<T> {
         })
     }
 
-    /// What waited long enough: at most one of each client.
+    /// Refusals that have waited long enough: at most one per client.
     pub fn due(&mut self, now: Instant) -> Vec<(T, u64)> {
         self.clients.values_mut().filter_map(|client| client.due(now)).collect()
     }

@@ -23,7 +23,7 @@ pub const RECORDINGS: &str = "recordings";
 /// Directory of the parameters.
 pub const PARAMS: &str = "params";
 
-/// What the names begin with, before a `.` or `-` or their end; counters are written and set aside under other endings.
+/// Start of the names, before a `.` or `-` or their end; counters are written and set aside under other endings.
 const OWN: [&str; 11] = [
     EVENTS,
     "counters",

@@ -32,8 +32,8 @@ pub struct Budget {
 }
 
 impl Budget {
-    /// What each of these buses gets: all that it needs, or less where that is more than [`MOST_BYTES`] together. Notes become fewer
-    /// first, then all rings shorter by the same part.
+    /// The budget of each of these buses: all it needs, or less if the total exceeds [`MOST_BYTES`]. Notes are reduced
+    /// first, then all rings in proportion.
     pub fn shared(mut needs: Vec<Budget>) -> Vec<Budget> {
         let total: usize = needs.iter().map(Budget::total).sum();
         if total <= MOST_BYTES {

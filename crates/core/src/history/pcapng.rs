@@ -1,5 +1,5 @@
-//! The frames of a recording as a pcapng capture: link type `RTAC_SERIAL`, as `drivegate trace --pcap` writes it, each frame
-//! with a comment that says what it is. Pure.
+//! The frames of a recording as a pcapng capture: link type `RTAC_SERIAL`, as `drivegate trace --pcap` writes it, each
+//! frame with a comment. Pure.
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 

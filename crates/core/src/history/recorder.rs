@@ -80,7 +80,7 @@ pub(super) fn empty_snapshot(spec: &DriveSpec) -> Snapshot {
     snapshot
 }
 
-/// A sample leaves its ring: what it said is known from before the oldest one.
+/// A sample leaves its ring: its values become part of the base state.
 fn leave(base: &mut Arc<Snapshot>, at: Instant, packed: &[u8]) {
     if let Some(gone) = TapedRead::unpack(at, packed) {
         Arc::make_mut(base).store(gone.table, gone.start, &gone.words, at);
@@ -205,7 +205,7 @@ impl Recorder {
         captures
     }
 
-    /// What all buses together may take is shared by them again: there may be more of them, or fewer.
+    /// Shares the total memory among the buses again, after their number has changed.
     fn share_memory(&mut self, reach: Reach) {
         let shares = Budget::shared(self.lines.iter().map(|line| line.need.clone()).collect());
         for (line, share) in self.lines.iter_mut().zip(shares) {

@@ -149,7 +149,7 @@ pub struct Frame {
     pub t: f64,
     /// Place of the drive that was asked.
     pub drive: Option<usize>,
-    /// What it was.
+    /// Its verdict.
     pub verdict: Verdict,
     /// The bytes; in the file two hexadecimal digits each.
     #[serde(rename = "hex", with = "hexadecimal")]

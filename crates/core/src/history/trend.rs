@@ -74,7 +74,7 @@ impl Reach {
     pub const FULL: Reach = Reach(1000);
     const LEAST: u16 = 10;
 
-    /// What all drives of these profiles can have.
+    /// The memory for all drives of these profiles.
     pub fn of<'p>(profiles: impl IntoIterator<Item = &'p Profile>) -> Reach {
         let wanted: usize = profiles.into_iter().map(bytes_of).sum();
         let share = MOST_BYTES.saturating_mul(1000) / wanted.max(1);

@@ -122,7 +122,7 @@ pub enum FileError {
 }
 
 impl ParameterFile {
-    /// The application as far as it shows: how many parameters there are, and a mark of which.
+    /// The application as far as it can be identified: number of parameters, and a mark of the set.
     pub fn application(&self) -> String {
         let ids: String = self.values.keys().map(|id| format!("{id}\n")).collect();
         let mark: String = hex(digest(&SHA256, ids.as_bytes()).as_ref(), 4);

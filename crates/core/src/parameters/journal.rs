@@ -161,7 +161,7 @@ fn owner<'a>(lines: &mut impl Iterator<Item = &'a str>) -> Result<Owner, String>
     })
 }
 
-/// What stands for an identification where the family has none.
+/// Placeholder for the identification of a family without one.
 pub const NO_IDENTIFICATION: &str = "none";
 
 /// The journal of a restore.
@@ -177,7 +177,7 @@ pub struct Journal {
     pub phase: Phase,
     /// Parameters of this phase that were done when the journal was written; perhaps more were.
     pub done: usize,
-    /// The drive may have been told to keep values of this restore.
+    /// The drive may have been made to save values of this restore.
     pub saved: bool,
     /// The plan of the first phase.
     pub plan: Plan,

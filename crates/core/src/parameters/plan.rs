@@ -100,8 +100,8 @@ pub fn plan(
 }
 
 impl Plan {
-    /// The plan that takes back the first `done` writes: the former values, the last write first. After each of its steps
-    /// the drive holds what it held before, so that it keeps the limits as well.
+    /// The plan that undoes the first `done` writes: the former values, in reverse order. After each step the drive has
+    /// a state it had before, so the limits are kept as well.
     #[must_use]
     pub fn back(&self, done: usize) -> Plan {
         let writes = self.writes.iter().take(done).rev().map(|write| ParameterWrite {

@@ -303,7 +303,7 @@ impl Reading {
     }
 }
 
-/// What people read: the value in its unit, and the name.
+/// The readable note: the value in its unit, and the name.
 fn note(label: &Label, value: Option<RawValue>) -> String {
     let shown = value.map_or(String::new(), |value| label.value(value));
     match (shown.as_str(), label.name.as_str()) {

@@ -40,7 +40,7 @@ pub enum Wanted {
 /// The next step after a reply.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Then {
-    /// What is wanted next.
+    /// The next step.
     Go,
     /// The same again after that time, for the reason given.
     Pause(Duration, String),
@@ -319,7 +319,8 @@ impl Restoration {
         }
     }
 
-    /// What someone at the drive can mend is waited for once something is written; before that there is no need to.
+    /// Once something is written, the restore waits for conditions that someone at the drive can fix; before that it
+    /// need not.
     fn wait_for_people(&mut self, waits: String, why: &str, now: Instant) -> Then {
         match self.touched {
             true => self.pause(PAUSE, &waits, now),

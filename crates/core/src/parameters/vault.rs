@@ -32,7 +32,7 @@ pub struct Status {
 pub enum RestoreStage {
     /// The drive is read.
     Reading,
-    /// What would be written is known; the requester for it decides.
+    /// The plan is ready; the requester decides.
     Prepared,
     /// It may not be done: the reasons.
     Refused(Vec<String>),
@@ -84,7 +84,7 @@ struct State {
     holds: BTreeMap<Machine, Arc<Hold>>,
     /// Machines whose journal was searched for.
     looked_for: BTreeSet<Machine>,
-    /// Journals that belong to no drive, of which an event told.
+    /// Journals without a drive that an event has reported.
     orphans: BTreeSet<PathBuf>,
     readings: BTreeMap<Machine, Status>,
     /// The last reading of each drive since the gateway started, whether the disk took it or not.
@@ -165,8 +165,7 @@ impl Vault {
 
     /// A reading of that drive begins.
     ///
-    /// # Errors
-    /// The number of the one that goes on already.
+    /// # Errors The number of the one already in progress.
     pub fn begin(&self, drive: &Machine) -> Result<u64, u64> {
         let mut state = self.lock();
         if let Some(reading) = state.readings.get(drive).filter(|reading| reading.result.is_none()) {
@@ -205,7 +204,7 @@ impl Vault {
         }
     }
 
-    /// What keeps commands from that drive, the same under whatever configuration.
+    /// The hold of that drive, the same for any configuration.
     pub fn hold(&self, drive: &Machine) -> Arc<Hold> {
         self.lock().holds.entry(drive.clone()).or_default().clone()
     }
@@ -216,12 +215,12 @@ impl Vault {
         Some(JournalFile::new(state.store.as_ref()?.dir(), drive))
     }
 
-    /// Whether nobody has looked for a journal of that machine; from now on someone has.
+    /// Whether a journal of that machine has not been searched for yet; marks it as searched.
     pub fn is_new(&self, drive: &Machine) -> bool {
         self.lock().looked_for.insert(drive.clone())
     }
 
-    /// These journals belong to no drive now; those of which that is new.
+    /// Sets the journals without a drive. Returns the new ones.
     pub fn new_orphans(&self, orphans: BTreeSet<PathBuf>) -> BTreeSet<PathBuf> {
         let before = std::mem::replace(&mut self.lock().orphans, orphans.clone());
         orphans.difference(&before).cloned().collect()

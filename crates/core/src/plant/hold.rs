@@ -52,7 +52,7 @@ impl BusHandle {
         }
     }
 
-    /// After a reload: the holds of machines that are in none of these buses have ended, and that is told.
+    /// After a reload: ends the holds of machines that are on none of these buses, and reports that.
     pub fn end_holds(&self, after: &[&BusHandle], events: &Events, now: Instant, time: SystemTime) {
         if !self.queue.is_guarded() {
             return;
@@ -210,7 +210,7 @@ impl DriveHandle {
         why
     }
 
-    /// A client gave back what it had asked for, and nothing is sent for it.
+    /// A client withdrew its request, and nothing is sent for it.
     pub fn said_stop(&self, origin: &Origin) {
         if self.bus.queue.is_guarded() {
             self.bus.queue.lock().hold_said_stop(self.index, origin);

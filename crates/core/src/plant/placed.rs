@@ -51,7 +51,7 @@ impl Placed {
         }
     }
 
-    /// The same for a command of which that was the stop: the one answer tells the result of both parts.
+    /// The same for a command split into stop and rest: the one result covers both parts.
     pub(super) fn with_rest(
         mut self,
         answer: oneshot::Receiver<Answer>,
@@ -153,7 +153,7 @@ fn answer_of(arriving: &mut Arriving<Answer>, cx: &mut Context<'_>) -> Poll<Answ
     })
 }
 
-/// What arrives once, for anyone who asks, as often as they ask.
+/// A value that arrives once and can be read repeatedly.
 #[derive(Debug)]
 enum Arriving<T> {
     Awaited(oneshot::Receiver<T>),
@@ -176,7 +176,7 @@ impl<T: Clone> Arriving<T> {
     }
 }
 
-/// What a poll gives at once.
+/// The immediate result of a poll.
 fn now<T>(poll: impl FnOnce(&mut Context<'_>) -> Poll<T>) -> Option<T> {
     match poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(ready) => Some(ready),

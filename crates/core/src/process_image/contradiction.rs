@@ -38,7 +38,7 @@ impl Reading<'_> {
         }
     }
 
-    /// What the good samples say of the motor, each with its time: whether it turns.
+    /// Whether the motor turns, by each good sample, with its time.
     fn motion(&self) -> impl Iterator<Item = (Instant, bool)> + '_ {
         let bits = [(ModelPoint::Running, false), (ModelPoint::ZeroSpeed, true)];
         // A motor that runs may run at zero speed, and one that is not at zero speed may be near it.

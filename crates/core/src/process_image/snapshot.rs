@@ -54,7 +54,7 @@ impl Cadence {
         Cadence(interval.max(self.0 - self.0.div_ceil(4)).min(most))
     }
 
-    /// Three intervals: what was not heard again within is no longer good.
+    /// Three intervals: a value not read again within this time is no longer good.
     pub fn good_for(self) -> Duration {
         Duration::from_millis(300) * u32::from(self.0)
     }
@@ -516,8 +516,8 @@ impl Reading<'_> {
         self.decided().ok()
     }
 
-    /// What the points say that decide the state, in their order; else the quality of the first that says nothing. A
-    /// point that the family lacks decides nothing.
+    /// The state by the deciding points, in their order; else the quality of the first that is not good. A point that
+    /// the family lacks decides nothing.
     fn decided(&self) -> Result<State, Quality> {
         const DECIDING: [(ModelPoint, State); 3] = [
             (ModelPoint::Fault, State::Fault),
@@ -542,8 +542,8 @@ impl Reading<'_> {
         }
     }
 
-    /// Quality of the drive as a whole: that of its process data and, while its state is not known, that of the point
-    /// for want of which it is not.
+    /// Quality of the drive as a whole: that of its process data or, while its state is unknown, that of the deciding
+    /// point.
     pub fn overall(&self) -> Quality {
         if self.snapshot.fast_at.is_none() {
             Quality::Bad

@@ -80,7 +80,7 @@ impl Saved {
         serde_json::to_vec(self).unwrap_or_default()
     }
 
-    /// What a file says.
+    /// The content of a file.
     ///
     /// # Errors
     /// It is none of these; why.

@@ -47,7 +47,7 @@ impl Interlock {
         })
     }
 
-    /// What is known of the point where it does not hold, and whether it was ever read.
+    /// The actual state of the point if the interlock is not satisfied, and whether the point was ever read.
     fn differs(&self, around: &Around, now: Instant) -> Option<(String, bool)> {
         let Some(image) = around.images.get(&self.drive) else {
             return Some(("there is no such drive".to_string(), true));

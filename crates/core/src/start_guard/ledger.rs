@@ -47,7 +47,7 @@ pub(super) struct Entry {
     refused: BTreeMap<Reason, u64>,
 }
 
-/// Drives of which one is started after the other.
+/// Drives that are started one after the other.
 #[derive(Debug, Default)]
 struct Group {
     last: Option<Instant>,
@@ -126,7 +126,7 @@ impl Guards {
         self.lock().to_write(now, time)
     }
 
-    /// What belongs on disk, once there is something; none after `time`.
+    /// Waits for a state to save; none after `time`.
     pub(super) fn wait_to_write(&self, most: Duration) -> Option<(u64, Saved)> {
         let is_up_to_date = |ledger: &mut Ledger| !ledger.is_behind();
         let waited = self.changed.wait_timeout_while(self.lock(), most, is_up_to_date);
@@ -234,7 +234,7 @@ impl Ledger {
         self.groups.entry(entry.group.clone()).or_default().reserved += 1;
     }
 
-    /// What is decided and will not be written any more counts as made; with a number, only that command's.
+    /// Counts decided starts that will not be written as made; with a number, only that command's.
     pub(super) fn settle(&mut self, machine: &Machine, number: Option<u64>) {
         let Some(entry) = self.motors.get_mut(machine) else {
             return;

@@ -36,7 +36,7 @@ pub(super) struct Reserved {
     pub(super) at: Instant,
     /// It is not written later.
     pub(super) until: Instant,
-    /// What must be on disk before.
+    /// The generation that must be saved first.
     pub(super) generation: u64,
 }
 
@@ -161,7 +161,7 @@ impl Motor {
         self.reserved = Some(reserved);
     }
 
-    /// What is decided counts as made, whatever became of it.
+    /// Counts decided starts as made, whatever their result.
     pub(super) fn settle(&mut self) {
         if let Some(reserved) = self.reserved.take() {
             self.count(reserved.at);

@@ -18,7 +18,7 @@ const LOOK: Duration = Duration::from_millis(2);
 #[derive(Debug)]
 pub struct BusGuards {
     shared: Arc<Guards>,
-    /// By their place on the bus; none of one whose starts concern nobody.
+    /// By their place on the bus; none for a drive without guards.
     drives: PerDrive<Option<Guarding>>,
 }
 
@@ -153,7 +153,7 @@ impl BusGuards {
         })
     }
 
-    /// The turn of a command has come. What it starts is counted when it may go, and once only.
+    /// A command has its turn. Its start is counted once, when it may be sent.
     pub fn clear(&self, command: &Command, now: Instant) -> Clearance {
         let all = command.reach().iter();
         let started = all.filter(|drive| command.effect(**drive).run == Some(true));
@@ -300,7 +300,7 @@ impl BusGuards {
         }
     }
 
-    /// A command that was cleared has ended: what it did not write counts as made.
+    /// A cleared command has ended: its unwritten starts count as made.
     pub fn settle(&self, drive: DriveIndex, number: u64) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().settle(&of.machine, Some(number));
@@ -378,7 +378,7 @@ fn refusal(refused: Guarded) -> Refusal {
     }
 }
 
-/// What a reading shows of the motor; none while it does not say whether it runs.
+/// The motor's state in a reading; none while that does not show whether it runs.
 fn seen(reading: &Reading<'_>) -> Option<Seen> {
     let sample = reading.model(ModelPoint::Running);
     let running = sample.good()?.as_bool();

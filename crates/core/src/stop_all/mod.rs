@@ -254,7 +254,7 @@ pub fn not_standing<'d>(drives: impl IntoIterator<Item = &'d DriveHandle>, now: 
     controlled.filter(|drive| !stands(drive)).count()
 }
 
-/// What a client that stops all may do at a drive: it was asked before the order was taken.
+/// The authority for the stops: already checked when the stop all was accepted.
 const MAY_WRITE: Authority = Authority::Write;
 
 #[cfg(test)]

@@ -8,8 +8,8 @@ use crate::process_image::{Access, DriveSpec};
 /// Time that drives have to carry out a broadcast before the next request (MODBUS over Serial Line 1.02, 2.4.1).
 pub const BROADCAST_PAUSE: Duration = Duration::from_millis(100);
 
-/// The write that stops every drive of a line at once when it is sent to all of them: only where all of them are to be stopped,
-/// and it means that to each of them. Nobody answers it, so a stop of its own has to follow for every drive.
+/// The write that stops every drive of a line at once when it is sent to all of them: only where all of them are to be
+/// stopped, and it means that to each of them. It gets no reply, so a separate stop must follow for every drive.
 pub fn stop_of_line<'d>(protocol: Protocol, drives: impl IntoIterator<Item = &'d DriveSpec>) -> Option<RequestPdu> {
     let mut stops = drives
         .into_iter()

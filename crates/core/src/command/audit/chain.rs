@@ -68,7 +68,7 @@ impl<'de> Deserialize<'de> for Hash {
     }
 }
 
-/// What a line records.
+/// The kind of a line.
 #[derive(Debug, Serialize)]
 #[serde(tag = "entry", rename_all = "snake_case")]
 pub enum Entry<'e> {
@@ -194,7 +194,7 @@ pub fn tail(window: &[u8], is_whole: bool) -> Option<Tail> {
     None
 }
 
-/// What a crash left after the last entry, without its line end, and whether it has one.
+/// The fragment left by a crash after the last entry, without its line end, and whether it has one.
 pub fn fragment(rest: &[u8]) -> (Option<(u64, Hash)>, bool) {
     let (bytes, ended) = match rest.strip_suffix(b"\n") {
         Some(bytes) => (bytes, true),

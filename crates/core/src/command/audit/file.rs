@@ -72,7 +72,7 @@ struct Queues {
     lost: (u64, u64),
     /// Losses that the file has.
     recorded: (u64, u64),
-    /// Threads that were started; only the newest goes on.
+    /// Number of started threads; only the newest continues.
     threads: u64,
     end: bool,
 }
@@ -129,8 +129,7 @@ impl AuditFile {
     /// Starts the thread that writes in its place from now on, with what waits and what was lost. In a file that an
     /// earlier one still writes it begins when that one has ended.
     ///
-    /// # Errors
-    /// The system does not provide a thread. This one goes on.
+    /// # Errors The system does not provide a thread. This one continues.
     pub fn succeed(&self, options: AuditFileOptions) -> io::Result<AuditFile> {
         AuditFile::behind(self.shared.clone(), options)
     }

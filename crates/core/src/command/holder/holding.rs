@@ -18,7 +18,7 @@ const MOST_STOOD: usize = 256;
 pub enum Verb {
     /// Takes a free drive, or renews.
     Take,
-    /// Renews what it holds.
+    /// Renews its hold.
     Renew,
     /// Gives it back; of one who does not hold it without effect.
     Release,
@@ -49,7 +49,7 @@ impl Verb {
 /// Who has a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum HoldState {
-    /// Nobody.
+    /// No holder.
     Free,
     /// A client.
     Held,
@@ -384,7 +384,7 @@ impl Holding {
         self.local = local;
     }
 
-    /// Whether the local control place has it, as far as was told.
+    /// Whether it is under local control, as last reported.
     pub fn is_local(&self) -> bool {
         self.local
     }

@@ -51,8 +51,8 @@ impl KeptReservation {
         }
     }
 
-    /// Who it is for, and until when it goes on after a start at `now`, which is `time` on the calendar; nothing where
-    /// it has ended, or its rank is no more. Where the clock stands before the stop, all of it is left.
+    /// Who it is for, and until when it continues after a start at `now`, which is `time` on the calendar; none if it
+    /// has ended, or its rank no longer exists. If the clock is earlier than the stop, all of it is left.
     pub fn goes_on(&self, rules: &Rules, now: Instant, time: SystemTime) -> Option<(Claim, Instant)> {
         let rank = rules.ranks.iter().position(|rank| **rank == *self.rank)?;
         let passed = milliseconds(time).saturating_sub(self.stopped_ms);

@@ -4,7 +4,7 @@ use crate::codec::Table;
 use crate::command::{Order, written};
 use crate::drive::{ModelPoint, Profile, Source};
 
-/// What a command sets of what can be commanded by priorities.
+/// The prioritised points that a command sets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Effect {
     /// The run command.

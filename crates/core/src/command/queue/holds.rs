@@ -42,7 +42,8 @@ pub struct Unheld {
 }
 
 impl Holds {
-    /// The rules and the holding of a drive, and where it is told what happened; nothing while `[authority]` is off.
+    /// Calls `change` with the rules and the holding of a drive, and the list of its changes; none while `[authority]`
+    /// is off.
     fn with<T>(
         &mut self,
         drive: DriveIndex,
@@ -219,8 +220,7 @@ impl Pending {
             .with(drive, |holding, rules, _| holding.renew(&who, rules, now));
     }
 
-    /// Whether the silence of that client is the one that counts for supervision: it holds the drive, or did last, or nobody
-    /// ever did.
+    /// Whether supervision follows that client: it holds the drive, or was the last holder, or there was none.
     pub fn hold_renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
         let Some(holding) = self.holds.rules.as_ref().and_then(|_| self.holds.drives.get(&drive)) else {
             return true;

@@ -1,4 +1,4 @@
-//! What is passed on for a tool to several drives, or unchecked to one: its place among the other commands of each.
+//! Requests passed on for a tool to several drives, or unchecked to one: their place among the other commands of each.
 
 use std::time::Instant;
 
@@ -7,8 +7,8 @@ use crate::command::{BackgroundRequest, Command, Outcome, PassedOn, Touched, Urg
 use crate::drive::DriveIndex;
 
 impl Pending {
-    /// What is passed on and may go, in its order: nothing older waits for any drive that it reaches. A stop that cannot go now,
-    /// its drive being away, holds up nothing that reaches others.
+    /// The passed-on requests that may be sent, in order: nothing older waits for any drive that they reach. A stop
+    /// that cannot be sent because its drive is offline does not hold up requests that also reach others.
     pub(super) fn passed_on(&self, may: &mut impl FnMut(&Command) -> bool) -> Vec<u64> {
         if self.waiting.iter().all(|c| c.passed_on.is_none()) {
             return Vec::new();
@@ -26,7 +26,7 @@ impl Pending {
         all
     }
 
-    /// What is passed on and goes as a command, since a command waits after it.
+    /// Passed-on requests that are sent as commands because a command waits for them.
     pub(super) fn pressed(&self) -> Vec<u64> {
         let mut waits: Vec<DriveIndex> = Vec::new();
         let mut pressed = Vec::new();

@@ -54,7 +54,7 @@ pub struct Drive {
     pub(super) run_paused: [u16; 2],
     pub(super) silent_at: Option<Instant>,
     pub(super) mains: InPhase,
-    /// Requests to a drive of which nothing was ever heard; `None` once there was something.
+    /// Requests to a drive that has never replied; `None` once it has.
     pub(super) in_vain: Option<u16>,
 }
 
@@ -83,7 +83,7 @@ impl Drive {
         f64::from(self.slowest.each(0).max().unwrap_or_default()) / 10.0
     }
 
-    /// How often a drive was asked of which nothing was ever heard.
+    /// Requests to a drive that has never replied.
     pub fn in_vain(&self) -> Option<u16> {
         self.in_vain
     }

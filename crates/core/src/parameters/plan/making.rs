@@ -20,7 +20,7 @@ pub(super) struct Making<'a> {
     risks: Vec<Risk>,
 }
 
-/// How an identification ends of which a point was not read.
+/// End of an identification with an unread point.
 pub const NOT_KNOWN: &str = "not known";
 
 /// A parameter once the plan is carried out.
@@ -314,7 +314,7 @@ impl<'a> Making<'a> {
         }
     }
 
-    /// What the drive would hold in the end must not contradict itself, unless another drive held it that way.
+    /// The final values must not violate limits, unless the other drive violated them, too.
     fn check_limits(&mut self) {
         let profile = self.profile;
         for limit in &profile.parameters.rules.limits {
