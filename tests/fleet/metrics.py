@@ -9,6 +9,7 @@ was missed, or the overview does not show those ten first.
 
 import argparse
 import asyncio
+import collections
 import json
 import os
 import pathlib
@@ -256,9 +257,8 @@ def dashboards(site):
                 found = query_api(site.port, "query_range", query=expression, start=now - 1800, end=now, step=15)["result"]
             times.append((time.monotonic() - began, title))
             # At any one moment.
-            count = len(found) if is_instant else max((sum(1 for each in found if each["values"][-1] == last)
-                                                       for last in [each["values"][-1] for each in found][:1]), default=0)
-            most = max(most, (count, title))
+            moments = collections.Counter(at for each in found for at, _ in each.get("values", [each.get("value")]))
+            most = max(most, (max(moments.values(), default=0), title))
         slowest = max(times)
         print(f"dashboard {name}: {len(times)} queries, {sum(t for t, _ in times):.2f} s together, the slowest {slowest[0]:.2f} s "
               f"({slowest[1]}); at most {most[0]} series ({most[1]})", flush=True)
