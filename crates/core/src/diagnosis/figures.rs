@@ -14,7 +14,7 @@ use crate::codec::describe::{self, Kind};
 use crate::codec::{LineFormat, Protocol, Request};
 use crate::drive::{DriveIndex, PerDrive};
 
-/// Memory of a drive, at most; a line has 2 KiB besides, at most.
+/// Maximum memory per drive; a line has at most 2 KiB in addition.
 pub const BYTES_PER_DRIVE: usize = 512;
 /// So many requests in a row without a reply are an absence: the drive is off, not badly connected.
 const ABSENCE: u16 = 12;
@@ -442,7 +442,7 @@ impl Figures {
         let asked = self.last.map(|(drive, _)| drive);
         let drive = match answering {
             Answering::Address(address) => self.drives.position(|drive| drive.address == address),
-            // A frame of N2 names nobody: it is late if anybody was silent lately.
+            // An N2 frame has no address: it is a late reply if any drive was silent recently.
             Answering::Anybody => {
                 let silent = self.drives.enumerate().filter(|(_, drive)| drive.was_silent(at));
                 silent

@@ -7,7 +7,7 @@
 //! - `known`: what is known of each drive, and which stand out.
 //! - [`rules`]: one rule for each cause. A rule that compares drives says nothing until most of them were asked often enough.
 //! - [`hold`]: a verdict comes and goes only by lasting evidence.
-//! - [`words`]: how causes are told, and what to do.
+//! - [`words`]: the texts of causes and remedies.
 
 pub mod counters;
 pub mod figures;
@@ -51,7 +51,7 @@ pub enum Cause {
     ReplyStartLost,
     /// Requests do not arrive whole.
     RequestEndLost,
-    /// The adapter hears its own request.
+    /// The adapter receives its own request.
     Echo,
     /// A USB adapter delivers in steps of 16 ms.
     LatencyTimer,
