@@ -59,7 +59,7 @@ pub struct BackgroundRequest {
     pub expires: Instant,
     /// Its ticket.
     pub ticket: Ticket,
-    /// What a request has besides that which is passed on for someone else; none of one of the gateway itself.
+    /// The extra data of a forwarded request; none for a request of the gateway itself.
     pub passed_on: Option<PassedOn>,
 }
 
@@ -125,7 +125,7 @@ impl BackgroundRequest {
         self.ticket.origin().kind == SourceKind::Schedule
     }
 
-    /// Whether the tool for which it is passed on has gone, or asked for something else.
+    /// Whether the tool that sent it has disconnected, or has sent another request.
     pub fn is_unwanted(&self) -> bool {
         self.passed_on
             .as_ref()

@@ -491,8 +491,8 @@ impl Figures {
         [lock(&self.arrivals), lock(&self.paced)]
     }
 
-    /// For each frequency of the mains: damaged replies that have one before, and how much closer in phase they are to it than
-    /// the sound replies of the same drive, -2 to 2.
+    /// For each frequency of the mains: damaged replies that have one before, and how much closer in phase they are to
+    /// it than the valid replies of the same drive, -2 to 2.
     pub fn in_phase(&self) -> [(f32, f32); MAINS.len()] {
         let of = |place: usize| {
             let sums = self.drives.iter().filter_map(|drive| drive.mains.sums.get(place));
