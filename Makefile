@@ -59,14 +59,14 @@ bench: ## Run the benchmarks
 	cargo bench --locked
 
 FUZZ_RUNS ?= 200000
-fuzz: ## Run every fuzz target FUZZ_RUNS times; wants nightly Rust and cargo-fuzz
+fuzz: ## Run every fuzz target FUZZ_RUNS times; needs nightly Rust and cargo-fuzz
 	for target in $$(cargo +nightly fuzz list); do \
 		mkdir -p fuzz/corpus/$$target; \
 		cargo +nightly fuzz run -s none "$$target" fuzz/corpus/$$target fuzz/seeds/$$target -- -runs=$(FUZZ_RUNS) -max_len=4096; \
 	done
 
 WORLD := cargo test --locked --profile world --test world
-check: ## Run the seeded world with its fixed seeds: virtual time, no outside tools
+check: ## Run the seeded world with its fixed seeds: virtual time, no external tools
 	$(WORLD)
 
 SEEDS ?= 1000
@@ -74,15 +74,15 @@ world: ## Run SEEDS new worlds, or with WORLD_SEED=n that one with its history
 	WORLD_SEEDS=$(SEEDS) $(WORLD) fixed -- --nocapture
 
 ONLY ?=
-mutants: ## Put faults into the core on purpose; the seeded world must find each. ONLY=name runs one
+mutants: ## Insert known faults into the core; the seeded world must find each. ONLY=name runs one
 	tests/world/mutants.py $(ONLY)
 
 HOURS ?= 2
-soak: build tools ## Run the gateway for HOURS under faults, floods and hostile clients, with its figures checked every minute
+soak: build tools ## Run the gateway for HOURS under faults, floods and hostile clients; its metrics are checked every minute
 	tests/soak/soak.py --hours $(HOURS)
 
 N ?= 100
-fleet: tools build ## Run N gateways with one broker and one Prometheus on this machine; prints what they cost
+fleet: tools build ## Run N gateways with one broker and one Prometheus on this machine; prints their resource use
 	.tools/venv/bin/python tests/fleet/fleet.py --gateways $(N)
 
 PARTS ?=
@@ -93,7 +93,7 @@ fleet-rollout: tools build ## Roll out good and bad configurations to 20 gateway
 	.tools/ansible/bin/python tests/fleet/rollout.py $(addprefix --part ,$(PARTS))
 
 BROKERS ?= mosquitto rmqttd ejabberd
-fleet-cluster: tools build ## Run gateways with brokers that are clusters, and harm their nodes; builds rmqttd, which takes many minutes. BROKERS=ejabberd runs that one
+fleet-cluster: tools build ## Run gateways with clustered brokers, and fail their nodes; builds rmqttd, which takes many minutes. BROKERS=ejabberd runs that one
 	tests/fleet/install.sh $(BROKERS)
 	.tools/venv/bin/python tests/fleet/cluster.py $(addprefix --broker ,$(BROKERS))
 
@@ -126,11 +126,11 @@ image: ## Build the container images into dist/ for ARCHITECTURES
 	@deploy/package/tools.sh image $(ARCHITECTURES)
 	deploy/package/image.sh $(ARCHITECTURES)
 
-release: ## Build all that a release consists of into dist/
+release: ## Build all files of a release into dist/
 	@deploy/package/tools.sh release $(ARCHITECTURES)
 	deploy/package/release.sh $(ARCHITECTURES)
 
-test-package: ## Install, upgrade, downgrade, remove and purge the packages in a booted Debian, ARM under qemu; wants root
+test-package: ## Install, upgrade, downgrade, remove and purge the packages in a booted Debian, ARM under qemu; needs root
 	@deploy/package/tools.sh test-package $(ARCHITECTURES)
 	deploy/package/deb.sh $(ARCHITECTURES)
 	for each in $(ARCHITECTURES); do deploy/package/test/package.sh dist/drivegate_*_"$$each".deb; done
@@ -139,11 +139,11 @@ test-static: ## Start the static binaries of ARCHITECTURES, ARM under qemu: the 
 	@deploy/package/tools.sh test-static $(ARCHITECTURES)
 	deploy/package/test/static.sh $(ARCHITECTURES)
 
-test-image: ## Build the images and run them by runc, ARM under qemu; wants root
+test-image: ## Build the images and run them with runc, ARM under qemu; needs root
 	@deploy/package/tools.sh test-image $(ARCHITECTURES)
 	deploy/package/image.sh $(ARCHITECTURES)
 	for each in $(ARCHITECTURES); do deploy/package/test/image.sh dist/drivegate_*_image_"$$each".tar; done
 
-clean: ## Remove everything that was built or installed here
+clean: ## Remove everything built or installed here
 	cargo clean
 	rm -rf .tools dist

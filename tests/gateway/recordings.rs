@@ -87,7 +87,7 @@ fn a_recording_by_command_is_listed_shown_and_exported() {
     assert_eq!(status, 400);
     assert!(refused.contains("it is `json`, `csv` or `pcap`"), "{refused}");
     site.until_metric("drivegate_recordings_total{trigger=\"command\"} 1");
-    // A file that is cut short is told of, with the place.
+    // A truncated file is reported, with the place.
     let file = site.file("state/recordings").join(format!("{id}.dgrec"));
     let bytes = fs::read(&file).unwrap();
     fs::write(site.file("half.dgrec"), &bytes[..bytes.len() / 2]).unwrap();
@@ -96,7 +96,7 @@ fn a_recording_by_command_is_listed_shown_and_exported() {
         .unwrap();
     let told = String::from_utf8(half.stderr).unwrap();
     assert_eq!(half.status.code(), Some(1));
-    assert!(told.contains("cut short, at byte "), "{told}");
+    assert!(told.contains("it is truncated, at byte "), "{told}");
     let unknown = drivegate(&["recordings", "show", "x", "--config", &site.config()])
         .output()
         .unwrap();

@@ -139,7 +139,7 @@ fn nothing_is_restored_without_leave_and_nothing_is_left_to_differ_with_it() {
     write_registers(plant.site.modbus, 1, 33_024, &[1]);
     plant.site.until_state("pump-1", "running");
     let (code, _, said) = plant.ran(&["restore", &before, "pump-1", "--force", "--yes"]);
-    assert_eq!((code, said.contains("the motor runs")), (Some(1), true), "{said}");
+    assert_eq!((code, said.contains("the motor is running")), (Some(1), true), "{said}");
     assert!(!plant.held());
     write_registers(plant.site.modbus, 1, 33_024, &[0]);
 }

@@ -73,7 +73,7 @@ fn starts_are_refused_and_wait_and_stops_pass() {
     assert_eq!((status, &answer["result"]), (409, &json!("interlocked")), "{answer}");
     let message = answer["error"]["message"].as_str().unwrap();
     assert!(
-        message.contains("`running` of fan-2 must be true and is false"),
+        message.contains("`running` of fan-2 must be true, but is false"),
         "{message}"
     );
     let refused = mbpoll_write(site.modbus, 1, COMMAND, &[1]).unwrap_err();

@@ -26,7 +26,7 @@ pub enum Apdu<'a> {
         accepts: Accepts,
         /// Its number.
         invoke: u8,
-        /// What is asked for.
+        /// What is requested.
         service: u8,
         /// Its content.
         data: &'a [u8],

@@ -1,4 +1,4 @@
-//! What a device is made of. The description of an object stands still; its value comes from the application when it is asked for.
+//! The objects of a device. The description of an object is fixed; its value is requested from the application.
 
 mod properties;
 

@@ -422,7 +422,7 @@ impl CommandRun {
         !self.begun || (self.tries.busy > 0 && !self.tries.in_doubt)
     }
 
-    /// How it ends when it is taken back while it is owed.
+    /// Its result when it is withdrawn before it is due.
     pub fn taken_back(&self) -> Outcome {
         match self.begun {
             true => Outcome::Exception(Exception::BUSY),

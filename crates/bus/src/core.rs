@@ -175,7 +175,7 @@ impl BusCore {
             ..Connection::default()
         };
         self.report.reconnected();
-        // What came meanwhile woke nobody.
+        // Commands that arrived meanwhile did not wake the bus.
         self.command_came();
     }
 

@@ -1,4 +1,4 @@
-//! The master's state of one drive, besides its image, polls and N2 session.
+//! The master's state of one drive, except its image, polls and N2 session.
 
 use std::time::{Duration, Instant};
 
@@ -137,7 +137,7 @@ impl DriveState {
                 };
                 match run.next(&self.words, profile, running, now) {
                     Next::Send(step) => {
-                        // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.
+                        // A stop does not wait: it is sent at once, even if a late reply may still arrive.
                         let blocked = self.late.blocks(&step.pdu, now).max(n2_late.blocks(&step.pdu, now));
                         if let Some(until) = blocked.filter(|_| run.waits_for_late()) {
                             run.hold_up();

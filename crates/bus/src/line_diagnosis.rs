@@ -89,7 +89,7 @@ impl LineDiagnosis {
         directions.take(3).map(|direction| format!("; {direction}")).collect()
     }
 
-    /// A request goes onto a line that was silent for so long.
+    /// A request is sent after that much silence on the line.
     pub(super) fn sending(&mut self, gap: Duration) {
         self.gap = gap;
     }

@@ -372,7 +372,7 @@ impl Master {
         }
     }
 
-    /// The turn goes onto the line at `now`.
+    /// The turn is sent at `now`.
     pub fn sending(&mut self, turn: &Turn, now: Instant) -> Sending {
         if let Purpose::Command { slot, step, .. } = &turn.purpose
             && let Some(drive) = self.drives.get_mut(turn.drive)

@@ -209,7 +209,7 @@ pub fn n2_look_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
     forms.is_none_or(|(a, b)| a.is_like(b) || b.is_like(a))
 }
 
-/// The first whole and sound frame, and the bytes up to its end.
+/// The first complete, valid frame, and the bytes up to its end.
 fn frame(bytes: &[u8]) -> Option<(usize, Answer)> {
     let begin = bytes.iter().position(u8::is_ascii_graphic)?;
     let frame = bytes.get(begin..)?;

@@ -21,7 +21,7 @@ pub const MOST_POLLS: u8 = 16;
 enum Phase {
     /// Identified never, or not since it went away.
     Unknown,
-    /// It has said that it waits for Identify.
+    /// It has reported that it waits for Identify.
     Waiting,
     /// It reports what has changed: polls left, and whether the next one acknowledges the report before.
     Reporting { left: u8, again: bool },

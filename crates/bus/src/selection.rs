@@ -12,7 +12,7 @@ use crate::process_image::Reading;
 
 /// Comparisons that differ, of one and the same selection, until it counts as changed.
 const DIFFERING: u8 = 3;
-/// Comparisons in a row that agree until process data is believed again.
+/// Matching comparisons in a row after which process data is trusted again.
 const AGREEING: u8 = 2;
 /// First and longest pause before a value is compared again that proved nothing, such as 0 of a motor that stands.
 const PAUSE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(600));

@@ -170,7 +170,7 @@ impl StartGate {
         self.guards.may_write(drive, number, now).is_ok()
     }
 
-    /// A write goes onto the line, of a command that starts the motor or of another one.
+    /// A write is sent, of a command that starts the motor or of another one.
     pub(super) fn written(
         &self,
         index: DriveIndex,

@@ -71,7 +71,7 @@ impl Lease {
     }
 }
 
-/// The inputs of supervision besides process data.
+/// The inputs of supervision, except process data.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Orders {
     /// Until when a client's queued or started command holds the lease.

@@ -24,7 +24,7 @@ const SMALL_BURST: usize = 4096;
 const OF_EACH_DRIVE: usize = 16;
 /// Events of drives and buses kept for late readers.
 const KEPT: usize = 4096;
-/// Refused commands kept besides them.
+/// Refused commands kept in addition.
 const REFUSALS_KEPT: usize = 512;
 
 /// The kind of an event.
@@ -377,7 +377,7 @@ impl Events {
         self.publish_in(&mut self.store(), event);
     }
 
-    /// Under the lock, so that listeners hear the events in the order of their ids.
+    /// Under the lock, so that listeners receive the events in the order of their ids.
     fn publish_in(&self, store: &mut Store, mut event: Event) {
         store.number += 1;
         event.id = store.number;

@@ -95,9 +95,9 @@ pub struct DriveSpec {
     pub turnaround: Duration,
     /// Minimum and maximum frequency, Hz, where the drive's own parameters cannot be read.
     pub frequency_range: Option<RangeInclusive<f64>>,
-    /// Values besides faults at which a recording is made.
+    /// Values, in addition to faults, that trigger a recording.
     pub triggers: Vec<PointTrigger>,
-    /// The permitted raw writes besides writable points.
+    /// The permitted raw writes in addition to writable points.
     pub raw_writes: RawWrites,
     /// The permitted access to its parameters.
     pub params: ParamsAccess,

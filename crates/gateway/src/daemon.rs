@@ -325,7 +325,7 @@ impl Daemon {
         let order = |name: &str| settings.buses.iter().position(|b| b.spec.name == name);
         kept.sort_by_key(|(bus, _)| order(&bus.spec.name));
         self.show(settings, &kept);
-        // Last: anyone who hears of a bus finds it in the plant.
+        // Last: whoever is notified of a bus finds it in the plant.
         for (bus, task) in &mut kept {
             if let Some(before) = handovers.remove(&bus.spec.name) {
                 tracing::info!(target: "drivegate::daemon", bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "starting the bus");

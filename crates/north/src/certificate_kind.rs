@@ -1,5 +1,5 @@
-//! The properties that decide whether a certificate is accepted, besides its signature: version, key, names, usages.
-//! For checks before a connection and messages after failed ones.
+//! The properties that decide whether a certificate is accepted, in addition to its signature: version, key, names,
+//! usages. For checks before a connection and messages after failed ones.
 
 use rustls_pki_types::{IpAddr, ServerName};
 use x509_cert::certificate::{Certificate, TbsCertificate, Version};

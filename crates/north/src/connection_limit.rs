@@ -156,7 +156,7 @@ impl From<Authority> for Rights {
     }
 }
 
-/// Why the gateway closes a connection that could go on.
+/// Why the gateway closes a working connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(super) enum CloseReason {
     /// See [`decide`].

@@ -204,7 +204,7 @@ pub(super) fn unusable(error: &rustls::Error, chain: &[CertificateDer<'_>]) -> I
         rustls::Error::InconsistentKeys(_) => TlsFile::Key.fault(FileProblem::KeyMismatch),
         _ if is_old => TlsFile::Certificate.fault(FileProblem::OldVersion { name }),
         _ if !key.signs => TlsFile::Certificate.fault(FileProblem::UnsupportedKey { name, kind: key.name }),
-        // All that is said of a key that cannot be read.
+        // The only message for a key that cannot be read.
         rustls::Error::General(_) => TlsFile::Key.fault(FileProblem::UnknownKey),
         rustls::Error::InvalidCertificate(CertificateError::Other(OtherError(cause))) => {
             TlsFile::Certificate.fault(FileProblem::Unusable(cause.to_string()))

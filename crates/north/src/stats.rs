@@ -275,7 +275,7 @@ pub enum SlotOutcome {
     Abandoned,
     /// No reply arrived within a second.
     Late,
-    /// No sound frame.
+    /// Not a valid frame.
     Broken,
 }
 

@@ -94,7 +94,7 @@ pub fn open_frame(frame: &[u8]) -> Option<(u8, Vec<u8>)> {
     parse(frame.get(noise(frame)..)?).ok()
 }
 
-/// The address and PDU of a frame that is whole but for its LRC, as far as they can be believed.
+/// The address and PDU of a frame without its LRC, as far as they can be trusted.
 pub fn damaged_frame(frame: &[u8]) -> Option<(u8, Vec<u8>)> {
     let body = body(frame.get(noise(frame)..)?).ok()?;
     check(&body).err()?;

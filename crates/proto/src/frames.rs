@@ -126,7 +126,7 @@ impl Frames {
         let mut incomplete = false;
         for at in 0..self.bytes.len() {
             let rest = self.bytes.get(at..).unwrap_or_default();
-            // Behind more than a glitch no reply is believed: the request that it belongs to may be among the garbage.
+            // After more than a glitch no reply is accepted: the request that it belongs to may be in the garbage.
             let open = open.filter(|_| at <= GLITCH);
             match rtu_at(rest, open) {
                 Look::Is(length, cut) if at <= GLITCH && matches!(cut, Cut::Reply { .. }) => {

@@ -147,7 +147,7 @@ impl Protocol {
         }
     }
 
-    /// Whether a reply from `address` that begins with this character may be believed although garbage came before it.
+    /// Whether a reply from `address` that begins with this character may be accepted although garbage preceded it.
     /// Never in N2: its reply has no address, and its check code 8 bits.
     pub fn may_begin_behind_garbage(self, address: u8, character: u8) -> bool {
         match self {
@@ -157,8 +157,8 @@ impl Protocol {
         }
     }
 
-    /// Whether bytes that are no sound reply begin as the reply to `request` does, so that they were that reply, mangled on
-    /// the line, and no noise before it. An N2 reply shows nothing of its request: there the length has to do.
+    /// Whether invalid bytes begin like the reply to `request`, so that they were that reply, damaged on the line, and
+    /// no noise before it. An N2 reply shows nothing of its request: there the length has to do.
     pub fn begins_reply(self, request: &Request, bytes: &[u8]) -> bool {
         let head = [request.address, request.pdu.function()];
         match self {
@@ -175,7 +175,7 @@ impl Protocol {
         }
     }
 
-    /// The address and PDU of any sound Modbus frame; `None` in N2, whose frames hold none.
+    /// The address and PDU of any valid Modbus frame; `None` in N2, whose frames have none.
     pub fn open_frame(self, frame: &[u8]) -> Option<(u8, Vec<u8>)> {
         match self {
             Protocol::ModbusRtu => rtu::open_frame(frame).map(|(address, pdu)| (address, pdu.to_vec())),

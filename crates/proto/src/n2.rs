@@ -8,9 +8,9 @@
 //! | AO n | holding register | 2 (n - 1) and the next, float, high word first | read of attribute 3; written by override |
 //! | ADI n | input register | 0x4000 + n - 1 | read of attribute 2 |
 //!
-//! A request that means no object has no frame: it never goes on the line. What no manual says stands in one table,
-//! see [`ASSUMPTIONS`]. The master's side is here; [`command`] has the frames themselves, which a simulated drive reads
-//! and answers with the same types.
+//! A request without an object has no frame: it is never sent. What no manual says stands in one table, see
+//! [`ASSUMPTIONS`]. The master's side is here; [`command`] has the frames themselves, which a simulated drive reads and
+//! answers with the same types.
 
 pub mod assumptions;
 pub mod command;
@@ -43,7 +43,7 @@ pub const RESPONSE_TIMEOUT: Duration = Duration::from_millis(250);
 /// Tries after the first (reference/n2.md 4: three tries).
 pub const RETRIES: u32 = 2;
 
-/// Session messages to a drive, besides reads and writes.
+/// Session messages to a drive, in addition to reads and writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Session {
     /// Who is there? A drive that has restarted answers nothing else.
@@ -212,7 +212,7 @@ pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     let used = begin + length + 1;
     let line = frame.get(..length).unwrap_or_default();
     match line.first() {
-        // The echo of a request, or another master's: nobody's answer.
+        // The echo of a request, or another master's request: not a reply.
         Some(b'>') => Decoded::Foreign { used },
         _ => match reply_in(request, line) {
             Ok(reply) => Decoded::Reply { used, reply },

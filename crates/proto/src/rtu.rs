@@ -81,7 +81,7 @@ pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     }
 }
 
-/// A frame of a length that its function does not have is nobody's answer, yet sound.
+/// A frame whose length does not fit its function is valid, but not a reply.
 fn foreign_or(bytes: &[u8], why: &'static str) -> Decoded {
     match open_frame(bytes) {
         Some(_) => Decoded::Foreign { used: bytes.len() },
@@ -100,7 +100,7 @@ fn frame_len(request: &Request, bytes: &[u8]) -> Option<usize> {
         22 => 7,
         43 => return device_identification_len(bytes),
         _ if own => request.pdu.reply_len(),
-        // A function that nobody was asked for: its length is not known, take the shortest frame.
+        // A function that was not requested: its length is not known, take the shortest frame.
         _ => 2,
     };
     Some(pdu + OVERHEAD)

@@ -274,7 +274,7 @@ fn proved(settings: &Settings) -> BTreeMap<&str, usize> {
     proved
 }
 
-/// The profiles in use that nobody has confirmed on hardware.
+/// The profiles in use that are not tested on hardware.
 fn unverified(settings: &Settings) -> BTreeSet<&str> {
     let drives = settings.buses.iter().flat_map(|bus| &bus.drives);
     let profiles = drives.map(|drive| &drive.profile).filter(|profile| !profile.verified);

@@ -188,7 +188,7 @@ impl DemoPlace {
         }
     }
 
-    /// The local socket; without a configuration file nobody could use it.
+    /// The local socket; without a configuration file it would not be usable.
     fn socket(&self) -> String {
         let socket = self.written.as_ref().map(Written::socket);
         socket.map_or_else(String::new, |socket| socket.display().to_string())

@@ -22,7 +22,7 @@ use crate::north::http::messages::{Expected, ExpectedDrive};
 use crate::north::local::SocketPath;
 use crate::process_image::DriveSpec;
 
-// The options by which a command is told its drive.
+// The options that select the drive of a command.
 #[derive(Debug, clap::Args)]
 pub(super) struct OneDrive {
     #[command(flatten)]

@@ -73,7 +73,7 @@ fn of(name: &str, source: &str) -> Result<String, (String, Finding)> {
     Ok(yaml::document(&nested(GROUP, nested("hosts", host))))
 }
 
-/// The first string that Ansible would not leave as it is, with its key.
+/// The first string that Ansible would change, with its key.
 fn template<'v>(value: &'v Value, key: &str) -> Option<(String, &'v str)> {
     match value {
         Value::String(text) if TEMPLATES.iter().any(|begin| text.contains(begin)) => Some((key.to_string(), text)),

@@ -1,4 +1,4 @@
-//! `drivegate listen`: finds out what is said on a line that another master owns, without a byte of its own.
+//! `drivegate listen`: analyses the traffic of a line that another master owns, without sending a byte.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

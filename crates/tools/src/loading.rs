@@ -95,7 +95,7 @@ impl Drop for Reader {
 #[derive(Debug, Default)]
 pub(super) struct Loads {
     loading: Option<Loading>,
-    /// Another one was asked for meanwhile.
+    /// Another one was requested meanwhile.
     again: bool,
     readers: Arc<AtomicUsize>,
 }
@@ -132,7 +132,7 @@ impl Loads {
         self.loading.is_some()
     }
 
-    /// Whether a reload was asked for while the last one was being read.
+    /// Whether a reload was requested while the last one was being read.
     pub(super) fn is_wanted_again(&mut self) -> bool {
         std::mem::take(&mut self.again)
     }

@@ -194,7 +194,7 @@ fn built_in(family: &str) -> Result<std::sync::Arc<crate::drive::Profile>, ExitC
     })
 }
 
-/// Pause between two lines of progress that nobody watches on a terminal.
+/// Interval of progress lines when the output is not a terminal.
 const SAID_EVERY: Duration = Duration::from_secs(60);
 
 /// One line on a terminal, kept up to date; elsewhere a line once a minute.

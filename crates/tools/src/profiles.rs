@@ -317,7 +317,7 @@ fn assumptions(profile: &Profile) -> String {
     report::lines(&table)
 }
 
-/// Points that a drive with a new fault is asked for.
+/// Points that are read when a drive has a new fault.
 fn on_fault(profile: &Profile) -> Vec<&str> {
     let points = profile.on_fault.iter().filter_map(|index| profile.points.get(*index));
     points.map(|point| point.name.as_str()).collect()
@@ -387,7 +387,7 @@ fn remarks(profile: &Profile, point: &Point) -> String {
     parts.join("; ")
 }
 
-/// That nobody has seen the profile right on hardware; empty otherwise.
+/// The note that the profile is not tested on hardware; empty otherwise.
 fn unverified(profile: &Profile) -> &'static str {
     match profile.verified {
         true => "",

@@ -96,7 +96,7 @@ async fn trace(args: &Args) -> Result<(), String> {
     ended.and(closed)
 }
 
-/// Whether to go on.
+/// Whether to continue.
 #[derive(Debug, PartialEq, Eq)]
 enum More {
     Yes,

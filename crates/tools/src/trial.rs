@@ -40,7 +40,7 @@ pub(super) struct Args {
     write: Option<PathBuf>,
 }
 
-/// Whether a signal has asked for the end.
+/// Whether a signal has requested the end.
 #[derive(Debug, Clone, Default)]
 struct Stop {
     flag: Arc<AtomicBool>,

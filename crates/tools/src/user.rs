@@ -81,7 +81,7 @@ impl UsersFile {
 
 fn add(file: &UsersFile, name: &str) -> Result<String, String> {
     if file.path.exists() {
-        // Before a password is asked for.
+        // Before the password prompt.
         file.open().list::<User>()?;
     }
     let user =

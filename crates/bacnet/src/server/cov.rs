@@ -15,7 +15,7 @@ const MOST_OF_DEVICE: usize = 128;
 /// How long an acknowledgement is awaited, and how often.
 const WAIT: Duration = Duration::from_secs(3);
 const TRIES: u8 = 3;
-/// Notifications in a row that found nobody, after which a subscription without end is over.
+/// Undelivered notifications in a row that end a subscription without a lifetime.
 const LOST: u8 = 3;
 
 /// What is subscribed to, and by whom.

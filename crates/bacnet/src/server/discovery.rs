@@ -28,7 +28,7 @@ impl Server {
                 Ok((range, sought)) => self.who_has(source, target, range, &sought, app, now),
                 Err(_) => self.counters.discarded += 1,
             },
-            // The clock is that of the host; what others say of themselves is not asked for.
+            // The clock is the host's; announcements of other devices are not needed.
             unconfirmed::TIME_SYNCHRONIZATION | unconfirmed::UTC_TIME_SYNCHRONIZATION => {}
             _ => {}
         }

@@ -32,7 +32,7 @@ use segments::Segments;
 use traffic::Traffic;
 use writing::Exchanges;
 
-/// What a server is told once.
+/// The settings of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Options {
     /// Its address.
@@ -159,7 +159,7 @@ impl Server {
         server
     }
 
-    /// Shows other devices from now on. Subscriptions to what is still there go on.
+    /// Replaces the devices. Subscriptions to objects that still exist continue.
     pub fn set_devices(&mut self, devices: Vec<Arc<Device>>) {
         let places = || devices.iter().enumerate();
         self.by_instance = places().map(|(place, device)| (device.instance, place)).collect();

@@ -23,7 +23,7 @@ const NEVER_TOLD: [PropertyId; 6] = [
 /// Longest value of a notification, which comes in one message.
 const LONGEST: usize = 1024;
 
-/// The properties that a subscription is told.
+/// The properties that a subscription reports.
 fn told_of(of: &Context<'_>, one: Option<PropertyRef>) -> Vec<PropertyRef> {
     let whole = |property: PropertyId| PropertyRef { property, index: None };
     match one {
@@ -90,7 +90,7 @@ impl Server {
             let (number, flags) = of.figure();
             for one in told_of(of, key.property) {
                 let mut value = Writer::default();
-                // What is not there any more, or too long by now, is told as nothing.
+                // Values that no longer exist, or are too long now, are sent as empty.
                 if property(&mut value, of, one, &self.environment).is_err() || value.bytes().len() > LONGEST {
                     value = Writer::default();
                 }

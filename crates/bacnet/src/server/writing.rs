@@ -63,7 +63,7 @@ struct Exchange {
     /// The write that is under way.
     current: Option<(ObjectId, PropertyRef)>,
     failed: Option<(Failure, Option<(ObjectId, PropertyRef)>)>,
-    /// Its client asked for something else by the same number since.
+    /// Its client has since sent another request with the same number.
     mute: bool,
     state: State,
 }

@@ -324,7 +324,7 @@ pub(super) fn is_prepared(profile: &Profile, words: &KnownWords, running: bool) 
     own.is_some_and(|own| control.is_run(control.at, own))
 }
 
-/// The request of a word with the control word as it is known; the read of that where it has to be asked for.
+/// The request of a word with the control word as it is known; or the read of the control word where it is not known.
 pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Known) -> Made {
     let Some(control) = profile.control.as_ref() else {
         return Made::Nothing;
@@ -334,7 +334,7 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
     if asks_first(word, control, own, known) {
         return Made::Send(read_of(at));
     }
-    // A word that nobody can ask for may have been taken away elsewhere: a motor that stands keeps standing.
+    // A word that cannot be read may have been cleared elsewhere: a stopped motor stays stopped.
     let is_told = known.check == Check::Read;
     let pulsed = match word {
         Word::ResetLow(setting) | Word::ResetHigh(setting) | Word::ResetEnd(setting) => Some(setting),
@@ -394,8 +394,8 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
     }
 }
 
-/// Whether the drive is asked for its word first: where a bit stays as it has it. A stop and a start do without, unless the other
-/// bits of the word are to be kept and it is not known.
+/// Whether the word is read from the drive first: where a bit keeps its value. A stop and a start do without, unless
+/// the other bits of the word are to be kept and it is not known.
 fn asks_first(word: Word, control: &Control, own: Option<u16>, known: Known) -> bool {
     let is_coil = matches!(control.at.table, Table::Coil | Table::DiscreteInput);
     if is_coil || known.blind || known.check != Check::NotYet {

@@ -14,7 +14,7 @@ pub struct KnownWords {
     words: BTreeMap<(Table, u16), u16>,
     /// The direction that was ordered last, where no bit of the drive keeps it until the next start.
     pub(super) direction: Option<bool>,
-    /// Those that it was asked for and reported, ever.
+    /// Those that were ever read successfully.
     reported: BTreeSet<(Table, u16)>,
     /// The functions that it takes, which it keeps when it restarts.
     pub(super) functions: TakenFunctions,

@@ -16,7 +16,7 @@ const LOOKS: u32 = 3;
 /// How far it is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
-    /// The drive is asked for its value.
+    /// The value is read from the drive.
     Value,
     /// It is asked whether its motor runs.
     Running,
@@ -24,7 +24,7 @@ enum Stage {
     Write,
     /// Releases the N2 override.
     Release,
-    /// The drive is asked for its value again.
+    /// The value is read from the drive again.
     ReadBack,
 }
 

@@ -17,7 +17,7 @@ use crate::drive::{Point, Profile, Raw, Value};
 pub(super) enum Action {
     /// A raw request, or a register of its own.
     Send(RequestPdu),
-    /// A write of what the drive keeps: left out where the drive, asked for it, says that it has it already.
+    /// A write of a value that the drive stores: left out where a read shows that the drive already has it.
     Change {
         pdu: RequestPdu,
         table: Table,
@@ -107,7 +107,7 @@ pub(super) enum Check {
     InVain,
 }
 
-/// What the request of a step depends on besides the known words.
+/// The other inputs of a step's request, in addition to the known words.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Known {
     pub(super) check: Check,
@@ -131,7 +131,7 @@ pub(super) fn sets_all_bits(profile: &Profile, values: &[(usize, Value)]) -> boo
     bits.all(|(bit, _)| values.iter().any(|(index, _)| *index == bit))
 }
 
-/// Why a command cannot be sent as it is: a point without a place at the drive, or a value that its place does not hold.
+/// Why a command cannot be sent: a point without a register in the drive, or a value that does not fit its register.
 /// Admitted ones have neither; one that has must not end as if the drive had taken it.
 pub(super) fn unsendable(profile: &Profile, values: &[(usize, Value)]) -> Option<Refusal> {
     values.iter().find_map(|(index, value)| {

@@ -24,7 +24,7 @@ const SILENT: Duration = Duration::from_secs(5);
 /// Longest pause between two looks at the time.
 const LOOK: Duration = Duration::from_millis(100);
 
-/// The state of one drive besides its image.
+/// The state of one drive, except its image.
 #[derive(Debug)]
 struct Known {
     address: u8,
@@ -110,7 +110,7 @@ impl ListenCore {
         }
     }
 
-    /// It was connected to again: what was said in between is not known.
+    /// It was reconnected: the traffic in between is not known.
     pub fn reconnected(&mut self) {
         self.decoder = decoder(&self.bus);
         self.report.reconnected();

@@ -1,7 +1,7 @@
 //! Decodes the traffic of another master and its drives, transaction by transaction. Pure: bytes and time are
 //! arguments.
 //!
-//! A reply is believed only where it is sure which request it answers:
+//! A reply is accepted only where it is certain which request it answers:
 //!
 //! - its request came directly before it, with at most the glitch of a line that changes direction between them: a request that
 //!   was mangled on the way may be among more;
@@ -12,8 +12,8 @@
 //!   that look like its reply are not believed ([`LateReplies`], [`N2LateReplies`]); the same request again is, as either
 //!   reply is true of it.
 //!
-//! What is not believed is counted and shown in the trace, and enters nothing. A mid-stream start, lost bytes and
-//! collisions cost the transactions that they hit: the next sound request starts again.
+//! Replies that are not accepted are counted and shown in the trace, and change no value. A mid-stream start, lost
+//! bytes and collisions cost only the affected transactions: decoding resumes at the next valid request.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -77,7 +77,7 @@ pub struct Exchange {
     pub asked_by: Instant,
     /// How it ended; `None` for a broadcast, which gets no reply.
     pub ended: Option<Ended>,
-    /// Why a reply is not believed.
+    /// Why a reply is not accepted.
     pub doubt: Option<&'static str>,
 }
 
@@ -114,7 +114,7 @@ pub struct Decoder {
     /// The N2 options of the drives, by address.
     n2: BTreeMap<u8, N2Options>,
     open: Option<Open>,
-    /// Garbage since the last sound frame, while no request is open.
+    /// Garbage since the last valid frame, while no request is open.
     garbage: Vec<u8>,
     quiet_since: Option<Instant>,
     late: BTreeMap<u8, LateReplies>,

@@ -3,7 +3,7 @@
 //! - [`decoder`]: bytes and their times in, transactions of the other master out; `codec::frames` cuts the bytes. Pure.
 //! - [`core`](self::core): the bus without its thread: what was received goes into the process image, events and the audit. Pure.
 //! - [`commands`]: what the other master commands, reported when it changes. Pure.
-//! - [`survey`]: who speaks to whom how often, for `drivegate listen`. Pure.
+//! - [`survey`]: which addresses are polled and how often, for `drivegate listen`. Pure.
 //! - [`n2_survey`]: what confirms or contradicts the assumptions about N2. Pure.
 //! - [`guess`]: protocol and format of a line from what is received with a setting. Pure.
 //!

@@ -1,4 +1,4 @@
-//! Who speaks to whom on a line that another master owns, what about, and how often. Pure: time is an argument.
+//! Which addresses another master polls, which registers, and how often. Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};

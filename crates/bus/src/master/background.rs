@@ -1,4 +1,4 @@
-//! Background transactions: when one goes on the line, and the result.
+//! Background transactions: when one is sent, and the result.
 
 use std::time::{Duration, Instant};
 
@@ -188,7 +188,7 @@ impl Master {
         })
     }
 
-    /// The background transaction goes onto the line. It is a command to every drive that hears it.
+    /// The background transaction is sent. It is a command to every drive that receives it.
     pub(super) fn background_sent(&mut self, now: Instant) {
         let Some(begun) = &mut self.background else { return };
         begun.sent = true;
@@ -223,7 +223,7 @@ impl Master {
         }
     }
 
-    /// Whether a background transaction has its turn that someone asked for.
+    /// Whether it is the turn of a background transaction that a client requested.
     pub(super) fn background_of_others(&self) -> bool {
         let begun = self.background.as_ref();
         begun.is_some_and(|begun| !begun.request.is_of_gateway())

@@ -33,7 +33,7 @@ impl Master {
         }
     }
 
-    /// A fault came up in a drive: it is asked for what its profile names for that.
+    /// A drive has a new fault: the fault points of its profile are read.
     pub fn fault_came(&mut self, drive: DriveIndex, now: Instant) {
         let Some(image) = self.bus.image.drives.get(drive) else {
             return;
@@ -88,7 +88,7 @@ impl Master {
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
             Ended::Corrupt(_) if came_mangled => {
-                // It may come once more, and sound.
+                // A valid reply may still follow.
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
             Ended::Silent | Ended::Corrupt(_) if self.sessions.is_empty() => {
@@ -198,7 +198,7 @@ impl Master {
         let took = end.took;
         let polled = match end.ended {
             Ended::Reply(_) if heard == Progress::Failed => Polled::Failed,
-            // A gateway in between reaches nobody: its word is no sign of the drive.
+            // A gateway in between cannot reach the drive: its reply says nothing about the drive.
             Ended::Reply(reply) if says_no_answer(&reply) => Polled::Failed,
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(code),
             Ended::Reply(reply) if self.proves_nothing(poll, &reply) => {
@@ -332,7 +332,7 @@ impl Master {
             self.restarted(index, now, news);
         }
         let reply = match end.ended {
-            // The drive did not look at it: it is said again, once the drive is identified.
+            // The drive ignored it: it is sent again once the drive is identified.
             Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => {
                 self.step_failed(index, slot, &unheard(Session::Identify), &Ended::Silent, end.took, now);
                 return;
@@ -389,7 +389,7 @@ impl Master {
             return;
         };
         if *ended == Ended::Corrupt(MAY_BE_LATE) {
-            // It was sent, perhaps without success: it is sent again when the answer can be believed.
+            // It was sent, perhaps without success: it is sent again when its reply can be trusted.
             if let Some(run) = drive.run(slot) {
                 run.wait_for_late_replies();
             }

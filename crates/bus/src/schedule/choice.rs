@@ -120,7 +120,7 @@ impl Schedule {
         })
     }
 
-    /// The read that a command asked for, waiting longest.
+    /// The read requested by a command that has waited longest.
     pub(super) fn due_asked(&self, now: Instant) -> Option<Poll> {
         let online = self.drives.enumerate();
         let online = online.filter(|(_, d)| d.presence == Presence::Online && !d.doubted && !d.is_quiet(now));

@@ -25,7 +25,7 @@ const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::f
 /// Pause before a read that no manual states is tried: where it failed, and where its reply proved nothing.
 pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(20));
 
-/// Process data without a fault for that long shows that the line is sound.
+/// Process data without a failure for that long shows that the line is healthy.
 const SOUND_FOR: Duration = Duration::from_secs(10);
 /// Pause before a slow request is tried again that the drive was too busy for.
 const BUSY_PAUSE: Duration = Duration::from_secs(1);
@@ -43,7 +43,7 @@ pub(super) struct Item {
     /// How often in a row.
     pub(super) refusals: u32,
     pub(super) failures: u32,
-    /// When it was last asked for without success.
+    /// Its last failed poll.
     pub(super) failed_at: Option<Instant>,
     /// A read of the once class, or one that a fault asks for, that is still to be done.
     pub(super) wanted: bool,
@@ -77,7 +77,7 @@ pub(super) struct DriveSchedule {
     pub(super) garbled: u32,
     /// It did not answer when it was asked last.
     pub(super) unanswered: bool,
-    /// When process data was last asked for without success.
+    /// The last failed poll of process data.
     pub(super) troubled: Option<Instant>,
     pub(super) items: Vec<Item>,
     /// Those that decide its state.

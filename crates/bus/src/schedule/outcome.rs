@@ -44,7 +44,7 @@ impl Schedule {
             item.unread = false;
             item.refusals = 0;
             if std::mem::take(&mut item.refused) {
-                // The bad point is sound again: it is read with its neighbours.
+                // The bad point is readable again: it is read with its neighbours.
                 item.whole_again = Some(now);
             }
             item.wanted = matches!(item.read.class, PollClass::Fast | PollClass::Slow);

@@ -22,7 +22,7 @@ pub use file::{AuditFile, AuditFileOptions};
 
 /// Records of commands that were sent to a drive, kept in memory.
 pub const AUDIT_KEPT: usize = 1000;
-/// Records of commands that were not sent, kept besides them.
+/// Records of commands that were not sent, kept in addition.
 const UNSENT_KEPT: usize = 500;
 /// Name of the log events of commands that were sent: the log has a way of its own for them.
 pub const SENT: &str = "sent command";

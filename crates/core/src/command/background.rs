@@ -59,7 +59,7 @@ pub struct BackgroundRequest {
     pub expires: Instant,
     /// Its ticket.
     pub ticket: Ticket,
-    /// What a request has besides that which is passed on for someone else; none of one of the gateway itself.
+    /// The extra data of a forwarded request; none for a request of the gateway itself.
     pub passed_on: Option<PassedOn>,
 }
 
@@ -68,15 +68,15 @@ pub struct BackgroundRequest {
 pub struct PassedOn {
     /// The address on the line; 0 is the broadcast, except on N2.
     pub address: u8,
-    /// It may change anything in anyone who hears it.
+    /// It may change any value of every drive that receives it.
     pub may_write: bool,
-    /// The drives of the bus that hear it.
+    /// The drives of the bus that receive it.
     pub reach: Vec<DriveIndex>,
     /// Those of them whose run command it clears.
     pub stops: Vec<DriveIndex>,
     /// Its effects on the priority arrays of the drives that receive it.
     pub effects: Vec<(DriveIndex, Effect)>,
-    /// It stops all that hear it, and goes before all that waits.
+    /// It stops all drives that receive it, and precedes all waiting commands.
     pub first: bool,
     /// Receives the reply frame, as the drive sent it.
     pub frame: oneshot::Sender<Vec<u8>>,
@@ -125,7 +125,7 @@ impl BackgroundRequest {
         self.ticket.origin().kind == SourceKind::Schedule
     }
 
-    /// Whether the tool for which it is passed on has gone, or asked for something else.
+    /// Whether the tool that sent it has disconnected, or has sent another request.
     pub fn is_unwanted(&self) -> bool {
         self.passed_on
             .as_ref()

@@ -151,7 +151,7 @@ impl Command {
         }
     }
 
-    /// The same to a drive of that profile, asked for at `asked`.
+    /// The same to a drive of that profile, requested at `asked`.
     pub fn asked_of(mut self, profile: &Profile, asked: Instant) -> Command {
         self.effects = vec![(self.drive, Effect::of(&self.order, profile))];
         self.touched = Touched::of(&self.order, &self.ranges, profile);

@@ -446,7 +446,7 @@ impl Priorities {
         };
         let starts = effect.run == Some(true);
         let run = starts.then(|| held(Commanded::Run, ModelPoint::Run)).flatten();
-        // A stop passes whatever it says besides.
+        // A stop passes, whatever else the command contains.
         let reference = effect.reference && effect.run != Some(false);
         run.or_else(|| {
             reference

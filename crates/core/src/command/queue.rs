@@ -19,7 +19,7 @@ use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal
 use crate::drive::DriveIndex;
 use crate::start_guard::BusGuards;
 
-/// Commands and forwarded reads that may wait on one bus, besides two stops for each drive.
+/// Commands and forwarded reads that may wait on one bus, in addition to two stops per drive.
 pub const CAPACITY: usize = 64;
 /// Most clients and drives whose turns are remembered.
 const SERVED_KEPT: usize = 4 * CAPACITY;

@@ -52,7 +52,7 @@ pub struct Ticket {
     drive: String,
     what: String,
     changes: Vec<Change>,
-    /// The drives, by name, that it starts or stops besides its own.
+    /// The other drives that it starts or stops, by name.
     runs: Vec<(String, bool)>,
     write: bool,
     accepted: Instant,

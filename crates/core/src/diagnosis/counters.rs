@@ -62,11 +62,11 @@ impl<const N: usize> Window<N> {
     }
 }
 
-/// Damage and sound replies of a drive by their place in the mains period, seen from its last damage.
+/// Damaged and valid replies of a drive by their phase in the mains period, relative to its last damaged one.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct InPhase {
     last: Option<Instant>,
-    /// For each frequency: number and sum of cosines of damaged replies, of sound ones.
+    /// For each frequency: number and sum of cosines of damaged replies, of valid ones.
     pub(super) sums: [[f32; 4]; MAINS.len()],
 }
 

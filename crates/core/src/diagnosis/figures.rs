@@ -14,7 +14,7 @@ use crate::codec::describe::{self, Kind};
 use crate::codec::{LineFormat, Protocol, Request};
 use crate::drive::{DriveIndex, PerDrive};
 
-/// Memory of a drive, at most; a line has 2 KiB besides, at most.
+/// Maximum memory per drive; a line has at most 2 KiB in addition.
 pub const BYTES_PER_DRIVE: usize = 512;
 /// So many requests in a row without a reply are an absence: the drive is off, not badly connected.
 const ABSENCE: u16 = 12;
@@ -442,7 +442,7 @@ impl Figures {
         let asked = self.last.map(|(drive, _)| drive);
         let drive = match answering {
             Answering::Address(address) => self.drives.position(|drive| drive.address == address),
-            // A frame of N2 names nobody: it is late if anybody was silent lately.
+            // An N2 frame has no address: it is a late reply if any drive was silent recently.
             Answering::Anybody => {
                 let silent = self.drives.enumerate().filter(|(_, drive)| drive.was_silent(at));
                 silent
@@ -491,8 +491,8 @@ impl Figures {
         [lock(&self.arrivals), lock(&self.paced)]
     }
 
-    /// For each frequency of the mains: damaged replies that have one before, and how much closer in phase they are to it than
-    /// the sound replies of the same drive, -2 to 2.
+    /// For each frequency of the mains: damaged replies that have one before, and how much closer in phase they are to
+    /// it than the valid replies of the same drive, -2 to 2.
     pub fn in_phase(&self) -> [(f32, f32); MAINS.len()] {
         let of = |place: usize| {
             let sums = self.drives.iter().filter_map(|drive| drive.mains.sums.get(place));

@@ -6,8 +6,8 @@
 //! - [`figures`]: what was counted in the last minute, for each drive and for the line. Bounded: see [`figures::BYTES_PER_DRIVE`].
 //! - `known`: what is known of each drive, and which stand out.
 //! - [`rules`]: one rule for each cause. A rule that compares drives says nothing until most of them were asked often enough.
-//! - [`hold`]: a verdict comes and goes only by lasting evidence.
-//! - [`words`]: how causes are told, and what to do.
+//! - [`hold`]: a verdict changes only on lasting evidence.
+//! - [`words`]: the texts of causes and remedies.
 
 pub mod counters;
 pub mod figures;
@@ -51,7 +51,7 @@ pub enum Cause {
     ReplyStartLost,
     /// Requests do not arrive whole.
     RequestEndLost,
-    /// The adapter hears its own request.
+    /// The adapter receives its own request.
     Echo,
     /// A USB adapter delivers in steps of 16 ms.
     LatencyTimer,
@@ -197,9 +197,9 @@ pub struct Counted {
     pub silent: u32,
     /// Invalid replies.
     pub damaged: u32,
-    /// Of those, and of the sound ones: a stray byte before the reply.
+    /// Of those, and of the valid ones: a stray byte before the reply.
     pub stray_before: u32,
-    /// Of the damaged: the beginning was lost, the rest was sound.
+    /// Of the damaged: the beginning was lost, the rest was valid.
     pub start_lost: u32,
     /// Replies after the time limit.
     pub late: u32,

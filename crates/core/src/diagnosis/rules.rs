@@ -26,7 +26,7 @@ pub struct Rules<'f> {
     names: &'f [String],
     now: Instant,
     known: Vec<Known>,
-    /// So many failures of others come of drives that speak when others are asked.
+    /// That many failures of other drives are caused by drives that reply to requests for others.
     disturbed: u32,
     /// Drives that are neither known nor absent.
     waiting: usize,

@@ -4,7 +4,7 @@ use crate::codec::{Decoded, Protocol, Reply, Request, RequestPdu};
 
 /// Stray bytes before a reply that still look like a line without bias or a late adapter.
 const MOST_STRAY: usize = 3;
-/// Bytes of the beginning of a reply that are restored to see whether the rest is sound.
+/// First bytes of a reply that are restored to check whether the rest is valid.
 const MOST_LOST: usize = 2;
 
 /// The shape of the received bytes.
@@ -16,7 +16,7 @@ pub enum Shape {
     Sound,
     /// Stray bytes, then the reply; whether all of them are zero.
     Led(bool),
-    /// The reply would be sound with its first bytes.
+    /// The reply would be valid with its first bytes.
     StartLost,
     /// The request came back without its end.
     CutEcho,
@@ -120,7 +120,8 @@ fn begins(protocol: Protocol, address: u8, first: u8) -> bool {
     }
 }
 
-/// Whether the reply is sound once its first bytes are put back: before what came, or instead of its mangled beginning.
+/// Whether the reply is valid once its first bytes are restored: before the received bytes, or in place of their
+/// damaged beginning.
 fn start_lost(protocol: Protocol, request: &Request, heard: &[u8]) -> bool {
     let address = format!("{:02X}", request.address).into_bytes();
     let head: Vec<u8> = match protocol {

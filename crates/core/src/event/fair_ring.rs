@@ -75,7 +75,7 @@ impl<K: Ord + Clone, T> FairRing<K, T> {
     }
 }
 
-/// Places that a source has besides those of its items. Doubling them would leave each source the most that it ever
+/// Places of a source in addition to those of its items. Doubling them would leave each source the most that it ever
 /// had.
 fn spare<T>(items: &VecDeque<T>) -> usize {
     items.len() / 8 + 4

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 const CLIENTS: usize = 64;
 /// Kinds of one client whose first refusal passes at once.
 const KINDS: usize = 16;
-/// Shortest time between two refusals of one client that pass, besides the first of a kind.
+/// Shortest time between two reported refusals of one client, except the first of a kind.
 const INTERVAL: Duration = Duration::from_secs(1);
 /// A client is forgotten when it was refused nothing for so long.
 const FORGOTTEN: Duration = Duration::from_secs(60);

@@ -86,7 +86,7 @@ impl Rotated {
         Ok((&mut open.file, bytes))
     }
 
-    /// Closes the file; it is opened again when that is asked for.
+    /// Closes the file; it is reopened on request.
     pub fn close(&mut self) {
         self.open = None;
     }

@@ -12,7 +12,7 @@ use crate::process_image::{BusSpec, DriveSpec};
 pub const MOST_BYTES: usize = 20 << 20;
 /// Bytes of events and commands of a drive, where there is room for it.
 pub const NOTES: usize = 64 << 10;
-/// Room besides the planned reads: retries, reads that commands ask for, reads after a fault.
+/// Room in addition to the planned reads: retries, reads requested by commands, reads after a fault.
 const RESERVE: f64 = 1.25;
 /// Rings below that size are not worth while.
 const LEAST: usize = 16 << 10;

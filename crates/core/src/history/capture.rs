@@ -16,7 +16,7 @@ const SIMPLE: u32 = 3;
 const PACKET: u32 = 6;
 /// Option of an interface: resolution of its times.
 const RESOLUTION: u16 = 9;
-/// Longest block or packet that is believed.
+/// Longest plausible block or packet.
 const LONGEST: usize = 1 << 20;
 
 /// Bytes of a line that arrived together.
@@ -100,7 +100,7 @@ impl Bytes<'_> {
         })
     }
 
-    /// A length that is believed.
+    /// A plausible length.
     fn length(self, at: usize) -> Result<usize, CaptureError> {
         let length = self.u32(at)? as usize;
         if length > LONGEST {
@@ -230,7 +230,7 @@ fn read_pcapng(file: &[u8], packets: &mut Vec<Packet>) -> Result<(), CaptureErro
         }
         at += length;
     }
-    // Of another interface besides the line nothing is said.
+    // Other interfaces than the line are not described.
     not_serial.filter(|_| packets.is_empty()).map_or(Ok(()), Err)
 }
 

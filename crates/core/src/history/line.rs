@@ -23,7 +23,7 @@ pub const BYTES: (usize, usize) = (2 * STEPS * size_of::<Bucket>(), STEPS * size
 pub struct Exchanges {
     /// All.
     pub all: u32,
-    /// Those without a sound answer.
+    /// Those without a valid reply.
     pub failed: u32,
 }
 

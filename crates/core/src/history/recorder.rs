@@ -18,12 +18,12 @@ use crate::process_image::{
     BusImage, DriveImage, DriveSpec, Link, Reading, Snapshot, Taped, TapedFrame, TapedRead, Taping,
 };
 
-/// Triggers of a recording that are noted besides the first.
+/// Further triggers that a recording notes after the first.
 const MOST_TRIGGERS: usize = 32;
 /// Age at which a value is still good here: a recording shows readings of any age.
 const ANY_AGE: Duration = Duration::from_secs(10 * 365 * 86_400);
 
-/// An entry for a drive, besides its samples.
+/// An entry for a drive, except its samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Note {
     /// When.
@@ -75,7 +75,7 @@ pub(super) fn empty_snapshot(spec: &DriveSpec) -> Snapshot {
     let mut plan = Plan::of(&spec.profile);
     plan.reads.extend_from_slice(&plan.on_fault);
     let mut snapshot = Snapshot::empty(&plan);
-    // What is not answered is not in the samples, so whatever is there was said.
+    // Failed reads are not in the samples, so every value there was reported.
     snapshot.link = Link::Online(std::time::SystemTime::UNIX_EPOCH);
     snapshot
 }

@@ -48,7 +48,7 @@ pub struct Header {
     pub values: Vec<Json>,
     /// The reads that the samples are of.
     pub reads: Vec<Read>,
-    /// Entries that the recorder could not take in time since the gateway started; 0 on a sound machine.
+    /// Entries that the recorder missed since the gateway started; 0 on a healthy machine.
     pub lost: u64,
 }
 

@@ -24,7 +24,7 @@ pub struct Claims {
     pub orphans: Vec<usize>,
 }
 
-/// Which of the `journals`, each with what it says of its owner, concern which of the `drives`, each with its name.
+/// Which of the `journals`, each with its owner, belong to which of the `drives`, each with its name.
 pub fn claims(journals: &[(JournalFile, Result<Owner, String>)], drives: &[(Machine, &str)]) -> Claims {
     let mut claims = Claims {
         drives: vec![None; drives.len()],

@@ -1,8 +1,8 @@
 //! A reading of all parameters of a drive: decides the next request and applies replies. Pure.
 //!
-//! A family names its parameters, or says where they may lie; then the drive is asked for each address, and what it refuses
-//! with 02 is not there. What an earlier reading found is asked for alone, until one of those is refused: the drive has another
-//! application then, and is asked for everything.
+//! A family lists its parameters or their address ranges; in a range each address is read, and an address refused with
+//! 02 does not exist. Later readings read only the addresses found before, until one of them is refused: then the drive
+//! has another application, and everything is read.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -32,7 +32,7 @@ pub enum Next {
     Go,
     /// The next request after that time, for the reason given.
     Pause(Duration, String),
-    /// It cannot go on.
+    /// It cannot continue.
     Failed(String),
 }
 

@@ -13,7 +13,7 @@ use crate::codec::{Exception, Reply};
 use crate::command::{Outcome, ParameterOrder, Refusal};
 use crate::drive::parameters::RawValue;
 
-/// A restore that cannot go on for that long ends.
+/// A restore that cannot continue for that long ends.
 const MOST_WAIT: Duration = Duration::from_secs(3600);
 /// Pause before a busy drive is asked again.
 const BUSY_PAUSE: Duration = Duration::from_millis(200);
@@ -82,7 +82,7 @@ pub struct Restoration {
     /// Something was written that is not saved.
     wrote: bool,
     saves: u32,
-    /// Since when it cannot go on.
+    /// Since when it cannot continue.
     waits_since: Option<Instant>,
     noted: Instant,
 }
@@ -166,7 +166,7 @@ impl Restoration {
         }
     }
 
-    /// The journal is on disk, or could not be written: then nothing more is written to the drive.
+    /// The journal is on disk, or could not be written: then the drive is not written to any more.
     pub fn recorded(&mut self, result: Result<(), String>, now: Instant) {
         self.noted = now;
         match result {
@@ -237,7 +237,7 @@ impl Restoration {
         self.pause(PAUSE, why, now)
     }
 
-    /// It cannot go on: someone stops it from outside.
+    /// It cannot continue: it was stopped from outside.
     pub fn give_up(&mut self, why: String) {
         self.state = match self.touched {
             true => State::Over(End::Unfinished(why)),

@@ -23,7 +23,7 @@ pub struct Status {
     pub remaining: Option<Duration>,
     /// Why it waits.
     pub waits: Option<String>,
-    /// The result of it; nothing while it goes on.
+    /// Its result; none while it is in progress.
     pub result: Option<Result<Arc<ParameterFile>, String>>,
 }
 

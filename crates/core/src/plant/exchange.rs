@@ -77,8 +77,8 @@ impl Exchange {
 
 impl BusHandle {
     /// Passes a request on to the line, in the share of background transactions. When this returns it is in the queue
-    /// of the bus, or answered. What may write is a command to every drive that hears it, with its place among their
-    /// other commands.
+    /// of the bus, or answered. A request that may write is a command to every drive that receives it, with its place
+    /// among their other commands.
     pub fn ask(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
         self.pass_on(question, false, writes, now)
     }
@@ -121,7 +121,8 @@ impl BusHandle {
         let stops = stops.map(|(index, _)| index).collect();
         let effects = heard().map(|(index, drive)| (index, Effect::of(&order, &drive.spec.profile)));
         let effects = effects.filter(|_| may_write).collect();
-        // What is not decoded may write anything. The registers are the same anyone who hears it.
+        // A request that is not decoded may write anything. The registers are the same for every drive that receives
+        // it.
         let touched = heard().next().map_or(Touched::Anything, |(_, drive)| {
             Touched::of(&order, &[], &drive.spec.profile)
         });

@@ -1,4 +1,4 @@
-//! Collects the state of a drive besides its points, for the causes why it does not run.
+//! Collects the state of a drive except its points, for the causes why it does not run.
 
 use std::time::Duration;
 

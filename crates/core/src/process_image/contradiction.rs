@@ -15,8 +15,8 @@ const SPEEDS: [(ModelPoint, f64); 3] = [
 
 impl Reading<'_> {
     /// Whether the point is a good speed that is not zero although a newer sample shows that the motor stands, or zero
-    /// although a newer one shows that it turns. Nothing is said of other points: current, torque and power can be
-    /// anything at any speed.
+    /// although a newer one shows that it turns. Other points are not judged: current, torque and power can be anything
+    /// at any speed.
     pub fn is_contradicted(&self, point: usize) -> bool {
         let model = self.spec.profile.points.get(point).and_then(|point| point.model);
         let Some((_, certain)) = SPEEDS.iter().find(|(speed, _)| Some(*speed) == model) else {

@@ -1,7 +1,7 @@
 //! The process image: the latest state of every drive and bus. One writer per bus, any number of readers.
 //!
-//! The writer replaces a drive's [`Snapshot`] as a whole after each transaction, so a reader always sees the
-//! registers of one poll together: a torn 32-bit value is impossible, and nobody waits for anybody.
+//! The writer replaces a drive's [`Snapshot`] as a whole after each transaction, so a reader always sees the registers
+//! of one poll together: a torn 32-bit value is impossible, and no reader waits for a writer.
 
 mod contradiction;
 mod health;
@@ -322,7 +322,7 @@ impl BusImage {
         Outcome::ALL.iter().map(|&o| self.counted(o)).sum()
     }
 
-    /// Transactions that failed: no or no sound answer.
+    /// Failed transactions: no reply or an invalid one.
     pub fn errors_total(&self) -> u64 {
         self.counted(Outcome::Timeout) + self.counted(Outcome::Corrupt)
     }

@@ -276,7 +276,7 @@ impl Ledger {
         }
     }
 
-    /// A word that starts a motor goes onto the line.
+    /// A word that starts a motor is sent.
     pub(super) fn start_written(&mut self, machine: &Machine, number: u64, client: &Arc<str>, now: Instant) {
         let Some(entry) = self.motors.get_mut(machine) else {
             return;

@@ -4,7 +4,7 @@
 //! them, since drives of several buses can belong to one group; every bus has its view of it, [`BusGuards`]. A command
 //! is judged when it is accepted ([`BusGuards::refuses`]), when its turn comes ([`BusGuards::clear`]), and before each
 //! of its writes ([`BusGuards::may_write`]). A start that is cleared counts from that moment, and is not written before
-//! it is on disk ([`keep`]). Stops ask nobody here, but for those that `min_run` delays.
+//! it is on disk ([`keep`]). Stops are not checked here, except those that `min_run` delays.
 //!
 //! - `motor`: what is known of one motor, and the rules. `ledger`: all motors, groups, and what is to be written.
 //! - `interlock`: whether the points hold that a start needs. `view`: the judgement.

@@ -104,7 +104,7 @@ impl Motor {
         reserved || self.written.is_some_and(|(of, _)| of == number)
     }
 
-    /// Why it may not be started now, besides its group.
+    /// Why it may not be started now, apart from its group.
     pub(super) fn hindered(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
         self.too_often(guard, now)
             .into_iter()
@@ -168,7 +168,7 @@ impl Motor {
         }
     }
 
-    /// A word of a command that starts the motor goes onto the line. Whether a start was made by it.
+    /// A word of a command that starts the motor is sent. Whether it made a start.
     pub(super) fn start_written(&mut self, number: u64, client: &Arc<str>, now: Instant) -> bool {
         if self.reserved.is_some_and(|reserved| reserved.number == number) {
             self.reserved = None;
@@ -197,7 +197,7 @@ impl Motor {
         (self.running, self.ran, self.stands_since) = (Some((true, now)), Some(true), None);
     }
 
-    /// A stop goes onto the line.
+    /// A stop is sent.
     pub(super) fn stop_written(&mut self, now: Instant) {
         self.stop_written = Some(now);
     }

@@ -292,7 +292,7 @@ impl BusGuards {
         }
     }
 
-    /// A word of a command of that client, which starts the motor, goes onto the line.
+    /// A word of a command of that client that starts the motor is sent.
     pub fn start_written(&self, drive: DriveIndex, number: u64, client: &Arc<str>, now: Instant) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().start_written(&of.machine, number, client, now);
@@ -317,7 +317,7 @@ impl BusGuards {
         }
     }
 
-    /// A stop goes onto the line.
+    /// A stop is sent.
     pub fn stop_written(&self, drive: DriveIndex, now: Instant) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().with(&of.machine, |motor| motor.stop_written(now));

@@ -183,7 +183,7 @@ impl Sides {
     }
 }
 
-/// Names each north side on which nobody is a principal, so that everybody there may only stop.
+/// Lists each north interface without a principal, where every client may only stop.
 pub(super) fn warn_of_nobody(reader: &Reader<'_>, rules: &Rules, sides: &Sides) {
     if rules.mode == Mode::Advisory {
         return;

@@ -140,7 +140,8 @@ fn read_options(
     options
 }
 
-/// What asks for a frame of the gateway on a line where it sends none is an error; what only says how it would ask has no effect.
+/// A key that needs a frame of the gateway on a line where it sends none is an error; a key that only sets how it would
+/// poll has no effect.
 fn check_listening(reader: &Reader<'_>, drives: &[drive::Found]) {
     for drive in drives {
         let name = drive.name.as_ref().map_or("?", |(name, _)| name);

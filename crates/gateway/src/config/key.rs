@@ -201,7 +201,8 @@ pub(super) fn table(about: &str, keys: Vec<(&'static str, bool, Value)>) -> Valu
     })
 }
 
-/// A name that can be part of topics, labels and addresses; these characters are allowed besides letters and digits.
+/// A name that can be part of topics, labels and addresses; these characters are allowed in addition to letters and
+/// digits.
 pub(super) struct Name(pub(super) &'static str);
 
 impl Form<String> for Name {

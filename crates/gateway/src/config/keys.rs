@@ -82,7 +82,8 @@ const HOUR: Duration = Duration::from_secs(3600);
 const LONGEST_EVERY: Duration = Duration::from_secs(10 * 8760 * 3600);
 /// Range of cadences and timeouts.
 const TIMES: Time = Time(MILLISECOND..=HOUR);
-/// `response_timeout`: an hour was allowed before. A master that waits so long for an absent drive serves nobody else.
+/// `response_timeout`: an hour was allowed before. A master that waits so long for an absent drive serves no other
+/// drive.
 pub(super) const RESPONSE_TIMEOUT: Capped = Capped {
     range: MILLISECOND..=Duration::from_secs(5),
     before: HOUR,
@@ -341,9 +342,9 @@ keys! {
             schema: || number_pair(Some(0.0), Some(MOST_HERTZ)),
             range: "[lowest, highest], Hz",
         }, or "none";
-        /// What [raw writes](modbus-tcp.md#what-raw-writes-may-set) may set besides the registers of writable points:
-        /// nothing, everything that the profile allows (`true`), or ranges of PDU addresses, for registers and coils
-        /// alike.
+        /// What [raw writes](modbus-tcp.md#what-raw-writes-may-set) may set in addition to the registers of writable
+        /// points: nothing, everything that the profile allows (`true`), or ranges of PDU addresses, for registers and
+        /// coils alike.
         raw_writes: Present = Own {
             schema: || json!({ "anyOf": [{ "type": "boolean" }, { "type": "array", "items": {
                 "type": "array", "items": { "type": "integer", "minimum": 0, "maximum": u16::MAX },
@@ -354,7 +355,7 @@ keys! {
         /// What may be done with its [parameters](parameters.md#restoring): `"read"`, or `"write"`: they may also be
         /// restored, which needs `access = "control"`.
         params: ParamsAccess = Words(&[("read", ParamsAccess::Read), ("write", ParamsAccess::Write)]), default "read";
-        /// Values that trigger a [recording](history.md#recordings), besides faults.
+        /// Values that trigger a [recording](history.md#recordings), in addition to faults.
         trigger: Present = Own { schema: || each(Trigger::schema()), range: "[[bus.drive.trigger]]" }, or "none";
     }
 
@@ -611,8 +612,8 @@ keys! {
         /// Status page, metrics, health and JSON interface. Read-only without `commands`; open to everyone who can connect
         /// unless there is a `tokens_file`.
         listen: SocketAddr = SOCKET, default "127.0.0.1:9488";
-        /// Names and addresses, without a port, by which the server is reached besides `localhost`, the host name of
-        /// this machine and its own addresses. Requests for any other [host](http.md#hosts) get 421.
+        /// Names and addresses, without a port, by which the server is reached in addition to `localhost`, the host
+        /// name of this machine and its own addresses. Requests for any other [host](http.md#hosts) get 421.
         hosts: Vec<String> = HOSTS, default [];
         /// File of access [tokens](http.md#tokens), made by `drivegate token add`. With it, all paths except `/healthz`
         /// and `/readyz` require a token.

@@ -61,7 +61,7 @@ use crate::process_image::{Access, BusSpec, DriveSpec};
 use keys::{GATEWAY, MODBUS_TCP, ROOT};
 use together::{Clients, judge};
 
-/// Where the gateway keeps its state unless it is told otherwise.
+/// The default state directory.
 const STATE_DIR: &str = "/var/lib/drivegate";
 /// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.
 pub(crate) const ENVIRONMENT: &str = "DRIVEGATE";

@@ -266,7 +266,7 @@ const PRIVATE: [&str; 8] = [
     "fe80::/10",
 ];
 
-/// Warns where the share of one address is probably too small: fewer connections are possible than are asked for, or
+/// Warns where the share of one address is probably too small: fewer connections are possible than requested, or
 /// clients come through a NAT and share an address.
 fn warn_of_shares(reader: &Reader<'_>, allowed: &[&IpNet], total: usize, per_address: usize) {
     let hosts = |network: &IpNet| match network.network().is_loopback() {

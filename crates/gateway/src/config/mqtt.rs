@@ -37,7 +37,7 @@ pub(super) struct Broker {
 }
 
 impl Broker {
-    /// Whether the way to it does not leave this machine.
+    /// Whether it is on this machine.
     fn is_here(&self) -> bool {
         let address: Option<IpAddr> = self.host.parse().ok();
         address.map_or(self.host.eq_ignore_ascii_case("localhost"), |address| {

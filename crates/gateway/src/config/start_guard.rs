@@ -110,7 +110,7 @@ pub(super) fn check(document: &Document, buses: &[bus::Found]) {
     }
 }
 
-/// Why a point is none that is true or false, and read without being asked for.
+/// Why a point is not a boolean that is polled.
 fn unfit(profile: &Profile, name: &str) -> Option<(String, String)> {
     let plan = Plan::of(profile);
     let is_bit = |index: usize| {

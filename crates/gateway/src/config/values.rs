@@ -28,7 +28,8 @@ pub(super) fn unknown_word<'a>(text: &str, words: impl Iterator<Item = &'a str> 
     Finding::new(format!("unknown word `{text}`"), remedy)
 }
 
-/// Checks a name that can be part of topics, labels and addresses; `joints` are allowed besides letters and digits.
+/// Checks a name that can be part of topics, labels and addresses; `joints` are allowed in addition to letters and
+/// digits.
 pub(super) fn check_name(text: &str, joints: &str) -> Result<(), Finding> {
     let letter = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit();
     let shape = text.starts_with(letter) && text.chars().all(|c| letter(c) || joints.contains(c));

@@ -16,7 +16,7 @@ const RETURN: Duration = Duration::from_secs(120);
 /// Buses of which that is kept, the latest ones.
 const MOST_BUSES: usize = 64;
 
-/// What the buses that a reload stopped have left, until someone goes on with it.
+/// The leases and states of buses stopped by a reload, until another bus continues them.
 #[derive(Debug, Default)]
 pub(super) struct Leases {
     left: BTreeMap<Machine, Left>,
@@ -39,7 +39,8 @@ pub(super) struct Parted {
 }
 
 impl Parted {
-    /// For a reload at `now`: the leases that may go on, and the buses that know who commanded their drives, the latest first.
+    /// For a reload at `now`: the leases that may continue, and the buses that know who commanded their drives, the
+    /// latest first.
     pub(super) fn recall(&mut self, now: Instant) -> (Leases, Vec<BusHandle>) {
         let is_kept = |at: &Instant| now.saturating_duration_since(*at) <= RETURN;
         self.leases.retain(|_, (at, _)| is_kept(at));
@@ -51,7 +52,7 @@ impl Parted {
         (leases, self.buses.iter().rev().map(|(_, bus)| bus.clone()).collect())
     }
 
-    /// After it: what nobody went on with, and the buses that were stopped.
+    /// After it: what no bus continued, and the buses that were stopped.
     pub(super) fn keep(&mut self, leases: &Leases, stopped: &[BusHandle], now: Instant) {
         self.leases.clone_from(&leases.parted);
         let left = leases.left.iter().filter(|(_, left)| left.lease.ends().is_some());

@@ -48,7 +48,7 @@ impl<S: Server> ServerSlot<S> {
         self.0.as_ref().map(|running| &running.server)
     }
 
-    /// Makes the server run as configured: unchanged options leave it alone, others restart it.
+    /// Makes the server run as configured: unchanged options keep it running, others restart it.
     ///
     /// # Errors
     /// It does not start, and does not run afterwards.
@@ -102,7 +102,7 @@ impl<S: Reconfigure + Send + 'static> Running<S>
 where
     S::Options: Send + Sync,
 {
-    /// Stops it behind what its clients have started, which nobody waits for.
+    /// Stops it after the requests that its clients have started, without waiting.
     async fn retire(mut self) {
         self.server.retire().await;
         if self.server.is_drained() {

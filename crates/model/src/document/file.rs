@@ -34,7 +34,7 @@ pub fn read_file(path: &Path) -> Result<String, Problem> {
         )
     })?;
     let is_long = bytes.len() as u64 > LONGEST;
-    // A program or an archive is told as such.
+    // A program or an archive is reported as such.
     if is_long && !bytes.contains(&0) {
         return Err(of_file(
             format!("the file is longer than {} MiB", LONGEST >> 20),

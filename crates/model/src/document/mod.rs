@@ -2,7 +2,7 @@
 //!
 //! A [`Reader`] returns the keys of one table. Keys that are missing, unknown or have the wrong type are collected as
 //! [`Problem`]s with file, line and key, so that one run reports every error of a file. A key is known once it was
-//! asked for: [`Reader::finish`] reports the others, each with the nearest known key.
+//! requested: [`Reader::finish`] reports the others, each with the nearest known key.
 //!
 //! `tree` holds the values, `value` the types they can be read as, `mistakes` what is often written instead of TOML.
 

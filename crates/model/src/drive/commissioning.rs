@@ -99,7 +99,7 @@ pub struct Shared<'p> {
 pub fn gather<'p>(profiles: &[&'p Profile], steps: &[Step]) -> Vec<Shared<'p>> {
     let mut gathered: Vec<Shared<'p>> = Vec::new();
     for step in steps {
-        // A line that one profile has in two steps is told in both.
+        // A line that one profile has in two steps is shown in both.
         let start = gathered.len();
         for profile in profiles {
             for line in profile.commissioning.lines(*step) {

@@ -142,7 +142,7 @@ impl Derived {
             Derived::Percent { .. } => {
                 let band = band.filter(|(low, high)| high > low)?;
                 let value = first.as_f64();
-                // A drive that is asked for less turns at its minimum; a negative zero is that in reverse.
+                // A drive with a lower reference turns at its minimum; a negative zero is the minimum in reverse.
                 let percent = percentage(value, band).unwrap_or(0.0_f64.copysign(value));
                 Some(Value::Number(tidy(percent)))
             }

@@ -66,7 +66,7 @@ pub struct Profile {
     pub may_stop_by_itself: bool,
     /// A broadcast that clears the whole control word stops every drive of the family on the line.
     pub broadcast_stop: bool,
-    /// Points that a drive with a new fault is asked for at once.
+    /// Points that are read at once when a drive has a new fault.
     pub on_fault: Vec<usize>,
     /// How it is commanded, where its profile says so in `[control]`.
     pub control: Option<Control>,
@@ -458,7 +458,7 @@ impl Profile {
     /// What `[control]` would say of a profile whose commands are points of one bit each.
     pub(super) fn control_of_bits(&self) -> Option<Control> {
         let setting = |point: ModelPoint, on: bool| {
-            // A run command that nobody may give is known for what it is all the same.
+            // A run command that no one may give is still recognised as one.
             let is_used = |of: &&Point| of.write || point == ModelPoint::Run;
             let read = self.model_point(point).filter(is_used)?;
             let written = read.write_to.and_then(|to| self.points.get(to));

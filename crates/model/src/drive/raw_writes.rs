@@ -1,4 +1,4 @@
-//! Which registers and coils a raw write may set, besides those of writable points. Pure.
+//! Which registers and coils a raw write may set, in addition to those of writable points. Pure.
 //!
 //! A register that no writable point names can change what the writable ones mean: with another maximum frequency 80 %
 //! is another speed, past every limit of the configuration. So it is not written unless the drive's configuration says so.

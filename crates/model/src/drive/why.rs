@@ -145,7 +145,7 @@ pub enum Giver {
     LocalControl,
 }
 
-/// The situation besides the points.
+/// The situation, except the points.
 pub struct Situation<'s> {
     /// When the reader looks.
     pub now: Instant,
@@ -157,7 +157,7 @@ pub struct Situation<'s> {
     pub is_commandable: bool,
     /// Why it accepts only stops, if so, and what ends that.
     pub held: Option<String>,
-    /// The last order that concerns the run command; asked for only while the motor does not run.
+    /// The last command of the run point; requested only while the motor does not run.
     pub order: &'s dyn Fn() -> Option<RunOrder>,
 }
 
@@ -196,7 +196,7 @@ pub fn explain(profile: &Profile, sample: &dyn Fn(usize) -> Sample, situation: &
         causes.push(look.unknown());
     }
     Explanation {
-        // It is enabled and stands: as good as not running.
+        // It is enabled and stopped: counts as not running.
         runs: runs.map(|running| running && causes.is_empty()),
         causes,
         not_told: look.not_told(),

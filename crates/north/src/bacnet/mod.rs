@@ -116,7 +116,7 @@ impl Options {
         3
     }
 
-    /// Whether a server with these options can go on with those: its sockets and what clients know of it stay.
+    /// Whether a server with these options can continue with those: its sockets and its identity for clients stay.
     fn continues(&self, other: &Options) -> bool {
         (self.listen, self.device, self.network, self.vendor)
             == (other.listen, other.device, other.network, other.vendor)

@@ -32,7 +32,7 @@ impl Sockets {
         let prefix = prefix(*listen.ip(), &routes);
         let to = broadcast_of(*listen.ip(), prefix);
         let broadcast_to = SocketAddrV4::new(to, port);
-        // A socket that is bound to no address hears broadcasts itself.
+        // A socket that is bound to no address receives broadcasts itself.
         let broadcast = match listen.ip().is_unspecified() {
             true => None,
             false => Some(shared(broadcast_to)?),
@@ -52,7 +52,7 @@ impl Sockets {
     }
 }
 
-/// A socket for broadcasts, which other programs of this host may hear, too.
+/// A socket for broadcasts, which other programs of this host may receive, too.
 fn shared(address: SocketAddrV4) -> io::Result<UdpSocket> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let socket = socket_with(AddressFamily::INET, SocketType::DGRAM, flags, None)?;

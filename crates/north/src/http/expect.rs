@@ -1,4 +1,4 @@
-//! Whether the gateway is the one that a client has in mind, and runs with the configuration that it has in mind.
+//! Whether the gateway is the one that a client expects, with the configuration that it expects.
 
 use std::path::Path;
 

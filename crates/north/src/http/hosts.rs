@@ -3,7 +3,7 @@
 
 use std::net::IpAddr;
 
-/// Names that always mean this machine, besides those that end in `.localhost`.
+/// Names that always mean this machine, in addition to those that end in `.localhost`.
 const LOOPBACK: [&str; 4] = ["localhost", "localhost.localdomain", "ip6-localhost", "ip6-loopback"];
 /// Longest name of a host.
 const LONGEST_NAME: usize = 255;

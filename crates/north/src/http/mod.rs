@@ -118,7 +118,7 @@ const ANSWERED_WITHIN: Duration = Duration::from_secs(60);
 pub struct Options {
     /// Address to listen on.
     pub listen: SocketAddr,
-    /// Names and addresses that it answers under, besides its own and those of the loopback.
+    /// Names and addresses under which it is reached, in addition to its own and those of the loopback.
     pub hosts: Vec<String>,
     /// The tokens for reading; `None`: everything is open.
     pub tokens: Option<Tokens>,

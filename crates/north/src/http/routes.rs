@@ -108,8 +108,7 @@ const RELOAD: &str = "/api/v1/reload";
 impl Reached {
     /// How the request with this head came.
     ///
-    /// # Errors
-    /// No server has said so.
+    /// # Errors No server has reported it.
     pub(super) fn of(head: &request::Parts) -> Replied<Reached> {
         let reached = head.extensions.get().cloned();
         reached.ok_or(StatusCode::INTERNAL_SERVER_ERROR.into())

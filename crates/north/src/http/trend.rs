@@ -62,7 +62,7 @@ impl Wanted {
         };
         let mut points: Vec<String> = Vec::new();
         for point in point.iter().flat_map(|points| points.split(',')).map(str::trim) {
-            // Once each, so that a reply is bounded whatever is asked for.
+            // Once each, so that a reply is bounded for any request.
             if !point.is_empty() && points.iter().all(|known| known != point) {
                 points.push(point.to_string());
             }

@@ -138,9 +138,9 @@ impl Credential for User {
 pub type Users = Credentials<User>;
 
 impl Users {
-    /// The hash behind which the password of that name has to be, if there is such a user, and hashes whose password nobody knows:
-    /// all together there is one of each cost that the file has. So the comparison takes as long for every name, known or not,
-    /// whatever the hashes of the file cost.
+    /// The hash behind which the password of that name has to be, if there is such a user, and hashes of unknown
+    /// passwords: all together there is one of each cost that the file has. So the comparison takes as long for every
+    /// name, known or not, whatever the hashes of the file cost.
     pub(super) fn hashes(&self, name: &str) -> (Option<&str>, Vec<String>) {
         let own = self.named(name).map(User::hash);
         let mut costs: Vec<&str> = self.0.iter().map(|user| cost(user.hash())).collect();

@@ -142,7 +142,7 @@ const NOT_HTTP: &str =
 
 /// Serves one client until it leaves, goes silent or yields to another one.
 async fn serve(stream: UnixStream, door: Arc<Door>, permit: ConnectionPermit) {
-    // Without a user id there is nobody to hold the command against.
+    // Without a user id the command has no owner.
     let Ok(peer) = stream.peer_cred() else { return };
     let place = permit.place();
     let mut stream = BufReader::new(stream);

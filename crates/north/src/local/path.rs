@@ -135,7 +135,7 @@ async fn bind(path: &Path) -> io::Result<Bound> {
     let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     let directory = directory.unwrap_or(Path::new("."));
     if directory == Path::new(SYSTEM_DIRECTORY) {
-        // Systemd makes it for a service; for a gateway that root starts by hand nobody does.
+        // Systemd creates it for a service, but not for a gateway that root starts by hand.
         let _ = std::fs::create_dir(directory);
     }
     let _lock = lock(directory).await?;

@@ -29,7 +29,7 @@ pub enum Format {
     OpenMetrics,
 }
 
-/// The content types, with the versions of OpenMetrics that can be asked for: their texts are the same.
+/// The content types, with the versions of OpenMetrics that can be requested: their texts are the same.
 const TYPES: [(Format, &str, &str); 3] = [
     (
         Format::OpenMetrics,
@@ -244,7 +244,7 @@ mod tests {
             Format::accepted(accept) == (Format::OpenMetrics, wanted.as_str())
         };
         assert!(is_open(prometheus, "1.0.0"));
-        // Requested alone: the answer has the version that was asked for.
+        // Requested alone: the response has the requested version.
         assert!(is_open("application/openmetrics-text; version=1.0.0", "1.0.0"));
         assert!(is_open("application/openmetrics-text; version=0.0.1", "0.0.1"));
         let quoted = "application/openmetrics-text;version=\"0.0.1\", text/plain;q=0.3";

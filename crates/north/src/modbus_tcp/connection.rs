@@ -112,7 +112,7 @@ struct Connection<'p, S> {
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
     async fn run(&mut self) -> Result<Infallible, End> {
-        // Once this is set nothing more is read; the requests that wait for the bus are still answered.
+        // Once this is set, reading stops; the requests that wait for the bus are still answered.
         let mut input_end: Option<End> = None;
         let mut half_frame_since: Option<Instant> = None;
         // One future for the whole connection, so that it registers with the token once and not with every request.
@@ -121,7 +121,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         loop {
             let consumed = self.process(&mut input_end);
             self.dialogue.collect(self.now.into_std());
-            // Before the answers leave: who has an answer is in use.
+            // Before the responses are sent: a client with a response is in use.
             if consumed.frames > 0 {
                 self.used();
             }

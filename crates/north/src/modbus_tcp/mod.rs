@@ -52,12 +52,12 @@ pub fn certificate_role(der: &[u8]) -> Option<Result<Option<String>, String>> {
     Some(certificate.role.map_err(|why| why.to_string()))
 }
 
-/// Clients that speak as on a serial line connect again and again: a line this often.
+/// Clients that send RTU frames over TCP reconnect again and again: a log line this often.
 const SERIAL_LOGGED: Duration = Duration::from_secs(600);
 /// Section of the TLS listener.
 const TLS_SECTION: &str = "[modbus_tcp.tls]";
 /// Maximum number of TLS handshakes at one time, and how many of them one address may have. A handshake that takes long
-/// yields to a newer one, so silent connections hold nobody up.
+/// yields to a newer one, so idle connections do not block new ones.
 const HANDSHAKES: Limits = Limits {
     total: 64,
     reserved: 0,
@@ -331,7 +331,7 @@ struct ServerState {
     /// TLS connections before they are admitted.
     handshakes: Arc<ConnectionLimit>,
     refusals: Refusals,
-    /// Log lines about clients that speak as on a serial line.
+    /// Log lines about clients that send RTU frames over TCP.
     serial_clients: LogThrottle,
     /// Cancelled when the server ends: its clients are not waited for any longer.
     stopping: CancellationToken,

@@ -80,7 +80,7 @@ impl Identity {
         let (mut errors, mut warnings) = (Vec::new(), Vec::new());
         let server = ServerIdentity::load(certificate, key, now).map_err(|faults| errors.extend(faults));
         let ca = pem::certificates(client_ca).map_err(|error| errors.push(TlsFile::ClientCa.fault(error)));
-        // An expired CA is still a trust anchor (RFC 5280, 6.1.1), so it refuses nobody.
+        // An expired CA is still a trust anchor (RFC 5280, 6.1.1), so no client is refused for it.
         let anchors = ca.iter().flatten().flat_map(|anchor| {
             let unsupported = unsupported_ca(client_ca, anchor);
             validity(client_ca, anchor, now).into_iter().chain(unsupported)

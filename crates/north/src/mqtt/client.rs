@@ -100,7 +100,7 @@ struct Client {
     publisher: Publisher,
     /// The announcer for Home Assistant, if on.
     announcer: Option<Announcer>,
-    /// Whether discovery messages of an earlier run were asked for, or need not be.
+    /// Whether discovery messages of an earlier run were requested, or are not needed.
     leftovers_known: bool,
     /// The subscriptions of the present connection.
     subscriptions: Vec<Subscription>,
@@ -458,7 +458,7 @@ impl Client {
     }
 
     /// Sends what is waiting, publishes `offline` and disconnects, all within half a second once the commands that are
-    /// in progress have ended. Anyone who is owed a result then has it from the client that comes after.
+    /// in progress have ended. The next client then sends the results that are still due.
     async fn shut_down(mut self) {
         self.take_pending_events();
         self.announcer = None;
@@ -478,7 +478,7 @@ impl Client {
         if tokio::time::timeout(LAST_WRITE, close).await.is_err() {
             tracing::warn!(target: "drivegate::north::mqtt", "the MQTT buffer is too slow: the last messages may be missing after a restart");
         }
-        // The client that a reload puts in its place goes on with them.
+        // The client that replaces it after a reload continues with them.
         self.stats.mqtt.keep_unread(Some(self.events));
         self.stats.mqtt.keep_broker(LinkOf::Topics, Some(self.link.broker()));
         let orders = self.commands.leave(self.outbox.into_results());

@@ -118,7 +118,7 @@ impl Commands {
         }
     }
 
-    /// The state handed over to the next client, besides these results.
+    /// The state handed over to the next client, in addition to these results.
     pub(super) fn leave(self, results: Vec<Message>) -> OrdersLeft {
         OrdersLeft {
             waiting: self.waiting,

@@ -65,7 +65,7 @@ pub(super) enum ConnectionEvent {
     Sent(u16),
     /// The broker acknowledged the message.
     Acked(u16),
-    /// The broker refused the message; the connection goes on.
+    /// The broker refused the message; the connection stays open.
     Refused(u16, PubAckReason),
     /// A message on a topic that was subscribed to.
     Message(Box<Incoming>),
@@ -363,7 +363,7 @@ pub(super) fn commanding(path: String) -> Filter {
     }
 }
 
-/// What a packet needs besides topic, payload and correlation data, bytes, at most.
+/// Maximum bytes of a packet in addition to topic, payload and correlation data.
 pub(super) const PACKET_OVERHEAD: usize = 24;
 
 /// Maximum size of the packet with `message`, bytes.

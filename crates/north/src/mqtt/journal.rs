@@ -4,8 +4,8 @@
 //! Segment files `{name}-{number}.log` in one directory, each a sequence of records ([`super::record`]): messages with
 //! ascending numbers, and marks up to which number all messages are acknowledged. Records are only appended. A segment
 //! whose messages are all acknowledged is deleted (the last one: truncated). When the buffer or the disk is full, the
-//! oldest segment is deleted. What is damaged is copied to `{name}-{number}-{offset}.damaged`; reading goes on at the next
-//! valid record.
+//! oldest segment is deleted. Damaged parts are copied to `{name}-{number}-{offset}.damaged`; reading continues at the
+//! next valid record.
 //!
 //! What cannot be written waits in memory behind what is on disk, so the order stays, and is written as soon as the disk
 //! takes it.

@@ -31,7 +31,7 @@ pub(super) enum Step {
     Sent(u16),
     /// The broker acknowledged the message.
     Acked(u16),
-    /// The broker refused the message; the connection goes on.
+    /// The broker refused the message; the connection stays open.
     Refused(u16, PubAckReason),
     /// A message on a topic that was subscribed to.
     Message(Box<Incoming>),

@@ -131,7 +131,7 @@ pub struct Options {
     pub commands: bool,
     /// Commands without an `id` are refused, except stops.
     pub require_id: bool,
-    /// Filters of response topics that are allowed besides those outside of `base`.
+    /// Filters of response topics that are allowed in addition to those outside of `base`.
     pub response_topics: Vec<String>,
     /// The topic levels `as/WHO` of principals; none where `[authority]` is off.
     pub principals: Option<Vec<String>>,

@@ -46,7 +46,7 @@ pub(super) struct Publisher {
     cursor: usize,
     buses: Vec<BusTopic>,
     buses_at: Option<Instant>,
-    /// Retained topics that are published besides.
+    /// Additional retained topics.
     besides: Vec<Arc<str>>,
     /// Largest packet of the broker, bytes.
     max_packet: usize,
@@ -141,7 +141,7 @@ impl Publisher {
     }
 
     /// Observes this plant from now on; publishes everything again and clears the topics that no longer exist.
-    /// `besides` are retained topics that someone else publishes.
+    /// `besides` are retained topics that other code publishes.
     pub(super) fn adopt(&mut self, plant: &Plant, besides: Vec<Arc<str>>) {
         let old: Vec<Arc<str>> = self.all_topics().cloned().collect();
         self.drives = plant
@@ -177,7 +177,7 @@ impl Publisher {
         self.vanished_cleared = false;
     }
 
-    /// The retained topics of drives and buses, and those besides.
+    /// The retained topics of drives and buses, and the additional ones.
     pub(super) fn all_topics(&self) -> impl Iterator<Item = &Arc<str>> {
         let drives = self
             .drives

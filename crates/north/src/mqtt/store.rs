@@ -2,7 +2,7 @@
 //! is, nothing else waits for it.
 //!
 //! While nothing waits on disk, a message goes to the outbox at once and to the disk for the case that the process ends
-//! before it is acknowledged. Otherwise it waits its turn behind what is on disk.
+//! before it is acknowledged. Otherwise it waits behind the messages on disk.
 
 use std::io;
 use std::path::PathBuf;
@@ -335,7 +335,7 @@ impl Thread {
         thread
     }
 
-    /// Works until nobody sends jobs any more; `bytes` is the size of the messages that wait.
+    /// Works until all senders of jobs are gone; `bytes` is the size of the messages that wait.
     fn work(mut self, jobs: &Receiver<Job>, bytes: &AtomicUsize) {
         loop {
             let mut load = None;

@@ -22,14 +22,14 @@ pub(super) struct SetTopic<'t> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct HoldTopic<'t> {
     pub(super) drive: &'t str,
-    /// Without one it is nobody's.
+    /// Without one it has no owner.
     pub(super) who: Option<&'t str>,
 }
 
 /// The topic at which all drives are stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct StopTopic<'t> {
-    /// WHO of `as/WHO`; without one it is nobody's.
+    /// WHO of `as/WHO`; without one it has no owner.
     pub(super) who: Option<&'t str>,
 }
 

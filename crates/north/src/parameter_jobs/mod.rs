@@ -35,7 +35,7 @@ pub struct How {
     pub pace: Pace,
 }
 
-/// Begins to read a drive, unless that goes on already; the number of the reading.
+/// Begins to read a drive, unless a reading is in progress; the number of the reading.
 ///
 /// # Errors
 /// Why it cannot be read.
@@ -106,7 +106,7 @@ struct Looks {
     waits: Option<String>,
 }
 
-/// Reads the parameters at the `known` addresses, or all where none is known; `seen` is told how far it is.
+/// Reads the parameters at the `known` addresses, or all where none is known; `seen` receives the progress.
 async fn read(
     drive: &DriveHandle,
     origin: Origin,

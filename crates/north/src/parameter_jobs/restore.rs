@@ -270,7 +270,7 @@ pub(super) async fn blocking<T: Send + 'static>(
     }
 }
 
-/// Whether a machine is the one to which a restore belongs, by what both said of themselves.
+/// Whether a machine is the one to which a restore belongs, by their identities.
 enum Identified {
     Same,
     /// It has not been read yet since the drive came back.
@@ -379,8 +379,7 @@ impl Run {
 
     /// The machine as it is configured now, whatever it is called.
     ///
-    /// # Errors
-    /// It is not, or what the restore was asked for by that name is another machine now.
+    /// # Errors It is not, or that name now belongs to another machine.
     fn bound(&mut self, plant: &Plant) -> Result<DriveHandle, String> {
         let of = self.restoration.journal().of.place();
         let drive = plant.drive_at(&self.machine).ok_or_else(|| {

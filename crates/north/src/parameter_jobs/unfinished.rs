@@ -1,5 +1,5 @@
 //! Restores that did not come to their end: whose journal is on disk. The machine of such a journal takes no commands
-//! but stops. A journal whose machine is no longer configured is told of by an event, and by `drivegate check`.
+//! but stops. A journal whose machine is no longer configured is reported by an event, and by `drivegate check`.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use crate::process_image::{Access, BusSpec, DriveSpec, Machine};
 /// Time for the journals to be read at the start; on a slow disk the drives are held until they are.
 const LOOK: Duration = Duration::from_secs(5);
 
-/// A journal, and what it says of its owner.
+/// A journal, and its owner.
 type Found = (JournalFile, Result<Owner, String>);
 
 /// A journal that concerns a drive.
@@ -119,7 +119,7 @@ pub fn orphans<'a>(
         .collect())
 }
 
-/// What is said of a journal that belongs to no drive.
+/// The message about a journal that belongs to no drive.
 fn orphaned((file, owner): &Found) -> (PathBuf, String, &'static str) {
     match owner {
         Ok(owner) => (

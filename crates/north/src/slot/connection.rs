@@ -49,7 +49,7 @@ pub(super) struct Connection<S> {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
-    /// A connection that begins with `greeting`; with a `port` it speaks telnet.
+    /// A connection that begins with `greeting`; with a `port` it uses telnet.
     pub(super) fn new(stream: S, tool: Arc<Tool>, port: Option<ServedPort>, greeting: Vec<u8>) -> Connection<S> {
         Connection {
             stream,

@@ -238,7 +238,7 @@ impl Dialogue {
     fn answer(&mut self, pending: &Pending, outcome: &Outcome, frame: Option<Vec<u8>>, now: Instant) {
         let protocol = self.tool.protocol();
         if pending.request.is_broadcast(protocol) {
-            // A broadcast that was sent is answered by nobody.
+            // A broadcast that was sent has no reply.
             let sent = outcome.is_ok();
             return self.tool.count(if sent {
                 SlotOutcome::Answered

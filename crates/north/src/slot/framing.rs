@@ -18,9 +18,9 @@ const HALF_FRAME: Duration = Duration::from_millis(250);
 /// A request of a tool.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Said {
-    /// A sound request.
+    /// A valid request.
     Request(ToolRequest),
-    /// Bytes that nobody answers: a wrong check code, half a frame, no frame at all.
+    /// Bytes that are not answered: a wrong check code, half a frame, no frame at all.
     Broken,
 }
 
@@ -30,7 +30,7 @@ pub(super) struct Framing {
     protocol: Protocol,
     frames: Frames,
     arrivals: Arrivals,
-    /// When the first byte came of what was said last.
+    /// When the first byte of the last message arrived.
     asked: Option<Instant>,
 }
 
@@ -50,7 +50,7 @@ impl Framing {
         self.arrivals.came(bytes.len(), now);
     }
 
-    /// What the tool said next, as far as that is clear at `now`.
+    /// The next message of the tool, as far as it is clear at `now`.
     pub(super) fn next(&mut self, now: Instant) -> Option<Said> {
         loop {
             let piece = self.frames.next(None, now)?;
@@ -65,7 +65,7 @@ impl Framing {
         }
     }
 
-    /// When the first byte came of what the tool said last.
+    /// When the first byte of the tool's last message arrived.
     pub(super) fn asked(&self) -> Option<Instant> {
         self.asked
     }

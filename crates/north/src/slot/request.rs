@@ -7,7 +7,7 @@ use crate::codec::{Exception, Protocol, RequestPdu, ascii, rtu};
 /// the drive, or clear what it has counted.
 const READING_DIAGNOSTICS: [u16; 10] = [0, 2, 11, 12, 13, 14, 15, 16, 17, 18];
 
-/// A sound frame of a tool.
+/// A valid frame of a tool.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct ToolRequest {
     /// Who is asked; 0 is the broadcast, except on N2.
@@ -40,7 +40,7 @@ pub(super) enum Refused {
 }
 
 impl ToolRequest {
-    /// The request in a whole frame; `None` where the frame is not sound: nobody answers that.
+    /// The request in a complete frame; `None` if the frame is invalid: it is not answered.
     pub(super) fn of(protocol: Protocol, frame: &[u8]) -> Option<ToolRequest> {
         let (address, pdu) = match protocol {
             Protocol::ModbusRtu => rtu::open_frame(frame).map(|(address, pdu)| (address, pdu.to_vec()))?,
@@ -56,7 +56,7 @@ impl ToolRequest {
         })
     }
 
-    /// Whether everybody on the line is asked, and nobody answers.
+    /// Whether it is a broadcast, which is not answered.
     pub(super) fn is_broadcast(&self, protocol: Protocol) -> bool {
         self.address == 0 && protocol != Protocol::N2
     }

@@ -247,7 +247,7 @@ impl Tool {
             }
         }
         for drive in drives {
-            // Its answer is nobody's: the broadcast has none.
+            // It has no reply: it was a broadcast.
             if let Some(stop) = stop_in(drive, pdu, now) {
                 drop(drive.place(stop, self.origin.clone(), Authority::Write, EXPIRY, now));
             }

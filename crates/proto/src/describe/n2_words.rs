@@ -40,7 +40,7 @@ pub(super) fn answer(asked: &RequestPdu, reply: &Reply) -> String {
     }
 }
 
-/// A line that nobody asked for: a request of another master, or an answer that came late.
+/// An unrequested line: a request of another master, or a late reply.
 pub(super) fn stray(bytes: &[u8]) -> String {
     if let Some((address, Ok(_))) = Command::decode(bytes) {
         return format!("foreign: a request to address {address}");
@@ -51,7 +51,7 @@ pub(super) fn stray(bytes: &[u8]) -> String {
     super::no_frame(bytes)
 }
 
-/// Whether the bytes are one sound answer of N2.
+/// Whether the bytes are one valid N2 reply.
 pub(super) fn is_answer(bytes: &[u8]) -> bool {
     bytes
         .strip_suffix(b"\r")

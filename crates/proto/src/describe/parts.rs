@@ -8,13 +8,13 @@ use crate::{Decoded, Protocol, Reply, Request, RequestPdu};
 /// What some bytes of a transaction are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// The request, sent back by an adapter that hears itself.
+    /// The request, echoed by the adapter.
     Echo,
     /// The reply to the request, perhaps an exception.
     Reply,
-    /// A sound frame of someone else.
+    /// A valid frame of another device.
     Foreign,
-    /// No sound frame.
+    /// Not a valid frame.
     Garbage,
 }
 
@@ -72,8 +72,8 @@ fn is_echo(protocol: Protocol, request: &Request, frame: &[u8], rest: &[u8], ans
     !like_its_reply || !answered || more.starts_with(frame)
 }
 
-/// Bytes until the reply that was believed although it stands behind garbage, or all. Exceptions and acknowledgements are
-/// not believed there.
+/// Bytes before the reply that was accepted although garbage precedes it, or all. Exceptions and acknowledgements are
+/// not accepted there.
 fn garbage_len(protocol: Protocol, request: &Request, rest: &[u8], answered: bool) -> usize {
     let is_reply = |at: &usize| {
         let behind = rest.get(*at..).unwrap_or_default();

@@ -5,7 +5,7 @@ use super::{Exception, RequestPdu, be, counted, pack, put, unpack, words};
 /// A reply of a slave.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Reply {
-    /// To functions 1 and 2, as many as were asked for.
+    /// To functions 1 and 2, as many as requested.
     Bits(Vec<bool>),
     /// To functions 3, 4 and 23.
     Registers(Vec<u16>),
@@ -76,7 +76,7 @@ impl Reply {
         }
     }
 
-    /// What the slave said in `pdu`, if it fits `request`.
+    /// The reply in `pdu`, if it fits `request`.
     ///
     /// # Errors
     /// [`Misfit`] when function, byte count or echo do not fit: the frame answers something else.
@@ -124,7 +124,7 @@ impl Reply {
     }
 }
 
-/// The frame is sound but no answer to the request: the bus drops it and waits on.
+/// The frame is valid but does not answer the request: the bus drops it and keeps waiting.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Misfit;
 

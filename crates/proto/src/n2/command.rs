@@ -79,7 +79,7 @@ pub(super) fn encode_text(address: u8, text: &[u8], out: &mut Vec<u8>) {
     seal(b'>', &body, out);
 }
 
-/// A command as a drive hears it: the address and the command, or the error code that is due.
+/// A command as a drive receives it: the address and the command, or the error code to return.
 pub type Heard = (u8, Result<Command, u8>);
 
 impl Command {

@@ -1,4 +1,4 @@
-//! `drivegate profiles check`: whether a profile is sound and its commands are safe.
+//! `drivegate profiles check`: whether a profile is valid and its commands are safe.
 
 use std::path::Path;
 use std::process::ExitCode;

@@ -1,4 +1,4 @@
-//! Where a backup is unpacked before it is put in place: a directory besides each destination, removed in any case.
+//! Where a backup is unpacked before it is put in place: a directory next to each destination, always removed.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read};

@@ -1,4 +1,4 @@
-//! The gateway at work: signals, commands of local clients, reloads, and the watchdog besides all of them.
+//! The gateway at work: signals, commands of local clients, reloads, and the watchdog.
 
 use std::path::Path;
 

@@ -1,4 +1,4 @@
-//! What the service manager, the metrics and the events are told of the gateway as a whole.
+//! The reports on the whole gateway to the service manager, the metrics and the events.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -89,7 +89,7 @@ impl Watch<'_> {
     }
 }
 
-/// The first error, and how many there are besides.
+/// The first error, and the number of further ones.
 fn summary(errors: &[String]) -> Option<String> {
     let (first, others) = errors.split_first()?;
     Some(match others.len() {

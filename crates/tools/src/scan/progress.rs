@@ -22,7 +22,7 @@ const REMEMBERED: usize = 32;
 pub(super) struct Progress {
     total: usize,
     done: usize,
-    /// Time of all remaining steps if nobody answers.
+    /// Time of all remaining steps if no drive replies.
     patience: Duration,
     /// What the last steps took, and what they would have taken at most.
     steps: VecDeque<(Duration, Duration)>,

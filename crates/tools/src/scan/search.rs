@@ -17,24 +17,24 @@ use crate::drive::profile::{Profile, Profiles};
 use crate::drive::{Probe, identify};
 use crate::line::{Line, LineOptions};
 
-/// What came from the line, besides replies.
+/// What was received apart from replies.
 #[derive(Debug, Default)]
 pub(crate) struct Heard {
     /// Settings and addresses that were answered with invalid frames.
     pub(crate) garbage: Vec<(Setting, u8)>,
     /// Bytes that came in transactions, echoes of requests aside.
     pub(crate) bytes: usize,
-    /// Bytes that came while nothing was asked for.
+    /// Bytes received while no request was open.
     pub(crate) unasked: usize,
     /// Requests that the adapter sent back.
     pub(crate) echoes: usize,
-    /// Replies that are sound but for their beginning, which was lost.
+    /// Replies without their beginning, otherwise valid.
     pub(crate) start_lost: usize,
     /// Echoes that lack their end.
     pub(crate) cut_echoes: usize,
     /// Stray bytes directly before a reply.
     pub(crate) stray_before: usize,
-    /// Answers of a gateway by which nobody is at the address.
+    /// Replies of a gateway that no drive is at the address.
     pub(crate) no_way: usize,
     /// Requests.
     pub(crate) requests: usize,
@@ -73,7 +73,7 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Listens for `time` before anything is sent: whether someone else speaks on the line.
+    /// Listens for `time` before anything is sent: whether there is another master on the line.
     ///
     /// # Errors
     /// The port cannot be opened, or was lost.

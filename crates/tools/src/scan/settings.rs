@@ -15,8 +15,8 @@ use crate::report;
 const USUAL_BAUDS: [u32; 3] = [9600, 19_200, 38_400];
 /// Bauds of Modbus ASCII tried by default: all that the switches of the TECO 7300PA can set, the factory setting first.
 const ASCII_BAUDS: [u32; 4] = [19_200, 9600, 4800, 2400];
-/// Baud that is assumed behind a raw device server, which sets up its line itself: the highest of the usual ones, because a
-/// reply that comes later than the wire needs is believed, one that comes earlier is not.
+/// Baud that is assumed behind a raw device server, which sets up its line itself: the highest of the usual ones,
+/// because a reply that comes later than the wire needs is accepted, one that comes earlier is not.
 const ASSUMED_BAUD: u32 = 38_400;
 /// All bauds of the built-in profiles and those of faster devices.
 const ALL_BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400, 1200, 600, 300];

@@ -283,7 +283,7 @@ impl Holding {
         }
     }
 
-    /// The client stopped, or gave its run back: it does not go on with a run that was refused.
+    /// The client stopped, or gave its run back: it does not continue a run that was refused.
     pub fn said_stop(&mut self, who: &Claim) {
         self.waiting.retain(|waiting| !waiting.who.is(who));
     }

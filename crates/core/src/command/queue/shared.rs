@@ -149,7 +149,7 @@ impl CommandQueue {
     /// Clears the wake-up.
     pub fn clear_wake(&self) {
         let mut count = [0u8; 8];
-        // Nothing to read means that nobody woke the bus.
+        // Nothing to read: the bus was not woken.
         let _ = rustix::io::read(&self.wake, &mut count);
     }
 

@@ -93,8 +93,8 @@ impl Pending {
         command.urgency == Urgency::Command && command.reach().iter().any(stopped)
     }
 
-    /// Of each drive one stop waits that does nothing else, and one that does. Later ones join theirs if they ask for the
-    /// same, and are answered with it; of two that do different things besides the newer one is sent.
+    /// Of each drive one stop waits that does nothing else, and one that does. Later ones join theirs if they ask for
+    /// the same, and are answered with it; of two that also do different things, the newer one is sent.
     pub(super) fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.drive;
         self.note_accepted(&stop, now);

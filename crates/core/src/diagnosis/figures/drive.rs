@@ -34,7 +34,7 @@ pub enum Sign {
     Late,
     /// Replies that used more than half of the time limit.
     Slow,
-    /// Transactions that show whether the adapter hears itself.
+    /// Transactions that show whether the adapter receives its own requests.
     EchoShown,
     /// It does.
     Echoed,

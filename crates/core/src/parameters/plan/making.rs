@@ -78,7 +78,7 @@ impl<'a> Making<'a> {
         self.finish()
     }
 
-    /// Something speaks against it that the user may override.
+    /// There is an objection that the user may override.
     fn doubt(&mut self, what: String, remedy: &str) {
         if self.wishes.force {
             self.risks.push(Risk(what));
@@ -92,7 +92,7 @@ impl<'a> Making<'a> {
         self.wishes.only.contains(id)
     }
 
-    /// Whether it is to be restored, unless something speaks against it.
+    /// Whether it is to be restored, unless there is an objection.
     fn is_asked_for(&self, id: &Id) -> bool {
         self.wishes.only.is_empty() || self.is_named_singly(id)
     }

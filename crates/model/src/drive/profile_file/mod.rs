@@ -75,7 +75,7 @@ const BUILT_IN: &[(&str, &str)] = files![
     "yaskawa-v1000.toml",
 ];
 
-/// Bases of bases that are followed; no sound set of files has so many.
+/// Nested bases that are followed; no valid set of files has so many.
 const MOST_BASES: usize = 16;
 
 impl Profiles {

@@ -404,7 +404,7 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
     }
 }
 
-/// Checks `scale_from`: a whole number that the drive is asked for.
+/// Checks `scale_from`: an integer that is read from the drive.
 pub(super) fn check_scale(reader: &Reader<'_>, index: usize, points: &[Point]) {
     let scale = points.get(index).and_then(Point::raw).and_then(|raw| raw.scale_from);
     let Some(scale) = scale.and_then(|scale| points.get(scale)) else {

@@ -1,8 +1,8 @@
 //! How often passwords may be tried. Pure: time is an argument.
 //!
-//! An attacker must not be able to lock an operator out, so nobody's attempts are counted against anybody else: each
-//! address has its own count, and a browser that has logged in as a user before has one of its own for that user. What is
-//! counted for a user over all addresses holds up only addresses that failed before themselves.
+//! An attacker must not be able to lock an operator out, so attempts of one client never count against another: each
+//! address has its own count, and a browser that has logged in as a user before has one of its own for that user. What
+//! is counted for a user over all addresses holds up only addresses that failed before themselves.
 
 use std::collections::HashMap;
 use std::hash::Hash;

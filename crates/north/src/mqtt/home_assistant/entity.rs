@@ -135,7 +135,7 @@ pub(super) fn of_gateway(sources: &Sources, id: &str, buses: &[String]) -> Entit
     buses.iter().flat_map(bus_entities).collect()
 }
 
-/// The entities of a drive: one for each published point, and those besides them.
+/// The entities of a drive: one for each published point, and the additional ones.
 pub(super) fn of_drive(sources: &Sources, id: &str, spec: &DriveSpec) -> Entities {
     let drive = DriveEntities { sources, id, spec };
     let published = payload::published_points(&spec.profile);

@@ -1,5 +1,5 @@
 //! The task that owns session, commands and connection. It never waits for the broker: what finds no room is kept, and
-//! the session is not asked for more until there is room.
+//! no more messages are taken from the session until there is room.
 
 mod answers;
 

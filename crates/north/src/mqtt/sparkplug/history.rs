@@ -1,4 +1,4 @@
-//! Values of one device while nobody receives them: the newest, in memory. Time is an argument.
+//! Values of one device while there is no receiver: the newest, in memory. Time is an argument.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};

@@ -16,7 +16,7 @@ struct State {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Host {
     state: Option<State>,
-    /// It speaks Sparkplug 3.0: a word that an older version left at the broker counts for nothing.
+    /// It uses Sparkplug 3.0: a STATE message that an older version left at the broker is ignored.
     has_objects: bool,
 }
 

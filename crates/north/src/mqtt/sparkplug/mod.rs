@@ -7,8 +7,8 @@
 //!                 commands ◀──────────────────────────── DCMD ◀───┘
 //! ```
 //!
-//! `topics`, `wire`, `metric`, `host`, `history` and `session` are pure: the session is told what the drives are and
-//! what the broker says, and is asked for the next message. `model` makes metrics of drives and buses, `orders` makes
+//! `topics`, `wire`, `metric`, `host`, `history` and `session` are pure: the session receives the drives' values and
+//! the broker's messages, and returns the next message. `model` makes metrics of drives and buses, `orders` makes
 //! commands of commands. `bd_seq` keeps the number of the session on disk. `client` is the task that owns them and the
 //! connection, which is apart from that of the MQTT topics, because its last will is the death of the node.
 

@@ -88,7 +88,7 @@ impl Orders {
         }
     }
 
-    /// What the client that comes after goes on with.
+    /// The state with which the next client continues.
     pub(super) fn leave(self) -> NodeOrdersLeft {
         NodeOrdersLeft(self.awaited)
     }
@@ -253,7 +253,7 @@ impl Request {
             return refused(Refusal::BadValue(why));
         }
         let placed = |mut metric: Metric| {
-            // Some hosts send the field empty besides an alias.
+            // Some hosts send the field empty in addition to an alias.
             metric.name = metric.name.filter(|name| !name.is_empty());
             let place = place(&metric);
             (metric, place)

@@ -1,5 +1,5 @@
-//! The session of the edge node: births before data, sequence numbers without gaps, deaths before new births. No I/O and
-//! no clock: it is told what happens, and asked for the next message.
+//! The session of the edge node: births before data, sequence numbers without gaps, deaths before new births. No I/O
+//! and no clock: it receives what happens, and returns the next message.
 
 mod device;
 
@@ -360,7 +360,7 @@ impl Session {
         self.past(tick).map_err(|due| again.into_iter().chain(due).min())
     }
 
-    /// What is to be said of a device now.
+    /// The message that is due for a device.
     fn device(&mut self, place: usize, tick: Tick) -> Result<Packet, Option<Instant>> {
         let least = self.rules.min_interval;
         let device = self.devices.get_mut(place).ok_or(None)?;
