@@ -283,7 +283,7 @@ fn described() -> Api {
         )
         .get(
             "/api/v1/buses/{name}/diagnosis",
-            Doc::object::<api::Diagnosis<'_>>("What is wrong with the line of a bus"),
+            Doc::object::<api::Diagnosis<'_>>("The diagnosis of the line of a bus"),
             views::diagnosis,
         )
         .get(

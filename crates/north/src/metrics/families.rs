@@ -251,7 +251,7 @@ fn buses(handles: &[BusHandle], all: &mut Families) {
     );
     let diagnosis = all.gauge(
         "drivegate_line_diagnosis",
-        "What is wrong with the line: 1 for each verdict that holds; drive is empty where it is about the whole line.",
+        "Diagnosis of the line: 1 for each active verdict; drive is empty if it concerns the whole line.",
     );
     for (labels, handle, health) in looks {
         let image = &handle.image;
