@@ -21,7 +21,7 @@ use drivegate::codec::{LineFormat, Protocol, Table};
 use drivegate::command::CommandQueue;
 use drivegate::drive::profile::Profiles;
 use drivegate::event::{Event, EventKind};
-use drivegate::north::NorthStats;
+use drivegate::north::NorthState;
 use drivegate::north::mqtt::{self, History, Options, Qos, Telemetry};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, Link};
@@ -69,7 +69,7 @@ fn measure() -> Result<(), Box<dyn Error>> {
 /// The gateway with its plant.
 struct Gateway {
     plant: SharedPlant,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     cancel: CancellationToken,
     mqtt: mqtt::Mqtt,
 }
@@ -108,7 +108,7 @@ impl Gateway {
             principals: None,
             sparkplug: None,
         };
-        let stats = Arc::<NorthStats>::default();
+        let stats = Arc::<NorthState>::default();
         let cancel = CancellationToken::new();
         let guard = runtime.enter();
         let mqtt = mqtt::start(options, plant.clone(), stats.clone(), cancel.clone());
@@ -159,11 +159,8 @@ fn plant(drives: u16) -> Result<Plant, Box<dyn Error>> {
         buses: vec![bus],
         events: Default::default(),
         writes: Default::default(),
-        recordings: Default::default(),
         stop_all: Arc::default(),
         drills: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
     })
 }
 

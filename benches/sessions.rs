@@ -18,7 +18,7 @@ use arc_swap::ArcSwap;
 use drivegate::codec::{LineFormat, Protocol, Table};
 use drivegate::command::CommandQueue;
 use drivegate::drive::profile::Profiles;
-use drivegate::north::NorthStats;
+use drivegate::north::NorthState;
 use drivegate::north::mqtt::{self, History, Options, Qos, Telemetry, sparkplug};
 use drivegate::plant::{BusHandle, Plant};
 use drivegate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, Link};
@@ -52,7 +52,7 @@ fn run() -> Result<(), Box<dyn Error>> {
         let name = format!("site-{:04}", FIRST + number);
         let plant = Arc::new(plant(&name, drives)?);
         let shared = Arc::new(ArcSwap::from(plant.clone()));
-        let stats = Arc::<NorthStats>::default();
+        let stats = Arc::<NorthState>::default();
         all.push((
             mqtt::start(options(&name)?, shared, stats.clone(), cancel.clone()),
             stats,
@@ -146,11 +146,8 @@ fn plant(name: &str, drives: u16) -> Result<Plant, Box<dyn Error>> {
         buses: vec![bus],
         events: Default::default(),
         writes: Default::default(),
-        recordings: Default::default(),
         stop_all: Arc::default(),
         drills: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
     })
 }
 

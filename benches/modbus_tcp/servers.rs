@@ -156,11 +156,8 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
         }],
         events: Default::default(),
         writes: Default::default(),
-        recordings: Default::default(),
         stop_all: Arc::default(),
         drills: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
     };
     let poll = move || {
         for (drive, value) in drives.iter().cycle().zip((0..=u16::MAX).cycle()) {

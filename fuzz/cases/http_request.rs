@@ -15,11 +15,8 @@ static SERVER: LazyLock<Offline> = LazyLock::new(|| {
         buses: Vec::new(),
         events: Default::default(),
         writes: Default::default(),
-        recordings: Default::default(),
         stop_all: Default::default(),
         drills: Default::default(),
-        parameters: Default::default(),
-        history: Default::default(),
     };
     Offline::new(Arc::new(ArcSwap::from_pointee(plant))).expect("a server")
 });

@@ -64,11 +64,8 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         buses: buses.collect(),
         events: Default::default(),
         writes: Default::default(),
-        recordings: Default::default(),
         stop_all: Default::default(),
         drills: Default::default(),
-        parameters: Default::default(),
-        history: Default::default(),
     }))
 });
 

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant, SystemTime};
 use drivegate::command::Authority;
 use drivegate::north::modbus_tcp::{self, Uncached};
 use drivegate::north::mqtt::Incoming;
-use drivegate::north::{NorthStats, mqtt};
+use drivegate::north::{NorthState, mqtt};
 use drivegate::plant::{Placed, SharedPlant};
 
 use super::scenario::Habit;
@@ -94,7 +94,7 @@ impl Servers {
             idle_timeout: None,
             uncached: Uncached::Forward,
         };
-        let stats = Arc::<NorthStats>::default();
+        let stats = Arc::<NorthState>::default();
         let modbus_tcp = modbus_tcp::Offline::new(options, plant.clone(), stats, address(250, 0), Authority::Write);
         Servers { plant, modbus_tcp }
     }

@@ -537,11 +537,8 @@ fn whatever_clients_try_nothing_goes_out_for_an_hour() {
         buses: vec![scene.handle.clone()],
         events: scene.events.clone(),
         writes: scene.writes.clone(),
-        recordings: Default::default(),
         stop_all: Arc::default(),
         drills: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
     };
     let profile = scene.handle.image.drives[0].spec.profile.clone();
     let index = |point: ModelPoint| profile.model_index(point).unwrap();

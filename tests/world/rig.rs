@@ -100,11 +100,8 @@ impl Rig {
             buses: vec![bus.handle.clone()],
             events,
             writes,
-            recordings: Default::default(),
             stop_all: Arc::default(),
             drills: Arc::default(),
-            parameters: Default::default(),
-            history: Default::default(),
         };
         Rig { bus, now, plant }
     }
@@ -180,11 +177,8 @@ impl Rig {
             buses: self.plant.buses.clone(),
             events: self.plant.events.clone(),
             writes: self.plant.writes.clone(),
-            recordings: Default::default(),
             stop_all: Arc::default(),
             drills: Arc::default(),
-            parameters: Default::default(),
-            history: Default::default(),
         }))
     }
 

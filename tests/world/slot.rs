@@ -10,7 +10,7 @@ use drivegate::codec::{LineFormat, Protocol, RequestPdu, Table};
 use drivegate::command::Urgency;
 use drivegate::drive::{DriveIndex, ModelPoint};
 use drivegate::north::slot::{Offline, Slot, SlotAccess};
-use drivegate::north::{NorthStats, SlotOutcome};
+use drivegate::north::{NorthState, SlotOutcome};
 use drivegate::process_image::Access;
 use drivegate::sim::random::Random;
 use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
@@ -55,7 +55,7 @@ struct Figures {
 struct ToolRig {
     rig: Rig,
     slot: Offline,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     dice: Random,
     question: Option<Question>,
     next: Instant,
@@ -92,7 +92,7 @@ impl ToolRig {
     fn with(line: Line, parts: Parts, access: SlotAccess, seed: u64) -> ToolRig {
         let mut rig = Rig::new(&line, parts);
         rig.until("all drives are read", Duration::from_secs(600), Rig::is_whole);
-        let stats: Arc<NorthStats> = Arc::default();
+        let stats: Arc<NorthState> = Arc::default();
         let slot = Offline::new(slot(&line, access), rig.shared_plant(), stats.clone(), "tool");
         ToolRig {
             next: rig.now,

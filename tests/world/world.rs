@@ -261,10 +261,7 @@ fn plant_of(buses: &[WorldBus], events: &Events, writes: &Arc<WriteStats>) -> Pl
         buses: buses.iter().map(|bus| bus.handle.clone()).collect(),
         events: events.clone(),
         writes: writes.clone(),
-        recordings: Default::default(),
         stop_all: Arc::default(),
         drills: Arc::default(),
-        parameters: Default::default(),
-        history: Default::default(),
     }
 }

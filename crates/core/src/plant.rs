@@ -17,8 +17,6 @@ use crate::drill::Drills;
 use crate::drive::DriveIndex;
 use crate::drive::why::Explanation;
 use crate::event::{Event, Events};
-use crate::history::{History, Recordings};
-use crate::parameters::Vault;
 use crate::process_image::{Access, BusImage, DriveImage, Machine, Reading};
 use crate::stop_all::StopAll;
 
@@ -99,16 +97,10 @@ pub struct Plant {
     pub events: Events,
     /// Counters of commands.
     pub writes: Arc<WriteStats>,
-    /// The recordings.
-    pub recordings: Arc<Recordings>,
     /// Commands that stop all drives.
     pub stop_all: Arc<StopAll>,
     /// Drills.
     pub drills: Arc<Drills>,
-    /// Readings of parameters.
-    pub parameters: Arc<Vault>,
-    /// The past of the drives.
-    pub history: Arc<History>,
 }
 
 /// Access to one drive.
@@ -146,11 +138,8 @@ impl Plant {
             buses,
             events: Events::default(),
             writes: Arc::default(),
-            recordings: Arc::default(),
             stop_all: Arc::default(),
             drills: Arc::default(),
-            parameters: Arc::default(),
-            history: Arc::default(),
         }
     }
 

@@ -27,10 +27,9 @@ use crate::command::{CommandQueue, NotStopped, Outcome, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::{Event, EventKind, Events};
 use crate::files::Keeper;
-use crate::history::{History, RecorderTask, Recordings};
+use crate::history::RecorderTask;
 use crate::north::local::Control;
-use crate::north::{NorthStats, ServerError, bacnet, http, local, modbus_tcp, mqtt, slot};
-use crate::parameters::Vault;
+use crate::north::{NorthState, ServerError, bacnet, http, local, modbus_tcp, mqtt, slot};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
 use crate::start_guard::{BusGuards, Guards};
@@ -70,19 +69,15 @@ pub struct Daemon {
     parted: Parted,
     events: Events,
     writes: Arc<WriteStats>,
-    stats: Arc<NorthStats>,
+    north: Arc<NorthState>,
     modbus_tcp: ServerSlot<modbus_tcp::Server>,
     mqtt: ServerSlot<mqtt::Mqtt>,
     http: ServerSlot<http::Http>,
     slots: ServerSlot<slot::Server>,
     bacnet: ServerSlot<bacnet::Server>,
     local: ServerSlot<local::Local>,
-    recordings: Arc<Recordings>,
-    /// Readings of parameters.
-    vault: Arc<Vault>,
     /// Reads parameters every so often.
     reader: Option<tokio::task::JoinHandle<()>>,
-    history: Arc<History>,
     recorder: Option<RecorderTask>,
     /// Keeps events and counters on disk.
     keeper: Option<Keeper>,
@@ -120,15 +115,9 @@ impl Daemon {
         let settings = file_limit::fit(settings);
         let drives = settings.buses.iter().map(|bus| bus.drives.len()).sum();
         let (events, writes) = (Events::of_drives(drives), Arc::new(WriteStats::default()));
-        let recordings = Arc::new(Recordings::default());
-        let vault = Arc::new(Vault::default());
-        let history = Arc::new(History::default());
         let plant = Plant {
             events: events.clone(),
             writes: writes.clone(),
-            recordings: recordings.clone(),
-            parameters: vault.clone(),
-            history: history.clone(),
             ..Plant::new(&settings.gateway, settings.stale_after, Vec::new())
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
@@ -141,17 +130,14 @@ impl Daemon {
             parted: Parted::default(),
             events,
             writes,
-            stats: Arc::default(),
+            north: Arc::default(),
             modbus_tcp: ServerSlot::default(),
             mqtt: ServerSlot::default(),
             http: ServerSlot::default(),
             slots: ServerSlot::default(),
             bacnet: ServerSlot::default(),
             local: ServerSlot::default(),
-            recordings,
-            vault,
             reader: None,
-            history,
             recorder: None,
             keeper: None,
             guards: Arc::default(),
@@ -169,7 +155,7 @@ impl Daemon {
         daemon.apply_keeper(&settings).await;
         daemon.apply_audit(&settings).await;
         // So that MQTT misses no event, though it comes after the buses: its first messages tell of them.
-        drop(daemon.stats.mqtt.keep_unread(Some(daemon.events.subscribe())));
+        drop(daemon.north.mqtt.keep_unread(Some(daemon.events.subscribe())));
         // Before the first start is counted.
         daemon.apply_guards(&settings).await;
         let prepared = daemon.prepare_buses(&settings)?;
@@ -215,8 +201,8 @@ impl Daemon {
     }
 
     /// Counters of the servers.
-    pub fn stats(&self) -> Arc<NorthStats> {
-        self.stats.clone()
+    pub fn stats(&self) -> Arc<NorthState> {
+        self.north.clone()
     }
 
     /// Applies a new configuration and returns what changed. What is unchanged keeps running without a lost cycle.
@@ -344,11 +330,8 @@ impl Daemon {
             buses: buses.iter().map(|(_, task)| task.handle().clone()).collect(),
             events: self.events.clone(),
             writes: self.writes.clone(),
-            recordings: self.recordings.clone(),
             stop_all: self.plant.load().stop_all.clone(),
             drills: self.plant.load().drills.clone(),
-            parameters: self.vault.clone(),
-            history: self.history.clone(),
         }));
         let images = buses
             .iter()
@@ -368,7 +351,7 @@ impl Daemon {
     fn prepare_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
         let failed = |error| StartError::Bus(bus.spec.name.clone(), error);
         let (_, slow_cycle) = bus.achievable();
-        let hold = |spec: &DriveSpec| self.vault.hold(&bus.spec.machine(spec));
+        let hold = |spec: &DriveSpec| self.north.parameters.hold(&bus.spec.machine(spec));
         let image = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), slow_cycle).with_hold(hold(spec)));
         let drives = bus.drives.iter().map(image).collect();
         let image = Arc::new(BusImage::new(bus.spec.clone(), drives));

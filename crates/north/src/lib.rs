@@ -53,7 +53,7 @@ pub use listener::ListenerStates;
 pub use pem::unreadable;
 pub use server::{Reconfigure, Server};
 pub use stats::{
-    BacnetStats, ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats,
+    BacnetStats, ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthState, RefusalStats, ReloadStats,
     ServerKind, SlotOutcome, SlotStats,
 };
 pub use tls_words::{GATEWAY, Peer, explain};

@@ -17,7 +17,7 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::{NorthStats, ServerError, ServerKind};
+use super::{NorthState, ServerError, ServerKind};
 
 use self::accept::{AcceptLoop, ListeningSocket, stop_listening};
 pub(crate) use self::state::ListenerState;
@@ -66,7 +66,7 @@ impl ListenerSpec {
 #[derive(Debug)]
 pub(super) struct Listeners<H> {
     server: ServerKind,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     /// Where listeners and connections run.
     tasks: TaskTracker,
     cancel: CancellationToken,
@@ -119,7 +119,7 @@ impl<H: ConnectionHandler> Listeners<H> {
     /// None yet; they run until `cancel`.
     pub(super) fn new(
         server: ServerKind,
-        stats: Arc<NorthStats>,
+        stats: Arc<NorthState>,
         tasks: TaskTracker,
         cancel: CancellationToken,
     ) -> Listeners<H> {

@@ -1,10 +1,10 @@
 //! Whether the gateway is ready: every bus is open, each drive was tried, and every server listens.
 
-use super::NorthStats;
+use super::NorthState;
 use crate::plant::Plant;
 
 /// Why the gateway is not ready; empty if it is.
-pub(crate) fn reasons(plant: &Plant, stats: &NorthStats) -> Vec<String> {
+pub(crate) fn reasons(plant: &Plant, stats: &NorthState) -> Vec<String> {
     let mut reasons = Vec::new();
     for bus in &plant.buses {
         let name = &bus.image.spec.name;

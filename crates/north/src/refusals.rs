@@ -7,19 +7,19 @@ use std::time::Instant;
 
 use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer, NoPlace};
 use super::log_throttle::LogThrottle;
-use super::{ConnectionRefusal, NorthStats, ServerKind};
+use super::{ConnectionRefusal, NorthState, ServerKind};
 use crate::command::Authority;
 
 /// The refusals of one server.
 #[derive(Debug)]
 pub(super) struct Refusals {
     server: ServerKind,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     logs: [LogThrottle; ConnectionRefusal::ALL.len()],
 }
 
 impl Refusals {
-    pub(super) fn new(server: ServerKind, stats: Arc<NorthStats>) -> Refusals {
+    pub(super) fn new(server: ServerKind, stats: Arc<NorthState>) -> Refusals {
         Refusals {
             server,
             stats,

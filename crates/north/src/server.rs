@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::{NorthStats, ServerError};
+use super::{NorthState, ServerError};
 use crate::plant::SharedPlant;
 
 /// Time limit for a server to stop.
@@ -29,7 +29,7 @@ pub trait Server: Sized + std::fmt::Debug {
     async fn start(
         options: Self::Options,
         plant: SharedPlant,
-        stats: Arc<NorthStats>,
+        stats: Arc<NorthState>,
         cancel: CancellationToken,
     ) -> Result<Self, ServerError>;
 

@@ -12,10 +12,18 @@ use super::http::PostedCommands;
 use super::listener::ListenerStates;
 use super::mqtt::{Broker, NodeOrdersLeft, OrdersLeft};
 use crate::event::Event;
+use crate::history::{History, Recordings};
+use crate::parameters::Vault;
 
-/// State that survives the servers a reload replaces: counters of all servers, and the accepted commands.
+/// What the servers share and a reload, which replaces servers, keeps: counters, recent commands, and what is recorded.
 #[derive(Debug, Default)]
-pub struct NorthStats {
+pub struct NorthState {
+    /// The recordings.
+    pub recordings: Arc<Recordings>,
+    /// Readings of parameters, and restores.
+    pub parameters: Arc<Vault>,
+    /// Trends, counters and events of the past.
+    pub history: Arc<History>,
     /// Of the Modbus TCP server.
     pub modbus_tcp: ModbusTcpStats,
     /// Of the MQTT client.

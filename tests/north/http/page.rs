@@ -45,6 +45,7 @@ fn url(server: &Server) -> String {
 async fn every_view_is_complete_and_accessible() {
     let Lively {
         mut plant,
+        stats,
         mut going_on,
     } = Lively::new();
     let nasty = hand_made::drive("line3", NASTY, 9, &hand_made::nx());
@@ -57,7 +58,7 @@ async fn every_view_is_complete_and_accessible() {
         health.reason = Some("the adapter is gone".to_string());
     });
     plant.events.publish(event(EventKind::Fault, NASTY, NASTY));
-    let server = Server::of(plant).await;
+    let server = Server::showing(plant, stats).await;
     let _answering = keep_answering(move || {
         hand_made::answer(&nasty, Instant::now(), hand_made::nx_faulted);
         going_on.answer();

@@ -1,11 +1,10 @@
 //! The parameters of a drive: none, kept ones, a reading that goes on, one that failed, a damaged file.
 
 use std::fs;
-use std::sync::Arc;
 use std::time::Duration;
 
 use drivegate::drive::parameters::RawValue;
-use drivegate::parameters::{Entry, Id, ParameterFile, Store, Vault};
+use drivegate::parameters::{Entry, Id, ParameterFile, Store};
 use serde_json::{Value, json};
 
 use super::client::get;
@@ -42,11 +41,10 @@ async fn json_of(server: &Server) -> Value {
 async fn the_last_reading_and_the_present_one_are_served() {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::new(folder.path().join("params"));
-    let mut plant = plant::mixed();
-    let vault = Arc::new(Vault::default());
-    plant.parameters = vault.clone();
+    let plant = plant::mixed();
     let machine = plant.drive("pump-1").unwrap().machine();
     let server = Server::of(plant).await;
+    let vault = server.stats.parameters.clone();
     let nothing = json!({"drive": "pump-1", "last": null, "reading": null, "error": null});
     assert_eq!(json_of(&server).await, nothing, "nothing is kept anywhere");
     vault.configure(Some(store.clone()), Default::default());
@@ -96,11 +94,8 @@ async fn an_unknown_drive_and_a_damaged_file_are_told() {
     let kept = store.keep(&reading()).unwrap();
     let text = fs::read_to_string(&kept).unwrap();
     fs::write(&kept, text.replace("102 = 5000", "102 = 5001")).unwrap();
-    let mut plant = plant::mixed();
-    let vault = Arc::new(Vault::default());
-    vault.configure(Some(store), Default::default());
-    plant.parameters = vault;
-    let server = Server::of(plant).await;
+    let server = Server::of(plant::mixed()).await;
+    server.stats.parameters.configure(Some(store), Default::default());
     let unknown = get(server.address, "/api/v1/drives/pump-9/params").await;
     assert_eq!(unknown.status, 404);
     assert!(

@@ -15,7 +15,7 @@ use drivegate::drive::profile::Profiles;
 use drivegate::drive::{ModelPoint, Profile};
 use drivegate::event::{Event, EventKind};
 use drivegate::north::http::{self, Http, Options};
-use drivegate::north::{NorthStats, SlotOutcome};
+use drivegate::north::{NorthState, SlotOutcome};
 use drivegate::north::{Reconfigure as _, Server as _};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{DriveImage, DriveSpec, LeaseAction, Link, Outcome, PollCycle, Supervision};
@@ -206,8 +206,8 @@ pub(crate) fn count_a_write(plant: &Plant) {
 }
 
 /// Figures of all north sides.
-pub(crate) fn stats() -> Arc<NorthStats> {
-    let stats = NorthStats::default();
+pub(crate) fn stats() -> Arc<NorthState> {
+    let stats = NorthState::default();
     stats.slots.count("line1", SlotOutcome::Answered);
     stats.modbus_tcp.connected();
     stats.modbus_tcp.answered(3, 0);
@@ -222,7 +222,7 @@ pub(crate) fn stats() -> Arc<NorthStats> {
 /// A served plant.
 pub(crate) struct Server {
     pub(crate) shared: SharedPlant,
-    pub(crate) stats: Arc<NorthStats>,
+    pub(crate) stats: Arc<NorthState>,
     pub(crate) cancel: CancellationToken,
     pub(crate) address: SocketAddr,
     pub(crate) http: Http,
@@ -230,14 +230,22 @@ pub(crate) struct Server {
 
 impl Server {
     pub(crate) async fn of(plant: Plant) -> Server {
+        Server::showing(plant, stats()).await
+    }
+
+    /// With what was recorded.
+    pub(crate) async fn showing(plant: Plant, stats: Arc<NorthState>) -> Server {
         let listen = SocketAddr::from(([127, 0, 0, 1], 0));
-        Server::with(plant, Options::at(listen)).await
+        Server::start(plant, stats, Options::at(listen)).await
     }
 
     pub(crate) async fn with(plant: Plant, options: Options) -> Server {
+        Server::start(plant, stats(), options).await
+    }
+
+    async fn start(plant: Plant, stats: Arc<NorthState>, options: Options) -> Server {
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let cancel = CancellationToken::new();
-        let stats = stats();
         let http = http::Http::start(options, shared.clone(), stats.clone(), cancel.clone())
             .await
             .expect("it starts");

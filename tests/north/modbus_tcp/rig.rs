@@ -12,7 +12,7 @@ use drivegate::command::{Command, CommandQueue, Order, Outcome};
 use drivegate::drive::RawWrites;
 use drivegate::drive::profile::{Profile, Profiles};
 use drivegate::north::modbus_tcp::{self, Listener, Options, Server, Uncached};
-use drivegate::north::{NorthStats, ServerError};
+use drivegate::north::{NorthState, ServerError};
 use drivegate::north::{Reconfigure as _, Server as _};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{Access, DriveImage, DriveSpec, LeaseAction, Link, Supervision};
@@ -166,7 +166,7 @@ pub(crate) fn acknowledge(command: &Command) -> Outcome {
 pub(crate) struct Rig {
     pub(crate) plant: SharedPlant,
     pub(crate) buses: Vec<FakeBus>,
-    pub(crate) stats: Arc<NorthStats>,
+    pub(crate) stats: Arc<NorthState>,
     pub(crate) cancel: CancellationToken,
     pub(crate) server: Server,
 }
@@ -303,7 +303,7 @@ impl Rig {
     pub(crate) async fn of(plant: Plant, options: Options) -> Rig {
         let buses = plant.buses.iter().map(|b| FakeBus::start(b.queue.clone())).collect();
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
-        let stats = Arc::new(NorthStats::default());
+        let stats = Arc::new(NorthState::default());
         let cancel = CancellationToken::new();
         let server = modbus_tcp::Server::start(options, plant.clone(), stats.clone(), cancel.clone())
             .await

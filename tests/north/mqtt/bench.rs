@@ -14,7 +14,7 @@ use drivegate::codec::{Protocol, Reply, Table};
 use drivegate::command::{Order, Outcome};
 use drivegate::drive::Value;
 use drivegate::event::{Event, EventKind};
-use drivegate::north::NorthStats;
+use drivegate::north::NorthState;
 use drivegate::north::mqtt::{self, History, Mqtt, Options, Qos, Telemetry};
 use drivegate::plant::{Plant, SharedPlant};
 use drivegate::process_image::{Access, DriveSpec, Link};
@@ -392,7 +392,7 @@ pub(crate) type Ordered = (usize, Vec<(String, Value)>, Duration);
 /// The MQTT client on a plant whose images the test fills, and whose commands a stand-in for the bus answers.
 pub(crate) struct Gateway {
     pub(crate) plant: SharedPlant,
-    pub(crate) stats: Arc<NorthStats>,
+    pub(crate) stats: Arc<NorthState>,
     pub(crate) orders: Arc<Mutex<Vec<Ordered>>>,
     cancel: CancellationToken,
     mqtt: Mqtt,
@@ -404,7 +404,7 @@ impl Gateway {
         keep_log();
         let runtime = runtime();
         let plant = Arc::new(ArcSwap::from_pointee(plant));
-        let stats = Arc::new(NorthStats::default());
+        let stats = Arc::new(NorthState::default());
         let cancel = CancellationToken::new();
         let guard = runtime.enter();
         let mqtt = mqtt::start(options, plant.clone(), stats.clone(), cancel.clone());

@@ -5,7 +5,7 @@ use std::time::SystemTime;
 
 use drivegate::drive::{Point, PollClass, Profile, Source};
 use drivegate::north::metrics::{self, Format};
-use drivegate::north::{NorthStats, http};
+use drivegate::north::{NorthState, http};
 use drivegate::plant::DriveHandle;
 use serde_json::Value as Json;
 
@@ -28,7 +28,7 @@ impl World {
         let json = http::drive_json(&drive, &Default::default(), self.now, wall).unwrap();
         check_json(&drive, &plant, &json, self.now);
         if reading.is_multiple_of(EVERY.1) {
-            let text = metrics::encode(&plant, &NorthStats::default(), self.now, Format::Prometheus).unwrap();
+            let text = metrics::encode(&plant, &NorthState::default(), self.now, Format::Prometheus).unwrap();
             check_metrics(&drive, &json, &text);
         }
     }

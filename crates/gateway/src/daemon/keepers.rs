@@ -22,7 +22,7 @@ impl Daemon {
             // A thread of it that panicked has logged that.
             let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
         }
-        let (recordings, history) = (self.recordings.clone(), self.history.clone());
+        let (recordings, history) = (self.north.recordings.clone(), self.north.history.clone());
         let options = settings.recordings.clone();
         let started = RecorderTask::start(options, recordings, history, self.events.clone(), &self.writes);
         self.recorder = Some(started.map_err(StartError::Recorder)?);
@@ -32,9 +32,9 @@ impl Daemon {
     /// Reads parameters every so often, where that is configured.
     pub(super) fn apply_params(&mut self, settings: &Settings) {
         let params = &settings.params;
-        self.vault
-            .configure(Some(Store::new(params.dir.clone())), params.names.clone());
-        self.vault.set_others(params.others.clone());
+        let vault = &self.north.parameters;
+        vault.configure(Some(Store::new(params.dir.clone())), params.names.clone());
+        vault.set_others(params.others.clone());
         if self.reader.is_some() && self.settings.params.every == params.every {
             return;
         }
@@ -42,7 +42,7 @@ impl Daemon {
             reader.abort();
         }
         let every = params.every;
-        self.reader = every.map(|every| tokio::spawn(keep_reading(self.plant.clone(), every)));
+        self.reader = every.map(|every| tokio::spawn(keep_reading(self.plant.clone(), vault.clone(), every)));
     }
 
     /// New drives whose parameters may be half restored take no commands but stops, before their bus starts.
@@ -51,7 +51,7 @@ impl Daemon {
             .buses
             .iter()
             .flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)));
-        hold_unfinished(&self.vault, &self.events, drives).await;
+        hold_unfinished(&self.north.parameters, &self.events, drives).await;
     }
 
     /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.
@@ -62,7 +62,7 @@ impl Daemon {
         }
         let first = self.keeper.is_none();
         self.stop_keeper().await;
-        match history::keep(&settings.state_dir, first, self.history.clone(), &self.events) {
+        match history::keep(&settings.state_dir, first, self.north.history.clone(), &self.events) {
             Ok(keeper) => self.keeper = Some(keeper),
             Err(error) => {
                 tracing::error!(

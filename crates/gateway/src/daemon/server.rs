@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
-use crate::north::{NorthStats, Reconfigure, Server, ServerError};
+use crate::north::{NorthState, Reconfigure, Server, ServerError};
 use crate::plant::SharedPlant;
 
 /// Time for what the clients of a server have started that a reload takes away, longer than any order waits for its
@@ -56,7 +56,7 @@ impl<S: Server> ServerSlot<S> {
         &mut self,
         configured: Option<&S::Options>,
         plant: &SharedPlant,
-        stats: &Arc<NorthStats>,
+        stats: &Arc<NorthState>,
     ) -> Result<(), ServerError> {
         if self.0.as_ref().map(|running| &running.options) == configured {
             return Ok(());
@@ -81,7 +81,7 @@ impl<S: Server> Running<S> {
     async fn start(
         options: &S::Options,
         plant: &SharedPlant,
-        stats: &Arc<NorthStats>,
+        stats: &Arc<NorthState>,
     ) -> Result<Running<S>, ServerError> {
         let cancel = CancellationToken::new();
         let server = S::start(options.clone(), plant.clone(), stats.clone(), cancel.clone()).await?;
@@ -130,7 +130,7 @@ where
         &mut self,
         configured: Option<&S::Options>,
         plant: &SharedPlant,
-        stats: &Arc<NorthStats>,
+        stats: &Arc<NorthState>,
     ) -> Result<Prepared<S>, ServerError> {
         Ok(match (&mut self.0, configured) {
             (None, None) => Prepared::Same,
@@ -208,7 +208,7 @@ mod tests {
         async fn start(
             name: Self::Options,
             _: SharedPlant,
-            _: Arc<NorthStats>,
+            _: Arc<NorthState>,
             cancel: CancellationToken,
         ) -> Result<Self, ServerError> {
             log(format!("start {name}"));
@@ -253,7 +253,7 @@ mod tests {
         }
     }
 
-    fn world() -> (SharedPlant, Arc<NorthStats>) {
+    fn world() -> (SharedPlant, Arc<NorthState>) {
         let plant = crate::plant::Plant::new("test", Duration::from_secs(1), Vec::new());
         (Arc::new(arc_swap::ArcSwap::from_pointee(plant)), Arc::default())
     }

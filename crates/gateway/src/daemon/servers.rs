@@ -28,7 +28,7 @@ impl Daemon {
     }
 
     async fn prepare_each(&mut self, settings: &Settings, prepared: &mut PreparedServers) -> Result<(), ServerError> {
-        let (plant, stats) = (&self.plant, &self.stats);
+        let (plant, stats) = (&self.plant, &self.north);
         let modbus_tcp = settings.modbus_tcp.as_ref();
         prepared.modbus_tcp = self.modbus_tcp.prepare(modbus_tcp, plant, stats).await?;
         prepared.slots = self.slots.prepare(settings.slots.as_ref(), plant, stats).await?;
@@ -56,9 +56,9 @@ impl Daemon {
         if settings.gateway != self.settings.gateway {
             self.mqtt.stop().await;
         }
-        let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.stats).await;
+        let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.north).await;
         // Events that came while no client was configured are not published later.
-        self.stats.mqtt.forget_what_is_left();
+        self.north.mqtt.forget_what_is_left();
         applied
     }
 
@@ -69,7 +69,7 @@ impl Daemon {
             socket: settings.socket.clone(),
             control: self.control.clone(),
         });
-        if let Err(error) = self.local.apply(options.as_ref(), &self.plant, &self.stats).await {
+        if let Err(error) = self.local.apply(options.as_ref(), &self.plant, &self.north).await {
             tracing::warn!(
                 target: "drivegate::local",
                 "{error}; `drivegate read`, `write`, `reload` and `health` cannot reach this gateway; set `socket` of [gateway], or \

@@ -33,7 +33,7 @@ pub use self::offline::Offline;
 
 use self::sockets::Sockets;
 use self::task::{Task, ToTask};
-use super::{NorthStats, ServerError, ServerKind};
+use super::{NorthState, ServerError, ServerKind};
 use crate::listener::ListenerState;
 use crate::plant::SharedPlant;
 use crate::server::{self, Reconfigure};
@@ -130,7 +130,7 @@ pub struct Server {
     address: SocketAddr,
     to_task: mpsc::UnboundedSender<ToTask>,
     busy: Arc<AtomicBool>,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     _state: ListenerState,
     tasks: TaskTracker,
 }
@@ -160,7 +160,7 @@ impl server::Server for Server {
     async fn start(
         options: Options,
         plant: SharedPlant,
-        stats: Arc<NorthStats>,
+        stats: Arc<NorthState>,
         cancel: CancellationToken,
     ) -> Result<Server, ServerError> {
         let sockets = bind(options.listen).await?;

@@ -21,7 +21,7 @@ use super::desk::{Desk, Ended};
 use super::kept::{self, KeptSlot};
 use super::sockets::Sockets;
 use super::writes::Waiting;
-use super::{NorthStats, Options};
+use super::{NorthState, Options};
 use crate::command::Commanded;
 use crate::drive::ModelPoint;
 use crate::event::{Event, EventKind};
@@ -54,7 +54,7 @@ type Ending = Pin<Box<dyn Future<Output = Ended> + Send>>;
 pub(super) struct Task {
     options: Arc<Options>,
     sockets: Sockets,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     busy: Arc<AtomicBool>,
     desk: Desk,
     writes: FuturesUnordered<Ending>,
@@ -76,7 +76,7 @@ impl Task {
         options: Options,
         sockets: Sockets,
         plant: SharedPlant,
-        stats: Arc<NorthStats>,
+        stats: Arc<NorthState>,
         busy: Arc<AtomicBool>,
     ) -> Task {
         let options = Arc::new(options);

@@ -61,7 +61,7 @@ pub(super) async fn log(State(app): State<Arc<AppState>>, RawQuery(query): RawQu
     let _turn = app.turn().await;
     let plant = app.plant.load();
     let found = plant.events.search(&search);
-    let recorded = Recorded::new(&plant.recordings);
+    let recorded = Recorded::new(&app.north.recordings);
     let shown: Vec<Shown<'_>> = found.iter().map(|event| recorded.show(event)).collect();
     Ok(Json(shown).into_response())
 }

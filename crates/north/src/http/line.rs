@@ -22,7 +22,7 @@ pub(super) async fn bus(State(app): State<Arc<AppState>>, Path(name): Path<Strin
     let handle = find_bus(&plant, &name)?;
     let _turn = app.turn().await;
     let clock = Clock::read();
-    let line = plant.history.line(&name);
+    let line = app.north.history.line(&name);
     let hour = match &line {
         Some(line) => line.lock().unwrap_or_else(PoisonError::into_inner).last_hour(clock),
         // It is being started.

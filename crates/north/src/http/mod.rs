@@ -64,7 +64,7 @@ use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, L
 use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
 use super::log_throttle::LogThrottle;
 use super::refusals::Refusals;
-use super::{NorthStats, ServerError, ServerIdentity, ServerKind, tls_words};
+use super::{NorthState, ServerError, ServerIdentity, ServerKind, tls_words};
 use crate::history::History;
 use crate::plant::{DriveHandle, SharedPlant};
 use crate::server::{self, Reconfigure};
@@ -169,7 +169,7 @@ pub struct Http {
     listeners: Listeners<HttpConnections>,
     terms: Arc<ArcSwap<Terms>>,
     plant: SharedPlant,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     operating: Arc<Operating>,
     tasks: TaskTracker,
     /// Cancelled when the server ends.
@@ -203,7 +203,7 @@ impl server::Server for Http {
     async fn start(
         options: Options,
         plant: SharedPlant,
-        stats: Arc<NorthStats>,
+        stats: Arc<NorthState>,
         cancel: CancellationToken,
     ) -> Result<Http, ServerError> {
         let cancel = cancel.child_token();
@@ -331,7 +331,7 @@ impl HttpConnections {
     fn new(
         options: &Options,
         plant: &SharedPlant,
-        stats: &Arc<NorthStats>,
+        stats: &Arc<NorthState>,
         terms: &Arc<ArcSwap<Terms>>,
         operating: &Arc<Operating>,
         (cancel, stopping): (&CancellationToken, &CancellationToken),

@@ -57,7 +57,7 @@ fn form(query: Option<&str>) -> Result<Form, QueryError> {
 /// The recordings, oldest first.
 pub(super) async fn list(State(app): State<Arc<AppState>>) -> Response {
     let _turn = app.turn().await;
-    let entries = app.plant.load().recordings.list();
+    let entries = app.north.recordings.list();
     Json(entries.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }
 
@@ -68,7 +68,7 @@ pub(super) async fn one(
     RawQuery(query): RawQuery,
 ) -> Replied {
     let form = form(query.as_deref())?;
-    let recordings = app.plant.load().recordings.clone();
+    let recordings = app.north.recordings.clone();
     // Files are read and converted away from the tasks of other clients, one at a time.
     let Ok(_permit) = app.files.acquire().await else {
         return Err(StatusCode::SERVICE_UNAVAILABLE.into());

@@ -26,7 +26,7 @@ use super::{
     Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, expect, line, page, points, recordings,
     replies, streams, trend, views,
 };
-use crate::NorthStats;
+use crate::NorthState;
 use crate::command::{Proof, SourceKind};
 use crate::command_json::{CommandResult, HoldReply, StopBody};
 use crate::connection_limit::{ConnectionLimit, ConnectionPlace, Limits};
@@ -41,7 +41,7 @@ use crate::stop_all::StopReport;
 #[derive(Debug)]
 pub(super) struct AppState {
     pub(super) plant: SharedPlant,
-    pub(super) stats: Arc<NorthStats>,
+    pub(super) north: Arc<NorthState>,
     pub(super) cancel: CancellationToken,
     /// Open event streams.
     pub(super) listeners: Arc<ConnectionLimit>,
@@ -135,13 +135,13 @@ impl Reached {
 /// All routes.
 pub(super) fn router(
     plant: SharedPlant,
-    stats: Arc<NorthStats>,
+    north: Arc<NorthState>,
     operating: Arc<Operating>,
     cancel: CancellationToken,
 ) -> Router {
     let app = Arc::new(AppState {
         plant,
-        stats,
+        north,
         cancel,
         listeners: ConnectionLimit::new(Limits::new(MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS)),
         rendering: Semaphore::new(1),

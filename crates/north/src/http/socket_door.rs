@@ -19,7 +19,7 @@ use super::in_use::InUse;
 use super::operating::Operating;
 use super::routes::{self, Client, LocalUser, Reached};
 use super::{Coverage, GRACE, HEAD_TIMEOUT, MAX_HEAD};
-use crate::NorthStats;
+use crate::NorthState;
 use crate::command::{Authority, Proof, SourceKind};
 use crate::connection_limit::{ConnectionLimit, ConnectionPlace, Limits, Newcomer};
 use crate::plant::SharedPlant;
@@ -31,7 +31,7 @@ pub(crate) struct SocketDoor {
 }
 
 impl SocketDoor {
-    pub(crate) fn new(plant: &SharedPlant, stats: &Arc<NorthStats>, cancel: CancellationToken) -> SocketDoor {
+    pub(crate) fn new(plant: &SharedPlant, stats: &Arc<NorthState>, cancel: CancellationToken) -> SocketDoor {
         let operating = Arc::new(Operating::new(stats.clone()));
         SocketDoor {
             router: routes::router(plant.clone(), stats.clone(), operating, cancel),
@@ -93,7 +93,7 @@ const BUFFER: usize = 64 * 1024;
 
 impl InProcess {
     /// For `who` started the command.
-    pub fn new(plant: &SharedPlant, stats: &Arc<NorthStats>, who: &str) -> InProcess {
+    pub fn new(plant: &SharedPlant, stats: &Arc<NorthState>, who: &str) -> InProcess {
         let cancel = CancellationToken::new();
         let user = LocalUser {
             kind: SourceKind::CommandLine,

@@ -82,7 +82,7 @@ pub(super) async fn trend(
     let clock = Clock::read();
     let wanted = Wanted::of(query.as_deref(), clock.wall)?;
     let _turn = app.turn().await;
-    let history = plant.history.drive(&name);
+    let history = app.north.history.drive(&name);
     let profile = &drive.image.spec.profile;
     let has = |point: &&ModelPoint| profile.model_index(**point).is_some();
     let known: Vec<ModelPoint> = POINTS.iter().filter(has).copied().collect();

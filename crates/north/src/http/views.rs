@@ -17,7 +17,6 @@ use super::routes::{AppState, Reached};
 use super::{api, page, query};
 use crate::local::control;
 use crate::parameters::ParameterFile;
-use crate::plant::Plant;
 use crate::{metrics, readiness};
 
 pub(super) async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
@@ -45,7 +44,7 @@ pub(super) async fn exposition(State(app): State<Arc<AppState>>, headers: Header
         .filter_map(|value| value.to_str().ok())
         .collect();
     let (format, content_type) = metrics::Format::accepted(&accept.join(","));
-    match metrics::encode(&app.plant.load(), &app.stats, Instant::now(), format) {
+    match metrics::encode(&app.plant.load(), &app.north, Instant::now(), format) {
         Ok(text) => {
             let headers = [(header::CONTENT_TYPE, content_type), (header::VARY, "accept")];
             (headers, text).into_response()
@@ -58,7 +57,7 @@ pub(super) async fn exposition(State(app): State<Arc<AppState>>, headers: Header
 }
 
 pub(super) async fn ready(State(app): State<Arc<AppState>>) -> Response {
-    let reasons = readiness::reasons(&app.plant.load(), &app.stats);
+    let reasons = readiness::reasons(&app.plant.load(), &app.north);
     if reasons.is_empty() {
         return "ready\n".into_response();
     }
@@ -72,7 +71,7 @@ pub(super) async fn ready(State(app): State<Arc<AppState>>) -> Response {
 
 /// Whether the gateway is ready, and why not: 200 in both cases.
 pub(super) async fn health(State(app): State<Arc<AppState>>) -> Response {
-    let reasons = readiness::reasons(&app.plant.load(), &app.stats);
+    let reasons = readiness::reasons(&app.plant.load(), &app.north);
     let ready = reasons.is_empty();
     Json(Health { ready, reasons }).into_response()
 }
@@ -101,7 +100,7 @@ pub(super) async fn drives(State(app): State<Arc<AppState>>, RawQuery(query): Ra
     let all: Vec<_> = plant.drives().collect();
     let all: Vec<_> = all
         .iter()
-        .map(|drive| api::Drive::new(drive, &plant.history, clock).only(shown.as_ref()))
+        .map(|drive| api::Drive::new(drive, &app.north.history, clock).only(shown.as_ref()))
         .collect();
     Json(all).into_response()
 }
@@ -111,7 +110,7 @@ pub(super) async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<Str
     let drive = plant.drive(&name).ok_or_else(|| no_drive(&plant, &name))?;
     let clock = api::Clock::new(Instant::now(), SystemTime::now());
     let stops = plant.drills.stops(&drive, SystemTime::now());
-    Ok(Json(api::Drive::new(&drive, &plant.history, clock).proven(stops)).into_response())
+    Ok(Json(api::Drive::new(&drive, &app.north.history, clock).proven(stops)).into_response())
 }
 
 /// Why a drive does not run.
@@ -130,19 +129,19 @@ pub(super) async fn params(State(app): State<Arc<AppState>>, Path(name): Path<St
     let plant = app.plant.load_full();
     let drive = plant.drive(&name).ok_or_else(|| no_drive(&plant, &name))?;
     let machine = drive.machine();
-    let status = plant.parameters.status(&machine);
-    let last = match plant.parameters.last(&machine) {
+    let status = app.north.parameters.status(&machine);
+    let last = match app.north.parameters.last(&machine) {
         Some(file) => Some(file),
-        None => stored_params(&app, &plant, &name).await?.map(Arc::new),
+        None => stored_params(&app, &name).await?.map(Arc::new),
     };
-    let restore = plant.parameters.restore(&machine);
+    let restore = app.north.parameters.restore(&machine);
     let parameters = Parameters::new(&name, last.as_deref(), status.as_ref(), restore.as_ref());
     Ok(Json(parameters).into_response())
 }
 
 /// The last reading on disk.
-async fn stored_params(app: &AppState, plant: &Plant, name: &str) -> Replied<Option<ParameterFile>> {
-    let Some(store) = plant.parameters.store() else {
+async fn stored_params(app: &AppState, name: &str) -> Replied<Option<ParameterFile>> {
+    let Some(store) = app.north.parameters.store() else {
         return Ok(None);
     };
     let unavailable = StatusCode::SERVICE_UNAVAILABLE;

@@ -52,7 +52,7 @@ impl ConnectionHandler for Recorder {
 struct Bench {
     events: mpsc::UnboundedReceiver<&'static str>,
     handler: Arc<Recorder>,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     stop: CancellationToken,
 }
 

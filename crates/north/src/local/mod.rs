@@ -25,7 +25,7 @@ use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Li
 use crate::http::{LocalUser, SocketDoor};
 use crate::plant::SharedPlant;
 use crate::server;
-use crate::{NorthStats, ServerError};
+use crate::{NorthState, ServerError};
 
 pub use control::{Control, ReloadOrder, absolute};
 pub use path::{RuntimeDirectories, SocketPath};
@@ -80,7 +80,7 @@ impl server::Server for Local {
     async fn start(
         options: Options,
         plant: SharedPlant,
-        stats: Arc<NorthStats>,
+        stats: Arc<NorthState>,
         cancel: CancellationToken,
     ) -> Result<Local, ServerError> {
         let paths = options.socket.of_gateway(&RuntimeDirectories::of_this_process());

@@ -1,5 +1,5 @@
 //! Every metric with its name, help, labels and values. Those of the common drive model are listed in `model`; counters
-//! of the servers come from `NorthStats`.
+//! of the servers come from `NorthState`.
 
 use std::sync::atomic::Ordering;
 use std::time::{Instant, SystemTime};
@@ -14,19 +14,19 @@ use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, BusImage, DriveImage, Outcome, Reading, public_points};
 use crate::start_guard::Reason;
 use crate::version::{self, VERSION};
-use crate::{NorthStats, ServerKind};
+use crate::{NorthState, ServerKind};
 
 /// All series, those of a family one after the other.
-pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Families {
+pub(super) fn collect(plant: &Plant, north: &NorthState, now: Instant) -> Families {
     let mut all = Families::default();
     drives(plant, now, &mut all);
-    runs(plant, &mut all);
+    runs(plant, north, &mut all);
     buses(&plant.buses, &mut all);
     writes(plant, &mut all);
-    recordings(plant, &mut all);
-    parameters(plant, &mut all);
-    north(stats, &mut all);
-    reload(stats, &mut all);
+    recordings(north, &mut all);
+    parameters(plant, north, &mut all);
+    servers(north, &mut all);
+    reload(north, &mut all);
     build(plant, &mut all);
     process(&process::read(), &mut all);
     all.sort();
@@ -159,7 +159,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
 }
 
 /// Counters of the drives that report whether they run.
-fn runs(plant: &Plant, all: &mut Families) {
+fn runs(plant: &Plant, north: &NorthState, all: &mut Families) {
     let starts = all.counter(
         "drivegate_drive_starts_total",
         "Observed starts of the motor; kept across restarts of the gateway.",
@@ -171,7 +171,7 @@ fn runs(plant: &Plant, all: &mut Families) {
     for drive in plant.drives() {
         let spec = &drive.image.spec;
         if spec.profile.model_index(ModelPoint::Running).is_some() {
-            let totals = plant.history.totals(&spec.name);
+            let totals = north.history.totals(&spec.name);
             let labels = labels_of(&drive.image);
             all.add(starts, labels.clone(), totals.starts);
             all.add(running, labels, SeriesValue::Total(totals.running_seconds));
@@ -296,24 +296,24 @@ fn writes(plant: &Plant, all: &mut Families) {
     }
 }
 
-fn recordings(plant: &Plant, all: &mut Families) {
+fn recordings(north: &NorthState, all: &mut Families) {
     let made = all.counter(
         "drivegate_recordings_total",
         "Recordings made since the start, by trigger.",
     );
-    let counts = plant.recordings.made();
+    let counts = north.recordings.made();
     for kind in TriggerKind::ALL {
         let count = counts.get(&kind).copied().unwrap_or_default();
         all.add(made, Labels::default().with("trigger", kind.name()), count);
     }
 }
 
-fn parameters(plant: &Plant, all: &mut Families) {
+fn parameters(plant: &Plant, north: &NorthState, all: &mut Families) {
     let changed = all.counter(
         "drivegate_parameters_changed_total",
         "Parameters of the drive that changed between two readings without being written by the gateway.",
     );
-    let counts = plant.parameters.changed();
+    let counts = north.parameters.changed();
     for drive in plant.drives() {
         let key = (drive.image.spec.bus.clone(), drive.image.spec.name.clone());
         let count = counts.get(&key).copied().unwrap_or_default();
@@ -321,7 +321,7 @@ fn parameters(plant: &Plant, all: &mut Families) {
     }
 }
 
-fn bacnet(stats: &NorthStats, all: &mut Families) {
+fn bacnet(stats: &NorthState, all: &mut Families) {
     let Some(figures) = stats.bacnet.get() else { return };
     let counters = figures.counters;
     let requests = all.counter(
@@ -366,7 +366,7 @@ fn bacnet(stats: &NorthStats, all: &mut Families) {
     }
 }
 
-fn north(stats: &NorthStats, all: &mut Families) {
+fn servers(stats: &NorthState, all: &mut Families) {
     all.one(
         Kind::Gauge,
         "drivegate_modbus_tcp_connections",
@@ -443,7 +443,7 @@ fn north(stats: &NorthStats, all: &mut Families) {
     }
 }
 
-fn reload(stats: &NorthStats, all: &mut Families) {
+fn reload(stats: &NorthState, all: &mut Families) {
     let (applied, at) = stats.reload.last();
     let since_epoch = at.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     all.one(

@@ -17,7 +17,7 @@ use prometheus_client::metrics::MetricType;
 use prometheus_client::registry::Registry;
 
 use self::series::{Families, Kind, SeriesValue};
-use super::NorthStats;
+use super::NorthState;
 use crate::plant::Plant;
 
 /// Text formats of an exposition.
@@ -93,7 +93,7 @@ fn weight<'r>(range: &'r str, wanted: &[&str]) -> Option<(Option<&'r str>, f64)>
 ///
 /// # Errors
 /// The encoder fails, which it does not when it writes to a string.
-pub fn encode(plant: &Plant, stats: &NorthStats, now: Instant, format: Format) -> Result<String, fmt::Error> {
+pub fn encode(plant: &Plant, stats: &NorthState, now: Instant, format: Format) -> Result<String, fmt::Error> {
     let mut registry = Registry::default();
     registry.register_collector(Box::new(Scrape {
         families: families::collect(plant, stats, now),
@@ -218,7 +218,7 @@ mod tests {
         let pump = drive("pump-1", Some(supervision));
         let plant = plant(vec![pump.clone(), drive("fan-2", None)]);
         let gauge = || {
-            let text = encode(&plant, &NorthStats::default(), Instant::now(), Format::Prometheus).unwrap();
+            let text = encode(&plant, &NorthState::default(), Instant::now(), Format::Prometheus).unwrap();
             let of = |line: &&str| line.contains("drivegate_drive_unsupervised") && !line.starts_with("# HELP");
             text.lines().filter(of).map(str::to_string).collect::<Vec<_>>()
         };

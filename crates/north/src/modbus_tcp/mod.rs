@@ -40,7 +40,7 @@ use crate::log_throttle::LogThrottle;
 use crate::plant::SharedPlant;
 use crate::refusals::Refusals;
 use crate::server::{self, Reconfigure};
-use crate::{NorthStats, ServerError, ServerKind, certificate};
+use crate::{NorthState, ServerError, ServerKind, certificate};
 
 pub use self::offline::Offline;
 pub use self::tls::{Identity, Role, Tls};
@@ -200,7 +200,7 @@ impl server::Server for Server {
     async fn start(
         options: Options,
         plant: SharedPlant,
-        stats: Arc<NorthStats>,
+        stats: Arc<NorthState>,
         cancel: CancellationToken,
     ) -> Result<Server, ServerError> {
         let cancel = cancel.child_token();
@@ -325,7 +325,7 @@ impl Reconfigure for Server {
 #[derive(Debug)]
 struct ServerState {
     options: ArcSwap<Options>,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     command_words: CommandWords,
     connections: Arc<ConnectionLimit>,
     /// TLS connections before they are admitted.
@@ -338,7 +338,7 @@ struct ServerState {
 }
 
 impl ServerState {
-    fn new(options: Options, stats: Arc<NorthStats>, stopping: CancellationToken) -> ServerState {
+    fn new(options: Options, stats: Arc<NorthState>, stopping: CancellationToken) -> ServerState {
         ServerState {
             stopping,
             connections: ConnectionLimit::new(options.limits()),

@@ -11,7 +11,7 @@ use super::dialogue::Dialogue;
 use super::routes::PlantView;
 use super::session::ClientSession;
 use super::{Options, ServerState};
-use crate::NorthStats;
+use crate::NorthState;
 use crate::command::Authority;
 use crate::plant::SharedPlant;
 
@@ -29,7 +29,7 @@ impl Offline {
     pub fn new(
         options: Options,
         plant: SharedPlant,
-        stats: Arc<NorthStats>,
+        stats: Arc<NorthState>,
         peer: SocketAddr,
         authority: Authority,
     ) -> Offline {

@@ -36,7 +36,7 @@ use crate::files::names::{MQTT_EVENTS, MQTT_HISTORY};
 use crate::log_throttle::LogThrottle;
 use crate::plant::{Plant, SharedPlant};
 use crate::stats::LinkOf;
-use crate::{MqttLoss, NorthStats};
+use crate::{MqttLoss, NorthState};
 
 /// Maximum time between two checks of the connection, the plant and the buffer.
 const CHECK: Duration = Duration::from_millis(25);
@@ -66,7 +66,7 @@ fn seconds(expiry: Duration) -> u32 {
 pub(super) async fn run(
     options: Options,
     plant: SharedPlant,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     events: Receiver<Arc<Event>>,
     cancel: CancellationToken,
 ) {
@@ -94,7 +94,7 @@ struct Client {
     plant: SharedPlant,
     /// The plant that the publisher observes.
     observed: Arc<Plant>,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     events: Receiver<Arc<Event>>,
     topics: Topics,
     publisher: Publisher,
@@ -128,7 +128,7 @@ struct Client {
 }
 
 impl Client {
-    fn new(options: Options, plant: SharedPlant, stats: Arc<NorthStats>, events: Receiver<Arc<Event>>) -> Client {
+    fn new(options: Options, plant: SharedPlant, stats: Arc<NorthState>, events: Receiver<Arc<Event>>) -> Client {
         let observed = plant.load_full();
         let topics = Topics::new(&options.base, &observed.gateway);
         let fresh = Arc::new(Notify::new());

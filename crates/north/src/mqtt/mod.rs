@@ -52,7 +52,7 @@ use std::time::Duration;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
-use super::NorthStats;
+use super::NorthState;
 use crate::plant::SharedPlant;
 use crate::{ServerError, server};
 
@@ -221,7 +221,7 @@ impl server::Server for Mqtt {
     async fn start(
         options: Options,
         plant: SharedPlant,
-        stats: Arc<NorthStats>,
+        stats: Arc<NorthState>,
         cancel: CancellationToken,
     ) -> Result<Mqtt, ServerError> {
         Ok(start(options, plant, stats, cancel))
@@ -234,7 +234,7 @@ impl server::Server for Mqtt {
 
 /// Starts the MQTT client; must be called within a Tokio runtime. It reconnects until it is cancelled. Events that are
 /// raised from now on, or were left unread by the client before, are published, so start it before the buses.
-pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Mqtt {
+pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthState>, cancel: CancellationToken) -> Mqtt {
     options.buffer = options.buffer.or_else(Buffer::of_system);
     // Subscribed here and not in the task, so that no event after this call is missed. What the client before this one left
     // unread comes first.

@@ -17,7 +17,7 @@ use super::Buffer;
 use super::journal::Journal;
 use super::outbox::{KEPT_BYTES, Message};
 use crate::files::names::MQTT_TOPICS;
-use crate::{MqttLoss, NorthStats};
+use crate::{MqttLoss, NorthState};
 
 /// Jobs that wait for the disk: a burst of events and its acknowledgements. The size of their messages is at most
 /// [`KEPT_BYTES`].
@@ -32,7 +32,7 @@ const LOCK_WAIT: Duration = Duration::from_millis(50);
 
 /// Counts lost messages of one kind.
 #[derive(Debug, Clone)]
-pub(super) struct LostCount(pub(super) Arc<NorthStats>, pub(super) MqttLoss);
+pub(super) struct LostCount(pub(super) Arc<NorthState>, pub(super) MqttLoss);
 
 impl LostCount {
     pub(super) fn add(&self, count: u64) {

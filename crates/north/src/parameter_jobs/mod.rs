@@ -244,11 +244,10 @@ const AGAIN: Duration = Duration::from_secs(600);
 const LOOK: Duration = Duration::from_secs(10);
 
 /// Reads the parameters of all drives every so often, for ever: of each bus one drive at a time.
-pub async fn keep_reading(plant: SharedPlant, every: Duration) {
+pub async fn keep_reading(plant: SharedPlant, vault: Arc<Vault>, every: Duration) {
     let mut begun: BTreeMap<Machine, SystemTime> = BTreeMap::new();
     loop {
         let plant_now = plant.load_full();
-        let vault = plant_now.parameters.clone();
         for bus in &plant_now.buses {
             let of_bus: Vec<DriveHandle> = plant_now
                 .drives()

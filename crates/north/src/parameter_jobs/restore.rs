@@ -115,14 +115,19 @@ fn passes(drive: &DriveHandle, plan: &Plan) -> Vec<String> {
 ///
 /// # Errors
 /// Why not; nothing was written.
-pub fn carry_out(plant: &SharedPlant, drive: &DriveHandle, number: u64, origin: Origin) -> Result<(), String> {
+pub fn carry_out(
+    plant: &SharedPlant,
+    vault: &Arc<Vault>,
+    drive: &DriveHandle,
+    number: u64,
+    origin: Origin,
+) -> Result<(), String> {
     let spec = &drive.image.spec;
     may_restore(spec)?;
     not_held(drive)?;
     drive
         .may_begin_restore(&origin, Instant::now())
         .map_err(|refusal| refusal.to_string())?;
-    let vault = plant.load().parameters.clone();
     let machine = drive.machine();
     let prepared = vault.carry_out(&machine, &spec.name, number)?;
     // The reference that stands may be another one than when it was prepared.
@@ -160,7 +165,7 @@ pub fn carry_out(plant: &SharedPlant, drive: &DriveHandle, number: u64, origin: 
     }
     let file = vault.journal(&spec.name).ok_or_else(no_store)?;
     let restoration = Restoration::begin(journal, Instant::now());
-    start(plant.clone(), vault, drive, (file, restoration), origin);
+    start(plant.clone(), vault.clone(), drive, (file, restoration), origin);
     Ok(())
 }
 
@@ -175,17 +180,22 @@ fn unmet_need(drive: &DriveHandle, journal: &Journal) -> Option<String> {
 ///
 /// # Errors
 /// Why it cannot be.
-pub async fn take_up(plant: &SharedPlant, drive: &DriveHandle, again: Again, origin: Origin) -> Result<(), String> {
+pub async fn take_up(
+    plant: &SharedPlant,
+    vault: &Arc<Vault>,
+    drive: &DriveHandle,
+    again: Again,
+    origin: Origin,
+) -> Result<(), String> {
     let spec = &drive.image.spec;
     may_restore(spec)?;
-    let vault = plant.load().parameters.clone();
     let nothing = || {
         format!(
             "no restore of `{}` was interrupted: there is nothing to resume",
             spec.name
         )
     };
-    let concerned = concerning(&vault, plant, drive).await?.ok_or_else(nothing)?;
+    let concerned = concerning(vault, plant, drive).await?.ok_or_else(nothing)?;
     let (file, text) = concerned.own(drive)?;
     let mut journal = Journal::parse(&text, &spec.profile).map_err(|why| not_understood(&file, &spec.name, &why))?;
     if journal.of.machine.is_none() {
@@ -206,7 +216,7 @@ pub async fn take_up(plant: &SharedPlant, drive: &DriveHandle, again: Again, ori
         Again::Resume => Restoration::resume(journal, now),
         Again::Undo => Restoration::undo(journal, now),
     };
-    start(plant.clone(), vault, drive, (file, restoration), origin);
+    start(plant.clone(), vault.clone(), drive, (file, restoration), origin);
     Ok(())
 }
 
@@ -215,14 +225,19 @@ pub async fn take_up(plant: &SharedPlant, drive: &DriveHandle, again: Again, ori
 ///
 /// # Errors
 /// Why not.
-pub async fn release(plant: &SharedPlant, drive: &DriveHandle, origin: &Origin) -> Result<(), String> {
+pub async fn release(
+    plant: &SharedPlant,
+    vault: &Arc<Vault>,
+    drive: &DriveHandle,
+    origin: &Origin,
+) -> Result<(), String> {
     let spec = &drive.image.spec;
-    let (vault, machine) = (plant.load().parameters.clone(), drive.machine());
+    let machine = drive.machine();
     if vault.restore(&machine).is_some_and(|restore| restore.goes_on()) {
         vault.update_restore(&machine, |restore| restore.is_unwanted = true);
         return Ok(());
     }
-    let concerned = concerning(&vault, plant, drive).await?;
+    let concerned = concerning(vault, plant, drive).await?;
     vault.begin_restore(&machine, &spec.name, RestoreStage::Working)?;
     let released = match concerned {
         Some(concerned) => blocking(move || concerned.file.release()).await.map(Some),

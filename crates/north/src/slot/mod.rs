@@ -28,7 +28,7 @@ use self::terms::{Terms, WritePaces};
 use super::connection_limit::Limits;
 use super::listener::{ListenerSpec, Listeners, NewSockets};
 use super::refusals::Refusals;
-use super::{NorthStats, ServerError, ServerKind};
+use super::{NorthState, ServerError, ServerKind};
 use crate::codec::{LineFormat, Protocol};
 use crate::plant::SharedPlant;
 use crate::server::{self, Reconfigure};
@@ -141,7 +141,7 @@ pub struct Server {
     listeners: Listeners<SlotListener>,
     ptys: Vec<RunningPty>,
     plant: SharedPlant,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     paces: Arc<WritePaces>,
     refusals: Arc<Refusals>,
     /// Listeners opened so far.
@@ -205,7 +205,7 @@ impl server::Server for Server {
     async fn start(
         options: Options,
         plant: SharedPlant,
-        stats: Arc<NorthStats>,
+        stats: Arc<NorthState>,
         cancel: CancellationToken,
     ) -> Result<Server, ServerError> {
         let cancel = cancel.child_token();

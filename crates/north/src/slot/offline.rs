@@ -7,7 +7,7 @@ use std::time::Instant;
 use super::Slot;
 use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
-use crate::NorthStats;
+use crate::NorthState;
 use crate::command::Proof;
 use crate::plant::SharedPlant;
 
@@ -20,7 +20,7 @@ pub struct Offline {
 
 impl Offline {
     /// The tool at `peer`.
-    pub fn new(slot: Slot, plant: SharedPlant, stats: Arc<NorthStats>, peer: &str) -> Offline {
+    pub fn new(slot: Slot, plant: SharedPlant, stats: Arc<NorthState>, peer: &str) -> Offline {
         Offline::of(
             Arc::new(Terms {
                 slot,

@@ -12,7 +12,7 @@ use crate::command::{self, Authority, Order, Origin, Outcome, Parts, Proof, Refu
 use crate::drive::plan::WireTime;
 use crate::plant::{BusHandle, DriveHandle, Exchange, Placed, Plant, Question, SharedPlant, Target, turn_away};
 use crate::process_image::Access;
-use crate::{NorthStats, SlotOutcome};
+use crate::{NorthState, SlotOutcome};
 
 /// Share of the time of a line that writes of tools take at most, stops apart.
 const SHARE_OF_WRITES: f64 = 0.1;
@@ -77,7 +77,7 @@ impl WritePaces {
 pub(super) struct Terms {
     pub(super) slot: Slot,
     pub(super) plant: SharedPlant,
-    pub(super) stats: Arc<NorthStats>,
+    pub(super) stats: Arc<NorthState>,
     pub(super) paces: Arc<WritePaces>,
 }
 

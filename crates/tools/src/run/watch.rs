@@ -10,7 +10,7 @@ use super::notify;
 use crate::daemon::{Daemon, Pulse};
 use crate::event::{Event, EventKind};
 use crate::log::LogHandle;
-use crate::north::NorthStats;
+use crate::north::NorthState;
 use crate::north::http::messages::ReloadOutcome;
 use crate::plant::{Plant, SharedPlant};
 use crate::printable;
@@ -24,7 +24,7 @@ pub(super) struct Watch<'l> {
     log: &'l LogHandle,
     pulse: Pulse,
     plant: SharedPlant,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     is_watched: bool,
     feed: Interval,
     /// When the last reload was refused, and why.

@@ -11,6 +11,7 @@ use drivegate::event::{Event, EventKind};
 use drivegate::history::assemble::assemble;
 use drivegate::history::recorder::{Note, NoteBody};
 use drivegate::history::{Clock, Recorder, RecorderOptions, RecorderTask, Store};
+use drivegate::north::NorthState;
 use drivegate::plant::{BusHandle, Plant};
 use drivegate::process_image::{BusImage, DriveImage, Outcome, TapedFrame, TapedRead, Verdict};
 
@@ -55,6 +56,7 @@ pub(super) type Cast = Vec<(Arc<DriveImage>, Play)>;
 /// The plant, and who makes it go on.
 pub(super) struct Lively {
     pub(super) plant: Plant,
+    pub(super) stats: Arc<NorthState>,
     pub(super) going_on: GoingOn,
 }
 
@@ -174,10 +176,11 @@ impl Lively {
             max_count: 100,
             warnings: false,
         };
-        let recorder = live_through(&plant, &cast, &options);
+        let stats = plant::stats();
+        let recorder = live_through(&plant, &stats, &cast, &options);
         let task = RecorderTask::start(
             options,
-            plant.recordings.clone(),
+            stats.recordings.clone(),
             Arc::default(),
             plant.events.clone(),
             &plant.writes,
@@ -191,7 +194,7 @@ impl Lively {
             _dir: dir,
             _task: task.expect("threads"),
         };
-        Lively { plant, going_on }
+        Lively { plant, stats, going_on }
     }
 }
 
@@ -258,7 +261,7 @@ fn answer(cast: &Cast, now: Instant) {
 }
 
 /// The past; who kept it.
-fn live_through(plant: &Plant, cast: &Cast, options: &RecorderOptions) -> Recorder {
+fn live_through(plant: &Plant, stats: &NorthState, cast: &Cast, options: &RecorderOptions) -> Recorder {
     let end = Clock::read();
     let begin = Clock {
         now: end.now.checked_sub(PAST).expect("the machine counts far enough back"),
@@ -271,7 +274,7 @@ fn live_through(plant: &Plant, cast: &Cast, options: &RecorderOptions) -> Record
         });
     }
     let buses: Vec<Arc<BusImage>> = plant.buses.iter().map(|bus| bus.image.clone()).collect();
-    let mut recorder = Recorder::new(options.clone(), plant.history.clone());
+    let mut recorder = Recorder::new(options.clone(), stats.history.clone());
     assert!(recorder.adopt(&buses, STALE_AFTER, begin).is_empty());
     let mut store = Store::open(options);
     let steps = (0..).map(|step| POLL * step).take_while(|t| *t <= PAST);

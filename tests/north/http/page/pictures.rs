@@ -14,8 +14,12 @@ const MOST_BYTES: u64 = 200 * 1024;
 /// The pages of the pictures render; with `DRIVEGATE_WRITE_PICTURES=1` they are written to `docs/pictures`.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn pictures_show_the_pages() {
-    let Lively { plant, mut going_on } = Lively::new();
-    let server = Server::of(plant).await;
+    let Lively {
+        plant,
+        stats,
+        mut going_on,
+    } = Lively::new();
+    let server = Server::showing(plant, stats).await;
     let _answering = keep_answering(move || going_on.answer());
     let elsewhere = tempfile::tempdir().expect("a directory");
     let dir = match std::env::var_os("DRIVEGATE_WRITE_PICTURES") {

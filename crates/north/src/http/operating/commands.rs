@@ -276,7 +276,7 @@ impl Operating {
         let Some(id) = id else {
             return Ok((sender, permit));
         };
-        let mut memory = self.stats.posted.lock();
+        let mut memory = self.north.posted.lock();
         let topic = format!("{}/{}", operator.user, drive.image.spec.name);
         let taken = Taken {
             topic: &topic,

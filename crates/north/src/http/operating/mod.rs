@@ -39,7 +39,7 @@ use self::throttle::{Source, Throttle};
 use self::verifier::Verifier;
 use super::routes::{LocalUser, Reached};
 use super::users::{MAX_PASSWORD, User, Users};
-use crate::NorthStats;
+use crate::NorthState;
 use crate::command::{Authority, Proof, SourceKind};
 use crate::log_throttle::LogThrottle;
 
@@ -74,7 +74,7 @@ pub(super) struct Operating {
     hasher: RandomState,
     /// For passwords in memory; `None` if the system has no random numbers: nothing is kept then.
     key: Option<hmac::Key>,
-    stats: Arc<NorthStats>,
+    north: Arc<NorthState>,
     in_progress: Arc<Semaphore>,
     /// Limits the log of failed logins.
     failures: LogThrottle,
@@ -164,14 +164,14 @@ pub(super) struct Credentials {
 }
 
 impl Operating {
-    pub(super) fn new(stats: Arc<NorthStats>) -> Operating {
+    pub(super) fn new(north: Arc<NorthState>) -> Operating {
         Operating {
             users: ArcSwapOption::empty(),
             state: Mutex::default(),
             verifier: Verifier::default(),
             hasher: RandomState::default(),
             key: hmac::Key::generate(hmac::HMAC_SHA256, &SystemRandom::new()).ok(),
-            stats,
+            north,
             in_progress: Arc::new(Semaphore::new(IN_PROGRESS)),
             failures: LogThrottle::default(),
         }

@@ -33,8 +33,7 @@ pub(in crate::http) async fn read(
         afresh: how.afresh,
         pace: if how.brisk { Pace::Brisk } else { Pace::Slow },
     };
-    let vault = app.plant.load().parameters.clone();
-    begin_reading(&vault, drive.clone(), operator.origin(), how).map_err(conflict)?;
+    begin_reading(&app.north.parameters, drive.clone(), operator.origin(), how).map_err(conflict)?;
     reading(&app, &drive)
 }
 
@@ -73,7 +72,7 @@ fn understood<T: DeserializeOwned>(body: &[u8]) -> Replied<T> {
 }
 
 async fn act_on(app: &AppState, drive: &DriveHandle, act: RestoreAct, origin: Origin) -> Result<(), String> {
-    let shared = &app.plant;
+    let (shared, vault) = (&app.plant, &app.north.parameters);
     match act {
         RestoreAct::Prepare { file, only, force } => {
             let wanted = ParameterFile::parse(&file).map_err(|why| format!("the file is invalid: {why}"))?;
@@ -81,25 +80,24 @@ async fn act_on(app: &AppState, drive: &DriveHandle, act: RestoreAct, origin: Or
                 only: only.iter().map(|id| Id::new(id)).collect(),
                 force,
             };
-            let vault = shared.load().parameters.clone();
-            prepare(&vault, drive.clone(), wanted, wishes, origin).map(drop)
+            prepare(vault, drive.clone(), wanted, wishes, origin).map(drop)
         }
-        RestoreAct::CarryOut { number } => carry_out(shared, drive, number, origin),
-        RestoreAct::Resume => take_up(shared, drive, Again::Resume, origin).await,
-        RestoreAct::Undo => take_up(shared, drive, Again::Undo, origin).await,
-        RestoreAct::Release => release(shared, drive, &origin).await,
+        RestoreAct::CarryOut { number } => carry_out(shared, vault, drive, number, origin),
+        RestoreAct::Resume => take_up(shared, vault, drive, Again::Resume, origin).await,
+        RestoreAct::Undo => take_up(shared, vault, drive, Again::Undo, origin).await,
+        RestoreAct::Release => release(shared, vault, drive, &origin).await,
     }
 }
 
 fn reading(app: &AppState, drive: &DriveHandle) -> Replied<Json<ParameterReading>> {
-    let status = app.plant.load().parameters.status(&drive.machine());
+    let status = app.north.parameters.status(&drive.machine());
     let name = &drive.image.spec.name;
     let status = status.ok_or_else(|| conflict(format!("the parameters of `{name}` have not been read yet")))?;
     Ok(Json(ParameterReading::new(&status)))
 }
 
 fn restored(app: &AppState, drive: &DriveHandle) -> Replied<Json<Restore>> {
-    let status = app.plant.load().parameters.restore(&drive.machine());
+    let status = app.north.parameters.restore(&drive.machine());
     let name = &drive.image.spec.name;
     let none = || {
         conflict(format!(

@@ -21,7 +21,7 @@ pub(in crate::http) async fn record(
     if plant.drive(&name).is_none() {
         return Err(no_drive(&plant, &name));
     }
-    let made = plant.recordings.record(&name, &operator.origin().who).await;
+    let made = app.north.recordings.record(&name, &operator.origin().who).await;
     let (id, after) = made.map_err(|why| refused(StatusCode::CONFLICT, why.to_string()))?;
     let after_s = after.as_secs_f64();
     Ok(Json(Recorded { id, after_s }))

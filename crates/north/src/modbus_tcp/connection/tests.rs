@@ -9,7 +9,7 @@ use super::super::client::Client;
 use super::super::routes::PlantView;
 use super::super::{Options, ServerState, Uncached};
 use super::*;
-use crate::NorthStats;
+use crate::NorthState;
 use crate::command::Authority;
 use crate::connection_limit::{ConnectionLimit, Limits, Newcomer};
 use crate::plant::Plant;
@@ -21,7 +21,7 @@ const ANSWER: [u8; 9] = [0, 1, 0, 0, 0, 3, 255, 0x84, 2];
 struct Bench {
     client: DuplexStream,
     server: JoinHandle<()>,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     cancel: CancellationToken,
     place: Arc<ConnectionPlace>,
 }
@@ -41,7 +41,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         uncached: Uncached::Refuse,
     };
     let plant = Plant::new("test", Duration::from_secs(1), Vec::new());
-    let stats = Arc::new(NorthStats::default());
+    let stats = Arc::new(NorthState::default());
     let state = ServerState::new(options, stats.clone(), CancellationToken::new());
     let view = PlantView::new(Arc::new(ArcSwap::from_pointee(plant)), None);
     let client = Client::new(([127, 0, 0, 1], 502).into(), None, Authority::ReadOnly);

@@ -28,7 +28,7 @@ use crate::log_throttle::LogThrottle;
 use crate::plant::{Plant, SharedPlant};
 use crate::process_image::Snapshot;
 use crate::stats::LinkOf;
-use crate::{MqttLoss, NorthStats};
+use crate::{MqttLoss, NorthState};
 
 /// Maximum time between two checks of the connection and the plant.
 const CHECK: Duration = Duration::from_millis(25);
@@ -63,7 +63,7 @@ pub(in crate::mqtt) async fn run(
     options: Options,
     broker: BrokerOptions,
     plant: SharedPlant,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     cancel: CancellationToken,
 ) {
     let mut client = Client::new(options, broker, plant, stats);
@@ -92,7 +92,7 @@ struct Client {
     broker: BrokerOptions,
     plant: SharedPlant,
     observed: Arc<Plant>,
-    stats: Arc<NorthStats>,
+    stats: Arc<NorthState>,
     session: Session,
     drives: Vec<Drive>,
     /// The drive that is looked at next, of those that are due.
@@ -125,7 +125,7 @@ fn tick() -> Tick {
 }
 
 impl Client {
-    fn new(options: Options, broker: BrokerOptions, plant: SharedPlant, stats: Arc<NorthStats>) -> Client {
+    fn new(options: Options, broker: BrokerOptions, plant: SharedPlant, stats: Arc<NorthState>) -> Client {
         let observed = plant.load_full();
         let topics = Topics::new(&options.group, &options.node, &options.primary_host);
         let now = Instant::now();

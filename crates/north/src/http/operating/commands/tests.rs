@@ -124,7 +124,7 @@ fn a_repetition_is_known_to_the_server_that_a_reload_starts() {
     let alice = operator("alice", "alice#1");
     let body = "{\"id\": 1, \"speed_reference\": 10}";
     let _first = bench.take(&alice, "p1", body);
-    bench.operating = Operating::new(bench.operating.stats.clone());
+    bench.operating = Operating::new(bench.operating.north.clone());
     assert!(matches!(bench.take(&alice, "p1", body), Progress::Repeated(_)));
 }
 
