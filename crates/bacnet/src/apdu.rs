@@ -6,7 +6,7 @@ use crate::types::{Abort, Error, Reject};
 /// Longest message that goes into a datagram of BACnet/IP.
 pub const MAX_APDU: usize = 1476;
 
-/// What a client takes as an answer.
+/// The responses that a client accepts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Accepts {
     /// Segments, and at most how many.
@@ -22,7 +22,7 @@ pub enum Apdu<'a> {
     Confirmed {
         /// It comes in segments.
         segmented: bool,
-        /// What its client takes.
+        /// What its client accepts.
         accepts: Accepts,
         /// Its number.
         invoke: u8,

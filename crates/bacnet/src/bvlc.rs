@@ -8,7 +8,7 @@ const BACNET_IP: u8 = 0x81;
 /// A datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Bvlc<'a> {
-    /// What became of a request to a BBMD.
+    /// The result of a request to a BBMD.
     Result(u16),
     /// A message to this host.
     Unicast(&'a [u8]),
@@ -81,7 +81,7 @@ pub fn register(seconds: u16) -> Vec<u8> {
     datagram(0x05, &seconds.to_be_bytes())
 }
 
-/// What became of a request.
+/// The result of a request.
 pub fn result(code: u16) -> Vec<u8> {
     datagram(0x00, &code.to_be_bytes())
 }

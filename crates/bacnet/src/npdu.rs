@@ -16,11 +16,11 @@ pub struct Npdu<'a> {
     pub from: Option<(u16, Mac)>,
     /// An answer is expected.
     pub expects: bool,
-    /// What it carries.
+    /// Its content.
     pub payload: Payload<'a>,
 }
 
-/// What a message of the network layer carries.
+/// The content of a network layer message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Payload<'a> {
     /// A message of the application layer.

@@ -36,7 +36,7 @@ pub struct Object {
     pub name: Arc<str>,
     /// What it is.
     pub description: Arc<str>,
-    /// What its values are.
+    /// The kind of its values.
     pub kind: Kind,
     /// How it is written.
     pub access: Access,
@@ -53,7 +53,7 @@ pub enum Access {
     Command,
 }
 
-/// What the values of an object are.
+/// The kind of an object's values.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Kind {
     /// Numbers.
@@ -131,7 +131,7 @@ pub enum ValueSource {
 /// A slot of a priority array.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Slot {
-    /// What stands in it.
+    /// Its value.
     pub value: Datum,
     /// Who wrote it.
     pub source: ValueSource,
@@ -142,13 +142,13 @@ pub struct Slot {
 /// The priorities of an object.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Commands {
-    /// What stands in each slot, priority 1 first.
+    /// The value of each slot, priority 1 first.
     pub slots: [Option<Slot>; 16],
     /// The priority that governs.
     pub current: Option<u8>,
-    /// What holds without any.
+    /// The value when all slots are empty.
     pub default: Option<Datum>,
-    /// Who gave the value that holds.
+    /// The source of the present value.
     pub source: ValueSource,
     /// When.
     pub at: Option<DateTime>,

@@ -1,4 +1,4 @@
-//! What requests say (clauses 13 to 16).
+//! The parameters of requests (clauses 13 to 16).
 
 use crate::encoding::{Read, Reader, Tag, text_of, u32_of};
 use crate::types::{Data, ObjectId, PropertyId, Reject};
@@ -76,7 +76,7 @@ pub fn who_is(data: &[u8]) -> Read<Range> {
     Ok(range)
 }
 
-/// What Who-Has asks for.
+/// What Who-Has searches for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Sought {
     /// An object by its identifier.
@@ -203,7 +203,7 @@ pub fn write_property_multiple(data: &[u8]) -> Read<Vec<WriteItem>> {
     }
 }
 
-/// What stands between the tags of that context, if it is one primitive value.
+/// The content between the tags of that context, if it is one primitive value.
 fn value(reader: &mut Reader<'_>, number: u8) -> Read<Option<Data>> {
     reader.open(number)?;
     let mut values = Vec::new();
@@ -292,7 +292,7 @@ pub fn subscribe_cov_property(data: &[u8]) -> Read<Subscribe> {
     })
 }
 
-/// What DeviceCommunicationControl wants.
+/// The request of DeviceCommunicationControl.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Control {
     /// Minutes; none: without end.

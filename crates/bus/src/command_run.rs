@@ -29,7 +29,7 @@ use crate::drive::{DriveIndex, Profile};
 /// Most stops to a drive that are sent before the end of a started pulse.
 const MOST_STOPS: u32 = 8;
 
-/// What a command needs next.
+/// The next step of a command.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Next {
     /// This request on the line.

@@ -216,7 +216,7 @@ impl BusCore {
             if now < clear {
                 return wait(clear, !chosen.turn.is_stop(), true);
             }
-            // What came too late while the line went silent is not sent.
+            // Commands that expired while the line went silent are not sent.
             if self.master.is_still_due(&chosen.turn, now) {
                 return Action::Send;
             }

@@ -130,7 +130,7 @@ impl DriveState {
         }
         for urgency in order {
             loop {
-                // What a faulted drive says of its motor may be from before the fault; it does not run by its run command.
+                // The motor state of a faulted drive may be from before the fault; it does not run by its run command.
                 let running = reading.is_set(ModelPoint::Running) && !reading.is_set(ModelPoint::Fault);
                 let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut) else {
                     break;

@@ -67,7 +67,7 @@ pub struct Exchanged {
     pub beats: Option<u32>,
 }
 
-/// What the transactions have shown about the line. It also holds for the next connection to the same line.
+/// Findings about the line from its transactions. They are kept for the next connection to the same line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Learned {
     protocol: Protocol,
@@ -133,7 +133,7 @@ impl LineState {
         };
     }
 
-    /// What the transactions have shown.
+    /// The findings from the transactions.
     pub fn learned(&self) -> Learned {
         self.learned
     }

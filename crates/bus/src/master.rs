@@ -131,14 +131,14 @@ pub struct TurnEnd {
     pub frame: Vec<u8>,
 }
 
-/// What a bus that ends hands over to the next one on the same line.
+/// State that a stopped bus hands over to the next one on the same line.
 #[derive(Debug, Clone, Default)]
 pub struct Handover {
     /// The leases of its drives, in their order.
     pub leases: Vec<Lease>,
     /// Until when a reply to its request may arrive; none if no bus used the line before.
     pub quiet_until: Option<Instant>,
-    /// What it learned about the line.
+    /// Its findings about the line.
     pub learned: Option<Learned>,
 }
 

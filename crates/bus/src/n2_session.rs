@@ -1,4 +1,4 @@
-//! What an N2 bus sends to a drive besides reads and commands (reference/n2.md 2 and 4). Pure: time is an argument.
+//! Messages of an N2 bus to a drive other than reads and commands (reference/n2.md 2 and 4). Pure: time is an argument.
 //!
 //! A drive that has restarted answers nothing before it is identified; then it reports, to polls, all it has. So a
 //! drive is identified first, its report is taken (and thrown away: the layout is not known, values are read), then it
@@ -195,7 +195,7 @@ impl Drive {
     fn identified(&mut self, reply: &Reply) -> Progress {
         match self.phase {
             Phase::Unknown | Phase::Waiting => self.report(),
-            // What is acknowledged may never have come.
+            // An acknowledged message may never have arrived.
             Phase::Reporting { left, .. } => self.phase = Phase::Reporting { left, again: false },
             Phase::Ready => {}
         }

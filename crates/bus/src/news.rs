@@ -68,7 +68,7 @@ pub enum News {
     StartRefused {
         /// Which drive.
         drive: DriveIndex,
-        /// Who gave it.
+        /// The client that gave it.
         origin: Origin,
         /// The command in one line.
         what: String,

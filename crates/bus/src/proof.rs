@@ -92,7 +92,7 @@ const FATES: [Fate; 9] = [
     Fate::Refused(Exception::BUSY),
 ];
 
-/// What happens in between, after so many requests.
+/// Incidents in between, after that many requests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Event {
     None,

@@ -44,7 +44,7 @@ pub(super) struct StartGate {
 pub(crate) struct Start {
     /// Its number in the queue.
     pub number: u64,
-    /// Who gave it.
+    /// The client that gave it.
     pub client: Arc<str>,
 }
 

@@ -296,7 +296,7 @@ impl AsFd for Exclusive {
 
 impl Drop for Exclusive {
     /// The kernel keeps the exclusive mode of a port until its last descriptor is closed and all is sent; until then
-    /// anyone who opens it again is told that it is busy.
+    /// opening it again fails as busy.
     fn drop(&mut self) {
         if let Err(error) = rustix::termios::ioctl_tiocnxcl(&self.0) {
             // An adapter that was unplugged.
@@ -365,7 +365,7 @@ fn connect(names: &mut Names, port: &str, address: &str, go_on: &dyn Fn() -> boo
         match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {
             Ok(stream) => {
                 stream.set_nodelay(true).map_err(failed)?;
-                // A server that lost its power says nothing; the system would go on trying for a quarter of an hour.
+                // A server without power does not answer; the system would keep trying for a quarter of an hour.
                 let patience = rustix::net::sockopt::set_tcp_user_timeout(&stream, UNACKNOWLEDGED.as_millis() as u32);
                 patience.map_err(|error| failed(error.into()))?;
                 stream.set_nonblocking(true).map_err(failed)?;

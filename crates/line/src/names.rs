@@ -12,7 +12,7 @@ use super::other_server::OtherServer;
 
 /// Longest wait for an answer.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// Anyone who waits is asked this often whether to go on.
+/// Waiting callers are asked this often whether to continue.
 const STEP: Duration = Duration::from_millis(100);
 
 type Found = io::Result<Vec<SocketAddr>>;
@@ -22,12 +22,12 @@ pub struct Names {
     ask: Arc<dyn Fn(&str) -> Found + Send + Sync>,
     patience: Duration,
     known: Vec<SocketAddr>,
-    /// The answer of a thread that still asks.
+    /// The result of a lookup still in progress.
     asked: Option<Receiver<Found>>,
     /// What the system said last instead of an address: repeated while it says nothing, so that the reason why a bus
     /// is down changes only when there is news.
     failure: Option<String>,
-    /// The last answer was none.
+    /// The last lookup found nothing.
     doubtful: bool,
     /// What the server turned out to be.
     pub(super) other: OtherServer,
@@ -70,7 +70,7 @@ impl Names {
             return Ok(vec![literal]);
         }
         let found = match self.asked.take() {
-            // What was asked for is not waited for twice while there is something to try.
+            // A lookup in progress is not waited for again while there is an address to try.
             Some(asked) if !self.known.is_empty() => self.wait(asked, Duration::ZERO, go_on),
             Some(asked) => self.wait(asked, self.patience, go_on),
             None => {

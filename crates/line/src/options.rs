@@ -1,4 +1,4 @@
-//! The options of a line, besides its port and its character format.
+//! The options of a line, except its port and its character format.
 
 use std::time::Duration;
 

@@ -26,7 +26,7 @@ pub(super) struct OtherServer(Arc<Known>);
 
 #[derive(Debug, Default)]
 struct Known {
-    /// It answers Modbus TCP.
+    /// It responds to Modbus TCP.
     found: AtomicBool,
     /// The drive in whose name it was asked: servers do not answer for all.
     unit: AtomicU8,
@@ -74,7 +74,7 @@ impl OtherServer {
         let asking = move || {
             if answers(server, unit) {
                 known.recognised(unit);
-                // Wakes anyone who waits on it, and who opens it again is told.
+                // Wakes all waiting callers, and reports to those that open it again.
                 let ended = silent.shutdown(Shutdown::Both);
                 tracing::debug!(target: "drivegate::line", ?ended, "a Modbus TCP server answers instead of a line");
             }

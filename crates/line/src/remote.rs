@@ -15,7 +15,7 @@ use super::{Lost, OpenError, poll_port, read, write_all};
 
 /// Time for the server to agree and to set up its port.
 const NEGOTIATION: Duration = Duration::from_secs(3);
-/// Anyone who waits is asked this often whether to go on.
+/// Waiting callers are asked this often whether to continue.
 const STEP: Duration = Duration::from_millis(100);
 
 /// A raw connection.
@@ -140,7 +140,7 @@ impl Remote {
             }
             let mut fds = [PollFd::from_borrowed_fd(remote.stream.as_fd(), PollFlags::IN)];
             poll_port(&mut fds, until.min(Instant::now() + STEP)).map_err(|lost| failed(lost.why))?;
-            // What the line said before it was set up is of no use.
+            // Bytes received before the line was set up are dropped.
             remote.receive(&mut buffer).map_err(|lost| failed(lost.why))?;
         }
         let (took, asked) = (remote.session.borrow().took(), settings.format.to_string());

@@ -100,7 +100,7 @@ mod tests {
         }
     }
 
-    /// What is said of a driver that changes the request like that.
+    /// The message about a driver that changes the request like that.
     fn said(options: &LineOptions, change: impl FnOnce(&mut SerialRs485)) -> Vec<String> {
         enable(options, |request| {
             change(request);

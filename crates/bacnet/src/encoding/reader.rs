@@ -16,7 +16,7 @@ pub enum Tag {
     Close(u8),
 }
 
-/// What reading gives.
+/// The result of reading.
 pub type Read<T> = Result<T, Reject>;
 
 /// Reads tagged values; everything out of place is an error that says how the request is rejected.

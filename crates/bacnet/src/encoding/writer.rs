@@ -16,12 +16,12 @@ fn minimal(bytes: &[u8]) -> &[u8] {
 }
 
 impl Writer {
-    /// What was written.
+    /// The bytes written.
     pub fn bytes(&self) -> &[u8] {
         &self.bytes
     }
 
-    /// What was written.
+    /// The bytes written.
     pub fn into_bytes(self) -> Vec<u8> {
         self.bytes
     }

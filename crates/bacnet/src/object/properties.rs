@@ -9,7 +9,7 @@ use crate::encoding::Writer;
 use crate::services::{PropertyRef, SUPPORTED};
 use crate::types::{Address, DateTime, Error, ObjectId, ObjectType, PropertyId as P};
 
-/// What all devices of a server share.
+/// The settings common to all devices of a server.
 #[derive(Debug, Clone)]
 pub(crate) struct Environment {
     pub(crate) vendor: u16,
@@ -424,7 +424,7 @@ fn datum(out: &mut Writer, kind: ObjectType, value: &Datum) {
     debug_assert!(kind != ObjectType::DEVICE);
 }
 
-/// What an object of that kind shows while nothing was read.
+/// The value of an object of that kind before the first read.
 fn nothing(kind: &Kind) -> Datum {
     match kind {
         Kind::Analog { .. } => Datum::Number(0.0),
@@ -534,7 +534,7 @@ fn time_stamp(out: &mut Writer, at: Option<DateTime>) {
     out.open(2).date_time(at.unwrap_or(DateTime::UNSPECIFIED)).close(2);
 }
 
-/// What a notification of an object tells: its value and its flags.
+/// The content of a notification of an object: its value and its flags.
 pub(crate) fn cov_value(of: &Context<'_>) -> &'static [P] {
     match of {
         Context::Device { .. } => &[P::SYSTEM_STATUS],

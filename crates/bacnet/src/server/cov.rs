@@ -18,7 +18,7 @@ const TRIES: u8 = 3;
 /// Undelivered notifications in a row that end a subscription without a lifetime.
 const LOST: u8 = 3;
 
-/// What is subscribed to, and by whom.
+/// The subscriber, and the subscribed object.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Key {
     pub(super) subscriber: Address,
@@ -28,7 +28,7 @@ pub(super) struct Key {
     pub(super) property: Option<PropertyRef>,
 }
 
-/// What was told last.
+/// The last reported values.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Told {
     /// The number, where the value is one.
@@ -94,7 +94,7 @@ pub(super) struct Cov {
     invoke: u8,
 }
 
-/// What a subscription shows at the moment, and the increment of its object.
+/// The present values of a subscription, and the increment of its object.
 pub(super) type Look<'a> = &'a mut dyn FnMut(u32, &Subscription) -> Option<(Told, f64)>;
 
 impl Cov {

@@ -1,4 +1,4 @@
-//! Who is there, and who has what (clauses 16.9, 16.10).
+//! Who-Is and Who-Has (clauses 16.9, 16.10).
 
 use std::sync::Arc;
 use std::time::Instant;

@@ -49,7 +49,7 @@ pub struct Options {
     pub bbmd: Option<SocketAddrV4>,
 }
 
-/// What stands behind the server.
+/// The application behind the server.
 pub trait Application {
     /// Whether that host may say anything at all.
     fn admits(&self, host: Ipv4Addr) -> bool;
@@ -63,7 +63,7 @@ pub trait Application {
     /// Whether that device answers.
     fn answers(&self, device: u32) -> bool;
 
-    /// What the object at that place shows.
+    /// The value of the object at that place.
     fn sample(&self, device: u32, place: usize) -> Sample;
 
     /// Its priorities.
@@ -213,7 +213,7 @@ impl Server {
         self.traffic.poll(now);
     }
 
-    /// What that device shows may have changed.
+    /// Values of that device may have changed.
     pub fn changed(&mut self, device: u32, app: &dyn Application, now: Instant) {
         self.look(device, app, now);
         self.notify(app, now);
@@ -246,12 +246,12 @@ impl Server {
         self.foreign = Foreign::new(bbmd, now);
     }
 
-    /// What became of the registration at the BBMD.
+    /// The result of the registration at the BBMD.
     pub fn registration(&self) -> Registration {
         self.foreign.state
     }
 
-    /// What happened so far.
+    /// The counters so far.
     pub fn counters(&self) -> Counters {
         Counters {
             dropped: self.traffic.dropped,

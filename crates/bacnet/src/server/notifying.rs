@@ -11,7 +11,7 @@ use crate::object::{Context, Device, cov_value, property};
 use crate::services::{PropertyRef, Subscribe, confirmed, unconfirmed};
 use crate::types::{Address, Error, ObjectId, ObjectType, PropertyId, WILDCARD};
 
-/// What no subscription can be to: several properties at once, clocks, and what a notification itself changes.
+/// Properties that cannot be subscribed to: several at once, clocks, and those that a notification itself changes.
 const NEVER_TOLD: [PropertyId; 6] = [
     PropertyId::ALL,
     PropertyId::REQUIRED,
@@ -82,7 +82,7 @@ impl Server {
         }
     }
 
-    /// What a subscription shows now.
+    /// The present values of a subscription.
     fn shows(&self, device: &Device, key: &Key, app: &dyn Application, now: Instant) -> Option<(Told, f64, Vec<u8>)> {
         self.with_object(device, key.object, app, now, |of| {
             let mut values = Writer::default();

@@ -1,4 +1,5 @@
-//! What may leave: to an address that asked at most eight times as many octets as came from it, and so many broadcasts a second.
+//! Limits of sending: to an address at most eight times the octets received from it, and a number of broadcasts per
+//! second.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::net::{Ipv4Addr, SocketAddrV4};
@@ -80,7 +81,7 @@ impl Known {
     }
 }
 
-/// What leaves, in order, within the limits.
+/// The outgoing messages, in order, within the limits.
 #[derive(Debug)]
 pub(super) struct Traffic {
     begun: Instant,
@@ -124,7 +125,7 @@ impl Traffic {
         }
     }
 
-    /// What is known of that address; the one that was quiet for longest is forgotten for it.
+    /// The state of that address; when the table is full, the one idle for longest is dropped.
     fn known(&mut self, address: Ipv4Addr, step: u64) -> Option<&mut Known> {
         if !self.known.contains_key(&address) {
             if self.known.len() >= ADDRESSES {

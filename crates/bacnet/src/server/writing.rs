@@ -28,7 +28,7 @@ const FOR_STOPS: usize = 256;
 pub struct Job {
     /// Names it in [`Server::written`].
     pub token: u64,
-    /// Who wrote.
+    /// The writer.
     pub from: Address,
     /// To which device.
     pub device: u32,
@@ -124,7 +124,7 @@ impl Exchanges {
     }
 }
 
-/// What becomes of a write at once.
+/// The immediate result of a write.
 enum Step {
     /// It is done.
     Done,
@@ -218,7 +218,7 @@ impl Server {
         self.go_on(token, app, now);
     }
 
-    /// What became of a job.
+    /// The result of a job.
     pub fn written(&mut self, token: u64, result: Result<(), Error>, app: &dyn Application, now: Instant) {
         let Some(exchange) = self.exchanges.running(token) else {
             return;

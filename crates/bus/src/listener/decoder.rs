@@ -55,7 +55,7 @@ pub enum Heard {
 /// A request of the other master, and the result.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Exchange {
-    /// Who was asked; 0 is the broadcast.
+    /// The polled address; 0 is the broadcast.
     pub address: u8,
     /// The request; `None` for a command without a request in the codec.
     pub request: Option<Request>,

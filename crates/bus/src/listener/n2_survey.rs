@@ -1,4 +1,5 @@
-//! What contradicts or confirms on a real trunk what is assumed of N2 ([`ASSUMPTIONS`](crate::codec::n2::ASSUMPTIONS)). Pure.
+//! Evidence from a real trunk for or against the assumptions about N2 ([`ASSUMPTIONS`](crate::codec::n2::ASSUMPTIONS)).
+//! Pure.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -288,7 +289,7 @@ mod tests {
         survey.report()
     }
 
-    /// What the report says of an assumption.
+    /// The report's text about an assumption.
     fn said<'r>(report: &'r str, assumption: &str) -> &'r str {
         let mut lines = report.lines().skip_while(|line| !line.contains(assumption));
         lines.nth(1).map_or("no such line", str::trim)

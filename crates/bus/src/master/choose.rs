@@ -336,7 +336,7 @@ impl Master {
             return self.begin_passed_on(command, None, now).map(Ok);
         }
         self.begin(command, chosen.rank, now);
-        // What was started is decided on again: it may wait, or another one may go first.
+        // Started commands are decided on again: one may wait, or another one may go first.
         None
     }
 

@@ -33,7 +33,7 @@ pub(super) fn look_at_hold(
         queue.hold_renewed(index, origin, now);
     }
     if local != before {
-        // What is not known is not local.
+        // An unknown control place does not count as local.
         queue.set_local(index, local == Some(true));
     }
     let stops = queue.rules().is_some_and(|rules| rules.stop_at_local);

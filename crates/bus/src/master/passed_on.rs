@@ -1,4 +1,4 @@
-//! What is passed on to drives of the bus for a tool or for the gateway's own broadcasts: when it may go, and that it goes.
+//! Requests forwarded for a tool, and the gateway's own broadcasts: when they may be sent, and the sending.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -277,7 +277,7 @@ pub(super) fn may_go(
             None => true,
         },
     };
-    // What goes to a drive that is away is answered, and starts nothing.
+    // A request to an absent drive is answered, and starts nothing.
     let goes = may && (online || command.passed_on.is_some());
     match late.starts.as_mut().filter(|_| goes) {
         Some(starts) => starts.may_go(command, now),

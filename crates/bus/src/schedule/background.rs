@@ -32,7 +32,7 @@ impl BackgroundShare {
     /// is not process data's to give.
     pub(super) fn earn(&mut self, passed: Duration) {
         for (pace, balance) in Pace::ALL.into_iter().zip(&mut self.balance) {
-            // What was not used in an hour is no burst afterwards.
+            // Share not used in an hour does not become a burst later.
             let most = self.longest.as_secs_f64().max(*balance);
             *balance = (*balance + passed.as_secs_f64() * pace.share()).min(most);
         }

@@ -135,7 +135,7 @@ impl Schedule {
     }
 
     fn due_slow(&self, now: Instant) -> Option<(Instant, Poll, Duration)> {
-        // What is read once when a drive comes online goes first: commands in percent rest on its frequencies.
+        // Points read once when a drive comes online go first: commands in percent depend on its frequencies.
         let rank = |due: Instant, item: &Item| {
             let first = item.read.class == PollClass::Once && item.failures == 0 && !item.refused;
             (!first, due)

@@ -168,7 +168,7 @@ pub struct Audit {
 pub struct RunOrdered {
     /// Run, or stop.
     pub run: bool,
-    /// Who gave it: source and client.
+    /// Its source and client.
     pub who: String,
     /// When its result arrived, or the wait was given up.
     pub at: Instant,

@@ -143,7 +143,7 @@ impl Outcome {
             Outcome::TimedOut | Outcome::Offline | Outcome::Expired | Outcome::NotStopped => {
                 Some(Exception::GATEWAY_TARGET)
             }
-            // What was not done is what the client must know of; never success, which would be both parts.
+            // The client must know what was not done; never success, which would mean both parts.
             Outcome::StopOnly(part) | Outcome::StopFailed(part) => {
                 Some(part.exception().unwrap_or(Exception::DEVICE_FAILURE))
             }
@@ -247,7 +247,7 @@ pub enum Refusal {
     OtherValue(String),
 }
 
-/// Who keeps others from a drive.
+/// The client that blocks a drive for others.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Holder {
     /// Who.
@@ -284,7 +284,7 @@ impl Refusal {
         }
     }
 
-    /// Who keeps the client from the drive, where someone does.
+    /// The client that blocks the drive, if any.
     pub fn holder(&self) -> Option<&Holder> {
         match self {
             Refusal::HeldByOther(holder) | Refusal::NeedsTake(holder) => Some(holder),

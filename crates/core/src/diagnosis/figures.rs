@@ -425,7 +425,7 @@ impl Figures {
             return;
         }
         let bytes = std::mem::take(&mut self.idle);
-        // What comes behind a damaged reply may be the rest of it.
+        // Bytes after a damaged reply may be the rest of it.
         if !self.answer_of_another(&bytes, now)
             && let Some((drive, End::Answered)) = self.last
             && let Some(drive) = self.drives.get_mut(drive)

@@ -17,7 +17,7 @@ pub(super) const SET_CONTROL: u8 = 5;
 pub(super) const SET_LINE_STATE_MASK: u8 = 10;
 pub(super) const SET_MODEM_STATE_MASK: u8 = 11;
 pub(super) const PURGE: u8 = 12;
-/// The answer of the server to a command has its number plus this.
+/// The server's reply to a command has its number plus this.
 pub(super) const ANSWER: u8 = 100;
 
 const NO_FLOW_CONTROL: u8 = 1;
@@ -36,9 +36,9 @@ pub(crate) struct Settings {
 /// How far the negotiation is.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum State {
-    /// The server has not said yet whether it has the option.
+    /// The server has not yet reported whether it has the option.
     Asked,
-    /// The server has the option; answers to settings are missing.
+    /// The server has the option; replies to settings are missing.
     Setting,
     /// All is set; from now on what comes from the line is data.
     Ready,
@@ -136,7 +136,7 @@ impl Session {
                     "the device server does not pass all bytes through (telnet option BINARY); use its raw port, with tcp://",
                 );
             }
-            // Answers to what was offered and asked for at first.
+            // Replies to the initial offers and requests.
             (Verb::Do | Verb::Will, BINARY | SUPPRESS_GO_AHEAD) => {}
             (Verb::Do, _) => replies.extend([IAC, Verb::Wont.byte(), option]),
             (Verb::Will, _) => replies.extend([IAC, Verb::Dont.byte(), option]),
@@ -208,7 +208,7 @@ pub(super) fn parity_code(parity: Parity) -> u8 {
     }
 }
 
-/// Appends a command, or the answer to one, with its value.
+/// Appends a command, or the reply to one, with its value.
 pub(super) fn set(replies: &mut Vec<u8>, command: u8, value: &[u8]) {
     replies.extend([IAC, SB, COM_PORT, command]);
     replies.extend(escape(value));

@@ -15,7 +15,7 @@ const NOTIFY_MODEM_STATE: u8 = 107;
 const MODEM_STATE: u8 = 0xB0;
 /// Who serves the port, for programs that ask.
 const NAME: &[u8] = b"drivegate";
-/// What is said of each option, once.
+/// The negotiation of each option, sent once.
 const OPTIONS: [(Verb, u8); 5] = [
     (Verb::Do, COM_PORT),
     (Verb::Will, BINARY),
@@ -62,7 +62,7 @@ impl ServedPort {
     fn option(&mut self, verb: Verb, option: u8, replies: &mut Vec<u8>) {
         let own = |verb| OPTIONS.contains(&(verb, option));
         match verb {
-            // Answers to what was said at first.
+            // Replies to the initial negotiation.
             Verb::Will if own(Verb::Do) => {}
             Verb::Do if own(Verb::Will) => {}
             Verb::Do if option == COM_PORT => {
@@ -76,7 +76,7 @@ impl ServedPort {
         }
     }
 
-    /// A setting is confirmed as it was asked for; a question, which is the value 0, is answered with what the line has.
+    /// A setting is confirmed as requested; a question, which is the value 0, is answered with what the line has.
     fn asked(&self, content: &[u8], replies: &mut Vec<u8>) {
         let [COM_PORT, command, value @ ..] = content else {
             return;
@@ -135,7 +135,7 @@ mod tests {
         [&[IAC, SB, COM_PORT], content, &[IAC, SE]].concat()
     }
 
-    /// The own client settles with it, whatever it asks for, and is told what it wants to hear.
+    /// drivegate's own client negotiates with it, whatever it requests, and receives the expected replies.
     #[test]
     fn the_client_of_this_program_settles_with_it() {
         let settings = Settings {

@@ -38,7 +38,7 @@ impl Verb {
     }
 }
 
-/// What the other end says besides data.
+/// What the other end sends apart from data.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Command {
     /// About an option.

@@ -32,7 +32,7 @@ impl Pending {
     fn inherit(&mut self, mut stop: Command, now: Instant) {
         self.numbered += 1;
         stop.number = self.numbered;
-        // What follows from it was noted there, too.
+        // Its consequences were noted there, too.
         (stop.effects, stop.slot) = (Vec::new(), None);
         match &self.closed {
             Some(outcome) => stop.answer(&outcome.clone(), now),
@@ -69,7 +69,7 @@ impl CommandQueue {
             stop.drive = place;
             match stop.client_waits_until() {
                 Some(_) => of_heir.inherit(stop, now),
-                // What supervision still wants, the lease knows.
+                // The lease knows the pending actions of supervision.
                 None => stop.answer(&Outcome::ShuttingDown, now),
             }
         }

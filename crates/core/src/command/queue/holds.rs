@@ -171,7 +171,7 @@ impl Pending {
         }
         let who = rules.claim_of(origin);
         command.reach().iter().find_map(|drive| {
-            // What it has accepted of stops is sent.
+            // Stops that it has accepted are sent.
             let asks = Some(Asks::of(command, *drive)).filter(|asks| *asks != Asks::Stop)?;
             let denial = self
                 .holds

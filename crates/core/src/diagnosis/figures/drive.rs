@@ -1,11 +1,11 @@
-//! What is counted of one drive.
+//! The counters of one drive.
 
 use std::time::Instant;
 
 use super::LATE;
 use crate::diagnosis::counters::{InPhase, Window};
 
-/// What is counted per drive in each step.
+/// The counters per drive in each step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sign {
     /// Sound replies.
