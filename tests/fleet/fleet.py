@@ -11,16 +11,13 @@ import collections
 import json
 import os
 import pathlib
-import shutil
-import signal
 import sys
-import tempfile
 import threading
 import time
 
 import paho.mqtt.client as paho
 
-from plant import MOSQUITTO, PROMETHEUS, Processes, free_ports, listens, memory, processor_seconds, query_api, until
+from plant import MOSQUITTO, PROMETHEUS, ROOT, Processes, attempt, free_ports, listens, memory, processor_seconds, query_api, until
 
 # docs/mqtt.md: the gateway tries again at intervals of up to 5 s; the rest is for the connection itself.
 BOUND = 8.0
@@ -204,6 +201,41 @@ def storm(options, processes, directory, subscriber, broker, broker_port, gatewa
     return broker, well
 
 
+def tried(processes, options):
+    directory, binary = processes.directory, options.binary
+    broker_port = free_ports(1)[0]
+    broker = start_broker(processes, directory, broker_port)
+    until("the broker's start", lambda: listens(broker_port), 20)
+    ports = configurations(directory, options, broker_port)
+    simulation = processes.start(
+        "lines", [binary, "simulate", "--config", directory / "lines.toml", "--speed", "max", "--autopilot"]
+    )
+    until("the simulated lines", lambda: all((directory / f"line{n}").exists() for n in range(options.gateways)), 60)
+    statuses = Subscriber(broker_port, "drivegate/+/status")
+    began = time.monotonic()
+    gateways = []
+    for number in range(options.gateways):
+        state = directory / f"state{number}"
+        state.mkdir()
+        command = [binary, "run", "--config", directory / f"{gateway_name(number)}.toml"]
+        runtime = {"STATE_DIRECTORY": str(state), "RUNTIME_DIRECTORY": str(state)}
+        gateways.append(processes.start(gateway_name(number), command, **runtime))
+    until("all gateways online", lambda: len(statuses.names_online()) == options.gateways, 120)
+    print(f"start: all gateways online after {time.monotonic() - began:.1f} s", flush=True)
+    prometheus, prometheus_port = start_prometheus(processes, directory, ports)
+    everything = Subscriber(broker_port, "drivegate/#")
+    time.sleep(70)
+    steady(options, everything, broker, gateways, simulation, prometheus, prometheus_port)
+    everything.end()
+    sys.stdout.flush()
+    broker, well = storm(options, processes, directory, statuses, broker, broker_port, gateways)
+    lost = [gateway_name(n) for n, process in enumerate(gateways) if process.poll() is not None]
+    if lost:
+        print(f"fleet: ended by themselves: {', '.join(lost)}")
+        well = False
+    return well
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--gateways", type=int, default=100)
@@ -212,53 +244,11 @@ def main():
     parser.add_argument("--topics", default="state,points", help="`topics` of [mqtt]")
     parser.add_argument("--seconds", type=float, default=60, help="how long the quiet state is measured")
     parser.add_argument("--outage", type=float, default=10, help="how long the broker is away, s")
-    parser.add_argument("--binary", default="target/release/drivegate")
+    parser.add_argument("--binary", type=pathlib.Path, default=ROOT / "target/release/drivegate")
     options = parser.parse_args()
-    binary = pathlib.Path(options.binary).resolve()
-    if not binary.is_file():
-        sys.exit(f"fleet: no program at {binary}; `make build` builds it")
-    directory = pathlib.Path(tempfile.mkdtemp(prefix="drivegate-fleet-"))
-    print(f"fleet: {options.gateways} gateways of {options.drives} drives, cycle {options.cycle}, topics {options.topics}; "
-          f"logs in {directory}", flush=True)
-    processes = Processes(directory)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-    well = False
-    try:
-        broker_port = free_ports(1)[0]
-        broker = start_broker(processes, directory, broker_port)
-        until("the broker's start", lambda: listens(broker_port), 20)
-        ports = configurations(directory, options, broker_port)
-        simulation = processes.start(
-            "lines", [binary, "simulate", "--config", directory / "lines.toml", "--speed", "max", "--autopilot"]
-        )
-        until("the simulated lines", lambda: all((directory / f"line{n}").exists() for n in range(options.gateways)), 60)
-        statuses = Subscriber(broker_port, "drivegate/+/status")
-        began = time.monotonic()
-        gateways = []
-        for number in range(options.gateways):
-            state = directory / f"state{number}"
-            state.mkdir()
-            command = [binary, "run", "--config", directory / f"{gateway_name(number)}.toml"]
-            runtime = {"STATE_DIRECTORY": str(state), "RUNTIME_DIRECTORY": str(state)}
-            gateways.append(processes.start(gateway_name(number), command, **runtime))
-        until("all gateways online", lambda: len(statuses.names_online()) == options.gateways, 120)
-        print(f"start: all gateways online after {time.monotonic() - began:.1f} s", flush=True)
-        prometheus, prometheus_port = start_prometheus(processes, directory, ports)
-        everything = Subscriber(broker_port, "drivegate/#")
-        time.sleep(70)
-        steady(options, everything, broker, gateways, simulation, prometheus, prometheus_port)
-        everything.end()
-        sys.stdout.flush()
-        broker, well = storm(options, processes, directory, statuses, broker, broker_port, gateways)
-        lost = [gateway_name(n) for n, process in enumerate(gateways) if process.poll() is not None]
-        if lost:
-            print(f"fleet: ended by themselves: {', '.join(lost)}")
-            well = False
-    finally:
-        processes.end()
-    if well:
-        shutil.rmtree(directory)
-    sys.exit(0 if well else 1)
+    if not options.binary.is_file():
+        sys.exit(f"fleet: no program at {options.binary}; `make build` builds it")
+    attempt("fleet", options, lambda directory, _: Processes(directory), lambda processes: tried(processes, options))
 
 
 if __name__ == "__main__":

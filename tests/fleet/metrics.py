@@ -15,14 +15,11 @@ import os
 import pathlib
 import resource
 import shutil
-import signal
-import sys
-import tempfile
 import threading
 import time
 import urllib.request
 
-from plant import MOSQUITTO, PROMETHEUS, ROOT, Processes, ask, free_ports, listens, memory, processor_seconds, query_api, to_toml, until
+from plant import MOSQUITTO, PROMETHEUS, ROOT, Processes, ask, attempt, free_ports, listens, memory, processor_seconds, query_api, to_toml, until
 
 REAL, BAD, ABSENT = 4, 10, 3
 LACKING = 6
@@ -307,17 +304,7 @@ def main():
     options = parser.parse_args()
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, 65536), most))
-    directory = pathlib.Path(tempfile.mkdtemp(prefix="drivegate-metrics-"))
-    print(f"metrics: {json.dumps(vars(options), default=str)}; logs in {directory}", flush=True)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-    site, is_well = Site(directory, options), False
-    try:
-        is_well = tried(site)
-    finally:
-        site.end()
-    if is_well:
-        shutil.rmtree(directory)
-    sys.exit(0 if is_well else 1)
+    attempt("metrics", options, Site, tried)
 
 
 if __name__ == "__main__":

@@ -9,9 +9,11 @@ import os
 import pathlib
 import random
 import shutil
+import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import urllib.parse
@@ -140,6 +142,21 @@ class Processes:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+
+def attempt(name, options, make, tried):
+    """Runs in a directory of its own, which stays for its logs if it was not well; ends the program."""
+    directory = pathlib.Path(tempfile.mkdtemp(prefix=f"drivegate-{name}-"))
+    print(f"{name}: {json.dumps(vars(options), default=str)}; logs in {directory}", flush=True)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    processes, is_well = make(directory, options), False
+    try:
+        is_well = tried(processes)
+    finally:
+        processes.end()
+    if is_well:
+        shutil.rmtree(directory)
+    sys.exit(0 if is_well else 1)
 
 
 def openssl(*arguments, **options):

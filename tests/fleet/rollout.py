@@ -15,11 +15,10 @@ import signal
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 
 import changes
-from plant import CYCLE, ROOT, Plant, to_toml, until
+from plant import CYCLE, ROOT, Plant, attempt, to_toml, until
 
 PLAYBOOKS = ROOT / "deploy/fleet/playbooks"
 
@@ -360,22 +359,7 @@ PARTS = {"good": good_change, "second-wave": second_wave, "meant": meant, "cut-o
          "pull": pull}
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--gateways", type=int, default=20)
-    parser.add_argument("--binary", default=ROOT / "target/release/drivegate")
-    parser.add_argument("--tools", default=ROOT / ".tools/ansible/bin", help="directory of ansible-playbook")
-    parser.add_argument("--part", action="append", default=[], help=f"bad, {', '.join(PARTS)}; without it all")
-    parser.add_argument("--change", action="append", default=[], help="a bad change by name; without it all")
-    options = parser.parse_args()
-    binary = pathlib.Path(options.binary).resolve()
-    if not binary.is_file():
-        sys.exit(f"rollout: no program at {binary}; `make build` builds it")
-    cases = {name: spoil for name, spoil in (changes.INVALID | changes.WORSE).items() if not options.change or name in options.change}
-    directory = pathlib.Path(tempfile.mkdtemp(prefix="drivegate-rollout-"))
-    print(f"rollout: {options.gateways} gateways; logs in {directory}", flush=True)
-    plant, is_well = Plant(directory, binary, options.gateways), False
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+def tried(plant, options, cases):
     try:
         controller = Controller(plant, pathlib.Path(options.tools).resolve())
         expect(certificates(plant, controller) == 0, controller.output)
@@ -389,14 +373,26 @@ def main():
             bad_changes(plant, controller, cases)
         counts = collections.Counter(process.poll() for process in plant.processes)
         expect(list(counts) == [None], f"processes that ended: {counts}")
-        is_well = True
     except Wrong as wrong:
         print(f"rollout: {wrong}")
-    finally:
-        plant.end()
-    if is_well:
-        shutil.rmtree(directory)
-    sys.exit(0 if is_well else 1)
+        return False
+    return True
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--gateways", type=int, default=20)
+    parser.add_argument("--binary", default=ROOT / "target/release/drivegate")
+    parser.add_argument("--tools", default=ROOT / ".tools/ansible/bin", help="directory of ansible-playbook")
+    parser.add_argument("--part", action="append", default=[], help=f"bad, {', '.join(PARTS)}; without it all")
+    parser.add_argument("--change", action="append", default=[], help="a bad change by name; without it all")
+    options = parser.parse_args()
+    binary = pathlib.Path(options.binary).resolve()
+    if not binary.is_file():
+        sys.exit(f"rollout: no program at {binary}; `make build` builds it")
+    cases = {name: spoil for name, spoil in (changes.INVALID | changes.WORSE).items() if not options.change or name in options.change}
+    attempt("rollout", options, lambda directory, _: Plant(directory, binary, options.gateways),
+            lambda plant: tried(plant, options, cases))
 
 
 if __name__ == "__main__":

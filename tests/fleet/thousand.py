@@ -12,18 +12,14 @@ import collections
 import json
 import os
 import pathlib
-import shutil
-import signal
 import subprocess
-import sys
-import tempfile
 import time
 
 import paho.mqtt.client as paho
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from plant import MOSQUITTO, ROOT, Certificates, Processes, ask, events_of, free_ports, listens, memory, processor_seconds, to_toml, until
+from plant import MOSQUITTO, ROOT, Certificates, Processes, ask, attempt, events_of, free_ports, listens, memory, processor_seconds, to_toml, until
 from sparkplug_host import Host, rebirth
 
 BOUND = 30.0
@@ -238,17 +234,7 @@ def main():
     parser.add_argument("--binary", type=pathlib.Path, default=ROOT / "target/release/drivegate")
     parser.add_argument("--sessions-binary", type=pathlib.Path, required=True, help="benches/sessions.rs, built")
     options = parser.parse_args()
-    directory = pathlib.Path(tempfile.mkdtemp(prefix="drivegate-thousand-"))
-    print(f"thousand: {json.dumps(vars(options), default=str)}; logs in {directory}", flush=True)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-    fleet, is_well = Fleet(directory, options), False
-    try:
-        is_well = tried(fleet)
-    finally:
-        fleet.end()
-    if is_well:
-        shutil.rmtree(directory)
-    sys.exit(0 if is_well else 1)
+    attempt("thousand", options, Fleet, tried)
 
 
 if __name__ == "__main__":
