@@ -129,7 +129,7 @@ function showTop(parts, drive) {
   hide(parts.fault, !fault);
   text(parts.quality, drive.quality === "good" ? "" : old(drive.age_ms, drive.quality));
   hide(parts.quality, drive.quality === "good");
-  const access = drive.access === "control" ? t("may be commanded") : t("is read-only");
+  const access = drive.access === "control" ? t("accepts commands") : t("read-only");
   const line = anchor(places.line(drive.bus), "", drive.bus);
   if (parts.known === JSON.stringify([drive.bus, drive.address, drive.unit, drive.profile, access])) return;
   parts.known = JSON.stringify([drive.bus, drive.address, drive.unit, drive.profile, access]);
