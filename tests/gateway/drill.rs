@@ -109,7 +109,7 @@ fn a_drill_proves_stops_and_is_kept() {
     let said = String::from_utf8(ran.stderr.clone()).unwrap();
     assert!(ran.status.success(), "{said}");
     assert!(
-        said.contains("the client is silent") && said.contains("the motor stood in time in each way"),
+        said.contains("the client is silent") && said.contains("the motor stopped in time each way"),
         "{said}"
     );
     check("pump-1 (gateway), pump-2 (order, gateway)");
@@ -187,7 +187,7 @@ fn what_ends_a_drill_is_named_and_the_motor_is_stopped() {
     let id = begin(json!(["gateway"]));
     let refused = crate::support::process::mbpoll_write(site.modbus, 1, 0x8101, &[1500]);
     assert!(refused.is_err());
-    stands(&id, "aborted", "gave an order: speed_reference=15");
+    stands(&id, "aborted", "sent a command: speed_reference=15");
     // Who may ends it.
     let id = begin(json!(["order", "gateway"]));
     assert_eq!(plant.curl("bob", "DELETE", &format!("/{id}"), &Json::Null).0, 200);

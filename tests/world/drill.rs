@@ -197,7 +197,7 @@ fn what_does_not_stop_is_named() {
     // It ignores stops: another master keeps it running.
     let mut play = of();
     let report = play.drill(&[Kind::Order], |rig, report| {
-        if is_at(report, "an order to stop") && !turns(rig) {
+        if is_at(report, "a stop command was sent") && !turns(rig) {
             rig.with_drive(1, |drive, _| {
                 drive.command(Command {
                     run: true,
@@ -221,7 +221,7 @@ fn what_does_not_stop_is_named() {
             rig.with_drive(1, |drive, _| drive.set_remote(false));
         }
     });
-    ends(&mut play, &report, DrillState::Aborted, "local control place");
+    ends(&mut play, &report, DrillState::Aborted, "local control");
     let mut play = of();
     let report = play.drill(&[Kind::Order], |rig, report| {
         if is_at(report, "the motor turns at") {
@@ -231,7 +231,7 @@ fn what_does_not_stop_is_named() {
     ends(&mut play, &report, DrillState::Aborted, "the drive has a fault");
     for (points, text) in [
         (&[("run", 0.0)][..], "mqtt bob stopped the drive"),
-        (&[("speed_reference", 15.0)][..], "mqtt bob gave an order"),
+        (&[("speed_reference", 15.0)][..], "mqtt bob sent a command"),
     ] {
         let mut play = of();
         let mut given = false;
@@ -303,7 +303,7 @@ impl Trouble {
     /// Makes it happen at the look at which `report` is said.
     fn look(self, rig: &mut Rig, report: &DrillReport, happened: &mut Option<Instant>) {
         let steady = is_at(report, "the motor turns at");
-        let stopping = is_at(report, "an order to stop");
+        let stopping = is_at(report, "a stop command was sent");
         let runs = |rig: &mut Rig, address: u8, run: bool| {
             let command = Command {
                 run,
@@ -356,12 +356,12 @@ impl Trouble {
         match self {
             Trouble::IgnoresStops => (DrillState::Failed, "the motor still turns"),
             Trouble::StopsLate => (DrillState::Passed, "in time"),
-            Trouble::Local => (DrillState::Aborted, "local control place"),
+            Trouble::Local => (DrillState::Aborted, "local control"),
             Trouble::Fault => (DrillState::Aborted, "the drive has a fault"),
             Trouble::PowerLoss => (DrillState::Aborted, "the drive went offline"),
             Trouble::StopOfAnother => (DrillState::Aborted, "mqtt bob stopped the drive"),
-            Trouble::CommandOfAnother => (DrillState::Aborted, "mqtt bob gave an order"),
-            Trouble::WrongMotor => (DrillState::NotProven, "turn"),
+            Trouble::CommandOfAnother => (DrillState::Aborted, "mqtt bob sent a command"),
+            Trouble::WrongMotor => (DrillState::NotProven, "the motor"),
             Trouble::SilentGateway => (DrillState::Failed, "after a silence of 25 s the motor still turns"),
         }
     }
@@ -423,7 +423,7 @@ fn a_thousand_drills_and_a_noisy_line() {
         play.rig.set_faults(FaultPlan::new(noise, seed));
         let mut stood = true;
         let report = play.drill(&[Kind::Order, Kind::Client], |rig, report| {
-            if report.steps.iter().any(|step| step.state == DrillState::Passed) && is_at(report, "the motor stood") {
+            if report.steps.iter().any(|step| step.state == DrillState::Passed) && is_at(report, "standstill after") {
                 stood &= !turns(rig);
             }
         });

@@ -139,7 +139,7 @@ impl Drills {
         if let Some(report) = state.cut_off.last() {
             let (id, drive) = (&report.id, &report.drive);
             return Err(not_now(format!(
-                "drill `{id}` of drive `{drive}` was cut off and is still being ended"
+                "drill `{id}` of drive `{drive}` was interrupted, and its motor is still being stopped"
             )));
         }
         let speed = speed.unwrap_or(options.max_speed);
@@ -356,8 +356,8 @@ impl State {
     fn stop_cut_off(&mut self, plant: &Plant, now: Instant, time: SystemTime) {
         let Some(report) = self.cut_off.pop() else { return };
         let why = match plant.drive_at(&report.machine()) {
-            _ if !run::is_recent(&report, time) => "that is too long ago to stop the motor now",
-            None => "the drive is not configured any more, so it got no stop",
+            _ if !run::is_recent(&report, time) => "that was too long ago to stop the motor now",
+            None => "the drive is no longer configured, so no stop was sent",
             Some(drive) => {
                 self.run = Some(Run::cut_off(report, &drive, now));
                 return;
@@ -410,7 +410,7 @@ impl State {
 fn possible(drive: &DriveHandle, kinds: &[Kind], speed: f64, options: DrillOptions) -> Result<(), DrillRefusal> {
     let spec = &drive.image.spec;
     if kinds.is_empty() {
-        return Err(not_possible("no way is named: order, client, gateway"));
+        return Err(not_possible("name at least one of order, client, gateway"));
     }
     if !(speed > 0.0 && speed <= options.max_speed) {
         let most = options.max_speed;
@@ -433,7 +433,7 @@ fn possible(drive: &DriveHandle, kinds: &[Kind], speed: f64, options: DrillOptio
     if kinds.contains(&Kind::Client) {
         let Some(supervision) = &spec.supervision else {
             return Err(not_possible(format!(
-                "drive `{}` has no supervision, so a client that falls silent stops nothing",
+                "drive `{}` has no supervision, so nothing stops it when its client goes silent",
                 spec.name
             )));
         };
@@ -454,7 +454,7 @@ fn may(drive: &DriveHandle, who: &Origin, now: Instant) -> Result<(), DrillRefus
         && !own
     {
         return Err(not_now(match view.holder {
-            Some(holder) => format!("{holder} holds the drive; a drill is its holder's"),
+            Some(holder) => format!("{holder} holds the drive; only the holder may run a drill"),
             None => "nobody holds the drive; take it first".to_string(),
         }));
     }
@@ -470,10 +470,10 @@ fn may(drive: &DriveHandle, who: &Origin, now: Instant) -> Result<(), DrillRefus
         .good()
         .is_some_and(|remote| !remote.as_bool())
     {
-        return Err(not_now("the drive is switched to its local control place"));
+        return Err(not_now("the drive is under local control"));
     }
     if reading.is_set(ModelPoint::Running) || reading.is_set(ModelPoint::Run) {
-        return Err(not_now("the motor runs; stop it first"));
+        return Err(not_now("the motor is running; stop it first"));
     }
     if let Some(why) = drive.image.hold.why() {
         return Err(not_now(why.to_string()));

@@ -1,4 +1,4 @@
-//! What is said of a drill, and the form in which drills are kept. Pure.
+//! Reports of drills, and the file that keeps them. Pure.
 
 use std::time::{Duration, SystemTime};
 
@@ -6,23 +6,23 @@ use serde::{Deserialize, Serialize};
 
 use crate::process_image::Machine;
 
-/// A way by which a motor is to stop.
+/// A way in which a motor must stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
-    /// An order to stop.
+    /// A stop command.
     Order,
-    /// Its client falls silent: the lease of its supervision runs out.
+    /// Its client goes silent: the lease of its supervision expires.
     Client,
-    /// The gateway falls silent: the drive's own supervision of its fieldbus acts.
+    /// The gateway goes silent: the drive's own fieldbus supervision acts.
     Gateway,
 }
 
 impl Kind {
-    /// All, in the order in which they are tried: behind the last one a drive may have a fault.
+    /// All, in the order of the tests: after the last one a drive may have a fault.
     pub const ALL: [Kind; 3] = [Kind::Order, Kind::Client, Kind::Gateway];
 
-    /// The word for it.
+    /// Its name.
     pub fn name(self) -> &'static str {
         match self {
             Kind::Order => "order",
@@ -32,26 +32,26 @@ impl Kind {
     }
 }
 
-/// How far a drill is, or how it ended.
+/// The progress or result of a drill.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DrillState {
-    /// It waits for its start.
+    /// Waiting for its start.
     Armed,
-    /// It is under way.
+    /// Running.
     Running,
-    /// The motor stood in time in each way.
+    /// The motor stopped in time each way.
     Passed,
-    /// It did not.
+    /// The motor did not stop in time.
     Failed,
-    /// Somebody or something ended it.
+    /// Ended early.
     Aborted,
-    /// Whether the motor stood could not be seen, or it could not be tried.
+    /// Standstill could not be observed, or the test could not be made.
     NotProven,
 }
 
 impl DrillState {
-    /// The word for it.
+    /// Its name.
     pub fn name(self) -> &'static str {
         match self {
             DrillState::Armed => "armed",
@@ -69,23 +69,23 @@ impl DrillState {
     }
 }
 
-/// One way that is tried.
+/// The test of one way to stop.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct DrillStep {
     /// Which.
     pub kind: Kind,
-    /// How far it is; `armed` until its turn.
+    /// Progress or result; `armed` until its turn.
     pub state: DrillState,
-    /// When the cause was given: the order, or the last sign of life (RFC 3339).
+    /// Time of the cause: the command, or the last sign of life (RFC 3339).
     #[serde(default)]
     pub cause_at: Option<String>,
     /// From the cause to the read that showed the motor standing, ms.
     #[serde(default)]
     pub took_ms: Option<u64>,
-    /// The motor stood by then at the latest: it was not asked before.
+    /// `took_ms` is an upper bound: the drive was not read before.
     #[serde(default)]
     pub upper_bound: bool,
-    /// What was seen.
+    /// The observation.
     #[serde(default)]
     pub seen: String,
 }
@@ -107,15 +107,15 @@ pub struct DrillReport {
     pub profile: String,
     /// Who armed it.
     pub who: String,
-    /// How far it is.
+    /// Progress or result.
     pub state: DrillState,
-    /// Why it ended so, or what happens now.
+    /// The reason for the result, or the current action.
     pub text: String,
     /// Speed at which the motor is stopped, % of its range.
     pub speed: f64,
     /// `max_speed` of `[drill]`, %.
     pub max_speed: f64,
-    /// Time in which the motor has to stand, ms.
+    /// Maximum time to standstill, ms.
     pub limit_ms: u64,
     /// When it was armed (RFC 3339).
     pub armed_at: String,
@@ -125,15 +125,15 @@ pub struct DrillReport {
     /// When it was over.
     #[serde(default)]
     pub ended_at: Option<String>,
-    /// What became of the stop with which every drill ends.
+    /// The result of the stop with which every drill ends.
     #[serde(default)]
     pub last_stop: Option<String>,
-    /// The ways that are tried.
+    /// The tests.
     pub steps: Vec<DrillStep>,
 }
 
 impl DrillReport {
-    /// Which machine it is of.
+    /// The machine.
     pub fn machine(&self) -> Machine {
         Machine {
             port: self.port.clone(),
@@ -143,20 +143,20 @@ impl DrillReport {
     }
 }
 
-/// What drills have proven of a way by which a motor is to stop.
+/// What drills have proven about one way to stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, utoipa::ToSchema)]
 pub struct StopProof {
     /// Which way.
     pub kind: Kind,
-    /// Whether the motor stood in time the last time; `null` where it was never tried.
+    /// Whether the motor stopped in time in the last test; `null` if there was none.
     pub passed: Option<bool>,
     /// How long ago that was, s.
     pub age_s: Option<u64>,
-    /// It failed, was never tried, or is older than `every` of `[drill]`.
+    /// The test failed, was never made, or is older than `every` of `[drill]`.
     pub due: bool,
 }
 
-/// The last time that a way was tried to its end on a machine.
+/// The last completed test of a way to stop on a machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Proof {
     port: String,
@@ -166,7 +166,7 @@ pub struct Proof {
     pub kind: Kind,
     /// When it ended, ms since 1970.
     pub at_ms: u64,
-    /// Whether the motor stood in time.
+    /// Whether the motor stopped in time.
     pub passed: bool,
 }
 
@@ -183,12 +183,12 @@ impl Proof {
         }
     }
 
-    /// Whether it is of that machine.
+    /// Whether it belongs to that machine.
     pub fn is_of(&self, machine: &Machine) -> bool {
         self.port == machine.port && self.address == machine.address && self.profile == machine.profile
     }
 
-    /// How long ago it was at `time`; none of a clock that stands before it.
+    /// Its age at `time`; 0 if the clock was set back.
     pub fn age(&self, time: SystemTime) -> Duration {
         let at = SystemTime::UNIX_EPOCH + Duration::from_millis(self.at_ms.min(LATEST_MS));
         time.duration_since(at).unwrap_or_default()

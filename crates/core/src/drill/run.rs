@@ -16,26 +16,26 @@ use crate::plant::{DriveHandle, Placed, Plant};
 use crate::process_image::{Machine, Reading};
 use crate::stop_all::{OneStop, Standstill};
 
-/// Time in which the start of a drill has to be on disk. A motor that starts later starts when nobody expects it.
+/// Maximum time to write the start of a drill to disk; a motor must not start when nobody expects it any more.
 const KEEP: Duration = Duration::from_secs(5);
-/// Time in which a start is sent: a guard may delay it.
+/// Expiry of the start; a guard may delay it.
 const START: Duration = Duration::from_secs(60);
-/// Time for which a start is repeated that was refused since a value was not read yet, and the pause before each repetition.
+/// How long a start is retried that needs a value not yet read, and the pause between retries.
 const START_AGAIN: Duration = Duration::from_secs(15);
 const AGAIN: Duration = Duration::from_millis(500);
-/// Time in which the motor has to turn at its speed.
+/// Maximum time to reach the speed.
 const SPEED_UP: Duration = Duration::from_secs(60);
-/// Time for which it turns at its speed before it is stopped.
+/// How long the motor runs at its speed before it is stopped.
 const STEADY: Duration = Duration::from_secs(2);
-/// Share of its speed from which it turns at it.
+/// Share of the requested speed that counts as reached.
 const AT_SPEED: f64 = 0.8;
-/// Where the drive does not tell its speed in percent, the motor turns at it so long after it began.
+/// Assumed run-up time of a drive that does not report its speed in percent.
 const UNTOLD_SPEED: Duration = Duration::from_secs(10);
-/// Time after a silence in which a read has to come.
+/// Maximum time to the first read after a silence.
 const READ: Duration = Duration::from_secs(15);
-/// Time in which the last stop has to be acknowledged, and the motor to stand for the next way.
+/// Maximum time for the acknowledgement of a stop, and for standstill before the next test.
 const LAST_STOP: Duration = Duration::from_secs(60);
-/// Age up to which the motor of a drill that was cut off is stopped at the next start. Later somebody may have started it since.
+/// Maximum age of an interrupted drill whose motor is stopped at the next start; after that, someone may have started it since.
 const CUT_OFF: Duration = Duration::from_secs(3600);
 
 /// A drill that is armed or under way.
@@ -46,51 +46,51 @@ pub(super) struct Run {
     drive: DriveHandle,
     /// Who armed it.
     who: Origin,
-    /// The same, as the orders of the drill name it.
+    /// The origin of the drill's own commands.
     own: Origin,
     options: DrillOptions,
     records: Option<Receiver<Arc<AuditRecord>>>,
-    /// Stops that the drive has got, as far as the drill expects them.
+    /// Stops of the drive that the drill expects so far.
     stops: u64,
     step: Step,
     since: Instant,
-    /// When the way that is tried began.
+    /// When the current test began.
     began: Instant,
-    /// Place of the way that is tried.
+    /// Index of the current test.
     at: usize,
     proofs: Vec<Proof>,
 }
 
-/// What the drill does.
+/// The phases of a drill.
 #[derive(Debug)]
 enum Step {
     Armed,
-    /// That it starts is being written to disk, as that generation: so a motor that a killed gateway leaves running is known.
+    /// The start is being written to disk as that generation, so that the next process knows of the motor.
     Keeping(u64),
-    /// The start was refused, and is repeated.
+    /// The start was refused; it is retried.
     Waiting,
-    /// The start is on its way to the drive.
+    /// The start was queued.
     Starting(Placed),
-    /// The motor has its start; when it was first seen to turn.
+    /// The drive acknowledged the start; when the motor was first seen turning.
     SpeedingUp(Option<Instant>),
-    /// It turns at its speed.
+    /// The motor runs at its speed.
     Steady,
-    /// It is to stop since then.
+    /// The stop was caused then; the motor should come to standstill.
     Caused(Instant, Cause),
-    /// The way was tried; the motor is stopped in any case.
+    /// The test is over; the motor is stopped in any case.
     Clearing(OneStop),
     /// The gateway was killed during it: the motor is stopped once the drive is online.
     CutOff,
-    /// The drill is over, and has ended so, but for its last stop.
+    /// The drill ended with that result; its last stop is pending.
     Ending(DrillState, OneStop),
     Over,
 }
 
-/// What is to stop the motor.
+/// What should stop the motor.
 #[derive(Debug)]
 enum Cause {
     Order(Placed),
-    /// Its client is silent; whether its lease has stopped it.
+    /// The client is silent; whether the lease has stopped the motor.
     Client {
         stopped: bool,
     },
@@ -98,17 +98,17 @@ enum Cause {
     Gateway(Instant),
 }
 
-/// What becomes of a way that is tried.
+/// The observation of a test.
 enum Seen {
     Nothing,
     Stood { took: Duration, upper_bound: bool },
     Ended(DrillState, String),
 }
 
-/// What is said of a drill during which the gateway was killed.
+/// Text of a drill during which the gateway was killed.
 const CUT_OFF_TEXT: &str = "the gateway was killed or lost power during it";
 
-/// Ends the report of a drill that was cut off without a stop, and says why there is none.
+/// Ends the report of an interrupted drill for which no stop is sent, and why not.
 pub(super) fn ended_without_stop(mut report: DrillReport, why: &str, time: SystemTime) -> Ended {
     report.state = DrillState::Aborted;
     report.text = format!("{CUT_OFF_TEXT}; {why}; look at the motor");
@@ -118,12 +118,12 @@ pub(super) fn ended_without_stop(mut report: DrillReport, why: &str, time: Syste
         step.seen = CUT_OFF_TEXT.to_string();
     }
     Ended {
-        who: Origin::new(SourceKind::Shutdown, "drill cut off"),
+        who: Origin::new(SourceKind::Shutdown, "interrupted drill"),
         report,
     }
 }
 
-/// Whether a drill that was cut off is so young that its motor is stopped. A clock that was set back makes none old.
+/// Whether an interrupted drill is recent enough for a stop. A clock that was set back makes none old.
 pub(super) fn is_recent(report: &DrillReport, time: SystemTime) -> bool {
     let started = report
         .started_at
@@ -132,7 +132,7 @@ pub(super) fn is_recent(report: &DrillReport, time: SystemTime) -> bool {
     started.is_none_or(|started| time.duration_since(started).unwrap_or_default() <= CUT_OFF)
 }
 
-/// A client in words.
+/// A client as text.
 pub(super) fn named(who: &Origin) -> String {
     format!("{} {}", who.kind.name(), who.who)
 }
@@ -200,7 +200,7 @@ impl Run {
 
     /// A drill during which the gateway was killed: its motor may still run.
     pub(super) fn cut_off(report: DrillReport, drive: &DriveHandle, now: Instant) -> Run {
-        let own = Origin::new(SourceKind::Shutdown, "drill cut off");
+        let own = Origin::new(SourceKind::Shutdown, "interrupted drill");
         let at = report.steps.iter().position(|step| step.state == DrillState::Running);
         Run {
             at: at.unwrap_or(report.steps.len()),
@@ -356,7 +356,7 @@ impl Run {
             .filter(|step| step.state == DrillState::Armed)
         {
             step.state = DrillState::NotProven;
-            step.seen = "it was not tried".to_string();
+            step.seen = "not tried".to_string();
         }
     }
 
@@ -407,7 +407,10 @@ impl Run {
         match placed.answer() {
             None => self.step = Step::Starting(placed),
             Some(answer) if answer.outcome.is_ok() => {
-                let why = format!("drill `{}` is under way: only stops pass, and end it", self.report.id);
+                let why = format!(
+                    "drill `{}` is running; only stops are accepted, and they end it",
+                    self.report.id
+                );
                 self.drive.image.hold.set(Some(why));
                 self.report.text = "waiting until the motor turns".to_string();
                 self.go(Step::SpeedingUp(None), now);
@@ -447,8 +450,10 @@ impl Run {
         if now.saturating_duration_since(self.since) > SPEED_UP {
             let seconds = SPEED_UP.as_secs();
             let why = match (turned, told) {
-                (Some(_), Some(speed)) => format!("the motor turned at {speed:.1} % only, {seconds} s after its start"),
-                _ => format!("the motor was not seen to turn within {seconds} s"),
+                (Some(_), Some(speed)) => {
+                    format!("the motor reached only {speed:.1} % within {seconds} s of its start")
+                }
+                _ => format!("the motor did not start to turn within {seconds} s"),
             };
             return self.end(DrillState::NotProven, why, now);
         }
@@ -471,7 +476,7 @@ impl Run {
                 let order = Order::Points(run.map(|run| (run, Value::Bool(false))).into_iter().collect());
                 let drive = self.drive.clone().at_once();
                 let placed = drive.place(order, self.own.clone(), Authority::Write, self.options.limit, now);
-                self.report.text = "an order to stop was given".to_string();
+                self.report.text = "a stop command was sent".to_string();
                 Cause::Order(placed)
             }
             Kind::Client => {
@@ -507,7 +512,7 @@ impl Run {
             Cause::Order(placed) => self.seen_of_order(cause, placed, reading, now),
             Cause::Client { stopped } => match self.seen_since(cause, cause, reading, now) {
                 Seen::Stood { .. } if !*stopped => {
-                    let why = "the motor stood before its supervision stopped it".to_string();
+                    let why = "the motor stopped before its supervision acted".to_string();
                     Seen::Ended(DrillState::NotProven, why)
                 }
                 seen => seen,
@@ -526,7 +531,7 @@ impl Run {
                 step.took_ms = Some(u64::try_from(took.as_millis()).unwrap_or(u64::MAX));
                 step.upper_bound = upper_bound;
                 let at_most = if upper_bound { "at most " } else { "" };
-                step.seen = format!("the motor stood after {at_most}{:.1} s", took.as_secs_f64());
+                step.seen = format!("standstill after {at_most}{:.1} s", took.as_secs_f64());
                 self.proofs.push(Proof::new(&self.machine, kind, time, true));
                 self.report.text.clone_from(&step.seen);
                 let stop = OneStop::place(&self.drive, self.machine.clone(), &self.own, now);
@@ -534,14 +539,14 @@ impl Run {
                 match self.at + 1 < self.report.steps.len() {
                     true => self.go(Step::Clearing(stop), now),
                     false => {
-                        self.report.text = "the motor stood in time in each way".to_string();
+                        self.report.text = "the motor stopped in time each way".to_string();
                         self.go(Step::Ending(DrillState::Passed, stop), now);
                     }
                 }
             }
             Seen::Stood { took, .. } => {
                 let why = format!(
-                    "the motor stood after {:.1} s, allowed are {} s",
+                    "standstill after {:.1} s; the limit is {} s",
                     took.as_secs_f64(),
                     limit.as_secs_f64()
                 );
@@ -583,7 +588,9 @@ impl Run {
                     format!("after {seconds} s the motor still turns: {what}"),
                 )
             }
-            Standstill::Unknown(why) => Seen::Ended(DrillState::NotProven, format!("standstill was not seen: {why}")),
+            Standstill::Unknown(why) => {
+                Seen::Ended(DrillState::NotProven, format!("standstill was not observed: {why}"))
+            }
         }
     }
 
@@ -605,7 +612,9 @@ impl Run {
                 Seen::Ended(DrillState::Failed, why)
             }
             Standstill::Unknown(_) if now < until + READ => Seen::Nothing,
-            Standstill::Unknown(why) => Seen::Ended(DrillState::NotProven, format!("standstill was not seen: {why}")),
+            Standstill::Unknown(why) => {
+                Seen::Ended(DrillState::NotProven, format!("standstill was not observed: {why}"))
+            }
         }
     }
 
@@ -619,7 +628,8 @@ impl Run {
             return self.begin_step(now);
         }
         if now.saturating_duration_since(self.since) > LAST_STOP {
-            let why = "the stop before the next way was not acknowledged, or the motor did not stand".to_string();
+            let why = "the stop before the next way was not acknowledged, or the motor did not come to standstill"
+                .to_string();
             self.at += 1;
             return self.end(DrillState::NotProven, why, now);
         }

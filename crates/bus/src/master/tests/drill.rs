@@ -94,7 +94,7 @@ fn a_switch_to_local_in_the_silence_proves_nothing() {
         }
     });
     assert_eq!(report.state, DrillState::Aborted, "{report:#?}");
-    assert!(says(&report, "local control place"), "{report:#?}");
+    assert!(says(&report, "local control"), "{report:#?}");
     assert_eq!(report.steps[0].state, DrillState::Aborted, "no proof: {report:#?}");
 }
 
@@ -111,7 +111,7 @@ fn a_silent_client_stops_a_motor_by_its_lease_only() {
         }
     });
     assert_eq!(report.state, DrillState::NotProven, "{report:#?}");
-    assert!(says(&report, "before its supervision stopped it"), "{report:#?}");
+    assert!(says(&report, "before its supervision acted"), "{report:#?}");
 }
 
 /// A plant with drills that a file keeps, and a drill of its first drive that was started.

@@ -16,7 +16,7 @@ use crate::process_image::Reading;
 const TOO_FAST: f64 = 5.0;
 
 /// Why a drill ends at a drive that takes its orders from elsewhere.
-pub(super) const LOCAL: &str = "the drive was switched to its local control place";
+pub(super) const LOCAL: &str = "the drive was switched to local control";
 
 pub(super) fn is_local(reading: &Reading<'_>) -> bool {
     let remote = reading.model(ModelPoint::Remote);
@@ -91,10 +91,12 @@ impl Run {
                         command,
                         ..
                     } = &*record;
-                    return Some(format!("{source} {client} gave an order: {command}"));
+                    return Some(format!("{source} {client} sent a command: {command}"));
                 }
                 Err(TryRecvError::Empty | TryRecvError::Closed) => return None,
-                Err(TryRecvError::Lagged(_)) => return Some("too many orders came to see who gave them".to_string()),
+                Err(TryRecvError::Lagged(_)) => {
+                    return Some("too many commands arrived to tell who sent them".to_string());
+                }
             }
         }
     }
