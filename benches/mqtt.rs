@@ -17,20 +17,16 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::codec::{LineFormat, Protocol, Table};
-use drivegate::command::CommandQueue;
-use drivegate::drive::profile::Profiles;
 use drivegate::event::{Event, EventKind};
 use drivegate::north::NorthState;
-use drivegate::north::mqtt::{self, History, Options, Qos, Telemetry};
-use drivegate::plant::{BusHandle, Plant, SharedPlant};
-use drivegate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, Link};
+use drivegate::north::mqtt::{self, History, Options, Telemetry};
+use drivegate::plant::SharedPlant;
 use rumqttc::mqttbytes::QoS;
 use rumqttc::{AsyncClient, MqttOptions, Packet};
 use tokio::runtime::Runtime;
 use tokio_util::sync::CancellationToken;
 
-use common::{option, quantile};
+use common::{option, quantile, session};
 
 fn main() -> ExitCode {
     common::exit(measure())
@@ -76,37 +72,16 @@ struct Gateway {
 
 impl Gateway {
     fn start(runtime: &Runtime, port: u16, drives: u16, min_interval: Duration) -> Result<Gateway, Box<dyn Error>> {
-        let plant = Arc::new(ArcSwap::from_pointee(plant(drives)?));
+        let plant = Arc::new(ArcSwap::from_pointee(session::plant("hall", drives)?));
         let options = Options {
-            brokers: vec![mqtt::Broker {
-                host: "127.0.0.1".to_string(),
-                port,
-            }],
-            tls: false,
-            client_id: "bench-gateway".to_string(),
-            username: None,
-            password: None,
-            ca: None,
-            identity: None,
             base: "bench".to_string(),
             telemetry: Telemetry {
                 state: true,
                 points: true,
                 history: History::Off,
             },
-            telemetry_qos: Qos::AtMostOnce,
-            event_qos: Qos::AtLeastOnce,
-            expiry: Some(Duration::from_secs(300)),
-            message_expiry: Some(Duration::from_secs(600)),
             min_interval,
-            max_interval: Duration::from_secs(60),
-            commands: false,
-            require_id: false,
-            response_topics: Vec::new(),
-            buffer: None,
-            home_assistant: None,
-            principals: None,
-            sparkplug: None,
+            ..session::options("bench-gateway", "127.0.0.1", port)
         };
         let stats = Arc::<NorthState>::default();
         let cancel = CancellationToken::new();
@@ -134,58 +109,6 @@ impl Gateway {
     }
 }
 
-fn plant(drives: u16) -> Result<Plant, Box<dyn Error>> {
-    let profile = Profiles::built_in().get("vacon-nx").ok_or("no profile")?.clone();
-    let image = |n: u16| {
-        let spec = DriveSpec::new(&format!("d{n}"), "line", n as u8, profile.clone());
-        Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
-    };
-    let spec = BusSpec {
-        name: "line".to_string(),
-        port: "/dev/null".to_string(),
-        protocol: Protocol::ModbusRtu,
-        format: LineFormat::new(115_200, "8N1")?,
-        cycle: Duration::from_millis(10),
-        slow_cycle: Duration::from_secs(1),
-    };
-    let bus = BusHandle {
-        image: Arc::new(BusImage::new(spec, (1..=drives).map(image).collect())),
-        queue: Arc::new(CommandQueue::new()?),
-    };
-    bus.image.update_health(|health| health.up = true);
-    Ok(Plant {
-        gateway: "hall".to_string(),
-        stale_after: Duration::from_secs(5),
-        buses: vec![bus],
-        events: Default::default(),
-        writes: Default::default(),
-        stop_all: Arc::default(),
-        drills: Arc::default(),
-    })
-}
-
-/// Updates each drive once a cycle, evenly spread, until the end.
-fn poll(plant: &Plant, cycle: Duration, end: &AtomicBool) {
-    let drives: Vec<_> = plant.drives().map(|drive| drive.image).collect();
-    let step = cycle / drives.len() as u32;
-    let mut next = Instant::now();
-    for (turn, drive) in drives.iter().cycle().enumerate() {
-        let value = (turn / drives.len() % 50_000) as u16;
-        let now = Instant::now();
-        drive.update(|snapshot| {
-            snapshot.link = Link::Online(SystemTime::UNIX_EPOCH);
-            snapshot.fast_at = Some(now);
-            let words = [0x0023, 0, value, value, value, 12, 300, 280, 2300, 540, 0];
-            snapshot.store(Table::Holding, 2100, &words, now);
-        });
-        if end.load(Ordering::Relaxed) {
-            return;
-        }
-        next += step;
-        std::thread::sleep(next.saturating_duration_since(Instant::now()));
-    }
-}
-
 /// Period and age of the states that a subscriber near the broker receives.
 fn states(
     runtime: &Runtime,
@@ -200,7 +123,7 @@ fn states(
     let gateway = Gateway::start(runtime, port, drives, min)?;
     let (plant, end) = (gateway.plant.load_full(), Arc::new(AtomicBool::new(false)));
     let ended = end.clone();
-    let poller = std::thread::spawn(move || poll(&plant, cycle, &ended));
+    let poller = std::thread::spawn(move || session::poll(&[plant], cycle, &ended));
     std::thread::sleep(Duration::from_secs(2));
     while arrived.try_recv().is_ok() {}
     std::thread::sleep(Duration::from_secs(seconds));

@@ -12,19 +12,14 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::Duration;
 
 use arc_swap::ArcSwap;
-use drivegate::codec::{LineFormat, Protocol, Table};
-use drivegate::command::CommandQueue;
-use drivegate::drive::profile::Profiles;
 use drivegate::north::NorthState;
-use drivegate::north::mqtt::{self, History, Options, Qos, Telemetry, sparkplug};
-use drivegate::plant::{BusHandle, Plant};
-use drivegate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, Link};
+use drivegate::north::mqtt::{self, Options, sparkplug};
 use tokio_util::sync::CancellationToken;
 
-use common::option;
+use common::{option, session};
 
 /// First number of the sessions: the names of those before are taken by processes.
 const FIRST: usize = 1000;
@@ -50,7 +45,7 @@ fn run() -> Result<(), Box<dyn Error>> {
     let (mut plants, mut all) = (Vec::new(), Vec::new());
     for number in 0..sessions {
         let name = format!("site-{:04}", FIRST + number);
-        let plant = Arc::new(plant(&name, drives)?);
+        let plant = Arc::new(session::plant(&name, drives)?);
         let shared = Arc::new(ArcSwap::from(plant.clone()));
         let stats = Arc::<NorthState>::default();
         all.push((
@@ -62,7 +57,7 @@ fn run() -> Result<(), Box<dyn Error>> {
     drop(guard);
     let end = Arc::new(AtomicBool::new(false));
     let ended = end.clone();
-    let poller = std::thread::spawn(move || poll(&plants, cycle, &ended));
+    let poller = std::thread::spawn(move || session::poll(&plants, cycle, &ended));
     println!("started");
     std::io::stdin().read_to_end(&mut Vec::new())?;
     end.store(true, Ordering::Relaxed);
@@ -82,34 +77,10 @@ fn options(name: &str) -> Result<Options, Box<dyn Error>> {
     let dir = PathBuf::from(option("--dir", ".".to_string())?).join(name);
     std::fs::create_dir_all(&dir)?;
     Ok(Options {
-        brokers: vec![mqtt::Broker {
-            host: "localhost".to_string(),
-            port: option("--port", 8883)?,
-        }],
         tls: !ca.is_empty(),
-        client_id: format!("drivegate-{name}"),
-        username: None,
-        password: None,
         ca: (!ca.is_empty()).then(|| PathBuf::from(ca)),
-        identity: None,
-        base: "drivegate".to_string(),
-        telemetry: Telemetry {
-            state: true,
-            points: false,
-            history: History::Off,
-        },
-        telemetry_qos: Qos::AtMostOnce,
-        event_qos: Qos::AtLeastOnce,
-        expiry: Some(Duration::from_secs(300)),
-        message_expiry: Some(Duration::from_secs(600)),
         min_interval: Duration::from_secs_f64(option("--min-interval", 0.05)?),
-        max_interval: Duration::from_secs(60),
         commands: true,
-        require_id: false,
-        response_topics: Vec::new(),
-        buffer: None,
-        home_assistant: None,
-        principals: None,
         sparkplug: Some(sparkplug::Options {
             group: "fleet".to_string(),
             node: name.to_string(),
@@ -118,60 +89,6 @@ fn options(name: &str) -> Result<Options, Box<dyn Error>> {
             history: true,
             state_dir: dir,
         }),
+        ..session::options(&format!("drivegate-{name}"), "localhost", option("--port", 8883)?)
     })
-}
-
-fn plant(name: &str, drives: u16) -> Result<Plant, Box<dyn Error>> {
-    let profile = Profiles::built_in().get("vacon-nx").ok_or("no profile")?.clone();
-    let image = |n: u16| {
-        let spec = DriveSpec::new(&format!("d{n}"), "line", n as u8, profile.clone());
-        Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
-    };
-    let spec = BusSpec {
-        name: "line".to_string(),
-        port: "/dev/null".to_string(),
-        protocol: Protocol::ModbusRtu,
-        format: LineFormat::new(115_200, "8N1")?,
-        cycle: Duration::from_millis(10),
-        slow_cycle: Duration::from_secs(1),
-    };
-    let bus = BusHandle {
-        image: Arc::new(BusImage::new(spec, (1..=drives).map(image).collect())),
-        queue: Arc::new(CommandQueue::new()?),
-    };
-    bus.image.update_health(|health| health.up = true);
-    Ok(Plant {
-        gateway: name.to_string(),
-        stale_after: Duration::from_secs(60),
-        buses: vec![bus],
-        events: Default::default(),
-        writes: Default::default(),
-        stop_all: Arc::default(),
-        drills: Arc::default(),
-    })
-}
-
-/// Updates each drive once a cycle, evenly spread, until the end.
-fn poll(plants: &[Arc<Plant>], cycle: Duration, end: &AtomicBool) {
-    let drives: Vec<_> = plants
-        .iter()
-        .flat_map(|plant| plant.drives().map(|drive| drive.image).collect::<Vec<_>>())
-        .collect();
-    let Ok(count) = u32::try_from(drives.len()) else { return };
-    let (step, mut next) = (cycle / count.max(1), Instant::now());
-    for (turn, drive) in drives.iter().cycle().enumerate() {
-        if end.load(Ordering::Relaxed) {
-            return;
-        }
-        let value = (turn / drives.len() % 50_000) as u16;
-        let now = Instant::now();
-        drive.update(|snapshot| {
-            snapshot.link = Link::Online(SystemTime::UNIX_EPOCH);
-            snapshot.fast_at = Some(now);
-            let words = [0x0023, 0, value, value, value, 12, 300, 280, 2300, 540, 0];
-            snapshot.store(Table::Holding, 2100, &words, now);
-        });
-        next += step;
-        std::thread::sleep(next.saturating_duration_since(Instant::now()));
-    }
 }

@@ -3,6 +3,7 @@
 #![allow(dead_code, unreachable_pub)]
 
 pub mod gateway;
+pub mod session;
 
 use std::error::Error;
 use std::fs;
