@@ -1,6 +1,7 @@
 //! A command on its way through the line, step by step: control words from the known ones, pulses, safe order. Pure.
 
 mod control;
+mod ending;
 mod functions;
 mod known_words;
 mod parameter;
@@ -21,9 +22,7 @@ use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
 use crate::codec::{Exception, Reply, Table};
-use crate::command::{
-    Command, Interruption, Order, Origin, Outcome, Receipt, Refusal, SourceKind, Ticket, Touched, Urgency,
-};
+use crate::command::{Command, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Touched, Urgency};
 use crate::drive::{DriveIndex, Profile};
 
 /// Most stops to a drive that are sent before the end of a started pulse.
@@ -393,41 +392,9 @@ impl CommandRun {
         }
     }
 
-    /// It goes no further, and ends with that outcome; a motor that it started is stopped.
-    fn give_up(&mut self, outcome: Outcome) {
-        self.actions.clear();
-        self.cut.get_or_insert(outcome);
-        self.only_ends = true;
-        self.tries.pause = None;
-        (self.tries.failures, self.check) = (0, Check::NotYet);
-        if std::mem::take(&mut self.started) {
-            self.actions.push_back(Action::Word(Word::Stop(None)));
-        }
-    }
-
     /// Whether it may write more than the end of a pulse.
     pub fn may_write_on(&self) -> bool {
         !self.only_ends
-    }
-
-    /// Ends it, except for the end of a pulse. Returns who sent it, and what it was.
-    pub fn refuse(&mut self, refusal: Refusal) -> Option<(Origin, String)> {
-        self.cut_off(Outcome::Refused(refusal));
-        let ticket = self.tickets.first()?;
-        Some((ticket.origin().clone(), ticket.what().to_string()))
-    }
-
-    /// Whether it is still pending: nothing of it was sent, or the drive was busy each time.
-    pub fn is_owed(&self) -> bool {
-        !self.begun || (self.tries.busy > 0 && !self.tries.in_doubt)
-    }
-
-    /// Its result when it is withdrawn before it is due.
-    pub fn taken_back(&self) -> Outcome {
-        match self.begun {
-            true => Outcome::Exception(Exception::BUSY),
-            false => Outcome::Withdrawn,
-        }
     }
 
     /// Whether it, or a part of it, was on the wire.
@@ -557,81 +524,6 @@ impl CommandRun {
     /// It has expired, and its remaining steps are not cancelled yet.
     pub fn is_late(&self, now: Instant) -> bool {
         now >= self.expires && !self.only_ends
-    }
-
-    /// A stop arrived: remaining steps are cancelled, except clearing a reset bit that is set. Returns the outcome if
-    /// that ends the command.
-    pub fn purge(&mut self) -> Option<Outcome> {
-        // The stop that came in is on its way.
-        self.started = false;
-        self.cut_off(self.unless_begun(Outcome::Purged, Interruption::Stop));
-        self.actions.is_empty().then(|| self.success())
-    }
-
-    /// Another client took the drive: the command ends, but the motor is left as it is. Returns the outcome if that
-    /// ends it at once.
-    pub fn taken(&mut self, refusal: Refusal) -> Option<Outcome> {
-        self.started = false;
-        self.cut_off(self.unless_begun(Outcome::Refused(refusal), Interruption::Taken));
-        self.actions.is_empty().then(|| self.success())
-    }
-
-    fn cut_off(&mut self, outcome: Outcome) {
-        let before = self.actions.len();
-        // A bit whose setting was sent and not answered may be set.
-        if self.tries.failures > 0 && self.actions.front().is_some_and(Action::is_reset) {
-            self.actions.pop_front();
-        }
-        let high = self.actions.iter().any(Action::is_reset);
-        self.actions
-            .retain(|a| !high && (a.ends_reset() || matches!(a, Action::Hold(_))));
-        // A hold without the end of a pulse after it holds nothing.
-        if !self.actions.iter().any(Action::ends_reset) {
-            self.actions.clear();
-        }
-        let left = self.actions.len();
-        if std::mem::take(&mut self.started) && before > left {
-            self.actions.push_back(Action::Word(Word::Stop(None)));
-        }
-        self.only_ends = true;
-        self.tries.pause = None;
-        if before != left {
-            self.cut = Some(outcome);
-            self.tries.failures = 0;
-        }
-    }
-
-    /// How the command ends when nothing is left to do.
-    pub fn success(&self) -> Outcome {
-        match &self.cut {
-            Some(outcome) => outcome.clone(),
-            None => Outcome::Acknowledged(self.reply.clone()),
-        }
-    }
-
-    /// Reports the acknowledgement. Returns what a read must show, and the receipts of those waiting for that.
-    pub fn acknowledge(self, outcome: &Outcome, now: Instant) -> (Vec<Effect>, Vec<Receipt>) {
-        let receipts = self.tickets.into_iter();
-        let receipts = receipts
-            .map(|ticket| ticket.acknowledge(outcome.clone(), now))
-            .collect();
-        (self.effects, receipts)
-    }
-
-    /// Ends the command with that outcome.
-    pub fn finish(self, outcome: &Outcome, now: Instant) {
-        self.tickets
-            .into_iter()
-            .for_each(|ticket| ticket.answer(outcome.clone(), now));
-    }
-
-    /// Ends a command that cannot continue: with `unbegun` if nothing of it was sent.
-    pub fn abandon(self, unbegun: Outcome, why: Interruption, now: Instant) {
-        let outcome = match &self.cut {
-            Some(outcome) => outcome.clone(),
-            None => self.unless_begun(unbegun, why),
-        };
-        self.finish(&outcome, now);
     }
 }
 

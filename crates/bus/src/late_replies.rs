@@ -136,7 +136,7 @@ impl LateReplies {
 
     /// A reply to `pdu` came that is no exception: nothing that was asked before and looks otherwise is still to come. It
     /// shows nothing where it may itself be the late reply to an earlier request. To be called before [`LateReplies::answered`].
-    pub fn settled_by(&mut self, pdu: &RequestPdu, now: Instant) {
+    pub(crate) fn settled_by(&mut self, pdu: &RequestPdu, now: Instant) {
         let owed = |late: &&LateReply| late.ends() > now && look_alike(&late.pdu, pdu);
         if self.expected.iter().any(|late| owed(&late)) {
             return;
@@ -157,7 +157,7 @@ impl LateReplies {
     /// Whether the reply to `pdu`, sent at `sent`, may be that to an earlier request: to another one that looks the same,
     /// or to the same write before another one. To be asked before [`LateReplies::answered`]; true once for each
     /// late reply, and `pdu`, which is to be sent once more, is expected in its place.
-    pub fn proves_nothing(&mut self, pdu: &RequestPdu, sent: Instant, now: Instant) -> bool {
+    pub(crate) fn proves_nothing(&mut self, pdu: &RequestPdu, sent: Instant, now: Instant) -> bool {
         let owed = |late: &LateReply| late.ends() > sent;
         let same = |late: &&mut LateReply| owed(late) && late.pdu == *pdu && late.overtaken > 0;
         if let Some(late) = self.expected.iter_mut().find(same) {
@@ -179,7 +179,7 @@ impl LateReplies {
 
     /// When the request was sent at the latest whose reply an answer to `pdu` at `now` may be: earlier than this one while a
     /// late reply to the same request may come. To be asked before [`LateReplies::answered`].
-    pub fn asked_by(&self, pdu: &RequestPdu, now: Instant) -> Instant {
+    pub(crate) fn asked_by(&self, pdu: &RequestPdu, now: Instant) -> Instant {
         let doubtful = |late: &LateReply| late.ends() > now && !late.settled;
         let same = self.expected.iter().find(|late| late.pdu == *pdu && doubtful(late));
         same.map_or(now, |late| late.since.or(late.before).unwrap_or(now))

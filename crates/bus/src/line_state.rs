@@ -154,25 +154,25 @@ impl LineState {
     }
 
     /// End of the last character on the line.
-    pub fn quiet_since(&self) -> Instant {
+    pub(crate) fn quiet_since(&self) -> Instant {
         self.quiet_since
     }
 
     /// When a request may go out that is wanted since `since`: when the line has been silent long enough, or has babbled
     /// too long.
-    pub fn clear_at(&self, since: Instant) -> Instant {
+    pub(crate) fn clear_at(&self, since: Instant) -> Instant {
         let since = since.max(self.left_alone);
         let silent = (self.quiet_since + self.silence).min(since + self.silence + BABBLE);
         silent.max(self.left_alone)
     }
 
     /// Nothing is sent before `until`.
-    pub fn leave_alone(&mut self, until: Instant) {
+    pub(crate) fn leave_alone(&mut self, until: Instant) {
         self.left_alone = until;
     }
 
     /// Whether the line babbled until then.
-    pub fn babbles(&self, since: Instant) -> bool {
+    pub(crate) fn babbles(&self, since: Instant) -> bool {
         self.quiet_since > since + BABBLE
     }
 
@@ -227,7 +227,7 @@ impl LineState {
     }
 
     /// Whether a transaction is in progress.
-    pub fn is_underway(&self) -> bool {
+    pub(crate) fn is_underway(&self) -> bool {
         self.underway.is_some()
     }
 

@@ -445,12 +445,12 @@ impl Master {
     }
 
     /// Takes the late replies that may still arrive on an N2 line, for the transaction about to start.
-    pub fn take_late(&mut self) -> N2LateReplies {
+    pub(crate) fn take_late(&mut self) -> N2LateReplies {
         std::mem::take(&mut self.n2_late)
     }
 
     /// Puts back what that transaction left of them.
-    pub fn put_late(&mut self, late: N2LateReplies) {
+    pub(crate) fn put_late(&mut self, late: N2LateReplies) {
         self.n2_late = late;
     }
 }

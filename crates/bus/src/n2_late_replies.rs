@@ -107,7 +107,7 @@ impl N2LateReplies {
     }
 
     /// When the object was asked for that the reply to this request shows, which came now.
-    pub fn asked_by(&self, address: u8, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
+    pub(crate) fn asked_by(&self, address: u8, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
         let late = self.0.iter().find(|late| late.is_of(address, pdu) && late.until > now);
         late.map(|late| late.asked)
     }
@@ -194,7 +194,7 @@ impl N2LateReplies {
     }
 
     /// The answer was doubtful: if it was a late one, the reply itself may still come. So may the late one, if it was not.
-    pub fn doubted(&mut self, asked: Asked<'_>, window: Duration, now: Instant) {
+    pub(crate) fn doubted(&mut self, asked: Asked<'_>, window: Duration, now: Instant) {
         let alike = |late: &&mut Late| Some(late.form) == form(asked.pdu);
         if let Some(late) = self.0.iter_mut().find(alike) {
             late.until = late.until.max(now + window);

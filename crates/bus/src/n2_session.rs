@@ -147,7 +147,7 @@ impl N2Sessions {
     }
 
     /// Drives that are due for a poll and would not be asked otherwise, because nothing of them is read so often.
-    pub fn neglected(&self, now: Instant) -> impl Iterator<Item = DriveIndex> {
+    pub(crate) fn neglected(&self, now: Instant) -> impl Iterator<Item = DriveIndex> {
         let due = move |drive: &Drive| drive.phase == Phase::Ready && drive.polled.is_some() && drive.is_due(now);
         let drives = self.drives.enumerate();
         drives.filter(move |(_, drive)| due(drive)).map(|(index, _)| index)

@@ -240,7 +240,7 @@ impl Schedule {
 
     /// The next action if `waiting` has its turn before `highest`, which also waits: a stop yields to a command, but
     /// not to the polls that the command must wait for.
-    pub fn next_of(&mut self, now: Instant, waiting: Option<Urgency>, highest: Option<Urgency>) -> Decision {
+    pub(crate) fn next_of(&mut self, now: Instant, waiting: Option<Urgency>, highest: Option<Urgency>) -> Decision {
         match self.next(now, waiting) {
             Decision::Poll(_) if self.turn != Turn::Asked => self.next(now, highest),
             decision => decision,
@@ -248,23 +248,23 @@ impl Schedule {
     }
 
     /// A fast round that was started by the last [`Schedule::next`], reported once.
-    pub fn take_round(&mut self) -> Option<RoundStart> {
+    pub(crate) fn take_round(&mut self) -> Option<RoundStart> {
         self.new_round.take()
     }
 
     /// A slow round (the first slow poll after all were done), reported once.
-    pub fn take_slow_round(&mut self) -> Option<RoundStart> {
+    pub(crate) fn take_slow_round(&mut self) -> Option<RoundStart> {
         self.new_slow.take()
     }
 
     /// A command (or a step of one) was on the line for `took`.
-    pub fn command_done(&mut self, urgency: Urgency, took: Duration) {
+    pub(crate) fn command_done(&mut self, urgency: Urgency, took: Duration) {
         self.commanded += took;
         self.share.commanded(urgency, took);
     }
 
     /// A poll has ended.
-    pub fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
+    pub(crate) fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
         let item = self.drives.get_mut(poll.drive);
         if let Some(item) = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read)) {
             // One without a result is made up for among the slow polls.
@@ -323,7 +323,7 @@ impl Schedule {
     }
 
     /// An offline drive did not reply to a command, which counts as a probe: the next one does not follow immediately.
-    pub fn probed_in_vain(&mut self, drive: DriveIndex, took: Duration, now: Instant) {
+    pub(crate) fn probed_in_vain(&mut self, drive: DriveIndex, took: Duration, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive)
             && let Presence::Away(at, pause) = drive.presence
         {
@@ -333,7 +333,7 @@ impl Schedule {
 
     /// An online drive did not reply to a command: its process data is read next, to find out whether it is still there
     /// before more is sent.
-    pub fn doubted(&mut self, index: DriveIndex) {
+    pub(crate) fn doubted(&mut self, index: DriveIndex) {
         let online = |drive: &&mut DriveSchedule| drive.presence == Presence::Online;
         let Some(drive) = self.drives.get_mut(index).filter(online) else {
             return;
@@ -362,14 +362,14 @@ impl Schedule {
     }
 
     /// No reply to that read proved it: its items are read singly, and it is tried again later.
-    pub fn not_proved(&mut self, drive: DriveIndex, read: &PlannedRead, pause: Duration, now: Instant) {
+    pub(crate) fn not_proved(&mut self, drive: DriveIndex, read: &PlannedRead, pause: Duration, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.take_apart(read, now, pause);
         }
     }
 
     /// A poll may not go before then.
-    pub fn postpone(&mut self, poll: &Poll, until: Instant) {
+    pub(crate) fn postpone(&mut self, poll: &Poll, until: Instant) {
         self.round.retain(|waiting| *waiting != (poll.drive, poll.read));
         let Some(drive) = self.drives.get_mut(poll.drive) else {
             return;
@@ -427,7 +427,7 @@ impl Schedule {
     }
 
     /// Everything is read again from a drive, including points read once.
-    pub fn read_again(&mut self, index: DriveIndex, now: Instant) {
+    pub(crate) fn read_again(&mut self, index: DriveIndex, now: Instant) {
         let Some(drive) = self.drives.get_mut(index) else {
             return;
         };
@@ -467,7 +467,7 @@ impl Schedule {
 
     /// A fault came up in a drive: what its profile names for that, and the slow reads that cover more of it, are due at
     /// once. They take no more of the line than slow reads have anyway.
-    pub fn fault_came(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
+    pub(crate) fn fault_came(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
         let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
         for item in items.into_iter().flatten() {
             match item.read.class {
@@ -513,7 +513,7 @@ impl Schedule {
     }
 
     /// A session step was needed before a drive's poll, which is still due: the others have their turn in between.
-    pub fn session_done(&mut self, drive: DriveIndex) {
+    pub(crate) fn session_done(&mut self, drive: DriveIndex) {
         if let Some(drive) = self.drives.get_mut(drive) {
             (drive.heard, drive.failures) = (true, 0);
         }

@@ -120,38 +120,38 @@ impl Transaction {
 
     /// A reply that is whole before `earliest`, when the request and a reply cannot both have been on the wire, is not
     /// believed: it is the last reply once more, or the echo of a write.
-    pub fn doubt_before(&mut self, earliest: Instant) {
+    pub(crate) fn doubt_before(&mut self, earliest: Instant) {
         self.doubted_before = Some(earliest);
     }
 
     /// The request is on the wire until `end`: bytes before that, except for the echo, are not a reply.
-    pub fn ignore_before(&mut self, end: Instant) {
+    pub(crate) fn ignore_before(&mut self, end: Instant) {
         self.ignored_before = Some(end);
     }
 
     /// Whether a reply arrived too early to be valid.
-    pub fn doubted(&self) -> bool {
+    pub(crate) fn doubted(&self) -> bool {
         self.doubted
     }
 
     /// Whether such a reply was all that arrived.
-    pub fn only_doubted(&self) -> bool {
+    pub(crate) fn only_doubted(&self) -> bool {
         self.doubted && !self.behind_doubted
     }
 
     /// Late replies that may still arrive on an N2 line.
-    pub fn expect_late(&mut self, late: N2LateReplies) {
+    pub(crate) fn expect_late(&mut self, late: N2LateReplies) {
         self.late = late;
     }
 
     /// Takes the late replies that may still arrive.
-    pub fn take_late(&mut self) -> N2LateReplies {
+    pub(crate) fn take_late(&mut self) -> N2LateReplies {
         std::mem::take(&mut self.late)
     }
 
     /// Whether what could not be believed was the drive's reply, mangled: it begins as that, or is as long. Nothing else
     /// is to come of it then.
-    pub fn is_mangled_reply(&self) -> bool {
+    pub(crate) fn is_mangled_reply(&self) -> bool {
         self.protocol.begins_reply(&self.request, &self.received)
     }
 
@@ -294,7 +294,7 @@ impl Transaction {
     }
 
     /// The frame of the reply, as the drive sent it; empty without one.
-    pub fn reply_frame(&self) -> &[u8] {
+    pub(crate) fn reply_frame(&self) -> &[u8] {
         let frame = self.received.get(self.reply.clone()).unwrap_or_default();
         let before = match self.protocol {
             // Blanks and glitches of a line that changes direction.
@@ -388,7 +388,7 @@ impl Transaction {
     }
 
     /// When the first byte of the (last) frame arrived.
-    pub fn first_byte(&self) -> Option<Instant> {
+    pub(crate) fn first_byte(&self) -> Option<Instant> {
         self.first_byte
     }
 

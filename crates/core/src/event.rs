@@ -131,7 +131,7 @@ impl EventKind {
     ];
 
     /// Whether someone should look: the log has it as a warning.
-    pub fn is_trouble(self) -> bool {
+    pub(crate) fn is_trouble(self) -> bool {
         match self {
             EventKind::Offline
             | EventKind::Fault
@@ -415,7 +415,7 @@ impl Events {
     }
 
     /// Publishes the refusals that waited long enough for their count.
-    pub fn publish_due(&self, now: Instant) {
+    pub(crate) fn publish_due(&self, now: Instant) {
         let mut store = self.store();
         let due = store.limit.due(now);
         due.into_iter()

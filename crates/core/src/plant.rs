@@ -229,7 +229,7 @@ impl DriveHandle {
     }
 
     /// Who gave the last stop that was taken in; none before the first one.
-    pub fn last_stop_by(&self) -> Option<Origin> {
+    pub(crate) fn last_stop_by(&self) -> Option<Origin> {
         self.bus.queue.lock().last_stop_by(self.index).cloned()
     }
 

@@ -214,12 +214,12 @@ impl SimulatedDrive {
     }
 
     /// A valid frame was on the line, for any address. Call it before the frame is acted upon.
-    pub fn bus_message(&mut self) {
+    pub(crate) fn bus_message(&mut self) {
         self.model.get_mut().bus_message();
     }
 
     /// A frame with a wrong check code was on the line.
-    pub fn bus_error(&mut self) {
+    pub(crate) fn bus_error(&mut self) {
         self.model.get_mut().bus_error();
     }
 
@@ -241,12 +241,12 @@ impl SimulatedDrive {
     }
 
     /// The answer to a frame to it whose check code is wrong; `None` when the drive stays silent.
-    pub fn check_error(&self) -> Option<Exception> {
+    pub(crate) fn check_error(&self) -> Option<Exception> {
         self.model.get().check_error()
     }
 
     /// A broadcast, which is not answered; a write ends the autopilot for good.
-    pub fn heard_broadcast(&mut self, request: &RequestPdu, now: SimTime) {
+    pub(crate) fn heard_broadcast(&mut self, request: &RequestPdu, now: SimTime) {
         self.advance(now);
         if request.is_write() {
             self.autopilot = None;
@@ -292,7 +292,7 @@ impl SimulatedDrive {
     }
 
     /// Power cycles so far: whatever shares its supply has restarted as often.
-    pub fn power_cycles(&self) -> u32 {
+    pub(crate) fn power_cycles(&self) -> u32 {
         self.power_cycles
     }
 
@@ -311,11 +311,6 @@ impl SimulatedDrive {
         self.model.get_mut().fill_parameters(&mut Random::new(seed));
     }
 
-    /// Whether an autopilot still runs it.
-    pub fn runs_by_itself(&self) -> bool {
-        self.autopilot.is_some()
-    }
-
     /// The drive of the Vacon NX family that it is, if it is one.
     pub fn as_nx(&mut self) -> Option<&mut NxDrive> {
         match &mut self.model {
@@ -325,7 +320,8 @@ impl SimulatedDrive {
     }
 
     /// The Vacon CX that it is, if it is one.
-    pub fn as_cx(&mut self) -> Option<&mut CxDrive> {
+    #[cfg(test)]
+    pub(crate) fn as_cx(&mut self) -> Option<&mut CxDrive> {
         match &mut self.model {
             AnyModel::Cx(drive) => Some(drive),
             _ => None,
@@ -359,7 +355,7 @@ mod tests {
             },
             minute,
         );
-        assert!(drive.runs_by_itself(), "reading leaves it alone");
+        assert!(drive.autopilot.is_some(), "reading leaves it alone");
         drive.answer(
             &RequestPdu::WriteRegister {
                 address: 2000,
@@ -367,7 +363,7 @@ mod tests {
             },
             minute,
         );
-        assert!(!drive.runs_by_itself());
+        assert!(drive.autopilot.is_none());
         drive.advance(minute * 5);
         assert_eq!(drive.state().output, 0.0, "the autopilot does not start it again");
     }

@@ -70,7 +70,7 @@ impl Slaves {
     }
 
     /// Makes all N2 boards so.
-    pub fn set_boards(&mut self, options: BoardOptions) {
+    pub(crate) fn set_boards(&mut self, options: BoardOptions) {
         for board in self.boards.values_mut() {
             board.options = options;
         }
@@ -87,7 +87,7 @@ impl Slaves {
     }
 
     /// Whether any drive runs.
-    pub fn any_runs(&self) -> bool {
+    pub(crate) fn any_runs(&self) -> bool {
         self.drives.values().any(|drive| drive.state().running)
     }
 
@@ -103,7 +103,7 @@ impl Slaves {
 
     /// Advances one drive to `now`, the next one with each call: a drive that is not polled has little to catch up when a
     /// request comes at last.
-    pub fn advance_next(&mut self, now: SimTime) {
+    pub(crate) fn advance_next(&mut self, now: SimTime) {
         let next = self
             .drives
             .range(self.served.saturating_add(1)..)

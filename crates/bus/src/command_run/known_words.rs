@@ -22,7 +22,7 @@ pub struct KnownWords {
 
 impl KnownWords {
     /// A word that the drive reports.
-    pub fn learn(&mut self, table: Table, address: u16, word: u16) {
+    pub(crate) fn learn(&mut self, table: Table, address: u16, word: u16) {
         if matches!(table, Table::Holding | Table::Coil) {
             self.words.insert((table, address), word);
             self.reported.insert((table, address));

@@ -240,13 +240,13 @@ impl CommandRun {
     }
 
     /// The step was acknowledged, perhaps by a late reply to another request.
-    pub fn doubted(&mut self) {
+    pub(crate) fn doubted(&mut self) {
         self.ask_before_repeating();
         self.tries.in_doubt = true;
     }
 
     /// Whether the drive may have taken a write that it did not answer: its words are not known then.
-    pub fn in_doubt(&self) -> bool {
+    pub(crate) fn in_doubt(&self) -> bool {
         self.tries.in_doubt
     }
 

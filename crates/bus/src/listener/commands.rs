@@ -97,7 +97,7 @@ impl Commands {
     }
 
     /// When something is due.
-    pub fn due_at(&self) -> Option<Instant> {
+    pub(crate) fn due_at(&self) -> Option<Instant> {
         self.waiting.as_ref().and(self.told).map(|told| told + PAUSE)
     }
 

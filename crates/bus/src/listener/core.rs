@@ -124,7 +124,7 @@ impl ListenCore {
 
     /// Answers whatever came into the queue all the same, which [`crate::command::admit`] prevents, and a gateway that is about to
     /// end: there is nothing to stop.
-    pub fn refuse_all(&mut self, now: Instant) {
+    pub(crate) fn refuse_all(&mut self, now: Instant) {
         let name = &self.bus.image.spec.name;
         let refusal = Refusal::NotAllowed(format!("bus `{name}` only listens; nothing is sent"));
         self.bus.queue.close(Outcome::Refused(refusal), now);

@@ -447,7 +447,7 @@ impl Master {
     }
 
     /// Whether a turn that was chosen earlier may still go out at `now`: the time of its command has not expired.
-    pub fn is_still_due(&mut self, turn: &Turn, now: Instant) -> bool {
+    pub(crate) fn is_still_due(&mut self, turn: &Turn, now: Instant) -> bool {
         if turn.purpose == Purpose::Background {
             return self.background_is_due(now);
         }

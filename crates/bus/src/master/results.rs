@@ -34,7 +34,7 @@ impl Master {
     }
 
     /// A drive has a new fault: the fault points of its profile are read.
-    pub fn fault_came(&mut self, drive: DriveIndex, now: Instant) {
+    pub(crate) fn fault_came(&mut self, drive: DriveIndex, now: Instant) {
         let Some(image) = self.bus.image.drives.get(drive) else {
             return;
         };

@@ -52,7 +52,7 @@ impl Schedule {
     /// Whether a transaction of that pace may go at `now`, which takes about `cost`. `idle`: nothing else is due. In
     /// idle time it does not delay the next round of process data, and goes only where its share owes nothing; instead
     /// of a poll that is due it goes once its share has earned it.
-    pub fn admits_background(&mut self, pace: Pace, cost: Duration, idle: bool, now: Instant) -> Admission {
+    pub(crate) fn admits_background(&mut self, pace: Pace, cost: Duration, idle: bool, now: Instant) -> Admission {
         let share = &mut self.background;
         let cost = cost + share.overrun;
         share.longest = share.longest.max(cost);
@@ -71,14 +71,14 @@ impl Schedule {
     }
 
     /// What is on account of the share of that pace took so long, and was no background transaction.
-    pub fn background_owes(&mut self, pace: Pace, took: Duration) {
+    pub(crate) fn background_owes(&mut self, pace: Pace, took: Duration) {
         if let Some(balance) = self.background.balance.get_mut(pace as usize) {
             *balance -= took.as_secs_f64();
         }
     }
 
     /// A background transaction has ended, for which the line was taken for `took`. `answered`: the drive replied.
-    pub fn background_done(&mut self, pace: Pace, admission: Admission, answered: bool, took: Duration) {
+    pub(crate) fn background_done(&mut self, pace: Pace, admission: Admission, answered: bool, took: Duration) {
         let share = &mut self.background;
         let paid = match admission {
             Admission::InIdleTime(cost) => took.saturating_sub(cost),

@@ -266,7 +266,7 @@ impl Audit {
     }
 
     /// Records the refusals that waited long enough for their count.
-    pub fn record_due(&self, now: Instant) {
+    pub(crate) fn record_due(&self, now: Instant) {
         let mut records = self.records();
         let due = records.refusals.due(now);
         due.into_iter()
@@ -315,7 +315,7 @@ impl Audit {
     }
 
     /// The last command to that drive that concerns its run command or was sent to reset its fault, and when it ended.
-    pub fn last_run(&self, drive: &str) -> Option<(Arc<AuditRecord>, Instant)> {
+    pub(crate) fn last_run(&self, drive: &str) -> Option<(Arc<AuditRecord>, Instant)> {
         self.records().runs.get(drive).cloned()
     }
 

@@ -84,7 +84,7 @@ pub struct PassedOn {
 
 impl PassedOn {
     /// Whether it is a command to drives of the bus, which has its place among their other commands.
-    pub fn is_order(&self) -> bool {
+    pub(crate) fn is_order(&self) -> bool {
         self.may_write && !self.reach.is_empty()
     }
 }

@@ -152,7 +152,7 @@ impl Command {
     }
 
     /// The same to a drive of that profile, requested at `asked`.
-    pub fn asked_of(mut self, profile: &Profile, asked: Instant) -> Command {
+    pub(crate) fn asked_of(mut self, profile: &Profile, asked: Instant) -> Command {
         self.effects = vec![(self.drive, Effect::of(&self.order, profile))];
         self.touched = Touched::of(&self.order, &self.ranges, profile);
         self.asked = Some(asked);
@@ -193,7 +193,7 @@ impl Command {
     }
 
     /// Whether it may go while the gateway ends: a stop, and the broadcast that stops a whole line.
-    pub fn ends_the_gateway(&self) -> bool {
+    pub(crate) fn ends_the_gateway(&self) -> bool {
         let is_broadcast = self.passed_on.is_some() && self.ticket.origin().kind == SourceKind::Shutdown;
         self.urgency == Urgency::Stop || is_broadcast
     }

@@ -137,13 +137,13 @@ impl Origin {
     }
 
     /// The same client, which appears under that name in audit and events.
-    pub fn acting(mut self, who: String) -> Origin {
+    pub(crate) fn acting(mut self, who: String) -> Origin {
         self.who = who;
         self
     }
 
     /// The same; a stop of it is a new one, also where its client repeats its word all the time.
-    pub fn insisting(mut self) -> Origin {
+    pub(crate) fn insisting(mut self) -> Origin {
         self.insists = true;
         self
     }

@@ -337,7 +337,7 @@ impl Priorities {
     }
 
     /// Whether the order that was planned still follows from a write: other sides may have withdrawn its slot since.
-    pub fn still_follows(&self, write: &SlotWrite) -> bool {
+    pub(crate) fn still_follows(&self, write: &SlotWrite) -> bool {
         match self.plan(write) {
             Follows::Order(_, entry) => write.heir.is_none_or(|heir| heir == entry.number),
             Follows::Nothing | Follows::Stop => false,

@@ -105,13 +105,13 @@ impl Ticket {
     }
 
     /// The drives that it starts or stops, where it goes to several.
-    pub fn with_runs(mut self, runs: Vec<(String, bool)>) -> Ticket {
+    pub(crate) fn with_runs(mut self, runs: Vec<(String, bool)>) -> Ticket {
         self.runs = runs;
         self
     }
 
     /// For the stop of a command whose rest depends on it.
-    pub fn with_rest(mut self, end: StopEnd) -> Ticket {
+    pub(crate) fn with_rest(mut self, end: StopEnd) -> Ticket {
         self.stop = Some(end);
         self
     }

@@ -54,7 +54,7 @@ impl Touched {
     }
 
     /// Whether it is the same which of the two goes first.
-    pub fn commutes(&self, other: &Touched) -> bool {
+    pub(crate) fn commutes(&self, other: &Touched) -> bool {
         let (
             Touched::These { sets, rests_on },
             Touched::These {

@@ -192,12 +192,12 @@ impl Figures {
     }
 
     /// How long the port has been open.
-    pub fn open_for(&self, now: Instant) -> Option<Duration> {
+    pub(crate) fn open_for(&self, now: Instant) -> Option<Duration> {
         self.opened.map(|opened| now.saturating_duration_since(opened))
     }
 
     /// Whether any drive has answered since the port was opened.
-    pub fn answered_since_opened(&self) -> bool {
+    pub(crate) fn answered_since_opened(&self) -> bool {
         self.answered_since_opened
     }
 
@@ -487,13 +487,13 @@ impl Figures {
     }
 
     /// How closely arrivals keep to the steps of a latency timer, 0 to 1, and how many there were; requests after a pause likewise.
-    pub fn in_steps(&self) -> [(f64, u32); 2] {
+    pub(crate) fn in_steps(&self) -> [(f64, u32); 2] {
         [lock(&self.arrivals), lock(&self.paced)]
     }
 
     /// For each frequency of the mains: damaged replies that have one before, and how much closer in phase they are to
     /// it than the valid replies of the same drive, -2 to 2.
-    pub fn in_phase(&self) -> [(f32, f32); MAINS.len()] {
+    pub(crate) fn in_phase(&self) -> [(f32, f32); MAINS.len()] {
         let of = |place: usize| {
             let sums = self.drives.iter().filter_map(|drive| drive.mains.sums.get(place));
             let (mut count, mut closer) = (0.0, 0.0);

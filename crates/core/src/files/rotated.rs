@@ -128,7 +128,7 @@ impl Rotated {
     ///
     /// # Errors
     /// A file cannot be renamed, or the current one not be brought to disk.
-    pub fn rotate(&mut self) -> io::Result<()> {
+    pub(crate) fn rotate(&mut self) -> io::Result<()> {
         self.sync()?;
         self.open = None;
         for number in (1..self.files.saturating_sub(1)).rev() {

@@ -35,7 +35,7 @@ impl Totals {
     }
 
     /// Whether they can have been counted.
-    pub fn is_sane(&self) -> bool {
+    pub(crate) fn is_sane(&self) -> bool {
         let fine = |figure: f64| figure.is_finite() && figure >= 0.0;
         fine(self.running_seconds) && self.energy_kwh.is_none_or(f64::is_finite)
     }

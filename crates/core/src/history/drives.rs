@@ -62,7 +62,7 @@ impl History {
     }
 
     /// The counters of all drives, including absent ones.
-    pub fn all_totals(&self) -> BTreeMap<String, Totals> {
+    pub(crate) fn all_totals(&self) -> BTreeMap<String, Totals> {
         let known = lock(&self.known);
         let mut all = known.absent.clone();
         all.extend(known.drives.iter().map(|(name, drive)| (name.clone(), drive.totals())));
@@ -70,7 +70,7 @@ impl History {
     }
 
     /// Adds the counts of earlier runs.
-    pub fn count_on(&self, totals: BTreeMap<String, Totals>) {
+    pub(crate) fn count_on(&self, totals: BTreeMap<String, Totals>) {
         let known = &mut *lock(&self.known);
         for (name, before) in totals {
             match known.drives.get(&name) {

@@ -93,7 +93,7 @@ impl Clock {
     }
 
     /// The time of day at an instant.
-    pub fn wall_at(&self, at: Instant) -> SystemTime {
+    pub(crate) fn wall_at(&self, at: Instant) -> SystemTime {
         match self.now.checked_duration_since(at) {
             Some(ago) => self.wall.checked_sub(ago).unwrap_or(SystemTime::UNIX_EPOCH),
             None => self.wall + at.saturating_duration_since(self.now),

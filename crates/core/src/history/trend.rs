@@ -93,7 +93,7 @@ impl Reach {
     }
 
     /// Memory of the trend of a point, from its first value on, bytes.
-    pub fn point_bytes(self) -> usize {
+    pub(crate) fn point_bytes(self) -> usize {
         let buckets: usize = self.ranges().into_iter().map(Range::buckets).sum();
         buckets * size_of::<Bucket>()
     }
@@ -216,7 +216,7 @@ impl DriveTrend {
     }
 
     /// Reaches back so far from now on; the newest steps stay.
-    pub fn set_reach(&mut self, reach: Reach) {
+    pub(crate) fn set_reach(&mut self, reach: Reach) {
         if std::mem::replace(&mut self.reach, reach) == reach {
             return;
         }

@@ -53,7 +53,7 @@ impl TriggerKind {
     ];
 
     /// Whether it has its own event, which gives the cause.
-    pub fn has_event(self) -> bool {
+    pub(crate) fn has_event(self) -> bool {
         match self {
             TriggerKind::Fault
             | TriggerKind::Warning

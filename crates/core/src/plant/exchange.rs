@@ -84,7 +84,7 @@ impl BusHandle {
     }
 
     /// The same of a broadcast that stops every drive of the bus: it goes before all that waits, stops included.
-    pub fn ask_first(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
+    pub(crate) fn ask_first(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
         self.pass_on(question, true, writes, now)
     }
 

@@ -426,7 +426,7 @@ impl Reading<'_> {
 
     /// As [`Reading::band`], for limits and conversions of commands: what the drive said longer than
     /// [`Reading::parameter_age`] ago is not known.
-    pub fn band_for_commands(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
+    pub(crate) fn band_for_commands(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
         self.band_of(minimum, maximum, |sample| {
             let age = self.now.saturating_duration_since(sample.at?);
             sample.good().filter(|_| age <= self.parameter_age())

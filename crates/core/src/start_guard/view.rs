@@ -111,7 +111,7 @@ impl BusGuards {
     }
 
     /// Why the motor may not be started now, as text; not counted.
-    pub fn hindrance(&self, drive: DriveIndex, now: Instant) -> Option<Guarded> {
+    pub(crate) fn hindrance(&self, drive: DriveIndex, now: Instant) -> Option<Guarded> {
         let of = self.of_drive(drive)?;
         let interlocked = self.interlocked(of, now);
         interlocked.or_else(|| {
@@ -349,7 +349,7 @@ impl BusGuards {
 
     /// Whether a stop of that client is an ordinary one, which waits for `min_run`: the first since its own order started the
     /// motor.
-    pub fn is_ordinary_stop(&self, drive: DriveIndex, client: &str, last_stop: Option<Instant>) -> bool {
+    pub(crate) fn is_ordinary_stop(&self, drive: DriveIndex, client: &str, last_stop: Option<Instant>) -> bool {
         let of = self.of_drive(drive).filter(|of| !of.guard.min_run.is_zero());
         of.is_some_and(|of| {
             let ledger = self.shared.lock();

@@ -139,17 +139,19 @@ impl TecoDrive {
         !self.operation_digit(1)
     }
 
-    /// Run and reverse, from the bus or from the terminals.
-    fn run_command(&self) -> (bool, bool) {
-        if self.run_from_bus() {
-            let word = self.control.operation;
-            (word & operation::RUN != 0, word & operation::REVERSE != 0)
-        } else {
-            let (forward, reverse) = (
-                self.terminals & terminal::FORWARD != 0,
-                self.terminals & terminal::REVERSE != 0,
-            );
-            (forward != reverse, reverse)
+    /// Whether bus or terminals say that the motor is to run.
+    fn is_told_to_run(&self) -> bool {
+        match self.run_from_bus() {
+            true => self.control.operation & operation::RUN != 0,
+            false => (self.terminals & terminal::FORWARD != 0) != (self.terminals & terminal::REVERSE != 0),
+        }
+    }
+
+    /// Whether they say that it is to turn in reverse.
+    fn is_told_to_reverse(&self) -> bool {
+        match self.run_from_bus() {
+            true => self.control.operation & operation::REVERSE != 0,
+            false => self.terminals & terminal::REVERSE != 0,
         }
     }
 
@@ -188,7 +190,7 @@ impl TecoDrive {
         if self.control.operation & operation::EXTERNAL_FAULT != 0 || self.terminals & terminal::EXTERNAL_FAULT != 0 {
             self.trip(fault::EXTERNAL);
         }
-        let (run, _) = self.run_command();
+        let run = self.is_told_to_run();
         self.body.running = match self.mode {
             Mode::Drive => self.body.latch.obeys(run),
             Mode::Program => {
@@ -289,7 +291,7 @@ impl Model for TecoDrive {
     }
 
     fn target(&self) -> f64 {
-        if self.run_command().1 {
+        if self.is_told_to_reverse() {
             -self.frequency()
         } else {
             self.frequency()

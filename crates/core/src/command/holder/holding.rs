@@ -317,7 +317,7 @@ impl Holding {
     }
 
     /// An accepted command has its turn and passes: it takes the hold again if that has ended since.
-    pub fn turn_came(&mut self, who: &Claim, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+    pub(crate) fn turn_came(&mut self, who: &Claim, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
         self.settle(rules, now, told);
         if asks.takes() && rules.mode == Mode::Exclusive && !self.is_held_by(who, now) {
             self.taken(who, rules, now, told);
@@ -390,7 +390,7 @@ impl Holding {
     }
 
     /// After a reload: principals that are gone hold nothing, those that changed have their new rank.
-    pub fn keep_known(&mut self, rules: &Rules, told: &mut Vec<Told>) {
+    pub(crate) fn keep_known(&mut self, rules: &Rules, told: &mut Vec<Told>) {
         if let State::Held(by, _) = &self.state
             && !rules.knows(by)
         {
@@ -420,7 +420,7 @@ impl Holding {
     }
 
     /// Whether the silence of that client is the one that counts: it is the holder, or was the last one.
-    pub fn is_whose_silence_counts(&self, who: Option<&Claim>) -> bool {
+    pub(crate) fn is_whose_silence_counts(&self, who: Option<&Claim>) -> bool {
         match &self.last {
             None => true,
             Some(last) => who.is_some_and(|who| who.is(last)),
@@ -436,12 +436,12 @@ impl Holding {
     }
 
     /// The client whose repeated stops end the holds of others: it should be cyclic.
-    pub fn repeater(&self) -> Option<&Arc<str>> {
+    pub(crate) fn repeater(&self) -> Option<&Arc<str>> {
         self.repeater.as_ref()
     }
 
     /// The present reservation: for whom, and until when.
-    pub fn reservation(&self) -> Option<(&Claim, Instant)> {
+    pub(crate) fn reservation(&self) -> Option<(&Claim, Instant)> {
         match &self.state {
             State::Reserved(by, until) => Some((by, *until)),
             State::Free | State::Held(..) => None,
@@ -456,7 +456,7 @@ impl Holding {
     }
 
     /// Whether that client holds the drive.
-    pub fn is_held_by(&self, who: &Claim, now: Instant) -> bool {
+    pub(crate) fn is_held_by(&self, who: &Claim, now: Instant) -> bool {
         self.held(now).is_some_and(|(by, _)| by.is(who))
     }
 

@@ -126,7 +126,7 @@ pub struct Rules {
 
 impl Rules {
     /// The principal that sent a command; none if unknown.
-    pub fn claim_of(&self, origin: &Origin) -> Option<Claim> {
+    pub(crate) fn claim_of(&self, origin: &Origin) -> Option<Claim> {
         let claim = self.claim(&origin.proof)?;
         Some(Claim {
             cyclic: claim.cyclic && !origin.insists,

@@ -54,7 +54,7 @@ impl CommandQueue {
 
     /// From now on the stops of that drive are those of another queue, in which it has that place: those that wait, and those
     /// that are still given to this one.
-    pub fn hand_over(&self, drive: DriveIndex, heir: &Arc<CommandQueue>, place: DriveIndex, now: Instant) {
+    pub(crate) fn hand_over(&self, drive: DriveIndex, heir: &Arc<CommandQueue>, place: DriveIndex, now: Instant) {
         let mut pending = self.lock();
         let stopped_at = pending.stopped_at.get(&drive).copied();
         let mut of_heir = heir.lock();

@@ -124,13 +124,19 @@ impl Pending {
     }
 
     /// The hold of a drive ends, for that reason.
-    pub fn hold_ends(&mut self, drive: DriveIndex, why: &str) {
+    pub(crate) fn hold_ends(&mut self, drive: DriveIndex, why: &str) {
         self.holds.with(drive, |holding, _, told| holding.end(why, told));
     }
 
     /// Why a command of that client is not accepted, where the hold of the drive keeps it. A run that is refused behind
     /// a stop is kept.
-    pub fn hold_refuses(&mut self, drive: DriveIndex, origin: &Origin, asks: Asks, now: Instant) -> Option<Refusal> {
+    pub(crate) fn hold_refuses(
+        &mut self,
+        drive: DriveIndex,
+        origin: &Origin,
+        asks: Asks,
+        now: Instant,
+    ) -> Option<Refusal> {
         self.holds.refuses(drive, origin, asks, now)
     }
 
@@ -221,7 +227,7 @@ impl Pending {
     }
 
     /// Whether supervision follows that client: it holds the drive, or was the last holder, or there was none.
-    pub fn hold_renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
+    pub(crate) fn hold_renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
         let Some(holding) = self.holds.rules.as_ref().and_then(|_| self.holds.drives.get(&drive)) else {
             return true;
         };
@@ -232,7 +238,7 @@ impl Pending {
     ///
     /// # Errors
     /// Why it may not; none while `[authority]` is off.
-    pub fn hold_act(
+    pub(crate) fn hold_act(
         &mut self,
         drive: DriveIndex,
         origin: &Origin,
@@ -281,7 +287,7 @@ impl Pending {
     }
 
     /// The client stopped, though nothing is sent for it.
-    pub fn hold_said_stop(&mut self, drive: DriveIndex, origin: &Origin) {
+    pub(crate) fn hold_said_stop(&mut self, drive: DriveIndex, origin: &Origin) {
         let Some(who) = self.holds.claim(origin) else { return };
         self.holds.with(drive, |holding, _, _| holding.said_stop(&who));
     }
@@ -323,7 +329,7 @@ impl Pending {
     }
 
     /// The client whose repeated stops end the holds of others.
-    pub fn repeater(&self, drive: DriveIndex) -> Option<Arc<str>> {
+    pub(crate) fn repeater(&self, drive: DriveIndex) -> Option<Arc<str>> {
         self.holds.drives.get(&drive)?.repeater().cloned()
     }
 
@@ -338,7 +344,7 @@ impl Pending {
     }
 
     /// The reservation of a drive: until when, for whom by name and rank, and for how long such a one lasts.
-    pub fn reservation(&self, drive: DriveIndex, now: Instant) -> Option<(Instant, String, String, Duration)> {
+    pub(crate) fn reservation(&self, drive: DriveIndex, now: Instant) -> Option<(Instant, String, String, Duration)> {
         let rules = self.holds.rules.as_ref()?;
         let (who, until) = self.holds.drives.get(&drive)?.reservation()?;
         let rank = rules.rank(who.rank).to_string();
@@ -356,7 +362,7 @@ impl Pending {
     }
 
     /// Continues the hold of the same machine after a reload.
-    pub fn take_over_holding(&mut self, drive: DriveIndex, mut holding: Holding) {
+    pub(crate) fn take_over_holding(&mut self, drive: DriveIndex, mut holding: Holding) {
         // The next reading says it again.
         holding.set_local(false, &mut Vec::new());
         self.holds.drives.insert(drive, holding);

@@ -89,7 +89,7 @@ impl Pending {
 impl CommandQueue {
     /// Takes in what is passed on for a tool, asked for at `asked`, and wakes the bus: a command to drives of the bus
     /// has its place among their other commands, anything else waits with the background requests.
-    pub fn submit_passed_on(&self, request: BackgroundRequest, touched: Touched, asked: Instant, now: Instant) {
+    pub(crate) fn submit_passed_on(&self, request: BackgroundRequest, touched: Touched, asked: Instant, now: Instant) {
         if request.passed_on.as_ref().is_some_and(PassedOn::is_order) {
             let mut command = request.into_command(touched);
             command.asked = Some(asked);

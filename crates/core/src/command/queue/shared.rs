@@ -66,7 +66,7 @@ impl CommandQueue {
     }
 
     /// Takes the stop of a command and its rest in, with nothing between them, and wakes the bus.
-    pub fn submit_parts(&self, stop: Command, mut rest: Command, now: Instant) {
+    pub(crate) fn submit_parts(&self, stop: Command, mut rest: Command, now: Instant) {
         let mut pending = self.lock();
         let outdated = pending.is_behind_its_stop(&rest);
         pending.push(stop, now);

@@ -145,7 +145,7 @@ impl Pending {
     }
 
     /// Who gave the last stop of that drive that was taken in.
-    pub fn last_stop_by(&self, drive: DriveIndex) -> Option<&Origin> {
+    pub(crate) fn last_stop_by(&self, drive: DriveIndex) -> Option<&Origin> {
         self.stopped_by.get(&drive)
     }
 

@@ -1,0 +1,119 @@
+//! How a command ends: taken back, cut short, refused at its turn, or answered.
+
+use std::time::Instant;
+
+use super::CommandRun;
+use super::control::Word;
+use super::steps::{Action, Check};
+use crate::codec::Exception;
+use crate::command::{Interruption, Origin, Outcome, Receipt, Refusal};
+use crate::confirm::Effect;
+
+impl CommandRun {
+    /// It goes no further, and ends with that outcome; a motor that it started is stopped.
+    pub(super) fn give_up(&mut self, outcome: Outcome) {
+        self.actions.clear();
+        self.cut.get_or_insert(outcome);
+        self.only_ends = true;
+        self.tries.pause = None;
+        (self.tries.failures, self.check) = (0, Check::NotYet);
+        if std::mem::take(&mut self.started) {
+            self.actions.push_back(Action::Word(Word::Stop(None)));
+        }
+    }
+
+    /// Ends it, except for the end of a pulse. Returns who sent it, and what it was.
+    pub fn refuse(&mut self, refusal: Refusal) -> Option<(Origin, String)> {
+        self.cut_off(Outcome::Refused(refusal));
+        let ticket = self.tickets.first()?;
+        Some((ticket.origin().clone(), ticket.what().to_string()))
+    }
+
+    /// Whether it is still pending: nothing of it was sent, or the drive was busy each time.
+    pub fn is_owed(&self) -> bool {
+        !self.begun || (self.tries.busy > 0 && !self.tries.in_doubt)
+    }
+
+    /// Its result when it is withdrawn before it is due.
+    pub fn taken_back(&self) -> Outcome {
+        match self.begun {
+            true => Outcome::Exception(Exception::BUSY),
+            false => Outcome::Withdrawn,
+        }
+    }
+
+    /// A stop arrived: remaining steps are cancelled, except clearing a reset bit that is set. Returns the outcome if
+    /// that ends the command.
+    pub fn purge(&mut self) -> Option<Outcome> {
+        // The stop that came in is on its way.
+        self.started = false;
+        self.cut_off(self.unless_begun(Outcome::Purged, Interruption::Stop));
+        self.actions.is_empty().then(|| self.success())
+    }
+
+    /// Another client took the drive: the command ends, but the motor is left as it is. Returns the outcome if that
+    /// ends it at once.
+    pub fn taken(&mut self, refusal: Refusal) -> Option<Outcome> {
+        self.started = false;
+        self.cut_off(self.unless_begun(Outcome::Refused(refusal), Interruption::Taken));
+        self.actions.is_empty().then(|| self.success())
+    }
+
+    pub(super) fn cut_off(&mut self, outcome: Outcome) {
+        let before = self.actions.len();
+        // A bit whose setting was sent and not answered may be set.
+        if self.tries.failures > 0 && self.actions.front().is_some_and(Action::is_reset) {
+            self.actions.pop_front();
+        }
+        let high = self.actions.iter().any(Action::is_reset);
+        self.actions
+            .retain(|a| !high && (a.ends_reset() || matches!(a, Action::Hold(_))));
+        // A hold without the end of a pulse after it holds nothing.
+        if !self.actions.iter().any(Action::ends_reset) {
+            self.actions.clear();
+        }
+        let left = self.actions.len();
+        if std::mem::take(&mut self.started) && before > left {
+            self.actions.push_back(Action::Word(Word::Stop(None)));
+        }
+        self.only_ends = true;
+        self.tries.pause = None;
+        if before != left {
+            self.cut = Some(outcome);
+            self.tries.failures = 0;
+        }
+    }
+
+    /// How the command ends when nothing is left to do.
+    pub fn success(&self) -> Outcome {
+        match &self.cut {
+            Some(outcome) => outcome.clone(),
+            None => Outcome::Acknowledged(self.reply.clone()),
+        }
+    }
+
+    /// Reports the acknowledgement. Returns what a read must show, and the receipts of those waiting for that.
+    pub fn acknowledge(self, outcome: &Outcome, now: Instant) -> (Vec<Effect>, Vec<Receipt>) {
+        let receipts = self.tickets.into_iter();
+        let receipts = receipts
+            .map(|ticket| ticket.acknowledge(outcome.clone(), now))
+            .collect();
+        (self.effects, receipts)
+    }
+
+    /// Ends the command with that outcome.
+    pub fn finish(self, outcome: &Outcome, now: Instant) {
+        self.tickets
+            .into_iter()
+            .for_each(|ticket| ticket.answer(outcome.clone(), now));
+    }
+
+    /// Ends a command that cannot continue: with `unbegun` if nothing of it was sent.
+    pub fn abandon(self, unbegun: Outcome, why: Interruption, now: Instant) {
+        let outcome = match &self.cut {
+            Some(outcome) => outcome.clone(),
+            None => self.unless_begun(unbegun, why),
+        };
+        self.finish(&outcome, now);
+    }
+}
