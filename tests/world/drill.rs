@@ -371,7 +371,12 @@ impl Trouble {
 fn whatever_goes_wrong_is_named_with_every_family() {
     for (number, (family, protocol)) in FAMILIES.into_iter().enumerate() {
         for trouble in Trouble::ALL {
-            let mut play = Play::of(&works(family, protocol), number as u64);
+            // Nothing else is to stop it.
+            let works = Line {
+                supervision: None,
+                ..works(family, protocol)
+            };
+            let mut play = Play::of(&works, number as u64);
             let has_remote = play.rig.good(1, ModelPoint::Remote).is_some();
             if trouble == Trouble::Local && !has_remote {
                 // It does not say who commands it, and stops or not.
@@ -507,9 +512,11 @@ impl Disk {
 fn a_kill_at_any_moment_leaves_no_motor_running() {
     let mut stopped = 0;
     for kill in 0..60_u32 {
-        let mut works = works("vacon-nx", Protocol::ModbusRtu);
         // Nothing else is to stop it.
-        works.supervision = None;
+        let works = Line {
+            supervision: None,
+            ..works("vacon-nx", Protocol::ModbusRtu)
+        };
         let mut play = Play::of(&works, u64::from(kill));
         play.rig.plant.drills.keep(true);
         let mut disk = Disk {
