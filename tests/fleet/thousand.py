@@ -36,6 +36,7 @@ class Fleet(Processes):
         self.gateways = []
         self.host = Host(options.drives)
         self.online = {}
+        self.asked = set()
         self.events = collections.Counter()
 
     def start_broker(self):
@@ -72,6 +73,11 @@ user root
     def received(self, _client, _data, message):
         if message.topic.startswith("spBv1.0/"):
             self.host.received(message.topic, message.payload)
+            _, _, kind, node, *_ = message.topic.split("/")
+            # It was at the broker before the host: a host asks those whose birth it missed.
+            if kind in ("NDATA", "DDATA") and node not in self.host.born and node not in self.asked:
+                self.asked.add(node)
+                self.client.publish(f"spBv1.0/{GROUP}/NCMD/{node}", rebirth(), 0)
         elif message.topic.endswith("/event"):
             event = json.loads(message.payload)
             self.events[message.topic.split("/")[1], event["boot"], event["id"]] += 1
@@ -153,6 +159,7 @@ user root
         end(self.broker)
         self.broker.wait()
         self.host.forget()
+        self.asked.clear()
         self.online.clear()
         time.sleep(self.options.outage)
         self.start_broker()
@@ -161,7 +168,8 @@ user root
         print(f"  the broker took {processor_seconds(self.broker.pid):.1f} s of a core", flush=True)
         self.costs("  the 10 s after that", 10)
         unknown = sum(self.host.unknown.values())
-        print(f"  status online: {len(self.online)}; data with an unknown alias: {unknown}", flush=True)
+        print(f"  status online: {len(self.online)}; data with an unknown alias: {unknown}; "
+              f"asked again for their births: {len(self.asked)}", flush=True)
         return is_well and len(self.online) == len(self.names()) and not unknown, dict(self.host.whole_at)
 
     def missing_events(self):
