@@ -71,7 +71,7 @@ check: ## Run the seeded world with its fixed seeds: virtual time, no external t
 
 SEEDS ?= 1000
 world: ## Run SEEDS new worlds, or with WORLD_SEED=n that one with its history
-	WORLD_SEEDS=$(SEEDS) $(WORLD) fixed -- --nocapture
+	WORLD_SEEDS=$(SEEDS) HOLDER_SEEDS=$(SEEDS) $(WORLD) -- --nocapture fixed only_the_holder
 
 ONLY ?=
 mutants: ## Insert known faults into the core; the seeded world must find each. ONLY=name runs one

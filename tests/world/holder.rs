@@ -292,11 +292,59 @@ impl Play {
     }
 }
 
+/// Number of worlds, each of about a thousand actions: 12, or what `make world` says.
+fn worlds() -> u64 {
+    super::number("HOLDER_SEEDS").unwrap_or(12)
+}
+
+/// How long sixty stops take that one client sends while another one has the motor run.
+fn stops_take(authority: bool, seed: u64) -> Duration {
+    let works = works(false);
+    let mut rig = Rig::new(&works, Parts::of(0, &works, seed));
+    rig.bus.handle.queue.set_authority(authority.then(rules));
+    let mut dice = Random::new(seed);
+    rig.until("online", PATIENCE, |rig| rig.is_whole());
+    let place = |rig: &mut Rig, client: usize, points: &[(&str, f64)]| {
+        let order = rig.points(1, points);
+        let placed = rig
+            .drive(1)
+            .place(order, origin(client), Authority::Write, DEFAULT_EXPIRY, rig.now);
+        rig.bus.command_came(rig.now);
+        placed
+    };
+    let mut took = Duration::ZERO;
+    for round in 0..60 {
+        let mut start = place(&mut rig, 1, &[("run", 1.0), ("speed_reference", 11.0)]);
+        let started = rig.answered(&mut start);
+        assert!(started.is_ok(), "authority {authority}, {round}: {started}");
+        rig.run(Duration::from_millis(dice.within(100..=900)));
+        let sent = rig.now;
+        let mut stop = place(&mut rig, 2, &[("run", 0.0)]);
+        let stopped = rig.answered(&mut stop);
+        assert!(stopped.is_ok(), "authority {authority}, {round}: {stopped}");
+        took += rig.now - sent;
+        rig.run(Duration::from_millis(dice.within(100..=900)));
+    }
+    took
+}
+
+#[test]
+fn authority_delays_no_stop() {
+    for seed in 0..4 {
+        let [without, with] = [false, true].map(|authority| stops_take(authority, seed));
+        let ratio = with.as_secs_f64() / without.as_secs_f64();
+        assert!(
+            (0.95..1.05).contains(&ratio),
+            "seed {seed}: {without:?}, with authority {with:?}"
+        );
+    }
+}
+
 #[test]
 fn only_the_holder_is_on_the_wire_and_every_stop() {
     let mut all = BTreeMap::new();
     let mut frames = 0;
-    for seed in 0..12 {
+    for seed in 0..worlds() {
         let mut play = Play::new(seed);
         play.rig.until("online", PATIENCE, |rig| rig.is_whole());
         play.faulty = seed % 3 == 2;
