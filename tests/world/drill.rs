@@ -450,7 +450,7 @@ fn one_at_a_time_by_who_armed_it_and_within_a_minute() {
     for (kinds, speed, why) in [
         (&Kind::ALL[..], Some(20.5), "allowed are more than 0 to 20 %"),
         (&Kind::ALL[..], Some(f64::NAN), "allowed are"),
-        (&[][..], None, "no way is named"),
+        (&[][..], None, "name at least one"),
     ] {
         let refused = arm(kinds, speed).unwrap_err().to_string();
         assert!(refused.contains(why), "{refused}");
