@@ -74,8 +74,9 @@ user root
         if message.topic.startswith("spBv1.0/"):
             self.host.received(message.topic, message.payload)
             _, _, kind, node, *_ = message.topic.split("/")
-            # It was at the broker before the host: a host asks those whose birth it missed.
-            if kind in ("NDATA", "DDATA") and node not in self.host.born and node not in self.asked:
+            # It was at the broker before the host, which asks the nodes whose own birth it missed.
+            is_born = "" in self.host.born.get(node, ())
+            if kind in ("DBIRTH", "NDATA", "DDATA") and not is_born and node not in self.asked:
                 self.asked.add(node)
                 self.client.publish(f"spBv1.0/{GROUP}/NCMD/{node}", rebirth(), 0)
         elif message.topic.endswith("/event"):
