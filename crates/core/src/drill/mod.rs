@@ -310,6 +310,11 @@ impl Drills {
         state.kept == state.generation
     }
 
+    /// Whether a drill waits for its start to be on disk.
+    pub fn waits_for_disk(&self) -> bool {
+        self.state().run.as_ref().is_some_and(Run::waits_for_disk)
+    }
+
     /// That generation is on disk.
     pub fn kept(&self, generation: u64, now: Instant) {
         let mut state = self.state();

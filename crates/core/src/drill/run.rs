@@ -271,6 +271,11 @@ impl Run {
         }
     }
 
+    /// Whether it waits for its start to be on disk.
+    pub(super) fn waits_for_disk(&self) -> bool {
+        matches!(self.step, Step::Keeping(_))
+    }
+
     /// What was started before generation `kept` was written may begin.
     pub(super) fn kept(&mut self, kept: u64, now: Instant) {
         if matches!(self.step, Step::Keeping(generation) if generation <= kept) {
@@ -280,7 +285,7 @@ impl Run {
 
     /// Its start cannot be written: nothing is started. Whether it was waiting for that.
     pub(super) fn not_kept(&mut self, why: &str, time: SystemTime) -> bool {
-        let waits = matches!(self.step, Step::Keeping(_));
+        let waits = self.waits_for_disk();
         if waits {
             let why = format!("its start could not be recorded on disk ({why}); nothing was started");
             self.finish(DrillState::Aborted, why, time);

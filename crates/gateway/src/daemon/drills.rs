@@ -107,7 +107,8 @@ impl Writer {
                 Err(error) => self.failed(drills, &error.to_string()),
             }
         }
-        let waits = self.again.is_some_and(|again| Instant::now() < again);
+        // A drill that waits for it is a reason to try at once.
+        let waits = self.again.is_some_and(|again| Instant::now() < again) && !drills.waits_for_disk();
         if self.writing.is_none() && !waits {
             self.writing = begin_to_write(drills, file);
         }
