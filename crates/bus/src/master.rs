@@ -12,7 +12,9 @@ mod passed_on;
 mod remains;
 mod results;
 mod shutdown;
+mod waits;
 
+use self::waits::Waits;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -152,9 +154,8 @@ pub struct Master {
     silence: Duration,
     schedule: Schedule,
     drives: PerDrive<DriveState>,
-    /// The N2 sessions of the drives.
-    sessions: N2Sessions,
-    n2_late: N2LateReplies,
+    /// What a transaction may have to wait for.
+    waits: Waits,
     /// The last reply on the line, valid or damaged: it may be repeated.
     last_answered: Option<(DriveIndex, RequestPdu)>,
     turns: Turns,
@@ -162,8 +163,6 @@ pub struct Master {
     background: Option<Begun>,
     /// The last one was passed on to drives of the bus as a command.
     passed_on_last: bool,
-    /// Replies that may still arrive from addresses without a configured drive.
-    strangers: BTreeMap<u8, LateReplies>,
     shutdown: Option<Shutdown>,
     /// The line was spoken on before it was opened: by this bus, or by the one before it.
     successor: bool,
@@ -172,10 +171,6 @@ pub struct Master {
     probes: PerDrive<u32>,
     /// A reply may have come late since before the transaction that is on the line.
     late_before: bool,
-    /// Which starts may be written; none where nothing is guarded.
-    starts: Option<StartGate>,
-    /// A drive to which a drill sends nothing but stops, and until when.
-    quiet: Option<(DriveIndex, Instant)>,
 }
 
 impl Master {
@@ -221,19 +216,21 @@ impl Master {
             schedule,
             probes: vec![0; drives.len()].into(),
             drives,
-            sessions,
-            n2_late: N2LateReplies::default(),
+            waits: Waits {
+                sessions,
+                n2_late: N2LateReplies::default(),
+                strangers: BTreeMap::new(),
+                starts: StartGate::of(&bus, now),
+                quiet: None,
+            },
             last_answered: None,
             turns: Turns::default(),
             background: None,
             passed_on_last: false,
-            strangers: BTreeMap::new(),
             shutdown: None,
             successor: before.quiet_until.is_some(),
             writes,
             late_before: false,
-            starts: StartGate::of(&bus, now),
-            quiet: None,
             bus,
         }
     }
@@ -241,7 +238,7 @@ impl Master {
     /// The port was opened: every drive must be found again.
     pub fn opened(&mut self, now: Instant) {
         self.schedule.reset(now);
-        self.sessions.reset();
+        self.waits.sessions.reset();
         self.last_answered = None;
         self.probes.fill(0);
     }
@@ -271,7 +268,7 @@ impl Master {
             }
         }
         drop(queue);
-        if let Some(starts) = &mut self.starts {
+        if let Some(starts) = &mut self.waits.starts {
             starts.settle(|_| false);
         }
         let close = |drive: &mut DriveState| {
@@ -284,9 +281,9 @@ impl Master {
             .drives
             .iter()
             .map(|drive| &drive.late)
-            .chain(self.strangers.values());
+            .chain(self.waits.strangers.values());
         let late = late.filter_map(LateReplies::until);
-        let window = match self.sessions.is_empty() {
+        let window = match self.waits.sessions.is_empty() {
             true => FORGOTTEN_AFTER,
             false => self.n2_window(),
         };
@@ -294,7 +291,11 @@ impl Master {
         Handover {
             leases,
             learned: None,
-            quiet_until: late.chain(self.n2_late.until()).chain(broken_off).chain([now]).max(),
+            quiet_until: late
+                .chain(self.waits.n2_late.until())
+                .chain(broken_off)
+                .chain([now])
+                .max(),
         }
     }
 
@@ -309,7 +310,7 @@ impl Master {
         if let Some(round) = self.schedule.take_round() {
             news.push(News::FastRound(round.cycle));
         }
-        if let Some(starts) = &mut self.starts {
+        if let Some(starts) = &mut self.waits.starts {
             news.append(&mut starts.take_told());
         }
         next.map_err(|until| until.min(now + LOOK_ROUND))
@@ -337,7 +338,7 @@ impl Master {
             }
         }
         self.look_at_starts(now);
-        for drive in self.sessions.neglected(now).collect::<Vec<_>>() {
+        for drive in self.waits.sessions.neglected(now).collect::<Vec<_>>() {
             self.schedule.ask(drive, now);
         }
         self.look_at_shutdown(now);
@@ -348,12 +349,12 @@ impl Master {
         let Master {
             bus,
             drives,
-            starts,
+            waits,
             writes,
             background,
             ..
         } = self;
-        let Some(starts) = starts else { return };
+        let Some(starts) = &mut waits.starts else { return };
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if starts.guards(index) {
                 let reading = image.reading(now, drive.fresh);
@@ -383,7 +384,7 @@ impl Master {
             };
             drive.sent(*slot, &step, now);
             let start = drive.run(*slot).and_then(|run| run.start.clone());
-            if let Some(starts) = self.starts.as_ref().filter(|_| step.pdu.is_write())
+            if let Some(starts) = self.waits.starts.as_ref().filter(|_| step.pdu.is_write())
                 && let Some(image) = self.bus.image.drives.get(turn.drive)
             {
                 starts.written(turn.drive, &image.spec.profile, &step.pdu, start.as_ref(), now);
@@ -410,10 +411,10 @@ impl Master {
             .drives
             .iter()
             .map(|drive| &drive.late)
-            .chain(self.strangers.values());
-        self.late_before = self.n2_late.may_come(now) || late.any(|late| late.may_come(now));
+            .chain(self.waits.strangers.values());
+        self.late_before = self.waits.n2_late.may_come(now) || late.any(|late| late.may_come(now));
         let last = self.last_answered.as_ref();
-        let n2 = !self.sessions.is_empty();
+        let n2 = !self.waits.sessions.is_empty();
         Sending {
             response_timeout: self.timeout_of(turn),
             late_may_come: self.late_before,
@@ -446,12 +447,12 @@ impl Master {
 
     /// Takes the late replies that may still arrive on an N2 line, for the transaction about to start.
     pub(crate) fn take_late(&mut self) -> N2LateReplies {
-        std::mem::take(&mut self.n2_late)
+        std::mem::take(&mut self.waits.n2_late)
     }
 
     /// Puts back what that transaction left of them.
     pub(crate) fn put_late(&mut self, late: N2LateReplies) {
-        self.n2_late = late;
+        self.waits.n2_late = late;
     }
 }
 

@@ -2,7 +2,6 @@
 
 use std::time::{Duration, Instant};
 
-use super::passed_on::Late;
 use super::{Master, Purpose, Turn, TurnEnd};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
@@ -115,25 +114,10 @@ impl Master {
             return Err(None);
         }
         let mut blocked: Option<Instant> = None;
-        let Master {
-            drives,
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet,
-            ..
-        } = self;
-        let mut late = Late {
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet: *quiet,
-        };
+        let Master { drives, waits, .. } = self;
         let may = |request: &BackgroundRequest| {
-            let until = late.blocks((request.drive, &request.pdu), request.passed_on.as_ref(), drives, now);
-            let until = until.max(late.quiet_until(request));
+            let until = waits.blocks((request.drive, &request.pdu), request.passed_on.as_ref(), drives, now);
+            let until = until.max(waits.quiet_until(request));
             blocked = blocked.into_iter().chain(until).min();
             until.is_none()
         };
@@ -182,7 +166,7 @@ impl Master {
             let pending = self.bus.queue.lock();
             // A stop that came in while the line went silent.
             !started.any(|drive| pending.was_stopped(*drive))
-        }) && self.starts.as_ref().is_none_or(|starts| {
+        }) && self.waits.starts.as_ref().is_none_or(|starts| {
             let mut started = begun.effects.iter().filter(|(_, effect)| effect.run == Some(true));
             started.all(|(drive, _)| starts.may_still_write(*drive, begun.number, now))
         })
@@ -200,7 +184,7 @@ impl Master {
                 drive.heard_order(renews, now);
             }
         }
-        let Some(starts) = self.starts.as_ref().filter(|_| orders.is_some()) else {
+        let Some(starts) = self.waits.starts.as_ref().filter(|_| orders.is_some()) else {
             return;
         };
         for (drive, effect) in &begun.effects {
@@ -238,7 +222,7 @@ impl Master {
     /// A background transaction has ended: it is answered, whatever came of it.
     pub(super) fn background_over(&mut self, turn: &Turn, mut end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         let index = turn.drive;
-        let heard = self.sessions.heard(index, &end.ended);
+        let heard = self.waits.sessions.heard(index, &end.ended);
         if heard == Progress::Restarted {
             self.restarted(index, now, news);
         }
@@ -340,12 +324,12 @@ impl Master {
 
     /// Whether a turn is a broadcast, without a reply.
     pub(super) fn is_broadcast(&self, turn: &Turn) -> bool {
-        self.stranger(turn) == Some(0) && self.sessions.is_empty()
+        self.stranger(turn) == Some(0) && self.waits.sessions.is_empty()
     }
 
     fn is_broadcast_of(&self, request: &BackgroundRequest) -> bool {
         let address = request.passed_on.as_ref().map(|passed_on| passed_on.address);
-        address == Some(0) && request.drive == NO_DRIVE && self.sessions.is_empty()
+        address == Some(0) && request.drive == NO_DRIVE && self.waits.sessions.is_empty()
     }
 
     /// How long the first byte of the reply is waited for where that is not as with the gateway's own requests: after a broadcast

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::passed_on::{Late, drop_in_vain, may_go};
+use super::passed_on::{drop_in_vain, may_go};
 use super::{Before, Master, Purpose, Turn};
 use crate::codec::RequestPdu;
 use crate::command::{
@@ -103,8 +103,8 @@ impl Master {
     fn decide(&mut self, now: Instant) -> Option<Result<Turn, Instant>> {
         self.purge(now);
         let quiet = self.bus.queue.quiet(now);
-        if quiet != self.quiet {
-            self.quiet = quiet;
+        if quiet != self.waits.quiet {
+            self.waits.quiet = quiet;
             self.schedule.keep_quiet(quiet);
         }
         if self.shutdown.is_none()
@@ -155,21 +155,15 @@ impl Master {
     /// stop goes between the two.
     fn checked_write(&mut self, now: Instant) -> Option<Ready> {
         let (slot, rank) = (Urgency::Command, Urgency::Command);
-        let Master {
-            drives,
-            bus,
-            n2_late,
-            sessions,
-            ..
-        } = self;
+        let Master { drives, bus, waits, .. } = self;
         let is_checked = |drive: &mut DriveState| drive.run(slot).is_some_and(CommandRun::is_checked);
         let (drive, state) = drives
             .enumerate_mut()
             .find_map(|(index, drive)| is_checked(drive).then_some((index, drive)))?;
         let image = bus.image.drives.get(drive)?;
-        match state.wanted(image, n2_late, now) {
+        match state.wanted(image, &waits.n2_late, now) {
             Wanted::Step(Urgency::Command, step)
-                if step.pdu.is_write() && sessions.before(drive, Some(slot), now).is_none() =>
+                if step.pdu.is_write() && waits.sessions.before(drive, Some(slot), now).is_none() =>
             {
                 Some(Ready {
                     drive,
@@ -208,34 +202,26 @@ impl Master {
 
     fn commands(&mut self, now: Instant) -> Commands {
         let mut commands = Commands::default();
-        let Master {
-            drives,
-            bus,
-            n2_late,
-            sessions,
-            starts,
-            quiet,
-            ..
-        } = self;
+        let Master { drives, bus, waits, .. } = self;
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if !drive.has_runs() {
                 continue;
             }
-            let mut wanted = drive.wanted(image, n2_late, now);
-            while let Some(starts) = starts
+            let mut wanted = drive.wanted(image, &waits.n2_late, now);
+            while let Some(starts) = &mut waits.starts
                 && starts.forbids(index, drive, &wanted, now)
             {
-                wanted = drive.wanted(image, n2_late, now);
+                wanted = drive.wanted(image, &waits.n2_late, now);
             }
-            let quiet = quiet.filter(|(quiet, _)| *quiet == index);
+            let quiet = waits.quiet.filter(|(quiet, _)| *quiet == index);
             match wanted {
                 Wanted::Step(slot, _) if quiet.is_some() && slot != Urgency::Stop => {
                     quiet.into_iter().for_each(|(_, until)| commands.wait(until));
                 }
                 Wanted::Step(slot, step) => {
                     // What N2 needs said before is blocked by late replies as the step itself is.
-                    let before = sessions.before(index, Some(slot), now).map(RequestPdu::N2);
-                    let blocked = before.and_then(|before| n2_late.blocks(&before, now));
+                    let before = waits.sessions.before(index, Some(slot), now).map(RequestPdu::N2);
+                    let blocked = before.and_then(|before| waits.n2_late.blocks(&before, now));
                     let waits = drive.run(slot).is_some_and(|run| run.waits_for_late());
                     if let Some(until) = blocked.filter(|_| waits) {
                         commands.wait(until);
@@ -271,21 +257,10 @@ impl Master {
             drives,
             schedule,
             bus,
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet,
+            waits,
             ..
         } = self;
         drop_in_vain(&mut pending, &bus.image.drives, now);
-        let mut late = Late {
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet: *quiet,
-        };
         let stands: PerDrive<bool> = drives
             .iter()
             .zip(&bus.image.drives)
@@ -299,7 +274,7 @@ impl Master {
                 now,
                 |command| {
                     let online = schedule.is_online(command.drive);
-                    may_go(command, online, &mut late, drives, now).unwrap_or_else(|at| {
+                    may_go(command, online, waits, drives, now).unwrap_or_else(|at| {
                         until = Some(until.map_or(at, |before| before.min(at)));
                         false
                     })
@@ -313,7 +288,7 @@ impl Master {
                 commands.wait(until);
             }
         }
-        if let Some(starts) = starts
+        if let Some(starts) = &mut waits.starts
             && starts.refuse(&mut pending, now)
         {
             // Others may go instead.
@@ -387,7 +362,11 @@ impl Master {
             // It waited for its turn: its time begins now.
             command.expires = command.expires.max(now + DEFAULT_EXPIRY);
         }
-        let start = self.starts.as_ref().and_then(|starts| starts.start_of(&command, index));
+        let start = self
+            .waits
+            .starts
+            .as_ref()
+            .and_then(|starts| starts.start_of(&command, index));
         let mut run = CommandRun::new(command, &image.spec.profile);
         (run.rank, run.renews, run.start) = (rank, renews, start);
         drive.begin(run);
@@ -400,7 +379,7 @@ impl Master {
             rank,
             step,
         } = ready;
-        match self.sessions.before(drive, Some(slot), now) {
+        match self.waits.sessions.before(drive, Some(slot), now) {
             Some(session) => Turn {
                 drive,
                 purpose: Purpose::Session(session, Before::Command(slot, rank)),
@@ -421,11 +400,11 @@ impl Master {
     fn poll(&mut self, poll: Poll, now: Instant) -> Option<Result<Turn, Instant>> {
         let pdu = poll.read.pdu();
         let drive = self.drives.get_mut(poll.drive)?;
-        let session = self.sessions.before(poll.drive, None, now);
+        let session = self.waits.sessions.before(poll.drive, None, now);
         let address = self.bus.image.drives.get(poll.drive)?.spec.address;
         let on_n2 = match session {
-            Some(session) => self.n2_late.blocks(&RequestPdu::N2(session), now),
-            None => self.n2_late.blocks_poll(address, &poll.read, now),
+            Some(session) => self.waits.n2_late.blocks(&RequestPdu::N2(session), now),
+            None => self.waits.n2_late.blocks_poll(address, &poll.read, now),
         };
         if let Some(until) = drive.late.blocks(&pdu, now).max(on_n2) {
             self.schedule.postpone(&poll, until);
@@ -452,7 +431,7 @@ impl Master {
             return self.background_is_due(now);
         }
         let Some(slot) = turn.slot() else { return true };
-        if let Some(starts) = self.starts.as_ref().filter(|_| slot == Urgency::Command)
+        if let Some(starts) = self.waits.starts.as_ref().filter(|_| slot == Urgency::Command)
             && let Some(drive) = self.drives.get_mut(turn.drive)
             && starts.may_not_write(turn.drive, drive, turn.pdu(), now).is_some()
         {

@@ -1,23 +1,16 @@
 //! Requests forwarded for a tool, and the gateway's own broadcasts: when they may be sent, and the sending.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
 use super::background::Begun;
+use super::waits::Waits;
 use super::{Master, Turn};
-use crate::codec::RequestPdu;
-use crate::command::{
-    BackgroundRequest, Chosen, Command, NO_DRIVE, Order, Outcome, Pace, PassedOn, Pending, Refusal, Urgency,
-};
-use crate::drive::{DriveIndex, PerDrive};
+use crate::command::{BackgroundRequest, Chosen, Command, NO_DRIVE, Order, Outcome, Pace, PassedOn, Pending, Refusal};
+use crate::drive::PerDrive;
 use crate::drive_state::DriveState;
-use crate::late_replies::LateReplies;
-use crate::n2_late_replies::N2LateReplies;
-use crate::n2_session::N2Sessions;
 use crate::process_image::DriveImage;
 use crate::schedule::Admission;
-use crate::start_gate::StartGate;
 
 /// Why what is passed on may not go: a drive that it reaches takes no commands but stops.
 fn held(passed_on: &PassedOn, drives: &PerDrive<Arc<DriveImage>>) -> Option<Outcome> {
@@ -29,70 +22,6 @@ fn held(passed_on: &PassedOn, drives: &PerDrive<Arc<DriveImage>>) -> Option<Outc
         .filter_map(|drive| drives.get(*drive))
         .find_map(|image| image.hold.why());
     why.map(|why| Outcome::Refused(Refusal::NotAllowed(why.to_string())))
-}
-
-/// Replies that may still come, to whatever was asked.
-pub(super) struct Late<'m> {
-    pub(super) sessions: &'m mut N2Sessions,
-    pub(super) n2_late: &'m N2LateReplies,
-    pub(super) strangers: &'m mut BTreeMap<u8, LateReplies>,
-    /// Which starts may be written.
-    pub(super) starts: &'m mut Option<StartGate>,
-    /// A drive to which nothing but stops is sent, and until when.
-    pub(super) quiet: Option<(DriveIndex, Instant)>,
-}
-
-impl Late<'_> {
-    /// Until when the transaction cannot go, if it cannot now.
-    pub(super) fn blocks(
-        &mut self,
-        (drive, pdu): (DriveIndex, &RequestPdu),
-        passed_on: Option<&PassedOn>,
-        drives: &mut PerDrive<DriveState>,
-        now: Instant,
-    ) -> Option<Instant> {
-        // A poll identifies the drive.
-        if self.sessions.before(drive, Some(Urgency::Read), now).is_some() {
-            return Some(now + super::LOOK_ROUND);
-        }
-        let late = match (passed_on, drives.get_mut(drive)) {
-            (_, Some(drive)) => Some(&mut drive.late),
-            (Some(passed_on), None) => self.strangers.get_mut(&passed_on.address),
-            (None, None) => None,
-        };
-        let late = late.and_then(|late| late.blocks(pdu, now));
-        late.max(self.n2_late.blocks(pdu, now))
-    }
-
-    /// Until when a request has to wait, since it would reach a drive that a drill sends nothing.
-    pub(super) fn quiet_until(&self, request: &BackgroundRequest) -> Option<Instant> {
-        let (quiet, until) = self.quiet?;
-        let reach = request.passed_on.as_ref().map_or(&[][..], |passed_on| &passed_on.reach);
-        (request.drive == quiet || reach.contains(&quiet)).then_some(until)
-    }
-
-    /// Whether what is passed on to drives of the bus can go: nothing has started for any of them.
-    ///
-    /// # Errors
-    /// When it can, if it must wait.
-    pub(super) fn may_pass_on(
-        &mut self,
-        command: &Command,
-        drives: &mut PerDrive<DriveState>,
-        now: Instant,
-    ) -> Result<bool, Instant> {
-        let busy = |drive: &DriveState| drive.is_busy(Urgency::Stop) || drive.is_busy(Urgency::Command);
-        if command.reach().iter().filter_map(|drive| drives.get(*drive)).any(busy) {
-            return Ok(false);
-        }
-        let Order::Write(pdu) = &command.order else {
-            return Ok(true);
-        };
-        match self.blocks((command.drive, pdu), command.passed_on.as_ref(), drives, now) {
-            Some(until) => Err(until),
-            None => Ok(true),
-        }
-    }
 }
 
 /// Ends passed-on requests that can no longer be sent: unwanted, or not permitted.
@@ -137,28 +66,17 @@ impl Master {
         let Master {
             drives,
             schedule,
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet,
+            waits,
             ..
         } = self;
-        let mut late = Late {
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet: *quiet,
-        };
         let chosen = pending.next_passed_on(now, |command| {
             let online = schedule.is_online(command.drive);
-            may_go(command, online, &mut late, drives, now).unwrap_or_else(|until| {
+            may_go(command, online, waits, drives, now).unwrap_or_else(|until| {
                 blocked = blocked.into_iter().chain([until]).min();
                 false
             })
         });
-        if let Some(starts) = starts {
+        if let Some(starts) = &mut waits.starts {
             starts.refuse(pending, now);
         }
         (chosen, blocked)
@@ -169,23 +87,9 @@ impl Master {
         let queue = self.bus.queue.clone();
         let mut pending = queue.lock();
         let chosen = pending.first_of_all(now)?;
-        let Master {
-            drives,
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet,
-            ..
-        } = self;
-        let mut late = Late {
-            sessions,
-            n2_late,
-            strangers,
-            starts,
-            quiet: *quiet,
-        };
-        late.may_pass_on(pending.get(chosen)?, drives, now)
+        let Master { drives, waits, .. } = self;
+        waits
+            .may_pass_on(pending.get(chosen)?, drives, now)
             .is_ok_and(|may| may)
             .then_some(())?;
         let command = pending.take(chosen)?;
@@ -260,18 +164,18 @@ impl Master {
 pub(super) fn may_go(
     command: &Command,
     online: bool,
-    late: &mut Late<'_>,
+    waits: &mut Waits,
     drives: &mut PerDrive<DriveState>,
     now: Instant,
 ) -> Result<bool, Instant> {
-    if let Some((quiet, until)) = late.quiet
+    if let Some((quiet, until)) = waits.quiet
         && command.reaches(quiet)
         && !command.stops(quiet)
     {
         return Err(until);
     }
     let may = match &command.passed_on {
-        Some(_) => late.may_pass_on(command, drives, now)?,
+        Some(_) => waits.may_pass_on(command, drives, now)?,
         None => match drives.get_mut(command.drive) {
             Some(drive) => super::choose::may_begin(drive, command, online, now)?,
             None => true,
@@ -279,7 +183,7 @@ pub(super) fn may_go(
     };
     // A request to an absent drive is answered, and starts nothing.
     let goes = may && (online || command.passed_on.is_some());
-    match late.starts.as_mut().filter(|_| goes) {
+    match waits.starts.as_mut().filter(|_| goes) {
         Some(starts) => starts.may_go(command, now),
         None => Ok(may),
     }

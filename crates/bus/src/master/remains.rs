@@ -36,8 +36,8 @@ impl Master {
         let late = self.drives.iter().map(|drive| drive.late.owed(now));
         let sum = |of: fn(&DriveState) -> bool| self.drives.iter().filter(|drive| of(drive)).count();
         Remains {
-            late_replies: late.sum::<usize>() + self.n2_late.owed(now),
-            strangers: self.strangers.values().filter(|late| late.may_come(now)).count(),
+            late_replies: late.sum::<usize>() + self.waits.n2_late.owed(now),
+            strangers: self.waits.strangers.values().filter(|late| late.may_come(now)).count(),
             begun: sum(DriveState::has_runs) + usize::from(self.background_of_others()),
             waiting: self.bus.queue.lock().len() + usize::from(self.bus.queue.background().has_of_others()),
             unconfirmed: sum(|drive| !drive.confirmations.is_empty()),

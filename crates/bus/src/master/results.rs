@@ -67,7 +67,7 @@ impl Master {
         }
         // The drive's own reply, unless a late one of an earlier transaction may have been that.
         let came_mangled = end.mangled && !self.late_before;
-        if !self.sessions.is_empty() {
+        if !self.waits.sessions.is_empty() {
             self.note_late_on_n2(turn, end, came_mangled, now);
         }
         let stranger = self.stranger(turn);
@@ -91,12 +91,12 @@ impl Master {
                 // A valid reply may still follow.
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
-            Ended::Silent | Ended::Corrupt(_) if self.sessions.is_empty() => {
+            Ended::Silent | Ended::Corrupt(_) if self.waits.sessions.is_empty() => {
                 let late = match (drive, stranger) {
                     (Some(drive), _) => Some(&mut drive.late),
                     (None, Some(address)) => {
-                        self.strangers.retain(|_, late| late.may_come(now));
-                        Some(self.strangers.entry(address).or_default())
+                        self.waits.strangers.retain(|_, late| late.may_come(now));
+                        Some(self.waits.strangers.entry(address).or_default())
                     }
                     (None, None) => None,
                 };
@@ -121,25 +121,25 @@ impl Master {
         let asked = Asked {
             address,
             pdu: &turn.pdu,
-            device: self.sessions.device(turn.drive),
+            device: self.waits.sessions.device(turn.drive),
             at: end.began,
         };
         match &end.ended {
             Ended::Reply(Reply::Exception(_)) => {}
             Ended::Reply(_) => {
-                self.n2_late.answered(address, &turn.pdu, window, now);
+                self.waits.n2_late.answered(address, &turn.pdu, window, now);
                 let Master {
-                    schedule, n2_late, bus, ..
+                    schedule, waits, bus, ..
                 } = self;
                 let drives = &bus.image.drives;
                 schedule.recall(now, |drive, read| {
                     let address = drives.get(drive).map_or(0, |image| image.spec.address);
-                    n2_late.blocks_poll(address, read, now).is_none()
+                    waits.n2_late.blocks_poll(address, read, now).is_none()
                 });
             }
             Ended::Corrupt(_) if came_mangled => {}
-            Ended::Corrupt(MAY_BE_LATE) => self.n2_late.doubted(asked, window, now),
-            Ended::Silent | Ended::Corrupt(_) => self.n2_late.given_up(asked, window, now),
+            Ended::Corrupt(MAY_BE_LATE) => self.waits.n2_late.doubted(asked, window, now),
+            Ended::Silent | Ended::Corrupt(_) => self.waits.n2_late.given_up(asked, window, now),
         }
     }
 
@@ -153,7 +153,7 @@ impl Master {
         now: Instant,
         news: &mut Vec<News>,
     ) {
-        let progress = self.sessions.done(drive, step, &end.ended, now);
+        let progress = self.waits.sessions.done(drive, step, &end.ended, now);
         match progress {
             Progress::Going | Progress::Failed => {}
             Progress::Unlike(device) => news.push(News::Unlike(drive, device)),
@@ -191,7 +191,7 @@ impl Master {
     /// Applies the result of a poll.
     fn polled(&mut self, poll: &Poll, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         // Of a step before the poll this is known already.
-        let heard = self.sessions.heard(poll.drive, &end.ended);
+        let heard = self.waits.sessions.heard(poll.drive, &end.ended);
         if heard == Progress::Restarted {
             self.restarted(poll.drive, now, news);
         }
@@ -250,7 +250,7 @@ impl Master {
         if let Some(drive) = self.drives.get_mut(index) {
             drive.went_offline(now);
         }
-        self.sessions.gone(index);
+        self.waits.sessions.gone(index);
         let gone = |c: &Command| c.drive == index && c.urgency != Urgency::Stop;
         self.bus.queue.lock().remove(now, &Outcome::Offline, gone);
         news.push(News::Offline(index));
@@ -271,7 +271,7 @@ impl Master {
             return;
         };
         let address = self.bus.image.drives.get(index).map(|image| image.spec.address);
-        let asked = address.and_then(|address| self.n2_late.asked_by(address, &pdu, now));
+        let asked = address.and_then(|address| self.waits.n2_late.asked_by(address, &pdu, now));
         let at = asked.unwrap_or_else(|| drive.late.asked_by(&pdu, now));
         drive.late.answered(&pdu, sent, now);
         if let Some(words) = reply.into_words() {
@@ -328,7 +328,7 @@ impl Master {
         if of_tool && slot != Urgency::Stop {
             self.schedule.background_owes(Pace::Brisk, end.took);
         }
-        if self.sessions.heard(index, &end.ended) == Progress::Restarted {
+        if self.waits.sessions.heard(index, &end.ended) == Progress::Restarted {
             self.restarted(index, now, news);
         }
         let reply = match end.ended {

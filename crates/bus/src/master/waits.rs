@@ -1,0 +1,80 @@
+//! What a transaction may have to wait for: replies that may still come late, N2 sessions, guards of starts, a drill.
+
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+use crate::codec::RequestPdu;
+use crate::command::{BackgroundRequest, Command, Order, PassedOn, Urgency};
+use crate::drive::{DriveIndex, PerDrive};
+use crate::drive_state::DriveState;
+use crate::late_replies::LateReplies;
+use crate::n2_late_replies::N2LateReplies;
+use crate::n2_session::N2Sessions;
+use crate::start_gate::StartGate;
+
+/// What a transaction may have to wait for.
+#[derive(Debug)]
+pub(super) struct Waits {
+    /// The N2 sessions of the drives.
+    pub(super) sessions: N2Sessions,
+    pub(super) n2_late: N2LateReplies,
+    /// Replies that may still arrive from addresses without a configured drive.
+    pub(super) strangers: BTreeMap<u8, LateReplies>,
+    /// Which starts may be written; none where nothing is guarded.
+    pub(super) starts: Option<StartGate>,
+    /// A drive to which a drill sends nothing but stops, and until when.
+    pub(super) quiet: Option<(DriveIndex, Instant)>,
+}
+
+impl Waits {
+    /// Until when the transaction cannot go, if it cannot now.
+    pub(super) fn blocks(
+        &mut self,
+        (drive, pdu): (DriveIndex, &RequestPdu),
+        passed_on: Option<&PassedOn>,
+        drives: &mut PerDrive<DriveState>,
+        now: Instant,
+    ) -> Option<Instant> {
+        // A poll identifies the drive.
+        if self.sessions.before(drive, Some(Urgency::Read), now).is_some() {
+            return Some(now + super::LOOK_ROUND);
+        }
+        let late = match (passed_on, drives.get_mut(drive)) {
+            (_, Some(drive)) => Some(&mut drive.late),
+            (Some(passed_on), None) => self.strangers.get_mut(&passed_on.address),
+            (None, None) => None,
+        };
+        let late = late.and_then(|late| late.blocks(pdu, now));
+        late.max(self.n2_late.blocks(pdu, now))
+    }
+
+    /// Until when a request has to wait, since it would reach a drive that a drill sends nothing.
+    pub(super) fn quiet_until(&self, request: &BackgroundRequest) -> Option<Instant> {
+        let (quiet, until) = self.quiet?;
+        let reach = request.passed_on.as_ref().map_or(&[][..], |passed_on| &passed_on.reach);
+        (request.drive == quiet || reach.contains(&quiet)).then_some(until)
+    }
+
+    /// Whether what is passed on to drives of the bus can go: nothing has started for any of them.
+    ///
+    /// # Errors
+    /// When it can, if it must wait.
+    pub(super) fn may_pass_on(
+        &mut self,
+        command: &Command,
+        drives: &mut PerDrive<DriveState>,
+        now: Instant,
+    ) -> Result<bool, Instant> {
+        let busy = |drive: &DriveState| drive.is_busy(Urgency::Stop) || drive.is_busy(Urgency::Command);
+        if command.reach().iter().filter_map(|drive| drives.get(*drive)).any(busy) {
+            return Ok(false);
+        }
+        let Order::Write(pdu) = &command.order else {
+            return Ok(true);
+        };
+        match self.blocks((command.drive, pdu), command.passed_on.as_ref(), drives, now) {
+            Some(until) => Err(until),
+            None => Ok(true),
+        }
+    }
+}
