@@ -1,8 +1,8 @@
 //! Drills: a motor is started at a low speed and stopped in each way by which it is to stop, and how long that took is kept.
 //!
 //! [`Drills::arm`] says what is to be tried, [`Drills::start`] begins it within [`ARMED`] and by the same client, and a task of the
-//! gateway calls [`Drills::look`] while one is under way. One at a time. However a drill ends, it ends with a stop: where drills are
-//! kept on disk, the motor starts once that is written, and a gateway that was killed meanwhile stops it when it is back. Pure: time
+//! gateway calls [`Drills::look`] while one is running. One at a time. Every drill ends with a stop, also one that a crash interrupts:
+//! where drills are kept on disk, the motor starts only after the start was written, and the next process sends the stop. Pure: time
 //! is an argument.
 
 mod report;
@@ -84,11 +84,11 @@ struct State {
     run: Option<Run>,
     ended: VecDeque<DrillReport>,
     proofs: Vec<Proof>,
-    /// Drills during which the gateway was killed; their motors may still run.
+    /// Drills interrupted by a crash; their motors may still run.
     cut_off: Vec<DrillReport>,
-    /// Drills that are over, before the audit and events have them.
+    /// Ended drills that are not in audit and events yet.
     unpublished: Vec<Ended>,
-    /// Whether a file keeps them.
+    /// Whether drills are kept on disk.
     keeps: bool,
     /// Counts what is to be kept.
     generation: u64,
@@ -166,7 +166,7 @@ impl Drills {
         let mut guard = self.state();
         let state = &mut *guard;
         state.drop_armed(now, time);
-        // Otherwise this drill would take the record of another one's end for an order.
+        // First, or this drill would mistake the audit record of another one's end for a command.
         state.publish(plant, now, time);
         let known = state.report(id).map(|report| report.state);
         let run = state.run.as_mut().filter(|run| run.report().id == id);
@@ -209,7 +209,7 @@ impl Drills {
         state.report(id).ok_or_else(|| DrillRefusal::Unknown(id.to_string()))
     }
 
-    /// Waits until there is something to look at or to keep.
+    /// Waits for a drill to start, or for [`wake`](Drills::wake).
     pub async fn begun(&self) {
         self.begun.notified().await;
     }
@@ -272,7 +272,7 @@ impl Drills {
         Some(ways(&drive.image.spec).into_iter().map(of).collect())
     }
 
-    /// Takes in what was kept before the start of the process. What was under way then is ended with a stop at the next looks.
+    /// Loads what an earlier process kept. The next looks stop the motor of a drill that was running then.
     pub fn restore(&self, saved: SavedDrills) {
         let mut state = self.state();
         let known = |state: &State, report: &DrillReport| state.report(&report.id).is_some();
@@ -284,12 +284,12 @@ impl Drills {
         state.bound();
     }
 
-    /// Whether a file keeps drills from now on: they start once it has them.
+    /// Sets whether drills are kept on disk; if so, they start once they are written.
     pub fn keep(&self, keeps: bool) {
         self.state().keeps = keeps;
     }
 
-    /// What is to be kept and its generation, as long as that is not [`kept`](Drills::kept).
+    /// What to write and its generation, until that is reported as [`kept`](Drills::kept).
     pub fn to_keep(&self) -> Option<(u64, SavedDrills)> {
         let state = self.state();
         if state.kept == state.generation {
@@ -304,7 +304,7 @@ impl Drills {
         Some((state.generation, SavedDrills::new(reports, state.proofs.clone())))
     }
 
-    /// Whether all that is to be kept is on disk.
+    /// Whether everything is on disk.
     pub fn is_kept(&self) -> bool {
         let state = self.state();
         state.kept == state.generation
@@ -315,7 +315,7 @@ impl Drills {
         self.state().run.as_ref().is_some_and(Run::waits_for_disk)
     }
 
-    /// That generation is on disk.
+    /// Reports that a generation is on disk.
     pub fn kept(&self, generation: u64, now: Instant) {
         let mut state = self.state();
         state.kept = state.kept.max(generation);
@@ -324,7 +324,7 @@ impl Drills {
         }
     }
 
-    /// What is to be kept cannot be written: a drill that waits for it does not start.
+    /// Reports that writing failed: a drill that waits for it does not start.
     pub fn not_kept(&self, why: &str, time: SystemTime) {
         let mut state = self.state();
         if state.run.as_mut().is_some_and(|run| run.not_kept(why, time)) {
@@ -350,14 +350,14 @@ impl State {
         false
     }
 
-    /// Adds what ended to the audit and the events.
+    /// Adds ended drills to audit and events.
     fn publish(&mut self, plant: &Plant, now: Instant, time: SystemTime) {
         for drill in self.unpublished.drain(..) {
             drill.publish(plant, now, time);
         }
     }
 
-    /// Begins to stop the motor of the next drill that was cut off.
+    /// Starts to stop the motor of the next interrupted drill.
     fn stop_cut_off(&mut self, plant: &Plant, now: Instant, time: SystemTime) {
         let Some(report) = self.cut_off.pop() else { return };
         let why = match plant.drive_at(&report.machine()) {

@@ -12,10 +12,10 @@ use crate::drive::ModelPoint;
 use crate::plant::Plant;
 use crate::process_image::Reading;
 
-/// Percent above `max_speed` at which a drill ends: the motor turns faster than it was told.
+/// Speed above `max_speed` that ends a drill, %.
 const TOO_FAST: f64 = 5.0;
 
-/// Why a drill ends at a drive that takes its orders from elsewhere.
+/// The reason when a drive is switched to local control.
 pub(super) const LOCAL: &str = "the drive was switched to local control";
 
 pub(super) fn is_local(reading: &Reading<'_>) -> bool {
@@ -24,7 +24,7 @@ pub(super) fn is_local(reading: &Reading<'_>) -> bool {
 }
 
 impl Run {
-    /// Why it does not go on.
+    /// The reason to end the drill early, if there is one.
     pub(super) fn interruption(&mut self, plant: &Plant, now: Instant) -> Option<String> {
         let there = plant.drive_at(&self.machine);
         if !there.is_some_and(|there| Arc::ptr_eq(&there.image, &self.drive.image)) {
