@@ -31,14 +31,14 @@ test: export CARGO_INCREMENTAL = 0
 # Documentation tests first, so that the output ends with the count of a suite that tests the product.
 test: tools lint deny advisories check ## Run every check and every test; installs missing test tools first
 	$(IN_OWN_TMP) cargo test --locked --workspace --doc
-	RUST_TEST_THREADS=$(TEST_THREADS) $(IN_OWN_TMP) cargo test --locked --workspace --tests --no-fail-fast
+	RUST_TEST_THREADS=$(TEST_THREADS) $(IN_OWN_TMP) cargo test --locked --workspace --exclude drivegate-world --tests --no-fail-fast
 
 tools: ## Install what the tests need (apt, PyPI, cargo); quick when nothing is missing
 	@tests/tools/install.sh
 
 lint: ## Check formatting and lints; any warning fails
 	cargo fmt --all --check
-	cargo clippy --locked --workspace --all-targets --test world -- -D warnings
+	cargo clippy --locked --workspace --all-targets -- -D warnings
 
 fmt: ## Format the code
 	cargo fmt --all
@@ -65,7 +65,7 @@ fuzz: ## Run every fuzz target FUZZ_RUNS times; needs nightly Rust and cargo-fuz
 		cargo +nightly fuzz run -s none "$$target" fuzz/corpus/$$target fuzz/seeds/$$target -- -runs=$(FUZZ_RUNS) -max_len=4096; \
 	done
 
-WORLD := cargo test --locked --profile world --test world
+WORLD := cargo test --locked --profile world -p drivegate-world --test world
 check: ## Run the seeded world with its fixed seeds: virtual time, no external tools
 	$(WORLD)
 

@@ -7,15 +7,15 @@
 use std::net::SocketAddrV4;
 use std::time::{Duration, Instant};
 
-use drivegate::bacnet::encoding::{Reader, Writer};
-use drivegate::bacnet::npdu::{self, Payload};
-use drivegate::bacnet::{Data, Mac, ObjectId, ObjectType, To, bvlc};
-use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
-use drivegate::command::{Outcome, Refusal};
-use drivegate::north::bacnet::{Offline, Options, WhenOffline};
-use drivegate::plant::Placed;
-use drivegate::process_image::{LeaseAction, Supervision};
-use drivegate::sim::random::Random;
+use drivegate_world::bacnet::encoding::{Reader, Writer};
+use drivegate_world::bacnet::npdu::{self, Payload};
+use drivegate_world::bacnet::{Data, Mac, ObjectId, ObjectType, To, bvlc};
+use drivegate_world::codec::{Protocol, Reply, RequestPdu, Table};
+use drivegate_world::command::{Outcome, Refusal};
+use drivegate_world::north::bacnet::{Offline, Options, WhenOffline};
+use drivegate_world::plant::Placed;
+use drivegate_world::process_image::{LeaseAction, Supervision};
+use drivegate_world::sim::random::Random;
 
 use super::bus::Seen;
 use super::orders::{reference_point, run_command};
@@ -498,7 +498,7 @@ fn all_at_once(seed: u64) -> (usize, usize) {
     }
     bench
         .rig
-        .set_faults(drivegate::sim::faults::FaultPlan::new("".parse().unwrap(), 0));
+        .set_faults(drivegate_world::sim::faults::FaultPlan::new("".parse().unwrap(), 0));
     bench.wait(Duration::from_secs(20));
     for client in &mut bench.clients {
         client.waits = false;

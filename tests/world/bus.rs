@@ -3,26 +3,26 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::bus::BusOptions;
-use drivegate::bus::core::{Action, BusCore, Closed};
-use drivegate::bus::master::{Handover, Purpose};
-use drivegate::bus::predict::predict;
-use drivegate::codec::wire::Silence;
-use drivegate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
-use drivegate::command::{CommandQueue, NO_DRIVE, WriteStats};
-use drivegate::drive::profile::Profiles;
-use drivegate::drive::{DriveIndex, PollClass, Profile};
-use drivegate::event::Events;
-use drivegate::line::LineOptions;
-use drivegate::plant::BusHandle;
-use drivegate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::half_duplex::{Delivery, HalfDuplex, LineRules};
-use drivegate::sim::random::Random;
-use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
-use drivegate::sim::slave::Slaves;
-use drivegate::sim::statistics::Transcript;
-use drivegate::start_guard::{BusGuards, Guards};
+use drivegate_world::bus::BusOptions;
+use drivegate_world::bus::core::{Action, BusCore, Closed};
+use drivegate_world::bus::master::{Handover, Purpose};
+use drivegate_world::bus::predict::predict;
+use drivegate_world::codec::wire::Silence;
+use drivegate_world::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
+use drivegate_world::command::{CommandQueue, NO_DRIVE, WriteStats};
+use drivegate_world::drive::profile::Profiles;
+use drivegate_world::drive::{DriveIndex, PollClass, Profile};
+use drivegate_world::event::Events;
+use drivegate_world::line::LineOptions;
+use drivegate_world::plant::BusHandle;
+use drivegate_world::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
+use drivegate_world::sim::faults::FaultPlan;
+use drivegate_world::sim::half_duplex::{Delivery, HalfDuplex, LineRules};
+use drivegate_world::sim::random::Random;
+use drivegate_world::sim::simulated_drive::{DriveOptions, ModelOptions};
+use drivegate_world::sim::slave::Slaves;
+use drivegate_world::sim::statistics::Transcript;
+use drivegate_world::start_guard::{BusGuards, Guards};
 
 use super::scenario::Line;
 
@@ -114,7 +114,7 @@ impl Parts {
         });
         let mut faults = FaultPlan::new(line.faults.parse().unwrap(), seed ^ 0xFA17 ^ index as u64);
         if let Some(point) = line.refuses
-            && let Some(raw) = profile.points[profile.point_index(point).unwrap()].raw()
+            && let Some(raw) = profile.points.get(profile.point_index(point).unwrap()).unwrap().raw()
         {
             faults = faults.refusing(1, raw.table, raw.address);
         }
@@ -212,7 +212,9 @@ impl WorldBus {
             handle(index, &self.line, &self.profile, format, &self.guards),
         );
         self.handle.take_over(std::slice::from_ref(&stopped), now);
-        stopped.queue.close(drivegate::command::Outcome::ShuttingDown, now);
+        stopped
+            .queue
+            .close(drivegate_world::command::Outcome::ShuttingDown, now);
         let (bus, options) = (self.handle.clone(), &self.options);
         self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
         if self.open {
@@ -244,14 +246,21 @@ impl WorldBus {
             return None;
         }
         let index = self.profile.point_index("maximum_frequency")?;
-        let raw = self.profile.points[index]
+        let raw = self
+            .profile
+            .points
+            .get(index)
+            .unwrap()
             .raw()
             .filter(|raw| raw.form.items() == 1)?
             .clone();
         let sim = self.sim(now);
         let drive = self.wire.slaves().drive(address)?;
         if let Some(hertz) = new {
-            let value = *raw.encode(drivegate::drive::Value::Number(hertz), 0).ok()?.first()?;
+            let value = *raw
+                .encode(drivegate_world::drive::Value::Number(hertz), 0)
+                .ok()?
+                .first()?;
             let address = raw.address;
             drive.answer(&RequestPdu::WriteRegister { address, value }, sim)?;
         }
@@ -259,7 +268,10 @@ impl WorldBus {
         let words = drive
             .answer(&RequestPdu::Read { table, start, count: 1 }, sim)?
             .words()?;
-        Some(raw.decode(&words, drivegate::drive::model::Kind::Number)?.as_f64())
+        Some(
+            raw.decode(&words, drivegate_world::drive::model::Kind::Number)?
+                .as_f64(),
+        )
     }
 
     /// The time of the line.

@@ -5,11 +5,11 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::command::Authority;
-use drivegate::north::modbus_tcp::{self, Uncached};
-use drivegate::north::mqtt::Incoming;
-use drivegate::north::{NorthState, mqtt};
-use drivegate::plant::{Placed, SharedPlant};
+use drivegate_world::command::Authority;
+use drivegate_world::north::modbus_tcp::{self, Uncached};
+use drivegate_world::north::mqtt::Incoming;
+use drivegate_world::north::{NorthState, mqtt};
+use drivegate_world::plant::{Placed, SharedPlant};
 
 use super::scenario::Habit;
 

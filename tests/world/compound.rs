@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use drivegate::codec::{Exception, Protocol, RequestPdu};
-use drivegate::command::{Order, Outcome, Refusal};
-use drivegate::drive::{ModelPoint, State, Value};
-use drivegate::sim::faults::FaultPlan;
+use drivegate_world::codec::{Exception, Protocol, RequestPdu};
+use drivegate_world::command::{Order, Outcome, Refusal};
+use drivegate_world::drive::{ModelPoint, State, Value};
+use drivegate_world::sim::faults::FaultPlan;
 
 use super::rig::{PATIENCE, Rig, line, write};
 use super::scenario::Line;

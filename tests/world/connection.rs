@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-use drivegate::bus::core::Closed;
-use drivegate::codec::Protocol;
-use drivegate::command::Outcome;
-use drivegate::diagnosis::Cause;
-use drivegate::drive::{ModelPoint, State, Value};
-use drivegate::event::EventKind;
+use drivegate_world::bus::core::Closed;
+use drivegate_world::codec::Protocol;
+use drivegate_world::command::Outcome;
+use drivegate_world::diagnosis::Cause;
+use drivegate_world::drive::{ModelPoint, State, Value};
+use drivegate_world::event::EventKind;
 
 use super::bus::{Parts, Seen};
 use super::rig::{PATIENCE, Rig, line};

@@ -4,12 +4,12 @@
 
 use std::time::Duration;
 
-use drivegate::codec::Protocol;
-use drivegate::command::Outcome;
-use drivegate::drive::profile::Profiles;
-use drivegate::drive::{ModelPoint, State};
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::random::Random;
+use drivegate_world::codec::Protocol;
+use drivegate_world::command::Outcome;
+use drivegate_world::drive::profile::Profiles;
+use drivegate_world::drive::{ModelPoint, State};
+use drivegate_world::sim::faults::FaultPlan;
+use drivegate_world::sim::random::Random;
 
 use super::rig::{Rig, line};
 use super::scenario::Line;
@@ -53,7 +53,7 @@ impl World {
         let takes = |name: &&str| {
             profile
                 .point_index(name)
-                .is_some_and(|index| profile.points[index].write)
+                .is_some_and(|index| profile.points.get(index).unwrap().write)
         };
         let mut references = ["frequency_reference", "speed_reference"].into_iter();
         World {

@@ -2,13 +2,13 @@
 
 use std::time::Duration;
 
-use drivegate::bus::predict::predict;
-use drivegate::codec::wire::Silence;
-use drivegate::codec::{Protocol, RequestPdu};
-use drivegate::command::{Order, Urgency};
-use drivegate::drive::{ModelPoint, PollClass, Value};
-use drivegate::plant::Placed;
-use drivegate::process_image::DriveSpec;
+use drivegate_world::bus::predict::predict;
+use drivegate_world::codec::wire::Silence;
+use drivegate_world::codec::{Protocol, RequestPdu};
+use drivegate_world::command::{Order, Urgency};
+use drivegate_world::drive::{ModelPoint, PollClass, Value};
+use drivegate_world::plant::Placed;
+use drivegate_world::process_image::DriveSpec;
 
 use super::bus::{Parts, Seen};
 use super::rig::{Rig, line};

@@ -4,13 +4,13 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::codec::Protocol;
-use drivegate::command::{Authority, DEFAULT_EXPIRY, Origin, Outcome, SourceKind};
-use drivegate::drill::{DrillOptions, DrillReport, DrillState, Drills, Kind, LOOK, SavedDrills};
-use drivegate::drive::ModelPoint;
-use drivegate::process_image::{LeaseAction, Supervision};
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::nx::Command;
+use drivegate_world::codec::Protocol;
+use drivegate_world::command::{Authority, DEFAULT_EXPIRY, Origin, Outcome, SourceKind};
+use drivegate_world::drill::{DrillOptions, DrillReport, DrillState, Drills, Kind, LOOK, SavedDrills};
+use drivegate_world::drive::ModelPoint;
+use drivegate_world::process_image::{LeaseAction, Supervision};
+use drivegate_world::sim::faults::FaultPlan;
+use drivegate_world::sim::nx::Command;
 
 use super::bus::Parts;
 use super::rig::{PATIENCE, Rig, line};

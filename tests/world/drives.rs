@@ -3,8 +3,8 @@
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
-use drivegate::codec::RequestPdu;
-use drivegate::command::written;
+use drivegate_world::codec::RequestPdu;
+use drivegate_world::command::written;
 
 use super::orders::{Unique, sets};
 

@@ -1,10 +1,10 @@
 //! Every family of the reference, over every protocol it speaks, commanded through the same sequence and read by the
 //! same names: what differs is in the profiles, nobody who commands a drive has to know.
 
-use drivegate::codec::Protocol;
-use drivegate::drive::profile::Profiles;
-use drivegate::drive::{ModelPoint, State, Value};
-use drivegate::sim::simulated_drive::ModelOptions;
+use drivegate_world::codec::Protocol;
+use drivegate_world::drive::profile::Profiles;
+use drivegate_world::drive::{ModelPoint, State, Value};
+use drivegate_world::sim::simulated_drive::ModelOptions;
 
 use super::rig::{PATIENCE, Rig, line};
 use super::scenario::Line;

@@ -5,21 +5,21 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::codec::{Protocol, Table};
-use drivegate::command::{
+use drivegate_world::codec::{Protocol, Table};
+use drivegate_world::command::{
     Authority, DEFAULT_EXPIRY, HoldState, Mode, Order, Origin, Outcome, Principal, Proof, Refusal, Rules, SourceKind,
     Verb, written,
 };
-use drivegate::plant::Placed;
-use drivegate::process_image::DriveSpec;
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::random::Random;
-use drivegate::start_guard::Guard;
+use drivegate_world::plant::Placed;
+use drivegate_world::process_image::DriveSpec;
+use drivegate_world::sim::faults::FaultPlan;
+use drivegate_world::sim::random::Random;
+use drivegate_world::start_guard::Guard;
 
 use super::bus::{Parts, Seen};
 use super::rig::{PATIENCE, Rig, line};
 use super::scenario::Line;
-use drivegate::drive::DriveIndex;
+use drivegate_world::drive::DriveIndex;
 
 const SECOND: Duration = Duration::from_secs(1);
 const LEASE: Duration = Duration::from_secs(3);
@@ -157,7 +157,10 @@ impl Play {
             return;
         };
         let profile = self.rig.bus.profile.clone();
-        let reference = profile.points[profile.point_index("speed_reference").unwrap()]
+        let reference = profile
+            .points
+            .get(profile.point_index("speed_reference").unwrap())
+            .unwrap()
             .raw()
             .unwrap()
             .address;

@@ -8,16 +8,16 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use drivegate::codec::wire::Silence;
-use drivegate::codec::{Protocol, Table};
-use drivegate::command::{Order, Outcome};
-use drivegate::drive::Point;
-use drivegate::drive::profile::{Profile, Profiles};
-use drivegate::plant::Placed;
-use drivegate::sim::faults::{Fault, FaultPlan};
-use drivegate::sim::half_duplex::Delivery;
-use drivegate::sim::nx::{NxOptions, Values};
-use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
+use drivegate_world::codec::wire::Silence;
+use drivegate_world::codec::{Protocol, Table};
+use drivegate_world::command::{Order, Outcome};
+use drivegate_world::drive::Point;
+use drivegate_world::drive::profile::{Profile, Profiles};
+use drivegate_world::plant::Placed;
+use drivegate_world::sim::faults::{Fault, FaultPlan};
+use drivegate_world::sim::half_duplex::Delivery;
+use drivegate_world::sim::nx::{NxOptions, Values};
+use drivegate_world::sim::simulated_drive::{DriveOptions, ModelOptions};
 
 use super::bus::{Parts, Seen};
 use super::orders::unique_reference;

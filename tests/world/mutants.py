@@ -90,7 +90,7 @@ def put_in(tree, mutants):
 
 
 def build():
-    command = ["cargo", "test", "--locked", "--profile", "world", "--test", "world", "--no-run", "--message-format=json"]
+    command = ["cargo", "test", "--locked", "--profile", "world", "-p", "drivegate-world", "--test", "world", "--no-run", "--message-format=json"]
     env = os.environ | {"CARGO_TARGET_DIR": str(ROOT / "target")}
     built = subprocess.run(command, cwd=COPY, env=env, stdout=subprocess.PIPE, text=True)
     messages = [json.loads(line) for line in built.stdout.splitlines() if line.startswith("{")]

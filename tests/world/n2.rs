@@ -3,11 +3,11 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use drivegate::codec::{Exception, Protocol, n2};
-use drivegate::command::Outcome;
-use drivegate::drive::{ModelPoint, Profile, Quality, State, Value};
-use drivegate::event::EventKind;
-use drivegate::sim::faults::FaultPlan;
+use drivegate_world::codec::{Exception, Protocol, n2};
+use drivegate_world::command::Outcome;
+use drivegate_world::drive::{ModelPoint, Profile, Quality, State, Value};
+use drivegate_world::event::EventKind;
+use drivegate_world::sim::faults::FaultPlan;
 
 use super::bus::Parts;
 use super::rig::{PATIENCE, Rig, line};

@@ -2,15 +2,15 @@
 
 use std::time::Duration;
 
-use drivegate::codec::{Exception, Protocol, RequestPdu};
-use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Refusal, SourceKind};
-use drivegate::drive::{ModelPoint, Quality, State, Value};
-use drivegate::event::EventKind;
-use drivegate::process_image::{Access, LeaseAction, Supervision};
-use drivegate::sim::faults::{Fault, FaultPlan};
-use drivegate::sim::nx::NxOptions;
-use drivegate::sim::simulated_drive::ModelOptions;
-use drivegate::sim::statistics::Recorded;
+use drivegate_world::codec::{Exception, Protocol, RequestPdu};
+use drivegate_world::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Refusal, SourceKind};
+use drivegate_world::drive::{ModelPoint, Quality, State, Value};
+use drivegate_world::event::EventKind;
+use drivegate_world::process_image::{Access, LeaseAction, Supervision};
+use drivegate_world::sim::faults::{Fault, FaultPlan};
+use drivegate_world::sim::nx::NxOptions;
+use drivegate_world::sim::simulated_drive::ModelOptions;
+use drivegate_world::sim::statistics::Recorded;
 
 use super::bus::Parts;
 use super::rig::{PATIENCE, Rig, line};

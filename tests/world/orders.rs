@@ -2,10 +2,10 @@
 
 use std::time::Instant;
 
-use drivegate::codec::{RequestPdu, Table};
-use drivegate::command::{Order, written};
-use drivegate::drive::{ModelPoint, Point, Profile, Value};
-use drivegate::sim::random::Random;
+use drivegate_world::codec::{RequestPdu, Table};
+use drivegate_world::command::{Order, written};
+use drivegate_world::drive::{ModelPoint, Point, PointIndex, Profile, Value};
+use drivegate_world::sim::random::Random;
 
 /// What an order wants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -97,19 +97,19 @@ pub struct Record {
 }
 
 /// The writable register with a figure of its own that sets the speed, and the values that it takes.
-pub fn reference_point(profile: &Profile) -> (usize, &Point) {
+pub fn reference_point(profile: &Profile) -> (PointIndex, &Point) {
     let names = ["speed_reference", "frequency_reference", "frequency_command"];
     let index = names.iter().find_map(|name| {
         let index = profile.point_index(name)?;
-        let point = &profile.points[index];
+        let point = profile.points.get(index).unwrap();
         (point.write && point.write_to.is_none() && point.raw().is_some()).then_some(index)
     });
     let index = index.unwrap_or_else(|| panic!("{} has no reference", profile.name));
-    (index, &profile.points[index])
+    (index, profile.points.get(index).unwrap())
 }
 
 /// A value of the reference that no order had for a long time, and the words that it is.
-pub fn unique_reference(profile: &Profile, number: usize) -> (usize, Value, Unique) {
+pub fn unique_reference(profile: &Profile, number: usize) -> (PointIndex, Value, Unique) {
     let (index, point) = reference_point(profile);
     let raw = point.raw().unwrap();
     // 0 to 40 in hundredths: within what every family takes, and never what supervision sets (20 %, of any range).
@@ -197,11 +197,11 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
             ))
         }
         Wish::Reset => model(ModelPoint::FaultReset, Value::Bool(true)),
-        Wish::Reverse => model(ModelPoint::Reverse, Value::Bool(number % 2 == 0)),
+        Wish::Reverse => model(ModelPoint::Reverse, Value::Bool(number.is_multiple_of(2))),
         Wish::Parameter => {
             let named = profile.point_index("acceleration_time");
             let index = named.filter(|_| profile.name.ends_with("n2"))?;
-            let raw = profile.points[index].raw()?;
+            let raw = profile.points.get(index).unwrap().raw()?;
             // 1 to 20.99 s.
             let value = Value::Number((100 + number % 2_000) as f64 / 100.0);
             let words = raw.encode(value, 0).ok()?;
@@ -216,7 +216,8 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
             } else {
                 ModelPoint::SpeedReference
             };
-            let writes = |index: &usize| profile.points[*index].write && !profile.name.ends_with("n2");
+            let writes =
+                |index: &PointIndex| profile.points.get(*index).unwrap().write && !profile.name.ends_with("n2");
             let index = profile.model_index(point).filter(writes)?;
             Some((Order::Points(vec![(index, value)]), None))
         }
@@ -248,7 +249,7 @@ fn raw_other(profile: &Profile, number: usize) -> Option<RequestPdu> {
         (last.saturating_sub(8).max(first)..=last).map(move |address| (range.table, address, range.write))
     });
     let named = profile.point_index("general_control_word");
-    let word = named.and_then(|index| profile.points[index].raw());
+    let word = named.and_then(|index| profile.points.get(index).unwrap().raw());
     let word = word.map(|raw| (raw.table, raw.address, 20));
     let is_point = |table, address| {
         let mut points = profile.points.iter();
@@ -266,7 +267,7 @@ fn raw_other(profile: &Profile, number: usize) -> Option<RequestPdu> {
             values: vec![0; 2],
         },
         // The process data behind the general control word.
-        _ if most > 1 && number % 2 == 0 => RequestPdu::WriteRegisters {
+        _ if most > 1 && number.is_multiple_of(2) => RequestPdu::WriteRegisters {
             start: address,
             values: vec![0; 2],
         },

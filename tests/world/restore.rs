@@ -5,18 +5,18 @@
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
-use drivegate::codec::{Protocol, Reply, RequestPdu};
-use drivegate::command::{Authority, Order, Origin, Outcome, ParameterOrder, SourceKind};
-use drivegate::drive::ModelPoint;
-use drivegate::parameters::{
+use drivegate_world::codec::{Protocol, Reply, RequestPdu};
+use drivegate_world::command::{Authority, Order, Origin, Outcome, ParameterOrder, SourceKind};
+use drivegate_world::drive::ModelPoint;
+use drivegate_world::parameters::{
     End, Journal, NO_IDENTIFICATION, Names, Next, Owner, ParameterFile, Phase, Plan, Reading, Restoration, Then,
     Wanted, Wishes, differences, plan,
 };
-use drivegate::plant::Placed;
-use drivegate::process_image::ParamsAccess;
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::nx::Command;
-use drivegate::sim::random::Random;
+use drivegate_world::plant::Placed;
+use drivegate_world::process_image::ParamsAccess;
+use drivegate_world::sim::faults::FaultPlan;
+use drivegate_world::sim::nx::Command;
+use drivegate_world::sim::random::Random;
 
 use super::bus::Seen;
 use super::rig::{Rig, line};
@@ -219,7 +219,7 @@ impl Bench {
                             if (*table, *start, *count) == (running.table, running.address, running.form.items()));
                     let words = asked.reply.as_ref().and_then(Reply::words).filter(|_| asks);
                     let stands = words
-                        .and_then(|words| running.decode(&words, drivegate::drive::model::Kind::Bool))
+                        .and_then(|words| running.decode(&words, drivegate_world::drive::model::Kind::Bool))
                         .is_some_and(|runs| !runs.as_bool());
                     self.stands = stands.then_some(asked.at);
                 }
@@ -486,7 +486,11 @@ fn one(seed: u64, cuts: u64) -> (usize, usize, usize, usize) {
     let written: BTreeSet<_> = bench.plan.writes.iter().map(|write| &write.id).collect();
     let others = differences(&before, &after);
     let others: Vec<_> = others.iter().filter(|one| !written.contains(&one.id)).collect();
-    assert_eq!(others, Vec::<&drivegate::parameters::Difference>::new(), "seed {seed}");
+    assert_eq!(
+        others,
+        Vec::<&drivegate_world::parameters::Difference>::new(),
+        "seed {seed}"
+    );
     if done {
         let source = held(&mut bench.rig, SOURCE);
         let left_out: BTreeSet<_> = bench.plan.left_out.iter().map(|(id, _)| id.clone()).collect();

@@ -4,16 +4,16 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
-use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
-use drivegate::drive::{ModelPoint, PollClass, Sample, State, Value};
-use drivegate::event::Events;
-use drivegate::plant::{DriveHandle, Placed, Plant, SharedPlant};
-use drivegate::process_image::{OnShutdown, Outcome as Counted};
-use drivegate::sim::SimTime;
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::simulated_drive::SimulatedDrive;
-use drivegate::sim::statistics::{Direction, Recorded};
+use drivegate_world::codec::{Protocol, Reply, RequestPdu, Table};
+use drivegate_world::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate_world::drive::{ModelPoint, PollClass, Sample, State, Value};
+use drivegate_world::event::Events;
+use drivegate_world::plant::{DriveHandle, Placed, Plant, SharedPlant};
+use drivegate_world::process_image::{OnShutdown, Outcome as Counted};
+use drivegate_world::sim::SimTime;
+use drivegate_world::sim::faults::FaultPlan;
+use drivegate_world::sim::simulated_drive::SimulatedDrive;
+use drivegate_world::sim::statistics::{Direction, Recorded};
 
 use super::bus::{Parts, Seen, WorldBus};
 use super::scenario::Line;

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use drivegate::codec::Protocol;
-use drivegate::drive::RawWrites;
-use drivegate::process_image::{DriveSpec, LeaseAction, OnShutdown, Supervision};
-use drivegate::sim::random::Random;
+use drivegate_world::codec::Protocol;
+use drivegate_world::drive::RawWrites;
+use drivegate_world::process_image::{DriveSpec, LeaseAction, OnShutdown, Supervision};
+use drivegate_world::sim::random::Random;
 
 /// One world.
 #[derive(Debug, Clone)]

@@ -2,13 +2,13 @@
 
 use std::time::{Duration, Instant};
 
-use drivegate::codec::{Protocol, Reply, Table};
-use drivegate::command::{Order, Outcome};
-use drivegate::drive::{ModelPoint, Value};
-use drivegate::plant::Placed;
-use drivegate::process_image::{LeaseAction, Supervision};
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::random::Random;
+use drivegate_world::codec::{Protocol, Reply, Table};
+use drivegate_world::command::{Order, Outcome};
+use drivegate_world::drive::{ModelPoint, Value};
+use drivegate_world::plant::Placed;
+use drivegate_world::process_image::{LeaseAction, Supervision};
+use drivegate_world::sim::faults::FaultPlan;
+use drivegate_world::sim::random::Random;
 
 use super::bus::{Parts, Seen};
 use super::clients::{Servers, answers, write_frame};

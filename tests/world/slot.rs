@@ -6,14 +6,14 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::codec::{LineFormat, Protocol, RequestPdu, Table};
-use drivegate::command::Urgency;
-use drivegate::drive::{DriveIndex, ModelPoint};
-use drivegate::north::slot::{Offline, Slot, SlotAccess};
-use drivegate::north::{NorthState, SlotOutcome};
-use drivegate::process_image::Access;
-use drivegate::sim::random::Random;
-use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
+use drivegate_world::codec::{LineFormat, Protocol, RequestPdu, Table};
+use drivegate_world::command::Urgency;
+use drivegate_world::drive::{DriveIndex, ModelPoint};
+use drivegate_world::north::slot::{Offline, Slot, SlotAccess};
+use drivegate_world::north::{NorthState, SlotOutcome};
+use drivegate_world::process_image::Access;
+use drivegate_world::sim::random::Random;
+use drivegate_world::sim::simulated_drive::{DriveOptions, ModelOptions};
 
 mod order;
 
@@ -180,7 +180,7 @@ impl ToolRig {
         let (address, pdu) = (self.asks)(&mut self.dice, &self.line);
         let mut frame = Vec::new();
         self.line.protocol.encode(
-            &drivegate::codec::Request {
+            &drivegate_world::codec::Request {
                 address,
                 pdu: pdu.clone(),
                 n2: self.rig.bus.profile.n2,
@@ -499,7 +499,7 @@ fn a_stop_of_a_tool_goes_as_a_stop_and_takes_a_held_start_away() {
     let set = |value: u16| RequestPdu::WriteRegister { address: 2000, value };
     let frame = |pdu: &RequestPdu| {
         let mut frame = Vec::new();
-        Protocol::ModbusRtu.encode(&drivegate::codec::Request::new(1, pdu.clone()), &mut frame);
+        Protocol::ModbusRtu.encode(&drivegate_world::codec::Request::new(1, pdu.clone()), &mut frame);
         frame
     };
     // A reference takes the share of writes; the start behind it is held.

@@ -6,16 +6,16 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::codec::{Protocol, RequestPdu, Table};
-use drivegate::command::{
+use drivegate_world::codec::{Protocol, RequestPdu, Table};
+use drivegate_world::command::{
     Authority, Mode, Order, Origin, Outcome, Principal, Proof, Refusal, Rules, SourceKind, written,
 };
-use drivegate::drive::{ModelPoint, State, Value};
-use drivegate::plant::Placed;
-use drivegate::process_image::DriveSpec;
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::random::Random;
-use drivegate::start_guard::{Guard, Guards, Interlock, Saved};
+use drivegate_world::drive::{ModelPoint, State, Value};
+use drivegate_world::plant::Placed;
+use drivegate_world::process_image::DriveSpec;
+use drivegate_world::sim::faults::FaultPlan;
+use drivegate_world::sim::random::Random;
+use drivegate_world::start_guard::{Guard, Guards, Interlock, Saved};
 
 use super::bus::Seen;
 use super::rig::{PATIENCE, Rig, line, write};

@@ -16,14 +16,16 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use drivegate::codec::{Protocol, Reply, RequestPdu};
-use drivegate::command::{Authority, CAPACITY, NO_DRIVE, Order, Origin, Outcome, SourceKind, WriteStats, written};
-use drivegate::drive::{ModelPoint, Quality, RawWrites, Value};
-use drivegate::event::{EventKind, Events};
-use drivegate::north::mqtt::Incoming;
-use drivegate::plant::{Plant, SharedPlant};
-use drivegate::process_image::{LeaseAction, OnShutdown};
-use drivegate::sim::random::Random;
+use drivegate_world::codec::{Protocol, Reply, RequestPdu};
+use drivegate_world::command::{
+    Authority, CAPACITY, NO_DRIVE, Order, Origin, Outcome, SourceKind, WriteStats, written,
+};
+use drivegate_world::drive::{ModelPoint, Quality, RawWrites, Value};
+use drivegate_world::event::{EventKind, Events};
+use drivegate_world::north::mqtt::Incoming;
+use drivegate_world::plant::{Plant, SharedPlant};
+use drivegate_world::process_image::{LeaseAction, OnShutdown};
+use drivegate_world::sim::random::Random;
 use tokio::sync::broadcast;
 use tokio::sync::oneshot;
 
@@ -89,7 +91,7 @@ pub struct World {
     now: Instant,
     plant: SharedPlant,
     events: Events,
-    heard_events: broadcast::Receiver<Arc<drivegate::event::Event>>,
+    heard_events: broadcast::Receiver<Arc<drivegate_world::event::Event>>,
     writes: Arc<WriteStats>,
     buses: Vec<WorldBus>,
     truths: Vec<Vec<Truth>>,

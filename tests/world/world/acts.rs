@@ -1,6 +1,7 @@
 //! What the clients do.
 
 use super::*;
+use drivegate_world::drive::PointIndex;
 
 /// How much longer a client waits whose order was answered at once.
 const TURNED_AWAY: Duration = Duration::from_millis(40);
@@ -87,7 +88,7 @@ impl World {
             Habit::Steady => self.plain(index, bus, drive, Wish::Reference, ms(2_000)),
             Habit::Duels if self.clients[index].open > 1 => {}
             Habit::Duels => {
-                let wish = if self.records.len() % 2 == 0 {
+                let wish = if self.records.len().is_multiple_of(2) {
                     Wish::Run
                 } else {
                     Wish::Stop
@@ -112,7 +113,7 @@ impl World {
             }
             Habit::Floods => {
                 let wish = match Wish::of(&mut self.dice) {
-                    Wish::RawRead if self.records.len() % 2 == 0 => Wish::RawOther,
+                    Wish::RawRead if self.records.len().is_multiple_of(2) => Wish::RawOther,
                     wish => wish,
                 };
                 self.plain(index, bus, drive, wish, ms(2_000));
@@ -126,7 +127,7 @@ impl World {
                 };
                 // Without the dice: the rest of the world is the same.
                 let wish = match wish {
-                    Wish::RawRead if self.records.len() % 2 == 0 => Wish::RawOther,
+                    Wish::RawRead if self.records.len().is_multiple_of(2) => Wish::RawOther,
                     wish => wish,
                 };
                 // One that is over soon may run out while the line falls silent before it.
@@ -325,7 +326,9 @@ impl World {
                 continue;
             };
             let id = self.record(client, bus, drive, wish, Duration::from_secs(2));
-            let field = |(index, value): &(usize, Value)| format!("\"{}\": {value}", profile.points[*index].name);
+            let field = |(index, value): &(PointIndex, Value)| {
+                format!("\"{}\": {value}", profile.points.get(*index).unwrap().name)
+            };
             let fields: Vec<String> = points.iter().map(field).collect();
             let name = self.buses[bus].handle.image.drives[drive].spec.name.clone();
             let message = Incoming {

@@ -1,6 +1,6 @@
 //! The end of the gateway.
 
-use drivegate::command::NotStopped;
+use drivegate_world::command::NotStopped;
 
 use super::*;
 
@@ -38,7 +38,7 @@ impl World {
             });
         }
         for (index, bus) in self.buses.iter_mut().enumerate() {
-            let on_shutdown = bus.line.on_shutdown == drivegate::process_image::OnShutdown::Stop;
+            let on_shutdown = bus.line.on_shutdown == drivegate_world::process_image::OnShutdown::Stop;
             let Some(missing) = missing.get(&index).filter(|_| on_shutdown) else {
                 continue;
             };

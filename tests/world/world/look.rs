@@ -51,17 +51,17 @@ impl World {
         self.read_by_http();
     }
 
-    pub(super) fn on_event(&mut self, event: &drivegate::event::Event) {
+    pub(super) fn on_event(&mut self, event: &drivegate_world::event::Event) {
         let text = format!("event {}: {}", event.kind.name(), event.text);
         self.note(move || text);
         let Some(name) = &event.drive else { return };
         for bus in 0..self.buses.len() {
             let drives = &self.buses[bus].handle.image.drives;
-            if let Some(drive) = drives.iter().position(|drive| drive.spec.name == *name) {
-                if event.kind == EventKind::Supervision {
-                    self.truths[bus][drive].supervised = Some(self.now);
-                    self.figures.supervised += 1;
-                }
+            if let Some(drive) = drives.iter().position(|drive| drive.spec.name == *name)
+                && event.kind == EventKind::Supervision
+            {
+                self.truths[bus][drive].supervised = Some(self.now);
+                self.figures.supervised += 1;
             }
         }
     }
@@ -181,7 +181,7 @@ impl World {
             let bad = |point: ModelPoint| {
                 profile.model_index(point).is_some() && reading.model(point).quality != Quality::Good
             };
-            use drivegate::drive::State;
+            use drivegate_world::drive::State;
             match reading.state() {
                 Some(State::Running) => assert!(!bad(ModelPoint::Running), "running though nobody knows"),
                 Some(State::Ready | State::NotReady) => {

@@ -3,10 +3,10 @@
 
 use std::time::SystemTime;
 
-use drivegate::drive::{Point, PollClass, Profile, Source};
-use drivegate::north::metrics::{self, Format};
-use drivegate::north::{NorthState, http};
-use drivegate::plant::DriveHandle;
+use drivegate_world::drive::{Point, PointIndex, PollClass, Profile, Source};
+use drivegate_world::north::metrics::{self, Format};
+use drivegate_world::north::{NorthState, http};
+use drivegate_world::plant::DriveHandle;
 use serde_json::Value as Json;
 
 use super::*;
@@ -38,8 +38,8 @@ fn name_of(point: &Point) -> &str {
     point.model.map_or(&point.name, |model| model.name())
 }
 
-fn is_good(json: &Json, profile: &Profile, index: usize) -> bool {
-    json["points"][name_of(&profile.points[index])]["quality"] == "good"
+fn is_good(json: &Json, profile: &Profile, index: PointIndex) -> bool {
+    json["points"][name_of(profile.points.get(index).unwrap())]["quality"] == "good"
 }
 
 fn check_json(drive: &DriveHandle, plant: &Plant, json: &Json, now: Instant) {
@@ -48,7 +48,7 @@ fn check_json(drive: &DriveHandle, plant: &Plant, json: &Json, now: Instant) {
     let slow = plant.stale_after + 2 * drive.bus.image.spec.slow_cycle;
     let points = &json["points"];
     let monitored = drive.image.snapshot().monitored.clone();
-    for (index, point) in profile.points.iter().enumerate() {
+    for (index, point) in profile.points.enumerate() {
         let own = name_of(point);
         let reported = &points[own];
         if reported["quality"] != "good" {
@@ -104,7 +104,7 @@ fn check_metrics(drive: &DriveHandle, json: &Json, text: &str) {
     let of_drive = format!("drive=\"{name}\"");
     let samples = text.lines().filter(|line| line.starts_with("drivegate_point_value{"));
     let samples: Vec<&str> = samples.filter(|line| line.contains(&of_drive)).collect();
-    for (index, point) in profile.points.iter().enumerate() {
+    for (index, point) in profile.points.enumerate() {
         let label = format!("point=\"{}\"", point.name);
         let sample = samples.iter().any(|line| line.contains(&label));
         assert!(
