@@ -43,10 +43,42 @@ pub enum Next {
 struct Scope {
     /// It sets every bit that can be commanded, except reset bits.
     whole: bool,
-    /// It sets the run command.
-    names_run: bool,
     /// It sets references only.
     reference_only: bool,
+    /// It is acknowledged only when the drive shows its effect.
+    reads_back: bool,
+}
+
+/// How much of a command was sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum OnWire {
+    Nothing,
+    /// Only reads that prepare a write.
+    Reads,
+    /// A write; of a command that reads, its read.
+    Command,
+}
+
+/// What is left to send.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    /// The steps as ordered.
+    Steps,
+    /// The same, after the last word of a sequence, which starts the motor: if the rest fails, a stop follows.
+    MotorStarted,
+    /// The end of a pulse, or that stop, which is sent whatever happens.
+    OnlyEnds,
+}
+
+/// Whether the drive may have executed a write whose reply is missing or not trusted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Doubt {
+    No,
+    /// A write was not acknowledged.
+    Unanswered,
+    /// The acknowledgement may have been a late reply to another request: the write is repeated only when no late reply
+    /// can arrive any more.
+    LateReply,
 }
 
 /// How far the tries of the present step got.
@@ -56,8 +88,7 @@ struct Tries {
     /// How the last attempt without a conclusive reply failed: [`Outcome::TimedOut`], [`Outcome::Garbled`] or
     /// [`Outcome::Unknown`].
     unanswered: Outcome,
-    /// A write was sent but not acknowledged: whether the drive executed it is unknown.
-    in_doubt: bool,
+    doubt: Doubt,
     /// Consecutive "busy" replies.
     busy: u32,
     /// It is tried again after that time.
@@ -80,32 +111,18 @@ pub struct CommandRun {
     tries: Tries,
     /// The outcome where it ends before all was sent.
     cut: Option<Outcome>,
-    /// Nothing is left but the end of a pulse, which is sent whatever happens.
-    only_ends: bool,
+    phase: Phase,
     reply: Reply,
-    /// It, or a part of it, was sent; a preparatory read does not count.
-    begun: bool,
-    /// Any step of it was on the wire.
-    reached_the_wire: bool,
-    /// Whether the motor runs, as the drive last reported.
-    running: bool,
-    check: Check,
+    on_wire: OnWire,
+    known: Known,
     /// The drive refused the function by which its present step was written: the other one is tried.
     by_other_function: bool,
     /// The register, or coil, of the run command.
     control: Option<(Table, u16)>,
-    /// The drive's own word cannot be read: bits that the command does not set are written as 0.
-    blind: bool,
     /// It waited for a late reply since its last step was chosen.
     held_up: bool,
-    /// A stop whose acknowledgement may have been a late reply.
-    waits_for_late: bool,
     /// Stops that were done since it was last written.
     overtaken: u32,
-    /// It is acknowledged only when the drive shows its effect.
-    reads_back: bool,
-    /// The last word of a sequence was sent, which starts the motor: if the rest fails, a stop follows.
-    started: bool,
     /// A stop as it was ordered, for a bus that takes the place of this one.
     stop: Option<Order>,
     /// The start that it causes, of a motor whose starts are counted.
@@ -133,10 +150,16 @@ impl CommandRun {
         let stop = (urgency == Urgency::Stop).then(|| order.clone());
         let scope = Scope {
             whole: matches!(&order, Order::Points(values) if sets_all_bits(profile, values)),
-            names_run: matches!(&order, Order::Points(values) if names_run(profile, values)),
             reference_only,
+            reads_back: matches!(&order, Order::Parameter(order) if order.from.is_some()),
         };
-        let reads_back = matches!(&order, Order::Parameter(order) if order.from.is_some());
+        let known = Known {
+            check: Check::NotYet,
+            blind: false,
+            names_run: matches!(&order, Order::Points(values) if names_run(profile, values)),
+            running: true,
+            masks: false,
+        };
         let parameter = match &order {
             Order::Parameter(order) => ParameterRun::new(order.clone(), profile),
             Order::Points(_) | Order::Write(_) | Order::Read(_) => None,
@@ -174,25 +197,19 @@ impl CommandRun {
             tries: Tries {
                 failures: 0,
                 unanswered: Outcome::TimedOut,
-                in_doubt: false,
+                doubt: Doubt::No,
                 busy: 0,
                 pause: None,
             },
             cut: unsendable.map(Outcome::Refused),
-            only_ends: false,
+            phase: Phase::Steps,
             reply: Reply::Written,
-            begun: was_begun,
-            reached_the_wire: was_begun,
-            running: true,
-            check: Check::NotYet,
+            on_wire: if was_begun { OnWire::Command } else { OnWire::Nothing },
+            known,
             by_other_function: false,
             control: profile.run_place().map(|place| (place.table, place.address)),
-            blind: false,
             held_up: false,
-            waits_for_late: false,
             overtaken: 0,
-            reads_back,
-            started: false,
             stop,
             start: None,
             renews: true,
@@ -210,7 +227,7 @@ impl CommandRun {
         let Some(ticket) = self.tickets.pop() else {
             return Err(Box::new(self));
         };
-        let expires = self.expires;
+        let (expires, was_begun) = (self.expires, self.has_begun());
         Ok(Command {
             drive,
             order,
@@ -226,7 +243,7 @@ impl CommandRun {
             asked: None,
             touched: Touched::Anything,
             passed_on: None,
-            was_begun: self.begun,
+            was_begun,
             // They are noted.
             effects: Vec::new(),
             slot: None,
@@ -282,9 +299,9 @@ impl CommandRun {
     /// What the command needs next. `running` is what the drive last reported. Once it has expired nothing more is
     /// sent, except to clear a reset bit that is set.
     pub fn next(&mut self, words: &KnownWords, profile: &Profile, running: bool, now: Instant) -> Next {
-        self.running = running;
+        (self.known.running, self.known.masks) = (running, words.functions.masks(profile));
         if self.is_late(now) {
-            let outcome = if self.tries.failures > 0 || self.tries.in_doubt {
+            let outcome = if self.tries.failures > 0 || self.in_doubt() {
                 self.tries.unanswered.clone()
             } else if self.tries.busy > 0 {
                 Outcome::Exception(Exception::BUSY)
@@ -294,7 +311,7 @@ impl CommandRun {
             self.cut_off(outcome);
         }
         if let Some(pause) = self.tries.pause.take() {
-            let end = if self.only_ends { now + pause } else { self.expires };
+            let end = if self.may_write_on() { self.expires } else { now + pause };
             self.not_before = Some((now + pause).min(end));
         }
         if let Some(at) = self.not_before {
@@ -313,13 +330,6 @@ impl CommandRun {
                 self.not_before = Some(until);
                 return Next::Wait(until);
             }
-            let known = Known {
-                check: self.check,
-                blind: self.blind,
-                names_run: self.scope.names_run,
-                running,
-                masks: words.functions.masks(profile),
-            };
             let step = match action {
                 Action::Await(_) => match self.awaits(now) {
                     Some(step) => Some(step),
@@ -329,7 +339,7 @@ impl CommandRun {
                     self.only_last_word(*reverse, profile);
                     continue;
                 }
-                Action::Word(word) => match control::word(*word, words, profile, known) {
+                Action::Word(word) => match control::word(*word, words, profile, self.known) {
                     Made::Send(step) => Some(step),
                     Made::Nothing => None,
                     Made::Refused(refusal) => {
@@ -337,7 +347,7 @@ impl CommandRun {
                         continue;
                     }
                 },
-                action => step_of(action, words, profile, known),
+                action => step_of(action, words, profile, self.known),
             };
             match step {
                 Some(mut step) => {
@@ -345,8 +355,12 @@ impl CommandRun {
                     if let Some(other) = other(&step.pdu).filter(|_| self.by_other_function) {
                         step.pdu = other;
                     }
-                    if let Some(Action::Word(Word::Sequence(number, _))) = self.actions.front() {
-                        self.started |= step.pdu.is_write() && control::is_last(profile, *number);
+                    if let Some(Action::Word(Word::Sequence(number, _))) = self.actions.front()
+                        && self.phase == Phase::Steps
+                        && step.pdu.is_write()
+                        && control::is_last(profile, *number)
+                    {
+                        self.phase = Phase::MotorStarted;
                     }
                     return Next::Send(step);
                 }
@@ -394,17 +408,17 @@ impl CommandRun {
 
     /// Whether it may write more than the end of a pulse.
     pub fn may_write_on(&self) -> bool {
-        !self.only_ends
+        self.phase != Phase::OnlyEnds
     }
 
-    /// Whether it, or a part of it, was on the wire.
+    /// Whether it, or a part of it, was on the wire; a preparatory read does not count.
     pub fn has_begun(&self) -> bool {
-        self.begun
+        self.on_wire == OnWire::Command
     }
 
     /// Whether any step of it was on the wire.
     pub fn reached_the_wire(&self) -> bool {
-        self.reached_the_wire
+        self.on_wire != OnWire::Nothing
     }
 
     /// The parameter that it sets, if it sets one.
@@ -418,7 +432,7 @@ impl CommandRun {
     /// Whether its write must be the next transaction: it sets a parameter and the drive just reported that its motor
     /// is stopped, or a bit of a settings register that was just read.
     pub fn is_checked(&mut self) -> bool {
-        let settings = self.check == Check::Read && self.settings().is_some();
+        let settings = self.known.check == Check::Read && self.settings().is_some();
         settings || self.parameter().is_some_and(|run| run.is_checked())
     }
 
@@ -426,7 +440,7 @@ impl CommandRun {
     /// other settings in the register.
     pub fn others_go_first(&mut self) {
         if self.settings().is_some() {
-            self.check = Check::NotYet;
+            self.known.check = Check::NotYet;
         }
         if let Some(run) = self.parameter() {
             run.check_again();
@@ -445,7 +459,7 @@ impl CommandRun {
 
     /// Whether the drive showed its effect before it was acknowledged.
     pub fn was_read_back(&self) -> bool {
-        self.reads_back
+        self.scope.reads_back
     }
 
     /// A step of it is on the wire.
@@ -453,8 +467,11 @@ impl CommandRun {
         if let Some(run) = self.parameter().filter(|_| step.purpose == StepPurpose::Execute) {
             run.written();
         }
-        self.reached_the_wire = true;
-        self.begun |= step.pdu.is_write() || self.urgency == Urgency::Read;
+        let sent = match step.pdu.is_write() || self.urgency == Urgency::Read {
+            true => OnWire::Command,
+            false => OnWire::Reads,
+        };
+        self.on_wire = self.on_wire.max(sent);
         if step.pdu.is_write() {
             self.overtaken = 0;
         }
@@ -467,20 +484,23 @@ impl CommandRun {
 
     /// Whether the end of its pulse goes before the next stop, because so many stops went first.
     pub fn is_put_off(&self) -> bool {
-        self.only_ends && self.overtaken >= MOST_STOPS
+        !self.may_write_on() && self.overtaken >= MOST_STOPS
     }
 
     /// `unbegun` where nothing of it was sent; else that it was cut short, its end being unknown.
     fn unless_begun(&self, unbegun: Outcome, why: Interruption) -> Outcome {
-        if self.begun { Outcome::Interrupted(why) } else { unbegun }
+        if self.has_begun() {
+            Outcome::Interrupted(why)
+        } else {
+            unbegun
+        }
     }
 
     /// The reply to its last step may have been a late one: the step is repeated when no late reply can arrive any
     /// more.
     pub fn wait_for_late_replies(&mut self) {
         self.ask_before_repeating();
-        self.tries.in_doubt = true;
-        self.waits_for_late = true;
+        self.tries.doubt = Doubt::LateReply;
     }
 
     fn ask_before_repeating(&mut self) {
@@ -492,7 +512,7 @@ impl CommandRun {
     /// Whether it waits while a late reply could be mistaken for the reply to its step. A stop waits only once it was
     /// sent.
     pub fn waits_for_late(&self) -> bool {
-        self.urgency != Urgency::Stop || self.waits_for_late
+        self.urgency != Urgency::Stop || self.tries.doubt == Doubt::LateReply
     }
 
     /// It must wait for a late reply: what it has read is outdated by then.
@@ -508,22 +528,22 @@ impl CommandRun {
             self.others_go_first();
             return true;
         }
-        let again = held_up && self.check == Check::Read;
+        let again = held_up && self.known.check == Check::Read;
         if again {
-            self.check = Check::NotYet;
+            self.known.check = Check::NotYet;
         }
         again
     }
 
     fn pop(&mut self) {
         self.actions.pop_front();
-        self.check = Check::NotYet;
+        self.known.check = Check::NotYet;
         self.by_other_function = false;
     }
 
     /// It has expired, and its remaining steps are not cancelled yet.
     pub fn is_late(&self, now: Instant) -> bool {
-        now >= self.expires && !self.only_ends
+        now >= self.expires && self.may_write_on()
     }
 }
 

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use crate::command::{Order, Receipt, written};
 use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, PollClass, Profile, Value};
+use crate::drive::{ModelPoint, PointIndex, PollClass, Profile, Value};
 use crate::process_image::Reading;
 
 /// Commands to one drive that are watched at one time; beyond that the oldest stays "acknowledged".
@@ -26,7 +26,7 @@ pub enum Effect {
     /// No fault is active.
     NoFault,
     /// The point (index in the profile) reads as it was written.
-    ReadBack(usize, Value),
+    ReadBack(PointIndex, Value),
 }
 
 impl Effect {
@@ -81,7 +81,7 @@ pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
                 .zip(run)
                 .and_then(|(index, run)| effect_of(profile, index, Value::Bool(run))));
             let word_at = |address| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word);
-            for (index, point) in profile.points.iter().enumerate().filter(|(_, p)| p.write && !p.pulse) {
+            for (index, point) in profile.points.enumerate().filter(|(_, p)| p.write && !p.pulse) {
                 let Some(raw) = point.raw().filter(|r| r.table == table) else {
                     continue;
                 };
@@ -98,7 +98,7 @@ pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
     effects
 }
 
-fn effect_of(profile: &Profile, index: usize, value: Value) -> Option<Effect> {
+fn effect_of(profile: &Profile, index: PointIndex, value: Value) -> Option<Effect> {
     let is = |point| profile.model_index(point) == Some(index);
     let reads = |point| profile.model_point(point).is_some_and(|p| p.class != PollClass::Never);
     if is(ModelPoint::Run) && reads(ModelPoint::Running) {

@@ -14,7 +14,7 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Admitted, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats, written};
 use crate::drive::control::{Control, ControlItem, OwnWord, Run, Setting};
 use crate::drive::profile::Form;
-use crate::drive::{DriveIndex, ModelPoint, Profile, Raw, Value};
+use crate::drive::{DriveIndex, ModelPoint, PointIndex, Profile, Raw, Value};
 
 /// Requests after which a command should have ended, reads of a state for which it waits among them.
 const MOST_FRAMES: usize = 1000;
@@ -165,7 +165,7 @@ impl Proof {
 fn overlaps(profile: &Profile, control: &Control) -> Result<(), Box<Counterexample>> {
     let is_own = |point: ModelPoint| profile.model_index(point);
     let own = [ModelPoint::Run, ModelPoint::Reverse, ModelPoint::FaultReset].map(is_own);
-    let points = profile.points.iter().enumerate();
+    let points = profile.points.enumerate();
     for (index, point) in points.filter(|(_, point)| point.is_commanded()) {
         let shares = |raw: &Raw| match raw.form {
             Form::Bit { bit, .. } if control.own_word == OwnWord::Kept => takes(control, 1u16 << bit.min(15)),
@@ -208,7 +208,7 @@ struct Case<'p> {
     /// The gateway knows the control word.
     known: bool,
     sets: Sets,
-    values: Vec<(usize, Value)>,
+    values: Vec<(PointIndex, Value)>,
 }
 
 /// The progress of a case.
@@ -230,7 +230,7 @@ impl<'p> Case<'p> {
         let values = sets
             .iter()
             .map(|(point, on)| Some((profile.model_index(*point)?, Value::Bool(*on))));
-        let values: Option<Vec<(usize, Value)>> = values.collect();
+        let values: Option<Vec<(PointIndex, Value)>> = values.collect();
         Some(Case {
             profile,
             control,
@@ -249,7 +249,7 @@ impl<'p> Case<'p> {
         self.says(ModelPoint::Run) == Some(false)
     }
 
-    fn begin(&self, values: Vec<(usize, Value)>, urgency: Urgency, now: Instant, expires: Instant) -> CommandRun {
+    fn begin(&self, values: Vec<(PointIndex, Value)>, urgency: Urgency, now: Instant, expires: Instant) -> CommandRun {
         let origin = Origin::new(SourceKind::LocalSocket, "proof");
         let (ticket, _) = Ticket::new(origin, "", String::new(), false, now, Arc::new(WriteStats::default()));
         let admitted = Admitted {

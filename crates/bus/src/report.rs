@@ -18,7 +18,7 @@ use super::tap::{self, Tap};
 use super::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::{Exception, Reply, Request, Table};
 use crate::command::WriteStats;
-use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, PollClass, Value};
+use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, PointIndex, PollClass, Value};
 use crate::event::{EventKind, Events};
 use crate::process_image::{
     Access, BusImage, DriveImage, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Verdict,
@@ -58,7 +58,7 @@ pub(super) struct Wanted {
     /// The drive with a new fault.
     pub(super) fault: Option<DriveIndex>,
     /// Drive, monitoring point and time.
-    pub(super) monitors: Vec<(DriveIndex, usize, Instant)>,
+    pub(super) monitors: Vec<(DriveIndex, PointIndex, Instant)>,
 }
 
 /// The known response of a drive to a silent master.
@@ -80,7 +80,7 @@ impl Report {
     ) -> Report {
         let drives = image.drives.len();
         let silence = image.spec.protocol.silence(options.silence, &image.spec.format);
-        let points = image.drives.iter().map(|drive| &*drive.spec.profile.points);
+        let points = image.drives.iter().map(|drive| &drive.spec.profile.points);
         Report {
             selections: Selections::new(points, now),
             diagnosis: LineDiagnosis::new(image.clone(), silence, options.response_timeout, now),

@@ -7,7 +7,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, Point, Raw};
+use crate::drive::{DriveIndex, ModelPoint, PerDrive, PerPoint, PlannedRead, Point, PointIndex, Raw};
 use crate::process_image::Reading;
 
 /// Comparisons that differ, of one and the same selection, until it counts as changed.
@@ -36,8 +36,8 @@ struct DriveSelections {
 /// A point of process data and the state of its comparisons.
 #[derive(Debug)]
 struct Compared {
-    point: usize,
-    monitor: usize,
+    point: PointIndex,
+    monitor: PointIndex,
     trust: Trust,
     /// Process data before the monitoring register was read, and that register: to be compared with the next process data.
     open: Option<(f64, f64)>,
@@ -68,27 +68,27 @@ enum Verdict {
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Findings {
     /// Monitoring points to be read, and when.
-    pub(super) wanted: Vec<(usize, Instant)>,
+    pub(super) wanted: Vec<(PointIndex, Instant)>,
     /// The points whose value comes from their monitoring register from now on, if that changed.
-    pub(super) monitored: Option<Vec<usize>>,
+    pub(super) monitored: Option<Vec<PointIndex>>,
     /// Points now known to differ, with both values: the first ones of the drive.
-    pub(super) differ: Vec<(usize, f64, f64)>,
+    pub(super) differ: Vec<(PointIndex, f64, f64)>,
     /// Points that match the profile again.
-    pub(super) restored: Vec<usize>,
+    pub(super) restored: Vec<PointIndex>,
 }
 
 impl Selections {
     /// Of drives with these points.
-    pub(super) fn new<'p>(drives: impl Iterator<Item = &'p [Point]>, now: Instant) -> Selections {
-        let compared = |(point, monitor): (usize, usize)| Compared {
+    pub(super) fn new<'p>(drives: impl Iterator<Item = &'p PerPoint<Point>>, now: Instant) -> Selections {
+        let compared = |(point, monitor): (PointIndex, PointIndex)| Compared {
             point,
             monitor,
             trust: Trust::Unproven(now, PAUSE.0),
             open: None,
             last: 0.0,
         };
-        let of = |points: &[Point]| {
-            let pairs = points.iter().enumerate();
+        let of = |points: &PerPoint<Point>| {
+            let pairs = points.enumerate();
             let pairs = pairs.filter_map(|(index, point)| Some((index, point.monitor?)));
             DriveSelections {
                 points: pairs.map(compared).collect(),
@@ -136,7 +136,7 @@ impl Selections {
             let running = profile.model_index(ModelPoint::Running);
             running.is_some_and(|running| reading.sample(running).good().is_some_and(|value| value.as_bool()))
         };
-        let value = |point: usize| reading.own_sample(point).good().map(|value| value.as_f64());
+        let value = |point: PointIndex| reading.own_sample(point).good().map(|value| value.as_f64());
         let (mut wanted, mut differ, mut restored) = (Vec::new(), Vec::new(), Vec::new());
         for compared in self.points(drive) {
             let Some((point, monitor)) = profile
@@ -178,12 +178,12 @@ impl Selections {
         &mut self,
         drive: DriveIndex,
         reading: &Reading<'_>,
-        wanted: Vec<(usize, Instant)>,
-        differ: Vec<(usize, f64, f64)>,
-        restored: Vec<usize>,
+        wanted: Vec<(PointIndex, Instant)>,
+        differ: Vec<(PointIndex, f64, f64)>,
+        restored: Vec<PointIndex>,
     ) -> Findings {
         let monitored = self.points(drive).filter(|compared| compared.is_monitored());
-        let monitored: Vec<usize> = monitored.map(|compared| compared.point).collect();
+        let monitored: Vec<PointIndex> = monitored.map(|compared| compared.point).collect();
         Findings {
             monitored: (monitored != reading.snapshot.monitored).then_some(monitored),
             wanted,

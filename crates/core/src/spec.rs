@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::codec::{LineFormat, Protocol};
-use crate::drive::{Profile, RawWrites};
+use crate::drive::{PointIndex, Profile, RawWrites};
 use crate::start_guard::{Guard, Interlock};
 
 /// Whether a drive may be commanded.
@@ -107,7 +107,7 @@ pub struct DriveSpec {
 #[derive(Debug, Clone, PartialEq)]
 pub struct PointTrigger {
     /// Index of the point in the profile.
-    pub point: usize,
+    pub point: PointIndex,
     pub limit: TriggerLimit,
     /// For how long without interruption.
     pub hold: Duration,
@@ -207,7 +207,7 @@ impl DriveSpec {
     }
 
     /// Limits of a command to that point: the configured ones, else the profile's.
-    pub fn limits_of(&self, point: usize) -> Option<RangeInclusive<f64>> {
+    pub fn limits_of(&self, point: PointIndex) -> Option<RangeInclusive<f64>> {
         let point = self.profile.points.get(point)?;
         self.limits.get(&point.name).cloned().or_else(|| point.range.clone())
     }

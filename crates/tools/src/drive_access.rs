@@ -17,7 +17,7 @@ use super::client::{Asked, Client, ClientError, Door, Gateway, NotFound, Reply, 
 use super::{EXIT_CONFIG, report};
 use crate::config::{BusSettings, Settings, environment};
 use crate::document::{candidates, nearest};
-use crate::drive::Profile;
+use crate::drive::{PointIndex, Profile};
 use crate::north::http::messages::{Expected, ExpectedDrive};
 use crate::north::local::SocketPath;
 use crate::process_image::DriveSpec;
@@ -150,7 +150,7 @@ impl Target {
 ///
 /// # Errors
 /// The message when there is none.
-pub(super) fn point(profile: &Profile, name: &str) -> Result<usize, String> {
+pub(super) fn point(profile: &Profile, name: &str) -> Result<PointIndex, String> {
     profile.point_index(name).ok_or_else(|| {
         let remedy = match candidates(name, profile.points.iter().map(|p| p.name.as_str())).as_slice() {
             [] => format!("`drivegate profiles show {}` lists them", profile.name),

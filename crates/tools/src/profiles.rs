@@ -18,7 +18,7 @@ use crate::config::{Settings, environment, unknown_profile};
 use crate::document::{Finding, Problem, format_duration};
 use crate::drive::control::Mask;
 use crate::drive::profile::{AddressRange, Form, Profiles};
-use crate::drive::{Bound, Derived, Point, Profile, Source, Step};
+use crate::drive::{Bound, Derived, Point, PointIndex, Profile, Source, Step};
 
 /// Mark of a point, fault text or address that no manual confirms.
 const NOT_VERIFIED: &str = "not verified";
@@ -475,7 +475,7 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
     }
 }
 
-fn name_of(profile: &Profile, point: usize) -> &str {
+fn name_of(profile: &Profile, point: PointIndex) -> &str {
     profile.points.get(point).map_or("?", |point| point.name.as_str())
 }
 

@@ -7,9 +7,9 @@ use super::{EXIT_CONFIG, report};
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{self, BusSettings, Settings, default_format};
 use crate::document::{self, Problem, nearest};
-use crate::drive::Point;
 use crate::drive::model::Kind;
 use crate::drive::profile::{Profile, Profiles};
+use crate::drive::{Point, PointIndex};
 use crate::process_image::DriveSpec;
 use crate::sim::by_profile::Given;
 use crate::sim::cx::AddressOffset;
@@ -153,13 +153,12 @@ fn model_of(profile: &Arc<Profile>) -> Result<ModelOptions, String> {
 }
 
 /// `POINT=VALUE`, the value as the point has it.
-fn given(text: &str, profile: &Profile) -> Result<(usize, Given), String> {
+fn given(text: &str, profile: &Profile) -> Result<(PointIndex, Given), String> {
     let (name, value) = text
         .split_once('=')
         .ok_or_else(|| format!("`{text}` has no value; in --set; write POINT=VALUE, such as voltage_l1=231.5"))?;
     let found = profile
         .points
-        .iter()
         .position(|point| point.name == name && point.raw().is_some());
     let found = found.and_then(|index| profile.points.get(index).map(|point| (index, point)));
     let (index, point) = found.ok_or_else(|| {

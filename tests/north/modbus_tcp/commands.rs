@@ -1,5 +1,6 @@
 //! Writes: what reaches the bus, and when they are answered.
 
+use drivegate::drive::PointIndex;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -16,7 +17,7 @@ fn named(rig: &Rig, order: &Order) -> String {
     let profile = rig.drive("pump-1").spec.profile.clone();
     match order {
         Order::Points(values) => {
-            let one = |(i, v): &(usize, Value)| format!("{}={v}", profile.points[*i].name);
+            let one = |(i, v): &(PointIndex, Value)| format!("{}={v}", profile.points.get(*i).unwrap().name);
             values.iter().map(one).collect::<Vec<_>>().join(" ")
         }
         other => format!("{other:?}"),

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant, SystemTime};
 use arc_swap::ArcSwap;
 use drivegate::codec::{Protocol, Reply, Table};
 use drivegate::command::{Order, Outcome};
-use drivegate::drive::Value;
+use drivegate::drive::{PointIndex, Value};
 use drivegate::event::{Event, EventKind};
 use drivegate::north::NorthState;
 use drivegate::north::mqtt::{self, History, Mqtt, Options, Qos, Telemetry};
@@ -507,7 +507,7 @@ async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
         for bus in &plant.load().buses {
             while let Some(command) = take_next(&bus.queue, now) {
                 let drive = &bus.image.drives[command.drive.place()];
-                let name = |index: usize| drive.spec.profile.points[index].name.clone();
+                let name = |index: PointIndex| drive.spec.profile.points.get(index).unwrap().name.clone();
                 if let Order::Points(points) = &command.order {
                     let points = points.iter().map(|(index, value)| (name(*index), *value)).collect();
                     // It may have come after `now`.

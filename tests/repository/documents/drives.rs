@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use drivegate::codec::{N2Options, Protocol, Table, n2};
 use drivegate::drive::profile::{Form, Profile, Profiles};
-use drivegate::drive::{Bound, Derived, ModelPoint, Point, PollClass, Source, Value};
+use drivegate::drive::{Bound, Derived, ModelPoint, Point, PointIndex, PollClass, Source, Value};
 
 /// The families, Modbus first.
 const MODBUS: [&str; 5] = ["vacon-nx", "eaton-svx", "eaton-hvx", "vacon-cx", "teco-7300pa"];
@@ -141,7 +141,7 @@ fn place(profile: &Profile, point: &Point) -> String {
 }
 
 fn derivation(profile: &Profile, derived: &Derived) -> String {
-    let name = |i: &usize| format!("`{}`", profile.points[*i].name);
+    let name = |i: &PointIndex| format!("`{}`", profile.points.get(*i).unwrap().name);
     let end = |bound: &Bound| match bound {
         Bound::Point(i) => name(i),
         Bound::Fixed(figure) => figure.to_string(),

@@ -12,7 +12,7 @@ use crate::codec::{Reply, RequestPdu, Table};
 use crate::command::Refusal;
 use crate::drive::control::{self, Control, ControlItem, Mask, OwnWord, Run, Setting, Until};
 use crate::drive::model::Kind;
-use crate::drive::{ModelPoint, Profile, Raw, Value};
+use crate::drive::{ModelPoint, PointIndex, Profile, Raw, Value};
 
 /// Pause between two looks at a state for which a sequence waits.
 pub(super) const LOOK_PAUSE: Duration = Duration::from_millis(20);
@@ -139,7 +139,7 @@ pub(super) struct Ordered {
 
 impl Ordered {
     /// Takes the value, if the point follows from `[control]`.
-    pub(super) fn takes(&mut self, profile: &Profile, index: usize, value: Value) -> bool {
+    pub(super) fn takes(&mut self, profile: &Profile, index: PointIndex, value: Value) -> bool {
         let is = |point: ModelPoint| {
             let model = profile.model_index(point);
             let written = model.and_then(|model| profile.points.get(model)?.write_to);
@@ -162,7 +162,7 @@ impl Ordered {
     }
 
     /// Whether the value says whether the motor is to run.
-    pub(super) fn says_run(mut self, profile: &Profile, index: usize, value: Value) -> bool {
+    pub(super) fn says_run(mut self, profile: &Profile, index: PointIndex, value: Value) -> bool {
         self.takes(profile, index, value) && self.run.is_some()
     }
 

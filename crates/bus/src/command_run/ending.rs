@@ -2,9 +2,9 @@
 
 use std::time::Instant;
 
-use super::CommandRun;
 use super::control::Word;
 use super::steps::{Action, Check};
+use super::{CommandRun, Phase};
 use crate::codec::Exception;
 use crate::command::{Interruption, Origin, Outcome, Receipt, Refusal};
 use crate::confirm::Effect;
@@ -14,10 +14,10 @@ impl CommandRun {
     pub(super) fn give_up(&mut self, outcome: Outcome) {
         self.actions.clear();
         self.cut.get_or_insert(outcome);
-        self.only_ends = true;
+        let phase = std::mem::replace(&mut self.phase, Phase::OnlyEnds);
         self.tries.pause = None;
-        (self.tries.failures, self.check) = (0, Check::NotYet);
-        if std::mem::take(&mut self.started) {
+        (self.tries.failures, self.known.check) = (0, Check::NotYet);
+        if phase == Phase::MotorStarted {
             self.actions.push_back(Action::Word(Word::Stop(None)));
         }
     }
@@ -31,12 +31,12 @@ impl CommandRun {
 
     /// Whether it is still pending: nothing of it was sent, or the drive was busy each time.
     pub fn is_owed(&self) -> bool {
-        !self.begun || (self.tries.busy > 0 && !self.tries.in_doubt)
+        !self.has_begun() || (self.tries.busy > 0 && !self.in_doubt())
     }
 
     /// Its result when it is withdrawn before it is due.
     pub fn taken_back(&self) -> Outcome {
-        match self.begun {
+        match self.has_begun() {
             true => Outcome::Exception(Exception::BUSY),
             false => Outcome::Withdrawn,
         }
@@ -46,7 +46,7 @@ impl CommandRun {
     /// that ends the command.
     pub fn purge(&mut self) -> Option<Outcome> {
         // The stop that came in is on its way.
-        self.started = false;
+        self.leave_motor();
         self.cut_off(self.unless_begun(Outcome::Purged, Interruption::Stop));
         self.actions.is_empty().then(|| self.success())
     }
@@ -54,9 +54,16 @@ impl CommandRun {
     /// Another client took the drive: the command ends, but the motor is left as it is. Returns the outcome if that
     /// ends it at once.
     pub fn taken(&mut self, refusal: Refusal) -> Option<Outcome> {
-        self.started = false;
+        self.leave_motor();
         self.cut_off(self.unless_begun(Outcome::Refused(refusal), Interruption::Taken));
         self.actions.is_empty().then(|| self.success())
+    }
+
+    /// Its end sends no stop of its own to a motor that it started.
+    fn leave_motor(&mut self) {
+        if self.phase == Phase::MotorStarted {
+            self.phase = Phase::Steps;
+        }
     }
 
     pub(super) fn cut_off(&mut self, outcome: Outcome) {
@@ -73,10 +80,10 @@ impl CommandRun {
             self.actions.clear();
         }
         let left = self.actions.len();
-        if std::mem::take(&mut self.started) && before > left {
+        let phase = std::mem::replace(&mut self.phase, Phase::OnlyEnds);
+        if phase == Phase::MotorStarted && before > left {
             self.actions.push_back(Action::Word(Word::Stop(None)));
         }
-        self.only_ends = true;
         self.tries.pause = None;
         if before != left {
             self.cut = Some(outcome);

@@ -6,7 +6,7 @@ use super::control::{LOOK_PAUSE, Word};
 use super::functions::other;
 use super::parameter::Then;
 use super::steps::{Action, Check};
-use super::{CommandRun, KnownWords, Step, StepPurpose};
+use super::{CommandRun, Doubt, KnownWords, Phase, Step, StepPurpose};
 use crate::codec::{Exception, Reply, RequestPdu};
 use crate::command::{Outcome, Urgency};
 
@@ -31,12 +31,12 @@ impl CommandRun {
             return self.parameter_answered(step, &reply, words);
         }
         // A read between the tries of a write does not make them more.
-        if !self.tries.in_doubt || step.purpose != StepPurpose::ReadWord {
+        if !self.in_doubt() || step.purpose != StepPurpose::ReadWord {
             self.tries.failures = 0;
         }
         // An exception shows nothing about an earlier try that was not answered.
         if step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
-            self.tries.in_doubt = false;
+            self.tries.doubt = Doubt::No;
         }
         if self.waits_while_busy(step, &reply) {
             return None;
@@ -45,20 +45,20 @@ impl CommandRun {
         match (step.purpose, reply) {
             (StepPurpose::Release, Reply::Exception(code)) => self.not_released(&code.to_string()),
             (StepPurpose::Compare, reply) => {
-                self.check = learn(step, &reply, words);
+                self.known.check = learn(step, &reply, words);
                 None
             }
             (StepPurpose::ReadWord, Reply::Exception(code)) => self.word_refused(step, code, words),
             (StepPurpose::ReadWord, reply) => match learn(step, &reply, words) {
                 Check::Read => {
-                    self.check = Check::Read;
+                    self.known.check = Check::Read;
                     None
                 }
                 _ => Some(Outcome::Exception(Exception::DEVICE_FAILURE)),
             },
             (StepPurpose::AskState, reply) => self.state_answered(&reply),
             // It says nothing of an earlier try that was not answered.
-            (StepPurpose::Execute, Reply::Exception(code)) if self.tries.in_doubt => self.ended(Outcome::Unknown(code)),
+            (StepPurpose::Execute, Reply::Exception(code)) if self.in_doubt() => self.ended(Outcome::Unknown(code)),
             (StepPurpose::Execute, Reply::Exception(code)) => self.ended(Outcome::Exception(code)),
             (purpose, reply) => {
                 words.written(&step.pdu);
@@ -94,8 +94,9 @@ impl CommandRun {
 
     /// It ends so; where its sequence started the motor, a stop goes before that.
     fn ended(&mut self, outcome: Outcome) -> Option<Outcome> {
-        if self.urgency == Urgency::Stop || self.only_ends || !self.started {
-            return Some(self.cut.clone().filter(|_| self.only_ends).unwrap_or(outcome));
+        if self.urgency == Urgency::Stop || self.phase != Phase::MotorStarted {
+            let cut = self.cut.clone().filter(|_| !self.may_write_on());
+            return Some(cut.unwrap_or(outcome));
         }
         self.give_up(outcome);
         None
@@ -112,15 +113,15 @@ impl CommandRun {
         // A read that the drive is still working on has changed nothing; it is repeated.
         let is_busy = matches!(reply, Reply::Exception(code) if code.is_busy()
             || (*code == Exception::ACKNOWLEDGE && step.purpose == StepPurpose::ReadWord));
-        if !(is_busy && waits) || (self.only_ends && self.tries.busy >= MOST_BUSY) {
+        if !(is_busy && waits) || (!self.may_write_on() && self.tries.busy >= MOST_BUSY) {
             return false;
         }
         let (first, longest) = BUSY_PAUSE;
         self.tries.pause = Some((first * (1 << self.tries.busy.min(5))).min(longest));
         self.tries.busy = self.tries.busy.saturating_add(1);
-        if self.check == Check::Read {
+        if self.known.check == Check::Read {
             // By the next try it may have changed again.
-            self.check = Check::NotYet;
+            self.known.check = Check::NotYet;
         }
         true
     }
@@ -149,7 +150,7 @@ impl CommandRun {
         let run = self.parameter()?;
         let then = run.answered(reply, &unanswered);
         if !run.is_in_doubt() {
-            (self.tries.failures, self.tries.in_doubt) = (0, false);
+            (self.tries.failures, self.tries.doubt) = (0, Doubt::No);
         }
         match then {
             Then::Go => None,
@@ -166,7 +167,7 @@ impl CommandRun {
 
     fn word_refused(&mut self, step: &Step, code: Exception, words: &KnownWords) -> Option<Outcome> {
         // The answer to a read does not show whether an earlier write was taken.
-        let refused = match self.tries.in_doubt {
+        let refused = match self.in_doubt() {
             true => self.tries.unanswered.clone(),
             false => Outcome::Exception(code),
         };
@@ -199,7 +200,9 @@ impl CommandRun {
     pub fn failed(&mut self, step: &Step, how: Outcome, retries: u32) -> Option<Outcome> {
         self.tries.failures += 1;
         self.tries.unanswered = how;
-        self.tries.in_doubt |= step.pdu.is_write();
+        if step.pdu.is_write() {
+            self.tries.doubt = self.tries.doubt.max(Doubt::Unanswered);
+        }
         let over = self.tries.failures > retries;
         if let Some(run) = self.parameter() {
             if step.purpose == StepPurpose::Release && over {
@@ -214,7 +217,7 @@ impl CommandRun {
         match step.purpose {
             StepPurpose::Release if over => return self.not_released("no reply"),
             StepPurpose::Compare if self.urgency == Urgency::Stop => {
-                self.check = Check::InVain;
+                self.known.check = Check::InVain;
                 return None;
             }
             StepPurpose::ReadWord if self.settings().is_some() => return over.then(|| self.without_answer()),
@@ -224,11 +227,11 @@ impl CommandRun {
             }
             _ => {}
         }
-        if step.pdu.is_write() && self.check == Check::Read {
+        if step.pdu.is_write() && self.known.check == Check::Read {
             // By the next try it may have changed again.
-            self.check = Check::NotYet;
+            self.known.check = Check::NotYet;
         }
-        if over && self.started && !self.only_ends {
+        if over && self.phase == Phase::MotorStarted {
             self.give_up(self.tries.unanswered.clone());
             return None;
         }
@@ -242,20 +245,20 @@ impl CommandRun {
     /// The step was acknowledged, perhaps by a late reply to another request.
     pub(crate) fn doubted(&mut self) {
         self.ask_before_repeating();
-        self.tries.in_doubt = true;
+        self.tries.doubt = self.tries.doubt.max(Doubt::Unanswered);
     }
 
     /// Whether the drive may have taken a write that it did not answer: its words are not known then.
     pub(crate) fn in_doubt(&self) -> bool {
-        self.tries.in_doubt
+        self.tries.doubt != Doubt::No
     }
 
     /// The word was asked for without success. Whether the command goes on with what is known all the same: where the
     /// drive never reports it (`unreadable`), and at the end of a pulse, which no read stands in the way of.
     fn goes_on(&mut self, unreadable: bool) -> bool {
-        let goes_on = self.check == Check::NotYet && (unreadable || self.ends_pulse());
+        let goes_on = self.known.check == Check::NotYet && (unreadable || self.ends_pulse());
         if goes_on {
-            self.check = Check::InVain;
+            self.known.check = Check::InVain;
             self.tries.failures = 0;
         }
         goes_on
@@ -265,11 +268,11 @@ impl CommandRun {
     /// command to a motor that stands, and one that sets every bit; another one could stop or turn a motor that runs,
     /// and ends with `outcome`.
     fn without_word(&mut self, outcome: Outcome) -> Option<Outcome> {
-        if self.urgency != Urgency::Stop && self.running && !self.scope.whole {
+        if self.urgency != Urgency::Stop && self.known.running && !self.scope.whole {
             return Some(outcome);
         }
-        self.blind = true;
-        self.check = Check::InVain;
+        self.known.blind = true;
+        self.known.check = Check::InVain;
         self.tries.failures = 0;
         None
     }

@@ -11,7 +11,7 @@ use crate::codec::{RequestPdu, Table};
 use crate::command::{Refusal, written};
 use crate::drive::control::Setting;
 use crate::drive::profile::Form;
-use crate::drive::{Point, Profile, Raw, Value};
+use crate::drive::{Point, PointIndex, Profile, Raw, Value};
 
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Action {
@@ -125,15 +125,15 @@ pub(super) struct Known {
 type WordChange = (Raw, Vec<(u8, bool)>);
 
 /// Whether a command sets every bit of the profile that can be commanded, reset bits apart.
-pub(super) fn sets_all_bits(profile: &Profile, values: &[(usize, Value)]) -> bool {
+pub(super) fn sets_all_bits(profile: &Profile, values: &[(PointIndex, Value)]) -> bool {
     let level = |p: &Point| p.write && !p.pulse && p.raw().is_some_and(|r| matches!(r.form, Form::Bit { .. }));
-    let mut bits = profile.points.iter().enumerate().filter(|(_, p)| level(p));
+    let mut bits = profile.points.enumerate().filter(|(_, p)| level(p));
     bits.all(|(bit, _)| values.iter().any(|(index, _)| *index == bit))
 }
 
 /// Why a command cannot be sent: a point without a register in the drive, or a value that does not fit its register.
 /// Admitted ones have neither; one that has must not end as if the drive had taken it.
-pub(super) fn unsendable(profile: &Profile, values: &[(usize, Value)]) -> Option<Refusal> {
+pub(super) fn unsendable(profile: &Profile, values: &[(PointIndex, Value)]) -> Option<Refusal> {
     values.iter().find_map(|(index, value)| {
         let Some(point) = profile.points.get(*index) else {
             return Some(Refusal::NotWritable(format!("there is no point {index}")));
@@ -154,7 +154,7 @@ pub(super) fn unsendable(profile: &Profile, values: &[(usize, Value)]) -> Option
 }
 
 /// Whether a command says whether the motor is to run.
-pub(super) fn names_run(profile: &Profile, values: &[(usize, Value)]) -> bool {
+pub(super) fn names_run(profile: &Profile, values: &[(PointIndex, Value)]) -> bool {
     let Some(control) = &profile.control else {
         return false;
     };
@@ -181,7 +181,12 @@ fn bits_of(raw: &Raw) -> u16 {
 }
 
 /// The actions of a command. `stopped`: it is the rest of a command whose stop went before it.
-pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool, stopped: bool) -> VecDeque<Action> {
+pub(super) fn actions(
+    profile: &Profile,
+    values: &[(PointIndex, Value)],
+    stop: bool,
+    stopped: bool,
+) -> VecDeque<Action> {
     let mut numbers = VecDeque::new();
     let mut pulses = VecDeque::new();
     let mut words: BTreeMap<(Table, u16), WordChange> = BTreeMap::new();

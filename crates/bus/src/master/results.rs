@@ -7,7 +7,7 @@ use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, is_reference, written};
 use crate::command_run::{Step, StepPurpose, read_place};
-use crate::drive::{DriveIndex, PlannedRead, Point, Raw};
+use crate::drive::{DriveIndex, PlannedRead, Point, PointIndex, Raw};
 use crate::n2_late_replies::Asked;
 use crate::n2_session::Progress;
 use crate::news::News;
@@ -49,7 +49,7 @@ impl Master {
     }
 
     /// Monitoring points are to be read then.
-    pub fn monitor(&mut self, drive: DriveIndex, point: usize, at: Instant) {
+    pub fn monitor(&mut self, drive: DriveIndex, point: PointIndex, at: Instant) {
         let Some(image) = self.bus.image.drives.get(drive) else {
             return;
         };

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 
 use crate::codec::{Reply, RequestPdu};
 use crate::command::written;
-use crate::drive::Profile;
 use crate::drive::control::{Control, ControlItem, Run, Setting, Step, Until};
+use crate::drive::{PointIndex, Profile};
 
 /// In which state a proof begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -249,7 +249,7 @@ impl<'p> Drive<'p> {
         if let Some(word) = self.words.get(&key(place)) {
             return u64::from(*word);
         }
-        let is_here = |point: usize| {
+        let is_here = |point: PointIndex| {
             let raw = self.profile.points.get(point).and_then(|point| point.raw());
             raw.is_some_and(|raw| (raw.table, raw.address) == (place.table, place.address))
         };

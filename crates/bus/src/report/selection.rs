@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use super::{Findings, RECENT, Report};
 use crate::codec::Exception;
-use crate::drive::{DriveIndex, PlannedRead};
+use crate::drive::{DriveIndex, PlannedRead, PointIndex};
 use crate::event::EventKind;
 use crate::process_image::DriveImage;
 
@@ -15,7 +15,7 @@ impl Report {
         index: DriveIndex,
         read: &PlannedRead,
         at: Instant,
-    ) -> Vec<(DriveIndex, usize, Instant)> {
+    ) -> Vec<(DriveIndex, PointIndex, Instant)> {
         let Some(drive) = self.drive(index) else {
             return Vec::new();
         };
@@ -48,14 +48,14 @@ impl Report {
             drive.update(|snapshot| snapshot.monitored.clone_from(monitored));
         }
         let points = &drive.spec.profile.points;
-        let name = |point: usize| points.get(point).map_or("", |point| &point.name);
+        let name = |point: PointIndex| points.get(point).map_or("", |point| &point.name);
         for point in &findings.restored {
             tracing::info!(
                 target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
                 "process data holds {} again; the value comes from there", name(*point)
             );
         }
-        let differ = |(point, own, monitored): &(usize, f64, f64)| {
+        let differ = |(point, own, monitored): &(PointIndex, f64, f64)| {
             format!(
                 "{} reads {own} there and {monitored} in its monitoring register",
                 name(*point)

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use super::*;
-use crate::drive::PollClass;
 use crate::drive::profile::Profiles;
+use crate::drive::{PointIndex, PollClass};
 
 fn nx() -> Arc<crate::drive::Profile> {
     Profiles::built_in().get("vacon-nx").unwrap().clone()
@@ -12,7 +12,7 @@ fn nx() -> Arc<crate::drive::Profile> {
 
 fn pair<'p>(profile: &'p crate::drive::Profile, name: &str) -> (&'p Point, &'p Point) {
     let point = profile.points.iter().find(|point| point.name == name).unwrap();
-    (point, &profile.points[point.monitor.unwrap()])
+    (point, profile.points.get(point.monitor.unwrap()).unwrap())
 }
 
 #[test]
@@ -49,8 +49,8 @@ fn what_a_comparison_shows() {
 fn trust_is_lost_after_three_and_comes_back_after_two() {
     let now = Instant::now();
     let mut compared = Compared {
-        point: 0,
-        monitor: 1,
+        point: PointIndex::new(0),
+        monitor: PointIndex::new(1),
         trust: Trust::Unproven(now, PAUSE.0),
         open: None,
         last: 0.0,
@@ -84,7 +84,7 @@ fn every_monitoring_register_is_in_a_request_of_its_own_class() {
         let profile = profiles.get(name).unwrap();
         let plan = crate::drive::Plan::of(profile);
         for point in profile.points.iter().filter(|point| point.monitor.is_some()) {
-            let raw = profile.points[point.monitor.unwrap()].raw().unwrap();
+            let raw = profile.points.get(point.monitor.unwrap()).unwrap().raw().unwrap();
             let in_plan = plan.monitors.iter().filter(|read| covers(read, raw));
             assert_eq!(in_plan.count(), 1, "{name} {}", point.name);
         }

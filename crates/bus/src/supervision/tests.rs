@@ -135,7 +135,7 @@ impl Bench {
     fn knows(&self, point: &str, value: Value) {
         let drive = self.image();
         let profile = &drive.spec.profile;
-        let point = &profile.points[profile.point_index(point).unwrap()];
+        let point = &profile.points.get(profile.point_index(point).unwrap()).unwrap();
         // A state of a register that has a point of its own.
         let (raw, value) = match &point.source {
             Source::Derived(Derived::State { any }) => {
@@ -144,7 +144,10 @@ impl Bench {
                 } else {
                     !any[0].is & any[0].mask
                 };
-                (profile.points[any[0].point].raw().unwrap(), Value::Number(held as f64))
+                (
+                    profile.points.get(any[0].point).unwrap().raw().unwrap(),
+                    Value::Number(held as f64),
+                )
             }
             _ => (point.raw().unwrap(), value),
         };

@@ -9,7 +9,7 @@ use crate::codec::{Protocol, RequestPdu, Table};
 use crate::drive::control::ControlItem;
 use crate::drive::model::Kind;
 use crate::drive::profile::AddressRange;
-use crate::drive::{Derived, ModelPoint, Point, Source, Value};
+use crate::drive::{Derived, ModelPoint, Point, PointIndex, Source, Value};
 use crate::process_image::{Access, DriveSpec, Hold, ParamsAccess, Reading};
 
 /// Values of an enumeration that a refusal names.
@@ -166,14 +166,14 @@ pub fn authority(drive: &Reading<'_>, client: Authority) -> Result<(), Refusal> 
     Ok(())
 }
 
-fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, Refusal> {
+fn points(drive: &Reading<'_>, values: Vec<(PointIndex, Value)>) -> Result<Admitted, Refusal> {
     let profile = &drive.spec.profile;
     if values.is_empty() {
         return Err(Refusal::BadValue(
             "the command names no point; nothing was written".to_string(),
         ));
     }
-    let mut resolved: Vec<(usize, Value)> = Vec::with_capacity(values.len());
+    let mut resolved: Vec<(PointIndex, Value)> = Vec::with_capacity(values.len());
     let mut ranges = Vec::new();
     for (index, value) in values {
         let point = profile.points.get(index).filter(|p| p.write).ok_or_else(|| {
@@ -190,7 +190,7 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
         ranges.extend(rests_on(drive, asked, (index, value)));
         resolved.push((index, value));
     }
-    let set = |end: &usize| resolved.iter().any(|(index, _)| index == end);
+    let set = |end: &PointIndex| resolved.iter().any(|(index, _)| index == end);
     if let Some(end) = ranges.iter().flat_map(FrequencyRange::ends).find(set) {
         return Err(changes_its_range(
             profile.points.get(end).map_or("", |p| p.name.as_str()),
@@ -229,7 +229,7 @@ fn changes_its_range(end: &str) -> Refusal {
 }
 
 /// The value in the point's kind and within its limits.
-fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Result<Value, Refusal> {
+fn checked(drive: &Reading<'_>, index: PointIndex, point: &Point, value: Value) -> Result<Value, Refusal> {
     let name = &point.name;
     let number = value.as_f64();
     if !number.is_finite() {
@@ -281,9 +281,9 @@ fn listed(point: &Point, value: Value) -> Result<(), Refusal> {
 
 /// Checks the limits of points for the same quantity: a command in Hz keeps the limits in percent, and vice versa.
 /// `asked` itself is already checked.
-fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<(), Refusal> {
+fn related_limits(drive: &Reading<'_>, asked: PointIndex, index: PointIndex, value: Value) -> Result<(), Refusal> {
     let written = (index, as_held(drive, (index, value)));
-    for (other, point) in drive.spec.profile.points.iter().enumerate() {
+    for (other, point) in drive.spec.profile.points.enumerate() {
         let limits = drive.spec.limits.get(&point.name);
         let Some(limits) = limits.filter(|_| other != asked && other != index) else {
             continue;
@@ -315,7 +315,7 @@ fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value)
 }
 
 /// A reference converted to the unit of another point, once a command sets it.
-pub fn converted(drive: &Reading<'_>, (index, value): (usize, Value), to: usize) -> Option<Value> {
+pub fn converted(drive: &Reading<'_>, (index, value): (PointIndex, Value), to: PointIndex) -> Option<Value> {
     let point = drive.spec.profile.points.get(index)?;
     let written = resolve(drive, index, point, value).ok()?;
     match becomes(drive, to, written) {
@@ -336,7 +336,7 @@ pub(super) enum Becomes {
 
 /// What a point is once the register of another one is written: itself, or by the point that takes its commands, or by
 /// conversion.
-pub(super) fn becomes(drive: &Reading<'_>, point: usize, written: (usize, Value)) -> Becomes {
+pub(super) fn becomes(drive: &Reading<'_>, point: PointIndex, written: (PointIndex, Value)) -> Becomes {
     let (index, value) = written;
     if point == index {
         return Becomes::Known(value);
@@ -365,7 +365,12 @@ pub(super) fn becomes(drive: &Reading<'_>, point: usize, written: (usize, Value)
 }
 
 /// A derived point becomes the point it rests on; the value must fit the register.
-fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Result<(usize, Value), Refusal> {
+fn resolve(
+    drive: &Reading<'_>,
+    index: PointIndex,
+    point: &Point,
+    value: Value,
+) -> Result<(PointIndex, Value), Refusal> {
     if let Some(target) = point.write_to {
         let base = drive.spec.profile.points.get(target).ok_or_else(|| {
             Refusal::NotWritable(format!("point {target} of `{}` cannot be written", drive.spec.name))
@@ -438,7 +443,7 @@ fn no_sign(point: &Point, value: Value) -> Refusal {
 }
 
 /// The value of a raw point as far as its register tells it: what is rounded to 0 has no sign.
-fn as_held(drive: &Reading<'_>, (index, value): (usize, Value)) -> Value {
+fn as_held(drive: &Reading<'_>, (index, value): (PointIndex, Value)) -> Value {
     let raw = drive.spec.profile.points.get(index).and_then(Point::raw);
     let held = raw.and_then(|raw| raw.decode(&raw.encode(value, 0).ok()?, Kind::Number));
     held.filter(|held| held.as_f64() == 0.0)
@@ -562,7 +567,7 @@ fn one_object(table: Table, first: u16, count: usize) -> Result<(), Refusal> {
 /// rests.
 fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<Vec<FrequencyRange>, Refusal> {
     let mut ranges = Vec::new();
-    for (index, point) in drive.spec.profile.points.iter().enumerate() {
+    for (index, point) in drive.spec.profile.points.enumerate() {
         let Some(raw) = point.raw().filter(|raw| raw.table == table) else {
             continue;
         };

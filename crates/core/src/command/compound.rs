@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 
 use super::{Order, Outcome, written};
 use crate::codec::{RequestPdu, Table};
-use crate::drive::{ModelPoint, Profile, Value};
+use crate::drive::{ModelPoint, PointIndex, Profile, Value};
 
 /// A command, its stop taken out.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,14 +44,14 @@ impl Parts {
 
 /// The stop part of a command: the values that are executed even if the rest is refused. None if it does not stop, or
 /// is contradictory.
-pub fn stop_of(values: &[(usize, Value)], profile: &Profile) -> Option<Vec<(usize, Value)>> {
-    let role = |(index, value): &(usize, Value)| role(profile, *index, *value);
+pub fn stop_of(values: &[(PointIndex, Value)], profile: &Profile) -> Option<Vec<(PointIndex, Value)>> {
+    let role = |(index, value): &(PointIndex, Value)| role(profile, *index, *value);
     let stops = values.iter().any(|value| role(value) == Role::Stop);
     let runs = values.iter().any(|value| role(value) == Role::Run);
     if !stops || runs {
         return None;
     }
-    let mut stop: Vec<(usize, Value)> = Vec::new();
+    let mut stop: Vec<(PointIndex, Value)> = Vec::new();
     for value in values {
         if matches!(role(value), Role::Stop | Role::Clears) && !stop.iter().any(|(index, _)| *index == value.0) {
             stop.push(*value);
@@ -60,19 +60,19 @@ pub fn stop_of(values: &[(usize, Value)], profile: &Profile) -> Option<Vec<(usiz
     Some(stop)
 }
 
-fn of_points(values: Vec<(usize, Value)>, profile: &Profile) -> Parts {
+fn of_points(values: Vec<(PointIndex, Value)>, profile: &Profile) -> Parts {
     let Some(stop) = stop_of(&values, profile) else {
         return Parts::One(Order::Points(values));
     };
-    let other = |(index, value): &(usize, Value)| role(profile, *index, *value) == Role::Other;
-    let rest: Vec<(usize, Value)> = values.into_iter().filter(other).collect();
+    let other = |(index, value): &(PointIndex, Value)| role(profile, *index, *value) == Role::Other;
+    let rest: Vec<(PointIndex, Value)> = values.into_iter().filter(other).collect();
     match rest.is_empty() {
         true => Parts::One(Order::Points(stop)),
         false => Parts::Two(Order::Points(stop), Order::Points(rest)),
     }
 }
 
-fn role(profile: &Profile, index: usize, value: Value) -> Role {
+fn role(profile: &Profile, index: PointIndex, value: Value) -> Role {
     // A point may take its commands at another one.
     let place = profile
         .points
@@ -141,7 +141,10 @@ mod tests {
             (index, Value::Number(*value))
         });
         let names = |order: Order| match order {
-            Order::Points(values) => values.iter().map(|(i, _)| profile.points[*i].name.clone()).collect(),
+            Order::Points(values) => values
+                .iter()
+                .map(|(i, _)| profile.points.get(*i).unwrap().name.clone())
+                .collect(),
             _ => Vec::new(),
         };
         match Parts::of(Order::Points(values.collect()), &profile) {

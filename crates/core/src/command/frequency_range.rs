@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use super::admit::{Becomes, becomes};
 use crate::codec::Table;
-use crate::drive::{Bound, Profile, Source, Value};
+use crate::drive::{Bound, PointIndex, Profile, Source, Value};
 use crate::process_image::Reading;
 
 /// A frequency range as it was when a command was admitted.
@@ -21,7 +21,7 @@ impl FrequencyRange {
     /// Whether it still is as it was; a command may have changed the drive's own range at `written`, and what was read
     /// before says nothing then.
     pub fn holds(&self, drive: &Reading<'_>, written: Option<Instant>) -> bool {
-        let read_before = |end: usize| {
+        let read_before = |end: PointIndex| {
             drive
                 .sample(end)
                 .at
@@ -32,15 +32,15 @@ impl FrequencyRange {
     }
 
     /// The points of the drive with the ends of its range.
-    pub(super) fn ends(&self) -> impl Iterator<Item = usize> {
+    pub(super) fn ends(&self) -> impl Iterator<Item = PointIndex> {
         ends((self.minimum, self.maximum))
     }
 }
 
 /// The ranges on which it rests that a command to `asked` sets a register, given as point and value, and keeps the limits.
-pub(super) fn rests_on(drive: &Reading<'_>, asked: usize, written: (usize, Value)) -> Vec<FrequencyRange> {
+pub(super) fn rests_on(drive: &Reading<'_>, asked: PointIndex, written: (PointIndex, Value)) -> Vec<FrequencyRange> {
     let mut ranges = Vec::new();
-    for (index, point) in drive.spec.profile.points.iter().enumerate() {
+    for (index, point) in drive.spec.profile.points.enumerate() {
         let matters = index == asked || drive.spec.limits.contains_key(&point.name);
         let Some((minimum, maximum)) = matters.then(|| band(&drive.spec.profile, index)).flatten() else {
             continue;
@@ -61,13 +61,13 @@ pub(super) fn rests_on(drive: &Reading<'_>, asked: usize, written: (usize, Value
 
 /// Whether the register is an end of a frequency range on which commands may rest.
 pub fn is_range_end(profile: &Profile, table: Table, address: u16) -> bool {
-    let bands = (0..profile.points.len()).filter_map(|point| band(profile, point));
+    let bands = profile.points.indexes().filter_map(|point| band(profile, point));
     let mut raws = bands.flat_map(ends).filter_map(|end| profile.points.get(end)?.raw());
     raws.any(|raw| raw.covers(table, address))
 }
 
 /// The ends of the band by which commands to that point are converted.
-fn band(profile: &Profile, point: usize) -> Option<(Bound, Bound)> {
+fn band(profile: &Profile, point: PointIndex) -> Option<(Bound, Bound)> {
     let point = profile.points.get(point)?;
     match (&point.source, point.write_to) {
         (_, Some(target)) => band(profile, target),
@@ -76,7 +76,7 @@ fn band(profile: &Profile, point: usize) -> Option<(Bound, Bound)> {
     }
 }
 
-fn ends((minimum, maximum): (Bound, Bound)) -> impl Iterator<Item = usize> {
+fn ends((minimum, maximum): (Bound, Bound)) -> impl Iterator<Item = PointIndex> {
     [minimum, maximum].into_iter().filter_map(|end| match end {
         Bound::Point(point) => Some(point),
         Bound::Fixed(_) => None,

@@ -47,7 +47,7 @@ pub use touched::Touched;
 use std::time::{Duration, Instant};
 
 use crate::codec::RequestPdu;
-use crate::drive::{DriveIndex, Profile, Value};
+use crate::drive::{DriveIndex, PointIndex, Profile, Value};
 
 /// Default time after which a command is no longer sent.
 pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);
@@ -59,7 +59,7 @@ pub const CONFIRMED: &str = "confirmed";
 #[derive(Debug, Clone, PartialEq)]
 pub enum Order {
     /// Points set as one command: index in the profile, value in engineering units.
-    Points(Vec<(usize, Value)>),
+    Points(Vec<(PointIndex, Value)>),
     /// A raw write, passed on as it is (except bits of a control word).
     Write(RequestPdu),
     /// A raw read outside the plan.

@@ -7,7 +7,7 @@ use super::{Order, Refusal, written};
 use crate::codec::Table;
 use crate::drive::model::Kind;
 use crate::drive::parameters::RawValue;
-use crate::drive::{Bound, Derived, Profile, Source, Value};
+use crate::drive::{Bound, Derived, PointIndex, Profile, Source, Value};
 use crate::process_image::Reading;
 
 /// When reference and range of a drive were written last; what was read before says nothing then.
@@ -23,7 +23,7 @@ pub struct LastWritten {
 struct Standing<'a> {
     drive: &'a Reading<'a>,
     /// The points with their own address that the command sets.
-    sets: &'a [(usize, Value)],
+    sets: &'a [(PointIndex, Value)],
     /// None if the command has not started yet: readings that are too old are then ignored.
     begun: Option<LastWritten>,
 }
@@ -85,7 +85,7 @@ pub fn is_reference(profile: &Profile, table: Table, address: u16) -> bool {
 }
 
 /// The points with an address of their own that a command sets.
-fn set_by(drive: &Reading<'_>, order: &Order) -> Vec<(usize, Value)> {
+fn set_by(drive: &Reading<'_>, order: &Order) -> Vec<(PointIndex, Value)> {
     let profile = &drive.spec.profile;
     match order {
         _ if drive.spec.limits.is_empty() => Vec::new(),
@@ -99,11 +99,10 @@ fn set_by(drive: &Reading<'_>, order: &Order) -> Vec<(usize, Value)> {
 }
 
 /// The numbers that these registers are.
-fn points_of(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Vec<(usize, Value)> {
+fn points_of(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Vec<(PointIndex, Value)> {
     let word = |address: u16| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word);
     let numbers = profile
         .points
-        .iter()
         .enumerate()
         .filter(|(_, point)| point.kind() != Kind::Bool);
     numbers
@@ -115,10 +114,10 @@ fn points_of(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Vec<(usiz
         .collect()
 }
 
-fn judge(drive: &Reading<'_>, sets: &[(usize, Value)], begun: Option<LastWritten>) -> Result<(), Refusal> {
+fn judge(drive: &Reading<'_>, sets: &[(PointIndex, Value)], begun: Option<LastWritten>) -> Result<(), Refusal> {
     let profile = &drive.spec.profile;
     let standing = Standing { drive, sets, begun };
-    for (index, point) in profile.points.iter().enumerate() {
+    for (index, point) in profile.points.enumerate() {
         let Some(limits) = drive.spec.limits.get(&point.name) else {
             continue;
         };
@@ -148,7 +147,7 @@ fn judge(drive: &Reading<'_>, sets: &[(usize, Value)], begun: Option<LastWritten
 
 impl<'a> Standing<'a> {
     /// By what a point follows from the reference, and an end of the band of that which the order sets; nothing where it sets none.
-    fn changed(&self, point: usize) -> Option<(&'a Derived, usize)> {
+    fn changed(&self, point: PointIndex) -> Option<(&'a Derived, PointIndex)> {
         let point = self.drive.spec.profile.points.get(point)?;
         match (&point.source, point.write_to) {
             (_, Some(target)) => self.changed(target),
@@ -160,7 +159,7 @@ impl<'a> Standing<'a> {
         }
     }
 
-    fn set(&self, point: usize) -> Option<f64> {
+    fn set(&self, point: PointIndex) -> Option<f64> {
         let (_, value) = self.sets.iter().find(|(index, _)| *index == point)?;
         Some(value.as_f64())
     }
@@ -183,7 +182,7 @@ impl<'a> Standing<'a> {
     }
 
     /// The value that the command gives a point, or else its present value.
-    fn known(&self, point: usize, written: Option<Instant>) -> Option<f64> {
+    fn known(&self, point: PointIndex, written: Option<Instant>) -> Option<f64> {
         if let Some(set) = self.set(point) {
             return Some(set);
         }

@@ -3,7 +3,7 @@
 use super::frequency_range::FrequencyRange;
 use super::{Order, written};
 use crate::codec::Table;
-use crate::drive::{Profile, Raw};
+use crate::drive::{PointIndex, Profile, Raw};
 
 /// A register or coil of a drive.
 type Item = (Table, u16);
@@ -26,7 +26,7 @@ pub enum Touched {
 impl Touched {
     /// The registers of a command to a drive of that profile, which rests on these frequency ranges.
     pub fn of(order: &Order, ranges: &[FrequencyRange], profile: &Profile) -> Touched {
-        let raw = |index: usize| profile.points.get(index).and_then(|point| point.raw());
+        let raw = |index: PointIndex| profile.points.get(index).and_then(|point| point.raw());
         let items = |raw: &Raw| {
             let table = raw.table;
             raw.addresses()

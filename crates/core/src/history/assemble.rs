@@ -9,7 +9,7 @@ use serde_json::Value as Json;
 use super::recorder::{Capture, Note, NoteBody, reading};
 use super::recording::{Bus, Column, CommandNote, Drive, EventNote, Frame, Further, Header, Read, Recording, VERSION};
 use super::summary;
-use crate::drive::{DriveIndex, Profile, Source};
+use crate::drive::{DriveIndex, PointIndex, Profile, Source};
 use crate::process_image::{Reading, Snapshot, TapedRead, value_or_null};
 
 pub fn assemble(capture: &Capture) -> Recording {
@@ -103,39 +103,49 @@ fn add_samples(capture: &Capture, recording: &mut Recording) {
         let reading = reading(spec, &snapshot, taped.at);
         let points = reads.get(read).map(|read| read.points.clone()).unwrap_or_default();
         let t = seconds(taped.at, capture.trigger.at);
-        recording.add_sample(t, read, points.iter().map(|point| value(&reading, *point)));
+        recording.add_sample(
+            t,
+            read,
+            points.iter().map(|point| value(&reading, PointIndex::new(*point))),
+        );
     }
     let at_trigger = at_trigger.unwrap_or(snapshot);
     let reading = reading(spec, &at_trigger, capture.trigger.at);
-    let all = 0..spec.profile.points.len();
+    let all = spec.profile.points.indexes();
     recording.header.values = all.map(|point| value(&reading, point)).collect();
 }
 
-fn value(reading: &Reading<'_>, point: usize) -> Json {
+fn value(reading: &Reading<'_>, point: PointIndex) -> Json {
     value_or_null(reading.sample(point).good())
 }
 
 /// The points that a read covers: those whose registers it has, and those derived from one of them.
 fn read_of(profile: &Profile, taped: &TapedRead) -> Read {
     let end = usize::from(taped.start) + taped.words.len();
-    let has = |point: usize| {
+    let has = |point: PointIndex| {
         let raw = profile.points.get(point).and_then(|point| point.raw());
         raw.is_some_and(|raw| {
             let within = |address: u16| address >= taped.start && usize::from(address) < end;
             raw.table == taped.table && raw.addresses().all(within)
         })
     };
-    let shows = |point: &usize| match profile.points.get(*point).map(|point| &point.source) {
+    let shows = |point: &PointIndex| match profile.points.get(*point).map(|point| &point.source) {
         Some(Source::Raw(_)) => has(*point),
         Some(Source::Derived(derived)) => derived.rests_on().into_iter().any(has),
         None => false,
     };
-    let shown = |point: &usize| profile.points.get(*point).is_some_and(|point| !point.hidden);
+    let shown = |point: &PointIndex| profile.points.get(*point).is_some_and(|point| !point.hidden);
     Read {
         table: taped.table,
         start: taped.start,
         count: u16::try_from(taped.words.len()).unwrap_or(u16::MAX),
-        points: (0..profile.points.len()).filter(shown).filter(shows).collect(),
+        points: profile
+            .points
+            .indexes()
+            .filter(shown)
+            .filter(shows)
+            .map(PointIndex::place)
+            .collect(),
     }
 }
 

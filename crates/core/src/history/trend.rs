@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use super::Clock;
 use super::buckets::Buckets;
 use crate::codec::Table;
-use crate::drive::{ModelPoint, Profile, Source};
+use crate::drive::{ModelPoint, PointIndex, Profile, Source};
 use crate::process_image::{Reading, TapedRead};
 
 /// A span of time and the steps it is kept in.
@@ -104,7 +104,7 @@ impl Reach {
     }
 }
 
-fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, usize)> {
+fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, PointIndex)> {
     let index = |point: ModelPoint| Some((point, profile.model_index(point)?));
     POINTS.into_iter().filter_map(index)
 }
@@ -173,7 +173,7 @@ type Registers = (Table, RangeInclusive<u16>);
 struct PointTrend {
     point: ModelPoint,
     /// Index in the profile.
-    index: usize,
+    index: PointIndex,
     /// Where its value is read from.
     registers: Vec<Registers>,
     /// It rests on points that are read elsewhere, too.
@@ -201,7 +201,7 @@ pub struct DriveTrend {
 impl DriveTrend {
     /// The trends of a drive of that profile, empty.
     pub fn new(profile: &Profile, reach: Reach, clock: Clock) -> DriveTrend {
-        let trend = |(point, index): (ModelPoint, usize)| PointTrend {
+        let trend = |(point, index): (ModelPoint, PointIndex)| PointTrend {
             point,
             index,
             registers: registers_of(profile, index),
@@ -360,7 +360,7 @@ fn shows(read: &TapedRead, (table, addresses): &Registers) -> bool {
 }
 
 /// Where the value of a point is read from, without the ends of a band.
-fn registers_of(profile: &Profile, index: usize) -> Vec<Registers> {
+fn registers_of(profile: &Profile, index: PointIndex) -> Vec<Registers> {
     let Some(point) = profile.points.get(index) else {
         return Vec::new();
     };

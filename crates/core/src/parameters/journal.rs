@@ -398,7 +398,7 @@ pub(super) mod tests {
         let mut journal = journal(vec![write(102, 5000, 10_000)]);
         journal.plan.handling = Handling {
             needs: Some(Need {
-                point: 0,
+                point: crate::drive::PointIndex::new(0),
                 value: false,
                 exception: Some(0x22),
                 remedy: "switch the operator to PRGM".to_string(),

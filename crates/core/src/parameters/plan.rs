@@ -7,8 +7,8 @@ mod tests;
 mod text;
 
 use super::file::{Id, ParameterFile};
-use crate::drive::Profile;
 use crate::drive::parameters::RawValue;
+use crate::drive::{PointIndex, Profile};
 use making::Making;
 pub use making::NOT_KNOWN;
 
@@ -32,7 +32,7 @@ pub struct ParameterWrite {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Need {
     /// Point of the profile (index) that shows it.
-    pub point: usize,
+    pub point: PointIndex,
     /// The required reading of the point. It is no guarantee: the drive may still refuse.
     pub value: bool,
     /// Exception code by which the drive refuses a write otherwise, N2 codes with 0x80 added; none where no manual says.

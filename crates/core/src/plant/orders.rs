@@ -12,7 +12,7 @@ use crate::command::{
     Refusal, SlotWrite, StopEnd, Ticket, Urgency, WriteStats,
 };
 use crate::drive::parameters::RawValue;
-use crate::drive::{DriveIndex, ModelPoint, Value};
+use crate::drive::{DriveIndex, ModelPoint, PointIndex, Value};
 use crate::event::RefusedCommand;
 use crate::process_image::Reading;
 
@@ -27,7 +27,7 @@ struct Terms {
 
 /// The points a command sets, with their previous values.
 pub(super) fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
-    let is = |point: ModelPoint, index: usize| reading.spec.profile.model_index(point) == Some(index);
+    let is = |point: ModelPoint, index: PointIndex| reading.spec.profile.model_index(point) == Some(index);
     match order {
         Order::Points(values) => values
             .iter()
@@ -424,10 +424,10 @@ impl DriveHandle {
     fn describe(&self, order: &Order) -> String {
         match order {
             Order::Points(values) => {
-                let name = |i: usize| self.image.spec.profile.points.get(i).map_or("?", |p| p.name.as_str());
+                let name = |i: PointIndex| self.image.spec.profile.points.get(i).map_or("?", |p| p.name.as_str());
                 let parts: Vec<String> = values
                     .iter()
-                    .map(|(i, v): &(usize, Value)| format!("{}={v}", name(*i)))
+                    .map(|(i, v): &(PointIndex, Value)| format!("{}={v}", name(*i)))
                     .collect();
                 parts.join(" ")
             }

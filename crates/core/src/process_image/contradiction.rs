@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use super::Reading;
-use crate::drive::{ModelPoint, Value};
+use crate::drive::{ModelPoint, PointIndex, Value};
 
 /// The speeds, each with the figure in its unit (%, Hz, rpm) above which the motor turns for certain.
 const SPEEDS: [(ModelPoint, f64); 3] = [
@@ -17,7 +17,7 @@ impl Reading<'_> {
     /// Whether the point is a good speed that is not zero although a newer sample shows that the motor stands, or zero
     /// although a newer one shows that it turns. Other points are not judged: current, torque and power can be anything
     /// at any speed.
-    pub fn is_contradicted(&self, point: usize) -> bool {
+    pub fn is_contradicted(&self, point: PointIndex) -> bool {
         let model = self.spec.profile.points.get(point).and_then(|point| point.model);
         let Some((_, certain)) = SPEEDS.iter().find(|(speed, _)| Some(*speed) == model) else {
             return false;

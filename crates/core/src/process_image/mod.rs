@@ -30,7 +30,7 @@ use tokio::sync::Notify;
 
 use self::health::TURNAROUNDS;
 use crate::diagnosis::Diagnosis;
-use crate::drive::{ModelPoint, PerDrive, Plan, Point, PollClass, Profile, Value};
+use crate::drive::{ModelPoint, PerDrive, Plan, Point, PointIndex, PollClass, Profile, Value};
 
 #[derive(Debug)]
 pub struct DriveImage {
@@ -350,14 +350,13 @@ pub fn value_or_null(value: Option<Value>) -> serde_json::Value {
 
 /// The model points and profile points of a drive with their names, in their public order; not those that are never
 /// read, of which there is nothing to show, nor hidden ones.
-pub fn public_points(profile: &Profile) -> Vec<(usize, &str)> {
+pub fn public_points(profile: &Profile) -> Vec<(PointIndex, &str)> {
     let is_read = |point: &Point| !point.hidden && (point.raw().is_none() || point.class != PollClass::Never);
     let model = ModelPoint::ALL
         .iter()
         .filter_map(|m| profile.model_index(*m).map(|i| (i, m.name())));
     let own = profile
         .points
-        .iter()
         .enumerate()
         .filter(|(_, p)| p.model.is_none())
         .map(|(i, p)| (i, p.name.as_str()));

@@ -7,7 +7,7 @@ use super::{DriveSpec, Hold};
 use crate::codec::{Exception, Table};
 use crate::drive::model::Kind;
 use crate::drive::profile::MOST_REGISTERS;
-use crate::drive::{Bound, ModelPoint, Plan, Point, PollClass, Quality, Raw, Sample, Source, State, Value};
+use crate::drive::{Bound, ModelPoint, Plan, Point, PointIndex, PollClass, Quality, Raw, Sample, Source, State, Value};
 
 /// Oldest age of a parameter of the drive on which a command may rest, where the line can renew it faster.
 const PARAMETER_AGE: Duration = Duration::from_secs(5);
@@ -107,7 +107,7 @@ pub struct Snapshot {
     pub heard: Option<Cadence>,
     /// Points whose value is that of their monitoring register, because a selector of the drive gives them another content
     /// than the profile states: see [`crate::drive::Point::monitor`].
-    pub monitored: Vec<usize>,
+    pub monitored: Vec<PointIndex>,
     /// Shared with the snapshots before, as far as nothing in them changed.
     spans: Vec<Arc<Span>>,
 }
@@ -268,7 +268,7 @@ impl Reading<'_> {
 
     /// For how long a value of that point is good once it was read, as long as the drive answers: that of its registers that
     /// age first.
-    pub fn good_for(&self, point: usize) -> Duration {
+    pub fn good_for(&self, point: PointIndex) -> Duration {
         let Some(point) = self.selected(point) else {
             return Duration::ZERO;
         };
@@ -343,7 +343,7 @@ impl Reading<'_> {
     }
 
     /// The point that a value is taken from: the point itself, or its monitoring register.
-    fn selected(&self, point: usize) -> Option<&Point> {
+    fn selected(&self, point: PointIndex) -> Option<&Point> {
         let points = &self.spec.profile.points;
         match self.snapshot.monitored.contains(&point) {
             true => points.get(points.get(point)?.monitor?),
@@ -351,12 +351,12 @@ impl Reading<'_> {
         }
     }
 
-    pub fn sample(&self, point: usize) -> Sample {
+    pub fn sample(&self, point: PointIndex) -> Sample {
         self.selected(point).map_or(Sample::NONE, |point| self.sample_of(point))
     }
 
     /// The sample of a point's own register, whatever a selector of the drive puts there.
-    pub fn own_sample(&self, point: usize) -> Sample {
+    pub fn own_sample(&self, point: PointIndex) -> Sample {
         let point = self.spec.profile.points.get(point);
         point.map_or(Sample::NONE, |point| self.sample_of(point))
     }

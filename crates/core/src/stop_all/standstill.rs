@@ -62,7 +62,7 @@ impl Reading<'_> {
     /// Why a motor may turn though the drive stands: the point that says so, or does not say otherwise yet. One that the drive
     /// refuses, or that is not polled, says nothing.
     pub fn may_turn(&self) -> Option<String> {
-        let points = (0..).zip(&self.spec.profile.points);
+        let points = self.spec.profile.points.enumerate();
         let reasons = points.filter_map(|(index, point)| {
             let blocks = point.blocks.as_ref()?;
             if !FED_OTHERWISE.contains(&blocks.cause.as_str()) {

@@ -12,7 +12,7 @@ use crate::codec::Protocol;
 use crate::document::{Finding, Place, Raw as Node, Reader, nearest};
 use crate::drive::model::Kind;
 use crate::drive::profile::Profiles;
-use crate::drive::{ModelPoint, Plan, PlannedRead, Point, PollClass, Profile, Value};
+use crate::drive::{ModelPoint, Plan, PlannedRead, Point, PointIndex, PollClass, Profile, Value};
 use crate::process_image::{
     Access, DriveSpec, LeaseAction, OnShutdown, ParamsAccess, PointTrigger, Supervision, TriggerLimit,
 };
@@ -262,16 +262,16 @@ fn read_trigger(table: &Reader<'_>, profile: Option<&Profile>) -> Option<PointTr
 }
 
 /// A polled numeric point.
-fn trigger_point(name: &str, profile: &Profile) -> Result<usize, Finding> {
+fn trigger_point(name: &str, profile: &Profile) -> Result<PointIndex, Finding> {
     let plan = Plan::of(profile);
-    let is_number = |index: usize| {
+    let is_number = |index: PointIndex| {
         let point = profile.points.get(index);
         point.is_some_and(|point| !point.hidden && !matches!(point.kind(), Kind::Bool | Kind::Text))
             && plan.shows(profile, index)
     };
     let index = profile.point_index(name);
     index.filter(|index| is_number(*index)).ok_or_else(|| {
-        let names = (0..).zip(&profile.points).filter(|(index, _)| is_number(*index));
+        let names = profile.points.enumerate().filter(|(index, _)| is_number(*index));
         let near = nearest(name, names.map(|(_, point)| point.name.as_str()));
         let remedy = near.map(|near| format!("did you mean `{near}`?"));
         let list = || {

@@ -8,7 +8,7 @@ use super::keys::{DRIVE, GUARD, INTERLOCK};
 use super::{BusSettings, bus};
 use crate::document::{Document, Place, Reader, nearest};
 use crate::drive::model::Kind;
-use crate::drive::{ModelPoint, Plan, Profile};
+use crate::drive::{ModelPoint, Plan, PointIndex, Profile};
 use crate::process_image::{Access, DriveSpec};
 use crate::start_guard::{Guard, Interlock};
 
@@ -113,14 +113,14 @@ pub(super) fn check(document: &Document, buses: &[bus::Found]) {
 /// Why a point is not a boolean that is polled.
 fn unfit(profile: &Profile, name: &str) -> Option<(String, String)> {
     let plan = Plan::of(profile);
-    let is_bit = |index: usize| {
+    let is_bit = |index: PointIndex| {
         let point = profile.points.get(index);
         point.is_some_and(|point| !point.hidden && point.kind() == Kind::Bool) && plan.shows(profile, index)
     };
     if profile.point_index(name).is_some_and(is_bit) {
         return None;
     }
-    let bits = (0..).zip(&profile.points).filter(|(index, _)| is_bit(*index));
+    let bits = profile.points.enumerate().filter(|(index, _)| is_bit(*index));
     let near = nearest(name, bits.map(|(_, point)| point.name.as_str()));
     let list = || format!("`drivegate profiles show {}` lists the points", profile.name);
     Some((

@@ -1,5 +1,6 @@
 //! How a family is commanded: the control word, which words run, stop and reset, and what comes before. Pure.
 
+use crate::drive::PointIndex;
 use std::time::Duration;
 
 use super::profile::Raw;
@@ -167,7 +168,7 @@ pub enum Until {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mask {
     /// Index of the point.
-    pub point: usize,
+    pub point: PointIndex,
     /// Bits of it that count.
     pub mask: u64,
     /// Their value.

@@ -1,5 +1,6 @@
 //! Points derived from the points of the drive. Pure.
 
+use crate::drive::PointIndex;
 use std::time::Instant;
 
 use super::control::Mask;
@@ -12,7 +13,7 @@ const ROUNDING: f64 = 1e-9;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Bound {
     /// Index of a point of the profile.
-    Point(usize),
+    Point(PointIndex),
     /// In the unit of the band.
     Fixed(f64),
 }
@@ -24,7 +25,7 @@ pub enum Derived {
     /// direction: a negative percentage is the same magnitude in reverse.
     Band {
         /// Point in percent.
-        of: usize,
+        of: PointIndex,
         /// Value at 0 %.
         minimum: Bound,
         /// Value at 100 %.
@@ -33,7 +34,7 @@ pub enum Derived {
     /// A value within a band as a percentage: `100 * (of - minimum) / (maximum - minimum)`, in either direction as well.
     Percent {
         /// Point in the unit of the band.
-        of: usize,
+        of: PointIndex,
         /// Value at 0 %.
         minimum: Bound,
         /// Value at 100 %.
@@ -42,23 +43,23 @@ pub enum Derived {
     /// True while the absolute value of the point is at most `within`.
     Zero {
         /// Point.
-        of: usize,
+        of: PointIndex,
         /// In the unit of the point.
         within: f64,
     },
     /// True while the two points differ by at most `within`.
     Equal {
         /// Point.
-        of: usize,
+        of: PointIndex,
         /// The other one.
-        to: usize,
+        to: PointIndex,
         /// In the unit of the points.
         within: f64,
     },
     /// True while all of the points are true.
     All {
         /// Points.
-        of: Vec<usize>,
+        of: Vec<PointIndex>,
     },
     /// True while a register is in one of these states.
     State {
@@ -68,7 +69,7 @@ pub enum Derived {
     /// Number of the lowest set bit, counted from 1; 0 if none is set.
     LowestBit {
         /// Point with a mask.
-        of: usize,
+        of: PointIndex,
     },
 }
 
@@ -88,7 +89,7 @@ impl Derived {
     }
 
     /// The point that a command to this one is converted to, with the ends of the band.
-    pub fn band(&self) -> Option<(usize, Bound, Bound)> {
+    pub fn band(&self) -> Option<(PointIndex, Bound, Bound)> {
         match *self {
             Derived::Band { of, minimum, maximum } | Derived::Percent { of, minimum, maximum } => {
                 Some((of, minimum, maximum))
@@ -98,8 +99,8 @@ impl Derived {
     }
 
     /// The points that the value itself is derived from, without the ends of a band.
-    pub fn sources(&self) -> impl Iterator<Item = usize> {
-        let (mut more, mut states): (&[usize], &[Mask]) = (&[], &[]);
+    pub fn sources(&self) -> impl Iterator<Item = PointIndex> {
+        let (mut more, mut states): (&[PointIndex], &[Mask]) = (&[], &[]);
         let (first, second) = match self {
             Derived::Band { of, .. }
             | Derived::Percent { of, .. }
@@ -120,12 +121,12 @@ impl Derived {
     }
 
     /// All points that it depends on, including the ends of a band.
-    pub fn rests_on(&self) -> Vec<usize> {
+    pub fn rests_on(&self) -> Vec<PointIndex> {
         self.sources().chain(self.ends()).collect()
     }
 
     /// The points that are the ends of its band.
-    pub fn ends(&self) -> impl Iterator<Item = usize> {
+    pub fn ends(&self) -> impl Iterator<Item = PointIndex> {
         let ends = self.band().map(|(_, low, high)| [low, high]);
         ends.into_iter().flatten().filter_map(|bound| match bound {
             Bound::Point(point) => Some(point),
@@ -238,6 +239,8 @@ mod tests {
 
     use super::*;
 
+    const A: PointIndex = PointIndex::new(0);
+    const B: PointIndex = PointIndex::new(1);
     const BAND: Option<(f64, f64)> = Some((10.0, 50.0));
 
     fn ends() -> (Bound, Bound) {
@@ -248,12 +251,12 @@ mod tests {
     fn bands_both_ways() {
         let (minimum, maximum) = ends();
         let band = Derived::Band {
-            of: 0,
+            of: A,
             minimum,
             maximum,
         };
         let percent = Derived::Percent {
-            of: 0,
+            of: A,
             minimum,
             maximum,
         };
@@ -271,12 +274,12 @@ mod tests {
     fn a_minimum_above_zero_is_that_of_either_direction() {
         let ((minimum, maximum), range) = (ends(), (10.0, 50.0));
         let band = Derived::Band {
-            of: 0,
+            of: A,
             minimum,
             maximum,
         };
         let percent = Derived::Percent {
-            of: 0,
+            of: A,
             minimum,
             maximum,
         };
@@ -321,8 +324,8 @@ mod tests {
             let low = if line { -low } else { low };
             let range = (low, low + width);
             let (minimum, maximum) = ends();
-            let band = Derived::Band { of: 0, minimum, maximum };
-            let percent = Derived::Percent { of: 0, minimum, maximum };
+            let band = Derived::Band { of: A, minimum, maximum };
+            let percent = Derived::Percent { of: A, minimum, maximum };
             prop_assume!(share != 0.0);
             let hertz = band.value([Value::Number(share)], Some(range)).unwrap().as_f64();
             prop_assert!(low <= 0.0 || (hertz < 0.0) == (share < 0.0));
@@ -342,12 +345,12 @@ mod tests {
     #[test]
     fn states_and_codes() {
         let number = Value::Number;
-        let zero = Derived::Zero { of: 0, within: 0.0 };
+        let zero = Derived::Zero { of: A, within: 0.0 };
         assert_eq!(zero.value([number(0.0)], None), Some(Value::Bool(true)));
         assert_eq!(zero.value([number(-0.01)], None), Some(Value::Bool(false)));
         let equal = Derived::Equal {
-            of: 0,
-            to: 1,
+            of: A,
+            to: B,
             within: 0.01,
         };
         assert_eq!(
@@ -359,12 +362,12 @@ mod tests {
             Some(Value::Bool(false))
         );
         assert_eq!(equal.value([number(10.0)], None), None);
-        let all = Derived::All { of: vec![0, 1] };
+        let all = Derived::All { of: vec![A, B] };
         assert_eq!(
             all.value([Value::Bool(true), Value::Bool(false)], None),
             Some(Value::Bool(false))
         );
-        let lowest = Derived::LowestBit { of: 0 };
+        let lowest = Derived::LowestBit { of: A };
         for (mask, code) in [(0, 0), (1, 1), (0x0204, 3), (0x1000, 13), (0x8000, 16)] {
             assert_eq!(lowest.value([Value::Integer(mask)], None), Some(Value::Integer(code)));
         }
@@ -377,7 +380,7 @@ mod tests {
             quality,
             at: None,
         };
-        let all = Derived::All { of: vec![0, 1] };
+        let all = Derived::All { of: vec![A, B] };
         let made = all.sample([sample(Quality::Good), sample(Quality::Stale)].into_iter(), None);
         assert_eq!((made.value, made.quality), (Some(Value::Bool(true)), Quality::Stale));
         assert_eq!(

@@ -12,7 +12,7 @@ fn profile(name: &str) -> std::sync::Arc<Profile> {
 
 /// A point as `table address[.bit] x scale`, `!` for an inverted bit, `derive` for a derived one, `-` for none.
 fn place(profile: &Profile, name: &str) -> String {
-    let Some(point) = profile.point_index(name).map(|i| &profile.points[i]) else {
+    let Some(point) = profile.point_index(name).and_then(|i| profile.points.get(i)) else {
         return "-".to_string();
     };
     let raw = match &point.source {
@@ -305,7 +305,7 @@ fn n2_maps_are_whole() {
 fn worked_replies() {
     let read = |name: &str, point: &str, words: &[u16]| {
         let profile = profile(name);
-        let point = &profile.points[profile.point_index(point).unwrap()];
+        let point = &profile.points.get(profile.point_index(point).unwrap()).unwrap();
         point.raw().unwrap().decode(words, point.kind()).unwrap()
     };
     let number = Value::Number;
@@ -465,7 +465,11 @@ fn limits_and_lines() {
         ("save_parameters", 0x0900),
     ] {
         let index = teco.point_index(point).unwrap();
-        assert_eq!(teco.points[index].raw().unwrap().address, address, "{point}");
+        assert_eq!(
+            teco.points.get(index).unwrap().raw().unwrap().address,
+            address,
+            "{point}"
+        );
     }
 }
 
@@ -552,7 +556,7 @@ fn process_data_in_by_application() {
             let (base, own) = (profile(family), profile(&format!("{family}-{application}")));
             assert_eq!((own.base.as_deref(), &own.simulator), (Some(family), &base.simulator));
             for (name, at) in points {
-                let point = &own.points[own.point_index(name).unwrap()];
+                let point = &own.points.get(own.point_index(name).unwrap()).unwrap();
                 assert_eq!(place(&own, name), *at, "{name} of {}", own.name);
                 assert!(point.write && point.raw().unwrap().form == Form::I16, "{name}");
             }
@@ -602,7 +606,11 @@ fn what_is_not_confirmed() {
         let profile = profile(name);
         for point in points {
             assert!(
-                !profile.points[profile.point_index(point).unwrap()].verified,
+                !profile
+                    .points
+                    .get(profile.point_index(point).unwrap())
+                    .unwrap()
+                    .verified,
                 "{point} of {name}"
             );
         }
@@ -614,12 +622,19 @@ fn what_is_not_confirmed() {
     ] {
         let profile = profile(name);
         assert!(
-            profile.points[profile.point_index(point).unwrap()].verified,
+            profile
+                .points
+                .get(profile.point_index(point).unwrap())
+                .unwrap()
+                .verified,
             "{point} of {name}"
         );
     }
     let width = profile("teco-7300pa-n2");
-    let width = &width.points[width.point_index("jump_frequency_width").unwrap()];
+    let width = &width
+        .points
+        .get(width.point_index("jump_frequency_width").unwrap())
+        .unwrap();
     assert_eq!(width.range, Some(0.0..=25.5));
     for (name, formats) in [
         ("vacon-cx", &["8N2", "8N1", "8E1", "8O1"][..]),

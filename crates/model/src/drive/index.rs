@@ -6,50 +6,73 @@ use std::ops::{Deref, DerefMut};
 
 use serde::Serialize;
 
-/// Which drive of a bus, in the order of the file.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize)]
-#[serde(transparent)]
-pub struct DriveIndex(usize);
+macro_rules! index {
+    ($(#[$doc:meta])* $name:ident) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize)]
+        #[serde(transparent)]
+        pub struct $name(usize);
 
-impl DriveIndex {
-    /// The drive at that place, from 0.
-    pub const fn new(place: usize) -> DriveIndex {
-        DriveIndex(place)
-    }
+        impl $name {
+            /// The one at that place, from 0.
+            pub const fn new(place: usize) -> $name {
+                $name(place)
+            }
 
-    /// Its place, from 0.
-    pub const fn place(self) -> usize {
-        self.0
-    }
+            /// Its place, from 0.
+            pub const fn place(self) -> usize {
+                self.0
+            }
+        }
+
+        impl From<usize> for $name {
+            fn from(place: usize) -> $name {
+                $name(place)
+            }
+        }
+
+        impl From<$name> for usize {
+            fn from(index: $name) -> usize {
+                index.0
+            }
+        }
+
+        /// As a plain number, for instance in tests.
+        impl PartialEq<usize> for $name {
+            fn eq(&self, place: &usize) -> bool {
+                self.0 == *place
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                self.0.fmt(f)
+            }
+        }
+
+        impl fmt::Debug for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                self.0.fmt(f)
+            }
+        }
+    };
 }
 
-impl From<usize> for DriveIndex {
-    fn from(place: usize) -> DriveIndex {
-        DriveIndex(place)
-    }
+index! {
+    /// Which drive of a bus, in the order of the file.
+    DriveIndex
 }
 
-impl From<DriveIndex> for usize {
-    fn from(index: DriveIndex) -> usize {
-        index.0
-    }
-}
-
-/// As a plain number, for instance in tests.
-impl PartialEq<usize> for DriveIndex {
-    fn eq(&self, place: &usize) -> bool {
-        self.0 == *place
-    }
-}
-
-impl fmt::Debug for DriveIndex {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(f)
-    }
+index! {
+    /// Which point of a profile, in the order of the profile.
+    PointIndex
 }
 
 /// One element for each drive of a bus.
 pub type PerDrive<T> = IndexVec<DriveIndex, T>;
+
+/// One element for each point of a profile.
+pub type PerPoint<T> = IndexVec<PointIndex, T>;
 
 /// A vector whose elements are found by an index of one type only; otherwise a slice.
 pub struct IndexVec<I, T> {
@@ -85,6 +108,11 @@ impl<I: From<usize> + Into<usize>, T> IndexVec<I, T> {
     /// All indexes. They do not borrow the vector.
     pub fn indexes(&self) -> impl DoubleEndedIterator<Item = I> + ExactSizeIterator + use<I, T> {
         (0..self.elements.len()).map(I::from)
+    }
+
+    /// Adds an element behind the others.
+    pub fn push(&mut self, element: T) {
+        self.elements.push(element);
     }
 
     /// The index of the first element that is as wanted.

@@ -17,7 +17,7 @@ pub mod why;
 
 pub use commissioning::{Commissioning, Step};
 pub use derive::{Bound, Derived};
-pub use index::{DriveIndex, IndexVec, PerDrive};
+pub use index::{DriveIndex, IndexVec, PerDrive, PerPoint, PointIndex};
 pub use model::tidy;
 pub use model::{ModelPoint, Quality, Sample, State, Value};
 pub use plan::{Plan, PlannedRead};

@@ -2,6 +2,7 @@
 
 mod rules;
 
+use crate::drive::PointIndex;
 use std::ops::RangeInclusive;
 
 use super::profile::Profile;
@@ -17,7 +18,7 @@ pub struct ParameterList {
     /// Where others may lie; the drive is read to find which of them it has.
     pub spans: Vec<Span>,
     /// Points that identify the drive in a file: indices in the profile.
-    pub identification: Vec<usize>,
+    pub identification: Vec<PointIndex>,
     /// The rules for writing them back.
     pub rules: WriteRules,
 }

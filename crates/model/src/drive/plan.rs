@@ -1,5 +1,6 @@
 //! The requests that read a drive: neighbouring points are read in one request.
 
+use crate::drive::PointIndex;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
@@ -116,7 +117,7 @@ impl Plan {
     fn behind_state(&self, profile: &Profile) -> Vec<PlannedRead> {
         let deciding = [ModelPoint::Fault, ModelPoint::Running, ModelPoint::Ready];
         let deciding = deciding.into_iter().filter_map(|point| profile.model_index(point));
-        let deciding: Vec<usize> = deciding.flat_map(|point| profile.raw_points_of(point)).collect();
+        let deciding: Vec<PointIndex> = deciding.flat_map(|point| profile.raw_points_of(point)).collect();
         let raws = || deciding.iter().filter_map(|point| profile.points.get(*point)?.raw());
         let decides =
             |read: &&PlannedRead| raws().any(|raw| raw.addresses().any(|address| read.covers(raw.table, address)));
@@ -130,7 +131,7 @@ impl Plan {
     }
 
     /// Whether these requests read a point of that profile: everything it is in or derived from.
-    pub fn shows(&self, profile: &Profile, point: usize) -> bool {
+    pub fn shows(&self, profile: &Profile, point: PointIndex) -> bool {
         match profile.points.get(point).map(|point| &point.source) {
             Some(Source::Raw(raw)) => {
                 let is_read = |address| self.reads.iter().any(|read| read.covers(raw.table, address));

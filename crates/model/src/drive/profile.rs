@@ -3,6 +3,7 @@
 
 mod raw;
 
+use crate::drive::{PerPoint, PointIndex};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -59,7 +60,7 @@ pub struct Profile {
     /// The functions by which single items and bits are written.
     pub functions: WriteFunctions,
     /// All points, in the order of the file.
-    pub points: Vec<Point>,
+    pub points: PerPoint<Point>,
     /// The drive counts what it receives, damaged or not, and tells it by function 08 (subfunctions 0B to 0F).
     pub counts_messages: bool,
     /// The drive may stop by itself when its master goes silent, and no readable point shows whether it does.
@@ -67,7 +68,7 @@ pub struct Profile {
     /// A broadcast that clears the whole control word stops every drive of the family on the line.
     pub broadcast_stop: bool,
     /// Points that are read at once when a drive has a new fault.
-    pub on_fault: Vec<usize>,
+    pub on_fault: Vec<PointIndex>,
     /// How it is commanded, where its profile says so in `[control]`.
     pub control: Option<Control>,
     /// Whether someone has seen the profile right on hardware, or it is made from manuals of that very family.
@@ -81,7 +82,7 @@ pub struct Profile {
     /// The meaning of a match of the `identify` reads; empty if they prove the family.
     pub identified: String,
     /// Index of each model point in `points`.
-    pub(super) model: Vec<Option<usize>>,
+    pub(super) model: Vec<Option<PointIndex>>,
     /// The text of the file, without its base.
     pub text: Cow<'static, str>,
     /// The file merged with its base, for profiles based on this one. None for built-in ones: their texts say it all, in a
@@ -254,11 +255,11 @@ pub struct Point {
     pub fast_if_carried: bool,
     /// The point that always has the same value, where a selector of the drive decides what this one has: the two are compared
     /// when the drive comes online.
-    pub monitor: Option<usize>,
+    pub monitor: Option<PointIndex>,
     /// Whether it can be commanded.
     pub write: bool,
     /// The point that receives the commands, in the same unit, if the drive reports the value elsewhere.
-    pub write_to: Option<usize>,
+    pub write_to: Option<PointIndex>,
     /// Written as a pulse 0, 1, 0.
     pub pulse: bool,
     /// Written only if the drive is not known to have the value already: it is stored in EEPROM with limited write cycles.
@@ -372,7 +373,7 @@ impl Point {
 
 impl Profile {
     /// Index of a model point.
-    pub fn model_index(&self, point: ModelPoint) -> Option<usize> {
+    pub fn model_index(&self, point: ModelPoint) -> Option<PointIndex> {
         self.model.get(point.index()).copied().flatten()
     }
 
@@ -382,7 +383,7 @@ impl Profile {
     }
 
     /// The points with registers of their own that a point is, or is derived from.
-    pub(crate) fn raw_points_of(&self, point: usize) -> Vec<usize> {
+    pub(crate) fn raw_points_of(&self, point: PointIndex) -> Vec<PointIndex> {
         match self.points.get(point).map(|point| &point.source) {
             Some(Source::Derived(derived)) => {
                 let of = derived.rests_on();
@@ -406,8 +407,8 @@ impl Profile {
     }
 
     /// Index of the point of that name.
-    pub fn point_index(&self, name: &str) -> Option<usize> {
-        self.points.iter().position(|p| p.name == name)
+    pub fn point_index(&self, name: &str) -> Option<PointIndex> {
+        self.points.position(|p| p.name == name)
     }
 
     /// The range that holds `address`.

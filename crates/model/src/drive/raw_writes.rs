@@ -154,7 +154,7 @@ mod tests {
     fn a_point_that_is_written_elsewhere_does_not_open_the_register_it_is_read_from() {
         let mut teco = profile("teco-7300pa");
         let index = teco.point_index("frequency_reference").unwrap();
-        assert!(teco.points[index].write && teco.points[index].write_to.is_some());
+        assert!(teco.points.get(index).unwrap().write && teco.points.get(index).unwrap().write_to.is_some());
         assert_eq!(
             refused(&RawWrites::Points, &teco, Table::Holding, 0x23..=0x23),
             Some(0x23)

@@ -4,6 +4,7 @@
 //! A profile names the bits of its family that keep a motor from running (`blocks` of a point); the rest follows from
 //! the common model. States that a family does not report are listed as such, rather than taken for granted.
 
+use crate::drive::PointIndex;
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
@@ -162,7 +163,7 @@ pub struct Situation<'s> {
 }
 
 /// Why the drive does not run; `sample` has its points, by their index in the profile.
-pub fn explain(profile: &Profile, sample: &dyn Fn(usize) -> Sample, situation: &Situation<'_>) -> Explanation {
+pub fn explain(profile: &Profile, sample: &dyn Fn(PointIndex) -> Sample, situation: &Situation<'_>) -> Explanation {
     let look = Look {
         profile,
         sample,
@@ -205,7 +206,7 @@ pub fn explain(profile: &Profile, sample: &dyn Fn(usize) -> Sample, situation: &
 
 struct Look<'l> {
     profile: &'l Profile,
-    sample: &'l dyn Fn(usize) -> Sample,
+    sample: &'l dyn Fn(PointIndex) -> Sample,
     situation: &'l Situation<'l>,
 }
 
@@ -323,7 +324,7 @@ impl Look<'_> {
 
     /// Points of which the profile says that they keep the motor from running.
     fn blocking_points(&self) -> impl Iterator<Item = Cause> + '_ {
-        let points = (0..).zip(&self.profile.points);
+        let points = self.profile.points.enumerate();
         points.filter_map(|(index, point)| {
             let blocks = point.blocks.as_ref()?;
             let sample = (self.sample)(index);

@@ -10,7 +10,7 @@ use super::units;
 use crate::command::Commanded;
 use crate::drive::model::Kind as Values;
 use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Point, PollClass, Source, State};
+use crate::drive::{ModelPoint, Point, PointIndex, PollClass, Source, State};
 use crate::process_image::{Access, BusSpec, DriveSpec};
 
 /// Analog inputs from 1 on.
@@ -50,17 +50,17 @@ const OTHER: &str = "other";
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Meaning {
     /// That point of the profile.
-    Point(usize),
+    Point(PointIndex),
     /// That point, an enumeration.
-    Enumeration(usize),
+    Enumeration(PointIndex),
     /// The state of the drive.
     State,
     /// The text of the active fault.
     FaultText,
     /// A command with priorities, and its point.
-    Slot(Commanded, usize),
+    Slot(Commanded, PointIndex),
     /// A pulse, and its point.
-    Reset(usize),
+    Reset(PointIndex),
     BusUp(usize),
     BusLoad(usize),
 }
@@ -247,11 +247,7 @@ fn commands(spec: &DriveSpec, all: &mut Objects) {
 /// The points that only the profile has, in its order, counted over all types.
 fn own(spec: &DriveSpec, all: &mut Objects) {
     let profile = &spec.profile;
-    let own = profile
-        .points
-        .iter()
-        .enumerate()
-        .filter(|(_, point)| point.model.is_none());
+    let own = profile.points.enumerate().filter(|(_, point)| point.model.is_none());
     for (number, (index, point)) in (OWN..).zip(own) {
         let writable = point.write && spec.access == Access::Control;
         let unread = point.raw().is_some() && point.class == PollClass::Never;
@@ -306,7 +302,7 @@ pub(super) fn state_of(point: &Point, code: i64) -> u32 {
     u32::try_from(place + 1).unwrap_or(u32::MAX)
 }
 
-fn describe(spec: &DriveSpec, index: usize) -> String {
+fn describe(spec: &DriveSpec, index: PointIndex) -> String {
     let Some(point) = spec.profile.points.get(index) else {
         return String::new();
     };
@@ -332,7 +328,7 @@ fn binary(point: Option<&Point>) -> Kind {
     }
 }
 
-fn analog(spec: &DriveSpec, index: usize, model: Option<ModelPoint>, limits: Option<RangeInclusive<f64>>) -> Kind {
+fn analog(spec: &DriveSpec, index: PointIndex, model: Option<ModelPoint>, limits: Option<RangeInclusive<f64>>) -> Kind {
     let point = spec.profile.points.get(index);
     let unit = point.map_or("", |point| point.unit.as_str());
     let raw = raw_of(spec, index, 4);
@@ -362,7 +358,7 @@ fn analog(spec: &DriveSpec, index: usize, model: Option<ModelPoint>, limits: Opt
 }
 
 /// Form and scale of the register behind a point.
-fn raw_of(spec: &DriveSpec, index: usize, depth: usize) -> Option<(Form, f64)> {
+fn raw_of(spec: &DriveSpec, index: PointIndex, depth: usize) -> Option<(Form, f64)> {
     let point = spec.profile.points.get(index)?;
     match &point.source {
         Source::Raw(raw) => Some((raw.form, raw.scale)),

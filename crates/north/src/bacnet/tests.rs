@@ -13,7 +13,7 @@ use crate::command::{
     Urgency,
 };
 use crate::drive::profile::Profiles;
-use crate::drive::{ModelPoint, Value};
+use crate::drive::{ModelPoint, PointIndex, Value};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link};
 
@@ -167,7 +167,7 @@ impl Bench {
         let Order::Points(values) = &command.order else {
             panic!("{:?}", command.order)
         };
-        let name = |index: usize| drive.image.spec.profile.points[index].name.clone();
+        let name = |index: PointIndex| drive.image.spec.profile.points.get(index).unwrap().name.clone();
         let values: Vec<String> = values
             .iter()
             .map(|(index, value)| format!("{}={value}", name(*index)))

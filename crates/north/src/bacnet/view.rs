@@ -17,7 +17,7 @@ use super::objects::{self, Meaning, Shown};
 use super::{Options, WhenOffline};
 use crate::codec::Table;
 use crate::command::{self, Commanded, Entry, Origin, Priorities, Refusal, SourceKind};
-use crate::drive::{ModelPoint, Quality, Source, Value};
+use crate::drive::{ModelPoint, PointIndex, Quality, Source, Value};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{Reading, Unavailable};
 
@@ -155,14 +155,14 @@ impl View {
         }
     }
 
-    fn drive_has(&self, reading: &Reading<'_>, what: Commanded, index: usize) -> Sample {
+    fn drive_has(&self, reading: &Reading<'_>, what: Commanded, index: PointIndex) -> Sample {
         self.point(reading, index, |value| match what {
             Commanded::Run | Commanded::Reverse => Datum::Bool(value.as_bool()),
             _ => Datum::Number(value.as_f64()),
         })
     }
 
-    fn point(&self, reading: &Reading<'_>, index: usize, datum: impl Fn(Value) -> Datum) -> Sample {
+    fn point(&self, reading: &Reading<'_>, index: PointIndex, datum: impl Fn(Value) -> Datum) -> Sample {
         let sample = reading.sample(index);
         let reliability = match sample.quality {
             Quality::Good => Reliability::NoFault,
@@ -237,7 +237,7 @@ fn datum_of(value: Value) -> Datum {
 }
 
 /// Whether the drive refuses a register of a point.
-fn refused(reading: &Reading<'_>, index: usize) -> bool {
+fn refused(reading: &Reading<'_>, index: PointIndex) -> bool {
     let Some(point) = reading.spec.profile.points.get(index) else {
         return false;
     };
@@ -253,7 +253,7 @@ fn refused(reading: &Reading<'_>, index: usize) -> bool {
 }
 
 /// The value of the slot that governs, in the unit of the point.
-fn governed(reading: &Reading<'_>, all: &Priorities, what: Commanded, index: usize) -> Option<Datum> {
+fn governed(reading: &Reading<'_>, all: &Priorities, what: Commanded, index: PointIndex) -> Option<Datum> {
     let (of, _, entry) = all.governing(what)?;
     if of == what {
         return Some(datum_of(entry.value));

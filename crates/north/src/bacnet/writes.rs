@@ -11,7 +11,7 @@ use crate::command::{
     self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite,
     SourceKind,
 };
-use crate::drive::Value;
+use crate::drive::{PointIndex, Value};
 use crate::plant::{DriveHandle, Placed};
 use crate::process_image::Machine;
 
@@ -111,7 +111,13 @@ fn described(job: &Job) -> String {
 }
 
 /// A write to a slot, and the order that follows from it.
-fn slot(handle: &DriveHandle, (what, index): (Commanded, usize), job: &Job, origin: Origin, now: Instant) -> Begun {
+fn slot(
+    handle: &DriveHandle,
+    (what, index): (Commanded, PointIndex),
+    job: &Job,
+    origin: Origin,
+    now: Instant,
+) -> Begun {
     let priority = job.priority.unwrap_or(16);
     let value = job.value.as_ref().and_then(value_of);
     if let Some(value) = value
@@ -191,7 +197,7 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
 }
 
 /// Whether the drive could be given that value at all; what is not known yet is judged when it becomes a command.
-fn possible(handle: &DriveHandle, index: usize, value: Value, now: Instant) -> Result<(), Refusal> {
+fn possible(handle: &DriveHandle, index: PointIndex, value: Value, now: Instant) -> Result<(), Refusal> {
     let order = Order::Points(vec![(index, value)]);
     match command::admit(order, &handle.reading(now), Authority::Write) {
         Err(refusal @ (Refusal::BadValue(_) | Refusal::NotWritable(_))) => Err(refusal),

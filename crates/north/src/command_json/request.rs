@@ -13,7 +13,7 @@ use serde_json::value::RawValue;
 use crate::command::{DEFAULT_EXPIRY, Refusal, sets_twice, stop_of};
 use crate::document::nearest;
 use crate::drive::model::Kind;
-use crate::drive::{Profile, Value};
+use crate::drive::{PointIndex, Profile, Value};
 use crate::plant::Plant;
 
 /// Maximum size of a command, bytes.
@@ -26,7 +26,7 @@ const MAX_EXPIRY_MS: u64 = 60_000;
 const MAX_NAME: usize = 64;
 
 /// Points to be set: index in the profile and value.
-pub(crate) type Points = Vec<(usize, Value)>;
+pub(crate) type Points = Vec<(PointIndex, Value)>;
 
 /// The `id` of a command: a number or a string, returned as it was written.
 #[derive(Debug, Clone, Serialize)]
@@ -179,7 +179,7 @@ fn request_expiry(value: &Json) -> Result<Duration, Refusal> {
 }
 
 /// The point of that name with its value. Limits are checked with the command.
-pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(usize, Value), Refusal> {
+pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(PointIndex, Value), Refusal> {
     let Some(index) = profile.point_index(name) else {
         let writable = || {
             profile

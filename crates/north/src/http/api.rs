@@ -10,7 +10,7 @@ use crate::command_json::HoldFields;
 use crate::diagnosis::{self, Counted, Verdict};
 use crate::drill::StopProof;
 use crate::drive::why::Cause;
-use crate::drive::{self, ModelPoint, Quality, State};
+use crate::drive::{self, ModelPoint, PointIndex, Quality, State};
 use crate::history::History;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
@@ -215,7 +215,7 @@ struct Point<'p> {
 
 impl Points<'_> {
     /// A stale value is shown with its quality; a bad point has no value.
-    fn point<'p>(&self, index: usize, point: &'p drive::Point) -> Point<'p> {
+    fn point<'p>(&self, index: PointIndex, point: &'p drive::Point) -> Point<'p> {
         let sample = self.reading.sample(index);
         let shown = sample.quality != Quality::Bad;
         let at = sample.at.filter(|_| shown);

@@ -13,7 +13,7 @@ use super::replies::{Replied, not_found};
 use super::routes::AppState;
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{self, Authority, Order, Origin};
-use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source};
+use crate::drive::{Point, PointIndex, PollClass, Profile, Quality, Raw, Sample, Source};
 use crate::plant::DriveHandle;
 use crate::process_image::{Link, Reading, Unavailable, public_points};
 
@@ -70,7 +70,7 @@ async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) 
 #[derive(Debug, Clone, Copy)]
 enum Wanted {
     /// A point, by its index.
-    Point(usize),
+    Point(PointIndex),
     Word(Word),
 }
 
@@ -113,7 +113,7 @@ fn wanted(profile: &Profile, names: &[&str]) -> Result<Vec<Wanted>, String> {
     let of = |name: &&str| {
         let has = |word: &Word| word.sources().iter().any(|point| profile.model_index(*point).is_some());
         let word = || Word::of(name).filter(has).map(Wanted::Word);
-        let shown = |index: &usize| profile.points.get(*index).is_some_and(|point| !point.hidden);
+        let shown = |index: &PointIndex| profile.points.get(*index).is_some_and(|point| !point.hidden);
         let point = profile.point_index(name).filter(shown).map(Wanted::Point);
         point
             .or_else(word)
@@ -154,7 +154,7 @@ async fn forwarded(drive: &DriveHandle, point: &Point, raw: &Raw, origin: Origin
 const NO_NUMBER: &str = "the register does not hold a number";
 
 /// Why a polled or derived point has no good value.
-fn why_not_good(drive: &DriveHandle, reading: &Reading<'_>, index: usize) -> String {
+fn why_not_good(drive: &DriveHandle, reading: &Reading<'_>, index: PointIndex) -> String {
     if !drive.bus_up() {
         let reason = drive.bus.image.health().reason;
         return reason.map_or("the bus is down".to_string(), |why| format!("the bus is down: {why}"));

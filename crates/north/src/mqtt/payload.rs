@@ -8,14 +8,14 @@ use serde::ser::{Serialize, SerializeMap, Serializer};
 use super::topics::Topics;
 use crate::command::HoldView;
 use crate::command_json::HoldFields;
-use crate::drive::{ModelPoint, Point, Profile, Quality, State, Value};
+use crate::drive::{ModelPoint, Point, PointIndex, Profile, Quality, State, Value};
 use crate::event::Event;
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, Reading, value_or_null};
 
 /// The points of a drive that are published: index in the profile and name. None of them is a key of the state object:
 /// profiles do not take such names.
-pub(super) fn published_points(profile: &Profile) -> Vec<(usize, &str)> {
+pub(super) fn published_points(profile: &Profile) -> Vec<(PointIndex, &str)> {
     crate::process_image::public_points(profile)
 }
 
@@ -44,7 +44,7 @@ pub(super) fn text_beside(point: &Point, value: Option<Value>) -> Option<(String
 impl StateContent {
     pub(super) fn of(
         reading: &Reading<'_>,
-        points: impl Iterator<Item = usize>,
+        points: impl Iterator<Item = PointIndex>,
         blocked_by: Vec<String>,
         stop_waits: Option<Duration>,
     ) -> StateContent {
@@ -75,7 +75,7 @@ pub(super) struct StateObject<'s> {
     /// Names in the order of `shown.points`.
     pub(super) names: &'s [String],
     /// Their indices in the profile.
-    pub(super) indices: &'s [usize],
+    pub(super) indices: &'s [PointIndex],
     pub(super) profile: &'s Profile,
     pub(super) fault_text: String,
     pub(super) age: Option<Duration>,
@@ -337,7 +337,7 @@ mod tests {
             let object = StateObject {
                 shown: &shown,
                 names: &["mode".to_string()],
-                indices: &[0],
+                indices: &[PointIndex::new(0)],
                 profile: &profile,
                 fault_text: String::new(),
                 age: None,

@@ -15,7 +15,7 @@ use super::connection::PACKET_OVERHEAD;
 use super::history::Recorder;
 use super::payload::{self, BusFigures, BusState, PointPayload, StateContent, StateObject};
 use super::topics::Topics;
-use crate::drive::ModelPoint;
+use crate::drive::{ModelPoint, PointIndex};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{Reading, Snapshot};
 
@@ -83,7 +83,7 @@ struct DriveTopics {
     state: Option<Arc<str>>,
     recorder: Recorder,
     /// Index in the profile and name of each published point.
-    indices: Vec<usize>,
+    indices: Vec<PointIndex>,
     names: Vec<String>,
     /// Number of points in the state object: all, unless the broker takes only smaller packets.
     fits: usize,
@@ -427,7 +427,7 @@ impl DriveTopics {
 
 /// The state object with the first points, of which there are so many.
 fn render(
-    (names, indices, fits): (&[String], &[usize], usize),
+    (names, indices, fits): (&[String], &[PointIndex], usize),
     reading: &Reading<'_>,
     shown: &StateContent,
     wall: SystemTime,

@@ -2,7 +2,7 @@
 
 use super::{COMMAND_WORD, FREQUENCY_REFERENCE, HEARTBEAT, NO_I16, NO_U16, REVERSE, RUN, SPEED_REFERENCE};
 use crate::command::Refusal;
-use crate::drive::{ModelPoint, Profile, Value};
+use crate::drive::{ModelPoint, PointIndex, Profile, Value};
 
 const FAULT_RESET: u16 = 1 << 2;
 
@@ -11,7 +11,7 @@ const FAULT_RESET: u16 = 1 << 2;
 pub(crate) struct CommandWrite {
     /// Points to set as one command: index in the profile, value in engineering units. May be empty when
     /// only the heartbeat was written.
-    pub(crate) points: Vec<(usize, Value)>,
+    pub(crate) points: Vec<(PointIndex, Value)>,
     /// The word at 0x8100, if it was written.
     pub(crate) word: Option<u16>,
     /// The heartbeat was written.
@@ -136,7 +136,7 @@ fn no_value(address: u32) -> Refusal {
     ))
 }
 
-fn writable(profile: &Profile, point: ModelPoint) -> Result<usize, Refusal> {
+fn writable(profile: &Profile, point: ModelPoint) -> Result<PointIndex, Refusal> {
     let index = profile.model_index(point);
     let index = index.filter(|i| profile.points.get(*i).is_some_and(|p| p.write));
     index.ok_or_else(|| {
@@ -153,7 +153,7 @@ fn command_word(
     profile: &Profile,
     word: u16,
     before: CommandContext,
-    points: &mut Vec<(usize, Value)>,
+    points: &mut Vec<(PointIndex, Value)>,
 ) -> Result<Option<Refusal>, Refusal> {
     points.push((writable(profile, ModelPoint::Run)?, Value::Bool(word & RUN != 0)));
     if word & !(RUN | REVERSE | FAULT_RESET) != 0 {

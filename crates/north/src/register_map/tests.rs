@@ -2,8 +2,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::*;
 use crate::codec::Table;
-use crate::drive::Profile;
 use crate::drive::profile::Profiles;
+use crate::drive::{PointIndex, Profile};
 use crate::process_image::{Access, DriveImage, DriveSpec, Link, Snapshot};
 
 const STALE_AFTER: Duration = Duration::from_secs(1);
@@ -278,7 +278,7 @@ fn a_large_drive_reads_as_float() {
     let now = Instant::now();
     let mut profile = nx();
     let current = profile.model_index(ModelPoint::MotorCurrent).unwrap();
-    let crate::drive::Source::Raw(raw) = &mut profile.points[current].source else {
+    let crate::drive::Source::Raw(raw) = &mut profile.points.get_mut(current).unwrap().source else {
         panic!("motor_current is raw");
     };
     raw.scale = 1.0;
@@ -293,7 +293,7 @@ fn a_large_drive_reads_as_float() {
 }
 
 fn named(profile: &Profile, write: &CommandWrite) -> Vec<String> {
-    let one = |(i, v): &(usize, Value)| format!("{}={v}", profile.points[*i].name);
+    let one = |(i, v): &(PointIndex, Value)| format!("{}={v}", profile.points.get(*i).unwrap().name);
     write.points.iter().map(one).collect()
 }
 
@@ -388,7 +388,7 @@ fn refused_command_writes() {
         ModelPoint::FrequencyReference,
     ] {
         let index = lacking.model_index(point).unwrap();
-        lacking.points[index].write = false;
+        lacking.points.get_mut(index).unwrap().write = false;
     }
     let (address, value) = (Exception::ADDRESS, Exception::VALUE);
     let table: &[(&Profile, u16, &[u16], Exception)] = &[
@@ -425,7 +425,7 @@ fn a_word_without_run_stops_whatever_is_wrong_with_the_rest() {
     let mut lacking = nx();
     for point in [ModelPoint::Reverse, ModelPoint::FrequencyReference] {
         let index = lacking.model_index(point).unwrap();
-        lacking.points[index].write = false;
+        lacking.points.get_mut(index).unwrap().write = false;
     }
     let (address, value) = (Exception::ADDRESS, Exception::VALUE);
     let table: &[(&Profile, u16, &[u16], Exception, &str)] = &[

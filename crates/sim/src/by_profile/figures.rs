@@ -8,7 +8,7 @@ use super::{AT_REFERENCE_BAND, Given, ProfileDrive};
 use crate::codec::Table;
 use crate::drive::control::{Mask, OwnWord, Run, Until};
 use crate::drive::profile::{Form, Part, PollClass, Raw};
-use crate::drive::{Derived, ModelPoint, Point, Profile, Source};
+use crate::drive::{Derived, ModelPoint, Point, PointIndex, Profile, Source};
 
 /// kW of the simulated motor.
 const NOMINAL_POWER: f64 = 3.0;
@@ -40,7 +40,9 @@ impl ProfileDrive {
             );
         }
         // Those with a scale in another register come after it.
-        let (scaled, plain): (Vec<usize>, Vec<usize>) = (0..profile.points.len())
+        let (scaled, plain): (Vec<PointIndex>, Vec<PointIndex>) = profile
+            .points
+            .indexes()
             .partition(|index| raw_of(&profile, *index).is_some_and(|raw| raw.scale_from.is_some()));
         for index in plain.into_iter().chain(scaled) {
             let Some((point, raw)) = profile.points.get(index).and_then(|point| Some((point, point.raw()?))) else {
@@ -114,7 +116,7 @@ impl ProfileDrive {
     /// Brings all registers up to date.
     pub(super) fn show(&mut self, now: SimTime) {
         let profile = self.profile();
-        for (index, point) in profile.points.iter().enumerate() {
+        for (index, point) in profile.points.enumerate() {
             if let (Some(raw), Some(number)) = (point.raw(), self.figure(index, point))
                 && raw.state_parts().is_none()
                 && !self.is_written(point, raw)
@@ -140,7 +142,7 @@ impl ProfileDrive {
     }
 
     /// What the motor makes of a point.
-    fn figure(&self, index: usize, point: &Point) -> Option<f64> {
+    fn figure(&self, index: PointIndex, point: &Point) -> Option<f64> {
         let (motor, ratings) = (&self.body.motor, &self.ratings);
         if self.options.values.contains_key(&index) || self.control.is_none() {
             return None;
@@ -188,7 +190,7 @@ impl ProfileDrive {
     /// The states that registers are to show, the ones that count most first.
     fn wishes(&self, profile: &Profile, now: SimTime) -> Vec<Wish> {
         let mut wishes: Vec<(u8, Wish)> = Vec::new();
-        for (index, point) in profile.points.iter().enumerate() {
+        for (index, point) in profile.points.enumerate() {
             let Some((rank, is)) = self.state_of(index, point) else {
                 continue;
             };
@@ -243,7 +245,7 @@ impl ProfileDrive {
     }
 
     /// Whether a state is so, and how much it counts.
-    fn state_of(&self, index: usize, point: &Point) -> Option<(u8, bool)> {
+    fn state_of(&self, index: PointIndex, point: &Point) -> Option<(u8, bool)> {
         if let Some(Given::Number(number)) = self.options.values.get(&index) {
             return Some((0, *number != 0.0));
         }
@@ -269,7 +271,7 @@ impl ProfileDrive {
     }
 }
 
-fn raw_of(profile: &Profile, index: usize) -> Option<&Raw> {
+fn raw_of(profile: &Profile, index: PointIndex) -> Option<&Raw> {
     profile.points.get(index).and_then(Point::raw)
 }
 

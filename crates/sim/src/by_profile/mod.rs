@@ -22,7 +22,7 @@ use super::parameter_set::Writes;
 use super::random::Random;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::drive::control::{Control, ControlItem, Run, Until};
-use crate::drive::{Bound, ModelPoint, Profile, Source, Value};
+use crate::drive::{Bound, ModelPoint, PointIndex, Profile, Source, Value};
 
 /// Time that a drive takes to come to the next state of its start sequence.
 const SETTLE: Duration = Duration::from_millis(30);
@@ -41,7 +41,7 @@ pub struct ProfileOptions {
     /// Time before a reply; none leaves it to the line.
     pub turnaround: Option<Duration>,
     /// What points without a motor behind them hold, by index.
-    pub values: BTreeMap<usize, Given>,
+    pub values: BTreeMap<PointIndex, Given>,
 }
 
 /// The value of a point as given.

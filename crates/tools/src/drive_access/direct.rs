@@ -7,7 +7,7 @@ use super::Configured;
 use crate::client::{Client, Door};
 use crate::config::{BusSettings, ParamsSettings, Settings};
 use crate::daemon::Daemon;
-use crate::drive::{Point, PollClass, Profile, Quality, Source};
+use crate::drive::{Point, PointIndex, PollClass, Profile, Quality, Source};
 use crate::north::http::InProcess;
 use crate::north::http::messages::Word;
 use crate::north::local::SocketPath;
@@ -137,7 +137,7 @@ impl Direct {
     async fn settled(&self, needs: Needs<'_>) {
         let profile = &self.drive.image.spec.profile;
         let index = |name: &str| profile.point_index(name);
-        let awaited: Vec<usize> = match needs {
+        let awaited: Vec<PointIndex> = match needs {
             Needs::Points(names) if !names.is_empty() => {
                 let of = |name: &String| match (index(name), Word::of(name)) {
                     (Some(index), _) => vec![index],
@@ -152,9 +152,9 @@ impl Direct {
             }
             Needs::Identification => profile.parameters.identification.clone(),
             Needs::Commands(names) if !names.iter().any(|name| is_derived(profile, index(name))) => Vec::new(),
-            _ => (0..profile.points.len()).collect(),
+            _ => profile.points.indexes().collect(),
         };
-        let polled: Vec<usize> = awaited.into_iter().filter(|index| is_polled(profile, *index)).collect();
+        let polled: Vec<PointIndex> = awaited.into_iter().filter(|index| is_polled(profile, *index)).collect();
         until(READ, || {
             let reading = self.drive.reading(Instant::now());
             polled.iter().all(|index| is_settled(&reading, *index))
@@ -176,14 +176,14 @@ impl Direct {
     }
 }
 
-fn is_derived(profile: &Profile, index: Option<usize>) -> bool {
+fn is_derived(profile: &Profile, index: Option<PointIndex>) -> bool {
     let point = index.and_then(|index| profile.points.get(index));
     point.is_some_and(|point| point.raw().is_none())
 }
 
 /// Whether the plan reads the point, or all that a derived one rests on.
-fn is_polled(profile: &Profile, index: usize) -> bool {
-    let read = |i: usize| profile.points.get(i).is_some_and(|p| p.class != PollClass::Never);
+fn is_polled(profile: &Profile, index: PointIndex) -> bool {
+    let read = |i: PointIndex| profile.points.get(i).is_some_and(|p| p.class != PollClass::Never);
     match profile.points.get(index).map(|p| &p.source) {
         Some(Source::Derived(derived)) => derived.rests_on().into_iter().all(read),
         Some(Source::Raw(raw)) => read(index) && raw.scale_from.is_none_or(read),
@@ -192,7 +192,7 @@ fn is_polled(profile: &Profile, index: usize) -> bool {
 }
 
 /// Whether the drive has answered or refused it.
-fn is_settled(reading: &Reading<'_>, index: usize) -> bool {
+fn is_settled(reading: &Reading<'_>, index: PointIndex) -> bool {
     let sources = match reading.spec.profile.points.get(index).map(|p| &p.source) {
         Some(Source::Derived(derived)) => derived.rests_on(),
         Some(Source::Raw(raw)) => std::iter::once(index).chain(raw.scale_from).collect(),

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 
 use super::*;
 use crate::codec::Exception;
-use crate::drive::Profile;
 use crate::drive::RawWrites;
 use crate::drive::profile::Profiles;
+use crate::drive::{PointIndex, Profile};
 use crate::process_image::{DriveImage, DriveSpec, Link};
 
 fn drive(access: Access) -> DriveImage {
@@ -35,7 +35,7 @@ fn try_order(order: Order) -> Result<Admitted, Refusal> {
     )
 }
 
-fn point(name: &str) -> usize {
+fn point(name: &str) -> PointIndex {
     Profiles::built_in().get("vacon-nx").unwrap().point_index(name).unwrap()
 }
 
@@ -198,7 +198,7 @@ fn a_limit_on_one_name_of_a_reference_holds_for_every_way_to_write_it() {
     const NAMES: [&str; 3] = ["speed_reference", "frequency_reference", "frequency_command"];
     for profile in Profiles::built_in().iter() {
         let names = NAMES.iter().filter(|name| profile.point_index(name).is_some());
-        let points: Vec<usize> = names.filter_map(|name| profile.point_index(name)).collect();
+        let points: Vec<PointIndex> = names.filter_map(|name| profile.point_index(name)).collect();
         // Of some families only percent is known.
         if points.len() < 2 && !profile.verified {
             continue;
@@ -215,12 +215,12 @@ fn a_limit_on_one_name_of_a_reference_holds_for_every_way_to_write_it() {
             reading.band_for_commands(low, high).unwrap().0
         };
         let low = minimum(&limited(profile, "speed_reference", 100.0));
-        let figure = |index: usize, percent: f64| match profile.points[index].unit.as_str() {
+        let figure = |index: PointIndex, percent: f64| match profile.points.get(index).unwrap().unit.as_str() {
             "%" => percent,
             _ => low + percent / 100.0 * (50.0 - low),
         };
         for limit in &points {
-            let image = limited(profile, &profile.points[*limit].name, figure(*limit, 80.0));
+            let image = limited(profile, &profile.points.get(*limit).unwrap().name, figure(*limit, 80.0));
             let asked = |order: Order| {
                 let reading = image.reading(Instant::now(), Duration::from_secs(1));
                 admit(order, &reading, Authority::Write).map_err(|refusal| refusal.code())
@@ -228,7 +228,9 @@ fn a_limit_on_one_name_of_a_reference_holds_for_every_way_to_write_it() {
             for way in &points {
                 let what = format!(
                     "{}: limit on `{}`, order of `{}`",
-                    profile.name, profile.points[*limit].name, profile.points[*way].name
+                    profile.name,
+                    profile.points.get(*limit).unwrap().name,
+                    profile.points.get(*way).unwrap().name
                 );
                 let order = |percent| Order::Points(vec![(*way, Value::Number(figure(*way, percent)))]);
                 let admitted = asked(order(79.0)).unwrap_or_else(|code| panic!("{what}: {code}"));
@@ -237,7 +239,7 @@ fn a_limit_on_one_name_of_a_reference_holds_for_every_way_to_write_it() {
                     panic!("{what}");
                 };
                 let (register, _) = values[0];
-                let raw = profile.points[register].raw().unwrap();
+                let raw = profile.points.get(register).unwrap().raw().unwrap();
                 let write = |percent| {
                     let words = raw.encode(Value::Number(figure(register, percent)), 0).unwrap();
                     Order::Write(match words.as_slice() {
@@ -392,7 +394,7 @@ fn no_command_rests_on_an_old_parameter() {
 }
 
 /// A TECO drive, whose reference is a frequency, written elsewhere than it is read, with a limit in percent.
-fn in_hertz(maximum: Option<u16>, order: impl Fn(&dyn Fn(&str) -> usize) -> Order) -> Result<Admitted, Refusal> {
+fn in_hertz(maximum: Option<u16>, order: impl Fn(&dyn Fn(&str) -> PointIndex) -> Order) -> Result<Admitted, Refusal> {
     let profile = Profiles::built_in().get("teco-7300pa").unwrap().clone();
     let mut spec = drive(Access::Control).spec;
     spec.profile = Arc::clone(&profile);

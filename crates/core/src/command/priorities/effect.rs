@@ -2,7 +2,7 @@
 
 use crate::codec::Table;
 use crate::command::{Order, written};
-use crate::drive::{ModelPoint, Profile, Source};
+use crate::drive::{ModelPoint, PointIndex, Profile, Source};
 
 /// The prioritised points that a command sets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -57,7 +57,7 @@ impl Effect {
 }
 
 /// The point whose register accepts the commands for a point.
-fn behind(profile: &Profile, index: usize) -> usize {
+fn behind(profile: &Profile, index: PointIndex) -> PointIndex {
     let mut at = index;
     // A point rests on one with a register, over one that takes its commands.
     for _ in 0..4 {

@@ -7,7 +7,7 @@ use super::super::ticket::tests::ticket;
 use super::super::{Admitted, Answer, Origin, SourceKind, Ticket, Touched, WriteStats};
 use super::*;
 use crate::codec::Table;
-use crate::drive::{DriveIndex, Value};
+use crate::drive::{DriveIndex, PointIndex, Value};
 
 mod order;
 mod slots;
@@ -34,7 +34,12 @@ struct Bench {
 }
 
 fn points(points: &[usize]) -> Order {
-    Order::Points(points.iter().map(|p| (*p, Value::Bool(true))).collect())
+    Order::Points(
+        points
+            .iter()
+            .map(|p| (PointIndex::new(*p), Value::Bool(true)))
+            .collect(),
+    )
 }
 
 /// Each point is a register of its own.
@@ -43,7 +48,7 @@ fn touched(order: &Order) -> Touched {
         Order::Points(values) => Touched::These {
             sets: values
                 .iter()
-                .map(|(point, _)| (Table::Holding, *point as u16))
+                .map(|(point, _)| (Table::Holding, point.place() as u16))
                 .collect(),
             rests_on: Vec::new(),
         },
@@ -106,7 +111,11 @@ impl Bench {
             let Order::Points(values) = &command.order else {
                 panic!("{command:?}")
             };
-            all.push((command.ticket.origin().who.clone(), command.drive.place(), values[0].0));
+            all.push((
+                command.ticket.origin().who.clone(),
+                command.drive.place(),
+                values[0].0.place(),
+            ));
         }
         all
     }
@@ -151,7 +160,7 @@ fn newer_references_replace_older_ones_of_the_same_points() {
 fn a_newer_reference_takes_the_place_of_the_older_one() {
     let mut bench = Bench::new();
     let reference = |bench: &mut Bench, percent: f64| {
-        let order = Order::Points(vec![(7, Value::Number(percent))]);
+        let order = Order::Points(vec![(PointIndex::new(7), Value::Number(percent))]);
         bench.give((SourceKind::Mqtt, "t"), 1, Urgency::Command, order, true)
     };
     let mut old = reference(&mut bench, 10.0);
@@ -160,7 +169,7 @@ fn a_newer_reference_takes_the_place_of_the_older_one() {
     assert_eq!(outcome(&mut old), Some(Outcome::Replaced));
     assert_eq!(outcome(&mut new), None);
     let sent: Vec<Order> = std::iter::from_fn(|| bench.take()).map(|c| c.order).collect();
-    let wanted = Order::Points(vec![(7, Value::Number(12.0))]);
+    let wanted = Order::Points(vec![(PointIndex::new(7), Value::Number(12.0))]);
     assert_eq!(
         sent,
         [wanted, points(&[1])],
@@ -168,7 +177,7 @@ fn a_newer_reference_takes_the_place_of_the_older_one() {
     );
     // A reference of another client does so too: whoever wrote last.
     let mut old = reference(&mut bench, 10.0);
-    let order = Order::Points(vec![(7, Value::Number(15.0))]);
+    let order = Order::Points(vec![(PointIndex::new(7), Value::Number(15.0))]);
     let _new = bench.give((SourceKind::ModbusTcp, "10.0.0.1:1"), 1, Urgency::Command, order, true);
     assert_eq!(outcome(&mut old), Some(Outcome::Replaced));
     assert_eq!(bench.pending.len(), 1);

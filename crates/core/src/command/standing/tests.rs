@@ -4,8 +4,8 @@ use std::time::Duration;
 use super::super::{Authority, Refusal, admit};
 use super::*;
 use crate::codec::{Protocol, RequestPdu};
-use crate::drive::RawWrites;
 use crate::drive::profile::Profiles;
+use crate::drive::{PointIndex, RawWrites};
 use crate::process_image::{Access, DriveImage, DriveSpec, Link};
 
 /// A drive with that limit of a point, whose registers were read so long ago.
@@ -43,7 +43,7 @@ fn on_n2(percent: f32, ago: Duration) -> DriveImage {
     )
 }
 
-fn point(image: &DriveImage, name: &str) -> usize {
+fn point(image: &DriveImage, name: &str) -> PointIndex {
     image.spec.profile.point_index(name).unwrap()
 }
 
@@ -95,7 +95,12 @@ fn a_raw_write_is_judged_alike() {
 fn a_limit_in_percent_rests_on_the_frequency_range_too() {
     let words: &[(Table, u16, &[u16])] = &[(Table::Holding, 0, &[4000])];
     let image = drive("vacon-cx", ("speed_reference", 80.0), words, Duration::ZERO);
-    let address = image.spec.profile.points[point(&image, "maximum_frequency")]
+    let address = image
+        .spec
+        .profile
+        .points
+        .get(point(&image, "maximum_frequency"))
+        .unwrap()
         .raw()
         .unwrap()
         .address;

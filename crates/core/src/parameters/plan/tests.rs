@@ -287,7 +287,7 @@ fn teco_takes_them_in_program_mode_and_saves_once() {
     assert_eq!(ids_of(&all), ["Cn-02", "On-20", "Bn-01"]);
     assert_eq!(all.handling.save, Some((0x0900, 0)));
     let need = all.handling.needs.clone().unwrap();
-    assert_eq!(teco.points[need.point].name, "ready");
+    assert_eq!(teco.points.get(need.point).unwrap().name, "ready");
     assert_eq!((need.value, need.exception), (false, Some(0x22)));
     assert_eq!(
         all.to_string(),

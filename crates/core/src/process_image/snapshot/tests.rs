@@ -15,7 +15,7 @@ fn a_value_within_a_band_is_as_good_as_the_band() {
     let now = Instant::now();
     let sample = || image.reading(now, Duration::from_secs(1)).sample(reference);
     let store = |name: &str, value: f64| {
-        let raw = profile.points[index(name)].raw().unwrap().clone();
+        let raw = profile.points.get(index(name)).unwrap().raw().unwrap().clone();
         let words = raw.encode(Value::Number(value), 0).unwrap();
         image.update(|s| s.store(raw.table, raw.address, &words, now));
     };

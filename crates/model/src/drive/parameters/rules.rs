@@ -1,5 +1,6 @@
 //! A family's rules for writing parameters back: exceptions, order, saving.
 
+use crate::drive::PointIndex;
 use std::ops::RangeInclusive;
 
 /// PDU addresses of parameters.
@@ -43,7 +44,7 @@ pub struct Lock {
     pub of: Addresses,
     /// Point (index in the profile) that is true only while the drive refuses them. While it is false the drive may still
     /// refuse them.
-    pub point: usize,
+    pub point: PointIndex,
     /// Exception code of the refusal; N2 codes with 0x80 added. None where no manual says.
     pub exception: Option<u8>,
     /// The remedy.

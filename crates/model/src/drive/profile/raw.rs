@@ -5,6 +5,7 @@ mod standing;
 
 use super::super::model::{Kind, Text, Value, tidy, tidy_product};
 use crate::codec::Table;
+use crate::drive::PointIndex;
 
 pub use form::{Form, Order};
 pub use standing::Part;
@@ -39,7 +40,7 @@ pub struct Raw {
     /// Engineering value of raw 0.
     pub offset: f64,
     /// Index of the point whose value is the power of ten by which a count is multiplied.
-    pub scale_from: Option<usize>,
+    pub scale_from: Option<PointIndex>,
 }
 
 /// The count that makes a point true, or false.

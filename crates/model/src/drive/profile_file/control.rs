@@ -1,5 +1,6 @@
 //! `[control]`: how a family is commanded.
 
+use crate::drive::{PerPoint, PointIndex};
 use std::time::Duration;
 
 use super::super::control::{Always, Control, ControlItem, Mask, OwnWord, Reset, Run, Setting, Step, Until};
@@ -21,7 +22,7 @@ const CONTROL_WORD: &str = "control_word";
 
 /// What the table refers to.
 pub(super) struct Around<'p> {
-    pub(super) points: &'p [Point],
+    pub(super) points: &'p PerPoint<Point>,
     pub(super) names: &'p [String],
     pub(super) ranges: &'p [AddressRange],
     pub(super) offsets: &'p Offsets,
@@ -374,7 +375,7 @@ fn read_reset(table: &Reader<'_>, around: &Around<'_>) -> Option<Reset> {
 /// The points of the common model that `[control]` makes, to be put behind `before` others: what they read as rests on the
 /// control word, or on a place of its own; a word that reads as something else is not read. A helper for the control word goes
 /// before them.
-pub(super) fn made_points(control: &Control, points: &[Point], before: usize) -> Vec<Point> {
+pub(super) fn made_points(control: &Control, points: &PerPoint<Point>, before: usize) -> Vec<Point> {
     let mut helpers: Vec<Point> = Vec::new();
     let mut index_of = |place: ControlItem| {
         let is_plain = |point: &Point| {
@@ -384,12 +385,12 @@ pub(super) fn made_points(control: &Control, points: &[Point], before: usize) ->
             })
         };
         let first = points.len() + before;
-        let known = points.iter().position(is_plain);
+        let known = points.position(is_plain).map(PointIndex::place);
         let known = known.or_else(|| helpers.iter().position(is_plain).map(|index| first + index));
-        known.unwrap_or_else(|| {
+        PointIndex::new(known.unwrap_or_else(|| {
             helpers.push(helper(control, place));
             first + helpers.len() - 1
-        })
+        }))
     };
     // The direction stands in the words of a sequence as commanded.
     let free = match (&control.run, control.reverse) {

@@ -4,6 +4,7 @@ use super::super::derive::{Bound, Derived};
 use super::super::model::Kind;
 use super::super::profile::{Point, PollClass, Source};
 use crate::document::{self, Finding, Reader};
+use crate::drive::{PerPoint, PointIndex};
 
 pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Source> {
     const KNOWN: [&str; 6] = ["band", "percent", "zero", "equal", "all", "lowest_bit"];
@@ -17,7 +18,7 @@ pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Sour
         })
     })?;
     let index = |key: &str, name: &str| point_of(reader, key, name, names);
-    let other = |key: &str| -> Option<usize> { index(key, &reader.required::<String>(key)?) };
+    let other = |key: &str| -> Option<PointIndex> { index(key, &reader.required::<String>(key)?) };
     let within = |default: f64| reader.or("within", default);
     let derived = match kind {
         "band" | "percent" => {
@@ -47,7 +48,7 @@ pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Sour
         }
         "all" => {
             let all: Vec<String> = reader.required("of")?;
-            let of: Option<Vec<usize>> = all.iter().map(|name| index("of", name)).collect();
+            let of: Option<Vec<PointIndex>> = all.iter().map(|name| index("of", name)).collect();
             Derived::All { of: of? }
         }
         _ => Derived::LowestBit { of: other("of")? },
@@ -55,8 +56,8 @@ pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Sour
     Some(Source::Derived(derived))
 }
 
-pub(super) fn point_of(reader: &Reader<'_>, key: &str, name: &str, names: &[String]) -> Option<usize> {
-    let index = names.iter().position(|n| n == name);
+pub(super) fn point_of(reader: &Reader<'_>, key: &str, name: &str, names: &[String]) -> Option<PointIndex> {
+    let index = names.iter().position(|n| n == name).map(PointIndex::new);
     if index.is_none() {
         let near = document::nearest(name, names.iter().map(String::as_str));
         let remedy = near.map_or_else(
@@ -81,8 +82,8 @@ fn read_bound(reader: &Reader<'_>, key: &str, names: &[String], default: Option<
 }
 
 /// The ends of a band are polled: commands are converted and limited by them, and they can be changed at the drive.
-pub(super) fn keep_ends_fresh(points: &mut [Point]) {
-    let ends: Vec<usize> = points
+pub(super) fn keep_ends_fresh(points: &mut PerPoint<Point>) {
+    let ends: Vec<PointIndex> = points
         .iter()
         .filter_map(|point| match &point.source {
             Source::Derived(derived) => Some(derived.ends()),
@@ -98,7 +99,7 @@ pub(super) fn keep_ends_fresh(points: &mut [Point]) {
 }
 
 /// Checks that a derived point is made of points that are read from the drive.
-pub(super) fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point]) {
+pub(super) fn check_derived(reader: &Reader<'_>, index: PointIndex, points: &PerPoint<Point>) {
     let Some(Source::Derived(derived)) = points.get(index).map(|p| &p.source) else {
         return;
     };

@@ -16,6 +16,7 @@ mod ranges;
 mod reference;
 mod states;
 
+use crate::drive::{PerPoint, PointIndex};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -258,16 +259,17 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         reader.problem("point", "the profile has no point", "write at least one [[point]]");
     }
     let names: Vec<String> = tables.iter().map(|t| t.optional("name").unwrap_or_default()).collect();
-    let mut points: Vec<Point> = (0..)
-        .zip(&tables)
-        .map(|(i, table)| read_point(table, i, &names, &ranges, &offsets))
+    let mut points: PerPoint<Point> = tables
+        .iter()
+        .enumerate()
+        .map(|(place, table)| read_point(table, place, &names, &ranges, &offsets))
         .collect();
     if protocols.contains(&Protocol::N2) {
         n2::write_on_change(&tables, &mut points);
     }
     reference::apply(reader, &mut points);
     keep_ends_fresh(&mut points);
-    for (index, table) in tables.iter().enumerate() {
+    for (index, table) in points.indexes().zip(&tables) {
         check_derived(table, index, &points);
         check_target(table, index, &points);
         check_monitor(table, index, &points);
@@ -305,7 +307,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     read_fault_help(reader, "fault_remedies", &mut faults, |fault| &mut fault.remedy);
     let model = ModelPoint::ALL
         .iter()
-        .map(|m| points.iter().position(|p| p.model == Some(*m)))
+        .map(|m| points.position(|p| p.model == Some(*m)))
         .collect();
     let bases = parameters_of_bases(base.as_deref(), known);
     let mut profile = Profile {
@@ -371,11 +373,11 @@ fn parameters_of_bases<'k>(base: Option<&str>, known: &'k Profiles) -> Vec<&'k P
 }
 
 /// `on_fault`: points that are read at once when a fault comes up; of a derived one, those that it is made of.
-fn read_on_fault(reader: &Reader<'_>, points: &[Point]) -> Vec<usize> {
+fn read_on_fault(reader: &Reader<'_>, points: &PerPoint<Point>) -> Vec<PointIndex> {
     let names: Vec<String> = reader.or("on_fault", Vec::new());
     let mut found = Vec::new();
     for name in names {
-        let index = points.iter().position(|point| point.name == name);
+        let index = points.position(|point| point.name == name);
         match index.map(|index| (index, points.get(index).map(|point| &point.source))) {
             Some((_, Some(Source::Derived(derived)))) => found.extend(derived.rests_on()),
             Some((index, _)) => found.push(index),

@@ -1,6 +1,7 @@
 //! The keys of `[parameters]` about writing parameters back: `only_by_name`, `nameplate`, `ratings`, `volatile`, `limits`, `save`,
 //! `lock`, `note`. A parameter is named by its id, several by `FIRST..LAST`.
 
+use crate::drive::PerPoint;
 use std::ops::RangeInclusive;
 
 use super::super::model::Kind;
@@ -15,7 +16,7 @@ pub(super) fn read(
     table: &Reader<'_>,
     list: &ParameterList,
     bases: &[&ParameterList],
-    points: &[Point],
+    points: &PerPoint<Point>,
     ranges: &[AddressRange],
 ) -> WriteRules {
     let rules = Rules { table, list, bases };
@@ -176,7 +177,7 @@ fn read_save(table: &Reader<'_>, ranges: &[AddressRange]) -> Option<(u16, u16)> 
 }
 
 /// `[parameters.lock]`: parameters that the drive takes in one mode only.
-fn read_lock(parent: &Reader<'_>, rules: &Rules<'_, '_>, points: &[Point]) -> Option<Lock> {
+fn read_lock(parent: &Reader<'_>, rules: &Rules<'_, '_>, points: &PerPoint<Point>) -> Option<Lock> {
     let table = parent.table("lock")?;
     let rules = Rules {
         table: &table,
@@ -196,7 +197,7 @@ fn read_lock(parent: &Reader<'_>, rules: &Rules<'_, '_>, points: &[Point]) -> Op
     table.finish();
     let name = name?;
     let is_it = |point: &Point| point.name == name && point.kind() == Kind::Bool;
-    let Some(point) = points.iter().position(is_it) else {
+    let Some(point) = points.position(is_it) else {
         let states = points.iter().filter(|point| point.kind() == Kind::Bool);
         let near = nearest(&name, states.map(|point| point.name.as_str()));
         let near = near.map(|near| format!("did you mean `{near}`?"));
@@ -276,7 +277,7 @@ list = ["A-1, 50, Upper, Hz, 0.1, 0, 50", "A-2, 51, Lower, Hz, 0.1", "A-3, 52, O
         let lock = rules.lock.as_ref().unwrap();
         assert_eq!(
             (&lock.of, lock.point, lock.exception),
-            (&vec![4..=5, 50..=50], 0, Some(0x22))
+            (&vec![4..=5, 50..=50], crate::drive::PointIndex::new(0), Some(0x22))
         );
         assert_eq!(profile.parameters.at(50).unwrap().range, Some(0.0..=50.0));
         assert_eq!(read("").unwrap().parameters.rules, Default::default());

@@ -3,6 +3,7 @@
 //! `list`: rows `id, address, name, unit, scale` and perhaps `, least, greatest`; `spans`: `"id 100 1998"` or `"group 100 9898"`;
 //! `identification`: names of points. The other keys are read in `parameter_rules`.
 
+use crate::drive::PerPoint;
 use std::ops::RangeInclusive;
 
 use super::super::parameters::{Label, Numbering, Parameter, ParameterList, Span, WriteRules};
@@ -14,7 +15,7 @@ use crate::document::Reader;
 pub(super) fn read(
     reader: &Reader<'_>,
     bases: &[&ParameterList],
-    points: &[Point],
+    points: &PerPoint<Point>,
     ranges: &[AddressRange],
 ) -> ParameterList {
     let Some(table) = reader.table("parameters") else {
@@ -60,9 +61,7 @@ pub(super) fn read(
     let spans = spans.collect();
     let names: Vec<String> = table.or("identification", Vec::new());
     let identification = names.iter().filter_map(|name| {
-        let index = points
-            .iter()
-            .position(|point| point.name == *name && point.raw().is_some());
+        let index = points.position(|point| point.name == *name && point.raw().is_some());
         if index.is_none() {
             table.problem(
                 "identification",

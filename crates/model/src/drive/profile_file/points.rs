@@ -1,5 +1,6 @@
 //! `[[point]]`: one named value.
 
+use crate::drive::{PerPoint, PointIndex};
 use std::collections::BTreeMap;
 
 use super::super::Value;
@@ -34,7 +35,7 @@ const FIRST_ADI: u16 = 0x4000;
 
 pub(super) fn read_point(
     reader: &Reader<'_>,
-    index: usize,
+    place: usize,
     names: &[String],
     ranges: &[AddressRange],
     offsets: &Offsets,
@@ -54,7 +55,7 @@ pub(super) fn read_point(
             format!("write another name, such as `drive_{name}`"),
         );
     }
-    if names.iter().take(index).any(|n| *n == name) {
+    if names.iter().take(place).any(|n| *n == name) {
         reader.problem("name", format!("there are two points `{name}`"), "rename one of them");
     }
     let model = ModelPoint::from_name(&name);
@@ -153,7 +154,7 @@ fn read_class(reader: &Reader<'_>) -> PollClass {
 }
 
 /// Checks `write_to`: the other point must be writable itself.
-pub(super) fn check_target(reader: &Reader<'_>, index: usize, points: &[Point]) {
+pub(super) fn check_target(reader: &Reader<'_>, index: PointIndex, points: &PerPoint<Point>) {
     let Some(point) = points.get(index) else { return };
     let Some(target) = point.write_to.and_then(|to| points.get(to)) else {
         return;
@@ -177,7 +178,7 @@ pub(super) fn check_target(reader: &Reader<'_>, index: usize, points: &[Point]) 
 }
 
 /// Checks `monitor`: both are registers of their own with values of the same type.
-pub(super) fn check_monitor(reader: &Reader<'_>, index: usize, points: &[Point]) {
+pub(super) fn check_monitor(reader: &Reader<'_>, index: PointIndex, points: &PerPoint<Point>) {
     let Some(point) = points.get(index) else { return };
     let Some(monitor) = point.monitor.and_then(|monitor| points.get(monitor)) else {
         return;
@@ -329,7 +330,7 @@ fn check_texts(reader: &Reader<'_>, point: &Point, names: &[String]) {
 }
 
 /// Checks the object of an N2 point: floats at even addresses below 0x4000, internal integers from there on.
-pub(super) fn check_object(reader: &Reader<'_>, index: usize, points: &[Point]) {
+pub(super) fn check_object(reader: &Reader<'_>, index: PointIndex, points: &PerPoint<Point>) {
     let Some(raw) = points
         .get(index)
         .and_then(Point::raw)
@@ -405,7 +406,7 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
 }
 
 /// Checks `scale_from`: an integer that is read from the drive.
-pub(super) fn check_scale(reader: &Reader<'_>, index: usize, points: &[Point]) {
+pub(super) fn check_scale(reader: &Reader<'_>, index: PointIndex, points: &PerPoint<Point>) {
     let scale = points.get(index).and_then(Point::raw).and_then(|raw| raw.scale_from);
     let Some(scale) = scale.and_then(|scale| points.get(scale)) else {
         return;

@@ -3,13 +3,14 @@
 use super::super::derive::{Bound, Derived};
 use super::super::profile::{Form, Point, PollClass, Source};
 use crate::document::{Finding, Reader};
+use crate::drive::{PerPoint, PointIndex};
 
 /// Range of a reference in percent, with and without sign.
 const SIGNED: [f64; 2] = [-100.0, 100.0];
 const UNSIGNED: [f64; 2] = [0.0, 100.0];
 
 /// Applies the table `speed_reference` of the profile to the points of the references.
-pub(super) fn apply(reader: &Reader<'_>, points: &mut [Point]) {
+pub(super) fn apply(reader: &Reader<'_>, points: &mut PerPoint<Point>) {
     let Some(table) = reader.table("speed_reference") else {
         return;
     };
@@ -17,10 +18,10 @@ pub(super) fn apply(reader: &Reader<'_>, points: &mut [Point]) {
     let minimum_counts = word(&table, "base", ["max", "min_max"]);
     let hertz = word(&table, "unit", ["percent", "hz"]);
     table.finish();
-    let place = |name: &str| points.iter().position(|p| p.name == name);
+    let place = |name: &str| points.position(|p| p.name == name);
     let found = place("speed_reference").filter(|i| points.get(*i).is_some_and(|p| p.raw().is_some()));
     let of_reference = |p: &Point| matches!(p.source, Source::Derived(Derived::Band { of, .. }) if Some(of) == found);
-    let (Some(speed), Some(frequency)) = (found, points.iter().position(of_reference)) else {
+    let (Some(speed), Some(frequency)) = (found, points.position(of_reference)) else {
         reader.problem(
             "speed_reference",
             "the family has no register for a reference in percent",
@@ -74,7 +75,7 @@ fn sign(point: &mut Point, signed: bool) {
 }
 
 /// The register holds a frequency: the two points swap their sources.
-fn in_hertz(points: &mut [Point], speed: usize, frequency: usize) {
+fn in_hertz(points: &mut PerPoint<Point>, speed: PointIndex, frequency: PointIndex) {
     let Some(Source::Derived(Derived::Band { minimum, maximum, .. })) = points.get(frequency).map(|p| p.source.clone())
     else {
         return;

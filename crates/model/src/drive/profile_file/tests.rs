@@ -359,7 +359,7 @@ fn choices_of_the_reference() {
         let source = format!("name = \"x\"\nbase = \"{base}\"\n{lines}\n");
         Profile::parse("x.toml", &source, false).unwrap_or_else(|found| panic!("{}", found[0]))
     };
-    let of = |profile: &Profile, name: &str| profile.points[profile.point_index(name).unwrap()].clone();
+    let of = |profile: &Profile, name: &str| profile.points.get(profile.point_index(name).unwrap()).unwrap().clone();
     let nx = read("vacon-nx", "speed_reference = { signed = false, base = \"max\" }");
     assert_eq!(of(&nx, "speed_reference").raw().unwrap().form, Form::U16);
     assert_eq!(of(&nx, "speed_reference").range, Some(0.0..=100.0));
@@ -396,7 +396,7 @@ fn ends_of_a_band_are_polled() {
            [[point]]\nname = \"most\"\nat = \"holding 3\"\nclass = \"once\"\n\
            [[point]]\nname = \"other\"\nat = \"holding 4\"\nclass = \"once\"\n";
     let profile = Profile::parse("m", &source, false).unwrap();
-    let class = |profile: &Profile, name: &str| profile.points[profile.point_index(name).unwrap()].class;
+    let class = |profile: &Profile, name: &str| profile.points.get(profile.point_index(name).unwrap()).unwrap().class;
     let of = |name| class(&profile, name);
     assert_eq!(
         (of("least"), of("most"), of("other")),
@@ -533,7 +533,7 @@ fn points_for_faults_are_read_by_their_registers() {
     let names: Vec<&str> = profile
         .on_fault
         .iter()
-        .map(|i| profile.points[*i].name.as_str())
+        .map(|i| profile.points.get(*i).unwrap().name.as_str())
         .collect();
     assert_eq!(names, ["fault_code_id99", "heatsink_temperature"]);
     // What is polled anyway, or is compared with process data, needs no read of its own.
@@ -546,7 +546,7 @@ fn points_for_faults_are_read_by_their_registers() {
     let names: Vec<&str> = derived
         .on_fault
         .iter()
-        .map(|i| derived.points[*i].name.as_str())
+        .map(|i| derived.points.get(*i).unwrap().name.as_str())
         .collect();
     assert!(names.contains(&"speed_reference"), "{names:?}");
     let removed = "name = \"p\"\nbase = \"vacon-nx\"\nremove = [\"motor_temperature\"]\n";
@@ -695,7 +695,7 @@ fn what_the_keys_of_a_value_make() {
          [[point]]\nname = \"count\"\nat = \"holding 4\"\ntype = \"u64\"\norder = \"CDAB\"\ninvalid = [-1]\n"
     );
     let profile = Profile::parse("p.toml", &text, false).unwrap();
-    let point = |name: &str| &profile.points[profile.point_index(name).unwrap()];
+    let point = |name: &str| profile.points.get(profile.point_index(name).unwrap()).unwrap();
     let raw = |name: &str| point(name).raw().unwrap();
     assert_eq!(raw("power").scale_from, profile.point_index("power_sf"));
     assert_eq!(raw("power_sf").invalid, [0x8000]);

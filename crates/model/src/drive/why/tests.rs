@@ -1,3 +1,4 @@
+use crate::drive::PointIndex;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -12,7 +13,7 @@ fn profile(name: &str) -> Arc<Profile> {
 /// What a drive says, by point; the rest is not known.
 struct Says {
     profile: Arc<Profile>,
-    values: BTreeMap<usize, Value>,
+    values: BTreeMap<PointIndex, Value>,
     order: Option<RunOrder>,
     contact: Contact,
     is_commandable: bool,
@@ -88,7 +89,7 @@ impl Says {
     fn explain(&self) -> Explanation {
         let now = Instant::now() + Duration::from_secs(100);
         let at = now - Duration::from_millis(140);
-        let sample = |index: usize| match self.values.get(&index) {
+        let sample = |index: PointIndex| match self.values.get(&index) {
             Some(value) => Sample {
                 value: Some(*value),
                 quality: Quality::Good,

@@ -19,7 +19,7 @@ use super::{Commander, Operating, Operator, Viewer, restart};
 use crate::command::{Answer, Authority, Order, Origin, Outcome, Parts, Refusal, SourceKind, stop_of};
 use crate::command_json::{self, CommandResult, Id, Repetition, SharedMemory, Taken, excerpt, find_id, unknown_drive};
 use crate::drive::model::Kind;
-use crate::drive::{ModelPoint, Point, Profile, RESTART_COMMUNICATION, Value};
+use crate::drive::{ModelPoint, Point, PointIndex, Profile, RESTART_COMMUNICATION, Value};
 use crate::plant::{DriveHandle, Placed, Plant, Shown};
 use crate::process_image::Access;
 
@@ -172,7 +172,7 @@ fn restarts(payload: &[u8]) -> bool {
 }
 
 /// Whether the points have the motor run.
-fn has_run(points: &[(usize, Value)], profile: &Profile) -> bool {
+fn has_run(points: &[(PointIndex, Value)], profile: &Profile) -> bool {
     let run = profile.model_index(ModelPoint::Run);
     points
         .iter()
@@ -351,10 +351,9 @@ fn description<'d>(drive: &'d DriveHandle, operator: &Operator) -> Commandable<'
     let writable = spec
         .profile
         .points
-        .iter()
         .enumerate()
         .filter(|(_, point)| controlled && point.write);
-    let point = |(index, point): (usize, &'d Point)| {
+    let point = |(index, point): (PointIndex, &'d Point)| {
         let limits = spec.limits_of(index).map(std::ops::RangeInclusive::into_inner);
         CommandablePoint {
             name: &point.name,

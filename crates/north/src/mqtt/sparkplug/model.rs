@@ -7,7 +7,7 @@ use super::metric::{Datum, Definition, Pace, Sample};
 use super::wire::DataType;
 use crate::drive::model::Kind;
 use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Point, Quality, State};
+use crate::drive::{ModelPoint, Point, PointIndex, Quality, State};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::Reading;
 
@@ -47,9 +47,9 @@ impl Moment {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Source {
-    Point(usize),
+    Point(PointIndex),
     /// The text of an enumeration.
-    TextOf(usize),
+    TextOf(PointIndex),
     State,
     FaultText,
     HoldState,

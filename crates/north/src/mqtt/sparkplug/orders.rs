@@ -17,11 +17,11 @@ use crate::command::{
     Answer, Authority, CONFIRMED, DEFAULT_EXPIRY, Order, Origin, Parts, Proof, Refusal, SourceKind, stop_of,
 };
 use crate::command_json::{SharedMemory, Taken, excerpt, resolve, unknown_drive};
-use crate::drive::{Profile, Value};
+use crate::drive::{PointIndex, Profile, Value};
 use crate::plant::{Placed, Plant};
 
 /// Points with their values, and why another one is refused.
-type Understood = (Vec<(usize, Value)>, Option<Refusal>);
+type Understood = (Vec<(PointIndex, Value)>, Option<Refusal>);
 
 /// Commands whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit
 /// only.

@@ -3,7 +3,7 @@
 use super::*;
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{BackgroundRequest, NO_DRIVE, Pace, PassedOn};
-use crate::drive::DriveIndex;
+use crate::drive::{DriveIndex, PointIndex};
 
 const START: u16 = 1;
 const STOP: u16 = 0;
@@ -61,7 +61,7 @@ impl Bench {
 }
 
 fn reference(percent: f64) -> Order {
-    Order::Points(vec![(7, Value::Number(percent))])
+    Order::Points(vec![(PointIndex::new(7), Value::Number(percent))])
 }
 
 #[test]
@@ -71,7 +71,10 @@ fn a_newer_reference_keeps_behind_an_order_that_sets_the_same() {
         bench.give((SourceKind::Mqtt, "t"), 1, Urgency::Command, order, only)
     };
     let mut first = give(&mut bench, reference(10.0), true);
-    let both = Order::Points(vec![(1, Value::Bool(true)), (7, Value::Number(20.0))]);
+    let both = Order::Points(vec![
+        (PointIndex::new(1), Value::Bool(true)),
+        (PointIndex::new(7), Value::Number(20.0)),
+    ]);
     let _both = give(&mut bench, both.clone(), false);
     let mut second = give(&mut bench, reference(30.0), true);
     assert_eq!((outcome(&mut first), outcome(&mut second)), (None, None));

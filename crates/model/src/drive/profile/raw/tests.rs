@@ -1,4 +1,5 @@
 use super::*;
+use crate::drive::PointIndex;
 
 fn raw(form: Form, scale: f64) -> Raw {
     Raw {
@@ -206,7 +207,7 @@ fn masks_states_and_powers_of_ten() {
     assert_eq!(state(3, false).decode(&[0xFFF2], Kind::Bool), Some(Value::Bool(false)));
     assert_eq!(state(0, true).decode(&[0xFFF0], Kind::Bool), Some(Value::Bool(false)));
     let scaled = Raw {
-        scale_from: Some(0),
+        scale_from: Some(PointIndex::new(0)),
         ..raw(Form::I16, 1.0)
     };
     assert_eq!(scaled.decode(&[1234], Kind::Number), None, "without its power");

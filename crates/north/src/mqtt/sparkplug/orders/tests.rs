@@ -2,6 +2,7 @@ use super::*;
 use crate::codec::Reply;
 use crate::command::{Outcome, Urgency};
 use crate::command_json::REMEMBERED;
+use crate::drive::PointIndex;
 use crate::mqtt::fixture;
 use crate::mqtt::sparkplug::model;
 use crate::mqtt::sparkplug::session::Rules;
@@ -80,7 +81,7 @@ impl Bench {
         }
     }
 
-    fn index(&self, point: &str) -> usize {
+    fn index(&self, point: &str) -> PointIndex {
         self.drive.drive.image.spec.profile.point_index(point).unwrap()
     }
 }
