@@ -427,3 +427,38 @@ fn prose_behind_a_command_is_noticed() {
         assert!(has_trailing_prose(wrong), "{wrong}");
     }
 }
+
+/// The first line of every fenced example in the comments of a crate, such as `text` or `sh`.
+fn examples_in_comments(crate_root: &Path) -> Vec<String> {
+    let sources = files(&crate_root.join("src"), "rs");
+    let fence = |line: &str| {
+        let comment = line.trim_start();
+        let comment = comment.strip_prefix("//!").or_else(|| comment.strip_prefix("///"))?;
+        Some(comment.trim().strip_prefix("```")?.to_string())
+    };
+    let of = |path: &PathBuf| read(path).lines().filter_map(fence).step_by(2).collect::<Vec<_>>();
+    sources.iter().flat_map(of).collect()
+}
+
+/// A manifest says `doctest = false` only where no comment holds an example that could be compiled.
+#[test]
+fn examples_in_comments_are_compiled() {
+    let crates = fs::read_dir(root().join("crates")).unwrap();
+    let crates = crates.map(|entry| entry.unwrap().path()).chain([root().to_path_buf()]);
+    let mut skipped = 0;
+    for folder in crates {
+        let manifest: toml::Table = read(&folder.join("Cargo.toml")).parse().unwrap();
+        let tested = manifest["lib"].get("doctest").and_then(toml::Value::as_bool);
+        if tested.unwrap_or(true) {
+            continue;
+        }
+        skipped += 1;
+        let text = |example: &String| example == "text";
+        let (found, at) = (examples_in_comments(&folder), folder.display());
+        assert!(
+            found.iter().all(text),
+            "{at}: doctest = false, but there are examples: {found:?}"
+        );
+    }
+    assert!(skipped > 5, "{skipped}");
+}
