@@ -17,7 +17,7 @@ use super::Buffer;
 use super::journal::Journal;
 use super::outbox::{KEPT_BYTES, Message};
 use crate::files::names::MQTT_TOPICS;
-use crate::{MqttLoss, NorthState};
+use crate::{MqttKind, NorthState};
 
 /// Jobs that wait for the disk: a burst of events and its acknowledgements. The size of their messages is at most
 /// [`KEPT_BYTES`].
@@ -32,7 +32,7 @@ const LOCK_WAIT: Duration = Duration::from_millis(50);
 
 /// Counts lost messages of one kind.
 #[derive(Debug, Clone)]
-pub(super) struct LostCount(pub(super) Arc<NorthState>, pub(super) MqttLoss);
+pub(super) struct LostCount(pub(super) Arc<NorthState>, pub(super) MqttKind);
 
 impl LostCount {
     pub(super) fn add(&self, count: u64) {
@@ -320,7 +320,7 @@ impl Thread {
             );
         }
         let thread = Thread {
-            base: journal.last(),
+            base: journal.last,
             dir,
             journal,
             report,
@@ -420,7 +420,7 @@ impl Thread {
         if lost > 0 {
             self.lost.add(lost);
         }
-        let (gone, missing) = (self.number(self.journal.gone()), self.journal.missing());
+        let (gone, missing) = (self.number(self.journal.gone), self.journal.counted);
         self.gone.through.store(gone, Ordering::Relaxed);
         self.gone.missing.store(missing, Ordering::Relaxed);
         if self.synced.elapsed() >= SYNC {

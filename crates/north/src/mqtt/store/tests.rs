@@ -1,9 +1,9 @@
 use super::super::Qos;
-use super::super::outbox::{Delivery, Kind, Outbox};
+use super::super::outbox::{Delivery, Outbox};
 use super::*;
 
 fn count() -> LostCount {
-    LostCount(Arc::default(), MqttLoss::Event)
+    LostCount(Arc::default(), MqttKind::Event)
 }
 
 fn lost(count: &LostCount) -> u64 {
@@ -179,14 +179,14 @@ async fn of_a_full_buffer_each_message_waits_or_is_counted_over_a_restart() {
     // The first 1,024 go to the outbox at once.
     for n in 0..1240 {
         let message = Message::not_retained("e", format!("{n:200}").into_bytes());
-        if let Some((number, message)) = store.push(message, outbox.room(Kind::Event) > 0) {
-            outbox.push(Kind::Event, message, number);
+        if let Some((number, message)) = store.push(message, outbox.room(MqttKind::Event) > 0) {
+            outbox.push(MqttKind::Event, message, number);
         }
     }
     settle(&mut store).await;
-    outbox.drop_gone(Kind::Event, store.gone());
+    outbox.drop_gone(MqttKind::Event, store.gone());
     let waiting = outbox.events() as u64 + store.waiting();
-    let given_up = lost(&counted) + outbox.take_lost().events;
+    let given_up = lost(&counted) + outbox.take_lost().iter().map(|(_, count)| count).sum::<u64>();
     assert!((150..400).contains(&waiting), "{waiting} in 64 KiB");
     assert_eq!(waiting + given_up, 1240);
     store.close().await;
