@@ -29,7 +29,7 @@ use super::reply::ResponseTopics;
 use super::request::Incoming;
 use super::retry::Retry;
 use super::session::{self, Client as _, Common, Will};
-use super::store::{Loaded, LostCount, Store};
+use super::store::{Loaded, Store};
 use super::topics::Topics;
 use super::{Buffer, History, Options};
 use crate::event::{BURST, Event, EventKind};
@@ -132,14 +132,13 @@ impl PlainClient {
         };
         let (events_buffer, history_buffer) = buffers(&options);
         let has_buffer = events_buffer.is_some();
-        let count = |kind| LostCount(stats.clone(), kind);
         let now = Instant::now();
         let mut left = stats.mqtt_left.lock().orders.take();
         let results = left.as_mut().map(|left| std::mem::take(&mut left.results));
         let commands = Commands::new(topics.clone(), rules, stats.commands.mqtt.clone(), left);
         let mut client = PlainClient {
-            store: Store::open(events_buffer, MQTT_EVENTS, count(MqttKind::Event)),
-            history: Store::open(history_buffer, MQTT_HISTORY, count(MqttKind::History)),
+            store: Store::open(events_buffer, MQTT_EVENTS, (stats, MqttKind::Event)),
+            history: Store::open(history_buffer, MQTT_HISTORY, (stats, MqttKind::History)),
             history_at: now,
             commands,
             outbox: Outbox::new(delivery),
