@@ -34,8 +34,6 @@ use crate::{MqttKind, NorthState};
 
 /// Messages published before other events have their turn.
 const MESSAGES: usize = 64;
-/// Longest wait for the file with the number of the session.
-const FILE: Duration = Duration::from_secs(1);
 /// Least time between two log lines of one kind.
 const LOGGED: Duration = Duration::from_secs(60);
 
@@ -191,20 +189,9 @@ impl NodeClient {
         self.buses_at = now + LOOK;
     }
 
-    /// The number of the next connection, kept on disk; a disk that is too slow is not waited for.
+    /// The number of the next connection, kept on disk.
     async fn next_number(&mut self) -> u8 {
-        let mut bd_seq = self.bd_seq.clone();
-        let work = tokio::task::spawn_blocking(move || {
-            let (number, written) = bd_seq.next();
-            (bd_seq, number, written.map_err(|error| error.to_string()))
-        });
-        let (number, written) = match tokio::time::timeout(FILE, work).await {
-            Ok(Ok((after, number, written))) => {
-                self.bd_seq = after;
-                (number, written)
-            }
-            _ => (self.bd_seq.unkept(), Err("the disk does not respond".to_string())),
-        };
+        let (number, written) = self.bd_seq.next().await;
         match written {
             Ok(()) => self.bd_seq_fails = false,
             Err(why) if !std::mem::replace(&mut self.bd_seq_fails, true) => {
