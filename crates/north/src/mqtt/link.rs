@@ -204,33 +204,30 @@ impl BrokerLink {
         Ok(())
     }
 
+    /// The connection that the broker accepted, and what the broker can do.
+    fn accepted(&mut self) -> Option<(&mut Connection, BrokerLimits)> {
+        match &mut self.state {
+            State::Up(connection, phase) => phase.limits().map(|limits| (connection, *limits)),
+            State::Down { .. } => None,
+        }
+    }
+
     /// Subscribes; false if the connection does not take it.
     pub(super) fn subscribe(&mut self, filters: Vec<Filter>) -> bool {
-        match &mut self.state {
-            State::Up(connection, phase) => phase
-                .limits()
-                .is_none_or(|limits| connection.subscribe(filters, *limits)),
-            State::Down { .. } => true,
-        }
+        let accepted = self.accepted();
+        accepted.is_none_or(|(connection, limits)| connection.subscribe(filters, limits))
     }
 
     /// Publishes a message; false if there is no room, or no connection.
     pub(super) fn publish(&mut self, message: Message) -> bool {
-        match &mut self.state {
-            State::Up(connection, phase) => phase
-                .limits()
-                .copied()
-                .is_some_and(|limits| connection.publish(message, limits)),
-            State::Down { .. } => false,
-        }
+        let accepted = self.accepted();
+        accepted.is_some_and(|(connection, limits)| connection.publish(message, limits))
     }
 
     /// Disconnects in order, so that the broker does not publish the last will; false without a connection that it accepted.
-    pub(super) fn disconnect(&self) -> bool {
-        match &self.state {
-            State::Up(connection, phase) => phase.limits().is_some_and(|limits| connection.disconnect(*limits)),
-            State::Down { .. } => false,
-        }
+    pub(super) fn disconnect(&mut self) -> bool {
+        let accepted = self.accepted();
+        accepted.is_some_and(|(connection, limits)| connection.disconnect(limits))
     }
 
     /// The client may publish: logged, with what is lost with this broker.
