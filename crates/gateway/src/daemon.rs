@@ -155,7 +155,7 @@ impl Daemon {
         daemon.apply_keeper(&settings).await;
         daemon.apply_audit(&settings).await;
         // So that MQTT misses no event, though it comes after the buses: its first messages tell of them.
-        drop(daemon.north.mqtt.keep_unread(Some(daemon.events.subscribe())));
+        daemon.north.mqtt_left.leave_events(daemon.events.subscribe());
         // Before the first start is counted.
         daemon.apply_guards(&settings).await;
         let prepared = daemon.prepare_buses(&settings)?;

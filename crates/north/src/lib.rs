@@ -23,6 +23,7 @@ pub mod register_map;
 mod server;
 mod server_trust;
 pub mod slot;
+mod state;
 mod stats;
 mod tls_words;
 
@@ -52,9 +53,10 @@ pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings}
 pub use listener::ListenerStates;
 pub use pem::unreadable;
 pub use server::{Reconfigure, Server};
+pub use state::NorthState;
 pub use stats::{
-    BacnetStats, ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthState, RefusalStats, ReloadStats,
-    ServerKind, SlotOutcome, SlotStats,
+    BacnetStats, ConnectionRefusal, ModbusTcpStats, MqttKind, MqttStats, RefusalStats, ReloadStats, ServerKind,
+    SlotOutcome, SlotStats,
 };
 pub use tls_words::{GATEWAY, Peer, explain};
 

@@ -2,47 +2,8 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
-
-use tokio::sync::broadcast::Receiver;
-
-use super::command_json::SharedMemory;
-use super::http::PostedCommands;
-use super::listener::ListenerStates;
-use super::mqtt::{Broker, NodeOrdersLeft, OrdersLeft};
-use crate::event::Event;
-use crate::history::{History, Recordings};
-use crate::parameters::Vault;
-
-/// What the servers share and a reload, which replaces servers, keeps: counters, recent commands, and what is recorded.
-#[derive(Debug, Default)]
-pub struct NorthState {
-    /// The recordings.
-    pub recordings: Arc<Recordings>,
-    /// Readings of parameters, and restores.
-    pub parameters: Arc<Vault>,
-    /// Trends, counters and events of the past.
-    pub history: Arc<History>,
-    /// Of the Modbus TCP server.
-    pub modbus_tcp: ModbusTcpStats,
-    /// Of the MQTT client.
-    pub mqtt: MqttStats,
-    /// Of the tool slots.
-    pub slots: SlotStats,
-    /// Of the BACnet server.
-    pub bacnet: BacnetStats,
-    /// Refused connections of all servers.
-    pub refused: RefusalStats,
-    /// The listeners of all servers, and whether they listen.
-    pub listeners: Arc<ListenerStates>,
-    /// The last time the configuration was read.
-    pub reload: ReloadStats,
-    /// Recent commands from the broker, and their results as payloads.
-    pub(super) taken: SharedMemory,
-    /// Recent commands over HTTP.
-    pub(super) posted: PostedCommands,
-}
 
 /// How the last reload ended; the start counts as one.
 #[derive(Debug)]
@@ -353,32 +314,12 @@ pub struct MqttStats {
     pub published: AtomicU64,
     /// Messages waiting for the broker.
     pub buffered: AtomicU64,
-    lost: [AtomicU64; MqttLoss::ALL.len()],
-    /// The retained topics of the client that runs, for the one that a reload puts in its place.
-    retained: Mutex<Vec<String>>,
-    /// The events that the last client left unread when it ended, for the one that a reload puts in its place.
-    unread_events: Mutex<Option<Receiver<Arc<Event>>>>,
-    /// The commands whose results the last client still owed when it ended, for the one that a reload puts in its
-    /// place.
-    orders: Mutex<Option<OrdersLeft>>,
-    /// Those of the last edge node.
-    node_orders: Mutex<Option<NodeOrdersLeft>>,
-    /// The brokers in use, by [`LinkOf`], for the clients that a reload puts in the place of these.
-    brokers: Mutex<[Option<Broker>; 2]>,
+    lost: [AtomicU64; MqttKind::ALL.len()],
 }
 
-/// Which client is linked to a broker.
+/// A kind of message that the MQTT client keeps until the broker has it; what it gives up is counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum LinkOf {
-    /// That of the plain topics.
-    Topics,
-    /// The edge node of Sparkplug.
-    Node,
-}
-
-/// A kind of message lost by the MQTT client.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum MqttLoss {
+pub enum MqttKind {
     Event,
     /// Results of commands.
     Result,
@@ -386,72 +327,31 @@ pub enum MqttLoss {
     History,
 }
 
-impl MqttLoss {
+impl MqttKind {
     /// All kinds.
-    pub const ALL: [MqttLoss; 3] = [MqttLoss::Event, MqttLoss::Result, MqttLoss::History];
+    pub const ALL: [MqttKind; 3] = [MqttKind::Event, MqttKind::Result, MqttKind::History];
 
     /// Name in the metrics.
     pub fn name(self) -> &'static str {
         match self {
-            MqttLoss::Event => "event",
-            MqttLoss::Result => "result",
-            MqttLoss::History => "history",
+            MqttKind::Event => "event",
+            MqttKind::Result => "result",
+            MqttKind::History => "history",
         }
     }
 }
 
 impl MqttStats {
-    /// Keeps the retained topics that are published; returns those kept before.
-    pub(crate) fn keep_retained(&self, topics: Vec<String>) -> Vec<String> {
-        let mut kept = self.retained.lock().unwrap_or_else(PoisonError::into_inner);
-        std::mem::replace(&mut kept, topics)
-    }
-
-    /// Keeps the events that a client leaves when it ends, or forgets them; returns those kept before.
-    pub fn keep_unread(&self, events: Option<Receiver<Arc<Event>>>) -> Option<Receiver<Arc<Event>>> {
-        let mut kept = self.unread_events.lock().unwrap_or_else(PoisonError::into_inner);
-        std::mem::replace(&mut kept, events)
-    }
-
-    /// Keeps the commands whose results a client owes when it ends, or forgets them; returns those kept before.
-    pub(crate) fn keep_orders(&self, orders: Option<OrdersLeft>) -> Option<OrdersLeft> {
-        let mut kept = self.orders.lock().unwrap_or_else(PoisonError::into_inner);
-        std::mem::replace(&mut kept, orders)
-    }
-
-    /// As [`MqttStats::keep_orders`], of an edge node.
-    pub(crate) fn keep_node_orders(&self, orders: Option<NodeOrdersLeft>) -> Option<NodeOrdersLeft> {
-        let mut kept = self.node_orders.lock().unwrap_or_else(PoisonError::into_inner);
-        std::mem::replace(&mut kept, orders)
-    }
-
-    /// Keeps the broker that a client used when it ended; returns the one kept before.
-    pub(crate) fn keep_broker(&self, of: LinkOf, broker: Option<Broker>) -> Option<Broker> {
-        let mut kept = self.brokers.lock().unwrap_or_else(PoisonError::into_inner);
-        kept.get_mut(of as usize)
-            .and_then(|kept| std::mem::replace(kept, broker))
-    }
-
-    /// Discards what the last client handed over, if no client takes it.
-    pub fn forget_what_is_left(&self) {
-        drop((
-            self.keep_unread(None),
-            self.keep_orders(None),
-            self.keep_node_orders(None),
-            [LinkOf::Topics, LinkOf::Node].map(|of| self.keep_broker(of, None)),
-        ));
-    }
-
     /// Counts lost messages.
-    pub(crate) fn lost(&self, kind: MqttLoss, count: u64) {
+    pub(crate) fn lost(&self, kind: MqttKind, count: u64) {
         if let Some(counter) = self.lost.get(kind as usize) {
             counter.fetch_add(count, Ordering::Relaxed);
         }
     }
 
     /// Messages lost so far, by kind.
-    pub fn losses(&self) -> impl Iterator<Item = (MqttLoss, u64)> {
+    pub fn losses(&self) -> impl Iterator<Item = (MqttKind, u64)> {
         let counts = self.lost.iter().map(|c| c.load(Ordering::Relaxed));
-        MqttLoss::ALL.into_iter().zip(counts)
+        MqttKind::ALL.into_iter().zip(counts)
     }
 }

@@ -58,7 +58,7 @@ impl Daemon {
         }
         let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.north).await;
         // Events that came while no client was configured are not published later.
-        self.north.mqtt.forget_what_is_left();
+        self.north.mqtt_left.discard();
         applied
     }
 

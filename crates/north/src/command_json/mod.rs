@@ -12,6 +12,6 @@ pub(super) use self::memory::REMEMBERED;
 pub(super) use self::memory::{Repetition, SharedMemory, Taken};
 #[cfg(test)]
 pub(super) use self::request::MAX_ID;
-pub(super) use self::request::{Asked, Id, MAX_PAYLOAD, check_size, excerpt, find_id, order, resolve, unknown_drive};
+pub(super) use self::request::{Asked, Id, MAX_PAYLOAD, check_size, excerpt, find_id, order, refuse_unknown, resolve};
 pub(super) use self::result::CommandResult;
 pub(super) use self::stop_all::{StopBody, stop_all};

@@ -3,18 +3,18 @@
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::fmt;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde::Serialize;
 use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value as Json;
 use serde_json::value::RawValue;
 
-use crate::command::{DEFAULT_EXPIRY, Refusal, sets_twice, stop_of};
+use crate::command::{Answer, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, sets_twice, stop_of};
 use crate::document::nearest;
 use crate::drive::model::Kind;
 use crate::drive::{PointIndex, Profile, Value};
-use crate::plant::Plant;
+use crate::plant::{DriveHandle, Placed, Plant};
 
 /// Maximum size of a command, bytes.
 pub(crate) const MAX_PAYLOAD: usize = 64 * 1024;
@@ -110,6 +110,39 @@ impl Asked {
             refused,
             wait: false,
         })
+    }
+
+    /// Whether it has a stop, which is executed whatever becomes of the rest.
+    pub(crate) fn stops(&self, profile: &Profile) -> bool {
+        stop_of(&self.points, profile).is_some()
+    }
+
+    /// Whether it does more than stop, so that its repetition is not executed.
+    pub(crate) fn does_more(&self, profile: &Profile) -> bool {
+        let whole = || matches!(Parts::of(Order::Points(self.points.clone()), profile), Parts::One(_));
+        self.refused.is_none() && !(self.stops(profile) && whole())
+    }
+
+    /// Gives it to the drive at `now`: as a whole, or its stop alone if the rest, `what`, is refused. It came at `came`.
+    ///
+    /// # Errors
+    /// The answer if all of it is refused.
+    pub(crate) fn place(
+        self,
+        drive: &DriveHandle,
+        what: &str,
+        origin: Origin,
+        (came, now): (Instant, Instant),
+    ) -> Result<Placed, Answer> {
+        let (write, expiry) = (Authority::Write, self.expiry);
+        let Some(refusal) = self.refused else {
+            let drive = drive.clone().waiting(self.wait);
+            return Ok(drive.place_asked(Order::Points(self.points), origin, write, expiry, came, now));
+        };
+        match stop_of(&self.points, &drive.image.spec.profile) {
+            Some(stop) => Ok(drive.place_stop(Order::Points(stop), (what, refusal), origin, write, expiry, now)),
+            None => Err(drive.refuse(what, refusal, origin, now)),
+        }
     }
 }
 
@@ -324,11 +357,17 @@ impl<'de> Visitor<'de> for IdVisitor {
 }
 
 /// The message for an unknown drive, with the nearest name.
-pub(crate) fn unknown_drive(name: &str, plant: &Plant) -> String {
+fn unknown_drive(name: &str, plant: &Plant) -> String {
     let drives: Vec<_> = plant.drives().map(|d| d.image.spec.name.clone()).collect();
     let near = (name.len() <= MAX_NAME).then(|| nearest(name, drives.iter().map(String::as_str)));
     let hint = near
         .flatten()
         .map_or(String::new(), |near| format!("; did you mean `{near}`?"));
     format!("there is no drive {}{hint}", excerpt(name.as_bytes()))
+}
+
+/// The answer to a command for a drive that there is not, and its audit.
+pub(crate) fn refuse_unknown(plant: &Plant, name: &str, what: &str, origin: Origin, now: Instant) -> Answer {
+    let shown = excerpt(name.as_bytes());
+    plant.refuse_unknown(shown.trim_matches('`'), what, unknown_drive(name, plant), origin, now)
 }

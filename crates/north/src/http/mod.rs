@@ -53,7 +53,7 @@ use tokio_util::task::TaskTracker;
 use self::hosts::Host;
 use self::in_use::InUse;
 use self::operating::Operating;
-pub(super) use self::operating::PostedCommands;
+pub(super) use self::operating::SharedReply;
 pub use self::operating::basic_authorization;
 pub(super) use self::routes::LocalUser;
 use self::routes::Reached;

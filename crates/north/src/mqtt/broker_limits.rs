@@ -4,6 +4,7 @@ use rumqttc::mqttbytes::QoS;
 use rumqttc::{ConnAck, LastWill};
 
 use super::connection::INFLIGHT;
+use super::session::Will;
 
 /// The broker's capabilities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -91,12 +92,12 @@ impl WillForm {
     }
 
     /// The last will in this form.
-    pub(super) fn will(self, topic: String, payload: impl Into<Vec<u8>>, retain: bool) -> LastWill {
+    pub(super) fn will(self, will: Will) -> LastWill {
         let qos = match self.unacknowledged {
             true => QoS::AtMostOnce,
             false => QoS::AtLeastOnce,
         };
-        LastWill::new(topic, payload, qos, retain && !self.not_retained, None)
+        LastWill::new(will.topic, will.payload, qos, will.retain && !self.not_retained, None)
     }
 }
 
@@ -108,7 +109,11 @@ mod tests {
     fn the_will_is_lessened_step_by_step_and_only_once_each() {
         let mut form = WillForm::default();
         let shape = |form: WillForm| {
-            let will = form.will("t".to_string(), "offline", true);
+            let will = form.will(Will {
+                topic: "t".to_string(),
+                payload: Vec::new(),
+                retain: true,
+            });
             (will.qos, will.retain)
         };
         assert_eq!(shape(form), (QoS::AtLeastOnce, true));

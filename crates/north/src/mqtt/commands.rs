@@ -13,9 +13,9 @@ use tokio::sync::oneshot;
 use super::outbox::Message;
 use super::reply::{Reply, ResponseTopics};
 use super::request::{self, Incoming};
-use super::topics::{HoldTopic, Topics};
-use crate::command::{Answer, Authority, Order, Origin, Parts, Proof, Refusal, SourceKind, Verb, stop_of};
-use crate::command_json::{HoldReply, Id, Repetition, SharedMemory, excerpt, stop_all, unknown_drive};
+use super::topics::{Target, Topics};
+use crate::command::{Answer, Authority, Origin, Proof, Refusal, SourceKind, Verb};
+use crate::command_json::{HoldReply, Id, Repetition, SharedMemory, excerpt, refuse_unknown, stop_all};
 use crate::plant::{Placed, Plant, Shown};
 use crate::stop_all::StopReport;
 
@@ -56,7 +56,7 @@ pub(super) struct Rules {
 
 /// Pending results that a client hands over to its successor.
 #[derive(Debug, Default)]
-pub(crate) struct OrdersLeft {
+pub(super) struct OrdersLeft {
     waiting: PendingCommands,
     confirming: PendingCommands,
     stopping: Vec<PendingStop>,
@@ -99,14 +99,13 @@ pub(super) struct FinishedCommand {
 }
 
 impl Commands {
-    /// `memory` outlives this client, so that a command is recognised after a reload.
-    pub(super) fn new(topics: Topics, rules: Rules, memory: SharedMemory) -> Commands {
-        memory.lock().abandon();
-        Commands::after(topics, rules, memory, OrdersLeft::default())
-    }
-
-    /// Continues with the commands handed over by the previous client.
-    pub(super) fn after(topics: Topics, rules: Rules, memory: SharedMemory, left: OrdersLeft) -> Commands {
+    /// `memory` outlives this client, so that a command is recognised after a reload; it continues with the commands that the
+    /// client before has `left`.
+    pub(super) fn new(topics: Topics, rules: Rules, memory: SharedMemory, left: Option<OrdersLeft>) -> Commands {
+        if left.is_none() {
+            memory.lock().abandon();
+        }
+        let left = left.unwrap_or_default();
         Commands {
             topics,
             client: SourceKind::Mqtt.name().into(),
@@ -146,39 +145,32 @@ impl Commands {
         now: Instant,
         time: SystemTime,
     ) -> Option<Message> {
-        if let Some(topic) = self.topics.parse_stop_all(&incoming.topic) {
-            return self.stop_all(&incoming, topic.who, plant, now);
-        }
-        if let Some(target) = self.topics.parse_hold(&incoming.topic) {
-            return self.hold(&incoming, target, plant, now);
-        }
-        let target = self.topics.parse_set(&incoming.topic)?;
+        let (target, who) = self.topics.parse(&incoming.topic)?;
         if incoming.retain && incoming.payload.is_empty() {
             return None; // a retained message was cleared
         }
-        let result = self.topics.drive(target.drive, "result");
-        let reply = Reply::to(&incoming, result, target.drive, &self.rules.responses);
-        let origin = self.origin(&incoming, target.who);
-        let what = || excerpt(&incoming.payload);
-        let Some(drive) = plant.drive(target.drive) else {
-            let name = excerpt(target.drive.as_bytes());
-            let why = unknown_drive(target.drive, plant);
-            let answer = plant.refuse_unknown(name.trim_matches('`'), &what(), why, origin, now);
-            return Some(reply.message(request::id(&incoming, target.point), &answer, Shown::default(), time));
+        let origin = self.origin(&incoming, who);
+        let (name, point) = match target {
+            Target::StopAll => return self.stop_all(&incoming, &origin, plant, now),
+            Target::Hold(drive) => return self.hold(&incoming, drive, origin, plant, now),
+            Target::Set(drive, point) => (drive, point),
+        };
+        let result = self.topics.drive(name, "result");
+        let reply = Reply::to(&incoming, result, name, &self.rules.responses);
+        let what = excerpt(&incoming.payload);
+        let Some(drive) = plant.drive(name) else {
+            let answer = refuse_unknown(plant, name, &what, origin, now);
+            return Some(reply.message(request::id(&incoming, point), &answer, Shown::default(), time));
         };
         let profile = &drive.image.spec.profile;
-        let request = request::read(&incoming, target.point, profile);
-        let refuse = |refusal, id, origin| {
-            Some(reply.message(id, &drive.refuse(&what(), refusal, origin, now), Shown::default(), time))
-        };
-        let asked = match request.order {
-            Err(refusal) => return refuse(refusal, request.id, origin),
+        let request = request::read(&incoming, point, profile);
+        let refused = |answer: &Answer, id| Some(reply.message(id, answer, Shown::default(), time));
+        let mut asked = match request.order {
+            Err(refusal) => return refused(&drive.refuse(&what, refusal, origin, now), request.id),
             Ok(asked) => asked,
         };
-        let (stop, order) = (stop_of(&asked.points, profile), Order::Points(asked.points));
-        let only_stops = stop.is_some() && matches!(Parts::of(order.clone(), profile), Parts::One(_));
-        let (mut refused, mut number) = (asked.refused, 0);
-        if refused.is_none() && !only_stops {
+        let mut number = 0;
+        if asked.does_more(profile) {
             let taken = incoming.taken();
             let print = self
                 .memory
@@ -190,27 +182,20 @@ impl Commands {
                 None => self.may_take(&reply, request.id.as_ref(), crowded, now).err(),
                 Some(Repetition::Outdated(why)) => Some(repeats(why)),
                 // Its stop is carried out once more, and answered once more.
-                Some(Repetition::Pending | Repetition::Answered(_)) if stop.is_some() => {
+                Some(Repetition::Pending | Repetition::Answered(_)) if asked.stops(profile) => {
                     Some(repeats("so only its stop is executed again"))
                 }
                 Some(Repetition::Pending) => return None,
                 Some(Repetition::Answered(previous)) => return Some(reply.with(previous.to_vec())),
             };
             match why {
-                Some(why) => refused = Some(Refusal::NotAllowed(why)),
+                Some(why) => asked.refused = Some(Refusal::NotAllowed(why)),
                 None => number = self.memory.lock().remember(&taken, print, stops, now),
             }
         }
-        let (client, expiry) = (Authority::Write, asked.expiry);
-        let placed = match (refused, stop) {
-            (None, _) => {
-                let drive = drive.clone().waiting(asked.wait);
-                drive.place_asked(order, origin, client, expiry, incoming.asked.unwrap_or(now), now)
-            }
-            (Some(refusal), Some(stop)) => {
-                drive.place_stop(Order::Points(stop), (&what(), refusal), origin, client, expiry, now)
-            }
-            (Some(refusal), None) => return refuse(refusal, request.id, origin),
+        let placed = match asked.place(&drive, &what, origin, (incoming.asked.unwrap_or(now), now)) {
+            Ok(placed) => placed,
+            Err(answer) => return refused(&answer, request.id),
         };
         let pending = PendingCommand {
             number,
@@ -221,29 +206,18 @@ impl Commands {
         self.follow(pending, time)
     }
 
-    /// The sender of a message: by its topic, which the broker's rules secure, and for the audit by its user property.
     fn origin(&self, incoming: &Incoming, as_whom: Option<&str>) -> Origin {
-        let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
-        let who = who
-            .as_deref()
-            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
         let proof = as_whom.map_or(Proof::Nothing, |who| Proof::Topic(who.into()));
-        Origin::of(self.client.clone(), SourceKind::Mqtt, who).proven(proof)
+        incoming.origin(&self.client, SourceKind::Mqtt).proven(proof)
     }
 
     /// Takes, renews, releases or breaks the hold of a drive; answered at once.
-    fn hold(&self, incoming: &Incoming, target: HoldTopic<'_>, plant: &Plant, now: Instant) -> Option<Message> {
-        if incoming.retain && incoming.payload.is_empty() {
-            return None; // a retained message was cleared
-        }
-        let result = self.topics.drive(target.drive, "result");
-        let reply = Reply::to(incoming, result, target.drive, &self.rules.responses);
-        let origin = self.origin(incoming, target.who);
+    fn hold(&self, incoming: &Incoming, name: &str, origin: Origin, plant: &Plant, now: Instant) -> Option<Message> {
+        let result = self.topics.drive(name, "result");
+        let reply = Reply::to(incoming, result, name, &self.rules.responses);
         let what = || format!("hold={}", excerpt(&incoming.payload));
-        let Some(drive) = plant.drive(target.drive) else {
-            let name = excerpt(target.drive.as_bytes());
-            let why = unknown_drive(target.drive, plant);
-            plant.refuse_unknown(name.trim_matches('`'), &what(), why, origin, now);
+        let Some(drive) = plant.drive(name) else {
+            refuse_unknown(plant, name, &what(), origin, now);
             return None;
         };
         let text = std::str::from_utf8(&incoming.payload).unwrap_or_default().trim();
@@ -266,15 +240,12 @@ impl Commands {
         };
         let seen = drive.hold_view(None, now).map(|(view, _)| view);
         // Strings and numbers can always be serialized.
-        let json = serde_json::to_vec(&HoldReply::new(target.drive, done, seen)).unwrap_or_default();
+        let json = serde_json::to_vec(&HoldReply::new(name, done, seen)).unwrap_or_default();
         Some(reply.with(json))
     }
 
     /// Takes a stop of all drives. Returns the answer where no stop is sent.
-    fn stop_all(&mut self, incoming: &Incoming, as_whom: Option<&str>, plant: &Plant, now: Instant) -> Option<Message> {
-        if incoming.retain && incoming.payload.is_empty() {
-            return None; // a retained message was cleared
-        }
+    fn stop_all(&mut self, incoming: &Incoming, origin: &Origin, plant: &Plant, now: Instant) -> Option<Message> {
         let reply = Reply::to(incoming, self.topics.result(), "", &self.rules.responses);
         let refuse = |why: String| Some(reply.with(refused_stop(&why)));
         if incoming.retain {
@@ -284,8 +255,7 @@ impl Commands {
             Ok(wanted) => wanted,
             Err(why) => return refuse(why),
         };
-        let origin = self.origin(incoming, as_whom);
-        match plant.stop_all.order(plant, &scope, &origin, wait, now) {
+        match plant.stop_all.order(plant, &scope, origin, wait, now) {
             Ok(order) => {
                 let report = order.report;
                 self.stopping.push(PendingStop { reply, report });

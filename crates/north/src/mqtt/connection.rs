@@ -2,10 +2,9 @@
 //!
 //! Client and event loop are discarded after any error: the outbox is better at keeping what rumqttc would keep
 //! (messages in flight). The polling task never publishes, and publishing never waits: what finds no room stays in the
-//! outbox until [`ConnectionEvent::Room`].
+//! outbox until [`Step::Room`].
 
 use std::collections::{HashMap, HashSet};
-use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -19,12 +18,11 @@ use rumqttc::{
     RetainForwardRule, StateError, SubscribeReasonCode, TlsConfiguration, Transport,
 };
 use rustls::ClientConfig;
-use tokio::net::TcpStream;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use super::broker_limits::{BrokerLimits, Lack};
-use super::dial::CONNECT_TIMEOUT;
+use super::dial::{CONNECT_TIMEOUT, Dial};
 use super::outbox::Message;
 use super::request::Incoming;
 use super::silence::{KEEP_ALIVE_S, Silence, Verdict};
@@ -55,10 +53,13 @@ const SEND_BUFFER: u32 = 256 << 10;
 /// Time for the DISCONNECT of a connection that the gateway gives up.
 const LAST_PACKET: Duration = Duration::from_millis(500);
 
+/// What happens on a connection.
 #[derive(Debug)]
-pub(super) enum ConnectionEvent {
-    /// The broker accepted the connection.
-    Connected(BrokerLimits),
+pub(super) enum Step {
+    /// The broker accepted the connection: the client subscribes.
+    Accepted(BrokerLimits),
+    /// The broker takes no wildcards: the client subscribes again.
+    Subscribe(BrokerLimits),
     /// The broker answered the subscriptions: of each, in order, the reason if it refused it.
     Subscribed(Vec<Option<String>>),
     /// The oldest published message with an acknowledgement was sent with this packet id.
@@ -71,8 +72,8 @@ pub(super) enum ConnectionEvent {
     Message(Box<Incoming>),
     /// There is room for further messages.
     Room,
-    /// Any other packet from the broker.
-    Alive,
+    /// Nothing for the client, such as any other packet from the broker.
+    Nothing,
     /// The connection stands and cannot be used any more, for this reason: it is to be given up.
     Stuck(&'static str),
     /// The broker refused the connection because of the last will. The last event.
@@ -81,56 +82,11 @@ pub(super) enum ConnectionEvent {
     Lost(String),
 }
 
-/// A filter that is subscribed to.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Subscription {
-    pub(super) filter: String,
-    pub(super) of: Subscribed,
-}
-
-impl Subscription {
-    /// As it is sent to the broker.
-    pub(super) fn filter(&self) -> Filter {
-        let path = self.filter.clone();
-        match self.of {
-            Subscribed::Commands => commanding(path),
-            Subscribed::Status | Subscribed::Birth => Filter {
-                retain_forward_rule: RetainForwardRule::Never,
-                ..Subscription::own(path)
-            },
-            Subscribed::Leftovers => Subscription::own(path),
-        }
-    }
-
-    /// Without what the gateway itself publishes.
-    fn own(path: String) -> Filter {
-        Filter {
-            path,
-            qos: QoS::AtLeastOnce,
-            nolocal: true,
-            ..Filter::default()
-        }
-    }
-}
-
-/// What a subscription is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Subscribed {
-    /// The status that others publish in the gateway's name.
-    Status,
-    /// The set topics.
-    Commands,
-    /// Home Assistant was started.
-    Birth,
-    /// Retained discovery messages of an earlier run.
-    Leftovers,
-}
-
 /// One connection, from the connection attempt to its end.
 #[derive(Debug)]
 pub(super) struct Connection {
     client: AsyncClient,
-    event: mpsc::Receiver<ConnectionEvent>,
+    event: mpsc::Receiver<Step>,
     backlog: Arc<Backlog>,
     aliases: Box<Aliases>,
     silence: Silence,
@@ -180,7 +136,7 @@ impl Aliases {
 #[derive(Debug, Default)]
 struct Backlog {
     messages: AtomicUsize,
-    /// Whether the client waits for [`ConnectionEvent::Room`].
+    /// Whether the client waits for [`Step::Room`].
     room_wanted: AtomicBool,
 }
 
@@ -193,19 +149,18 @@ impl Drop for Connection {
 }
 
 impl Connection {
-    /// Starts to connect to `broker` as this client, with this last will; `dial` makes the TCP connection.
-    pub(super) fn open<Dialled>(
+    /// Starts to connect to `broker` as this client, with this last will; `dial` makes the TCP connection, first to the
+    /// address of number `first`.
+    pub(super) fn open(
         options: &Options,
         (broker, client_id): (&Broker, &str),
         will: LastWill,
         tls: Option<Arc<ClientConfig>>,
-        dial: impl Fn(NetworkOptions) -> Dialled + Send + Sync + 'static,
-    ) -> Connection
-    where
-        Dialled: Future<Output = io::Result<TcpStream>> + Send + 'static,
-    {
+        (dial, first): (Dial, usize),
+    ) -> Connection {
         let mut mqtt = mqtt_options(options, (broker, client_id), will, tls);
-        mqtt.set_socket_connector(move |_, network| dial(network));
+        let broker = broker.clone();
+        mqtt.set_socket_connector(move |_, network| dial.clone().connect(broker.clone(), first, network));
         let (client, eventloop) = AsyncClient::builder(mqtt).capacity(REQUESTS).build();
         let (sender, event) = mpsc::channel(EVENTS);
         let backlog = Arc::<Backlog>::default();
@@ -224,21 +179,21 @@ impl Connection {
     }
 
     /// The next event. Cancel safe.
-    pub(super) async fn next(&mut self) -> ConnectionEvent {
+    pub(super) async fn next(&mut self) -> Step {
         // The sender is dropped without a last event only if the task panicked.
-        let silent = || ConnectionEvent::Lost("the MQTT client failed".to_string());
+        let silent = || Step::Lost("the MQTT client failed".to_string());
         let event = self.event.recv().await.unwrap_or_else(silent);
-        if matches!(event, ConnectionEvent::Sent(_) | ConnectionEvent::Room) {
+        if matches!(event, Step::Sent(_) | Step::Room) {
             return event;
         }
         self.silence.heard(Instant::now());
         match event {
-            ConnectionEvent::Subscribed(_) if self.silence.answered() => ConnectionEvent::Alive,
-            ConnectionEvent::Subscribed(answers) => {
+            Step::Subscribed(_) if self.silence.answered() => Step::Nothing,
+            Step::Subscribed(answers) => {
                 self.answers.extend(answers);
                 match self.answers.len() < self.wanted {
-                    true => ConnectionEvent::Alive,
-                    false => ConnectionEvent::Subscribed(std::mem::take(&mut self.answers)),
+                    true => Step::Nothing,
+                    false => Step::Subscribed(std::mem::take(&mut self.answers)),
                 }
             }
             event => event,
@@ -283,7 +238,7 @@ impl Connection {
         verdict == Verdict::Lost
     }
 
-    /// Publishes a message; false if there is no room until [`ConnectionEvent::Room`].
+    /// Publishes a message; false if there is no room until [`Step::Room`].
     pub(super) fn publish(&mut self, message: Message, limits: BrokerLimits) -> bool {
         let telemetry = message.retain && !message.payload.is_empty();
         let alias = telemetry
@@ -363,6 +318,16 @@ pub(super) fn commanding(path: String) -> Filter {
     }
 }
 
+/// These topics, without what the gateway itself publishes.
+pub(super) fn of_others(path: String) -> Filter {
+    Filter {
+        path,
+        qos: QoS::AtLeastOnce,
+        nolocal: true,
+        ..Filter::default()
+    }
+}
+
 /// Maximum bytes of a packet in addition to topic, payload and correlation data.
 pub(super) const PACKET_OVERHEAD: usize = 24;
 
@@ -406,7 +371,7 @@ fn mqtt_options(
 }
 
 /// Polls until the first error and reports the events.
-async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>, backlog: Arc<Backlog>) {
+async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<Step>, backlog: Arc<Backlog>) {
     let mut accepted = false;
     // Since when, at the earliest, there was what the next event tells.
     let mut came = Instant::now();
@@ -433,56 +398,52 @@ async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>, ba
                 let left = backlog.messages.fetch_sub(1, Ordering::SeqCst).saturating_sub(1);
                 if left <= REQUESTS / 2
                     && backlog.room_wanted.swap(false, Ordering::SeqCst)
-                    && event.send(ConnectionEvent::Room).await.is_err()
+                    && event.send(Step::Room).await.is_err()
                 {
                     return;
                 }
-                (packet != 0).then_some(ConnectionEvent::Sent(packet))
+                (packet != 0).then_some(Step::Sent(packet))
             }
             Ok(event) => interpret(event, came),
             Err(ConnectionError::ConnectionRefused(ConnectReturnCode::QoSNotSupported)) => {
-                Some(ConnectionEvent::Refuses(Lack::Acknowledgements))
+                Some(Step::Refuses(Lack::Acknowledgements))
             }
             Err(ConnectionError::ConnectionRefused(ConnectReturnCode::RetainNotSupported)) => {
-                Some(ConnectionEvent::Refuses(Lack::Retained))
+                Some(Step::Refuses(Lack::Retained))
             }
-            Err(error) if accepted && is_closed(&error) => Some(ConnectionEvent::Lost(CLOSED.to_string())),
-            Err(error) if accepted => Some(ConnectionEvent::Lost(reason(&error))),
-            Err(error) => Some(ConnectionEvent::Lost(refusal(&error))),
+            Err(error) if accepted && is_closed(&error) => Some(Step::Lost(CLOSED.to_string())),
+            Err(error) if accepted => Some(Step::Lost(reason(&error))),
+            Err(error) => Some(Step::Lost(refusal(&error))),
         };
         let Some(item) = item else { continue };
-        accepted |= matches!(item, ConnectionEvent::Connected(_));
-        let end = matches!(item, ConnectionEvent::Lost(_) | ConnectionEvent::Refuses(_));
+        accepted |= matches!(item, Step::Accepted(_));
+        let end = matches!(item, Step::Lost(_) | Step::Refuses(_));
         if event.send(item).await.is_err() || end {
             return;
         }
     }
 }
 
-fn interpret(event: Event, came: Instant) -> Option<ConnectionEvent> {
+fn interpret(event: Event, came: Instant) -> Option<Step> {
     match event {
-        Event::Incoming(Packet::ConnAck(ack)) => Some(ConnectionEvent::Connected(BrokerLimits::of(&ack))),
+        Event::Incoming(Packet::ConnAck(ack)) => Some(Step::Accepted(BrokerLimits::of(&ack))),
         Event::Incoming(Packet::SubAck(ack)) => {
             let refused = |code: &SubscribeReasonCode| match code {
                 SubscribeReasonCode::Success(_) => None,
                 why => Some(format!("{why:?}")),
             };
-            Some(ConnectionEvent::Subscribed(
-                ack.return_codes.iter().map(refused).collect(),
-            ))
+            Some(Step::Subscribed(ack.return_codes.iter().map(refused).collect()))
         }
         Event::Incoming(Packet::PubAck(ack)) => Some(match ack.reason {
-            PubAckReason::Success | PubAckReason::NoMatchingSubscribers => ConnectionEvent::Acked(ack.pkid),
-            why => ConnectionEvent::Refused(ack.pkid, why),
+            PubAckReason::Success | PubAckReason::NoMatchingSubscribers => Step::Acked(ack.pkid),
+            why => Step::Refused(ack.pkid, why),
         }),
         Event::Incoming(Packet::Publish(publish)) => {
-            Incoming::of(publish, came).map(|message| ConnectionEvent::Message(Box::new(message)))
+            Incoming::of(publish, came).map(|message| Step::Message(Box::new(message)))
         }
-        Event::Incoming(_) => Some(ConnectionEvent::Alive),
+        Event::Incoming(_) => Some(Step::Nothing),
         // A packet id was about to be used again before its acknowledgement.
-        Event::Outgoing(Outgoing::AwaitAck(_)) => {
-            Some(ConnectionEvent::Stuck("the broker did not acknowledge a message"))
-        }
+        Event::Outgoing(Outgoing::AwaitAck(_)) => Some(Step::Stuck("the broker did not acknowledge a message")),
         Event::Outgoing(_) | Event::Auth(_) => None,
     }
 }

@@ -57,7 +57,7 @@ pub(super) struct Journal {
     unwritten: VecDeque<(u64, Message)>,
     unwritten_bytes: usize,
     /// The last number given to a message.
-    last: u64,
+    pub(super) last: u64,
     /// Up to here messages were loaded, taken or lost.
     passed: u64,
     /// Up to here all messages are acknowledged; the mark on disk may be older.
@@ -65,10 +65,10 @@ pub(super) struct Journal {
     marked: u64,
     unsynced: bool,
     lost: u64,
-    /// Of the gaps in the numbers that are still to be met, those that are counted already.
-    counted: u64,
+    /// Of the gaps in the numbers that are still to be met, those that are counted already: lost messages among those that wait.
+    pub(super) counted: u64,
     /// Up to here nothing is kept: the buffer was full. What of it was taken and is not acknowledged is lost.
-    gone: u64,
+    pub(super) gone: u64,
     /// The files were deleted since the last call of [`Journal::take_wiped`].
     wiped: bool,
 }
@@ -193,11 +193,6 @@ impl Journal {
         Ok(())
     }
 
-    /// Number of the last message.
-    pub(super) fn last(&self) -> u64 {
-        self.last
-    }
-
     /// Number of messages that wait to be taken.
     pub(super) fn waiting(&self) -> u64 {
         self.loaded.len() as u64 + (self.last - self.passed)
@@ -211,16 +206,6 @@ impl Journal {
     /// Number of messages lost since the last call: the buffer was full, or they were damaged.
     pub(super) fn take_lost(&mut self) -> u64 {
         std::mem::take(&mut self.lost)
-    }
-
-    /// Up to this message nothing is kept any more, because the buffer was full.
-    pub(super) fn gone(&self) -> u64 {
-        self.gone
-    }
-
-    /// Number of lost messages among those that wait.
-    pub(super) fn missing(&self) -> u64 {
-        self.counted
     }
 
     /// Number of messages that are not acknowledged and are on no disk: anyone who ends now loses them.

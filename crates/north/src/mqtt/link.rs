@@ -4,44 +4,17 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use rumqttc::PubAckReason;
 use rumqttc::mqttbytes::v5::Filter;
 
 use super::back_off::Rotation;
 use super::broker_limits::{BrokerLimits, WillForm};
-use super::connection::{CLOSED, Connection, ConnectionEvent, NO_WILDCARDS, SUBSCRIBE_TIMEOUT};
+use super::connection::{CLOSED, Connection, NO_WILDCARDS, SUBSCRIBE_TIMEOUT, Step};
 use super::dial::Dial;
 use super::outage_log::OutageLog;
 use super::outbox::Message;
-use super::request::Incoming;
+use super::session::Will;
 use super::takeover::Takeovers;
 use super::{Broker, Options, tls};
-
-/// The meaning of a connection event for the client.
-#[derive(Debug)]
-pub(super) enum Step {
-    /// The broker accepted the connection: the client subscribes.
-    Accepted(BrokerLimits),
-    /// The broker takes no wildcards: the client subscribes again.
-    Subscribe(BrokerLimits),
-    /// The broker answered the subscriptions: of each, in order, the reason if it refused it. The first time on this connection,
-    /// with what the broker can do: the client may publish from now on.
-    Subscribed(Vec<Option<String>>, Option<BrokerLimits>),
-    /// The oldest published message with an acknowledgement was sent with this packet id.
-    Sent(u16),
-    /// The broker acknowledged the message.
-    Acked(u16),
-    /// The broker refused the message; the connection stays open.
-    Refused(u16, PubAckReason),
-    /// A message on a topic that was subscribed to.
-    Message(Box<Incoming>),
-    /// The client is to give the connection up, for this reason.
-    GiveUp(&'static str),
-    /// There is no connection any more, for this reason: the client calls [`BrokerLink::lost`].
-    Lost(String),
-    /// Nothing, or room for more.
-    Nothing,
-}
 
 /// The next action of the link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -144,43 +117,55 @@ impl BrokerLink {
         }
     }
 
-    /// The next event of the connection; pending while there is none. Cancel safe.
-    pub(super) async fn next(&mut self) -> ConnectionEvent {
-        match &mut self.state {
+    /// What happens next on the connection; pending while nothing does. Cancel safe.
+    pub(super) async fn next(&mut self) -> Step {
+        let step = match &mut self.state {
             State::Down { .. } => std::future::pending().await,
             State::Up(connection, _) => connection.next().await,
-        }
+        };
+        self.apply(step)
     }
 
-    /// Applies an event.
-    pub(super) fn take(&mut self, event: ConnectionEvent) -> Step {
+    fn apply(&mut self, step: Step) -> Step {
         let State::Up(_, phase) = &mut self.state else {
             return Step::Nothing;
         };
-        match event {
-            ConnectionEvent::Connected(limits) => {
+        match (step, &mut *phase) {
+            (Step::Accepted(limits), _) => {
                 let since = Instant::now();
                 *phase = Phase::Subscribing { limits, since };
                 Step::Accepted(limits)
             }
-            ConnectionEvent::Subscribed(answers) => answered(phase, answers),
-            ConnectionEvent::Sent(packet) => Step::Sent(packet),
-            ConnectionEvent::Acked(packet) => Step::Acked(packet),
-            ConnectionEvent::Refused(packet, why) => Step::Refused(packet, why),
-            ConnectionEvent::Message(message) => Step::Message(message),
-            ConnectionEvent::Room | ConnectionEvent::Alive => Step::Nothing,
-            ConnectionEvent::Stuck(why) => Step::GiveUp(why),
-            ConnectionEvent::Lost(why) => Step::Lost(why),
+            (Step::Subscribed(answers), Phase::Subscribing { limits, .. })
+                if limits.wildcards && answers.iter().flatten().any(|why| why == NO_WILDCARDS) =>
+            {
+                limits.wildcards = false;
+                Step::Subscribe(*limits)
+            }
             // Another connection follows at once with a lesser will, if there is one.
-            ConnectionEvent::Refuses(lack) if self.will.lessen(lack) => {
+            (Step::Refuses(lack), _) if self.will.lessen(lack) => {
                 tracing::debug!(target: "drivegate::north::mqtt", "{}the broker refuses the last will ({lack:?}); trying a lesser one", self.prefix);
                 self.state = State::Down {
                     retry_at: Instant::now(),
                 };
                 Step::Nothing
             }
-            ConnectionEvent::Refuses(_) => Step::Lost("the broker refuses the last will in every form".to_string()),
+            (Step::Refuses(_), _) => Step::Lost("the broker refuses the last will in every form".to_string()),
+            (step, _) => step,
         }
+    }
+
+    /// The broker answered the subscriptions; what it can do, if that was the first time on this connection: the client may
+    /// publish from now on.
+    pub(super) fn become_ready(&mut self) -> Option<BrokerLimits> {
+        let State::Up(_, phase) = &mut self.state else {
+            return None;
+        };
+        let Phase::Subscribing { limits, since } = *phase else {
+            return None;
+        };
+        *phase = Phase::Ready { limits, since };
+        Some(limits)
     }
 
     /// The action due now.
@@ -203,50 +188,46 @@ impl BrokerLink {
     /// Starts to connect to the broker whose turn it is, with this last will.
     ///
     /// # Errors
-    /// Why it cannot: then the client calls [`BrokerLink::lost`].
-    pub(super) async fn connect(&mut self, topic: String, payload: Vec<u8>, retain: bool) -> Result<(), String> {
+    /// Why it cannot.
+    pub(super) async fn connect(&mut self, will: Will) -> Result<(), String> {
         let options = self.options.clone();
         // Read for each attempt, so that renewed certificates are used without a restart.
         let config = tokio::task::spawn_blocking(move || tls::client_config(&options)).await;
         let config = config.map_err(|error| error.to_string())?;
         let config = config.map_err(|error| error.to_string())?;
-        let will = self.will.will(topic, payload, retain);
-        let (broker, dial, round) = (self.broker(), self.dial.clone(), self.rotation.round());
-        let way = move |options| dial.clone().connect(broker.clone(), round, options);
-        let target = (&self.broker(), self.client_id.as_str());
-        let connection = Connection::open(&self.options, target, will, config, way);
+        let will = self.will.will(will);
+        let broker = self.broker();
+        let target = (&broker, self.client_id.as_str());
+        let dial = (self.dial.clone(), self.rotation.round());
+        let connection = Connection::open(&self.options, target, will, config, dial);
         self.state = State::Up(connection, Phase::Connecting);
         Ok(())
     }
 
+    /// The connection that the broker accepted, and what the broker can do.
+    fn accepted(&mut self) -> Option<(&mut Connection, BrokerLimits)> {
+        match &mut self.state {
+            State::Up(connection, phase) => phase.limits().map(|limits| (connection, *limits)),
+            State::Down { .. } => None,
+        }
+    }
+
     /// Subscribes; false if the connection does not take it.
     pub(super) fn subscribe(&mut self, filters: Vec<Filter>) -> bool {
-        match &mut self.state {
-            State::Up(connection, phase) => match phase.limits() {
-                Some(limits) => connection.subscribe(filters, *limits),
-                None => true,
-            },
-            State::Down { .. } => true,
-        }
+        let accepted = self.accepted();
+        accepted.is_none_or(|(connection, limits)| connection.subscribe(filters, limits))
     }
 
     /// Publishes a message; false if there is no room, or no connection.
     pub(super) fn publish(&mut self, message: Message) -> bool {
-        match &mut self.state {
-            State::Up(connection, phase) => phase
-                .limits()
-                .copied()
-                .is_some_and(|limits| connection.publish(message, limits)),
-            State::Down { .. } => false,
-        }
+        let accepted = self.accepted();
+        accepted.is_some_and(|(connection, limits)| connection.publish(message, limits))
     }
 
     /// Disconnects in order, so that the broker does not publish the last will; false without a connection that it accepted.
-    pub(super) fn disconnect(&self) -> bool {
-        match &self.state {
-            State::Up(connection, phase) => phase.limits().is_some_and(|limits| connection.disconnect(*limits)),
-            State::Down { .. } => false,
-        }
+    pub(super) fn disconnect(&mut self) -> bool {
+        let accepted = self.accepted();
+        accepted.is_some_and(|(connection, limits)| connection.disconnect(limits))
     }
 
     /// The client may publish: logged, with what is lost with this broker.
@@ -259,6 +240,11 @@ impl BrokerLink {
         if let Some(outages) = self.outages.get_mut(self.rotation.current()) {
             outages.end();
         }
+    }
+
+    /// The connection could not be ended in order.
+    pub(super) fn log_unorderly(&self) {
+        tracing::warn!(target: "drivegate::north::mqtt", "{}the orderly disconnect timed out; the broker publishes the last will", self.prefix);
     }
 
     /// Ends the connection for this reason, and tells the broker. The last will is published if it is `true_now`.
@@ -318,25 +304,6 @@ impl BrokerLink {
         match std::mem::replace(&mut self.state, State::Down { retry_at }) {
             State::Up(connection, _) => Some(connection),
             State::Down { .. } => None,
-        }
-    }
-}
-
-/// The broker answered the subscriptions.
-fn answered(phase: &mut Phase, answers: Vec<Option<String>>) -> Step {
-    match phase {
-        Phase::Connecting => Step::Nothing,
-        Phase::Ready { .. } => Step::Subscribed(answers, None),
-        Phase::Subscribing { limits, .. }
-            if limits.wildcards && answers.iter().flatten().any(|why| why == NO_WILDCARDS) =>
-        {
-            limits.wildcards = false;
-            Step::Subscribe(*limits)
-        }
-        Phase::Subscribing { limits, since } => {
-            let (limits, since) = (*limits, *since);
-            *phase = Phase::Ready { limits, since };
-            Step::Subscribed(answers, Some(limits))
         }
     }
 }

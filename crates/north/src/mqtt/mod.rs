@@ -11,10 +11,10 @@
 //!
 //! `payload`, `publisher`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and
 //! in which order; `offline` drives `commands` without a broker. `broker_limits`, `silence`, `retry` and `takeover` judge what the broker does,
-//! without I/O as well, `back_off` chooses the broker. `client` is the task that owns them. `link` is the way to one of the brokers,
-//! for both clients: it owns the `connection`, which wraps
-//! rumqttc, which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are
-//! sent again from the outbox. `sparkplug` is a client of its own, on a link of its own.
+//! without I/O as well, `back_off` chooses the broker. `client` owns them. `sparkplug` is a client of its own, on a link of
+//! its own. `session` is the loop of both: it connects, reconnects, follows reloads and disconnects. `link` is the way to
+//! one of the brokers: it owns the `connection`, which wraps rumqttc, which keeps no state: every connection is a new client
+//! with a clean session, and unacknowledged messages are sent again from the outbox.
 
 mod back_off;
 mod broker_limits;
@@ -24,6 +24,7 @@ mod connection;
 mod dial;
 #[cfg(test)]
 pub(super) mod fixture;
+mod handover;
 mod history;
 mod home_assistant;
 mod journal;
@@ -37,6 +38,8 @@ mod record;
 mod reply;
 mod request;
 mod retry;
+mod rounds;
+mod session;
 mod silence;
 pub mod sparkplug;
 mod store;
@@ -56,11 +59,10 @@ use super::NorthState;
 use crate::plant::SharedPlant;
 use crate::{ServerError, server};
 
-pub(crate) use self::commands::OrdersLeft;
+pub use self::handover::Handover;
 pub use self::offline::{Offline, Published};
 pub use self::record::whole_records;
 pub use self::request::Incoming;
-pub(crate) use self::sparkplug::NodeOrdersLeft;
 
 /// A secret that is not printed in logs.
 #[derive(Clone, PartialEq, Eq)]
@@ -239,7 +241,7 @@ pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthState>, c
     // Subscribed here and not in the task, so that no event after this call is missed. What the client before this one left
     // unread comes first.
     let events = plant.load().events.subscribe();
-    let unread = stats.mqtt.keep_unread(None);
+    let unread = stats.mqtt_left.lock().unread.take();
     let events = unread.filter(|unread| unread.same_channel(&events)).unwrap_or(events);
     let node = options.sparkplug.clone().map(|node| {
         let broker = options.clone();

@@ -54,7 +54,7 @@ impl Offline {
         };
         Offline {
             plant,
-            commands: Commands::new(Topics::new(base, &gateway), rules, SharedMemory::default()),
+            commands: Commands::new(Topics::new(base, &gateway), rules, SharedMemory::default(), None),
             held: VecDeque::new(),
             results: Vec::new(),
             begun: (now, time),

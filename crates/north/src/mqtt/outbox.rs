@@ -10,6 +10,7 @@ use std::sync::Arc;
 
 use super::Qos;
 use super::store::Number;
+use crate::MqttKind;
 
 /// Maximum number of waiting results and their size in bytes: beyond it, no more commands are received.
 const RESULTS: usize = 16_384;
@@ -58,23 +59,13 @@ impl Message {
     }
 }
 
-/// The queues, in the order of their turns.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
-    /// Results of commands.
-    Result,
-    Event,
-    /// Values of an outage.
-    History,
-}
-
 /// Identifies an entry while its message is in flight.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Key {
     /// Telemetry of this topic.
     Latest(Arc<str>),
     /// Entry of a queue, with this serial number.
-    Queued(Kind, u64),
+    Queued(MqttKind, u64),
 }
 
 /// An entry that left the outbox.
@@ -83,7 +74,7 @@ pub(super) struct Settled {
     /// Topic of the message.
     pub(super) topic: Arc<str>,
     /// Its queue; `None` for telemetry.
-    pub(super) kind: Option<Kind>,
+    pub(super) kind: Option<MqttKind>,
 }
 
 /// How messages are published.
@@ -127,6 +118,8 @@ struct Queue {
     bytes: usize,
     /// The broker refused one of them for now; all wait for [`Outbox::retry`], so that the order stays.
     put_back: bool,
+    /// Given up since the last [`Outbox::take_lost`]: too many waited, or they broke connections.
+    lost: u64,
 }
 
 /// All messages that wait or are in flight.
@@ -150,15 +143,6 @@ pub(super) struct Outbox {
     has_leader: bool,
     /// Whose turn it is: results, events or telemetry.
     turn: usize,
-    lost: Lost,
-}
-
-/// Messages lost because too many waited, or because they broke connections.
-#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Lost {
-    pub(super) results: u64,
-    pub(super) events: u64,
-    pub(super) history: u64,
 }
 
 impl Outbox {
@@ -176,7 +160,6 @@ impl Outbox {
             unacknowledged: HashMap::new(),
             has_leader: false,
             turn: 0,
-            lost: Lost::default(),
         }
     }
 
@@ -211,7 +194,7 @@ impl Outbox {
     /// Adds a result.
     pub(super) fn push_result(&mut self, message: Message) {
         *self.results_of.entry(message.topic.clone()).or_default() += 1;
-        self.push(Kind::Result, message, None);
+        self.push(MqttKind::Result, message, None);
     }
 
     /// The results that the broker has not acknowledged, in order.
@@ -220,9 +203,9 @@ impl Outbox {
     }
 
     /// Adds an event or history, with its number if it is on disk; if too many wait, the oldest is dropped.
-    pub(super) fn push(&mut self, kind: Kind, message: Message, number: Option<Number>) {
+    pub(super) fn push(&mut self, kind: MqttKind, message: Message, number: Option<Number>) {
         let message = match (kind, self.delivery.events) {
-            (Kind::Event | Kind::History, Qos::AtMostOnce) => Message {
+            (MqttKind::Event | MqttKind::History, Qos::AtMostOnce) => Message {
                 acknowledged: false,
                 ..message
             },
@@ -231,12 +214,11 @@ impl Outbox {
         self.serial += 1;
         let serial = self.serial;
         let queue = self.queue_mut(kind);
-        let mut dropped = 0;
-        while kind != Kind::Result && queue.is_full_for(&message) {
+        while kind != MqttKind::Result && queue.is_full_for(&message) {
             // Entries in flight are dropped last: they have probably been delivered.
             let victim = queue.entries.iter().position(|e| !e.in_flight).unwrap_or(0);
             queue.remove(victim);
-            dropped += 1;
+            queue.lost += 1;
         }
         queue.bytes += message.bytes();
         queue.entries.push_back(Entry {
@@ -246,45 +228,34 @@ impl Outbox {
             in_flight: false,
             attempts: 0,
         });
-        match kind {
-            Kind::Event => self.lost.events += dropped,
-            Kind::History => self.lost.history += dropped,
-            Kind::Result => {}
-        }
     }
 
     /// Nothing up to this message is on disk any more, because the buffer was full: what waits of it is lost, as it would be
     /// after a restart. What is in flight has probably been delivered.
-    pub(super) fn drop_gone(&mut self, kind: Kind, through: Number) {
+    pub(super) fn drop_gone(&mut self, kind: MqttKind, through: Number) {
         let queue = self.queue_mut(kind);
         let is_older = |entry: &&Entry| entry.number.is_none_or(|number| number <= through);
         let is_gone = |entry: &Entry| !entry.in_flight && entry.number.is_some();
-        let mut dropped = 0;
         // The numbers ascend, so this ends with the first one that is kept.
         while let Some(place) = queue.entries.iter().take_while(is_older).position(is_gone) {
             queue.remove(place);
-            dropped += 1;
-        }
-        match kind {
-            Kind::Event => self.lost.events += dropped,
-            Kind::History => self.lost.history += dropped,
-            Kind::Result => {}
+            queue.lost += 1;
         }
     }
 
-    fn queue(&self, kind: Kind) -> &Queue {
+    fn queue(&self, kind: MqttKind) -> &Queue {
         match kind {
-            Kind::Result => &self.results,
-            Kind::Event => &self.events,
-            Kind::History => &self.history,
+            MqttKind::Result => &self.results,
+            MqttKind::Event => &self.events,
+            MqttKind::History => &self.history,
         }
     }
 
-    fn queue_mut(&mut self, kind: Kind) -> &mut Queue {
+    fn queue_mut(&mut self, kind: MqttKind) -> &mut Queue {
         match kind {
-            Kind::Result => &mut self.results,
-            Kind::Event => &mut self.events,
-            Kind::History => &mut self.history,
+            MqttKind::Result => &mut self.results,
+            MqttKind::Event => &mut self.events,
+            MqttKind::History => &mut self.history,
         }
     }
 
@@ -301,7 +272,7 @@ impl Outbox {
     }
 
     /// Number of messages of that kind that may be loaded from disk now.
-    pub(super) fn room(&self, kind: Kind) -> usize {
+    pub(super) fn room(&self, kind: MqttKind) -> usize {
         let queue = self.queue(kind);
         match queue.bytes < LOADED_BYTES {
             true => LOADED.saturating_sub(queue.entries.len()),
@@ -310,16 +281,13 @@ impl Outbox {
     }
 
     /// The first message of that kind that is not acknowledged and on disk.
-    pub(super) fn oldest(&self, kind: Kind) -> Option<Number> {
+    pub(super) fn oldest(&self, kind: MqttKind) -> Option<Number> {
         self.queue(kind).entries.iter().find_map(|entry| entry.number)
     }
 
     /// Number of events, results and history that wait or are in flight.
     pub(super) fn waiting(&self) -> usize {
-        [Kind::Result, Kind::Event, Kind::History]
-            .map(|kind| self.queue(kind).entries.len())
-            .iter()
-            .sum()
+        self.urgent() + self.history.entries.len()
     }
 
     /// Number of events that wait or are in flight.
@@ -333,7 +301,7 @@ impl Outbox {
     }
 
     /// Number of messages of that kind that are nowhere else.
-    pub(super) fn unkept(&self, kind: Kind) -> u64 {
+    pub(super) fn unkept(&self, kind: MqttKind) -> u64 {
         self.queue(kind)
             .entries
             .iter()
@@ -351,9 +319,9 @@ impl Outbox {
         self.latest.contains_key(topic)
     }
 
-    /// The messages lost since the last call.
-    pub(super) fn take_lost(&mut self) -> Lost {
-        std::mem::take(&mut self.lost)
+    /// The number of messages of each kind lost since the last call.
+    pub(super) fn take_lost(&mut self) -> [(MqttKind, u64); MqttKind::ALL.len()] {
+        MqttKind::ALL.map(|kind| (kind, std::mem::take(&mut self.queue_mut(kind).lost)))
     }
 
     /// Number of messages whose acknowledgement is awaited.
@@ -371,11 +339,11 @@ impl Outbox {
         let of = |kind| self.queue(kind).next(kind, free);
         let turns = (0..3).map(|step| (self.turn + step) % 3);
         let next = turns.into_iter().find_map(|turn| match turn {
-            0 => of(Kind::Result),
-            1 => of(Kind::Event),
+            0 => of(MqttKind::Result),
+            1 => of(MqttKind::Event),
             _ => self.next_latest(free),
         });
-        next.or_else(|| may_history.then(|| of(Kind::History)).flatten())
+        next.or_else(|| may_history.then(|| of(MqttKind::History)).flatten())
     }
 
     fn next_latest(&self, free: bool) -> Option<(Key, Message)> {
@@ -415,9 +383,9 @@ impl Outbox {
                     entry.in_flight = true;
                 }
                 match kind {
-                    Kind::Result => self.turn = 1,
-                    Kind::Event => self.turn = 2,
-                    Kind::History => {}
+                    MqttKind::Result => self.turn = 1,
+                    MqttKind::Event => self.turn = 2,
+                    MqttKind::History => {}
                 }
             }
         }
@@ -510,7 +478,7 @@ impl Outbox {
                 let queue = self.queue_mut(kind);
                 let place = queue.place(serial)?;
                 let topic = queue.remove(place)?.message.topic;
-                if kind == Kind::Result {
+                if kind == MqttKind::Result {
                     self.forget_result(&topic);
                 }
                 Some(Settled {
@@ -548,7 +516,7 @@ impl Outbox {
         while let Some(place) = self.results.entries.iter().position(|e| e.attempts >= RESULT_ATTEMPTS) {
             if let Some(entry) = self.results.remove(place) {
                 self.forget_result(&entry.message.topic);
-                self.lost.results += 1;
+                self.results.lost += 1;
             }
         }
     }
@@ -568,7 +536,7 @@ impl Queue {
         self.entries.len() >= KEPT || !self.entries.is_empty() && self.bytes + message.bytes() > KEPT_BYTES
     }
 
-    fn next(&self, kind: Kind, free: bool) -> Option<(Key, Message)> {
+    fn next(&self, kind: MqttKind, free: bool) -> Option<(Key, Message)> {
         let entry = self.entries.iter().find(|e| !e.in_flight).filter(|_| !self.put_back)?;
         let may = free || !entry.message.acknowledged;
         may.then(|| (Key::Queued(kind, entry.serial), entry.message.clone()))

@@ -47,6 +47,7 @@ impl StateContent {
         points: impl Iterator<Item = PointIndex>,
         blocked_by: Vec<String>,
         stop_waits: Option<Duration>,
+        hold: Option<HoldView>,
     ) -> StateContent {
         let shown = |index| {
             let sample = reading.sample(index);
@@ -57,15 +58,9 @@ impl StateContent {
             quality: reading.overall(),
             blocked_by,
             stop_waits: stop_waits.map(|time| u64::try_from(time.as_millis().div_ceil(1000)).unwrap_or(u64::MAX)),
-            hold: None,
+            hold: hold.map(HoldFields::from),
             points: points.map(shown).collect(),
         }
-    }
-
-    /// The same with who holds the drive.
-    pub(super) fn with_hold(mut self, hold: Option<HoldView>) -> StateContent {
-        self.hold = hold.map(HoldFields::from);
-        self
     }
 }
 
@@ -401,6 +396,7 @@ mod tests {
             [running, ready].into_iter(),
             Vec::new(),
             None,
+            None,
         );
         let object = StateObject {
             shown: &shown,
@@ -429,6 +425,7 @@ mod tests {
             &image.reading(now, second),
             [running, ready].into_iter(),
             Vec::new(),
+            None,
             None,
         );
         assert_eq!((shown.state, shown.quality), (Some(State::Ready), Quality::Good));

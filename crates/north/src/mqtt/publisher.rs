@@ -2,7 +2,7 @@
 //! Time is an argument.
 //!
 //! A drive is looked at when its image was updated, when a change may be published at last, and four times a second for
-//! what changes by itself (age). A few drives at a time, so that commands do not wait for a thousand of them.
+//! what changes by itself (age).
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -14,6 +14,7 @@ use super::Telemetry;
 use super::connection::PACKET_OVERHEAD;
 use super::history::Recorder;
 use super::payload::{self, BusFigures, BusState, PointPayload, StateContent, StateObject};
+use super::rounds::{self, LOOK};
 use super::topics::Topics;
 use crate::drive::{ModelPoint, PointIndex};
 use crate::plant::{BusHandle, DriveHandle, Plant};
@@ -21,10 +22,6 @@ use crate::process_image::{Reading, Snapshot};
 
 /// Minimum time between publications because counters or load of a bus changed, which they do all the time.
 const FIGURES_INTERVAL: Duration = Duration::from_secs(1);
-/// Maximum time between two looks at a drive.
-const LOOK: Duration = Duration::from_millis(250);
-/// Number of drives looked at in one call.
-const DRIVES: usize = 32;
 
 /// A retained message to be published.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -251,16 +248,10 @@ impl Publisher {
         let (pace, mode, most) = (self.pace, self.telemetry.history, self.max_packet);
         let all = self.look(now, |drive| {
             let fresh = drive.is_fresh();
-            let (names, indices) = (&drive.names, &drive.indices);
             let reading = drive.drive.reading(now);
-            let hold = drive.drive.hold_view(None, now).map(|(view, _)| view);
-            let words = drive.drive.why(&reading).words();
-            let shown =
-                StateContent::of(&reading, indices.iter().copied(), words, drive.drive.stop_waits(now)).with_hold(hold);
-            let render = |shown: &StateContent| {
-                let fits = drive.fits;
-                render((names, indices, fits), &reading, shown, wall, true)
-            };
+            let shown = drive.shown(&reading);
+            let points = (drive.names.as_slice(), drive.indices.as_slice(), drive.fits);
+            let render = |shown: &StateContent| render(points, &reading, shown, wall, true);
             drive.recorder.limit(most);
             let wait = drive.recorder.record(mode, pace.min, shown, fresh, render, now);
             drive.seen = Some(reading.snapshot);
@@ -283,22 +274,15 @@ impl Publisher {
 
     /// Looks at the drives that are due, a few in one call; whether none is left.
     fn look(&mut self, now: Instant, mut look: impl FnMut(&mut DriveTopics)) -> bool {
-        let count = self.drives.len();
-        let mut looked = 0;
-        for step in 0..count {
-            let place = (self.cursor + step) % count;
-            let Some(drive) = self.drives.get_mut(place) else { break };
-            if !drive.is_fresh() && drive.look_at.is_some_and(|at| at > now) {
-                continue;
+        let drives = &self.drives;
+        let is_due = |place| drives.get(place).is_some_and(|drive: &DriveTopics| drive.is_due(now));
+        let (due, all) = rounds::due(&mut self.cursor, drives.len(), is_due);
+        for place in due {
+            if let Some(drive) = self.drives.get_mut(place) {
+                look(drive);
             }
-            if looked == DRIVES {
-                self.cursor = place;
-                return false;
-            }
-            looked += 1;
-            look(drive);
         }
-        true
+        all
     }
 
     fn next(&self, all: bool, now: Instant, buses_at: Option<Instant>) -> Instant {
@@ -349,6 +333,17 @@ impl DriveTopics {
         self.seen.as_ref().is_none_or(|seen| image.is_newer_than(seen))
     }
 
+    fn is_due(&self, now: Instant) -> bool {
+        self.is_fresh() || self.look_at.is_none_or(|at| at <= now)
+    }
+
+    fn shown(&self, reading: &Reading<'_>) -> StateContent {
+        let (drive, indices) = (&self.drive, self.indices.iter().copied());
+        let words = drive.why(reading).words();
+        let hold = drive.hold_view(None, reading.now).map(|(view, _)| view);
+        StateContent::of(reading, indices, words, drive.stop_waits(reading.now), hold)
+    }
+
     /// The line of the log about a state that is published without some of its points.
     fn reduced(&self, most: usize) -> String {
         let omitted = self.names.get(self.fits..).unwrap_or_default().join(", ");
@@ -381,15 +376,7 @@ impl DriveTopics {
     fn tick(&mut self, pace: PublishInterval, most: usize, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
         let drive = self.drive.clone();
         let reading = drive.reading(now);
-        let hold = self.drive.hold_view(None, now).map(|(view, _)| view);
-        let words = self.drive.why(&reading).words();
-        let shown = StateContent::of(
-            &reading,
-            self.indices.iter().copied(),
-            words,
-            self.drive.stop_waits(now),
-        )
-        .with_hold(hold);
+        let shown = self.shown(&reading);
         let mut look_at = now + LOOK.min(pace.max);
         for point in &mut self.points {
             let payload = match point.source {

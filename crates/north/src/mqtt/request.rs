@@ -1,11 +1,12 @@
 //! Parses the messages on set topics.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use rumqttc::Publish;
 use serde_json::Value as Json;
 
-use crate::command::{DEFAULT_EXPIRY, Refusal};
+use crate::command::{DEFAULT_EXPIRY, Origin, Refusal, SourceKind};
 use crate::command_json::{self, Asked, Id, MAX_PAYLOAD, Taken, check_size, excerpt, find_id, resolve};
 use crate::drive::Profile;
 
@@ -62,9 +63,14 @@ impl Incoming {
         }
         Some(incoming)
     }
-}
 
-impl Incoming {
+    /// The sender: by its topic, which the broker's rules secure, and for the audit by its user property.
+    pub(super) fn origin(&self, client: &Arc<str>, kind: SourceKind) -> Origin {
+        let who = self.who.as_deref().map(|who| excerpt(who.as_bytes()));
+        let who = who.as_deref().map_or(self.topic.as_str(), |who| who.trim_matches('`'));
+        Origin::of(client.clone(), kind, who)
+    }
+
     /// The message, as far as its repetition is recognised by it.
     pub(super) fn taken(&self) -> Taken<'_> {
         Taken {
@@ -150,8 +156,6 @@ fn bare(payload: &[u8]) -> Result<Json, Refusal> {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use super::*;
     use crate::command_json::MAX_ID;
     use crate::drive::Value;

@@ -17,7 +17,7 @@ use super::Buffer;
 use super::journal::Journal;
 use super::outbox::{KEPT_BYTES, Message};
 use crate::files::names::MQTT_TOPICS;
-use crate::{MqttLoss, NorthState};
+use crate::{MqttKind, NorthState};
 
 /// Jobs that wait for the disk: a burst of events and its acknowledgements. The size of their messages is at most
 /// [`KEPT_BYTES`].
@@ -29,16 +29,6 @@ const SYNC: Duration = Duration::from_secs(1);
 /// Attempts to lock the directory, and the wait between them: a process that is stopping may still hold it.
 const LOCK_ATTEMPTS: u32 = 20;
 const LOCK_WAIT: Duration = Duration::from_millis(50);
-
-/// Counts lost messages of one kind.
-#[derive(Debug, Clone)]
-pub(super) struct LostCount(pub(super) Arc<NorthState>, pub(super) MqttLoss);
-
-impl LostCount {
-    pub(super) fn add(&self, count: u64) {
-        self.0.mqtt.lost(self.1, count);
-    }
-}
 
 /// Number of a message: from 1 in this run, 0 and less for those of earlier runs.
 pub(super) type Number = i64;
@@ -83,63 +73,61 @@ pub(super) struct Store {
 
 #[derive(Debug)]
 struct Disk {
-    lost: LostCount,
     jobs: Sender<Job>,
-    /// Size of the messages among them.
-    bytes: Arc<AtomicUsize>,
-    gone: Arc<Gone>,
     loaded: mpsc::Receiver<Loaded>,
-    ended: tokio::sync::oneshot::Receiver<()>,
+    shared: Arc<Shared>,
 }
 
-/// What the disk gave up because the buffer was full.
+/// What the client and the thread share.
 #[derive(Debug)]
-struct Gone {
-    /// Up to this message nothing is kept.
-    through: AtomicI64,
+struct Shared {
+    stats: Arc<NorthState>,
+    /// Of all messages of the store.
+    kind: MqttKind,
+    /// Size of the messages among the jobs.
+    bytes: AtomicUsize,
+    /// Up to this message nothing is kept, because the buffer was full.
+    gone: AtomicI64,
     /// Number of lost messages among those after it.
     missing: AtomicU64,
 }
 
-impl Default for Gone {
-    fn default() -> Gone {
-        Gone {
-            through: AtomicI64::new(Number::MIN),
+impl Shared {
+    fn new(stats: Arc<NorthState>, kind: MqttKind) -> Arc<Shared> {
+        Arc::new(Shared {
+            stats,
+            kind,
+            bytes: AtomicUsize::new(0),
+            gone: AtomicI64::new(Number::MIN),
             missing: AtomicU64::new(0),
-        }
+        })
+    }
+
+    fn lost(&self, count: u64) {
+        self.stats.mqtt.lost(self.kind, count);
     }
 }
 
 impl Store {
-    /// Opens the buffer of that name, without waiting for it; without a buffer, messages are not kept. If it cannot be
-    /// used, that is logged and messages wait in memory.
-    pub(super) fn open(buffer: Option<Buffer>, name: &'static str, lost: LostCount) -> Store {
+    /// Opens the buffer of that name for messages of this kind, without waiting for it; without a buffer, messages are not
+    /// kept. If it cannot be used, that is logged and messages wait in memory.
+    pub(super) fn open(
+        buffer: Option<Buffer>,
+        name: &'static str,
+        (stats, kind): (&Arc<NorthState>, MqttKind),
+    ) -> Store {
         let Some(buffer) = buffer else {
             return Store::default();
         };
         // Takes memory as it fills: the channel of the standard library would hold the space of all jobs from the start.
         let (jobs, todo) = flume::bounded(JOBS);
         let (sender, loaded) = mpsc::channel(4);
-        let (end, ended) = tokio::sync::oneshot::channel();
-        let of_thread = lost.clone();
-        let bytes: Arc<AtomicUsize> = Arc::default();
-        let gone: Arc<Gone> = Arc::default();
-        let (waiting, given_up) = (bytes.clone(), gone.clone());
-        let work = move || {
-            Thread::open(&buffer, name, sender, of_thread, given_up).work(&todo, &waiting);
-            // The client may be gone.
-            let _ = end.send(());
-        };
+        let shared = Shared::new(stats.clone(), kind);
+        let of_thread = shared.clone();
+        let work = move || Thread::open(&buffer, name, sender, of_thread).work(&todo);
         match std::thread::Builder::new().name(name.to_string()).spawn(work) {
             Ok(_) => Store {
-                disk: Some(Disk {
-                    lost,
-                    jobs,
-                    bytes,
-                    gone,
-                    loaded,
-                    ended,
-                }),
+                disk: Some(Disk { jobs, loaded, shared }),
                 ..Store::default()
             },
             Err(error) => {
@@ -161,7 +149,7 @@ impl Store {
         } else if now {
             return Some((None, message));
         } else {
-            disk.lost.add(1);
+            disk.shared.lost(1);
             return None;
         }
         if now {
@@ -232,7 +220,7 @@ impl Store {
 
     /// Up to this message nothing is kept any more, because the buffer was full; what of it is in the outbox is lost.
     pub(super) fn gone(&self) -> Number {
-        let gone = self.disk.as_ref().map(|disk| disk.gone.through.load(Ordering::Relaxed));
+        let gone = self.disk.as_ref().map(|disk| disk.shared.gone.load(Ordering::Relaxed));
         gone.unwrap_or(Number::MIN)
     }
 
@@ -240,15 +228,15 @@ impl Store {
     pub(super) fn waiting(&self) -> u64 {
         let Some(disk) = &self.disk else { return 0 };
         let kept = u64::try_from(self.pushed - self.through.max(self.gone())).unwrap_or_default();
-        kept.saturating_sub(disk.gone.missing.load(Ordering::Relaxed))
+        kept.saturating_sub(disk.shared.missing.load(Ordering::Relaxed))
     }
 
     /// Writes what waits and ends; the caller limits the time.
     pub(super) async fn close(self) {
-        if let Some(Disk { jobs, ended, .. }) = self.disk {
+        if let Some(Disk { jobs, mut loaded, .. }) = self.disk {
             drop(jobs);
-            // An error means that the thread has ended.
-            let _ = ended.await;
+            // Its end comes after the last report.
+            while loaded.recv().await.is_some() {}
         }
     }
 }
@@ -257,14 +245,14 @@ impl Disk {
     /// Gives a message to the disk, unless too much waits for it.
     fn append(&self, message: &Message, sent: bool) -> bool {
         let bytes = message.bytes();
-        if self.bytes.load(Ordering::Relaxed) + bytes > KEPT_BYTES {
+        if self.shared.bytes.load(Ordering::Relaxed) + bytes > KEPT_BYTES {
             return false;
         }
         // Before the thread can subtract it.
-        self.bytes.fetch_add(bytes, Ordering::Relaxed);
+        self.shared.bytes.fetch_add(bytes, Ordering::Relaxed);
         let given = self.jobs.try_send(Job::Append(message.clone(), sent)).is_ok();
         if !given {
-            self.bytes.fetch_sub(bytes, Ordering::Relaxed);
+            self.shared.bytes.fetch_sub(bytes, Ordering::Relaxed);
         }
         given
     }
@@ -275,8 +263,7 @@ struct Thread {
     dir: PathBuf,
     journal: Journal,
     report: mpsc::Sender<Loaded>,
-    lost: LostCount,
-    gone: Arc<Gone>,
+    shared: Arc<Shared>,
     /// The topics to be kept for the next run.
     topics: Vec<String>,
     /// The last number of earlier runs.
@@ -287,13 +274,7 @@ struct Thread {
 }
 
 impl Thread {
-    fn open(
-        buffer: &Buffer,
-        name: &'static str,
-        report: mpsc::Sender<Loaded>,
-        lost: LostCount,
-        gone: Arc<Gone>,
-    ) -> Thread {
+    fn open(buffer: &Buffer, name: &'static str, report: mpsc::Sender<Loaded>, shared: Arc<Shared>) -> Thread {
         let dir = buffer.dir.clone();
         let mut attempts = LOCK_ATTEMPTS;
         let journal = loop {
@@ -320,12 +301,11 @@ impl Thread {
             );
         }
         let thread = Thread {
-            base: journal.last(),
+            base: journal.last,
             dir,
             journal,
             report,
-            lost,
-            gone,
+            shared,
             topics: Vec::new(),
             failing: false,
             synced: Instant::now(),
@@ -335,8 +315,8 @@ impl Thread {
         thread
     }
 
-    /// Works until all senders of jobs are gone; `bytes` is the size of the messages that wait.
-    fn work(mut self, jobs: &Receiver<Job>, bytes: &AtomicUsize) {
+    /// Works until all senders of jobs are gone.
+    fn work(mut self, jobs: &Receiver<Job>) {
         loop {
             let mut load = None;
             let mut next = match jobs.recv_timeout(SYNC) {
@@ -348,7 +328,7 @@ impl Thread {
             while let Some(job) = next.take() {
                 match job {
                     Job::Append(message, sent) => {
-                        bytes.fetch_sub(message.bytes(), Ordering::Relaxed);
+                        self.shared.bytes.fetch_sub(message.bytes(), Ordering::Relaxed);
                         self.journal.append(message, sent);
                     }
                     Job::Acknowledge(number) => self.journal.acknowledge(self.base.saturating_add_signed(number)),
@@ -373,7 +353,7 @@ impl Thread {
         self.sync();
         let unkept = self.journal.unkept();
         if unkept > 0 {
-            self.lost.add(unkept);
+            self.shared.lost(unkept);
             tracing::error!(
                 target: "drivegate::north::mqtt", "{unkept} messages that the broker did not accept are lost: {} does \
                                                    not accept them either; check mqtt.buffer",
@@ -416,13 +396,10 @@ impl Thread {
         if self.journal.take_wiped() && !self.topics.is_empty() {
             self.write_topics();
         }
-        let lost = self.journal.take_lost();
-        if lost > 0 {
-            self.lost.add(lost);
-        }
-        let (gone, missing) = (self.number(self.journal.gone()), self.journal.missing());
-        self.gone.through.store(gone, Ordering::Relaxed);
-        self.gone.missing.store(missing, Ordering::Relaxed);
+        self.shared.lost(self.journal.take_lost());
+        let (gone, missing) = (self.number(self.journal.gone), self.journal.counted);
+        self.shared.gone.store(gone, Ordering::Relaxed);
+        self.shared.missing.store(missing, Ordering::Relaxed);
         if self.synced.elapsed() >= SYNC {
             self.sync();
         }

@@ -9,28 +9,15 @@ pub(super) struct Topics {
     root: String,
 }
 
-/// A set topic: the drive and, for a bare value, the point.
+/// What a message on a topic commands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct SetTopic<'t> {
-    pub(super) drive: &'t str,
-    pub(super) point: Option<&'t str>,
-    /// WHO in `as/WHO`.
-    pub(super) who: Option<&'t str>,
-}
-
-/// The topic at which the hold of a drive is taken, renewed, released or broken.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct HoldTopic<'t> {
-    pub(super) drive: &'t str,
-    /// Without one it has no owner.
-    pub(super) who: Option<&'t str>,
-}
-
-/// The topic at which all drives are stopped.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct StopTopic<'t> {
-    /// WHO of `as/WHO`; without one it has no owner.
-    pub(super) who: Option<&'t str>,
+pub(super) enum Target<'t> {
+    /// The drive and, for a bare value, the point.
+    Set(&'t str, Option<&'t str>),
+    /// The hold of this drive is taken, renewed, released or broken.
+    Hold(&'t str),
+    /// All drives are stopped.
+    StopAll,
 }
 
 impl Topics {
@@ -61,157 +48,147 @@ impl Topics {
         format!("{}/drive/{drive}/point/{point}", self.root)
     }
 
-    /// The filters of all set topics.
-    pub(super) fn set_filters(&self) -> [String; 3] {
-        [self.drive("+", "set"), self.drive("+", "set/+"), self.stop_all()]
-    }
-
-    /// The filters of those of the topics that name a client, and of the holds.
-    pub(super) fn authority_filters(&self) -> [String; 5] {
-        [
-            self.drive("+", "as/+/set"),
-            self.drive("+", "as/+/set/+"),
-            self.drive("+", "as/+/hold"),
-            self.drive("+", "hold"),
-            format!("{}/as/+/stop", self.root),
-        ]
-    }
-
-    /// The same for these clients, for a broker that takes no wildcards.
-    pub(super) fn authority_topics(&self, plant: &Plant, clients: &[String]) -> Vec<String> {
-        let of_drive = |drive: DriveHandle| {
-            let spec = &drive.image.spec;
-            let points = || spec.profile.points.iter().filter(|point| point.is_commanded());
-            let of_client = |who: &String| {
-                let leaf = |leaf: &str| self.drive(&spec.name, &format!("as/{who}/{leaf}"));
-                let points = points().map(|point| leaf(&format!("set/{}", point.name)));
-                [leaf("set"), leaf("hold")]
-                    .into_iter()
-                    .chain(points)
-                    .collect::<Vec<_>>()
-            };
-            let hold = self.drive(&spec.name, "hold");
-            std::iter::once(hold)
-                .chain(clients.iter().flat_map(of_client))
-                .collect::<Vec<_>>()
-        };
-        let stops = clients.iter().map(|who| format!("{}/as/{who}/stop", self.root));
-        stops.chain(plant.drives().flat_map(of_drive)).collect()
-    }
-
-    /// Who stops all drives by that topic; `None` for any other topic.
-    pub(super) fn parse_stop_all<'t>(&self, topic: &'t str) -> Option<StopTopic<'t>> {
-        let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix('/')?;
-        if rest == "set/stop" {
-            return Some(StopTopic { who: None });
-        }
-        let who = rest.strip_prefix("as/")?.strip_suffix("/stop")?;
-        (!who.contains('/')).then_some(StopTopic { who: Some(who) })
-    }
-
-    /// Whose hold of which drive a topic is about; `None` for any other topic.
-    pub(super) fn parse_hold<'t>(&self, topic: &'t str) -> Option<HoldTopic<'t>> {
-        let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix("/drive/")?;
-        let levels: Vec<&str> = rest.split('/').collect();
-        match levels.as_slice() {
-            [drive, "hold"] => Some(HoldTopic { drive, who: None }),
-            [drive, "as", who, "hold"] => Some(HoldTopic { drive, who: Some(who) }),
-            _ => None,
-        }
-    }
-
-    /// Where all drives are stopped.
-    pub(super) fn stop_all(&self) -> String {
-        format!("{}/set/stop", self.root)
-    }
-
-    /// Where the answers to that go.
-    pub(super) fn result(&self) -> String {
-        format!("{}/result", self.root)
-    }
-
-    /// The set topics of each drive of this plant, for a broker that takes no wildcards.
-    pub(super) fn set_topics(&self, plant: &Plant) -> Vec<String> {
+    /// The filters of all set topics; with `clients`, also of those that name one of them, and of the holds. For a broker
+    /// that takes no wildcards, the topics of this plant.
+    pub(super) fn set_filters(&self, plant: Option<&Plant>, clients: Option<&[String]>) -> Vec<String> {
+        let any = || vec!["+".to_string()];
         let of_drive = |drive: DriveHandle| {
             let spec = &drive.image.spec;
             let points = spec.profile.points.iter().filter(|point| point.is_commanded());
-            let points = points.map(|point| self.drive(&spec.name, &format!("set/{}", point.name)));
-            let whole = self.drive(&spec.name, "set");
-            std::iter::once(whole).chain(points).collect::<Vec<String>>()
+            (spec.name.clone(), points.map(|point| point.name.clone()).collect())
         };
-        std::iter::once(self.stop_all())
-            .chain(plant.drives().flat_map(of_drive))
-            .collect()
+        let drives: Vec<(String, Vec<String>)> = match plant {
+            None => vec![("+".to_string(), any())],
+            Some(plant) => plant.drives().map(of_drive).collect(),
+        };
+        let sets = |who: &str| {
+            let leaves = |(drive, points): &(String, Vec<String>)| {
+                let points = points.iter().map(|point| format!("set/{point}"));
+                let leaves = std::iter::once("set".to_string()).chain(points);
+                leaves
+                    .map(|leaf| self.drive(drive, &format!("{who}{leaf}")))
+                    .collect::<Vec<_>>()
+            };
+            drives.iter().flat_map(leaves).collect::<Vec<_>>()
+        };
+        let mut filters = sets("");
+        filters.push(format!("{}/set/stop", self.root));
+        let Some(clients) = clients else { return filters };
+        for who in plant.map_or_else(any, |_| clients.to_vec()) {
+            filters.extend(sets(&format!("as/{who}/")));
+            filters.extend(
+                drives
+                    .iter()
+                    .map(|(drive, _)| self.drive(drive, &format!("as/{who}/hold"))),
+            );
+            filters.push(format!("{}/as/{who}/stop", self.root));
+        }
+        filters.extend(drives.iter().map(|(drive, _)| self.drive(drive, "hold")));
+        filters
     }
 
-    /// Which drive and point a topic sets; `None` for any other topic.
-    pub(super) fn parse_set<'t>(&self, topic: &'t str) -> Option<SetTopic<'t>> {
-        let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix("/drive/")?;
+    /// What a topic commands, and WHO of `as/WHO`; without one it has no owner. `None` for any other topic.
+    pub(super) fn parse<'t>(&self, topic: &'t str) -> Option<(Target<'t>, Option<&'t str>)> {
+        let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix('/')?;
         let levels: Vec<&str> = rest.split('/').collect();
-        let (drive, who, point) = match levels.as_slice() {
-            [drive, "set"] => (drive, None, None),
-            [drive, "set", point] => (drive, None, Some(*point)),
-            [drive, "as", who, "set"] => (drive, Some(*who), None),
-            [drive, "as", who, "set", point] => (drive, Some(*who), Some(*point)),
+        let (drive, levels) = match levels.as_slice() {
+            ["set", "stop"] => return Some((Target::StopAll, None)),
+            ["as", who, "stop"] => return Some((Target::StopAll, Some(who))),
+            ["drive", drive, levels @ ..] => (*drive, levels),
             _ => return None,
         };
-        Some(SetTopic { drive, point, who })
+        let (who, leaf) = match levels {
+            ["as", who, leaf @ ..] => (Some(*who), leaf),
+            leaf => (None, leaf),
+        };
+        let target = match leaf {
+            ["set"] => Target::Set(drive, None),
+            ["set", point] => Target::Set(drive, Some(point)),
+            ["hold"] => Target::Hold(drive),
+            _ => return None,
+        };
+        Some((target, who))
+    }
+
+    /// Where the answers to a stop of all drives go.
+    pub(super) fn result(&self) -> String {
+        format!("{}/result", self.root)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::fixture;
     use super::*;
 
     #[test]
-    fn topics_that_name_a_client_are_recognised() {
+    fn topics_of_commands_are_recognised() {
         let topics = Topics::new("plant/a", "hall");
-        let set = |topic| topics.parse_set(topic).map(|t| (t.drive, t.who, t.point));
-        assert_eq!(set("plant/a/hall/drive/p1/as/x/set"), Some(("p1", Some("x"), None)));
-        assert_eq!(
-            set("plant/a/hall/drive/p1/as/x/set/run"),
-            Some(("p1", Some("x"), Some("run")))
-        );
-        assert_eq!(set("plant/a/hall/drive/p1/as/set"), None);
-        let hold = |topic| topics.parse_hold(topic).map(|t| (t.drive, t.who));
-        assert_eq!(hold("plant/a/hall/drive/p1/hold"), Some(("p1", None)));
-        assert_eq!(hold("plant/a/hall/drive/p1/as/x/hold"), Some(("p1", Some("x"))));
-        assert_eq!(hold("plant/a/hall/drive/p1/as/x/y/hold"), None);
-        let stop = |topic| topics.parse_stop_all(topic).map(|t| t.who);
-        assert_eq!(stop("plant/a/hall/set/stop"), Some(None));
-        assert_eq!(stop("plant/a/hall/as/x/stop"), Some(Some("x")));
-        for other in [
-            "plant/a/hall/as/x/y/stop",
-            "plant/a/hall/as/stop",
-            "plant/b/hall/set/stop",
+        let (set, hold, stop) = (Target::Set, Target::Hold, Target::StopAll);
+        for (topic, target, who) in [
+            ("drive/p1/set", set("p1", None), None),
+            ("drive/p1/set/run", set("p1", Some("run")), None),
+            ("drive/p1/as/x/set", set("p1", None), Some("x")),
+            ("drive/p1/as/x/set/run", set("p1", Some("run")), Some("x")),
+            ("drive/p1/hold", hold("p1"), None),
+            ("drive/p1/as/x/hold", hold("p1"), Some("x")),
+            ("set/stop", stop, None),
+            ("as/x/stop", stop, Some("x")),
         ] {
-            assert_eq!(topics.parse_stop_all(other), None, "{other}");
+            let topic = format!("plant/a/hall/{topic}");
+            assert_eq!(topics.parse(&topic), Some((target, who)), "{topic}");
         }
-    }
-
-    #[test]
-    fn set_topics_are_recognised() {
-        let topics = Topics::new("plant/a", "hall");
-        let parse = |topic| topics.parse_set(topic).map(|t| (t.drive, t.point));
-        assert_eq!(parse("plant/a/hall/drive/p1/set"), Some(("p1", None)));
-        assert_eq!(parse("plant/a/hall/drive/p1/set/run"), Some(("p1", Some("run"))));
         for other in [
             "plant/a/hall/drive/p1/set/run/x",
             "plant/a/hall/drive/p1/state",
             "plant/a/hall/drive/p1",
+            "plant/a/hall/drive/p1/as/set",
+            "plant/a/hall/drive/p1/as/x/y/hold",
             "plant/a/hallway/drive/p1/set",
+            "plant/a/hall/as/x/y/stop",
+            "plant/a/hall/as/stop",
+            "plant/b/hall/set/stop",
             "drive/p1/set",
             "",
         ] {
-            assert_eq!(parse(other), None, "{other}");
+            assert_eq!(topics.parse(other), None, "{other}");
         }
+    }
+
+    #[test]
+    fn filters_match_what_is_recognised() {
+        let topics = Topics::new("plant/a", "hall");
+        let own = ["drive/+/set", "drive/+/set/+", "set/stop"];
+        let named = [
+            "drive/+/as/+/set",
+            "drive/+/as/+/set/+",
+            "drive/+/as/+/hold",
+            "as/+/stop",
+            "drive/+/hold",
+        ];
+        let below = |filters: &[&str]| filters.iter().map(|f| format!("plant/a/hall/{f}")).collect::<Vec<_>>();
+        assert_eq!(topics.set_filters(None, None), below(&own));
         assert_eq!(
-            topics.set_filters(),
-            [
-                "plant/a/hall/drive/+/set",
-                "plant/a/hall/drive/+/set/+",
-                "plant/a/hall/set/stop"
-            ]
+            topics.set_filters(None, Some(&["x".to_string()])),
+            below(&[&own[..], &named].concat())
         );
+        let plant = fixture::plant(&["p1", "p2"]);
+        let filters = topics.set_filters(Some(&plant), Some(&["x".to_string()]));
+        assert!(
+            filters.iter().all(|filter| topics.parse(filter).is_some()),
+            "{filters:?}"
+        );
+        for wanted in [
+            "drive/p2/as/x/set/run",
+            "drive/p1/hold",
+            "as/x/stop",
+            "drive/p1/set",
+            "set/stop",
+        ] {
+            assert!(
+                filters.contains(&format!("plant/a/hall/{wanted}")),
+                "{wanted} in {filters:?}"
+            );
+        }
     }
 }

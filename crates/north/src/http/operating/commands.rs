@@ -16,15 +16,12 @@ use super::super::body::Payload;
 use super::super::replies::{Replied, refused};
 use super::super::routes::AppState;
 use super::{Commander, Operating, Operator, Viewer, restart};
-use crate::command::{Answer, Authority, Order, Origin, Outcome, Parts, Refusal, SourceKind, stop_of};
-use crate::command_json::{self, CommandResult, Id, Repetition, SharedMemory, Taken, excerpt, find_id, unknown_drive};
+use crate::command::{Answer, Origin, Outcome, Refusal, SourceKind};
+use crate::command_json::{self, CommandResult, Id, Repetition, Taken, excerpt, find_id};
 use crate::drive::model::Kind;
 use crate::drive::{ModelPoint, Point, PointIndex, Profile, RESTART_COMMUNICATION, Value};
 use crate::plant::{DriveHandle, Placed, Plant, Shown};
 use crate::process_image::Access;
-
-/// The commands that came over HTTP, also to the server that a reload starts in the place of one that ended.
-pub(crate) type PostedCommands = SharedMemory<SharedReply>;
 
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct CommandReply {
@@ -205,48 +202,34 @@ impl Operating {
         payload: &[u8],
         (asked_at, now, time): (Instant, Instant, SystemTime),
     ) -> Progress {
-        let (id, origin) = (find_id(payload), operator.origin());
+        let (id, origin, what) = (find_id(payload), operator.origin(), excerpt(payload));
         let reply =
             |answer: &Answer| Progress::Known(CommandReply::new(id.as_ref(), name, answer, Shown::default(), time));
         let Some(drive) = plant.drive(name) else {
-            let shown = excerpt(name.as_bytes());
-            let why = unknown_drive(name, plant);
-            let answer = plant.refuse_unknown(shown.trim_matches('`'), &excerpt(payload), why, origin, now);
+            let answer = command_json::refuse_unknown(plant, name, &what, origin, now);
             return reply(&answer);
         };
         let profile = &drive.image.spec.profile;
-        let refuse = |refusal, origin| reply(&drive.refuse(&excerpt(payload), refusal, origin, now));
-        let asked = match command_json::order(payload, profile) {
+        let mut asked = match command_json::order(payload, profile) {
             Ok(asked) => asked,
-            Err(refusal) => return refuse(refusal, origin),
+            Err(refusal) => return reply(&drive.refuse(&what, refusal, origin, now)),
         };
-        let (stop, runs) = (stop_of(&asked.points, profile), has_run(&asked.points, profile));
-        let order = Order::Points(asked.points);
-        let only_stops = stop.is_some() && matches!(Parts::of(order.clone(), profile), Parts::One(_));
-        let (mut refused, mut shared) = (asked.refused, None);
-        if refused.is_none() && !only_stops {
+        let (runs, mut shared) = (has_run(&asked.points, profile), None);
+        if asked.does_more(profile) {
             match self.remember(&drive, operator, payload, id.as_ref(), now) {
                 Ok(remembered) => shared = Some(remembered),
-                Err(Known::Reply(reply)) if stop.is_none() => return Progress::Repeated(reply),
+                Err(Known::Reply(reply)) if !asked.stops(profile) => return Progress::Repeated(reply),
                 Err(Known::Reply(_)) => {
                     let why = "it repeats an earlier command, so only its stop is executed again; send it with \
                                another `id`";
-                    refused = Some(Refusal::NotAllowed(why.to_string()));
+                    asked.refused = Some(Refusal::NotAllowed(why.to_string()));
                 }
-                Err(Known::Refused(why)) => refused = Some(Refusal::NotAllowed(why)),
+                Err(Known::Refused(why)) => asked.refused = Some(Refusal::NotAllowed(why)),
             }
         }
-        let (client, expiry) = (Authority::Write, asked.expiry);
-        let placed = match (refused, stop) {
-            (None, _) => {
-                let drive = drive.clone().waiting(asked.wait);
-                drive.place_asked(order, origin, client, expiry, asked_at, now)
-            }
-            (Some(refusal), Some(stop)) => {
-                let rest = (excerpt(payload), refusal);
-                drive.place_stop(Order::Points(stop), (&rest.0, rest.1), origin, client, expiry, now)
-            }
-            (Some(refusal), None) => return refuse(refusal, origin),
+        let placed = match asked.place(&drive, &what, origin, (asked_at, now)) {
+            Ok(placed) => placed,
+            Err(answer) => return reply(&answer),
         };
         Progress::Placed(Waiting {
             placed,
@@ -276,7 +259,7 @@ impl Operating {
         let Some(id) = id else {
             return Ok((sender, permit));
         };
-        let mut memory = self.north.posted.lock();
+        let mut memory = self.north.commands.http.lock();
         let topic = format!("{}/{}", operator.user, drive.image.spec.name);
         let taken = Taken {
             topic: &topic,

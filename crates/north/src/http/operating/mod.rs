@@ -45,7 +45,7 @@ use crate::log_throttle::LogThrottle;
 
 use self::asker::Commander;
 pub(super) use self::asker::Viewer;
-pub(crate) use self::commands::PostedCommands;
+pub(crate) use self::commands::SharedReply;
 pub(super) use self::commands::{Commandable, command, commands_of, heartbeat};
 pub(super) use self::drills::{DrillWish, arm_drill, drill, drills, end_drill, start_drill};
 pub(super) use self::hold::{HoldAct, hold, hold_of};

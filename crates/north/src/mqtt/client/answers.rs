@@ -1,26 +1,10 @@
-//! Subscriptions, and messages that the broker refuses.
+//! Messages that the broker refuses.
 
 use rumqttc::PubAckReason;
 
-use super::discovery::subscriptions;
 use super::*;
 
-impl Client {
-    pub(super) fn subscribe(&mut self, limits: BrokerLimits) {
-        let plant = (!limits.wildcards).then_some(self.observed.as_ref());
-        self.subscriptions = subscriptions(
-            &self.topics,
-            (self.options.commands, self.options.principals.as_deref()),
-            self.announcer.as_ref(),
-            self.leftovers_known,
-            plant,
-        );
-        let filters = self.subscriptions.iter().map(Subscription::filter).collect();
-        if !self.link.subscribe(filters) {
-            self.give_up("the subscription could not be sent");
-        }
-    }
-
+impl PlainClient {
     /// The broker refused a message. What must arrive, and what it refuses for now only, is published again.
     pub(super) fn refused(&mut self, packet: u16, why: PubAckReason) {
         let for_now = matches!(why, PubAckReason::QuotaExceeded | PubAckReason::PacketIdentifierInUse);
@@ -53,11 +37,8 @@ impl Client {
     /// A message cannot be delivered: counted, and logged once a minute.
     pub(super) fn drop_refused(&mut self, settled: Option<&Settled>, why: &str) {
         let Some(Settled { topic, kind }) = settled else { return };
-        match kind {
-            Some(Kind::Event) => self.stats.mqtt.lost(MqttLoss::Event, 1),
-            Some(Kind::Result) => self.stats.mqtt.lost(MqttLoss::Result, 1),
-            Some(Kind::History) => self.stats.mqtt.lost(MqttLoss::History, 1),
-            None => {}
+        if let Some(kind) = kind {
+            self.common.stats.mqtt.lost(*kind, 1);
         }
         self.log_refused(&format!("dropped a message on {topic}"), why, Instant::now());
     }

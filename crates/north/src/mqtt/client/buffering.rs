@@ -4,16 +4,14 @@ use super::*;
 
 /// What an event takes on disk, bytes, at most for all but the longest texts.
 const EVENT_BYTES: u64 = 512;
-/// Minimum time between two log lines about lost messages.
-const LOST_LOGGED: Duration = Duration::from_secs(60);
 
-impl Client {
+impl PlainClient {
     pub(super) fn on_event(&mut self, event: Result<Arc<Event>, RecvError>) {
         match event {
             Ok(event) => self.store_event(&event),
             Err(RecvError::Lagged(lost)) => self.missed(lost),
             // The plant was replaced.
-            Err(RecvError::Closed) => self.events = self.plant.load().events.subscribe(),
+            Err(RecvError::Closed) => self.events = self.common.plant.load().events.subscribe(),
         }
         self.take_pending_events();
     }
@@ -36,7 +34,7 @@ impl Client {
 
     pub(super) fn missed(&mut self, lost: u64) {
         self.missed += lost;
-        self.stats.mqtt.lost(MqttLoss::Event, lost);
+        self.common.stats.mqtt.lost(MqttKind::Event, lost);
         tracing::error!(
             target: "drivegate::north::mqtt", "{lost} events arrived too fast and were not published, {} since the start; they are in the log",
             self.missed
@@ -46,36 +44,39 @@ impl Client {
     pub(super) fn store_event(&mut self, event: &Event) {
         // Refusals have a part of the room only, so that they push out no other event.
         if event.kind == EventKind::RefusedCommand && self.waiting_events() >= refusal_limit(&self.options) {
-            self.stats.mqtt.lost(MqttLoss::Event, 1);
+            self.common.stats.mqtt.lost(MqttKind::Event, 1);
             return;
         }
         let (topics, payload) = payload::event(&self.topics, event, &self.plant_of(event));
         for topic in topics {
-            self.keep(Kind::Event, Message::not_retained(topic, payload.clone()));
+            self.keep(MqttKind::Event, Message::not_retained(topic, payload.clone()));
         }
         if let Some((topic, payload)) = payload::recording(&self.topics, event) {
-            self.keep(Kind::Event, Message::not_retained(topic, payload));
+            self.keep(MqttKind::Event, Message::not_retained(topic, payload));
         }
     }
 
     /// The plant that has the drives of an event: the newest, or the one before if a reload removed the bus.
     fn plant_of(&self, event: &Event) -> Arc<Plant> {
-        let newest = self.plant.load_full();
+        let newest = self.common.plant.load_full();
         let has_bus = |plant: &Plant| plant.buses.iter().any(|bus| bus.image.spec.name == event.bus);
         match event.bus.is_empty() || has_bus(&newest) {
             true => newest,
-            false => self.observed.clone(),
+            false => self.common.observed.clone(),
+        }
+    }
+
+    fn store_of(&mut self, kind: MqttKind) -> &mut Store {
+        match kind {
+            MqttKind::History => &mut self.history,
+            MqttKind::Event | MqttKind::Result => &mut self.store,
         }
     }
 
     /// Gives a message to the store, and to the outbox if its turn has come.
-    pub(super) fn keep(&mut self, kind: Kind, message: Message) {
+    pub(super) fn keep(&mut self, kind: MqttKind, message: Message) {
         let room = self.outbox.room(kind) > 0;
-        let store = if kind == Kind::Event {
-            &mut self.store
-        } else {
-            &mut self.history
-        };
+        let store = self.store_of(kind);
         if let Some((number, message)) = store.push(message, room) {
             self.outbox.push(kind, message, number);
         }
@@ -84,22 +85,17 @@ impl Client {
     /// Keeps what was recorded and not kept yet.
     pub(super) fn keep_recorded(&mut self) {
         for Update { topic, payload } in self.publisher.recorded() {
-            self.keep(Kind::History, Message::not_retained(topic, payload));
+            self.keep(MqttKind::History, Message::not_retained(topic, payload));
         }
     }
 
-    pub(super) fn on_loaded(&mut self, kind: Kind, loaded: Loaded) {
+    pub(super) fn on_loaded(&mut self, kind: MqttKind, loaded: Loaded) {
         let opened = matches!(loaded, Loaded::Opened { .. });
-        let store = if kind == Kind::Event {
-            &mut self.store
-        } else {
-            &mut self.history
-        };
-        let (messages, topics) = store.take(loaded);
+        let (messages, topics) = self.store_of(kind).take(loaded);
         for (number, message) in messages {
             self.outbox.push(kind, message, Some(number));
         }
-        if kind == Kind::Event && opened {
+        if kind == MqttKind::Event && opened {
             self.clear_old(topics);
             self.remember_topics();
         }
@@ -124,15 +120,18 @@ impl Client {
     /// Keeps the retained topics for the next run, with those that are still to be cleared.
     pub(super) fn remember_topics(&self) {
         let topics = self.retained_topics();
-        self.stats.mqtt.keep_retained(topics.clone());
+        self.common.stats.mqtt_left.lock().retained = topics.clone();
         self.store.remember(topics);
     }
 
     /// Counts what ends with this client, because there is no buffer.
     pub(super) fn count_unkept(&mut self) {
-        let (events, history) = (self.outbox.unkept(Kind::Event), self.outbox.unkept(Kind::History));
-        self.stats.mqtt.lost(MqttLoss::Event, events);
-        self.stats.mqtt.lost(MqttLoss::History, history);
+        let (events, history) = (
+            self.outbox.unkept(MqttKind::Event),
+            self.outbox.unkept(MqttKind::History),
+        );
+        self.common.stats.mqtt.lost(MqttKind::Event, events);
+        self.common.stats.mqtt.lost(MqttKind::History, history);
         if events + history > 0 {
             tracing::warn!(
                 target: "drivegate::north::mqtt", "{} events or arrays of history that the broker did not accept are \
@@ -145,24 +144,17 @@ impl Client {
 
     /// Counts what the outbox lost, and logs it once a minute.
     pub(super) fn count_lost(&mut self, now: Instant) {
-        let lost = self.outbox.take_lost();
-        let counts = [
-            (MqttLoss::Event, lost.events),
-            (MqttLoss::Result, lost.results),
-            (MqttLoss::History, lost.history),
-        ];
-        for (kind, count) in counts {
-            self.stats.mqtt.lost(kind, count);
+        for (kind, count) in self.outbox.take_lost() {
+            self.common.stats.mqtt.lost(kind, count);
         }
-        let total: u64 = self.stats.mqtt.losses().map(|(_, count)| count).sum();
-        let (logged, at) = self.lost_logged;
-        if total > logged && at.is_none_or(|at| now.saturating_duration_since(at) >= LOST_LOGGED) {
+        let total: u64 = self.common.stats.mqtt.losses().map(|(_, count)| count).sum();
+        if total > self.lost_logged && self.lost.permit(now).is_some() {
             tracing::warn!(
                 target: "drivegate::north::mqtt", "{} events, results or arrays of history were lost since the last such line: the buffer is full or \
                  damaged, or the broker refuses them",
-                total - logged
+                total - self.lost_logged
             );
-            self.lost_logged = (total, Some(now));
+            self.lost_logged = total;
         }
     }
 }

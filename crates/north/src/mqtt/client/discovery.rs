@@ -1,7 +1,22 @@
 //! Discovery for Home Assistant, and what is subscribed to.
 
+use rumqttc::RetainForwardRule;
+
 use super::*;
-use crate::mqtt::connection::Subscribed;
+use crate::mqtt::connection::{commanding, of_others};
+
+/// What a subscription is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Subscribed {
+    /// The status that others publish in the gateway's name.
+    Status,
+    /// The set topics.
+    Commands,
+    /// Home Assistant was started.
+    Birth,
+    /// Retained discovery messages of an earlier run.
+    Leftovers,
+}
 
 /// The discovery messages, if they are configured.
 pub(super) fn announcer(options: &Options, topics: &Topics) -> Option<Announcer> {
@@ -29,47 +44,39 @@ pub(super) fn subscriptions(
     announcer: Option<&Announcer>,
     leftovers_known: bool,
     plant: Option<&Plant>,
-) -> Vec<Subscription> {
-    let subscription = |of| move |filter| Subscription { filter, of };
-    let sets = commands.then(|| match plant {
-        None => topics.set_filters().to_vec(),
-        Some(plant) => topics.set_topics(plant),
-    });
-    let named = principals.filter(|_| commands).map(|principals| match plant {
-        None => topics.authority_filters().to_vec(),
-        Some(plant) => topics.authority_topics(plant, principals),
-    });
-    let sets = sets.into_iter().chain(named);
+) -> Vec<(Subscribed, Filter)> {
+    let news = |path| Filter {
+        retain_forward_rule: RetainForwardRule::Never,
+        ..of_others(path)
+    };
+    let birth = announcer.map(|announcer| (Subscribed::Birth, news(announcer.birth_topic())));
     let leftovers = announcer.filter(|_| !leftovers_known && plant.is_none());
-    std::iter::once(topics.status())
-        .map(subscription(Subscribed::Status))
-        .chain(sets.flatten().map(subscription(Subscribed::Commands)))
-        .chain(
-            announcer
-                .map(Announcer::birth_topic)
-                .map(subscription(Subscribed::Birth)),
-        )
-        .chain(
-            leftovers
-                .map(Announcer::own_filter)
-                .map(subscription(Subscribed::Leftovers)),
-        )
+    let leftovers = leftovers.map(|announcer| (Subscribed::Leftovers, of_others(announcer.own_filter())));
+    let sets = commands.then(|| topics.set_filters(plant, principals));
+    let sets = sets
+        .into_iter()
+        .flatten()
+        .map(|path| (Subscribed::Commands, commanding(path)));
+    let status = (Subscribed::Status, news(topics.status()));
+    std::iter::once(status)
+        .chain(sets)
+        .chain(birth)
+        .chain(leftovers)
         .collect()
 }
 
 /// Logs what the broker refuses, with the reason for each subscription that it refuses. The gateway can do without the
 /// status that others publish.
-pub(super) fn report_refused(subscriptions: &[Subscription], refused: &[Option<String>]) {
+pub(super) fn report_refused(subscriptions: &[(Subscribed, Filter)], refused: &[Option<String>]) {
     let of = |wanted: Subscribed| {
-        let mut pairs = subscriptions.iter().zip(refused).filter(move |(s, _)| s.of == wanted);
-        pairs.find_map(|(subscription, why)| Some((&subscription.filter, why.as_ref()?)))
+        let pairs = subscriptions
+            .iter()
+            .zip(refused)
+            .filter(move |((of, _), _)| *of == wanted);
+        pairs.filter_map(|((_, filter), why)| Some((filter.path.as_str(), why.as_ref()?)))
     };
-    if let Some((_, why)) = of(Subscribed::Commands) {
-        let refused = subscriptions.iter().zip(refused);
-        let filters: Vec<&str> = refused
-            .filter(|(subscription, why)| subscription.of == Subscribed::Commands && why.is_some())
-            .map(|(subscription, _)| subscription.filter.as_str())
-            .collect();
+    if let Some((_, why)) = of(Subscribed::Commands).next() {
+        let filters: Vec<&str> = of(Subscribed::Commands).map(|(filter, _)| filter).collect();
         let more = match filters.len() {
             0..=2 => String::new(),
             all => format!(" and {} more", all - 2),
@@ -79,13 +86,13 @@ pub(super) fn report_refused(subscriptions: &[Subscription], refused: &[Option<S
             filters.get(..filters.len().min(2)).unwrap_or_default().join(" and ")
         );
     }
-    if let Some((filter, why)) = of(Subscribed::Birth) {
+    if let Some((filter, why)) = of(Subscribed::Birth).next() {
         tracing::warn!(
             target: "drivegate::north::mqtt", "the broker refuses {filter} ({why}): the drives are not announced again when Home Assistant starts; allow \
              the client to subscribe to it"
         );
     }
-    if let Some((filter, why)) = of(Subscribed::Leftovers) {
+    if let Some((filter, why)) = of(Subscribed::Leftovers).next() {
         tracing::warn!(
             target: "drivegate::north::mqtt", "the broker refuses {filter} ({why}): drives removed before this start stay in Home Assistant; allow the \
              client to subscribe to it, or set mqtt.buffer"
@@ -93,12 +100,12 @@ pub(super) fn report_refused(subscriptions: &[Subscription], refused: &[Option<S
     }
 }
 
-impl Client {
+impl PlainClient {
     /// Clears what the client before a reload has published and this one does not.
     pub(super) fn take_over(&mut self) {
-        let before = self.stats.mqtt.keep_retained(Vec::new());
+        let before = std::mem::take(&mut self.common.stats.mqtt_left.lock().retained);
         self.clear_old(before);
-        self.stats.mqtt.keep_retained(self.retained_topics());
+        self.common.stats.mqtt_left.lock().retained = self.retained_topics();
     }
 
     /// Whether a message is about discovery: it was one of Home Assistant, or one of an earlier run.

@@ -39,20 +39,27 @@ fn options(buffer: Option<Buffer>) -> Options {
     }
 }
 
-async fn client(buffer: Option<Buffer>) -> Client {
+async fn client(buffer: Option<Buffer>) -> PlainClient {
     client_with(options(buffer)).await
 }
 
-async fn client_with(options: Options) -> Client {
+async fn client_with(options: Options) -> PlainClient {
     let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(fixture::plant(&["p1"])));
     let events = plant.load().events.subscribe();
-    Client::new(options, plant, Arc::default(), events)
+    PlainClient::new(options, plant, Arc::default(), events)
+}
+
+fn lost_events(client: &mut PlainClient) -> u64 {
+    let lost = client.outbox.take_lost().into_iter();
+    lost.filter(|(kind, _)| *kind == MqttKind::Event)
+        .map(|(_, count)| count)
+        .sum()
 }
 
 /// Raises events while the client is busy, then lets it receive them.
-async fn burst(client: &mut Client, count: usize) {
+async fn burst(client: &mut PlainClient, count: usize) {
     for n in 0..count {
-        client.plant.load().events.publish(Event {
+        client.common.plant.load().events.publish(Event {
             bus: "line1".to_string(),
             drive: Some("p1".to_string()),
             ..Event::new(EventKind::Offline, SystemTime::UNIX_EPOCH, format!("event {n}"))
@@ -67,14 +74,14 @@ async fn a_busy_client_loses_no_event_of_a_burst() {
     let mut client = client(None).await;
     burst(&mut client, 1000).await;
     assert_eq!(
-        (client.outbox.waiting(), client.missed, client.outbox.take_lost().events),
+        (client.outbox.waiting(), client.missed, lost_events(&mut client)),
         (1000, 0, 0)
     );
     let (_, first) = client.outbox.next(1, true).unwrap();
     assert!(first.payload.windows(8).any(|w| w == b"event 0\""));
     burst(&mut client, BURST - 1000).await;
     assert_eq!(
-        (client.outbox.waiting(), client.missed, client.outbox.take_lost().events),
+        (client.outbox.waiting(), client.missed, lost_events(&mut client)),
         (BURST, 0, 0)
     );
 }
@@ -99,7 +106,7 @@ async fn lost_events_are_counted() {
 }
 
 /// A fault, then refusals, more than there is room for; events that wait then, and events lost.
-async fn a_fault_and_a_flood(client: &mut Client, refusals: usize) -> (u64, u64) {
+async fn a_fault_and_a_flood(client: &mut PlainClient, refusals: usize) -> (u64, u64) {
     burst(client, 1).await;
     for n in 0..refusals {
         let event = Event {
@@ -114,7 +121,7 @@ async fn a_fault_and_a_flood(client: &mut Client, refusals: usize) -> (u64, u64)
         };
         client.on_event(Ok(Arc::new(event)));
     }
-    let (_, lost) = client.stats.mqtt.losses().next().unwrap();
+    let (_, lost) = client.common.stats.mqtt.losses().next().unwrap();
     (client.waiting_events(), lost)
 }
 
@@ -149,9 +156,9 @@ async fn refusals_push_out_no_event_of_a_drive_in_memory_or_on_disk() {
 }
 
 /// A reload: bus `line1` with drive `p1` is gone, `line2` with `p2` is there.
-fn reload(client: &Client) {
+fn reload(client: &PlainClient) {
     let mut plant = Plant {
-        events: client.plant.load().events.clone(),
+        events: client.common.plant.load().events.clone(),
         ..fixture::plant(&["p2"])
     };
     let bus = &mut plant.buses[0];
@@ -160,11 +167,11 @@ fn reload(client: &Client) {
         ..bus.image.spec.clone()
     };
     bus.image = Arc::new(BusImage::new(spec, bus.image.drives.to_vec()));
-    client.plant.store(Arc::new(plant));
+    client.common.plant.store(Arc::new(plant));
 }
 
 /// The topics of what waits, in order.
-fn waiting(client: &mut Client) -> Vec<String> {
+fn waiting(client: &mut PlainClient) -> Vec<String> {
     let next = || {
         let (key, message) = client.outbox.next(1, true)?;
         client.outbox.give_up(key);
@@ -178,12 +185,12 @@ async fn events_of_a_bus_that_a_reload_removes_or_adds_go_to_its_drives() {
     let mut client = client(None).await;
     reload(&client);
     for bus in ["line1", "line2"] {
-        client.plant.load().events.publish(Event {
+        client.common.plant.load().events.publish(Event {
             bus: bus.to_string(),
             ..Event::new(EventKind::BusDown, SystemTime::UNIX_EPOCH, String::new())
         });
     }
-    client.update_plant();
+    session::follow_plant(&mut client);
     client.take_pending_events();
     assert_eq!(
         waiting(&mut client),
@@ -196,11 +203,11 @@ async fn a_reload_while_the_broker_is_away_keeps_the_history_so_far() {
     let mut options = options(None);
     options.telemetry.history = History::All;
     let mut client = client_with(options).await;
-    fixture::read(&client.plant.load(), "p1", 0x0023, 2500, Instant::now());
+    fixture::read(&client.common.plant.load(), "p1", 0x0023, 2500, Instant::now());
     client.look();
     assert_eq!(waiting(&mut client), [""; 0], "no array is complete");
     reload(&client);
-    client.update_plant();
+    session::follow_plant(&mut client);
     assert_eq!(waiting(&mut client), ["drivegate/hall/drive/p1/history"]);
 }
 
@@ -214,7 +221,7 @@ async fn what_is_in_memory_only_is_counted_when_the_client_ends() {
     for (buffer, expected) in [(None, 5), (Some(buffer), 0)] {
         let mut client = client(buffer).await;
         burst(&mut client, 5).await;
-        let stats = client.stats.clone();
+        let stats = client.common.stats.clone();
         client.shut_down().await;
         assert_eq!(stats.mqtt.losses().map(|(_, count)| count).sum::<u64>(), expected);
     }

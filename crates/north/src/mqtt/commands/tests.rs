@@ -6,7 +6,7 @@ use serde_json::Value as Json;
 use super::super::fixture;
 use super::*;
 use crate::codec::Reply as BusReply;
-use crate::command::{Outcome, Receipt, Urgency};
+use crate::command::{Order, Outcome, Receipt, Urgency};
 use crate::command_json::REMEMBERED;
 use crate::drive::Value;
 
@@ -41,7 +41,7 @@ impl Bench {
     fn succeed_client(&mut self) {
         let after = |left| {
             let topics = Topics::new("drivegate", "hall");
-            Commands::after(topics, rules(false), self.memory.clone(), left)
+            Commands::new(topics, rules(false), self.memory.clone(), Some(left))
         };
         let before = std::mem::replace(&mut self.commands, after(OrdersLeft::default()));
         self.commands = after(before.leave(Vec::new()));
@@ -91,7 +91,7 @@ impl Bench {
 }
 
 fn commands(memory: &SharedMemory) -> Commands {
-    Commands::new(Topics::new("drivegate", "hall"), rules(false), memory.clone())
+    Commands::new(Topics::new("drivegate", "hall"), rules(false), memory.clone(), None)
 }
 
 fn rules(require_id: bool) -> Rules {

@@ -78,20 +78,15 @@ pub(super) fn of_drive_availability(sources: &Sources, spec: &DriveSpec) -> Valu
 /// The health of the buses.
 pub(super) fn of_gateway(sources: &Sources, id: &str, buses: &[String]) -> Entities {
     let bus_entities = |bus: &String| {
-        let entity = |platform: Platform, leaf: &str, name: &str, template: &str, more: Value| {
-            let mut entity = Map::new();
-            entity.insert("p".into(), platform.name().into());
-            entity.insert("name".into(), format!("{bus} {name}").into());
-            entity.insert(
-                "uniq_id".into(),
-                format!("{id}_bus_{}_{leaf}", super::id_of(bus)).into(),
-            );
-            entity.insert("ent_cat".into(), "diagnostic".into());
-            entity.insert("stat_t".into(), sources.topics.bus(bus).into());
-            let template = format!("{{{{ {template} if value_json is defined else none }}}}");
-            entity.insert("val_tpl".into(), template.into());
-            extend(&mut entity, more);
-            (format!("{}_{bus}_{leaf}", platform.name()), Value::from(entity))
+        let entity = |platform, leaf: &str, name: &str, template: &str, more: Value| {
+            let always = json!({
+                "name": format!("{bus} {name}"),
+                "uniq_id": format!("{id}_bus_{}_{leaf}", super::id_of(bus)),
+                "ent_cat": "diagnostic",
+                "stat_t": sources.topics.bus(bus),
+                "val_tpl": format!("{{{{ {template} if value_json is defined else none }}}}"),
+            });
+            component(platform, &format!("{bus}_{leaf}"), [always, more])
         };
         let measured = |unit: &str| json!({ "unit_of_meas": unit, "stat_cla": "measurement" });
         [
@@ -164,12 +159,10 @@ struct DriveEntities<'d> {
 }
 
 impl DriveEntities<'_> {
-    fn entity(&self, platform: Platform, name: &str) -> Map<String, Value> {
-        let mut entity = Map::new();
-        entity.insert("p".into(), platform.name().into());
-        entity.insert("name".into(), title(name).into());
-        entity.insert("uniq_id".into(), format!("{}_{name}", self.id).into());
-        entity
+    /// The entity of a point, with all of these keys.
+    fn entity<const N: usize>(&self, platform: Platform, name: &str, keys: [Value; N]) -> (String, Value) {
+        let own = json!({ "name": title(name), "uniq_id": format!("{}_{name}", self.id) });
+        component(platform, name, std::iter::once(own).chain(keys))
     }
 
     /// Whether it can be commanded from Home Assistant.
@@ -189,38 +182,29 @@ impl DriveEntities<'_> {
         }
         let name = &point.name;
         let send = |value: &str| format!("{{\"id\": \"{{{{ now().timestamp() }}}}\", \"{name}\": {value} }}");
-        let (platform, more) = match point.kind() {
+        let (platform, more, shown) = match point.kind() {
             Kind::Bool if point.pulse => (
                 Platform::Button,
                 json!({ "pl_prs": "true", "cmd_tpl": send("{{ value }}") }),
+                Value::Null,
             ),
             Kind::Bool => (
                 Platform::Switch,
                 json!({ "pl_on": "true", "pl_off": "false", "cmd_tpl": send("{{ value }}") }),
+                self.show(name, &Shown::Bool),
             ),
             Kind::Number | Kind::Integer | Kind::Text => {
                 let (least, most) = self.limits(point)?;
-                let more = json!({
+                let mut more = json!({
                     "min": least, "max": most, "step": 0.01, "mode": "box", "unit_of_meas": point.unit,
                     "cmd_tpl": send("{{ value }}"),
                 });
-                (Platform::Number, more)
+                extend(&mut more, device_class(&point.unit));
+                (Platform::Number, more, self.show(name, &Shown::Within(least, most)))
             }
         };
-        let mut entity = self.entity(platform, name);
-        entity.insert("cmd_t".into(), self.sources.topics.drive(&self.spec.name, "set").into());
-        entity.insert("qos".into(), 1.into());
-        match platform {
-            Platform::Switch => self.show(&mut entity, name, &Shown::Bool),
-            Platform::Number => {
-                let (least, most) = self.limits(point)?;
-                self.show(&mut entity, name, &Shown::Within(least, most));
-                device_class(&mut entity, &point.unit);
-            }
-            _ => {}
-        }
-        extend(&mut entity, more);
-        Some((format!("{}_{name}", platform.name()), entity.into()))
+        let topic = self.sources.topics.drive(&self.spec.name, "set");
+        Some(self.entity(platform, name, [json!({ "cmd_t": topic, "qos": 1 }), more, shown]))
     }
 
     /// Limits of a command; none where only the drive knows them, or where they leave one value only, of which Home Assistant
@@ -236,66 +220,50 @@ impl DriveEntities<'_> {
 
     fn sensor(&self, point: &Point) -> (String, Value) {
         let name = &point.name;
-        let platform = sensor_platform(point);
-        let mut entity = self.entity(platform, name);
-        if point.model.is_none() {
-            entity.insert("ent_cat".into(), "diagnostic".into());
-        }
-        if !point.texts.is_empty() {
-            self.show(&mut entity, name, &Shown::Texts(point));
-            return (format!("{}_{name}", platform.name()), entity.into());
-        }
-        match point.kind() {
+        let category = match point.model {
+            None => json!({ "ent_cat": "diagnostic" }),
+            Some(_) => Value::Null,
+        };
+        let (shown, more) = match point.kind() {
+            _ if !point.texts.is_empty() => (Shown::Texts(point), Value::Null),
             Kind::Bool => {
-                self.show(&mut entity, name, &Shown::Bool);
-                entity.insert("pl_on".into(), "true".into());
-                entity.insert("pl_off".into(), "false".into());
                 let class = match point.model {
-                    Some(ModelPoint::Running) => Some("running"),
-                    Some(ModelPoint::Fault | ModelPoint::Warning) => Some("problem"),
-                    _ => None,
+                    Some(ModelPoint::Running) => json!({ "dev_cla": "running" }),
+                    Some(ModelPoint::Fault | ModelPoint::Warning) => json!({ "dev_cla": "problem" }),
+                    _ => Value::Null,
                 };
-                entity.extend(class.map(|class| ("dev_cla".to_string(), class.into())));
+                let mut more = json!({ "pl_on": "true", "pl_off": "false" });
+                extend(&mut more, class);
+                (Shown::Bool, more)
             }
-            Kind::Number => {
-                self.show(&mut entity, name, &Shown::Plain);
-                quantity(&mut entity, point);
-            }
-            Kind::Integer => {
-                self.show(&mut entity, name, &Shown::Plain);
-                // A count of 64 bits, not a code.
-                if !point.unit.is_empty() {
-                    quantity(&mut entity, point);
-                }
-            }
-            Kind::Text => self.show(&mut entity, name, &Shown::Plain),
-        }
-        (format!("{}_{name}", platform.name()), entity.into())
+            Kind::Number => (Shown::Plain, quantity(point)),
+            // A count of 64 bits, not a code.
+            Kind::Integer if !point.unit.is_empty() => (Shown::Plain, quantity(point)),
+            Kind::Integer | Kind::Text => (Shown::Plain, Value::Null),
+        };
+        self.entity(sensor_platform(point), name, [category, self.show(name, &shown), more])
     }
 
     /// The topic of a published value and the template that shows it.
-    fn show(&self, entity: &mut Map<String, Value>, name: &str, shown: &Shown<'_>) {
+    fn show(&self, name: &str, shown: &Shown<'_>) -> Value {
         let points = self.sources.telemetry.points;
         let topic = match points {
             true => self.sources.topics.point(&self.spec.name, name),
             false => self.sources.topics.drive(&self.spec.name, "state"),
         };
-        entity.insert("stat_t".into(), topic.into());
-        entity.insert("val_tpl".into(), shown.template(name, points).into());
+        json!({ "stat_t": topic, "val_tpl": shown.template(name, points) })
     }
 
     fn state(&self) -> (String, Value) {
-        let mut entity = self.entity(Platform::Sensor, "state");
-        self.show(&mut entity, "state", &Shown::Plain);
+        // It has something to say of a drive that is offline.
+        let available = of_gateway_availability(self.sources);
         let states: Vec<&str> = State::ALL.into_iter().map(State::name).collect();
-        extend(&mut entity, json!({ "dev_cla": "enum", "ops": states }));
-        self.available_with_gateway(&mut entity);
-        ("sensor_state".to_string(), entity.into())
+        let more = json!({ "dev_cla": "enum", "ops": states, "avty": available });
+        self.entity(Platform::Sensor, "state", [self.show("state", &Shown::Plain), more])
     }
 
     /// The state has its text next to it even if the code is zero; a topic of its own is then empty.
     fn fault_text(&self) -> (String, Value) {
-        let mut entity = self.entity(Platform::Sensor, "fault_text");
         let topics = &self.sources.topics;
         let (topic, template) = match self.sources.telemetry.state {
             true => (
@@ -305,26 +273,17 @@ impl DriveEntities<'_> {
             ),
             false => (topics.point(&self.spec.name, "fault_text"), "{{ value or none }}"),
         };
-        extend(&mut entity, json!({ "stat_t": topic, "val_tpl": template }));
-        ("sensor_fault_text".to_string(), entity.into())
+        let shown = json!({ "stat_t": topic, "val_tpl": template });
+        self.entity(Platform::Sensor, "fault_text", [shown])
     }
 
     fn events(&self) -> (String, Value) {
-        let mut entity = self.entity(Platform::Event, "event");
         let kinds: Vec<&str> = EventKind::ALL.into_iter().map(EventKind::name).collect();
         let topic = self.sources.topics.drive(&self.spec.name, "event");
         let template = "{{ dict(value_json, event_type=value_json['event']) | to_json }}";
-        extend(
-            &mut entity,
-            json!({ "stat_t": topic, "evt_typ": kinds, "val_tpl": template, "qos": 1 }),
-        );
-        self.available_with_gateway(&mut entity);
-        ("event_event".to_string(), entity.into())
-    }
-
-    /// It has something to say of a drive that is offline.
-    fn available_with_gateway(&self, entity: &mut Map<String, Value>) {
-        entity.insert("avty".into(), of_gateway_availability(self.sources));
+        let available = of_gateway_availability(self.sources);
+        let all = json!({ "stat_t": topic, "evt_typ": kinds, "val_tpl": template, "qos": 1, "avty": available });
+        self.entity(Platform::Event, "event", [all])
     }
 
     /// Takes away what the points of `COMMANDS` were when the drive could be commanded, or could not: a component that is
@@ -397,20 +356,21 @@ impl Shown<'_> {
 }
 
 /// Unit and kind of a quantity.
-fn quantity(entity: &mut Map<String, Value>, point: &Point) {
+fn quantity(point: &Point) -> Value {
+    let mut quantity = device_class(&point.unit);
     if !point.unit.is_empty() {
-        entity.insert("unit_of_meas".into(), point.unit.as_str().into());
+        extend(&mut quantity, json!({ "unit_of_meas": point.unit }));
     }
-    device_class(entity, &point.unit);
     let counts = matches!(point.model, Some(ModelPoint::Energy | ModelPoint::OperatingHours))
         || COUNTED.contains(&point.unit.as_str());
     let class = match point.class {
         _ if counts && may_fall(point) => "total",
         _ if counts => "total_increasing",
         PollClass::Fast | PollClass::Slow => "measurement",
-        PollClass::Once | PollClass::Fault | PollClass::Monitor | PollClass::Never => return,
+        PollClass::Once | PollClass::Fault | PollClass::Monitor | PollClass::Never => return quantity,
     };
-    entity.insert("stat_cla".into(), class.into());
+    extend(&mut quantity, json!({ "stat_cla": class }));
+    quantity
 }
 
 /// Whether a count may go down, as a balance does: Home Assistant would take that for a meter that starts again.
@@ -427,7 +387,7 @@ fn may_fall(point: &Point) -> bool {
 
 /// The device class of Home Assistant that has this unit, if there is one in all versions from 2024.12 on: it refuses the
 /// whole device for a class that it does not know.
-fn device_class(entity: &mut Map<String, Value>, unit: &str) {
+fn device_class(unit: &str) -> Value {
     let class = match unit {
         "A" | "mA" => "current",
         "V" | "mV" => "voltage",
@@ -441,13 +401,20 @@ fn device_class(entity: &mut Map<String, Value>, unit: &str) {
         "var" => "reactive_power",
         "m³" => "volume",
         "m³/h" => "volume_flow_rate",
-        _ => return,
+        _ => return json!({}),
     };
-    entity.insert("dev_cla".into(), class.into());
+    json!({ "dev_cla": class })
 }
 
-fn extend(entity: &mut Map<String, Value>, more: Value) {
-    if let Value::Object(more) = more {
+/// A component of the message, with all of these keys.
+fn component(platform: Platform, name: &str, keys: impl IntoIterator<Item = Value>) -> (String, Value) {
+    let mut component = json!({ "p": platform.name() });
+    keys.into_iter().for_each(|keys| extend(&mut component, keys));
+    (format!("{}_{name}", platform.name()), component)
+}
+
+fn extend(entity: &mut Value, more: Value) {
+    if let (Value::Object(entity), Value::Object(more)) = (entity, more) {
         entity.extend(more);
     }
 }

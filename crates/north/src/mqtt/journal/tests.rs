@@ -72,7 +72,7 @@ fn an_acknowledged_journal_is_empty_and_forgets_its_numbers() {
         append(&mut journal, 0..100);
         let taken = take_all(&mut journal);
         assert_eq!((taken.len(), journal.take_lost()), (100, 0), "round {round}");
-        journal.acknowledge(journal.last());
+        journal.acknowledge(journal.last);
         journal.write().unwrap();
         let path = files(dir.path(), SUFFIX).pop().unwrap();
         assert_eq!(fs::metadata(path).unwrap().len(), 0);
@@ -81,7 +81,7 @@ fn an_acknowledged_journal_is_empty_and_forgets_its_numbers() {
         let mut journal = open(dir.path(), BIG);
         assert_eq!(numbers(&take_all(&mut journal)), [100]);
         assert_eq!(journal.take_lost(), 0);
-        journal.acknowledge(journal.last());
+        journal.acknowledge(journal.last);
         journal.write().unwrap();
     }
 }
@@ -148,7 +148,7 @@ fn a_file_of_another_version_is_left_as_it_is() {
         let mut journal = open(dir.path(), BIG);
         append(&mut journal, n..n + 1);
         assert_eq!(numbers(&take_all(&mut journal)), [n]);
-        journal.acknowledge(journal.last());
+        journal.acknowledge(journal.last);
         journal.write().unwrap();
         assert_eq!(journal.take_lost(), 0);
         assert_eq!(fs::read(&path).unwrap(), later);
@@ -208,7 +208,7 @@ fn a_full_buffer_drops_its_oldest_segment() {
         "the newest, in order"
     );
     assert!(journal.bytes() > max * 9 / 10);
-    journal.acknowledge(journal.last());
+    journal.acknowledge(journal.last);
     journal.write().unwrap();
     assert_eq!((journal.bytes(), files(dir.path(), SUFFIX).len()), (0, 1));
 }

@@ -27,6 +27,11 @@ fn drain(outbox: &mut Outbox, limit: usize) -> Vec<(String, Vec<u8>)> {
     sent
 }
 
+fn lost(outbox: &mut Outbox, kind: MqttKind) -> u64 {
+    let (_, count) = outbox.take_lost().into_iter().find(|(of, _)| *of == kind).unwrap();
+    count
+}
+
 fn names(sent: &[(String, Vec<u8>)]) -> Vec<&str> {
     sent.iter().map(|(t, _)| t.as_str()).collect()
 }
@@ -54,7 +59,7 @@ fn the_limit_bounds_what_is_in_flight() {
     let mut outbox = outbox();
     for i in 0..10 {
         outbox.put(topic(&format!("t{i}")), Vec::new());
-        outbox.push(Kind::Event, event("e"), None);
+        outbox.push(MqttKind::Event, event("e"), None);
     }
     assert_eq!(drain(&mut outbox, 3).len(), 3);
     assert_eq!(outbox.in_flight(), 3);
@@ -68,8 +73,8 @@ fn leader_first_then_results_events_and_telemetry_in_turn() {
     let mut outbox = outbox();
     for i in 1..=3 {
         outbox.put(topic(&format!("t{i}")), Vec::new());
-        outbox.push(Kind::Event, event(&format!("e{i}")), None);
-        outbox.push(Kind::History, event(&format!("h{i}")), None);
+        outbox.push(MqttKind::Event, event(&format!("e{i}")), None);
+        outbox.push(MqttKind::History, event(&format!("h{i}")), None);
     }
     outbox.push_result(event("r1"));
     outbox.push_result(event("r2"));
@@ -80,7 +85,7 @@ fn leader_first_then_results_events_and_telemetry_in_turn() {
         "status", "r1", "e1", "t1", "r2", "e2", "t2", "e3", "t3", "h1", "h2", "h3",
     ];
     assert_eq!(names(&sent), order);
-    outbox.push(Kind::History, event("h4"), None);
+    outbox.push(MqttKind::History, event("h4"), None);
     assert!(outbox.next(100, false).is_none(), "the history has its pace");
 }
 
@@ -89,7 +94,7 @@ fn after_a_lost_connection_events_are_sent_again_in_order() {
     let mut outbox = outbox();
     outbox.put(topic("t"), Vec::new());
     for name in ["e1", "e2", "e3"] {
-        outbox.push(Kind::Event, event(name), None);
+        outbox.push(MqttKind::Event, event(name), None);
     }
     assert_eq!(drain(&mut outbox, 3).len(), 3);
     outbox.numbered(1).unwrap();
@@ -114,32 +119,32 @@ fn a_result_that_breaks_connections_is_dropped() {
         assert_eq!(drain(&mut outbox, 10).len(), 1);
         outbox.lost();
     }
-    assert_eq!((outbox.waiting(), outbox.take_lost().results), (0, 1));
+    assert_eq!((outbox.waiting(), lost(&mut outbox, MqttKind::Result)), (0, 1));
 }
 
 #[test]
 fn queues_are_bounded_and_drop_the_oldest() {
     let mut outbox = outbox();
     for i in 0..KEPT + 2 {
-        outbox.push(Kind::Event, event(&format!("e{i}")), None);
+        outbox.push(MqttKind::Event, event(&format!("e{i}")), None);
     }
-    assert_eq!((outbox.waiting(), outbox.take_lost().events), (KEPT, 2));
+    assert_eq!((outbox.waiting(), lost(&mut outbox, MqttKind::Event)), (KEPT, 2));
     assert_eq!(outbox.next(1, true).unwrap().1.topic.as_ref(), "e2");
     // Arrays of the history are large.
     let array = |n: usize| Message::not_retained("h", format!("{n:33000}").into_bytes());
     let mut count = 0;
-    while outbox.room(Kind::History) > 0 {
-        outbox.push(Kind::History, array(count), None);
+    while outbox.room(MqttKind::History) > 0 {
+        outbox.push(MqttKind::History, array(count), None);
         count += 1;
     }
     assert!((30..40).contains(&count), "{count} are loaded at a time");
-    (count..2000).for_each(|n| outbox.push(Kind::History, array(n), None));
-    let queue = outbox.queue(Kind::History);
+    (count..2000).for_each(|n| outbox.push(MqttKind::History, array(n), None));
+    let queue = outbox.queue(MqttKind::History);
     let (kept, bytes) = (queue.entries.len(), queue.bytes);
     assert!((KEPT_BYTES - 40_000..=KEPT_BYTES).contains(&bytes), "{bytes}");
     let first = &queue.entries.front().unwrap().message;
     assert_eq!(*first, array(2000 - kept), "the newest are kept");
-    assert_eq!(outbox.take_lost().history as usize, 2000 - kept);
+    assert_eq!(lost(&mut outbox, MqttKind::History) as usize, 2000 - kept);
 }
 
 #[test]
@@ -174,7 +179,7 @@ fn telemetry_without_acknowledgement_passes_a_full_window() {
         expiry: Some(300),
     });
     for name in ["e1", "e2"] {
-        outbox.push(Kind::Event, event(name), Some(7));
+        outbox.push(MqttKind::Event, event(name), Some(7));
     }
     outbox.put(topic("t"), vec![1]);
     outbox.put_lasting(topic("gone"), Vec::new());
@@ -187,7 +192,7 @@ fn telemetry_without_acknowledgement_passes_a_full_window() {
         (false, Some(300), true)
     );
     assert!(outbox.mark_published(key, false).is_some());
-    assert_eq!(outbox.oldest(Kind::Event), Some(7));
+    assert_eq!(outbox.oldest(MqttKind::Event), Some(7));
     outbox.numbered(1).unwrap();
     outbox.acked(1);
     let (_, message) = outbox.next(1, true).unwrap();
@@ -199,7 +204,7 @@ fn inconsistent_packet_ids_are_detected() {
     let mut outbox = outbox();
     assert!(outbox.numbered(1).is_err());
     for name in ["a", "b"] {
-        outbox.push(Kind::Event, event(name), None);
+        outbox.push(MqttKind::Event, event(name), None);
     }
     drain(&mut outbox, 10);
     assert!(outbox.numbered(1).is_ok());
@@ -220,7 +225,7 @@ fn messages_that_cannot_be_sent_are_dropped() {
 fn what_the_broker_refuses_for_now_is_published_again_in_its_order() {
     let mut outbox = outbox();
     for name in ["e1", "e2", "e3"] {
-        outbox.push(Kind::Event, event(name), None);
+        outbox.push(MqttKind::Event, event(name), None);
     }
     assert_eq!(drain(&mut outbox, 2).len(), 2);
     (1..=2).for_each(|packet| outbox.numbered(packet).unwrap());

@@ -282,7 +282,7 @@ fn many_drives_are_looked_at_a_few_at_a_time() {
             .iter()
             .filter(|u| u.topic.ends_with("/state") && !u.topic.contains("/point/"));
         let now = now.count();
-        assert!(now <= DRIVES);
+        assert!(now <= rounds::DRIVES);
         states += now;
         if next > bench.now {
             assert_eq!((calls, states), (4, 100));

@@ -1,14 +1,18 @@
-//! The number of the session (bdSeq), which connects the death of a node to its birth, kept over restarts. Blocking: it
-//! writes a file.
+//! The number of the session (bdSeq), which connects the death of a node to its birth, kept over restarts
+//! in a file.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use crate::files::names::SPARKPLUG;
 
+/// Longest wait for the file.
+const WRITE: Duration = Duration::from_secs(1);
+
 /// Gives each connection its number, 0 to 255 in a circle.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub(super) struct BdSeq {
     path: PathBuf,
     number: u8,
@@ -32,28 +36,26 @@ impl BdSeq {
         }
     }
 
-    /// The number of the next connection; the file has it when this returns. A connection that no broker accepted leaves
-    /// its number to the next one.
+    /// The number of the next connection; the file has it when this returns, unless the disk is too slow. A connection that
+    /// no broker accepted leaves its number to the next one.
     ///
     /// # Errors
-    /// The file cannot be written; the number is valid all the same.
-    pub(super) fn next(&mut self) -> (u8, io::Result<()>) {
-        if self.kept && !self.used {
+    /// Why the file does not have it; the number is valid all the same.
+    pub(super) async fn next(&mut self) -> (u8, Result<(), String>) {
+        if std::mem::take(&mut self.used) {
+            (self.number, self.kept) = (self.number.wrapping_add(1), false);
+        }
+        if self.kept {
             return (self.number, Ok(()));
         }
-        self.unkept();
-        let written = self.write();
+        let (path, number) = (self.path.clone(), self.number);
+        let work = tokio::task::spawn_blocking(move || write(&path, number));
+        let written = match tokio::time::timeout(WRITE, work).await {
+            Ok(Ok(written)) => written.map_err(|error| error.to_string()),
+            _ => Err("the disk does not respond".to_string()),
+        };
         self.kept = written.is_ok();
-        (self.number, written)
-    }
-
-    /// The same without the file, which must be written later.
-    pub(super) fn unkept(&mut self) -> u8 {
-        if std::mem::take(&mut self.used) {
-            self.number = self.number.wrapping_add(1);
-        }
-        self.kept = false;
-        self.number
+        (number, written)
     }
 
     /// A broker accepted a connection with the number.
@@ -64,60 +66,60 @@ impl BdSeq {
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
+}
 
-    fn write(&self) -> io::Result<()> {
-        if let Some(dir) = self.path.parent() {
-            fs::create_dir_all(dir)?;
-        }
-        let new = self.path.with_extension("new");
-        let mut file = File::create(&new)?;
-        writeln!(file, "{}", self.number)?;
-        file.sync_data()?;
-        fs::rename(&new, &self.path)
+fn write(path: &Path, number: u8) -> io::Result<()> {
+    if let Some(dir) = path.parent() {
+        fs::create_dir_all(dir)?;
     }
+    let new = path.with_extension("new");
+    let mut file = File::create(&new)?;
+    writeln!(file, "{number}")?;
+    file.sync_data()?;
+    fs::rename(&new, path)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn next(bd_seq: &mut BdSeq) -> u8 {
-        let (number, written) = bd_seq.next();
+    async fn next(bd_seq: &mut BdSeq) -> u8 {
+        let (number, written) = bd_seq.next().await;
         written.unwrap();
         number
     }
 
-    #[test]
-    fn numbers_go_on_over_restarts() {
+    #[tokio::test]
+    async fn numbers_go_on_over_restarts() {
         let dir = tempfile::tempdir().unwrap();
         let state = dir.path().join("state");
         let mut bd_seq = BdSeq::open(&state);
         assert_eq!(
-            (next(&mut bd_seq), next(&mut bd_seq)),
+            (next(&mut bd_seq).await, next(&mut bd_seq).await),
             (0, 0),
             "no broker took the first"
         );
         for expected in 1..=255 {
             bd_seq.accepted();
-            assert_eq!(next(&mut bd_seq), expected);
+            assert_eq!(next(&mut bd_seq).await, expected);
         }
         bd_seq.accepted();
-        assert_eq!(next(&mut bd_seq), 0);
+        assert_eq!(next(&mut bd_seq).await, 0);
         // Killed before or after the broker accepted the connection: the next run cannot know.
-        assert_eq!(next(&mut BdSeq::open(&state)), 1);
-        assert_eq!(next(&mut BdSeq::open(&state)), 2);
+        assert_eq!(next(&mut BdSeq::open(&state)).await, 1);
+        assert_eq!(next(&mut BdSeq::open(&state)).await, 2);
         fs::write(state.join(SPARKPLUG), "damaged").unwrap();
-        assert_eq!(next(&mut BdSeq::open(&state)), 0);
+        assert_eq!(next(&mut BdSeq::open(&state)).await, 0);
     }
 
-    #[test]
-    fn without_a_directory_the_numbers_begin_anew() {
+    #[tokio::test]
+    async fn without_a_directory_the_numbers_begin_anew() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("file");
         fs::write(&file, "").unwrap();
         let mut bd_seq = BdSeq::open(&file);
         for expected in 0..3 {
-            let (number, written) = bd_seq.next();
+            let (number, written) = bd_seq.next().await;
             assert_eq!((number, written.is_err()), (expected, true));
             bd_seq.accepted();
         }

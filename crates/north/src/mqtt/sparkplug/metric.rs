@@ -1,7 +1,48 @@
 //! Metrics as the session knows them, and how they become metrics of a payload.
 
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
 use super::wire::{self, DataType, MetricValue, PropertyContent, PropertySet};
 use crate::drive::{Quality, Value};
+
+/// A moment: on the clock that measures intervals, and on the calendar.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Moment {
+    pub(super) now: Instant,
+    pub(super) wall: SystemTime,
+}
+
+impl Moment {
+    /// The present.
+    pub(super) fn present() -> Moment {
+        Moment {
+            now: Instant::now(),
+            wall: SystemTime::now(),
+        }
+    }
+
+    /// ms since 1970.
+    pub(super) fn millis(self) -> u64 {
+        self.millis_at(None)
+    }
+
+    /// ms since 1970 at an earlier time, if there is one.
+    pub(super) fn millis_at(self, at: Option<Instant>) -> u64 {
+        let age = at.map(|at| self.now.saturating_duration_since(at)).unwrap_or_default();
+        let time = self.wall.checked_sub(age).unwrap_or(self.wall);
+        let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
+        u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
+    }
+
+    /// What is known now: good, or bad without a value.
+    pub(super) fn sample(self, value: Option<Datum>) -> Sample {
+        Sample {
+            quality: if value.is_some() { Quality::Good } else { Quality::Bad },
+            value,
+            time: self.millis(),
+        }
+    }
+}
 
 /// A value of a metric.
 #[derive(Debug, Clone, PartialEq)]
@@ -11,6 +52,12 @@ pub(super) enum Datum {
     Unsigned(u64),
     Number(f64),
     Text(String),
+}
+
+impl Datum {
+    pub(super) fn text(text: &str) -> Datum {
+        Datum::Text(text.to_string())
+    }
 }
 
 impl From<Value> for Datum {
@@ -81,6 +128,18 @@ fn quality_code(quality: Quality) -> u32 {
 }
 
 impl Definition {
+    /// A metric without unit and limits.
+    pub(super) fn new(name: &str, datatype: DataType) -> Definition {
+        Definition {
+            name: name.to_string(),
+            datatype,
+            unit: String::new(),
+            low: None,
+            high: None,
+            pace: Pace::Normal,
+        }
+    }
+
     /// The metric in a birth, with all that is fixed.
     pub(super) fn birth(&self, naming: Naming, sample: &Sample) -> wire::Metric {
         let mut metric = self.metric(sample);

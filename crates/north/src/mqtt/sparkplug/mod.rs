@@ -26,7 +26,7 @@ mod wire;
 use std::path::PathBuf;
 
 pub(super) use self::client::run;
-pub(crate) use self::orders::NodeOrdersLeft;
+pub(super) use self::orders::NodeOrdersLeft;
 
 /// Configuration of the edge node; broker and credentials are those of the MQTT client.
 #[derive(Debug, Clone, PartialEq)]

@@ -1,9 +1,9 @@
 //! Which metrics the node and its drives have, and what they are now. Time is an argument.
 
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::SystemTime;
 
 use super::super::payload;
-use super::metric::{Datum, Definition, Pace, Sample};
+use super::metric::{Datum, Definition, Moment, Pace, Sample};
 use super::wire::DataType;
 use crate::drive::model::Kind;
 use crate::drive::profile::Form;
@@ -14,36 +14,6 @@ use crate::process_image::Reading;
 /// The result of the last command over Sparkplug: its code, and why it failed.
 pub(super) const COMMAND_RESULT: &str = "command_result";
 pub(super) const COMMAND_ERROR: &str = "command_error";
-
-/// Milliseconds since 1970.
-pub(super) fn millis(time: SystemTime) -> u64 {
-    let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
-    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
-}
-
-/// Time as the sources of metrics need it.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Moment {
-    pub(super) now: Instant,
-    /// The time of day then.
-    pub(super) wall: SystemTime,
-}
-
-impl Moment {
-    fn millis_at(self, at: Option<Instant>) -> u64 {
-        let age = at.map(|at| self.now.saturating_duration_since(at)).unwrap_or_default();
-        millis(self.wall.checked_sub(age).unwrap_or(self.wall))
-    }
-
-    /// A value that is known at any time.
-    fn known(self, value: Datum) -> Sample {
-        Sample {
-            value: Some(value),
-            quality: Quality::Good,
-            time: millis(self.wall),
-        }
-    }
-}
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Source {
@@ -73,6 +43,7 @@ impl DriveMetrics {
     /// With their definitions; `commands` says whether commands over Sparkplug are served.
     pub(super) fn new(drive: DriveHandle, commands: bool) -> (DriveMetrics, Vec<Definition>) {
         let spec = &drive.image.spec;
+        let text = |name: &str| Definition::new(name, DataType::String);
         let mut all = vec![(Source::State, text("state"))];
         for (index, name) in payload::published_points(&spec.profile) {
             let Some(point) = spec.profile.points.get(index) else {
@@ -80,12 +51,10 @@ impl DriveMetrics {
             };
             let range = spec.limits_of(index);
             let definition = Definition {
-                name: name.to_string(),
-                datatype: datatype(point),
                 unit: point.unit.clone(),
                 low: range.as_ref().map(|range| *range.start()),
                 high: range.as_ref().map(|range| *range.end()),
-                pace: Pace::Normal,
+                ..Definition::new(name, datatype(point))
             };
             all.push((Source::Point(index), definition));
             if let Some((name, _)) = payload::text_beside(point, None) {
@@ -100,10 +69,9 @@ impl DriveMetrics {
             all.push((Source::Holder, text("Hold/Holder")));
             all.push((Source::HoldRank, text("Hold/Rank")));
             let left = Definition {
-                datatype: DataType::Int64,
                 unit: "s".to_string(),
                 pace: Pace::Figure,
-                ..text("Hold/Left")
+                ..Definition::new("Hold/Left", DataType::Int64)
             };
             all.push((Source::HoldLeft, left));
         }
@@ -143,80 +111,49 @@ impl DriveMetrics {
             let sample = reading.sample(index);
             // What is no longer good is so now.
             let at = sample.at.filter(|_| sample.quality == Quality::Good);
-            (sample.good(), sample.quality, moment.millis_at(at))
+            (sample.good(), sample.quality, at)
         };
-        match source {
+        let (value, quality, at) = match source {
             Source::Point(index) => {
-                let (value, quality, time) = of(index);
-                Sample {
-                    value: value.map(Datum::from),
-                    quality,
-                    time,
-                }
+                let (value, quality, at) = of(index);
+                (value.map(Datum::from), quality, at)
             }
             Source::TextOf(index) => {
-                let (value, quality, time) = of(index);
+                let (value, quality, at) = of(index);
                 let point = reading.spec.profile.points.get(index);
                 let text = value.map(|value| point.and_then(|p| p.text_of(value)).unwrap_or_default());
-                Sample {
-                    value: text.map(|text| Datum::Text(text.to_string())),
-                    quality,
-                    time,
-                }
+                (text.map(Datum::text), quality, at)
             }
             Source::State => {
                 let state = reading.state();
+                let quality = state.map_or(reading.overall(), |_| Quality::Good);
                 let fast_at = reading.snapshot.fast_at.filter(|_| !reading.is_stale());
-                Sample {
-                    value: state.map(|state: State| Datum::Text(state.name().to_string())),
-                    quality: if state.is_some() {
-                        Quality::Good
-                    } else {
-                        reading.overall()
-                    },
-                    time: moment.millis_at(fast_at),
-                }
+                (state.map(|state: State| Datum::text(state.name())), quality, fast_at)
             }
             Source::FaultText => {
                 let code = reading.model(ModelPoint::FaultCode);
                 let good = code.good().is_some();
-                Sample {
-                    value: good.then(|| Datum::Text(reading.fault_text())),
-                    quality: code.quality,
-                    time: moment.millis_at(code.at.filter(|_| good)),
-                }
+                let text = good.then(|| Datum::Text(reading.fault_text()));
+                (text, code.quality, code.at.filter(|_| good))
             }
             Source::HoldState | Source::Holder | Source::HoldRank | Source::HoldLeft => {
                 let view = self.drive.hold_view(None, moment.now).map(|(view, _)| view);
                 let value = view.map(|view| match source {
-                    Source::HoldState => Datum::Text(view.state.name().to_string()),
+                    Source::HoldState => Datum::text(view.state.name()),
                     Source::Holder => Datum::Text(view.holder.unwrap_or_default().to_string()),
                     Source::HoldRank => Datum::Text(view.rank.unwrap_or_default().to_string()),
                     _ => Datum::Integer(view.left_s.and_then(|left| i64::try_from(left).ok()).unwrap_or(-1)),
                 });
-                Sample {
-                    quality: if value.is_some() { Quality::Good } else { Quality::Bad },
-                    value,
-                    time: millis(moment.wall),
-                }
+                return moment.sample(value);
             }
             Source::CommandResult | Source::CommandError => {
                 let (code, error) = self.result.as_ref().map_or(("", ""), |(c, e)| (c.as_str(), e.as_str()));
                 let text = if source == Source::CommandResult { code } else { error };
-                moment.known(Datum::Text(text.to_string()))
+                return moment.sample(Some(Datum::text(text)));
             }
-        }
-    }
-}
-
-fn text(name: &str) -> Definition {
-    Definition {
-        name: name.to_string(),
-        datatype: DataType::String,
-        unit: String::new(),
-        low: None,
-        high: None,
-        pace: Pace::Normal,
+        };
+        let time = moment.millis_at(at);
+        Sample { value, quality, time }
     }
 }
 
@@ -230,67 +167,43 @@ fn datatype(point: &Point) -> DataType {
     }
 }
 
-/// The metrics of the node: `Bus/{bus}/…`, as in the health object of the bus.
-pub(super) fn node_definitions(plant: &Plant) -> Vec<Definition> {
+/// The metrics of the node, and what they are now: `Bus/{bus}/…`, as in the health object of the bus.
+pub(super) fn node_metrics(plant: &Plant, moment: Moment) -> (Vec<Definition>, Vec<Sample>) {
+    use DataType::{Double, Int64, String};
     use Pace::{Figure, Normal};
     let of_bus = |bus: &BusHandle| {
-        let of = |leaf: &str, datatype, unit: &str, pace| Definition {
-            name: format!("Bus/{}/{leaf}", bus.image.spec.name),
-            datatype,
-            unit: unit.to_string(),
-            low: None,
-            high: None,
-            pace,
-        };
-        [
-            of("state", DataType::String, "", Normal),
-            of("reason", DataType::String, "", Normal),
-            of("drives", DataType::Int64, "", Normal),
-            of("online", DataType::Int64, "", Normal),
-            of("load", DataType::Double, "", Figure),
-            of("fast_cycle_ms", DataType::Double, "ms", Figure),
-            of("slow_cycle_ms", DataType::Double, "ms", Figure),
-            of("transactions", DataType::Int64, "", Figure),
-            of("errors", DataType::Int64, "", Figure),
-            of("queue", DataType::Int64, "", Figure),
-        ]
-    };
-    plant.buses.iter().flat_map(of_bus).collect()
-}
-
-/// Their values, in the same order.
-pub(super) fn node_samples(plant: &Plant, moment: Moment) -> Vec<Sample> {
-    let of_bus = |bus: &BusHandle| {
         let (state, figures) = payload::bus_now(bus);
-        let count = |count: u64| moment.known(Datum::Integer(i64::try_from(count).unwrap_or(i64::MAX)));
-        let figure = |figure: Option<f64>| match figure {
-            Some(figure) => moment.known(Datum::Number(figure)),
-            None => Sample {
-                value: None,
-                quality: Quality::Bad,
-                time: millis(moment.wall),
-            },
+        let of = |leaf: &str, datatype, unit: &str, pace, value| {
+            let definition = Definition {
+                unit: unit.to_string(),
+                pace,
+                ..Definition::new(&format!("Bus/{}/{leaf}", bus.image.spec.name), datatype)
+            };
+            (definition, moment.sample(value))
         };
-        let word = if state.up { "up" } else { "down" };
+        let text = |text: &str| Some(Datum::text(text));
+        let count = |count: u64| Some(Datum::Integer(i64::try_from(count).unwrap_or(i64::MAX)));
+        let figure = |figure: Option<f64>| figure.map(Datum::Number);
+        let reason = state.reason.unwrap_or_default();
         [
-            moment.known(Datum::Text(word.to_string())),
-            moment.known(Datum::Text(state.reason.unwrap_or_default())),
-            count(state.drives as u64),
-            count(state.online as u64),
-            figure(figures.load),
-            figure(figures.fast_cycle_ms),
-            figure(figures.slow_cycle_ms),
-            count(figures.transactions),
-            count(figures.errors),
-            count(figures.queue as u64),
+            of("state", String, "", Normal, text(if state.up { "up" } else { "down" })),
+            of("reason", String, "", Normal, text(&reason)),
+            of("drives", Int64, "", Normal, count(state.drives as u64)),
+            of("online", Int64, "", Normal, count(state.online as u64)),
+            of("load", Double, "", Figure, figure(figures.load)),
+            of("fast_cycle_ms", Double, "ms", Figure, figure(figures.fast_cycle_ms)),
+            of("slow_cycle_ms", Double, "ms", Figure, figure(figures.slow_cycle_ms)),
+            of("transactions", Int64, "", Figure, count(figures.transactions)),
+            of("errors", Int64, "", Figure, count(figures.errors)),
+            of("queue", Int64, "", Figure, count(figures.queue as u64)),
         ]
     };
-    plant.buses.iter().flat_map(of_bus).collect()
+    plant.buses.iter().flat_map(of_bus).unzip()
 }
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
+    use std::time::{Duration, Instant, UNIX_EPOCH};
 
     use super::super::super::fixture;
     use super::*;
@@ -335,7 +248,7 @@ mod tests {
             now: Instant::now(),
             wall: UNIX_EPOCH,
         };
-        let (definitions, samples) = (node_definitions(&plant), node_samples(&plant, moment));
+        let (definitions, samples) = node_metrics(&plant, moment);
         assert_eq!(definitions.len(), samples.len());
         let value = |name: &str| {
             let place = definitions.iter().position(|d| d.name == name).unwrap();

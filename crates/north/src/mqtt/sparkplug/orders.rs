@@ -13,19 +13,16 @@ use super::super::request::Incoming;
 use super::model::DriveMetrics;
 use super::session::Session;
 use super::wire::{self, Metric, MetricValue, Payload};
-use crate::command::{
-    Answer, Authority, CONFIRMED, DEFAULT_EXPIRY, Order, Origin, Parts, Proof, Refusal, SourceKind, stop_of,
-};
-use crate::command_json::{SharedMemory, Taken, excerpt, resolve, unknown_drive};
-use crate::drive::{PointIndex, Profile, Value};
+use crate::command::{Answer, CONFIRMED, DEFAULT_EXPIRY, Proof, Refusal, SourceKind};
+use crate::command_json::{Asked, SharedMemory, Taken, excerpt, refuse_unknown, resolve};
+use crate::drive::Profile;
 use crate::plant::{Placed, Plant};
-
-/// Points with their values, and why another one is refused.
-type Understood = (Vec<(PointIndex, Value)>, Option<Refusal>);
 
 /// Commands whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit
 /// only.
 const AWAITED: usize = 4096;
+/// What the audit shows of a command that was not read.
+const UNREAD: &str = "a Sparkplug command";
 /// Metrics in a command.
 const METRICS: usize = 64;
 
@@ -40,7 +37,7 @@ pub(super) struct Orders {
 
 /// Commands whose results a node leaves to its successor.
 #[derive(Debug)]
-pub(crate) struct NodeOrdersLeft(VecDeque<Awaited>);
+pub(in crate::mqtt) struct NodeOrdersLeft(VecDeque<Awaited>);
 
 #[derive(Debug)]
 struct Awaited {
@@ -104,64 +101,44 @@ impl Orders {
         plant: &Plant,
         now: Instant,
     ) -> Option<Finished> {
-        let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
-        let who = who
-            .as_deref()
-            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
-        let origin = Origin::of(self.client.clone(), SourceKind::Sparkplug, who).proven(Proof::Sparkplug);
+        let origin = incoming
+            .origin(&self.client, SourceKind::Sparkplug)
+            .proven(Proof::Sparkplug);
         let Some((place, metrics)) = target else {
-            let name = excerpt(device.as_bytes());
-            let why = unknown_drive(device, plant);
-            plant.refuse_unknown(name.trim_matches('`'), "a Sparkplug command", why, origin, now);
+            refuse_unknown(plant, device, UNREAD, origin, now);
             return None;
         };
         let drive = &metrics.drive;
-        let request = Request::read(incoming, |metric| {
-            session.metric(place, metric.name.as_deref(), metric.alias)
-        });
+        let placed = |metric: &Metric| session.metric(place, metric.name.as_deref(), metric.alias);
+        let request = match Request::read(incoming, placed) {
+            Ok(request) => request,
+            Err(refusal) => {
+                let answer = drive.refuse(UNREAD, refusal, origin, now);
+                return Some(Finished::of(device, Vec::new(), &answer, None));
+            }
+        };
         let touched = request.metrics();
-        let points = request.points(
-            &drive.image.spec.profile,
-            |metric| session.definition(place, metric).map(|d| d.name.clone()),
-            |metric| session.alias(place, metric),
-        );
-        let refuse = |refusal, origin| {
-            let answer = drive.refuse(&request.what(), refusal, origin, now);
-            Some(Finished::of(device, touched.clone(), &answer, None))
-        };
-        let (points, mut refused) = match points {
-            Err(refusal) => return refuse(refusal, origin),
-            Ok(points) => points,
-        };
+        let refused = |answer: &Answer| Some(Finished::of(device, touched.clone(), answer, None));
+        let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
+        let expiry = life.map_or(DEFAULT_EXPIRY, |life| life.min(DEFAULT_EXPIRY));
         let profile = &drive.image.spec.profile;
-        let (stop, order) = (stop_of(&points, profile), Order::Points(points));
-        let only_stops = stop.is_some() && matches!(Parts::of(order.clone(), profile), Parts::One(_));
-        if refused.is_none()
-            && !only_stops
+        let mut asked = match request.asked(profile, (session, place), expiry) {
+            Err(refusal) => return refused(&drive.refuse(&request.what(), refusal, origin, now)),
+            Ok(asked) => asked,
+        };
+        if asked.does_more(profile)
             && request.timestamp.is_some()
             && let Err(why) = self.remember(incoming, now)
         {
-            refused = Some(Refusal::NotAllowed(why.to_string()));
+            asked.refused = Some(Refusal::NotAllowed(why.to_string()));
         }
-        let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
-        let expiry = life.map_or(DEFAULT_EXPIRY, |life| life.min(DEFAULT_EXPIRY));
-        let mut placed = match (refused, stop) {
-            (None, _) => drive.place_asked(
-                order,
-                origin,
-                Authority::Write,
-                expiry,
-                incoming.asked.unwrap_or(now),
-                now,
-            ),
-            (Some(refusal), Some(stop)) => {
-                let (what, stop) = (request.what(), Order::Points(stop));
-                drive.place_stop(stop, (&what, refusal), origin, Authority::Write, expiry, now)
-            }
-            (Some(refusal), None) => return refuse(refusal, origin),
+        let came = incoming.asked.unwrap_or(now);
+        let mut placed = match asked.place(drive, &request.what(), origin, (came, now)) {
+            Ok(placed) => placed,
+            Err(answer) => return refused(&answer),
         };
         if let Some(answer) = placed.answer().filter(|answer| !answer.outcome.is_ok()) {
-            return Some(Finished::of(device, touched, &answer, None));
+            return refused(&answer);
         }
         if self.awaited.len() < AWAITED {
             self.awaited.push_back(Awaited {
@@ -224,33 +201,26 @@ impl Orders {
 /// What a message asks for.
 struct Request {
     /// The metrics as they came, and their place in the session.
-    metrics: Result<Vec<(Metric, Option<usize>)>, Refusal>,
+    metrics: Vec<(Metric, Option<usize>)>,
     timestamp: Option<u64>,
 }
 
 impl Request {
-    fn read(incoming: &Incoming, place: impl Fn(&Metric) -> Option<usize>) -> Request {
-        let refused = |refusal| Request {
-            metrics: Err(refusal),
-            timestamp: None,
-        };
+    fn read(incoming: &Incoming, place: impl Fn(&Metric) -> Option<usize>) -> Result<Request, Refusal> {
         if incoming.retain {
             let why = "a retained message is never a command; publish it without the retain flag and clear the topic";
-            return refused(Refusal::NotAllowed(why.to_string()));
+            return Err(Refusal::NotAllowed(why.to_string()));
         }
         if let Some(bytes) = incoming.oversized {
-            return refused(Refusal::BadValue(format!(
-                "the payload has {bytes} bytes, at most 65536 are allowed"
-            )));
+            let why = format!("the payload has {bytes} bytes, at most 65536 are allowed");
+            return Err(Refusal::BadValue(why));
         }
-        let payload = match Payload::decoded(&incoming.payload) {
-            Ok(payload) => payload,
-            Err(why) => return refused(Refusal::BadValue(format!("the payload is not Sparkplug B: {why}"))),
-        };
+        let payload = Payload::decoded(&incoming.payload)
+            .map_err(|why| Refusal::BadValue(format!("the payload is not Sparkplug B: {why}")))?;
         let count = payload.metrics.len();
         if count > METRICS {
             let why = format!("the command has {count} metrics, at most {METRICS} are allowed");
-            return refused(Refusal::BadValue(why));
+            return Err(Refusal::BadValue(why));
         }
         let placed = |mut metric: Metric| {
             // Some hosts send the field empty in addition to an alias.
@@ -258,21 +228,18 @@ impl Request {
             let place = place(&metric);
             (metric, place)
         };
-        Request {
-            metrics: Ok(payload.metrics.into_iter().map(placed).collect()),
+        Ok(Request {
+            metrics: payload.metrics.into_iter().map(placed).collect(),
             timestamp: payload.timestamp,
-        }
+        })
     }
 
     fn metrics(&self) -> Vec<usize> {
-        self.metrics.iter().flatten().filter_map(|(_, place)| *place).collect()
+        self.metrics.iter().filter_map(|(_, place)| *place).collect()
     }
 
     /// For the audit, if it is refused before it becomes a command.
     fn what(&self) -> String {
-        let Ok(metrics) = &self.metrics else {
-            return "a Sparkplug command".to_string();
-        };
         let name = |(metric, _): &(Metric, Option<usize>)| {
             let value = json(metric).map_or_else(|| "null".to_string(), |value| value.to_string());
             match (&metric.name, metric.alias) {
@@ -281,20 +248,21 @@ impl Request {
                 (None, None) => format!("?={value}"),
             }
         };
-        let all: Vec<String> = metrics.iter().take(8).map(name).collect();
+        let all: Vec<String> = self.metrics.iter().take(8).map(name).collect();
         excerpt(all.join(" ").as_bytes())
     }
 
-    /// The points that are understood, and why another one is not.
-    fn points(
+    /// What is asked for of the device at this place of the session.
+    fn asked(
         &self,
         profile: &Profile,
-        name: impl Fn(usize) -> Option<String>,
-        alias: impl Fn(usize) -> Option<u64>,
-    ) -> Result<Understood, Refusal> {
-        let metrics = self.metrics.as_ref().map_err(Clone::clone)?;
+        (session, device): (&Session, usize),
+        expiry: Duration,
+    ) -> Result<Asked, Refusal> {
+        let alias = |metric| session.alias(device, metric);
+        let name = |metric| session.definition(device, metric).map(|d| d.name.clone());
         let point = |(metric, place): &(Metric, Option<usize>)| {
-            if let (Some(name), Some(sent), Some(own)) = (&metric.name, metric.alias, place.and_then(&alias))
+            if let (Some(name), Some(sent), Some(own)) = (&metric.name, metric.alias, place.and_then(alias))
                 && sent != own
                 && sent != 0
             {
@@ -304,7 +272,7 @@ impl Request {
                      birth with `Node Control/Rebirth` if the aliases are old"
                 )));
             }
-            let name = match (&metric.name, place.and_then(&name)) {
+            let name = match (&metric.name, place.and_then(name)) {
                 (Some(name), _) => name.clone(),
                 (None, Some(name)) => name,
                 (None, None) => {
@@ -325,13 +293,13 @@ impl Request {
             resolve(profile, &name, &value)
         };
         let (mut points, mut refused) = (Vec::new(), None);
-        for metric in metrics {
+        for metric in &self.metrics {
             match point(metric) {
                 Ok(point) => points.push(point),
                 Err(refusal) => refused = refused.or(Some(refusal)),
             }
         }
-        Ok((points, refused))
+        Asked::new(points, expiry, refused, profile)
     }
 }
 

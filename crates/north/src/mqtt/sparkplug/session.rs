@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use self::device::{Device, name};
 use super::host::Host;
-use super::metric::{Datum, Definition, Naming, Pace, Sample};
+use super::metric::{Datum, Definition, Moment, Naming, Sample};
 use super::topics::{Kind, StateForm, Topics};
 use super::wire::{DataType, Metric, Payload};
 use crate::drive::Quality;
@@ -45,14 +45,6 @@ pub(super) struct Packet {
     pub(super) kind: Kind,
     pub(super) device: Option<String>,
     pub(super) payload: Payload,
-}
-
-/// Time, as the session needs it.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Tick {
-    pub(super) now: Instant,
-    /// ms since 1970.
-    pub(super) millis: u64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -153,8 +145,8 @@ impl Session {
     }
 
     /// The last will of a connection with this number.
-    pub(super) fn will(&self, bd_seq: u8, millis: u64) -> Packet {
-        death(bd_seq, millis)
+    pub(super) fn will(&self, bd_seq: u8, moment: Moment) -> Packet {
+        death(bd_seq, moment)
     }
 
     /// The broker accepted the connection with this number and takes packets of so many bytes; the state of the host is
@@ -297,29 +289,29 @@ impl Session {
     }
 
     /// The death of the node, before the connection is closed; nothing else is sent on it.
-    pub(super) fn end(&mut self, millis: u64) -> Packet {
+    pub(super) fn end(&mut self, moment: Moment) -> Packet {
         self.closed();
-        death(self.bd_seq, millis)
+        death(self.bd_seq, moment)
     }
 
     /// The next message, if one is due; else when to ask again, unless something happens before. Once returned it counts
     /// as sent.
-    pub(super) fn next(&mut self, tick: Tick) -> Result<Packet, Option<Instant>> {
+    pub(super) fn next(&mut self, moment: Moment) -> Result<Packet, Option<Instant>> {
         match self.phase {
             Phase::Away | Phase::Waiting => Err(None),
-            Phase::NodeBirth(Some(at)) if at > tick.now => Err(Some(at)),
-            Phase::NodeBirth(_) => Ok(self.node_birth(tick)),
+            Phase::NodeBirth(Some(at)) if at > moment.now => Err(Some(at)),
+            Phase::NodeBirth(_) => Ok(self.node_birth(moment)),
             Phase::DeviceBirths(from) => match self.next_born(from) {
                 Some(place) => {
                     self.phase = Phase::DeviceBirths(place + 1);
-                    self.device_birth(place, tick).ok_or(None)
+                    self.device_birth(place, moment).ok_or(None)
                 }
                 None => {
                     self.phase = Phase::Live;
-                    self.live(tick)
+                    self.live(moment)
                 }
             },
-            Phase::Live => self.live(tick),
+            Phase::Live => self.live(moment),
         }
     }
 
@@ -329,22 +321,22 @@ impl Session {
         rest.filter(|(_, device)| waits(device)).map(|(place, _)| place).next()
     }
 
-    fn live(&mut self, tick: Tick) -> Result<Packet, Option<Instant>> {
+    fn live(&mut self, moment: Moment) -> Result<Packet, Option<Instant>> {
         if let Some(name) = self.departed.pop() {
-            return Ok(self.packet(Kind::DeviceDeath, Some(name), Vec::new(), tick));
+            return Ok(self.packet(Kind::DeviceDeath, Some(name), Vec::new(), moment));
         }
         if self.rebirth {
-            let due = self.born_at.map_or(tick.now, |at| at + REBIRTH);
-            return if due > tick.now {
+            let due = self.born_at.map_or(moment.now, |at| at + REBIRTH);
+            return if due > moment.now {
                 Err(Some(due))
             } else {
-                Ok(self.node_birth(tick))
+                Ok(self.node_birth(moment))
             };
         }
         let mut again: Option<Instant> = None;
         for step in 0..self.devices.len() {
             let place = (self.cursor + step) % self.devices.len();
-            match self.device(place, tick) {
+            match self.device(place, moment) {
                 Ok(packet) => {
                     self.cursor = place + 1;
                     return Ok(packet);
@@ -352,91 +344,80 @@ impl Session {
                 Err(due) => again = again.into_iter().chain(due).min(),
             }
         }
-        let (metrics, due) = self.node.data(self.rules.min_interval, tick.now);
+        let (metrics, due) = self.node.data(self.rules.min_interval, moment.now);
         if !metrics.is_empty() {
-            return Ok(self.packet(Kind::NodeData, None, metrics, tick));
+            return Ok(self.packet(Kind::NodeData, None, metrics, moment));
         }
         again = again.into_iter().chain(due).min();
-        self.past(tick).map_err(|due| again.into_iter().chain(due).min())
+        self.past(moment).map_err(|due| again.into_iter().chain(due).min())
     }
 
     /// The message that is due for a device.
-    fn device(&mut self, place: usize, tick: Tick) -> Result<Packet, Option<Instant>> {
+    fn device(&mut self, place: usize, moment: Moment) -> Result<Packet, Option<Instant>> {
         let least = self.rules.min_interval;
         let device = self.devices.get_mut(place).ok_or(None)?;
         if device.gone {
             (device.gone, device.born) = (false, false);
             let name = device.name.clone();
-            return Ok(self.packet(Kind::DeviceDeath, Some(name), Vec::new(), tick));
+            return Ok(self.packet(Kind::DeviceDeath, Some(name), Vec::new(), moment));
         }
         if device.present && !device.born {
-            return self.device_birth(place, tick).ok_or(None);
+            return self.device_birth(place, moment).ok_or(None);
         }
         if !device.born {
             return Err(None);
         }
-        let (metrics, due) = device.data(least, tick.now);
+        let (metrics, due) = device.data(least, moment.now);
         if metrics.is_empty() {
             return Err(due);
         }
         let name = device.name.clone();
-        Ok(self.packet(Kind::DeviceData, Some(name), metrics, tick))
+        Ok(self.packet(Kind::DeviceData, Some(name), metrics, moment))
     }
 
     /// The next message of the history.
-    fn past(&mut self, tick: Tick) -> Result<Packet, Option<Instant>> {
+    fn past(&mut self, moment: Moment) -> Result<Packet, Option<Instant>> {
         let holds = |device: &&mut Device| device.born && !device.history.is_empty();
         let device = self.devices.iter_mut().find(holds).ok_or(None)?;
         if let Some(due) = self
             .history_at
             .map(|at| at + HISTORY_PACE)
-            .filter(|due| *due > tick.now)
+            .filter(|due| *due > moment.now)
         {
             return Err(Some(due));
         }
         let (name, metrics) = (device.name.clone(), device.history(self.history_values));
-        self.history_at = Some(tick.now);
-        Ok(self.packet(Kind::DeviceData, Some(name), metrics, tick))
+        self.history_at = Some(moment.now);
+        Ok(self.packet(Kind::DeviceData, Some(name), metrics, moment))
     }
 
-    fn node_birth(&mut self, tick: Tick) -> Packet {
+    fn node_birth(&mut self, moment: Moment) -> Packet {
         self.seq = u8::MAX;
-        (self.phase, self.rebirth, self.born_at) = (Phase::DeviceBirths(0), false, Some(tick.now));
+        (self.phase, self.rebirth, self.born_at) = (Phase::DeviceBirths(0), false, Some(moment.now));
         for device in &mut self.devices {
             // The birth of the node ends what hosts knew of its devices.
             (device.born, device.gone) = (false, false);
         }
-        let control = Definition {
-            name: REBIRTH_METRIC.to_string(),
-            datatype: DataType::Boolean,
-            unit: String::new(),
-            low: None,
-            high: None,
-            pace: Pace::Normal,
-        };
-        let off = Sample {
-            value: Some(Datum::Bool(false)),
-            quality: Quality::Good,
-            time: tick.millis,
-        };
-        let mut metrics = vec![number(self.bd_seq, tick.millis), control.birth(Naming::Name, &off)];
-        metrics.extend(self.node.birth(tick));
-        self.packet(Kind::NodeBirth, None, metrics, tick)
+        let control = Definition::new(REBIRTH_METRIC, DataType::Boolean);
+        let off = moment.sample(Some(Datum::Bool(false)));
+        let mut metrics = vec![number(self.bd_seq, moment), control.birth(Naming::Name, &off)];
+        metrics.extend(self.node.birth(moment));
+        self.packet(Kind::NodeBirth, None, metrics, moment)
     }
 
-    fn device_birth(&mut self, place: usize, tick: Tick) -> Option<Packet> {
+    fn device_birth(&mut self, place: usize, moment: Moment) -> Option<Packet> {
         let device = self.devices.get_mut(place)?;
-        let (name, metrics) = (device.name.clone(), device.birth(tick));
-        Some(self.packet(Kind::DeviceBirth, Some(name), metrics, tick))
+        let (name, metrics) = (device.name.clone(), device.birth(moment));
+        Some(self.packet(Kind::DeviceBirth, Some(name), metrics, moment))
     }
 
-    fn packet(&mut self, kind: Kind, device: Option<String>, metrics: Vec<Metric>, tick: Tick) -> Packet {
+    fn packet(&mut self, kind: Kind, device: Option<String>, metrics: Vec<Metric>, moment: Moment) -> Packet {
         self.seq = self.seq.wrapping_add(1);
         Packet {
             kind,
             device,
             payload: Payload {
-                timestamp: Some(tick.millis),
+                timestamp: Some(moment.millis()),
                 metrics,
                 seq: Some(self.seq.into()),
             },
@@ -445,30 +426,18 @@ impl Session {
 }
 
 /// The metric `bdSeq`.
-fn number(bd_seq: u8, millis: u64) -> Metric {
-    let definition = Definition {
-        name: "bdSeq".to_string(),
-        datatype: DataType::Int64,
-        unit: String::new(),
-        low: None,
-        high: None,
-        pace: Pace::Normal,
-    };
-    let sample = Sample {
-        value: Some(Datum::Integer(bd_seq.into())),
-        quality: Quality::Good,
-        time: millis,
-    };
-    definition.data(Naming::Name, &sample, Some(Quality::Good))
+fn number(bd_seq: u8, moment: Moment) -> Metric {
+    let sample = moment.sample(Some(Datum::Integer(bd_seq.into())));
+    Definition::new("bdSeq", DataType::Int64).data(Naming::Name, &sample, Some(Quality::Good))
 }
 
-fn death(bd_seq: u8, millis: u64) -> Packet {
+fn death(bd_seq: u8, moment: Moment) -> Packet {
     Packet {
         kind: Kind::NodeDeath,
         device: None,
         payload: Payload {
-            timestamp: Some(millis),
-            metrics: vec![number(bd_seq, millis)],
+            timestamp: Some(moment.millis()),
+            metrics: vec![number(bd_seq, moment)],
             seq: None,
         },
     }

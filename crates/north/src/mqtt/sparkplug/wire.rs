@@ -110,25 +110,18 @@ impl Payload {
 /// The data types of Sparkplug that are used or understood.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum DataType {
-    Int32,
-    Int64,
-    UInt64,
-    Double,
-    Boolean,
-    String,
+    Int32 = 3,
+    Int64 = 4,
+    UInt64 = 8,
+    Double = 10,
+    Boolean = 11,
+    String = 12,
 }
 
 impl DataType {
     /// The code in metrics and properties.
     pub(super) fn code(self) -> u32 {
-        match self {
-            DataType::Int32 => 3,
-            DataType::Int64 => 4,
-            DataType::UInt64 => 8,
-            DataType::Double => 10,
-            DataType::Boolean => 11,
-            DataType::String => 12,
-        }
+        self as u32
     }
 }
 

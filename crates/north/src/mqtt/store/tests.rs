@@ -1,13 +1,9 @@
 use super::super::Qos;
-use super::super::outbox::{Delivery, Kind, Outbox};
+use super::super::outbox::{Delivery, Outbox};
 use super::*;
 
-fn count() -> LostCount {
-    LostCount(Arc::default(), MqttLoss::Event)
-}
-
-fn lost(count: &LostCount) -> u64 {
-    count.0.mqtt.losses().map(|(_, count)| count).sum()
+fn lost(stats: &NorthState) -> u64 {
+    stats.mqtt.losses().map(|(_, count)| count).sum()
 }
 
 fn event(n: usize) -> Message {
@@ -15,18 +11,15 @@ fn event(n: usize) -> Message {
 }
 
 /// A store whose disk does nothing until the test wants it.
-fn stalled() -> (Store, Receiver<Job>, mpsc::Sender<Loaded>, LostCount) {
+fn stalled() -> (Store, Receiver<Job>, mpsc::Sender<Loaded>, Arc<NorthState>) {
     let (jobs, todo) = flume::bounded(JOBS);
     let (report, loaded) = mpsc::channel(4);
-    let lost = count();
+    let lost = Arc::<NorthState>::default();
     let store = Store {
         disk: Some(Disk {
-            lost: lost.clone(),
             jobs,
-            bytes: Arc::default(),
-            gone: Arc::default(),
             loaded,
-            ended: tokio::sync::oneshot::channel().1,
+            shared: Shared::new(lost.clone(), MqttKind::Event),
         }),
         ..Store::default()
     };
@@ -106,7 +99,7 @@ async fn what_is_not_acknowledged_is_there_in_the_next_run() {
         dir: dir.path().to_path_buf(),
         max_bytes: 1 << 20,
     };
-    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", count());
+    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", (&Arc::default(), MqttKind::Event));
     for n in 0..10 {
         store.push(event(n), false);
     }
@@ -119,7 +112,7 @@ async fn what_is_not_acknowledged_is_there_in_the_next_run() {
     store.remember(vec!["a/b".to_string(), "c".to_string()]);
     store.close().await;
 
-    let mut store = Store::open(Some(buffer), "mqtt-events", count());
+    let mut store = Store::open(Some(buffer), "mqtt-events", (&Arc::default(), MqttKind::Event));
     let report = store.next().await;
     let (_, topics) = store.take(report);
     assert_eq!(topics, ["a/b", "c"]);
@@ -140,7 +133,7 @@ async fn a_directory_that_cannot_be_used_leaves_messages_in_memory() {
         dir: "/proc/drivegate".into(),
         max_bytes: 1 << 20,
     };
-    let mut store = Store::open(Some(buffer), "mqtt-events", count());
+    let mut store = Store::open(Some(buffer), "mqtt-events", (&Arc::default(), MqttKind::Event));
     store.push(event(0), true);
     let report = store.next().await;
     store.take(report);
@@ -167,8 +160,8 @@ async fn of_a_full_buffer_each_message_waits_or_is_counted_over_a_restart() {
         dir: dir.path().to_path_buf(),
         max_bytes: 64 << 10,
     };
-    let counted = count();
-    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", counted.clone());
+    let counted = Arc::<NorthState>::default();
+    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", (&counted, MqttKind::Event));
     let report = store.next().await;
     store.take(report);
     let mut outbox = Outbox::new(Delivery {
@@ -179,20 +172,20 @@ async fn of_a_full_buffer_each_message_waits_or_is_counted_over_a_restart() {
     // The first 1,024 go to the outbox at once.
     for n in 0..1240 {
         let message = Message::not_retained("e", format!("{n:200}").into_bytes());
-        if let Some((number, message)) = store.push(message, outbox.room(Kind::Event) > 0) {
-            outbox.push(Kind::Event, message, number);
+        if let Some((number, message)) = store.push(message, outbox.room(MqttKind::Event) > 0) {
+            outbox.push(MqttKind::Event, message, number);
         }
     }
     settle(&mut store).await;
-    outbox.drop_gone(Kind::Event, store.gone());
+    outbox.drop_gone(MqttKind::Event, store.gone());
     let waiting = outbox.events() as u64 + store.waiting();
-    let given_up = lost(&counted) + outbox.take_lost().events;
+    let given_up = lost(&counted) + outbox.take_lost().iter().map(|(_, count)| count).sum::<u64>();
     assert!((150..400).contains(&waiting), "{waiting} in 64 KiB");
     assert_eq!(waiting + given_up, 1240);
     store.close().await;
 
-    let counted = count();
-    let mut store = Store::open(Some(buffer), "mqtt-events", counted.clone());
+    let counted = Arc::<NorthState>::default();
+    let mut store = Store::open(Some(buffer), "mqtt-events", (&counted, MqttKind::Event));
     let report = store.next().await;
     store.take(report);
     assert_eq!(store.waiting(), waiting);
@@ -214,7 +207,7 @@ async fn deleted_files_and_topics_are_written_again() {
         dir: dir.path().join("buffer"),
         max_bytes: 1 << 20,
     };
-    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", count());
+    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", (&Arc::default(), MqttKind::Event));
     store.remember(vec!["a/b".to_string()]);
     (0..5).for_each(|n| drop(store.push(event(n), false)));
     let report = store.next().await;
@@ -223,7 +216,7 @@ async fn deleted_files_and_topics_are_written_again() {
     std::fs::remove_dir_all(&buffer.dir).unwrap();
     store.push(event(5), false);
     store.close().await;
-    let mut store = Store::open(Some(buffer), "mqtt-events", count());
+    let mut store = Store::open(Some(buffer), "mqtt-events", (&Arc::default(), MqttKind::Event));
     let report = store.next().await;
     let (_, topics) = store.take(report);
     assert_eq!((store.waiting(), topics), (6, vec!["a/b".to_string()]));
@@ -238,7 +231,7 @@ async fn a_list_of_topics_that_finds_no_room_leaves_nothing_behind() {
     };
     let new = dir.path().join(format!("{MQTT_TOPICS}.new"));
     std::os::unix::fs::symlink("/dev/full", &new).unwrap();
-    let store = Store::open(Some(buffer), "mqtt-events", count());
+    let store = Store::open(Some(buffer), "mqtt-events", (&Arc::default(), MqttKind::Event));
     store.remember(vec!["a/b".to_string()]);
     store.close().await;
     assert!(new.symlink_metadata().is_err(), "it would take the room of messages");

@@ -157,9 +157,9 @@ fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
         crate::drive::Value::Bool(false),
     )];
     let _placed = drive.place(
-        Order::Points(points),
+        crate::command::Order::Points(points),
         origin,
-        Authority::Write,
+        crate::command::Authority::Write,
         Duration::from_secs(1),
         bench.now,
     );

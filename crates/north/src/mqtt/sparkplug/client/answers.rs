@@ -1,41 +1,29 @@
 //! What the broker answers to the subscriptions, and births that fit into its packets.
 
-use rumqttc::mqttbytes::QoS;
-use rumqttc::mqttbytes::v5::Filter;
-
 use super::*;
 use crate::mqtt::connection::{PACKET_OVERHEAD, commanding};
 use crate::mqtt::sparkplug::session::FIXED_METRICS;
 use crate::mqtt::sparkplug::topics::Kind;
+use rumqttc::mqttbytes::QoS;
 
-impl Client {
-    pub(super) fn filters(&self, limits: BrokerLimits) -> Vec<Filter> {
-        let drives = self
-            .drives
-            .iter()
-            .map(|drive| drive.metrics.drive.image.spec.name.as_str());
-        filters(
-            &self.topics,
-            self.broker.commands,
-            (!limits.wildcards).then(|| drives.collect()),
-        )
-    }
-
-    pub(super) fn subscribe(&mut self, limits: BrokerLimits) {
-        let filters = self.filters(limits);
-        if !self.link.subscribe(filters) {
-            self.give_up("the subscription could not be sent");
+impl NodeClient {
+    /// What the node subscribes to: commands for itself, the primary host, commands for its devices.
+    pub(super) fn subscriptions(&self, limits: BrokerLimits) -> Vec<Filter> {
+        let topics = &self.topics;
+        let plain = |path| Filter {
+            path,
+            qos: QoS::AtLeastOnce,
+            ..Filter::default()
+        };
+        let mut filters = vec![commanding(topics.node_commands())];
+        filters.extend(topics.state().into_iter().chain(topics.old_state()).map(plain));
+        let name = |drive: &Drive| topics.commands_of(&drive.metrics.drive.image.spec.name);
+        match limits.wildcards {
+            _ if !self.broker.commands => {}
+            true => filters.push(commanding(topics.device_commands())),
+            false => filters.extend(self.drives.iter().map(name).map(commanding)),
         }
-    }
-
-    /// The broker answered the subscriptions.
-    pub(super) fn subscribed(&mut self, refused: &[Option<String>], ready: Option<BrokerLimits>) {
-        if let Some(limits) = self.link.limits() {
-            self.report_refused(&self.filters(limits), refused);
-        }
-        if let Some(limits) = ready {
-            self.ready(limits);
-        }
+        filters
     }
 
     pub(super) fn report_refused(&self, filters: &[Filter], refused: &[Option<String>]) {
@@ -47,7 +35,7 @@ impl Client {
             {
                 tracing::error!(
                     target: "drivegate::north::mqtt", "the broker refuses a Sparkplug subscription ({why}); allow client {} to subscribe to {}",
-                    self.link.client_id(),
+                    self.common.link.client_id(),
                     filter.path
                 );
             }
@@ -56,7 +44,7 @@ impl Client {
 
     /// A birth without the metrics for which the broker's packets are too small; the session leaves them out from now on.
     pub(super) fn fitted(&mut self, mut packet: Packet) -> Packet {
-        let Some(limits) = self.link.limits() else {
+        let Some(limits) = self.common.link.limits() else {
             return packet;
         };
         let (most, all) = (limits.max_packet, packet.payload.metrics.len());
@@ -85,22 +73,4 @@ impl Client {
         }
         packet
     }
-}
-
-/// What the node subscribes to: commands for itself, the primary host, commands for its devices.
-/// `drives` if the broker takes no wildcards.
-fn filters(topics: &Topics, commands: bool, drives: Option<Vec<&str>>) -> Vec<Filter> {
-    let plain = |path| Filter {
-        path,
-        qos: QoS::AtLeastOnce,
-        ..Filter::default()
-    };
-    let mut filters = vec![commanding(topics.node_commands())];
-    filters.extend(topics.state().into_iter().chain(topics.old_state()).map(plain));
-    match drives {
-        _ if !commands => {}
-        None => filters.push(commanding(topics.device_commands())),
-        Some(drives) => filters.extend(drives.into_iter().map(|drive| commanding(topics.commands_of(drive)))),
-    }
-    filters
 }

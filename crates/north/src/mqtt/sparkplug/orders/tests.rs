@@ -1,10 +1,9 @@
 use super::*;
 use crate::codec::Reply;
-use crate::command::{Outcome, Urgency};
+use crate::command::{Order, Outcome, Urgency};
 use crate::command_json::REMEMBERED;
-use crate::drive::PointIndex;
+use crate::drive::{PointIndex, Value};
 use crate::mqtt::fixture;
-use crate::mqtt::sparkplug::model;
 use crate::mqtt::sparkplug::session::Rules;
 use crate::mqtt::sparkplug::topics::Topics;
 use drivegate_testkit::{audited, next_command};
@@ -28,7 +27,7 @@ fn bench() -> Bench {
         history: true,
         min_interval: Duration::ZERO,
     });
-    session.adopt(model::node_definitions(&plant), vec![("p1".to_string(), definitions)]);
+    session.adopt(Vec::new(), vec![("p1".to_string(), definitions)]);
     Bench {
         orders: Orders::new(SharedMemory::default(), None),
         plant,

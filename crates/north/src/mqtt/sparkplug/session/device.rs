@@ -3,10 +3,8 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use super::Tick;
-use crate::drive::Quality;
 use crate::mqtt::sparkplug::history::Recorder;
-use crate::mqtt::sparkplug::metric::{Definition, Naming, Pace, Sample};
+use crate::mqtt::sparkplug::metric::{Definition, Moment, Naming, Pace, Sample};
 use crate::mqtt::sparkplug::wire::Metric;
 
 /// Least time between two messages because of figures alone.
@@ -60,19 +58,15 @@ impl Device {
     }
 
     /// All metrics, those that nothing is known of too; they count as published at `now`.
-    pub(super) fn birth(&mut self, tick: Tick) -> Vec<Metric> {
-        let unknown = Sample {
-            value: None,
-            quality: Quality::Bad,
-            time: tick.millis,
-        };
+    pub(super) fn birth(&mut self, moment: Moment) -> Vec<Metric> {
+        let unknown = moment.sample(None);
         let samples = self.now_is.iter().chain(std::iter::repeat(&unknown));
         let all = self.definitions.iter().zip(&self.namings).zip(samples);
         let metrics = all.map(|((d, naming), sample)| d.birth(*naming, sample));
         let metrics = metrics.take(self.most).collect();
         let sent = (0..self.definitions.len()).map(|place| self.now_is.get(place).cloned());
         self.sent = sent.collect();
-        (self.born, self.gone, self.changed, self.sent_at) = (true, false, false, Some(tick.now));
+        (self.born, self.gone, self.changed, self.sent_at) = (true, false, false, Some(moment.now));
         self.repeat.clear();
         metrics
     }

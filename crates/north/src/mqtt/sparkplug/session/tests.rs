@@ -1,6 +1,7 @@
 //! What a host sees of the session, held against the rules of the specification.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::time::UNIX_EPOCH;
 
 use super::*;
 use crate::mqtt::sparkplug::wire::MetricValue;
@@ -25,14 +26,7 @@ fn live() -> Rules {
 }
 
 fn definitions(names: &[&str]) -> Vec<Definition> {
-    let of = |name: &&str| Definition {
-        name: name.to_string(),
-        datatype: DataType::Double,
-        unit: String::new(),
-        low: None,
-        high: None,
-        pace: Pace::Normal,
-    };
+    let of = |name: &&str| Definition::new(name, DataType::Double);
     names.iter().map(of).collect()
 }
 
@@ -197,10 +191,10 @@ impl Bench {
         bench
     }
 
-    fn tick(&self) -> Tick {
-        Tick {
+    fn tick(&self) -> Moment {
+        Moment {
             now: self.start + Duration::from_millis(self.time),
-            millis: self.time,
+            wall: UNIX_EPOCH + Duration::from_millis(self.time),
         }
     }
 
@@ -211,7 +205,7 @@ impl Bench {
     }
 
     fn connect(&mut self, bd_seq: u8) {
-        self.host.connect(&self.session.will(bd_seq, self.time));
+        self.host.connect(&self.session.will(bd_seq, self.tick()));
         self.session.opened(bd_seq, usize::MAX);
     }
 
@@ -404,7 +398,7 @@ fn the_primary_host_opens_and_ends_the_session() {
     assert!(!bench.state(true, 101));
     assert!(!bench.state(false, 100), "it is older than the last");
     assert!(bench.state(false, 101), "the connection is given up");
-    let death = bench.session.end(bench.time);
+    let death = bench.session.end(bench.tick());
     bench.host.see(&death);
     assert_eq!(bench.send(9), 0);
     // The next connection waits for a state of its own.
@@ -593,7 +587,7 @@ fn a_thousand_connections() {
                         let ends = bench.state(online, bench.time);
                         alive |= online;
                         if ends {
-                            let death = bench.session.end(bench.time);
+                            let death = bench.session.end(bench.tick());
                             bench.host.see(&death);
                             break;
                         }
@@ -637,7 +631,7 @@ fn a_thousand_connections() {
 }
 
 /// Names and nulls of the metrics of the next message, which is of this kind.
-fn next_metrics(session: &mut Session, kind: Kind, tick: Tick) -> Vec<(String, bool)> {
+fn next_metrics(session: &mut Session, kind: Kind, tick: Moment) -> Vec<(String, bool)> {
     let packet = session.next(tick).unwrap();
     assert_eq!(packet.kind, kind);
     let metrics = packet.payload.metrics.into_iter();
@@ -652,8 +646,8 @@ fn births_have_every_metric_though_nothing_is_known_yet() {
     session.adopt(definitions(&["Bus/line1/state", "Bus/line1/load"]), vec![]);
     session.opened(0, usize::MAX);
     session.subscribed();
-    let (now, millis) = (Instant::now(), 7);
-    let metrics = next_metrics(&mut session, Kind::NodeBirth, Tick { now, millis });
+    let now = Moment::present();
+    let metrics = next_metrics(&mut session, Kind::NodeBirth, now);
     let expected = [
         ("bdSeq", false),
         (REBIRTH_METRIC, false),
@@ -662,9 +656,9 @@ fn births_have_every_metric_though_nothing_is_known_yet() {
     ];
     assert_eq!(metrics, expected.map(|(name, null)| (name.to_string(), null)));
     session.tell_node(vec![sample(1.0, 8), sample(2.0, 8)]);
-    let later = Tick {
-        now: now + Duration::from_secs(2),
-        millis: 8,
+    let later = Moment {
+        now: now.now + Duration::from_secs(2),
+        ..now
     };
     let metrics = next_metrics(&mut session, Kind::NodeData, later);
     assert_eq!(metrics.len(), 2, "what becomes known is told");
@@ -678,9 +672,9 @@ fn what_was_left_out_of_a_birth_is_in_no_data() {
     session.opened(0, 1000);
     session.subscribed();
     let start = Instant::now();
-    let at = |s: u64| Tick {
+    let at = |s: u64| Moment {
         now: start + Duration::from_secs(s),
-        millis: s * 1000,
+        wall: UNIX_EPOCH + Duration::from_secs(s),
     };
     let tell = |session: &mut Session, number: f64| {
         let samples = (0..3).map(|_| sample(number, 1)).collect();

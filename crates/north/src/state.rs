@@ -1,0 +1,48 @@
+//! What the servers share.
+
+use std::sync::Arc;
+
+use super::command_json::SharedMemory;
+use super::http::SharedReply;
+use super::listener::ListenerStates;
+use super::mqtt::Handover;
+use super::stats::{BacnetStats, ModbusTcpStats, MqttStats, RefusalStats, ReloadStats, SlotStats};
+use crate::history::{History, Recordings};
+use crate::parameters::Vault;
+
+/// What the servers share and a reload, which replaces servers, keeps: counters, recent commands, and what is recorded.
+#[derive(Debug, Default)]
+pub struct NorthState {
+    /// The recordings.
+    pub recordings: Arc<Recordings>,
+    /// Readings of parameters, and restores.
+    pub parameters: Arc<Vault>,
+    /// Trends, counters and events of the past.
+    pub history: Arc<History>,
+    /// Of the Modbus TCP server.
+    pub modbus_tcp: ModbusTcpStats,
+    /// Of the MQTT client.
+    pub mqtt: MqttStats,
+    /// Of the tool slots.
+    pub slots: SlotStats,
+    /// Of the BACnet server.
+    pub bacnet: BacnetStats,
+    /// Refused connections of all servers.
+    pub refused: RefusalStats,
+    /// The listeners of all servers, and whether they listen.
+    pub listeners: Arc<ListenerStates>,
+    /// The last time the configuration was read.
+    pub reload: ReloadStats,
+    /// Recent commands.
+    pub(super) commands: RememberedCommands,
+    /// What an MQTT client leaves to the next one.
+    pub mqtt_left: Handover,
+}
+
+/// The recent commands of all ways that recognise a repetition. They outlive the servers that a reload replaces.
+#[derive(Debug, Default)]
+pub(super) struct RememberedCommands {
+    /// From the broker.
+    pub(super) mqtt: SharedMemory,
+    pub(super) http: SharedMemory<SharedReply>,
+}
