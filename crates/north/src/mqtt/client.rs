@@ -1,4 +1,4 @@
-//! The task that owns outbox, journal and publisher, and publishes while there is a connection.
+//! The client of the plain topics: it owns outbox, journal and publisher, and publishes while there is a connection.
 
 mod answers;
 mod buffering;

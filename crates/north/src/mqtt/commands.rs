@@ -64,9 +64,9 @@ pub(super) struct OrdersLeft {
     pub(super) results: Vec<Message>,
 }
 
-/// A command that is not finished.
+/// A command, until it is answered.
 #[derive(Debug)]
-struct PendingCommand {
+pub(super) struct PendingCommand {
     number: u64,
     id: Option<Id>,
     reply: Reply,
@@ -83,19 +83,9 @@ struct PendingStop {
 /// A finished command.
 #[derive(Debug)]
 pub(super) enum Finished {
-    Command(FinishedCommand),
+    Command(PendingCommand, Answer, Shown),
     /// A stop of all drives.
     StopAll(Reply, StopReport),
-}
-
-/// A command whose result is known.
-#[derive(Debug)]
-pub(super) struct FinishedCommand {
-    number: u64,
-    id: Option<Id>,
-    reply: Reply,
-    answer: Answer,
-    shown: Shown,
 }
 
 impl Commands {
@@ -291,7 +281,7 @@ impl Commands {
     /// Returns the result of a refused command; any other waits.
     fn follow(&mut self, mut pending: PendingCommand, time: SystemTime) -> Option<Message> {
         match pending.placed.answer().filter(|answer| !answer.outcome.is_ok()) {
-            Some(answer) => Some(self.result(pending.end(answer, Shown::default()), time)),
+            Some(answer) => Some(self.result(pending, &answer, Shown::default(), time)),
             None => {
                 self.waiting.push(pending);
                 None
@@ -317,7 +307,7 @@ impl Commands {
     fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<Finished> {
         match self.poll_stopped(cx) {
             Poll::Ready((reply, report)) => Poll::Ready(Finished::StopAll(reply, report)),
-            Poll::Pending => self.poll_command(cx).map(Finished::Command),
+            Poll::Pending => self.poll_command(cx),
         }
     }
 
@@ -333,10 +323,12 @@ impl Commands {
         Poll::Pending
     }
 
-    fn poll_command(&mut self, cx: &mut Context<'_>) -> Poll<FinishedCommand> {
+    fn poll_command(&mut self, cx: &mut Context<'_>) -> Poll<Finished> {
         while let Some(mut pending) = self.waiting.take(|r| r.placed.poll_answer(cx).is_ready()) {
             match pending.placed.answer() {
-                Some(answer) if !answer.outcome.is_ok() => return Poll::Ready(pending.end(answer, Shown::default())),
+                Some(answer) if !answer.outcome.is_ok() => {
+                    return Poll::Ready(Finished::Command(pending, answer, Shown::default()));
+                }
                 _ => self.confirming.push(pending),
             }
         }
@@ -347,7 +339,7 @@ impl Commands {
         });
         let finished = next.and_then(|mut pending| {
             let (answer, shown) = (pending.placed.answer()?, pending.placed.shown());
-            Some(pending.end(answer, shown))
+            Some(Finished::Command(pending, answer, shown))
         });
         finished.map_or(Poll::Pending, Poll::Ready)
     }
@@ -355,20 +347,18 @@ impl Commands {
     /// The one answer to what is finished, at `time`.
     pub(super) fn answer(&mut self, finished: Finished, time: SystemTime) -> Message {
         match finished {
-            Finished::Command(finished) => self.result(finished, time),
+            Finished::Command(pending, answer, shown) => self.result(pending, &answer, shown, time),
             // Strings and words can always be serialized.
             Finished::StopAll(reply, report) => reply.with(serde_json::to_vec(&report).unwrap_or_default()),
         }
     }
 
     /// The one result of a finished command, at `time`.
-    fn result(&mut self, finished: FinishedCommand, time: SystemTime) -> Message {
-        let message = finished
-            .reply
-            .message(finished.id, &finished.answer, finished.shown, time);
+    fn result(&mut self, pending: PendingCommand, answer: &Answer, shown: Shown, time: SystemTime) -> Message {
+        let message = pending.reply.message(pending.id, answer, shown, time);
         self.memory
             .lock()
-            .finished(finished.number, &message.payload.as_slice().into());
+            .finished(pending.number, &message.payload.as_slice().into());
         message
     }
 
@@ -389,16 +379,6 @@ fn repeats(why: &str) -> String {
 }
 
 impl PendingCommand {
-    fn end(self, answer: Answer, shown: Shown) -> FinishedCommand {
-        FinishedCommand {
-            number: self.number,
-            id: self.id,
-            reply: self.reply,
-            answer,
-            shown,
-        }
-    }
-
     /// Number of bytes whose length the client controls.
     fn bytes(&self) -> usize {
         self.reply.bytes() + self.id.as_ref().map_or(0, |id| id.text().len())

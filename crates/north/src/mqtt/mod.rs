@@ -9,12 +9,13 @@
 //!                commands ◀──────────────────────── set topics ◀──────┘
 //! ```
 //!
-//! `payload`, `publisher`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and
-//! in which order; `offline` drives `commands` without a broker. `broker_limits`, `silence`, `retry` and `takeover` judge what the broker does,
-//! without I/O as well, `back_off` chooses the broker. `client` owns them. `sparkplug` is a client of its own, on a link of
-//! its own. `session` is the loop of both: it connects, reconnects, follows reloads and disconnects. `link` is the way to
-//! one of the brokers: it owns the `connection`, which wraps rumqttc, which keeps no state: every connection is a new client
-//! with a clean session, and unacknowledged messages are sent again from the outbox.
+//! `payload`, `publisher`, `rounds`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O: they decide
+//! what is published, when, and in which order; `offline` drives `commands` without a broker. `broker_limits`, `silence`,
+//! `retry` and `takeover` judge what the broker does, without I/O as well, `back_off` chooses the broker. `client` owns
+//! them. `sparkplug` is a client of its own, on a link of its own. `session` is the loop of both: it connects, reconnects,
+//! follows reloads and disconnects. `link` is the way to one of the brokers: it owns the `connection`, which wraps rumqttc,
+//! which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are sent again
+//! from the outbox. `handover` keeps what a client leaves to the one after a reload.
 
 mod back_off;
 mod broker_limits;

@@ -2,7 +2,7 @@
 
 use serde_json::{Map, Value, json};
 
-use super::entity::{self, Entities};
+use super::entity::{self, Entities, extend};
 use super::{Sources, id_of};
 use crate::plant::{DriveHandle, Plant};
 
@@ -84,34 +84,31 @@ impl Device {
                 let spec = &drive.image.spec;
                 let title = spec.profile.described();
                 let mut head = self.head(sources, &spec.name, made(&title), Some(gateway));
-                head.insert("avty".into(), entity::of_drive_availability(sources, spec));
+                extend(
+                    &mut head,
+                    json!({ "avty": entity::of_drive_availability(sources, spec) }),
+                );
                 (head, entity::of_drive(sources, &self.id, spec))
             }
         };
         parts(&head, entities, limit)
     }
 
-    fn head(
-        &self,
-        sources: &Sources,
-        name: &str,
-        (manufacturer, model): (&str, &str),
-        gateway: Option<&str>,
-    ) -> Map<String, Value> {
+    fn head(&self, sources: &Sources, name: &str, (manufacturer, model): (&str, &str), gateway: Option<&str>) -> Value {
         let version = crate::version::VERSION;
         let mut device = match gateway {
             Some(gateway) => json!({ "ids": [self.id], "name": name, "mdl": model, "via_device": gateway }),
             None => json!({ "ids": [self.id], "name": name, "mdl": model, "sw": version }),
         };
-        if let Some(device) = device.as_object_mut().filter(|_| !manufacturer.is_empty()) {
-            device.insert("mf".into(), manufacturer.into());
+        if !manufacturer.is_empty() {
+            extend(&mut device, json!({ "mf": manufacturer }));
         }
-        let mut head = Map::new();
-        head.insert("dev".into(), device);
-        head.insert("o".into(), json!({ "name": "drivegate", "sw": version }));
-        head.insert("avty".into(), entity::of_gateway_availability(sources));
-        head.insert("avty_mode".into(), "all".into());
-        head
+        json!({
+            "dev": device,
+            "o": { "name": "drivegate", "sw": version },
+            "avty": entity::of_gateway_availability(sources),
+            "avty_mode": "all",
+        })
     }
 }
 
@@ -129,11 +126,11 @@ pub(super) fn made(title: &str) -> (&str, &str) {
 }
 
 /// The entities with the head, in payloads of at most `limit` bytes as far as possible.
-fn parts(head: &Map<String, Value>, entities: Entities, limit: usize) -> Vec<Vec<u8>> {
+fn parts(head: &Value, entities: Entities, limit: usize) -> Vec<Vec<u8>> {
     let render = |entities: Map<String, Value>| {
         let mut message = head.clone();
-        message.insert("cmps".into(), entities.into());
-        Value::from(message).to_string().into_bytes()
+        extend(&mut message, json!({ "cmps": entities }));
+        message.to_string().into_bytes()
     };
     let empty = render(Map::new()).len();
     let mut payloads = Vec::new();

@@ -413,7 +413,8 @@ fn component(platform: Platform, name: &str, keys: impl IntoIterator<Item = Valu
     (format!("{}_{name}", platform.name()), component)
 }
 
-fn extend(entity: &mut Value, more: Value) {
+/// Adds keys, or replaces them.
+pub(super) fn extend(entity: &mut Value, more: Value) {
     if let (Value::Object(entity), Value::Object(more)) = (entity, more) {
         entity.extend(more);
     }

@@ -58,9 +58,10 @@ impl BdSeq {
         (number, written)
     }
 
-    /// A broker accepted a connection with the number.
-    pub(super) fn accepted(&mut self) {
+    /// A broker accepted the connection with the last number, which is returned.
+    pub(super) fn accepted(&mut self) -> u8 {
         self.used = true;
+        self.number
     }
 
     pub(super) fn path(&self) -> &Path {

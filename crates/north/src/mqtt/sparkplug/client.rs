@@ -1,4 +1,4 @@
-//! The task that owns session, commands and connection. It never waits for the broker: what finds no room is kept, and
+//! The edge node as a client of its broker: it owns the session and the commands. It never waits for the broker: what finds no room is kept, and
 //! no more messages are taken from the session until there is room.
 
 mod answers;
@@ -94,8 +94,6 @@ struct NodeClient {
     /// A message that found no room.
     held: Option<Message>,
     buses_at: Instant,
-    /// Number of the connection.
-    number: u8,
     /// Whether the death of the node is to be declared at this broker, and how long to wait before the next one.
     leaving: Option<Duration>,
     /// When another broker is tried, because the primary host is not online at this one.
@@ -132,7 +130,6 @@ impl NodeClient {
             bd_seq_fails: false,
             held: None,
             buses_at: now,
-            number: 0,
             leaving: None,
             host_until: None,
             waits_logged: false,
@@ -321,8 +318,8 @@ impl session::Client for NodeClient {
     }
 
     async fn will(&mut self) -> Will {
-        self.number = self.next_number().await;
-        let death = self.session.will(self.number, Moment::present());
+        let number = self.next_number().await;
+        let death = self.session.will(number, Moment::present());
         Will {
             topic: self.topics.of(death.kind, None),
             payload: death.payload.encoded(),
@@ -331,8 +328,8 @@ impl session::Client for NodeClient {
     }
 
     fn accepted(&mut self, limits: BrokerLimits) {
-        self.bd_seq.accepted();
-        self.session.opened(self.number, limits.max_packet);
+        let number = self.bd_seq.accepted();
+        self.session.opened(number, limits.max_packet);
     }
 
     fn filters(&mut self, limits: BrokerLimits) -> Vec<Filter> {

@@ -9,7 +9,7 @@
 //!
 //! `topics`, `wire`, `metric`, `host`, `history` and `session` are pure: the session receives the drives' values and
 //! the broker's messages, and returns the next message. `model` makes metrics of drives and buses, `orders` makes
-//! commands of commands. `bd_seq` keeps the number of the session on disk. `client` is the task that owns them and the
+//! commands of commands. `bd_seq` keeps the number of the session on disk. `client` owns them and the
 //! connection, which is apart from that of the MQTT topics, because its last will is the death of the node.
 
 mod bd_seq;
