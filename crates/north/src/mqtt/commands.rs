@@ -147,29 +147,25 @@ impl Commands {
         };
         let result = self.topics.drive(name, "result");
         let reply = Reply::to(&incoming, result, name, &self.rules.responses);
-        let what = excerpt(&incoming.payload);
+        let (id, what) = (request::id(&incoming, point), excerpt(&incoming.payload));
         let Some(drive) = plant.drive(name) else {
             let answer = refuse_unknown(plant, name, &what, origin, now);
-            return Some(reply.message(request::id(&incoming, point), &answer, Shown::default(), time));
+            return Some(reply.message(id, &answer, Shown::default(), time));
         };
         let profile = &drive.image.spec.profile;
-        let request = request::read(&incoming, point, profile);
         let refused = |answer: &Answer, id| Some(reply.message(id, answer, Shown::default(), time));
-        let mut asked = match request.order {
-            Err(refusal) => return refused(&drive.refuse(&what, refusal, origin, now), request.id),
+        let mut asked = match request::order(&incoming, point, profile) {
+            Err(refusal) => return refused(&drive.refuse(&what, refusal, origin, now), id),
             Ok(asked) => asked,
         };
         let mut number = 0;
         if asked.does_more(profile) {
             let taken = incoming.taken();
-            let print = self
-                .memory
-                .lock()
-                .fingerprint(&taken, request.id.as_ref().map(Id::text));
+            let print = self.memory.lock().fingerprint(&taken, id.as_ref().map(Id::text));
             let stops = drive.stops();
             let repeated = self.memory.lock().repeated(&taken, print, stops, now);
             let why = match repeated {
-                None => self.may_take(&reply, request.id.as_ref(), crowded, now).err(),
+                None => self.may_take(&reply, id.as_ref(), crowded, now).err(),
                 Some(Repetition::Outdated(why)) => Some(repeats(why)),
                 // Its stop is carried out once more, and answered once more.
                 Some(Repetition::Pending | Repetition::Answered(_)) if asked.stops(profile) => {
@@ -185,11 +181,11 @@ impl Commands {
         }
         let placed = match asked.place(&drive, &what, origin, (incoming.asked.unwrap_or(now), now)) {
             Ok(placed) => placed,
-            Err(answer) => return refused(&answer, request.id),
+            Err(answer) => return refused(&answer, id),
         };
         let pending = PendingCommand {
             number,
-            id: request.id,
+            id,
             placed,
             reply,
         };

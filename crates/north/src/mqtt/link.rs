@@ -243,7 +243,7 @@ impl BrokerLink {
     }
 
     /// The connection could not be ended in order.
-    pub(super) fn log_unorderly(&self) {
+    pub(super) fn log_timed_out(&self) {
         tracing::warn!(target: "drivegate::north::mqtt", "{}the orderly disconnect timed out; the broker publishes the last will", self.prefix);
     }
 

@@ -84,23 +84,6 @@ impl Incoming {
     }
 }
 
-/// The content of a message.
-#[derive(Debug, PartialEq)]
-pub(super) struct SetRequest {
-    /// The `id`, also if the rest is refused.
-    pub(super) id: Option<Id>,
-    /// Points and expiry.
-    pub(super) order: Result<Asked, Refusal>,
-}
-
-/// Parses a message on a set topic; `point` is the point of a bare value.
-pub(super) fn read(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> SetRequest {
-    SetRequest {
-        id: id(incoming, point),
-        order: order(incoming, point, profile),
-    }
-}
-
 /// The `id` of a message, read before the rest, so that a client finds its request in the result whatever else is
 /// wrong. `None` if the payload is not JSON or contains several.
 pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Id> {
@@ -110,7 +93,11 @@ pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Id> {
     }
 }
 
-fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<Asked, Refusal> {
+/// What a message on a set topic asks for; `point` is the point of a bare value.
+///
+/// # Errors
+/// Why nothing of it is executed.
+pub(super) fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<Asked, Refusal> {
     if incoming.retain {
         return Err(Refusal::NotAllowed(
             "a retained message is never a command; publish it without the retain flag and clear the topic".to_string(),
@@ -169,6 +156,19 @@ mod tests {
         Incoming {
             payload: payload.into(),
             ..Incoming::default()
+        }
+    }
+
+    struct SetRequest {
+        /// Also if the rest is refused.
+        id: Option<Id>,
+        order: Result<Asked, Refusal>,
+    }
+
+    fn read(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> SetRequest {
+        SetRequest {
+            id: id(incoming, point),
+            order: order(incoming, point, profile),
         }
     }
 

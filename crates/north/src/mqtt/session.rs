@@ -242,6 +242,6 @@ async fn leave(client: &mut impl Client) {
         }
     };
     if tokio::time::timeout(LEAVE, disconnect).await.is_err() {
-        client.common().link.log_unorderly();
+        client.common().link.log_timed_out();
     }
 }

@@ -1,5 +1,5 @@
-//! The edge node as a client of its broker: it owns the session and the commands. It never waits for the broker: what finds no room is kept, and
-//! no more messages are taken from the session until there is room.
+//! The edge node as a client of its broker: it owns the session and the commands. It never waits for the broker: what finds
+//! no room is kept, and no more messages are taken from the session until there is room.
 
 mod answers;
 
