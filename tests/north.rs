@@ -14,5 +14,4 @@ mod north {
     mod http;
     mod modbus_tcp;
     mod mqtt;
-    mod plant;
 }

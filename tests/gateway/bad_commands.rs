@@ -5,6 +5,7 @@ use std::net::TcpStream;
 
 use drivegate::sim::statistics::Direction;
 use drivegate::sim::wire::SimulatedBus;
+use drivegate_testkit::rows;
 
 use crate::support::process::{PATIENCE, Running, api, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, drive, functions};
@@ -35,14 +36,14 @@ class = "slow"
 write = true
 "#;
 
-struct Bench {
+struct RecordedSite {
     site: Site,
     line: SimulatedBus,
     _others: [Running; 2],
 }
 
 /// Drives `pump` and `plain`, which may be commanded, `watched`, which may not, and `gone`, which is not there.
-fn bench() -> Bench {
+fn rig() -> RecordedSite {
     let drives = [
         controlled("pump", 1, ""),
         controlled("plain", 2, "").replace("\"vacon-nx\"", "\"plain\""),
@@ -66,14 +67,14 @@ fn bench() -> Bench {
         (tried.as_u64() >= Some(2)).then_some(())
     });
     line.record(100_000);
-    Bench {
+    RecordedSite {
         site,
         line,
         _others: others,
     }
 }
 
-impl Bench {
+impl RecordedSite {
     /// The PDU that answers one.
     fn ask(&self, unit: u8, pdu: &[u8]) -> Vec<u8> {
         let mut stream = TcpStream::connect(("127.0.0.1", self.site.modbus)).unwrap();
@@ -103,73 +104,34 @@ fn write(start: u16, values: &[u16]) -> Vec<u8> {
     }
 }
 
+/// Below `drivegate/test/drive`: topic, payload, code of the refusal, and a part of its text.
+const SET_TOPICS: &str = r#"pump/set                      | {"speed_reference": NaN}                                        | bad_value     | not JSON
+pump/set                      | {"speed_reference": -Infinity}                                  | bad_value     | not JSON
+pump/set                      | {"speed_reference": 1e999}                                      | bad_value     | not JSON
+pump/set                      | {"speed_reference": "50"}                                       | bad_value     | quotes
+pump/set                      | {"speed_reference": null}                                       | bad_value     | speed_reference
+pump/set                      | {"speed_reference": [50]}                                       | bad_value     | speed_reference
+pump/set                      | {"run": "true"}                                                 | bad_value     | not true or false
+pump/set                      | {"run": 2}                                                      | bad_value     | not true or false
+pump/set                      | {"run": true, "run": false}                                     | bad_value     | twice
+pump/set                      | {"run": true, "speed_reference": 50, "frequency_reference": 30} | bad_value     | twice
+pump/set                      | {"run": true, "speed_reference": 1000}                          | bad_value     | outside the limits
+pump/set                      | {"run": true, "ready": true}                                    | not_writable  | read-only
+pump/set/speed_reference      | nan                                                             | bad_value     | number
+pump/set/speed_reference      | inf                                                             | bad_value     | number
+plain/set                     | {"run": true, "reverse": true}                                  | not_writable  | reverse
+plain/set                     | {"run": true, "speed_reference": 10}                            | not_writable  | speed_reference
+plain/set/frequency_reference | 10                                                              | not_writable  | frequency_reference
+watched/set                   | {"run": true}                                                   | not_allowed   | only monitored
+gone/set                      | {"run": true}                                                   | offline       | not sent
+nobody/set                    | {"run": true}                                                   | unknown_drive | nobody"#;
+
 #[test]
 fn nothing_of_a_bad_command_reaches_a_drive() {
-    let bench = bench();
+    let rig = rig();
     let mut wrong: Vec<String> = Vec::new();
-    for (topic, payload, code, text) in [
-        ("pump/set", r#"{"speed_reference": NaN}"#, "bad_value", "not JSON"),
-        ("pump/set", r#"{"speed_reference": -Infinity}"#, "bad_value", "not JSON"),
-        ("pump/set", r#"{"speed_reference": 1e999}"#, "bad_value", "not JSON"),
-        ("pump/set", r#"{"speed_reference": "50"}"#, "bad_value", "quotes"),
-        (
-            "pump/set",
-            r#"{"speed_reference": null}"#,
-            "bad_value",
-            "speed_reference",
-        ),
-        (
-            "pump/set",
-            r#"{"speed_reference": [50]}"#,
-            "bad_value",
-            "speed_reference",
-        ),
-        ("pump/set", r#"{"run": "true"}"#, "bad_value", "not true or false"),
-        ("pump/set", r#"{"run": 2}"#, "bad_value", "not true or false"),
-        ("pump/set", r#"{"run": true, "run": false}"#, "bad_value", "twice"),
-        (
-            "pump/set",
-            r#"{"run": true, "speed_reference": 50, "frequency_reference": 30}"#,
-            "bad_value",
-            "twice",
-        ),
-        (
-            "pump/set",
-            r#"{"run": true, "speed_reference": 1000}"#,
-            "bad_value",
-            "outside the limits",
-        ),
-        (
-            "pump/set",
-            r#"{"run": true, "ready": true}"#,
-            "not_writable",
-            "read-only",
-        ),
-        ("pump/set/speed_reference", "nan", "bad_value", "number"),
-        ("pump/set/speed_reference", "inf", "bad_value", "number"),
-        (
-            "plain/set",
-            r#"{"run": true, "reverse": true}"#,
-            "not_writable",
-            "reverse",
-        ),
-        (
-            "plain/set",
-            r#"{"run": true, "speed_reference": 10}"#,
-            "not_writable",
-            "speed_reference",
-        ),
-        (
-            "plain/set/frequency_reference",
-            "10",
-            "not_writable",
-            "frequency_reference",
-        ),
-        ("watched/set", r#"{"run": true}"#, "not_allowed", "only monitored"),
-        ("gone/set", r#"{"run": true}"#, "offline", "not sent"),
-        ("nobody/set", r#"{"run": true}"#, "unknown_drive", "nobody"),
-    ] {
-        let result = bench.site.ask(topic, payload);
+    for [topic, payload, code, text] in rows(SET_TOPICS) {
+        let result = rig.site.ask(topic, payload);
         let message = result["error"]["message"].as_str().unwrap_or_default();
         if result["ok"] != false || result["error"]["code"] != code || !message.contains(text) {
             wrong.push(format!("{topic} {payload}: {result}"));
@@ -195,16 +157,16 @@ fn nothing_of_a_bad_command_reaches_a_drive() {
         (99, write(0x8100, &[1]), 0x0A),          // nobody
         (1, vec![22, 0x07, 0xD0, 0, 1, 0, 1], 1), // mask write, which the drive does not have
     ] {
-        let answer = bench.ask(unit, &pdu);
+        let answer = rig.ask(unit, &pdu);
         if answer != [pdu[0] | 0x80, exception] {
             wrong.push(format!("unit {unit} {pdu:02X?}: {answer:02X?}"));
         }
     }
     assert!(wrong.is_empty(), "{wrong:#?}");
-    assert_eq!(bench.writes(), 0, "only reads are on the line");
+    assert_eq!(rig.writes(), 0, "only reads are on the line");
     // Each that names a drive, of Modbus each that names a function it has; refusals of one kind are counted.
     until("all refusals in the audit", || {
-        let audit = bench.site.audit();
+        let audit = rig.site.audit();
         let of = |source: &str| {
             let own = audit.iter().filter(|r| r["source"] == source);
             own.filter_map(|r| r["count"].as_u64()).sum::<u64>()
@@ -215,16 +177,16 @@ fn nothing_of_a_bad_command_reaches_a_drive() {
     // A good one that comes again, as QoS 1 allows: nothing more is written, the same result.
     let (again, first) = (1..)
         .map(|id| format!(r#"{{"id": "order-{id}", "speed_reference": 12.5}}"#))
-        .map(|order| (order.clone(), bench.site.ask("pump/set", &order)))
+        .map(|order| (order.clone(), rig.site.ask("pump/set", &order)))
         .find(|(_, result)| result["ok"] == true && result["result"] == "confirmed")
         .unwrap();
-    let written = bench.writes();
-    assert_eq!(bench.site.ask("pump/set", &again), first, "from memory");
-    assert_eq!(bench.writes(), written);
+    let written = rig.writes();
+    assert_eq!(rig.site.ask("pump/set", &again), first, "from memory");
+    assert_eq!(rig.writes(), written);
 
     // Two clients that set different bits do not undo each other.
     let control_words = || {
-        let frames = bench.line.transcript();
+        let frames = rig.line.transcript();
         let to_drives = frames.iter().filter(|f| f.direction == Direction::ToDrives);
         let words = to_drives.filter(|f| f.bytes.starts_with(&[1, 6, 0x07, 0xD0]));
         // A word that is not acknowledged in time is written again.
@@ -232,13 +194,13 @@ fn nothing_of_a_bad_command_reaches_a_drive() {
         words.dedup();
         words
     };
-    bench.site.order("pump/set/run", "true");
-    bench.site.order("pump/set/reverse", "true");
+    rig.site.order("pump/set/run", "true");
+    rig.site.order("pump/set/reverse", "true");
     assert_eq!(control_words(), [1, 3]);
     let word = write(2000, &[1]);
-    until("the word as a whole", || (bench.ask(1, &word) == word).then_some(()));
-    bench.site.order("pump/set", r#"{"reverse": true}"#);
+    until("the word as a whole", || (rig.ask(1, &word) == word).then_some(()));
+    rig.site.order("pump/set", r#"{"reverse": true}"#);
     assert_eq!(control_words(), [1, 3, 1, 3], "a raw write is known to the next bit");
-    bench.site.order("pump/set/run", "false");
+    rig.site.order("pump/set/run", "false");
     assert_eq!(control_words().last(), Some(&2));
 }

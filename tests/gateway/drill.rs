@@ -3,10 +3,8 @@
 use serde_json::{Value as Json, json};
 
 use crate::support::process::{Running, get, until, write_registers};
-use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled};
-use crate::support::tools::{feed, run, tool};
-
-const PASSWORD: &str = "correct horse battery";
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, USERS, controlled};
+use crate::support::tools::{feed, run};
 
 fn program() -> &'static std::path::Path {
     std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"))
@@ -20,9 +18,8 @@ struct Plant {
 fn plant() -> Plant {
     let supervised = "supervision = { timeout = \"2s\", action = \"stop\" }";
     let drives = [controlled("pump-1", 1, supervised), controlled("pump-2", 2, "")].concat();
-    let http = format!("{HTTP}commands = true\nusers_file = \"users\"\n");
     let drill = "[drill]\nmax_speed = 20.0\nlimit = \"8s\"\n";
-    let site = Site::of(&[LINE1, &drives, MODBUS_TCP, &http, drill]);
+    let site = Site::of(&[LINE1, &drives, MODBUS_TCP, HTTP, USERS, drill]);
     site.change(
         "[gateway]\n",
         &format!(
@@ -32,14 +29,7 @@ fn plant() -> Plant {
         ),
     );
     std::fs::create_dir(site.file("state")).unwrap();
-    for user in ["alice", "bob"] {
-        let added = feed(
-            program(),
-            &["user", "add", "--file", &site.path("users"), user],
-            &format!("{PASSWORD}\n"),
-        );
-        assert!(added.status.success(), "{added:?}");
-    }
+    ["alice", "bob"].iter().for_each(|user| site.add_user(user));
     let simulator = site.simulate(&["--addresses", "1-2", "--baud", "38400"]);
     let gateway = site.run_ready();
     site.until_state("pump-1", "ready");
@@ -51,16 +41,10 @@ fn plant() -> Plant {
 
 impl Plant {
     fn curl(&self, user: &str, method: &str, path: &str, body: &Json) -> (u16, Json) {
-        let url = format!("http://127.0.0.1:{}/api/v1/drills{path}", self.site.http);
-        let (user, body) = (format!("{user}:{PASSWORD}"), body.to_string());
-        let mut arguments = vec!["-s", "-u", &user, "-X", method, "-w", "\n%{http_code}", &url];
-        if method == "POST" {
-            arguments.extend(["-d", &body]);
-        }
-        let output = run(&tool("curl"), &arguments);
-        let text = String::from_utf8(output.stdout).unwrap();
-        let (body, status) = text.rsplit_once('\n').unwrap();
-        (status.parse().unwrap(), serde_json::from_str(body).unwrap())
+        let body = body.to_string();
+        let arguments = ["-X", method, "-d", &body];
+        let count = if method == "POST" { 4 } else { 2 };
+        self.site.curl(user, &format!("drills{path}"), &arguments[..count])
     }
 
     fn ended(&self, id: &str) -> Json {

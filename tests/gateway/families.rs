@@ -8,7 +8,7 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::Duration;
 
-use cases::{CASES, Case, Order};
+use cases::{Case, Order, cases};
 
 use crate::support::process::{PATIENCE, Running, api, free_port, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
@@ -16,7 +16,7 @@ use crate::support::tools::{python, root};
 
 /// Each profile with the module of its drive.
 pub(super) fn peers() -> impl Iterator<Item = (&'static str, &'static str)> {
-    let mut all: Vec<_> = CASES.iter().map(|case| (case.profile, case.peer)).collect();
+    let mut all: Vec<_> = cases().iter().map(|case| (case.profile, case.peer)).collect();
     all.sort_unstable();
     all.dedup();
     all.into_iter()
@@ -130,8 +130,8 @@ fn obeys(case: &Case) {
     let rig = Rig::new(case, false);
     let name = case.profile;
     assert_ne!(rig.state(), "running", "{name}");
-    rig.order(case.reference);
-    rig.order(case.start);
+    rig.order(&case.reference);
+    rig.order(&case.start);
     rig.printed("motor forward", 0);
     rig.site.until_state("drive", "running");
     let speed = || {
@@ -143,34 +143,34 @@ fn obeys(case: &Case) {
     if case.shows_frequency {
         until("a frequency", speed);
     }
-    rig.order(case.stop);
+    rig.order(&case.stop);
     rig.printed("motor stopped", 0);
     until("the end of running", || (rig.state() != "running").then_some(()));
     let mut stopped = 1;
     if !case.reverse.is_empty() {
-        rig.order(case.reverse);
+        rig.order(&case.reverse);
         rig.printed("motor reverse", 0);
         rig.site.until_state("drive", "running");
         if case.shows_reversed {
             rig.site.until_point("drive", "reversed", true);
         }
     }
-    for order in case.refused {
+    for order in &case.refused {
         assert!(rig.is_refused(order), "{name}: {order:?}");
     }
-    rig.order(case.stop);
+    rig.order(&case.stop);
     if !case.reverse.is_empty() {
         rig.printed("motor stopped", stopped);
         stopped += 1;
     }
-    rig.order(case.reference);
-    rig.order(case.start);
+    rig.order(&case.reference);
+    rig.order(&case.start);
     rig.printed("motor forward", 1);
     rig.drive.signal("USR1");
     rig.printed("motor stopped", stopped);
     rig.site.until_state("drive", "fault");
     if !case.reset.is_empty() {
-        rig.order(case.reset);
+        rig.order(&case.reset);
         rig.printed("\nreset", 0);
         until("the end of the fault", || (rig.state() != "fault").then_some(()));
         // No reset starts the motor.
@@ -183,12 +183,12 @@ fn obeys(case: &Case) {
 /// A drive that is not prepared does not run, and is not said to.
 fn stays(case: &Case) {
     let rig = Rig::new(case, true);
-    rig.order(case.reference);
-    rig.order(case.start);
+    rig.order(&case.reference);
+    rig.order(&case.start);
     std::thread::sleep(Duration::from_millis(500));
     assert!(!rig.drive.output().contains("motor"), "{}", case.profile);
     assert_ne!(rig.state(), "running", "{}", case.profile);
-    rig.order(case.stop);
+    rig.order(&case.stop);
 }
 
 /// The common model's command word.
@@ -210,7 +210,7 @@ fn obeys_the_common_model(case: &Case) {
     };
     // By the sign of the reference otherwise.
     let turns_back = !["abb", "invertek"].contains(&case.peer);
-    rig.order(case.reference);
+    rig.order(&case.reference);
     done(command(true, false, false));
     rig.printed("motor forward", 0);
     rig.site.until_state("drive", "running");
@@ -262,7 +262,7 @@ fn obeys_the_common_model(case: &Case) {
 /// A start that the drive does not follow fails where the family has a sequence, and leaves no run command behind.
 fn fails_to_start(case: &Case) {
     let rig = Rig::new(case, true);
-    rig.order(case.reference);
+    rig.order(&case.reference);
     let answer = rig.exchange(&command(true, false, false));
     assert_eq!(answer != Answer::Done, case.has_sequence(), "{}", case.profile);
     std::thread::sleep(Duration::from_millis(300));
@@ -277,7 +277,7 @@ fn fails_to_start(case: &Case) {
 
 /// The cases of every third family, so that three tests run side by side.
 fn every_third(first: usize, check: fn(&Case)) {
-    for case in CASES.iter().skip(first).step_by(3) {
+    for case in cases().iter().skip(first).step_by(3) {
         println!("{}", case.profile);
         check(case);
     }
@@ -330,7 +330,7 @@ fn drives_obey_the_common_model_3() {
 
 #[test]
 fn a_start_that_is_not_followed_fails() {
-    for case in CASES.iter().filter(|case| case.has_sequence()) {
+    for case in cases().iter().filter(|case| case.has_sequence()) {
         fails_to_start(case);
     }
 }

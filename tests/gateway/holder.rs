@@ -2,13 +2,11 @@
 
 use serde_json::{Value as Json, json};
 
-use crate::support::process::{Running, mbpoll_read, mbpoll_write, until, write_registers};
-use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled};
-use crate::support::tools::{feed, run, tool};
+use crate::support::process::{Running, api, mbpoll_read, mbpoll_write, until, write_registers};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, USERS, controlled};
 
 mod clients;
 
-const PASSWORD: &str = "correct horse battery";
 const AUTHORITY: &str = r#"
 [authority]
 mode = "exclusive"
@@ -34,13 +32,8 @@ struct Plant {
 
 fn plant() -> Plant {
     let drives = controlled("pump-1", 1, "");
-    let http = format!("{HTTP}commands = true\nusers_file = \"users\"\n");
-    let site = Site::of(&[LINE1, &drives, MODBUS_TCP, MQTT, &http, AUTHORITY]);
-    let file = site.path("users");
-    let program = std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"));
-    let arguments = ["user", "add", "--file", &file, "alice"];
-    let added = feed(program, &arguments, &format!("{PASSWORD}\n"));
-    assert!(added.status.success(), "{added:?}");
+    let site = Site::of(&[LINE1, &drives, MODBUS_TCP, MQTT, HTTP, USERS, AUTHORITY]);
+    site.add_user("alice");
     let simulator = site.simulate(&["--addresses", "1", "--baud", "38400"]);
     let broker = site.broker();
     let gateway = site.run_ready();
@@ -54,31 +47,14 @@ fn plant() -> Plant {
 
 impl Plant {
     fn curl(&self, what: &str, body: &str) -> (u16, Json) {
-        let url = format!("http://127.0.0.1:{}/api/v1/drives/pump-1/{what}", self.site.http);
-        let user = format!("alice:{PASSWORD}");
-        let arguments = ["-s", "-u", &user, "-d", body, "-w", "\n%{http_code}", &url];
-        let output = run(&tool("curl"), &arguments);
-        let text = String::from_utf8(output.stdout).unwrap();
-        let (body, status) = text.rsplit_once('\n').unwrap();
-        (status.parse().unwrap(), serde_json::from_str(body).unwrap())
-    }
-
-    fn mosquitto(&self, topic: &str, payload: &str) -> Json {
-        let port = self.site.mqtt.to_string();
-        let topic = format!("drivegate/test/drive/pump-1/{topic}");
-        let client = ["-h", "127.0.0.1", "-p", &port, "-V", "5", "-q", "1", "-W", "60"];
-        let request = ["-t", &topic, "-e", "answers/1", "-m", payload];
-        let output = run(&tool("mosquitto_rr"), &[&client[..], &request].concat());
-        serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {output:?}"))
+        self.site.curl("alice", &format!("drives/pump-1/{what}"), &["-d", body])
     }
 
     /// 0x8013 and 0x8104 as the PLC reads them, and the state over HTTP.
     fn seen(&self) -> (u16, u16, Json, Json) {
         let read = |address| until("registers", || mbpoll_read(self.site.modbus, 1, address, 1).ok())[0];
         let (holder, own) = (read(0x8013), read(0x8104));
-        let url = format!("http://127.0.0.1:{}/api/v1/drives/pump-1", self.site.http);
-        let output = run(&tool("curl"), &["-s", &url]);
-        let drive: Json = serde_json::from_slice(&output.stdout).unwrap();
+        let drive = api(self.site.http, "pump-1");
         (holder, own, drive["hold"].clone(), drive["holder"].clone())
     }
 
@@ -109,7 +85,7 @@ fn who_sees_and_may_what() {
         (&answer["holder"], &answer["holder_rank"]),
         (&json!("plc"), &json!("automation"))
     );
-    let answer = plant.mosquitto("as/cloud/set", r#"{"speed_reference": 10}"#);
+    let answer = plant.site.ask("pump-1/as/cloud/set", r#"{"speed_reference": 10}"#);
     assert_eq!(
         (&answer["result"], &answer["holder"]),
         (&json!("held_by_other"), &json!("plc")),
@@ -117,11 +93,14 @@ fn who_sees_and_may_what() {
     );
     // Nobody is nobody, also with a drive's name right.
     for topic in ["set", "as/stranger/set"] {
-        let answer = plant.mosquitto(topic, r#"{"speed_reference": 10}"#);
+        let answer = plant.site.ask(&format!("pump-1/{topic}"), r#"{"speed_reference": 10}"#);
         assert_eq!(answer["result"], "not_allowed", "{answer}");
     }
-    assert_eq!(plant.mosquitto("as/cloud/hold", "break")["result"], "held_by_other");
-    assert_eq!(plant.mosquitto("hold", "take")["result"], "not_allowed");
+    assert_eq!(
+        plant.site.ask("pump-1/as/cloud/hold", "break")["result"],
+        "held_by_other"
+    );
+    assert_eq!(plant.site.ask("pump-1/hold", "take")["result"], "not_allowed");
     assert_eq!(plant.site.point("pump-1", "output_frequency"), 25.0);
     // A higher rank takes it over: the motor runs on.
     assert_eq!(plant.curl("hold", r#"{"action": "take"}"#).0, 409);
@@ -146,7 +125,7 @@ fn who_sees_and_may_what() {
         "a release by another has no effect"
     );
     // A stop of anybody passes and ends the hold; that of nobody reserves nothing.
-    let answer = plant.mosquitto("set", r#"{"run": false}"#);
+    let answer = plant.site.ask("pump-1/set", r#"{"run": false}"#);
     assert_eq!(answer["result"], "confirmed", "{answer}");
     assert_eq!(plant.seen(), (0, 0, json!("free"), json!(null)));
     // Behind the stop of the operator the PLC does not start the motor by going on.
@@ -156,7 +135,7 @@ fn who_sees_and_may_what() {
     assert_eq!(status, 200, "{answer}");
     assert_eq!(plant.seen(), (4, 0, json!("reserved"), json!("alice")));
     busy(plant.write(0x8100, &[1, 5000]));
-    let answer = plant.mosquitto("as/cloud/set", r#"{"run": true}"#);
+    let answer = plant.site.ask("pump-1/as/cloud/set", r#"{"run": true}"#);
     assert_eq!(
         (&answer["result"], &answer["holder"]),
         (&json!("held_by_other"), &json!("alice")),

@@ -9,6 +9,7 @@ use drivegate::drive::profile::Profiles;
 use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use drivegate_testkit as testkit;
 use serde_json::Value as Json;
 use tokio_modbus::client::{Reader as _, Writer as _};
 use tokio_modbus::slave::{Slave, SlaveContext as _};
@@ -263,7 +264,7 @@ fn what_another_master_of_n2_reads_is_shown() {
     ));
     assert_eq!(said.len(), 8, "{said:?}");
     let drive = shared.drive("d1");
-    let profile = Profiles::built_in().get("vacon-nx-n2").unwrap().clone();
+    let profile = testkit::profile("vacon-nx-n2");
     let mut compared = 0;
     for (kind, number, values) in said.iter().filter(|(kind, _, _)| kind == "AI") {
         let at = 2 * (number - 1);

@@ -1,10 +1,9 @@
 //! A gateway in service: the watchdog beside a silent line, reloads that are asked for and refused, health, backups.
 
 use std::fs;
-use std::os::unix::net::UnixDatagram;
 
 use super::drive_access::{Ran, ran};
-use crate::support::process::{PATIENCE, Running, drivegate, get, until};
+use crate::support::process::{Notifications, PATIENCE, Running, drivegate, get, until};
 use crate::support::site::{HTTP, LINE1, Site, controlled};
 
 fn site() -> Site {
@@ -25,42 +24,29 @@ fn an_absent_drive_with_a_long_timeout_holds_up_neither_the_watchdog_nor_a_reloa
     let site = site();
     site.change("response_timeout = \"2s\"", "response_timeout = \"20s\"");
     let line = site.line(&[]);
-    let socket = UnixDatagram::bind(site.file("notify")).unwrap();
-    socket.set_read_timeout(Some(PATIENCE)).unwrap();
-    let until_notified = |wanted: &str| {
-        let mut bytes = [0; 1000];
-        loop {
-            let count = socket.recv(&mut bytes).expect("a notification");
-            if String::from_utf8_lossy(&bytes[..count]).contains(wanted) {
-                return;
-            }
-        }
-    };
+    let notified = Notifications::at(site.file("notify"));
     let mut command = drivegate(&["run", "--config", &site.config()]);
-    command
-        .env("NOTIFY_SOCKET", site.file("notify"))
-        .env("WATCHDOG_USEC", "1000000");
-    let mut gateway = Running::spawn(&mut command);
+    let mut gateway = Running::spawn(notified.of(&mut command));
     gateway.until_printed("20s is longer than any drive takes to start its reply; 5s is used");
-    until_notified("STATUS=1 of 1 buses up, 0 of 1 drives online");
+    notified.until("STATUS=1 of 1 buses up, 0 of 1 drives online");
     // The watchdog is looked at twice a second, an exchange takes 5 s.
     until("two requests", || (line.transcript().len() > 1).then_some(()));
-    until_notified("WATCHDOG=1");
+    notified.until("WATCHDOG=1");
     let printed = gateway.output();
     assert!(!printed.contains("stalled"), "{printed}");
     // The exchange that waits is broken off for a reload of its bus, and for a stop.
     site.change("silence = \"chars\"", "silence = \"spec\"");
     gateway.signal("HUP");
-    until_notified("RELOADING=1");
-    until_notified("READY=1\nSTATUS=");
-    until_notified("WATCHDOG=1");
+    notified.until("RELOADING=1");
+    notified.until("READY=1\nSTATUS=");
+    notified.until("WATCHDOG=1");
     let sound = site.change("baud = 38400", "baud = 1");
     gateway.signal("HUP");
-    until_notified("0 of 1 drives online; reload refused at ");
+    notified.until("0 of 1 drives online; reload refused at ");
     site.configure(&[&sound]);
     gateway.signal("HUP");
-    until_notified("READY=1\nSTATUS=1 of 1 buses up, 0 of 1 drives online");
-    until_notified("WATCHDOG=1");
+    notified.until("READY=1\nSTATUS=1 of 1 buses up, 0 of 1 drives online");
+    notified.until("WATCHDOG=1");
     gateway.signal("TERM");
     assert!(gateway.ended().success());
 }

@@ -11,7 +11,9 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::drive_access::{Line, Ran, ran};
+use crate::support::mqtt::next_json;
 use crate::support::process::{self, Running, free_port, mbpoll_read, mbpoll_write, until};
+use crate::support::site::curl;
 use crate::support::tools::tool;
 
 /// A client that writes and reads HTTP itself.
@@ -465,12 +467,7 @@ fn a_configured_frequency_range_counts_as_over_mqtt() {
     });
     assert_eq!(family.value("speed_reference"), 50.0);
     until("the same over MQTT", || {
-        let output = Command::new(tool("mosquitto_sub"))
-            .args(["-h", "127.0.0.1", "-p", &port.to_string(), "-C", "1", "-W", "5"])
-            .args(["-t", "drivegate/plant/drive/fan-1/point/speed_reference"])
-            .output()
-            .unwrap();
-        let value: Value = serde_json::from_slice(&output.stdout).ok()?;
+        let value = next_json(port, "drivegate/plant/drive/fan-1/point/speed_reference")?;
         (value == 50.0).then_some(())
     });
 }
@@ -479,15 +476,7 @@ fn a_configured_frequency_range_counts_as_over_mqtt() {
 fn http(line: &Line, arguments: &[&str], path: &str) -> (u16, Value) {
     let socket = line.socket().display().to_string();
     let url = format!("http://gateway{path}");
-    let mut command = Command::new(tool("curl"));
-    command.args(["-sS", "-w", "\n%{http_code}", "--unix-socket", &socket]);
-    let output = command.args(arguments).arg(url).output().unwrap();
-    let text = String::from_utf8(output.stdout).unwrap();
-    let (body, status) = text.rsplit_once('\n').unwrap();
-    (
-        status.parse().unwrap(),
-        serde_json::from_str(body).unwrap_or(json!(body)),
-    )
+    curl(&[&["--unix-socket", &socket][..], arguments, &[&url]].concat())
 }
 
 #[test]

@@ -78,10 +78,7 @@ fn only_what_the_gateway_did_not_write_is_told_as_a_change() {
     assert_eq!(events(&site), Vec::<String>::new(), "the gateway wrote it");
 
     second();
-    let write = RequestPdu::WriteRegister {
-        address: MAXIMUM_FREQUENCY,
-        value: 4321,
-    };
+    let write = RequestPdu::write_register(MAXIMUM_FREQUENCY, 4321);
     line.with_drive(1, |drive, now| drive.answer(&write, now)).unwrap();
     let (code, text, said) = ran(&site, &["params", "read", "pump-1"]);
     assert_eq!(code, Some(0), "{said}");

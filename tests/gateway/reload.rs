@@ -2,10 +2,9 @@
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
-use std::os::unix::net::UnixDatagram;
 use std::process::Command;
 
-use crate::support::process::{PATIENCE, Running, drivegate, get, until, until_ready};
+use crate::support::process::{Notifications, PATIENCE, Running, drivegate, get, until, until_ready};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled};
 
 const READ: [u8; 12] = [0, 1, 0, 0, 0, 6, 1, 3, 0x08, 0x36, 0, 1];
@@ -126,33 +125,19 @@ fn make_pipe(site: &Site, name: &str) {
 fn a_file_that_cannot_be_read_holds_up_neither_the_watchdog_nor_a_stop() {
     let site = site();
     let _line = site.line(&[1]);
-    let socket = UnixDatagram::bind(site.file("notify")).unwrap();
-    socket.set_read_timeout(Some(PATIENCE)).unwrap();
-    let until_notified = |wanted: &str| {
-        let mut bytes = [0; 1000];
-        loop {
-            let count = socket.recv(&mut bytes).expect("a notification");
-            if String::from_utf8_lossy(&bytes[..count]).contains(wanted) {
-                return;
-            }
-        }
-    };
+    let notified = Notifications::at(site.file("notify"));
     let run = || {
-        let config = site.config();
-        let mut command = drivegate(&["run", "--config", &config]);
-        command
-            .env("NOTIFY_SOCKET", site.file("notify"))
-            .env("WATCHDOG_USEC", "1000000");
-        Running::spawn(&mut command)
+        let mut command = drivegate(&["run", "--config", &site.config()]);
+        Running::spawn(notified.of(&mut command))
     };
     let mut gateway = run();
-    until_notified("READY=1");
+    notified.until("READY=1");
     // `profile_dirs` is the folder of the site.
     make_pipe(&site, "pipe.toml");
     gateway.signal("HUP");
-    until_notified("RELOADING=1");
-    until_notified("WATCHDOG=1");
-    until_notified("WATCHDOG=1");
+    notified.until("RELOADING=1");
+    notified.until("WATCHDOG=1");
+    notified.until("WATCHDOG=1");
     assert_eq!(Client::connect(site.modbus).ask(&READ).len(), 11);
     gateway.signal("TERM");
     assert!(gateway.ended().success());

@@ -3,11 +3,8 @@
 use serde_json::{Value as Json, json};
 
 use crate::support::process::{Running, api, get, mbpoll_write, until, until_ready, write_registers};
-use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled};
-use crate::support::tools::{feed, run, tool};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, USERS, controlled};
 
-/// The password of `alice`.
-const PASSWORD: &str = "correct horse battery";
 const COMMAND: u16 = 0x8100;
 
 /// `pump-1` is guarded, and needs `fan-2` to run.
@@ -15,26 +12,13 @@ fn site(guard: &str) -> Site {
     let line = LINE1.replace("profile_dirs", "state_dir = \"state\"\nprofile_dirs");
     let guarded = format!("guard = {guard}\ninterlocks = [{{ drive = \"fan-2\", point = \"running\" }}]");
     let drives = controlled("pump-1", 1, &guarded) + &controlled("fan-2", 2, "");
-    let http = format!("{HTTP}commands = true\nusers_file = \"users\"\n");
-    let site = Site::of(&[&line, &drives, MODBUS_TCP, MQTT, &http]);
-    let program = std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"));
-    let added = feed(
-        program,
-        &["user", "add", "--file", &site.path("users"), "alice"],
-        &format!("{PASSWORD}\n"),
-    );
-    assert!(added.status.success(), "{added:?}");
+    let site = Site::of(&[&line, &drives, MODBUS_TCP, MQTT, HTTP, USERS]);
+    site.add_user("alice");
     site
 }
 
 fn curl(site: &Site, drive: &str, body: &str) -> (u16, Json) {
-    let url = format!("http://127.0.0.1:{}/api/v1/drives/{drive}/commands", site.http);
-    let user = format!("alice:{PASSWORD}");
-    let arguments = ["-s", "-u", &user, "-d", body, "-w", "\n%{http_code}", &url];
-    let output = run(&tool("curl"), &arguments);
-    let text = String::from_utf8(output.stdout).unwrap();
-    let (body, status) = text.rsplit_once('\n').unwrap();
-    (status.parse().unwrap(), serde_json::from_str(body).unwrap())
+    site.curl("alice", &format!("drives/{drive}/commands"), &["-d", body])
 }
 
 /// Stops `pump-1` and waits until it stands.

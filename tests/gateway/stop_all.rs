@@ -3,13 +3,11 @@
 use serde_json::{Value as Json, json};
 
 use crate::support::process::{Running, drivegate, mbpoll_read, mbpoll_write, until, write_registers};
-use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, drive};
-use crate::support::tools::{feed, run, tool};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, PASSWORD, Site, USERS, controlled, drive};
+use crate::support::tools::{run, tool};
 
 const STOP_ALL: u16 = 0x0100;
 const NOT_STANDING: u16 = 0x8101;
-/// The password of `alice`.
-const PASSWORD: &str = "correct horse battery";
 
 /// Drives 1 and 2 take commands, 3 is monitored; 2 is in the group `fans`.
 struct Plant {
@@ -19,16 +17,8 @@ struct Plant {
 
 fn plant() -> Plant {
     let drives = controlled("pump-1", 1, "") + &controlled("fan-1", 2, "group = \"fans\"") + &drive("pump-3", 3, "");
-    let http = format!("{HTTP}commands = true\nusers_file = \"users\"\n");
-    let site = Site::of(&[LINE1, &drives, MODBUS_TCP, MQTT, &http]);
-    let file = site.path("users");
-    let program = std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"));
-    let added = feed(
-        program,
-        &["user", "add", "--file", &file, "alice"],
-        &format!("{PASSWORD}\n"),
-    );
-    assert!(added.status.success(), "{added:?}");
+    let site = Site::of(&[LINE1, &drives, MODBUS_TCP, MQTT, HTTP, USERS]);
+    site.add_user("alice");
     let simulator = site.simulate(&["--addresses", "1-3", "--baud", "38400"]);
     let broker = site.broker();
     let gateway = site.run_ready();
@@ -56,21 +46,11 @@ impl Plant {
     }
 
     fn curl(&self, body: &str) -> (u16, Json) {
-        let url = format!("http://127.0.0.1:{}/api/v1/stop", self.site.http);
-        let user = format!("alice:{PASSWORD}");
-        let arguments = ["-s", "-u", &user, "-d", body, "-w", "\n%{http_code}", &url];
-        let output = run(&tool("curl"), &arguments);
-        let text = String::from_utf8(output.stdout).unwrap();
-        let (body, status) = text.rsplit_once('\n').unwrap();
-        (status.parse().unwrap(), serde_json::from_str(body).unwrap())
+        self.site.curl("alice", "stop", &["-d", body])
     }
 
     fn mosquitto(&self, payload: &str) -> Json {
-        let port = self.site.mqtt.to_string();
-        let client = ["-h", "127.0.0.1", "-p", &port, "-V", "5", "-q", "1", "-W", "60"];
-        let request = ["-t", "drivegate/test/set/stop", "-e", "answers/1", "-m", payload];
-        let output = run(&tool("mosquitto_rr"), &[&client[..], &request].concat());
-        serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {output:?}"))
+        self.site.respond("drivegate/test/set/stop", payload)
     }
 
     fn command_line(&self, arguments: &[&str]) -> (i32, String) {

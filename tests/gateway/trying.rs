@@ -98,17 +98,17 @@ impl Drop for OnTerminal {
     }
 }
 
-struct Bench {
+struct TwoDrives {
     folder: TempDir,
     line: SimulatedBus,
 }
 
-impl Bench {
+impl TwoDrives {
     /// Drives at 3 and 7.
-    fn start() -> Bench {
+    fn start() -> TwoDrives {
         let folder = tempfile::tempdir().unwrap();
         let line = line_of(&folder.path().join("line"), &[3, 7]);
-        Bench { folder, line }
+        TwoDrives { folder, line }
     }
 
     fn path(&self, name: &str) -> String {
@@ -161,10 +161,10 @@ fn is_sound(config: &str) {
 
 #[test]
 fn on_a_terminal_it_ends_with_values_and_a_configuration() {
-    let bench = Bench::start();
-    let taken = bench.path("taken.toml");
+    let rig = TwoDrives::start();
+    let taken = rig.path("taken.toml");
     std::fs::write(&taken, "mine").unwrap();
-    let mut trial = OnTerminal::start(&words(&bench.arguments(&[])));
+    let mut trial = OnTerminal::start(&words(&rig.arguments(&[])));
     let shown = trial.until_shown("Save this as a configuration?");
     assert!(
         shown.contains("found modbus-rtu 38400 8N1, address 7: vacon-nx"),
@@ -181,7 +181,7 @@ fn on_a_terminal_it_ends_with_values_and_a_configuration() {
     assert_eq!(api(http, "drive-2")["access"], "monitor");
     trial.press(&format!("{taken}\n"));
     trial.until_shown("taken.toml exists already");
-    let written = bench.path("plant.toml");
+    let written = rig.path("plant.toml");
     trial.press(&format!("{written}\n"));
     trial.until_shown(&format!("Configuration written to {written}"));
     assert_eq!(std::fs::read_to_string(&taken).unwrap(), "mine");
@@ -189,15 +189,15 @@ fn on_a_terminal_it_ends_with_values_and_a_configuration() {
     assert!(get(http, "/").is_some_and(|(status, _)| status == 200));
     trial.press("\x03");
     assert!(trial.ended().success(), "{}", trial.screen());
-    bench.is_only_read();
+    rig.is_only_read();
 }
 
 #[test]
 fn ctrl_c_ends_it_at_any_moment() {
-    let bench = Bench::start();
+    let rig = TwoDrives::start();
     // While the line is listened to, or searched.
     for moment in ["looking for drives", " left, "] {
-        let port = bench.path("line");
+        let port = rig.path("line");
         let mut trial = OnTerminal::start(&["try", "--port", &port, "--addresses", "100-247"]);
         trial.until_shown(moment);
         trial.press("\x03");
@@ -207,7 +207,7 @@ fn ctrl_c_ends_it_at_any_moment() {
         trial.until_shown("stopped; nothing was written");
     }
     // At the question.
-    let mut trial = OnTerminal::start(&words(&bench.arguments(&[])));
+    let mut trial = OnTerminal::start(&words(&rig.arguments(&[])));
     trial.until_shown("Save this as a configuration?");
     trial.press("\x03");
     assert!(trial.ended().success(), "{}", trial.screen());
@@ -215,28 +215,28 @@ fn ctrl_c_ends_it_at_any_moment() {
 
 #[test]
 fn a_script_has_an_option_for_the_question() {
-    let bench = Bench::start();
-    let written = bench.path("plant.toml");
-    let mut trial = Running::drivegate(&words(&bench.arguments(&["--write", &written])));
+    let rig = TwoDrives::start();
+    let written = rig.path("plant.toml");
+    let mut trial = Running::drivegate(&words(&rig.arguments(&["--write", &written])));
     let printed = trial.until_printed("Configuration written to ");
     assert_eq!(api(page(&printed), "drive-1")["state"], "ready");
     is_sound(&written);
     trial.signal("TERM");
     assert!(trial.ended().success());
-    let again = ran(&mut drivegate(&words(&bench.arguments(&["--write", &written]))));
+    let again = ran(&mut drivegate(&words(&rig.arguments(&["--write", &written]))));
     assert_eq!(again.code, 2, "{}", again.err);
     assert!(again.err.contains("exists already"), "{}", again.err);
     // Nobody to ask, and nothing said.
-    let mut silent = Running::drivegate(&words(&bench.arguments(&[])));
+    let mut silent = Running::drivegate(&words(&rig.arguments(&[])));
     silent.until_printed("no configuration was written; --write FILE writes one");
     silent.signal("INT");
     assert!(silent.ended().success());
-    bench.is_only_read();
+    rig.is_only_read();
 }
 
 #[test]
 fn what_was_heard_tells_a_dead_line_from_a_wrong_setting() {
-    let nobody = Bench::start();
+    let nobody = TwoDrives::start();
     let port = nobody.path("line");
     let fast = ["--protocol", "modbus-rtu", "--baud", "38400", "--format", "8N1"];
     let silent = ran(drivegate(&["try", "--port", &port, "--addresses", "1,2"]).args(fast));

@@ -6,17 +6,18 @@ use std::time::{Duration, Instant};
 use drivegate::bus::{BusOptions, BusTask};
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{LineFormat, Protocol};
-use drivegate::command::{Authority, CommandQueue, Order, Origin, Outcome, SourceKind, WriteStats};
-use drivegate::drive::profile::{Profile, Profiles};
+use drivegate::command::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate::drive::profile::Profile;
 use drivegate::drive::{ModelPoint, State, Value};
 use drivegate::event::Events;
 use drivegate::line::LineOptions;
-use drivegate::plant::{BusHandle, DriveHandle, Plant};
-use drivegate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
+use drivegate::plant::{DriveHandle, Plant};
+use drivegate::process_image::{BusSpec, DriveImage, DriveSpec};
 use drivegate::sim::endpoint::EndpointOptions;
 use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::simulated_drive::DriveOptions;
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use drivegate_testkit as testkit;
 
 use crate::support::process::PATIENCE;
 
@@ -55,7 +56,7 @@ impl Default for Setup {
         Setup {
             drives: 1,
             protocol: Protocol::ModbusRtu,
-            profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
+            profile: testkit::nx(),
             endpoint: None,
             port: None,
             options: LineOptions::default(),
@@ -84,26 +85,21 @@ impl Rig {
         });
         let line = line.unwrap();
         let spec = BusSpec {
-            name: "line1".to_string(),
             port: setup.port.unwrap_or_else(|| line.address()),
             protocol: setup.protocol,
             format,
-            cycle: Duration::from_millis(10),
             slow_cycle: Duration::from_millis(500),
+            ..testkit::bus_spec("line1")
         };
         let image = |address| {
             let spec = DriveSpec {
-                access: Access::Control,
                 turnaround: Duration::from_micros(500),
-                ..DriveSpec::new(&drive(address), "line1", address, setup.profile.clone())
+                ..testkit::controlled(&drive(address), "line1", address, &setup.profile)
             };
             // Nothing is stale because this machine is busy.
             Arc::new(DriveImage::new(spec, Duration::from_millis(500)).with_stale_floor(PATIENCE))
         };
-        let handle = BusHandle {
-            image: Arc::new(BusImage::new(spec, (1..=setup.drives).map(image).collect())),
-            queue: Arc::new(CommandQueue::new().unwrap()),
-        };
+        let handle = testkit::bus(spec, (1..=setup.drives).map(image).collect());
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let options = BusOptions {
             response_timeout: setup.response_timeout,

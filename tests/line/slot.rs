@@ -14,15 +14,15 @@ use crate::support::tools::{python, root, run, run_well, tool};
 /// Requests of each peer.
 const REQUESTS: &str = "60";
 
-struct Bench {
+struct SlotSite {
     site: Site,
     raw: u16,
     rfc2217: u16,
 }
 
-impl Bench {
+impl SlotSite {
     /// Two drives and a slot with that access.
-    fn new(access: &str) -> Bench {
+    fn new(access: &str) -> SlotSite {
         let (raw, rfc2217) = (free_port(), free_port());
         let slot = format!(
             "[[bus.slot]]\nlisten = \"127.0.0.1:{raw}\"\nrfc2217 = \"127.0.0.1:{rfc2217}\"\npty = \"tool\"\n\
@@ -33,7 +33,7 @@ impl Bench {
             drive("pump-2", 2, ""),
         ];
         let site = Site::of(&[LINE1, "cycle = \"30ms\"\n", &drives.concat(), &slot, HTTP]);
-        Bench { site, raw, rfc2217 }
+        SlotSite { site, raw, rfc2217 }
     }
 
     fn connect(&self) -> TcpStream {
@@ -74,15 +74,15 @@ fn ask(stream: &mut TcpStream, request: &[u8]) -> Vec<u8> {
 
 #[test]
 fn programs_of_others_read_through_the_slot() {
-    let bench = Bench::new("read");
-    let _line = bench.site.line(&[1, 2]);
-    let _gateway = bench.site.run_ready();
+    let rig = SlotSite::new("read");
+    let _line = rig.site.line(&[1, 2]);
+    let _gateway = rig.site.run_ready();
     let script = root().join("tests/peers/slot_tool.py").display().to_string();
-    let pty = bench.site.path("tool");
+    let pty = rig.site.path("tool");
     for (way, target) in [
-        ("raw", format!("127.0.0.1:{}", bench.raw)),
+        ("raw", format!("127.0.0.1:{}", rig.raw)),
         ("serial", pty.clone()),
-        ("rfc2217", format!("127.0.0.1:{}", bench.rfc2217)),
+        ("rfc2217", format!("127.0.0.1:{}", rig.rfc2217)),
     ] {
         print!("{}", run_well(&python(), &[&script, way, &target, REQUESTS]));
     }
@@ -97,17 +97,17 @@ fn programs_of_others_read_through_the_slot() {
             .contains("[2102]:")
             .then_some(())
     });
-    assert!(bench.counted("answered") + bench.counted("exception") >= 180.0);
+    assert!(rig.counted("answered") + rig.counted("exception") >= 180.0);
     let mode = std::fs::metadata(&pty).unwrap().permissions().mode();
     assert_eq!(mode & 0o777, 0o660);
 }
 
 #[test]
 fn writes_are_decoded_limited_and_audited() {
-    let bench = Bench::new("write");
-    let line = bench.site.line(&[1, 2]);
-    let _gateway = bench.site.run_ready();
-    let mut stream = bench.connect();
+    let rig = SlotSite::new("write");
+    let line = rig.site.line(&[1, 2]);
+    let _gateway = rig.site.run_ready();
+    let mut stream = rig.connect();
     let reference = |value: u16| {
         let [high, low] = value.to_be_bytes();
         [6, 0x07, 0xD2, high, low]
@@ -130,7 +130,7 @@ fn writes_are_decoded_limited_and_audited() {
         "a function that cannot be checked"
     );
     let audit = until("the records", || {
-        Some(bench.site.audit()).filter(|audit| audit.len() >= 4)
+        Some(rig.site.audit()).filter(|audit| audit.len() >= 4)
     });
     let results: Vec<_> = audit
         .iter()
@@ -151,23 +151,23 @@ fn writes_are_decoded_limited_and_audited() {
 
 #[test]
 fn tools_that_misbehave_harm_nobody() {
-    let bench = Bench::new("read");
-    let _line = bench.site.line(&[1, 2]);
-    let _gateway = bench.site.run_ready();
+    let rig = SlotSite::new("read");
+    let _line = rig.site.line(&[1, 2]);
+    let _gateway = rig.site.run_ready();
     let request = frame(1, &[3, 0x08, 0x34, 0, 3]);
     let answered =
         |answer: &[u8]| rtu::open_frame(answer).is_some_and(|(address, pdu)| address == 1 && pdu[..2] == [3, 6]);
-    let mut sound = bench.connect();
+    let mut sound = rig.connect();
     assert!(answered(&ask(&mut sound, &request)));
     // One floods and never reads, one sends half a frame and falls silent.
-    let mut flood = bench.connect();
+    let mut flood = rig.connect();
     flood.set_nonblocking(true).unwrap();
     let all = request.repeat(4000);
     let begun = Instant::now();
     for _ in 0..20 {
         let _ = flood.write(&all);
     }
-    let mut half = bench.connect();
+    let mut half = rig.connect();
     half.write_all(&request[..5]).unwrap();
     assert!(
         answered(&ask(&mut sound, &request)),
@@ -187,27 +187,27 @@ fn tools_that_misbehave_harm_nobody() {
     });
     assert!(answered(&ask(&mut half, &request)), "behind half a frame");
     until("what was broken is counted", || {
-        (bench.counted("broken") >= 1.0).then_some(())
+        (rig.counted("broken") >= 1.0).then_some(())
     });
-    let abandoned = bench.counted("abandoned");
+    let abandoned = rig.counted("abandoned");
     assert!(abandoned >= 1.0, "the flood gave its own requests up");
     // No more is taken of it than a fast line brings, 50,000 bytes a second, and what one read takes.
     let most = (begun.elapsed().as_secs_f64() * 50_000.0 + 1024.0) / request.len() as f64;
     assert!(abandoned <= most, "{abandoned} of {most}");
-    bench.site.until_state("pump-1", "ready");
+    rig.site.until_state("pump-1", "ready");
 }
 
 #[test]
 fn a_reload_changes_slots_and_leaves_the_bus_alone() {
-    let bench = Bench::new("read");
-    let _line = bench.site.line(&[1, 2]);
-    let mut gateway = bench.site.run_ready();
-    let pty = bench.site.file("tool");
+    let rig = SlotSite::new("read");
+    let _line = rig.site.line(&[1, 2]);
+    let mut gateway = rig.site.run_ready();
+    let pty = rig.site.file("tool");
     until("the link", || pty.is_symlink().then_some(()));
     let write = frame(1, &[6, 0x07, 0xD2, 0x13, 0x88]);
-    let mut stream = bench.connect();
+    let mut stream = rig.connect();
     assert_eq!(ask(&mut stream, &write), frame(1, &[0x86, 1]));
-    bench.site.change("access = \"read\"", "access = \"write\"");
+    rig.site.change("access = \"read\"", "access = \"write\"");
     gateway.signal("HUP");
     gateway.until_printed("configuration reloaded");
     // Who was connected connects again.
@@ -215,7 +215,7 @@ fn a_reload_changes_slots_and_leaves_the_bus_alone() {
     until("the connection of the old slot ends", || {
         matches!(stream.read(&mut rest), Ok(0)).then_some(())
     });
-    assert_eq!(ask(&mut bench.connect(), &write), write);
+    assert_eq!(ask(&mut rig.connect(), &write), write);
     assert!(!gateway.output().contains("stopping the bus"), "{}", gateway.output());
     gateway.signal("TERM");
     assert!(gateway.ended().success());

@@ -1,8 +1,7 @@
 //! The broker of the demo with clients that were written elsewhere: mosquitto's, paho, and the library of the gateway.
 
-use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
-use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
@@ -15,22 +14,23 @@ use rumqttc::{
 use tokio::runtime::Runtime;
 use tokio_util::sync::CancellationToken;
 
+use crate::support::mqtt::{Subscriber, client_of};
 use crate::support::process::PATIENCE;
-use crate::support::tools::{python, run_well, tool};
+use crate::support::tools::{python, run_well};
 
 /// Longest wait for something that has to happen. It happens at once, so this measures nothing.
 const DEADLINE: Duration = PATIENCE;
 const VERSIONS: [&str; 2] = ["mqttv311", "mqttv5"];
 
 /// A broker on a port of its own.
-struct Bench {
+struct DemoBroker {
     broker: Broker,
     cancel: CancellationToken,
     runtime: Runtime,
 }
 
-impl Bench {
-    fn new() -> Bench {
+impl DemoBroker {
+    fn new() -> DemoBroker {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
             .enable_all()
@@ -39,21 +39,22 @@ impl Bench {
         let cancel = CancellationToken::new();
         let any_port: SocketAddr = "127.0.0.1:0".parse().unwrap();
         let broker = runtime.block_on(Broker::start(any_port, cancel.clone())).unwrap();
-        Bench {
+        DemoBroker {
             broker,
             cancel,
             runtime,
         }
     }
 
-    fn port(&self) -> String {
-        self.broker.local_addr().port().to_string()
+    fn port(&self) -> u16 {
+        self.broker.local_addr().port()
     }
 
     fn publish(&self, version: &str, arguments: &[&str]) {
-        let port = self.port();
-        let to = ["-V", version, "-h", "127.0.0.1", "-p", &port];
-        run_well(&tool("mosquitto_pub"), &[&to[..], arguments].concat());
+        let published = client_of(version, "mosquitto_pub", self.port())
+            .args(arguments)
+            .status();
+        assert!(published.unwrap().success(), "{arguments:?}");
     }
 
     /// Starts `mosquitto_sub` and waits until it is subscribed.
@@ -75,9 +76,12 @@ impl Bench {
     }
 
     fn reader(&self, program: &str, version: &str, format: &str, arguments: &[&str]) -> Reader {
-        let mut command = Command::new(tool(program));
-        command.args(["-V", version, "-h", "127.0.0.1", "-p", &self.port(), "-F", format]);
-        Reader::start(command.args(arguments))
+        let mut command = client_of(version, program, self.port());
+        let (sender, lines) = channel();
+        let client = Subscriber::start(command.args(["-F", format]).args(arguments), move |line| {
+            let _ = sender.send(line);
+        });
+        Reader { _client: client, lines }
     }
 
     fn connect(&self) -> Raw {
@@ -88,46 +92,24 @@ impl Bench {
 
     /// A client of the library: nothing happens but by `next`.
     fn library_client(&self, id: &str) -> (AsyncClient, EventLoop) {
-        let options = MqttOptions::new(id, ("127.0.0.1", self.broker.local_addr().port()));
+        let options = MqttOptions::new(id, ("127.0.0.1", self.port()));
         AsyncClient::builder(options).capacity(10).build()
     }
 }
 
-/// A client program whose lines are read. It is killed (SIGKILL) when dropped.
+/// A client program whose lines are read.
 struct Reader {
-    child: Child,
+    _client: Subscriber,
     lines: Receiver<String>,
 }
 
 impl Reader {
-    fn start(command: &mut Command) -> Reader {
-        let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn();
-        let mut child = child.unwrap();
-        let output = BufReader::new(child.stdout.take().unwrap());
-        let (sender, lines) = channel();
-        std::thread::spawn(move || {
-            for line in output.lines().map_while(Result::ok) {
-                if sender.send(line).is_err() {
-                    return;
-                }
-            }
-        });
-        Reader { child, lines }
-    }
-
     /// The next message.
     fn line(&self) -> String {
         let line = || self.lines.recv_timeout(DEADLINE).expect("the client prints a line");
         std::iter::repeat_with(line)
             .find(|line| !line.ends_with("ready"))
             .unwrap()
-    }
-}
-
-impl Drop for Reader {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 
@@ -178,13 +160,13 @@ fn connect(level: u8, id: u8, keep_alive: u8) -> Vec<u8> {
 
 #[test]
 fn messages_reach_subscribers_of_both_versions() {
-    let bench = Bench::new();
+    let rig = DemoBroker::new();
     // Two filters match, and the message comes once; a wildcard leaves topics with $ alone.
-    let readers = VERSIONS.map(|version| bench.subscribe(version, &["-t", "a/+/c", "-t", "#", "-q", "2"]));
+    let readers = VERSIONS.map(|version| rig.subscribe(version, &["-t", "a/+/c", "-t", "#", "-q", "2"]));
     for version in VERSIONS {
         for qos in ["0", "1"] {
-            bench.publish(version, &["-t", "$a/b/c", "-m", "x"]);
-            bench.publish(version, &["-t", "a/ü/c", "-m", version, "-q", qos]);
+            rig.publish(version, &["-t", "$a/b/c", "-m", "x"]);
+            rig.publish(version, &["-t", "a/ü/c", "-m", version, "-q", qos]);
             for reader in &readers {
                 assert_eq!(reader.line(), format!("a/ü/c q{qos} r0 {version}"));
             }
@@ -195,40 +177,40 @@ fn messages_reach_subscribers_of_both_versions() {
 #[test]
 fn retained_messages_are_set_replaced_and_deleted() {
     for version in VERSIONS {
-        let bench = Bench::new();
-        bench.publish(version, &["-t", "s/1", "-m", "old", "-r"]);
-        bench.publish(version, &["-t", "s/1", "-m", "new", "-r", "-q", "1"]);
-        bench.publish(version, &["-t", "s/2", "-m", "gone", "-r"]);
-        bench.publish(version, &["-t", "s/2", "-n", "-r"]);
-        let reader = bench.subscribe(version, &["-t", "s/#", "-q", "1"]);
+        let rig = DemoBroker::new();
+        rig.publish(version, &["-t", "s/1", "-m", "old", "-r"]);
+        rig.publish(version, &["-t", "s/1", "-m", "new", "-r", "-q", "1"]);
+        rig.publish(version, &["-t", "s/2", "-m", "gone", "-r"]);
+        rig.publish(version, &["-t", "s/2", "-n", "-r"]);
+        let reader = rig.subscribe(version, &["-t", "s/#", "-q", "1"]);
         assert_eq!(reader.line(), "s/1 q1 r1 new");
-        bench.publish(version, &["-t", "s/1", "-m", "live", "-r"]);
+        rig.publish(version, &["-t", "s/1", "-m", "live", "-r"]);
         assert_eq!(reader.line(), "s/1 q0 r0 live");
-        bench.publish(version, &["-t", "s/1", "-n", "-r"]);
+        rig.publish(version, &["-t", "s/1", "-n", "-r"]);
         assert_eq!(reader.line(), "s/1 q0 r0 ");
     }
 }
 
 #[test]
 fn the_will_of_a_killed_client_is_published_and_retained() {
-    let bench = Bench::new();
+    let rig = DemoBroker::new();
     for version in VERSIONS {
-        let watcher = bench.subscribe(version, &["-t", version]);
+        let watcher = rig.subscribe(version, &["-t", version]);
         let will = ["--will-payload", "offline", "--will-retain", "--will-qos", "1"];
         let arguments = [&["-t", "own", "--will-topic", version], &will[..]].concat();
-        drop(bench.subscribe(version, &arguments));
+        drop(rig.subscribe(version, &arguments));
         assert_eq!(watcher.line(), format!("{version} q0 r0 offline"));
-        let late = bench.subscribe(version, &["-t", version, "-q", "1"]);
+        let late = rig.subscribe(version, &["-t", version, "-q", "1"]);
         assert_eq!(late.line(), format!("{version} q1 r1 offline"));
     }
 }
 
 #[test]
 fn v5_properties_pass_through_and_a_request_gets_its_response() {
-    let bench = Bench::new();
+    let rig = DemoBroker::new();
     let format = "%C|%P|%E|%D|%R|%F|%p";
-    let new = bench.subscribe_as("mqttv5", format, &["-t", "request"]);
-    let old = bench.subscribe("mqttv311", &["-t", "request"]);
+    let new = rig.subscribe_as("mqttv5", format, &["-t", "request"]);
+    let old = rig.subscribe("mqttv311", &["-t", "request"]);
     let mut arguments = vec!["-t", "request", "-e", "answer", "-m", "x"];
     for property in [
         &["content-type", "text/plain"][..],
@@ -239,10 +221,10 @@ fn v5_properties_pass_through_and_a_request_gets_its_response() {
     ] {
         arguments.extend(["-D", "publish"].iter().chain(property));
     }
-    let client = bench.reader("mosquitto_rr", "mqttv5", format, &arguments);
+    let client = rig.reader("mosquitto_rr", "mqttv5", format, &arguments);
     assert_eq!(new.line(), "text/plain|key:value|60|c|answer|1|x");
     assert_eq!(old.line(), "request q0 r0 x");
-    bench.publish(
+    rig.publish(
         "mqttv5",
         &["-t", "answer", "-m", "y", "-D", "publish", "correlation-data", "c"],
     );
@@ -291,9 +273,9 @@ one.disconnect()
 
 #[test]
 fn paho_works_in_both_versions() {
-    let bench = Bench::new();
+    let rig = DemoBroker::new();
     for version in ["MQTTv311", "MQTTv5"] {
-        run_well(&python(), &["-c", PAHO, &bench.port(), version]);
+        run_well(&python(), &["-c", PAHO, &rig.port().to_string(), version]);
     }
 }
 
@@ -313,9 +295,9 @@ async fn next(events: &mut EventLoop) -> Result<Packet, ConnectionError> {
 
 #[test]
 fn the_library_of_the_gateway_publishes_and_subscribes_and_is_replaced_by_its_twin() {
-    let bench = Bench::new();
-    bench.runtime.block_on(async {
-        let (client, mut events) = bench.library_client("gateway");
+    let rig = DemoBroker::new();
+    rig.runtime.block_on(async {
+        let (client, mut events) = rig.library_client("gateway");
         assert!(matches!(next(&mut events).await, Ok(Packet::ConnAck(_))));
         client.subscribe("gw/#", QoS::AtLeastOnce).await.unwrap();
         assert!(matches!(next(&mut events).await, Ok(Packet::SubAck(_))));
@@ -339,7 +321,7 @@ fn the_library_of_the_gateway_publishes_and_subscribes_and_is_replaced_by_its_tw
                 other => panic!("{other:?}"),
             }
         }
-        let (_twin, mut others) = bench.library_client("gateway");
+        let (_twin, mut others) = rig.library_client("gateway");
         next(&mut others).await.unwrap();
         let Err(ConnectionError::MqttState(StateError::ServerDisconnect { reason_code, .. })) = next(&mut events).await
         else {
@@ -352,11 +334,11 @@ fn the_library_of_the_gateway_publishes_and_subscribes_and_is_replaced_by_its_tw
 #[test]
 fn stop_cancel_and_drop_close_everything() {
     for how in ["stop", "cancel", "drop"] {
-        let Bench {
+        let DemoBroker {
             broker,
             cancel,
             runtime,
-        } = Bench::new();
+        } = DemoBroker::new();
         let address = broker.local_addr();
         let mut clients: Vec<Raw> = (0..20).map(|_| Raw(TcpStream::connect(address).unwrap())).collect();
         for (client, id) in clients.iter_mut().zip(b'a'..).skip(10) {
@@ -380,8 +362,8 @@ fn stop_cancel_and_drop_close_everything() {
 
 #[test]
 fn malformed_packets_close_their_own_connection_only() {
-    let bench = Bench::new();
-    let mut witness = bench.connect();
+    let rig = DemoBroker::new();
+    let mut witness = rig.connect();
     witness.connect(b'w', 0);
     witness.subscribe();
     let connected = |level: u8, packet: &[u8]| [&connect(level, b'x', 0), packet].concat();
@@ -398,20 +380,20 @@ fn malformed_packets_close_their_own_connection_only() {
         (connected(5, &[0x30, 4, 0, 1, b'+', 0]), &[0xE0, 2, 0x90, 0]),
     ];
     for (bytes, last) in bad {
-        let mut client = bench.connect();
+        let mut client = rig.connect();
         // The broker may have closed the connection before all is sent.
         let _ = client.0.write_all(&bytes);
         let answer = client.until_closed();
         assert!(answer.ends_with(last), "{bytes:02X?}: {answer:02X?}");
     }
-    bench.publish("mqttv5", &["-t", "t", "-m", "ok"]);
+    rig.publish("mqttv5", &["-t", "t", "-m", "ok"]);
     witness.expect(&[0x30, 5, 0, 1, b't', b'o', b'k']);
 }
 
 #[test]
 fn a_silent_client_is_closed_after_one_and_a_half_keep_alives() {
-    let bench = Bench::new();
-    let mut client = bench.connect();
+    let rig = DemoBroker::new();
+    let mut client = rig.connect();
     let begin = Instant::now();
     client.connect(b's', 1);
     client.until_closed();
@@ -424,14 +406,14 @@ fn a_silent_client_is_closed_after_one_and_a_half_keep_alives() {
 
 #[test]
 fn connections_are_bounded_and_places_come_free() {
-    let bench = Bench::new();
-    let mut clients: Vec<Raw> = (0..128).map(|_| bench.connect()).collect();
+    let rig = DemoBroker::new();
+    let mut clients: Vec<Raw> = (0..128).map(|_| rig.connect()).collect();
     clients[127].connect(b'c', 0);
-    bench.connect().until_closed();
+    rig.connect().until_closed();
     drop(clients.pop());
     let begin = Instant::now();
     let served = || {
-        let mut client = bench.connect();
+        let mut client = rig.connect();
         client.0.write_all(&connect(4, b'x', 0)).is_ok() && client.0.read_exact(&mut [0; 4]).is_ok()
     };
     while !served() {
@@ -441,9 +423,9 @@ fn connections_are_bounded_and_places_come_free() {
 
 #[test]
 fn a_client_that_does_not_read_stops_nobody_else() {
-    let bench = Bench::new();
+    let rig = DemoBroker::new();
     let [mut stuck, mut reader, mut publisher] = [b's', b'r', b'p'].map(|id| {
-        let mut client = bench.connect();
+        let mut client = rig.connect();
         client.connect(id, 0);
         client
     });

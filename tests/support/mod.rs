@@ -1,6 +1,7 @@
 //! What tests of several targets share: outside programs and processes, a gateway's site, plants made by hand.
 #![allow(dead_code, reason = "each target takes what it needs")]
 
+pub(crate) mod mqtt;
 pub(crate) mod process;
 pub(crate) mod site;
 pub(crate) mod tools;

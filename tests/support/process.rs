@@ -3,8 +3,8 @@
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::os::linux::net::SocketAddrExt;
-use std::os::unix::net::{SocketAddr, UnixListener};
-use std::path::Path;
+use std::os::unix::net::{SocketAddr, UnixDatagram, UnixListener};
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicU16, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
@@ -114,6 +114,34 @@ pub(crate) fn drivegate(arguments: &[&str]) -> Command {
         .env("STATE_DIRECTORY", state)
         .env("TMPDIR", temporary);
     command
+}
+
+/// The socket by which systemd hears of a service, for one that runs with a watchdog of a second.
+pub(crate) struct Notifications(UnixDatagram, PathBuf);
+
+impl Notifications {
+    /// The socket is this file.
+    pub(crate) fn at(file: PathBuf) -> Notifications {
+        let socket = UnixDatagram::bind(&file).unwrap();
+        socket.set_read_timeout(Some(PATIENCE)).unwrap();
+        Notifications(socket, file)
+    }
+
+    /// Has the program send them.
+    pub(crate) fn of<'c>(&self, command: &'c mut Command) -> &'c mut Command {
+        command.env("NOTIFY_SOCKET", &self.1).env("WATCHDOG_USEC", "1000000")
+    }
+
+    /// Waits for one that has this text.
+    pub(crate) fn until(&self, wanted: &str) {
+        let mut bytes = [0; 1000];
+        loop {
+            let count = self.0.recv(&mut bytes).expect("a notification");
+            if String::from_utf8_lossy(&bytes[..count]).contains(wanted) {
+                return;
+            }
+        }
+    }
 }
 
 fn keep(stream: impl Read + Send + 'static, output: &Arc<Mutex<String>>) {

@@ -11,8 +11,9 @@ use drivegate::sim::statistics::Direction;
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use tempfile::TempDir;
 
+use super::mqtt::client;
 use super::process::{Running, api, free_port, get, until, until_ready};
-use super::tools::{root, run, run_well, tool};
+use super::tools::{feed, root, run, tool};
 
 /// The gateway and its bus `line1`; a reply that comes late on a busy machine still comes in time.
 pub(crate) const LINE1: &str = "[gateway]\nname = \"test\"\nprofile_dirs = [\".\"]\n\
@@ -22,6 +23,10 @@ pub(crate) const MODBUS_TCP: &str =
     "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\nstale_after = \"1min\"\n";
 pub(crate) const MQTT: &str = "[mqtt]\nurl = \"mqtt://127.0.0.1:{mqtt}\"\ncommands = true\n";
 pub(crate) const HTTP: &str = "[http]\nlisten = \"127.0.0.1:{http}\"\n";
+/// Commands over HTTP, by users in the file `users`.
+pub(crate) const USERS: &str = "commands = true\nusers_file = \"users\"\n";
+/// Of every user.
+pub(crate) const PASSWORD: &str = "correct horse battery";
 
 /// The section of a Vacon NX; `keys` are further lines of it.
 pub(crate) fn drive(name: &str, address: u8, keys: &str) -> String {
@@ -101,6 +106,21 @@ impl Site {
         text
     }
 
+    /// Adds a user to the file `users`.
+    pub(crate) fn add_user(&self, name: &str) {
+        let program = Path::new(env!("CARGO_BIN_EXE_drivegate"));
+        let arguments = ["user", "add", "--file", &self.path("users"), name];
+        let added = feed(program, &arguments, &format!("{PASSWORD}\n"));
+        assert!(added.status.success(), "{added:?}");
+    }
+
+    /// Status and reply of a request of a user to the HTTP API, by curl; `more` has the method or the body.
+    pub(crate) fn curl(&self, user: &str, path: &str, more: &[&str]) -> (u16, serde_json::Value) {
+        let url = format!("http://127.0.0.1:{}/api/v1/{path}", self.http);
+        let login = format!("{user}:{PASSWORD}");
+        curl(&[&["-u", &login][..], more, &[&url]].concat())
+    }
+
     /// Simulated drives at the port of `line1`, at 38400; what is on their line is written down.
     pub(crate) fn line(&self, addresses: &[u8]) -> SimulatedBus {
         line_of(&self.file("line1"), addresses)
@@ -167,17 +187,24 @@ impl Site {
 
     /// Runs `mosquitto_pub`; the message is with the broker when this returns.
     pub(crate) fn publish(&self, arguments: &[&str]) {
-        let port = self.mqtt.to_string();
-        let client = ["-h", "127.0.0.1", "-p", &port, "-V", "5", "-q", "1"];
-        run_well(&tool("mosquitto_pub"), &[&client, arguments].concat());
+        let published = client("mosquitto_pub", self.mqtt)
+            .args(["-q", "1"])
+            .args(arguments)
+            .output();
+        let published = published.unwrap();
+        assert!(published.status.success(), "{published:?}");
     }
 
-    /// The response to a message to a set topic, by a client of its own.
+    /// The response to a message to a set topic of a drive, by a client of its own.
     pub(crate) fn ask(&self, topic: &str, payload: &str) -> serde_json::Value {
-        let (port, topic) = (self.mqtt.to_string(), format!("drivegate/test/drive/{topic}"));
-        let client = ["-h", "127.0.0.1", "-p", &port, "-V", "5", "-q", "1", "-W", "60"];
-        let request = ["-t", &topic, "-e", "answers/1", "-m", payload];
-        let output = run(&tool("mosquitto_rr"), &[&client[..], &request].concat());
+        self.respond(&format!("drivegate/test/drive/{topic}"), payload)
+    }
+
+    /// The response to a message, by a client of its own.
+    pub(crate) fn respond(&self, topic: &str, payload: &str) -> serde_json::Value {
+        let mut client = client("mosquitto_rr", self.mqtt);
+        client.args(["-q", "1", "-W", "60", "-t", topic, "-e", "answers/1", "-m", payload]);
+        let output = client.output().unwrap();
         serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{topic} {payload}: {error}: {output:?}"))
     }
 
@@ -187,6 +214,18 @@ impl Site {
             Some(self.ask(topic, payload)).filter(|result| result["ok"] == true)
         })
     }
+}
+
+/// Status and reply, JSON or a text, of a request by curl.
+pub(crate) fn curl(arguments: &[&str]) -> (u16, serde_json::Value) {
+    let output = run(
+        &tool("curl"),
+        &[&["-sS", "-w", "\n%{http_code}"][..], arguments].concat(),
+    );
+    let text = String::from_utf8(output.stdout).unwrap();
+    let (body, status) = text.rsplit_once('\n').unwrap();
+    let reply = serde_json::from_str(body).unwrap_or_else(|_| body.into());
+    (status.parse().unwrap(), reply)
 }
 
 /// Simulated drives behind a link, at 38400; what is on their line is written down.

@@ -261,7 +261,7 @@ mod tests {
     const WINDOW: Duration = Duration::from_millis(750);
 
     fn read(table: Table, start: u16, count: u16) -> RequestPdu {
-        RequestPdu::Read { table, start, count }
+        RequestPdu::read(table, start, count)
     }
 
     fn asked(address: u8, pdu: &RequestPdu, at: Instant) -> Asked<'_> {

@@ -16,3 +16,11 @@ pub mod version;
 
 use drivegate_model::drive;
 use drivegate_proto as codec;
+
+/// Plants made by hand, for the tests: the source of the package that depends on this one.
+#[cfg(test)]
+#[path = "../../testkit/src/lib.rs"]
+pub mod testkit;
+
+#[cfg(test)]
+extern crate self as drivegate_core;

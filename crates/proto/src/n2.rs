@@ -102,17 +102,17 @@ pub fn pdu_of(command: &Command) -> Option<RequestPdu> {
         Command::Read { object, attribute } if *attribute == object.region.value_attribute() => {
             let (table, start) = object.place()?;
             let count = object.items();
-            Some(RequestPdu::Read { table, start, count })
+            Some(RequestPdu::read(table, start, count))
         }
         Command::Override { object, data } => match (object.place()?, data.as_slice()) {
             ((Table::Coil, address), [value]) => Some(RequestPdu::WriteCoil {
                 address,
                 on: *value != 0,
             }),
-            ((Table::Holding, start), [a, b, c, d]) => Some(RequestPdu::WriteRegisters {
+            ((Table::Holding, start), [a, b, c, d]) => Some(RequestPdu::write_registers(
                 start,
-                values: vec![u16::from_be_bytes([*a, *b]), u16::from_be_bytes([*c, *d])],
-            }),
+                &[u16::from_be_bytes([*a, *b]), u16::from_be_bytes([*c, *d])],
+            )),
             _ => None,
         },
         Command::Release { object } => {

@@ -170,7 +170,7 @@ mod tests {
     fn read(table: Table, start: u16, count: u16) -> Request {
         Request {
             address: 1,
-            pdu: RequestPdu::Read { table, start, count },
+            pdu: RequestPdu::read(table, start, count),
             n2: Default::default(),
         }
     }
@@ -178,10 +178,7 @@ mod tests {
     fn write(start: u16, values: &[u16]) -> Request {
         Request {
             address: 1,
-            pdu: RequestPdu::WriteRegisters {
-                start,
-                values: values.to_vec(),
-            },
+            pdu: RequestPdu::write_registers(start, values),
             n2: Default::default(),
         }
     }
@@ -189,7 +186,7 @@ mod tests {
     fn set(address: u16, value: u16) -> Request {
         Request {
             address: 1,
-            pdu: RequestPdu::WriteRegister { address, value },
+            pdu: RequestPdu::write_register(address, value),
             n2: Default::default(),
         }
     }

@@ -313,14 +313,7 @@ mod tests {
     const SILENCE: Duration = Duration::from_micros(911);
 
     fn exchange() -> (Request, Vec<u8>, Vec<u8>) {
-        let request = Request::new(
-            1,
-            RequestPdu::Read {
-                table: Table::Holding,
-                start: 2100,
-                count: 2,
-            },
-        );
+        let request = Request::new(1, RequestPdu::read(Table::Holding, 2100, 2));
         let (mut asked, mut reply) = (Vec::new(), Vec::new());
         rtu::encode_request(&request, &mut asked);
         rtu::encode_frame(1, &[3, 4, 1, 2, 3, 4], &mut reply);

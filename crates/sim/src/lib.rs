@@ -27,6 +27,8 @@ pub mod endpoint;
 pub mod faults;
 pub(crate) mod framing;
 pub mod half_duplex;
+#[cfg(test)]
+mod in_time;
 pub(crate) mod model;
 pub(crate) mod motor;
 pub(crate) mod n2;

@@ -24,32 +24,32 @@ const FORCED: Wishes = Wishes {
 };
 
 /// A drive of a family alone on its line.
-struct Bench {
+struct DriveOnLine {
     profile: Arc<Profile>,
     slaves: Slaves,
     now: SimTime,
 }
 
-impl Bench {
-    fn new(profile: &Arc<Profile>) -> Bench {
+impl DriveOnLine {
+    fn new(profile: &Arc<Profile>) -> DriveOnLine {
         let model = ModelOptions::by_name(profile.simulator.as_deref().unwrap()).unwrap();
-        let mut bench = Bench {
+        let mut rig = DriveOnLine {
             profile: profile.clone(),
             slaves: Slaves::new([DriveOptions::new(ADDRESS, model)], SimTime::ZERO),
             now: SimTime::ZERO,
         };
-        if bench.is_n2() {
-            bench.ask(RequestPdu::N2(Session::Identify));
+        if rig.is_n2() {
+            rig.ask(RequestPdu::N2(Session::Identify));
         }
-        bench
+        rig
     }
 
     /// With random parameters, in the mode in which it takes them.
-    fn filled(profile: &Arc<Profile>, seed: u64) -> Bench {
-        let mut bench = Bench::new(profile);
-        bench.drive().fill_parameters(seed);
-        bench.drive().set_programming(true);
-        bench
+    fn filled(profile: &Arc<Profile>, seed: u64) -> DriveOnLine {
+        let mut rig = DriveOnLine::new(profile);
+        rig.drive().fill_parameters(seed);
+        rig.drive().set_programming(true);
+        rig
     }
 
     fn is_n2(&self) -> bool {
@@ -91,11 +91,8 @@ impl Bench {
     fn write(&mut self, write: &ParameterWrite) -> Reply {
         let address = write.address;
         self.ask(match write.to {
-            RawValue::Word(value) => RequestPdu::WriteRegister { address, value },
-            RawValue::Float(bits) => RequestPdu::WriteRegisters {
-                start: address,
-                values: vec![(bits >> 16) as u16, bits as u16],
-            },
+            RawValue::Word(value) => RequestPdu::write_register(address, value),
+            RawValue::Float(bits) => RequestPdu::write_registers(address, &[(bits >> 16) as u16, bits as u16]),
         })
     }
 
@@ -111,7 +108,7 @@ impl Bench {
             );
         }
         if let Some((address, value)) = plan.handling.save {
-            assert_eq!(self.ask(RequestPdu::WriteRegister { address, value }), Reply::Written);
+            assert_eq!(self.ask(RequestPdu::write_register(address, value)), Reply::Written);
         }
     }
 }
@@ -125,7 +122,7 @@ fn families() -> Vec<(Arc<Profile>, BTreeSet<u16>)> {
         .filter(|profile| profile.base.is_none() && !profile.parameters.is_empty());
     let families: Vec<_> = all
         .map(|profile| {
-            let file = Bench::new(profile).read(BTreeSet::new());
+            let file = DriveOnLine::new(profile).read(BTreeSet::new());
             (profile.clone(), Reading::addresses_of(profile, &file))
         })
         .collect();
@@ -140,28 +137,28 @@ fn the_parameters_of_any_drive_go_to_any_other_of_its_family_and_back() {
         .into_iter()
         .flat_map(|family| (1..=SEEDS).map(move |seed| (family.clone(), seed)))
     {
-        let wanted = Bench::filled(&profile, seed).read(known.clone());
-        let mut bench = Bench::filled(&profile, seed + 1000);
-        let present = bench.read(known.clone());
+        let wanted = DriveOnLine::filled(&profile, seed).read(known.clone());
+        let mut rig = DriveOnLine::filled(&profile, seed + 1000);
+        let present = rig.read(known.clone());
         let (plan, _) = plan(&profile, &wanted, &present, &FORCED).unwrap();
         let half = plan.writes.len() / 2;
         written += plan.writes.len();
-        bench.carry_out(&plan);
-        let left: BTreeSet<_> = differences(&wanted, &bench.read(known.clone()))
+        rig.carry_out(&plan);
+        let left: BTreeSet<_> = differences(&wanted, &rig.read(known.clone()))
             .into_iter()
             .map(|difference| difference.id)
             .collect();
         let left_out: BTreeSet<_> = plan.left_out.iter().map(|(id, _)| id.clone()).collect();
         assert_eq!(left, left_out, "{}", profile.name);
-        check_wear(&mut bench, &plan);
+        check_wear(&mut rig, &plan);
 
         // The same, cut half way, is taken back.
-        let mut bench = Bench::filled(&profile, seed + 1000);
+        let mut rig = DriveOnLine::filled(&profile, seed + 1000);
         for write in &plan.writes[..half] {
-            assert_eq!(bench.write(write), Reply::Written);
+            assert_eq!(rig.write(write), Reply::Written);
         }
-        bench.carry_out(&plan.back(half));
-        assert_eq!(differences(&present, &bench.read(known)), [], "{}", profile.name);
+        rig.carry_out(&plan.back(half));
+        assert_eq!(differences(&present, &rig.read(known)), [], "{}", profile.name);
     }
     assert!(written > 1000, "{written}");
 }
@@ -170,8 +167,8 @@ fn the_parameters_of_any_drive_go_to_any_other_of_its_family_and_back() {
 #[test]
 fn the_counters_of_a_drive_are_read_behind_its_parameters() {
     for (profile, known) in families() {
-        let mut bench = Bench::new(&profile);
-        let file = bench.read(known.clone());
+        let mut rig = DriveOnLine::new(&profile);
+        let file = rig.read(known.clone());
         // The counters are read one after the other, and count themselves.
         let (received, own) = (known.len() + 1, known.len() + 4);
         let of = format!("{received} messages received, 0 damaged, {own} to this drive");
@@ -188,7 +185,7 @@ fn the_counters_of_a_drive_are_read_behind_its_parameters() {
             while let Some(pdu) = reading.request() {
                 let outcome = match pdu {
                     RequestPdu::Diagnostics { .. } => end.clone(),
-                    pdu => match bench.ask(pdu) {
+                    pdu => match rig.ask(pdu) {
                         Reply::Exception(exception) => Outcome::Exception(exception),
                         reply => Outcome::Acknowledged(reply),
                     },
@@ -209,9 +206,9 @@ fn the_counters_of_a_drive_are_read_behind_its_parameters() {
 }
 
 /// Each parameter was written once, and the memory that keeps it as often.
-fn check_wear(bench: &mut Bench, plan: &Plan) {
-    let (profile, is_n2) = (bench.profile.clone(), bench.is_n2());
-    let writes = bench.drive().parameter_writes();
+fn check_wear(rig: &mut DriveOnLine, plan: &Plan) {
+    let (profile, is_n2) = (rig.profile.clone(), rig.is_n2());
+    let writes = rig.drive().parameter_writes();
     let taken: u32 = writes.values().map(|writes| writes.taken).sum();
     assert_eq!(taken as usize, plan.writes.len(), "{}", profile.name);
     assert!(
@@ -234,10 +231,10 @@ fn check_wear(bench: &mut Bench, plan: &Plan) {
 #[test]
 fn a_locked_drive_refuses_what_the_plan_says_it_will() {
     for (profile, known) in families() {
-        let wanted = Bench::filled(&profile, 1).read(known.clone());
-        let mut bench = Bench::filled(&profile, 2);
-        bench.drive().set_programming(false);
-        let (plan, _) = plan(&profile, &wanted, &bench.read(known), &FORCED).unwrap();
+        let wanted = DriveOnLine::filled(&profile, 1).read(known.clone());
+        let mut rig = DriveOnLine::filled(&profile, 2);
+        rig.drive().set_programming(false);
+        let (plan, _) = plan(&profile, &wanted, &rig.read(known), &FORCED).unwrap();
         let lock = profile.parameters.rules.lock.clone();
         let code = plan
             .handling
@@ -250,7 +247,7 @@ fn a_locked_drive_refuses_what_the_plan_says_it_will() {
             let is_locked = lock
                 .as_ref()
                 .is_some_and(|lock| crate::drive::parameters::has(&lock.of, write.address));
-            let reply = bench.write(write);
+            let reply = rig.write(write);
             match (is_locked, code) {
                 (true, Some(code)) => assert_eq!(reply, Reply::Exception(code), "{}", write.line),
                 (true, None) => panic!("the plan does not say what the lock returns"),
@@ -264,14 +261,14 @@ fn a_locked_drive_refuses_what_the_plan_says_it_will() {
 fn a_write_while_the_motor_is_fed_is_recorded() {
     let mut random = Random::new(3);
     for (profile, known) in families() {
-        let mut bench = Bench::new(&profile);
-        bench.drive().command(Command {
+        let mut rig = DriveOnLine::new(&profile);
+        rig.drive().command(Command {
             run: true,
             reverse: false,
             reference: 5000,
         });
-        bench.now += Duration::from_secs(2);
-        let wanted = bench.read(known);
+        rig.now += Duration::from_secs(2);
+        let wanted = rig.read(known);
         let parameters = &profile.parameters;
         let free = wanted
             .read_values()
@@ -293,9 +290,9 @@ fn a_write_while_the_motor_is_fed_is_recorded() {
             line: String::new(),
             volatile: false,
         };
-        assert!(bench.drive().state().running, "{}", profile.name);
-        assert_eq!(bench.write(&write), Reply::Written);
-        let fed: u32 = bench
+        assert!(rig.drive().state().running, "{}", profile.name);
+        assert_eq!(rig.write(&write), Reply::Written);
+        let fed: u32 = rig
             .drive()
             .parameter_writes()
             .values()

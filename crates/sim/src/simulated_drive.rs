@@ -347,22 +347,9 @@ mod tests {
             SimTime::ZERO,
         );
         let minute = Duration::from_secs(60);
-        drive.answer(
-            &RequestPdu::Read {
-                table: Table::Holding,
-                start: 2100,
-                count: 11,
-            },
-            minute,
-        );
+        drive.answer(&RequestPdu::read(Table::Holding, 2100, 11), minute);
         assert!(drive.autopilot.is_some(), "reading leaves it alone");
-        drive.answer(
-            &RequestPdu::WriteRegister {
-                address: 2000,
-                value: 0,
-            },
-            minute,
-        );
+        drive.answer(&RequestPdu::write_register(2000, 0), minute);
         assert!(drive.autopilot.is_none());
         drive.advance(minute * 5);
         assert_eq!(drive.state().output, 0.0, "the autopilot does not start it again");
@@ -380,14 +367,7 @@ mod tests {
         let year = Duration::from_secs(365 * 86_400);
         drive.advance(year);
         assert!(matches!(
-            drive.answer(
-                &RequestPdu::Read {
-                    table: Table::Holding,
-                    start: 2100,
-                    count: 1
-                },
-                year
-            ),
+            drive.answer(&RequestPdu::read(Table::Holding, 2100, 1), year),
             Some(Reply::Registers(_))
         ));
     }

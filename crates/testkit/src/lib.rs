@@ -1,25 +1,17 @@
-//! What the tests of several packages share.
+//! What the tests of several packages share: plants made by hand, and what came out of a queue or the audit.
+//!
+//! No bus runs: a test fills the process images and empties the queues. The unit tests of `drivegate-core` compile this
+//! source as a module of their own, because this package depends on that one.
+#![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "tests may panic")]
 
-use std::time::Instant;
+mod commands;
+mod families;
+pub mod mqtt;
+mod plant;
 
-use drivegate_core::command::{Audit, Command, Pending, Urgency};
-use serde_json::Value;
-
-/// All records of the audit that are kept, oldest first. What cannot be read as JSON is null.
-pub fn audited(audit: &Audit) -> Vec<Value> {
-    let lines = audit.recent(None);
-    lines
-        .iter()
-        .map(|line| serde_json::from_str(line).unwrap_or_default())
-        .collect()
-}
-
-/// Takes the next command of that rank or a higher one, where every drive is free and no stop is redundant.
-pub fn next_command(pending: &mut Pending, lowest: Urgency, now: Instant) -> Option<Command> {
-    let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
-    let chosen = ranks
-        .into_iter()
-        .filter(|rank| *rank <= lowest)
-        .find_map(|rank| pending.next(rank, now, |_| true, |_| false))?;
-    pending.take(chosen)
-}
+pub use commands::{audited, next_command, take_next, ticket};
+pub use families::{Family, Order, families, number, orders, rows};
+pub use plant::{
+    STALE_AFTER, bus, bus_spec, controlled, image, monitored, nx, nx_bus, nx_plant, online, profile, read, read_all,
+    read_nx, up,
+};

@@ -7,10 +7,10 @@ use std::process::{Command, Stdio};
 
 use serde_json::{Value as Json, json};
 
-use super::PASSWORD;
+use crate::support::mqtt::{client, next_json};
 use crate::support::process::{Running, api, until};
-use crate::support::site::{HTTP, LINE1, MQTT, Site, controlled};
-use crate::support::tools::{feed, python, root, run, run_well, tool};
+use crate::support::site::{HTTP, LINE1, MQTT, Site, USERS, controlled};
+use crate::support::tools::{python, root, run_well, tool};
 
 const MODBUS_TCP: &str =
     "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.0/8\"]\nstale_after = \"1min\"\n";
@@ -71,28 +71,20 @@ struct Plant {
 }
 
 fn plant() -> Plant {
-    let http = format!("{HTTP}commands = true\nusers_file = \"users\"\n");
-    let site = Site::of(&[LINE1, &controlled("pump-1", 1, ""), MODBUS_TCP, MQTT, AUTHORITY, &http]);
-    let program = std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"));
-    let arguments = ["user", "add", "--file", &site.path("users"), "alice"];
-    let added = feed(program, &arguments, &format!("{PASSWORD}\n"));
-    assert!(added.status.success(), "{added:?}");
+    let site = Site::of(&[
+        LINE1,
+        &controlled("pump-1", 1, ""),
+        MODBUS_TCP,
+        MQTT,
+        AUTHORITY,
+        HTTP,
+        USERS,
+    ]);
+    site.add_user("alice");
     let simulator = site.simulate(&["--addresses", "1", "--baud", "38400"]);
     let broker = site.broker();
-    let port = site.mqtt.to_string();
-    let arguments = [
-        "-h",
-        "127.0.0.1",
-        "-p",
-        &port,
-        "-V",
-        "5",
-        "-t",
-        "spBv1.0/#",
-        "-F",
-        "%r|%q|%t|%x",
-    ];
-    let heard = Running::start(&tool("mosquitto_sub"), &arguments);
+    let mut client = client("mosquitto_sub", site.mqtt);
+    let heard = Running::spawn(client.args(["-t", "spBv1.0/#", "-F", "%r|%q|%t|%x"]));
     let gateway = site.run_ready();
     site.until_connected(true);
     site.until_state("pump-1", "ready");
@@ -116,10 +108,8 @@ impl Plant {
     }
 
     fn curl(&self, what: &str, body: &Json) -> Json {
-        let url = format!("http://127.0.0.1:{}/api/v1/drives/pump-1/{what}", self.site.http);
-        let (user, body) = (format!("alice:{PASSWORD}"), body.to_string());
-        let output = run(&tool("curl"), &["-s", "-u", &user, "-d", &body, &url]);
-        serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {output:?}"))
+        let what = format!("drives/pump-1/{what}");
+        self.site.curl("alice", &what, &["-d", &body.to_string()]).1
     }
 
     fn sparkplug(&self, arguments: &[&str], input: &str) -> String {
@@ -210,14 +200,10 @@ impl Plant {
             (_, _) => 2,
         };
         assert_eq!(plc, expected, "0x8013 while {state} for {holder}");
-        let seen = self.curl_get("hold");
+        let (_, seen) = self.site.curl("alice", "drives/pump-1/hold", &[]);
         assert_eq!((&seen["hold"], &seen["holder"]), (&json!(state), holder), "{seen}");
-        let port = self.site.mqtt.to_string();
         until("the state by MQTT", || {
-            let topic = "drivegate/test/drive/pump-1/state";
-            let arguments = ["-h", "127.0.0.1", "-p", &port, "-t", topic, "-C", "1", "-W", "10"];
-            let output = run(&tool("mosquitto_sub"), &arguments);
-            let message: Json = serde_json::from_slice(&output.stdout).ok()?;
+            let message = next_json(self.site.mqtt, "drivegate/test/drive/pump-1/state")?;
             (message["hold"] == state && message["holder"] == *holder).then_some(())
         });
         until("the metrics of the host", || {
@@ -230,13 +216,6 @@ impl Plant {
             let is_holder = last("Hold/Holder").is_some_and(|value| value.as_str().unwrap_or_default() == shown);
             (last("Hold/State")? == state && is_holder).then_some(())
         });
-    }
-
-    fn curl_get(&self, what: &str) -> Json {
-        let url = format!("http://127.0.0.1:{}/api/v1/drives/pump-1/{what}", self.site.http);
-        let user = format!("alice:{PASSWORD}");
-        let output = run(&tool("curl"), &["-s", "-u", &user, &url]);
-        serde_json::from_slice(&output.stdout).unwrap()
     }
 
     /// The operator takes the drive, whoever has it, and gives it back.
@@ -277,7 +256,7 @@ fn each_client_sees_and_may_what_the_table_says() {
                 Client::Nobody => ("free", Json::Null),
                 _ => ("reserved", json!(stopper.name())),
             };
-            let seen = plant.curl_get("hold");
+            let (_, seen) = plant.site.curl("alice", "drives/pump-1/hold", &[]);
             assert_eq!(
                 (&seen["hold"], &seen["holder"]),
                 (&json!(state), &left),

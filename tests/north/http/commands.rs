@@ -7,6 +7,7 @@ use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Sour
 use drivegate::drive::Value;
 use drivegate::north::http::{Options, Scope, Token, Tokens, User, Users};
 use drivegate::process_image::{Access, LeaseAction, Supervision};
+use drivegate_testkit::{image, monitored};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio::time::timeout;
@@ -14,7 +15,6 @@ use tokio::time::timeout;
 use super::client::{EventStream, PATIENCE, Reply, get, post, raw, request};
 use super::plant::{self, Server};
 use crate::north::modbus_tcp::rig::FakeBus;
-use crate::north::plant as hand_made;
 use crate::support::tools::{run, tool};
 
 const PASSWORD: &str = "correct horse";
@@ -57,9 +57,9 @@ impl Rig {
                 action: LeaseAction::Stop,
                 adopt: false,
             }),
-            ..hand_made::spec("line1", "pump-1", 1, &plant::nx())
+            ..monitored("pump-1", "line1", 1, &plant::nx())
         };
-        let drives = vec![hand_made::image(pump), plant::drive("line1", "fan-2", 2, &plant::nx())];
+        let drives = vec![image(pump), plant::drive("line1", "fan-2", 2, &plant::nx())];
         for drive in &drives {
             plant::answer(drive, Instant::now(), plant::nx_running);
         }

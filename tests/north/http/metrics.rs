@@ -5,6 +5,8 @@ use std::fs;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
+use drivegate_testkit::rows;
+
 use super::client::{get, request};
 use super::plant::{self, STALE_AFTER, Server};
 use crate::support::process::{PATIENCE, Running, free_port};
@@ -223,70 +225,49 @@ async fn points_without_a_metric_of_their_own() {
     );
 }
 
+/// Series, labels and value in the plant in which everything occurs.
+const VALUES: &str = "\
+drivegate_drive_up                      | bus=line1,drive=pump-1                | 1
+drivegate_drive_up                      | bus=line1,drive=fan-2                 | 0
+drivegate_drive_up                      | bus=line1,drive=mixer-3               | 0
+drivegate_drive_state                   | bus=line1,drive=pump-1,state=running  | 1
+drivegate_drive_state                   | bus=line1,drive=pump-1,state=ready    | 0
+drivegate_drive_state                   | bus=line1,drive=fan-2,state=offline   | 1
+drivegate_drive_state                   | bus=line2,drive=saw-4,state=fault     | 1
+drivegate_drive_output_frequency_hertz  | bus=line1,drive=pump-1                | 25
+drivegate_drive_motor_current_amperes   | bus=line1,drive=pump-1                | 4.2
+drivegate_drive_running                 | bus=line1,drive=pump-1                | 1
+drivegate_drive_fault_code              | bus=line2,drive=saw-4                 | 7
+drivegate_drive_turnaround_seconds      | bus=line1,drive=pump-1                | 0.0019
+drivegate_drive_transactions_total      | bus=line1,drive=fan-2,outcome=timeout | 1
+drivegate_drive_transactions_total      | bus=line1,drive=fan-2,outcome=corrupt | 0
+drivegate_bus_up                        | bus=line1                             | 1
+drivegate_bus_load_ratio                | bus=line1                             | 0.4375
+drivegate_bus_queue_depth               | bus=line1                             | 0
+drivegate_bus_cycle_seconds_bucket      | bus=line1,class=fast,le=0.01          | 0
+drivegate_bus_cycle_seconds_bucket      | bus=line1,class=fast,le=0.0125        | 1
+drivegate_bus_cycle_seconds_bucket      | bus=line1,class=fast,le=+Inf          | 1
+drivegate_bus_cycle_seconds_sum         | bus=line1,class=fast                  | 0.0125
+drivegate_bus_cycle_seconds_count       | bus=line1,class=slow                  | 1
+drivegate_bus_transaction_seconds_count | bus=line2                             | 1
+drivegate_writes_total                  | source=mqtt,result=timeout            | 1
+drivegate_write_seconds_count           |                                       | 1
+drivegate_modbus_tcp_connections        |                                       | 1
+drivegate_modbus_tcp_requests_total     | function=3,outcome=ok                 | 1
+drivegate_modbus_tcp_requests_total     | function=6,outcome=illegal_function   | 1
+drivegate_slot_requests_total           | bus=line1,outcome=answered            | 1
+drivegate_mqtt_connected                |                                       | 1
+drivegate_mqtt_published_total          |                                       | 17
+drivegate_mqtt_buffered_messages        |                                       | 2";
+
 #[tokio::test]
 async fn values() {
     let plant = plant::mixed();
     plant::count_a_write(&plant);
     let server = Server::of(plant).await;
     let text = scrape(&server).await;
-    for (name, labels, expected) in [
-        ("drivegate_drive_up", "bus=line1,drive=pump-1", 1.0),
-        ("drivegate_drive_up", "bus=line1,drive=fan-2", 0.0),
-        ("drivegate_drive_up", "bus=line1,drive=mixer-3", 0.0),
-        ("drivegate_drive_state", "bus=line1,drive=pump-1,state=running", 1.0),
-        ("drivegate_drive_state", "bus=line1,drive=pump-1,state=ready", 0.0),
-        ("drivegate_drive_state", "bus=line1,drive=fan-2,state=offline", 1.0),
-        ("drivegate_drive_state", "bus=line2,drive=saw-4,state=fault", 1.0),
-        ("drivegate_drive_output_frequency_hertz", "bus=line1,drive=pump-1", 25.0),
-        ("drivegate_drive_motor_current_amperes", "bus=line1,drive=pump-1", 4.2),
-        ("drivegate_drive_running", "bus=line1,drive=pump-1", 1.0),
-        ("drivegate_drive_fault_code", "bus=line2,drive=saw-4", 7.0),
-        ("drivegate_drive_turnaround_seconds", "bus=line1,drive=pump-1", 0.0019),
-        (
-            "drivegate_drive_transactions_total",
-            "bus=line1,drive=fan-2,outcome=timeout",
-            1.0,
-        ),
-        (
-            "drivegate_drive_transactions_total",
-            "bus=line1,drive=fan-2,outcome=corrupt",
-            0.0,
-        ),
-        ("drivegate_bus_up", "bus=line1", 1.0),
-        ("drivegate_bus_load_ratio", "bus=line1", 0.4375),
-        ("drivegate_bus_queue_depth", "bus=line1", 0.0),
-        (
-            "drivegate_bus_cycle_seconds_bucket",
-            "bus=line1,class=fast,le=0.01",
-            0.0,
-        ),
-        (
-            "drivegate_bus_cycle_seconds_bucket",
-            "bus=line1,class=fast,le=0.0125",
-            1.0,
-        ),
-        (
-            "drivegate_bus_cycle_seconds_bucket",
-            "bus=line1,class=fast,le=+Inf",
-            1.0,
-        ),
-        ("drivegate_bus_cycle_seconds_sum", "bus=line1,class=fast", 0.0125),
-        ("drivegate_bus_cycle_seconds_count", "bus=line1,class=slow", 1.0),
-        ("drivegate_bus_transaction_seconds_count", "bus=line2", 1.0),
-        ("drivegate_writes_total", "source=mqtt,result=timeout", 1.0),
-        ("drivegate_write_seconds_count", "", 1.0),
-        ("drivegate_modbus_tcp_connections", "", 1.0),
-        ("drivegate_modbus_tcp_requests_total", "function=3,outcome=ok", 1.0),
-        (
-            "drivegate_modbus_tcp_requests_total",
-            "function=6,outcome=illegal_function",
-            1.0,
-        ),
-        ("drivegate_slot_requests_total", "bus=line1,outcome=answered", 1.0),
-        ("drivegate_mqtt_connected", "", 1.0),
-        ("drivegate_mqtt_published_total", "", 17.0),
-        ("drivegate_mqtt_buffered_messages", "", 2.0),
-    ] {
+    for [name, labels, expected] in rows(VALUES) {
+        let expected: f64 = expected.parse().unwrap();
         assert_eq!(value(&text, name, labels), Some(expected), "{name} {labels}");
     }
     let info = series(&text)

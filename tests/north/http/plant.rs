@@ -7,11 +7,10 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::codec::{Exception, Protocol, Table};
-use drivegate::command::{self, Origin, SourceKind, Ticket};
+use drivegate::codec::{Exception, Table};
+use drivegate::command;
 use drivegate::diagnosis::{Cause, Certainty, Counted, Diagnosis, Verdict};
 use drivegate::drive::model::Kind;
-use drivegate::drive::profile::Profiles;
 use drivegate::drive::{ModelPoint, Profile};
 use drivegate::event::{Event, EventKind};
 use drivegate::north::http::{self, Http, Options};
@@ -19,10 +18,10 @@ use drivegate::north::{NorthState, SlotOutcome};
 use drivegate::north::{Reconfigure as _, Server as _};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{DriveImage, DriveSpec, LeaseAction, Link, Outcome, PollCycle, Supervision};
+use drivegate_testkit::{bus_spec, image, monitored, profile, read_all, ticket};
 use tokio_util::sync::CancellationToken;
 
-use crate::north::plant;
-pub(crate) use crate::north::plant::nx;
+pub(crate) use drivegate_testkit::nx;
 
 pub(crate) const STALE_AFTER: Duration = Duration::from_secs(60);
 
@@ -90,35 +89,28 @@ pub(crate) fn nx_faulted(address: u16) -> u16 {
 }
 
 pub(crate) fn drive(bus: &str, name: &str, address: u8, profile: &Arc<Profile>) -> Arc<DriveImage> {
-    plant::image(plant::spec(bus, name, address, profile))
+    image(monitored(name, bus, address, profile))
 }
 
 /// A drive with a lease.
 pub(crate) fn supervised(bus: &str, name: &str, address: u8, profile: &Arc<Profile>) -> Arc<DriveImage> {
-    plant::image(DriveSpec {
+    image(DriveSpec {
         supervision: Some(Supervision {
             timeout: STALE_AFTER,
             action: LeaseAction::Hold,
             adopt: false,
         }),
-        ..plant::spec(bus, name, address, profile)
+        ..monitored(name, bus, address, profile)
     })
 }
 
 pub(crate) fn bus(name: &str, drives: Vec<Arc<DriveImage>>) -> BusHandle {
-    plant::bus(name, Protocol::ModbusRtu, drives)
+    drivegate_testkit::bus(bus_spec(name), drives)
 }
 
 /// The drive answers, and all its points were read at `at`.
 pub(crate) fn answer(image: &DriveImage, at: Instant, word: impl Fn(u16) -> u16) {
-    image.update(|snapshot| {
-        snapshot.link = Link::Online(SystemTime::now());
-        snapshot.fast_at = Some(at);
-        for read in &image.plan.reads {
-            let words: Vec<u16> = (0..read.count).map(|i| word(read.start + i)).collect();
-            snapshot.store(read.table, read.start, &words, at);
-        }
-    });
+    read_all(image, at, word);
     image.count(Outcome::Ok);
     image.set_turnaround(Duration::from_micros(1900));
 }
@@ -150,7 +142,7 @@ pub(crate) fn open(bus: &BusHandle) {
 }
 
 pub(crate) fn plant(buses: Vec<BusHandle>) -> Plant {
-    plant::plant("pump-house", STALE_AFTER, buses)
+    Plant::new("pump-house", STALE_AFTER, buses)
 }
 
 pub(crate) fn event(kind: EventKind, drive: &str, text: &str) -> Event {
@@ -184,8 +176,7 @@ pub(crate) fn mixed() -> Plant {
 
 /// A drive that answers, ready and without a fault, and refuses to say whether it runs.
 pub(crate) fn secretive() -> Arc<DriveImage> {
-    let cx = Profiles::built_in().get("vacon-cx").expect("built in").clone();
-    let image = drive("line1", "fan-1", 1, &cx);
+    let image = drive("line1", "fan-1", 1, &profile("vacon-cx"));
     answer(&image, Instant::now(), |address| u16::from(address == 1));
     image.update(|s| s.refuse(Table::DiscreteInput, 2, 1, Exception::ADDRESS));
     image
@@ -193,15 +184,7 @@ pub(crate) fn secretive() -> Arc<DriveImage> {
 
 /// One command that was answered.
 pub(crate) fn count_a_write(plant: &Plant) {
-    let origin = Origin::new(SourceKind::Mqtt, "t");
-    let (ticket, _answer) = Ticket::new(
-        origin,
-        "pump-1",
-        "run=true".to_string(),
-        true,
-        Instant::now(),
-        plant.writes.clone(),
-    );
+    let (ticket, _answer) = ticket(&plant.writes, Instant::now());
     ticket.answer(command::Outcome::TimedOut, Instant::now() + Duration::from_millis(20));
 }
 

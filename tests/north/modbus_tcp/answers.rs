@@ -9,10 +9,10 @@ use drivegate::command::Outcome;
 use drivegate::north::modbus_tcp::Uncached;
 use drivegate::process_image::{Access, Link};
 
+use drivegate_testkit::{number, rows};
+
 use super::rig::{Client, Rig, frame, options, plant, plant_where, registers, until, words, write};
 use crate::support::tools;
-
-const PROCESS_DATA: [u16; 11] = [0x0023, 0x2000, 5000, 2500, 1440, 123, 455, 387, 2301, 540, 0];
 
 /// Unit 1, a Vacon NX with its coils and discrete inputs missing.
 const NX: u8 = 1;
@@ -77,238 +77,68 @@ const STATES: [(State, &str, &str); 12] = [
 ];
 
 /// A kind of request, a row of the table: what, unit, PDU, and the outcome in each state.
-fn kinds() -> Vec<(&'static str, u8, Vec<u8>, &'static str)> {
-    let identify = vec![43, 14, 1, 0];
-    vec![
-        (
-            "03 polled registers",
-            NX,
-            words(3, &[2100, 11]),
-            "ok ok ok ok 0A 0B 0B 0A ok ok ok ok",
-        ),
-        (
-            "04 the same",
-            NX,
-            words(4, &[2100, 11]),
-            "ok ok ok ok 0A 0B 0B 0A ok ok ok ok",
-        ),
-        (
-            "03 registers that are not polled",
-            NX,
-            words(3, &[500, 3]),
-            "ok ok ok 02 0A 0B ok 0A 06 02 0B 04",
-        ),
-        (
-            "03 more than the drive's limit per request",
-            NX,
-            words(3, &[500, 31]),
-            "03 03 03 02 0A 03 03 0A 03 03 03 03",
-        ),
-        (
-            "03 across the end of the raw view",
-            NX,
-            words(3, &[0x7FFF, 2]),
-            "02 02 02 02 0A 02 02 02 02 02 02 02",
-        ),
-        (
-            "03 quantity 0",
-            NX,
-            words(3, &[2100, 0]),
-            "03 03 03 03 0A 03 03 03 03 03 03 03",
-        ),
-        (
-            "03 quantity 126",
-            NX,
-            words(3, &[2100, 126]),
-            "03 03 03 03 0A 03 03 03 03 03 03 03",
-        ),
-        (
-            "03 or 04 common model, float block",
-            NX,
-            words(3, &[0x8000, 19]),
-            "ok ok ok ok 0A ok ok ok ok ok ok ok",
-        ),
-        (
-            "03 beyond the end of a block",
-            NX,
-            words(3, &[0x8014, 2]),
-            "02 02 02 02 0A 02 02 02 02 02 02 02",
-        ),
-        (
-            "01 polled coils",
-            METER,
-            words(1, &[7, 1]),
-            "ok ok ok ok 0A 0B 0B 0A ok ok ok ok",
-        ),
-        (
-            "02 polled discrete inputs",
-            METER,
-            words(2, &[3, 2]),
-            "ok ok ok ok 0A 0B 0B 0A ok ok ok ok",
-        ),
-        (
-            "01 coils that are not polled",
-            METER,
-            words(1, &[9, 10]),
-            "ok ok ok 02 0A 0B ok 0A 06 02 0B 04",
-        ),
-        (
-            "01 on a drive without coils",
-            NX,
-            words(1, &[0, 1]),
-            "01 01 01 01 0A 01 01 01 01 01 01 01",
-        ),
-        (
-            "02 on a drive without discrete inputs",
-            NX,
-            words(2, &[0, 1]),
-            "01 01 01 01 0A 01 01 01 01 01 01 01",
-        ),
-        (
-            "06 command, 0x8100",
-            NX,
-            words(6, &[0x8100, 1]),
-            "ok 01 01 ok 0A 0B ok 0A 06 02 0B 04",
-        ),
-        (
-            "16 command block",
-            NX,
-            write(0x8100, &[1, 2500, 0xFFFF, 9]),
-            "ok 01 01 ok 0A 0B ok 0A 06 02 0B 04",
-        ),
-        (
-            "06 heartbeat, 0x8103",
-            NX,
-            words(6, &[0x8103, 9]),
-            "ok 01 01 ok 0A ok ok ok ok ok ok ok",
-        ),
-        (
-            "06 command with undefined bits",
-            NX,
-            words(6, &[0x8100, 8]),
-            "03 01 01 03 0A 03 03 03 03 03 03 03",
-        ),
-        (
-            "06 a reference outside the limits",
-            NX,
-            words(6, &[0x8101, 10_001]),
-            "03 01 01 03 0A 03 03 03 03 03 03 03",
-        ),
-        (
-            "06 to the common model",
-            NX,
-            words(6, &[0x8004, 1]),
-            "02 01 01 02 0A 02 02 02 02 02 02 02",
-        ),
-        (
-            "06 raw register",
-            NX,
-            words(6, &[2002, 5000]),
-            "ok 01 01 ok 0A 0B ok 0A 06 02 0B 04",
-        ),
-        (
-            "16 raw registers",
-            NX,
-            write(2000, &[1, 0, 5000]),
-            "ok 01 01 ok 0A 0B ok 0A 06 02 0B 04",
-        ),
-        (
-            "06 raw register, read-only",
-            NX,
-            words(6, &[2100, 1]),
-            "02 01 01 02 0A 02 02 02 02 02 02 02",
-        ),
-        (
-            "06 raw register of no writable point",
-            NX,
-            words(6, &[101, 10_000]),
-            "02 01 01 02 0A 02 02 02 02 02 02 02",
-        ),
-        (
-            "16 raw registers, one of no writable point",
-            NX,
-            write(2001, &[0, 5000]),
-            "02 01 01 02 0A 02 02 02 02 02 02 02",
-        ),
-        (
-            "16 the same with the control word",
-            NX,
-            write(2000, &[1, 0, 5000]),
-            "ok 01 01 ok 0A 0B ok 0A 06 02 0B 04",
-        ),
-        (
-            "06 raw register, unmapped",
-            NX,
-            words(6, &[7000, 1]),
-            "02 01 01 02 0A 02 02 02 02 02 02 02",
-        ),
-        (
-            "06 raw register, value outside the profile",
-            NX,
-            words(6, &[2002, 10_001]),
-            "03 01 01 03 0A 03 03 03 03 03 03 03",
-        ),
-        (
-            "16 wrong byte count",
-            NX,
-            vec![16, 0x81, 0, 0, 1, 3, 0, 0, 0],
-            "03 01 01 03 0A 03 03 03 03 03 03 03",
-        ),
-        (
-            "05 coil",
-            METER,
-            words(5, &[7, 0xFF00]),
-            "ok 01 01 ok 0A 0B ok 0A 06 02 0B 04",
-        ),
-        (
-            "15 coils",
-            METER,
-            vec![15, 0, 7, 0, 2, 1, 3],
-            "ok 01 01 ok 0A 0B ok 0A 06 02 0B 04",
-        ),
-        (
-            "05 value neither on nor off",
-            METER,
-            words(5, &[7, 1]),
-            "03 01 01 03 0A 03 03 03 03 03 03 03",
-        ),
-        (
-            "15 wrong byte count",
-            METER,
-            vec![15, 0, 0, 0, 100, 1, 0],
-            "03 01 01 03 0A 03 03 03 03 03 03 03",
-        ),
-        (
-            "05 on a drive without coils",
-            NX,
-            words(5, &[0, 0xFF00]),
-            "01 01 01 01 0A 01 01 01 01 01 01 01",
-        ),
-        (
-            "22 mask write (not supported)",
-            NX,
-            words(22, &[2000, 0, 0]),
-            "01 01 01 01 0A 01 01 01 01 01 01 01",
-        ),
-        (
-            "23 read and write (not supported)",
-            NX,
-            vec![23, 8, 0x34, 0, 1, 7, 0xD0, 0, 1, 2, 0, 1],
-            "01 01 01 01 0A 01 01 01 01 01 01 01",
-        ),
-        (
-            "43/14 identification",
-            NX,
-            identify,
-            "ok ok ok ok 0A ok ok ok ok ok ok ok",
-        ),
-        (
-            "43/13, or any other function",
-            NX,
-            vec![43, 13, 1, 0],
-            "01 01 01 01 0A 01 01 01 01 01 01 01",
-        ),
-    ]
+const KINDS: &str = "\
+03 polled registers                        | 1 | 3 2100 11                            | ok ok ok ok 0A 0B 0B 0A ok ok ok ok
+04 the same                                | 1 | 4 2100 11                            | ok ok ok ok 0A 0B 0B 0A ok ok ok ok
+03 registers that are not polled           | 1 | 3 500 3                              | ok ok ok 02 0A 0B ok 0A 06 02 0B 04
+03 more than the drive's limit per request | 1 | 3 500 31                             | 03 03 03 02 0A 03 03 0A 03 03 03 03
+03 across the end of the raw view          | 1 | 3 0x7FFF 2                           | 02 02 02 02 0A 02 02 02 02 02 02 02
+03 quantity 0                              | 1 | 3 2100 0                             | 03 03 03 03 0A 03 03 03 03 03 03 03
+03 quantity 126                            | 1 | 3 2100 126                           | 03 03 03 03 0A 03 03 03 03 03 03 03
+03 or 04 common model, float block         | 1 | 3 0x8000 19                          | ok ok ok ok 0A ok ok ok ok ok ok ok
+03 beyond the end of a block               | 1 | 3 0x8014 2                           | 02 02 02 02 0A 02 02 02 02 02 02 02
+01 polled coils                            | 4 | 1 7 1                                | ok ok ok ok 0A 0B 0B 0A ok ok ok ok
+02 polled discrete inputs                  | 4 | 2 3 2                                | ok ok ok ok 0A 0B 0B 0A ok ok ok ok
+01 coils that are not polled               | 4 | 1 9 10                               | ok ok ok 02 0A 0B ok 0A 06 02 0B 04
+01 on a drive without coils                | 1 | 1 0 1                                | 01 01 01 01 0A 01 01 01 01 01 01 01
+02 on a drive without discrete inputs      | 1 | 2 0 1                                | 01 01 01 01 0A 01 01 01 01 01 01 01
+06 command, 0x8100                         | 1 | 6 0x8100 1                           | ok 01 01 ok 0A 0B ok 0A 06 02 0B 04
+16 command block                           | 1 | 0x8100 <- 1 2500 0xFFFF 9            | ok 01 01 ok 0A 0B ok 0A 06 02 0B 04
+06 heartbeat, 0x8103                       | 1 | 6 0x8103 9                           | ok 01 01 ok 0A ok ok ok ok ok ok ok
+06 command with undefined bits             | 1 | 6 0x8100 8                           | 03 01 01 03 0A 03 03 03 03 03 03 03
+06 a reference outside the limits          | 1 | 6 0x8101 10001                       | 03 01 01 03 0A 03 03 03 03 03 03 03
+06 to the common model                     | 1 | 6 0x8004 1                           | 02 01 01 02 0A 02 02 02 02 02 02 02
+06 raw register                            | 1 | 6 2002 5000                          | ok 01 01 ok 0A 0B ok 0A 06 02 0B 04
+16 raw registers                           | 1 | 2000 <- 1 0 5000                     | ok 01 01 ok 0A 0B ok 0A 06 02 0B 04
+06 raw register, read-only                 | 1 | 6 2100 1                             | 02 01 01 02 0A 02 02 02 02 02 02 02
+06 raw register of no writable point       | 1 | 6 101 10000                          | 02 01 01 02 0A 02 02 02 02 02 02 02
+16 raw registers, one of no writable point | 1 | 2001 <- 0 5000                       | 02 01 01 02 0A 02 02 02 02 02 02 02
+16 the same with the control word          | 1 | 2000 <- 1 0 5000                     | ok 01 01 ok 0A 0B ok 0A 06 02 0B 04
+06 raw register, unmapped                  | 1 | 6 7000 1                             | 02 01 01 02 0A 02 02 02 02 02 02 02
+06 raw register, value outside the profile | 1 | 6 2002 10001                         | 03 01 01 03 0A 03 03 03 03 03 03 03
+16 wrong byte count                        | 1 | bytes 16 0x81 0 0 1 3 0 0 0          | 03 01 01 03 0A 03 03 03 03 03 03 03
+05 coil                                    | 4 | 5 7 0xFF00                           | ok 01 01 ok 0A 0B ok 0A 06 02 0B 04
+15 coils                                   | 4 | bytes 15 0 7 0 2 1 3                 | ok 01 01 ok 0A 0B ok 0A 06 02 0B 04
+05 value neither on nor off                | 4 | 5 7 1                                | 03 01 01 03 0A 03 03 03 03 03 03 03
+15 wrong byte count                        | 4 | bytes 15 0 0 0 100 1 0               | 03 01 01 03 0A 03 03 03 03 03 03 03
+05 on a drive without coils                | 1 | 5 0 0xFF00                           | 01 01 01 01 0A 01 01 01 01 01 01 01
+22 mask write (not supported)              | 1 | 22 2000 0 0                          | 01 01 01 01 0A 01 01 01 01 01 01 01
+23 read and write (not supported)          | 1 | bytes 23 8 0x34 0 1 7 0xD0 0 1 2 0 1 | 01 01 01 01 0A 01 01 01 01 01 01 01
+43/14 identification                       | 1 | bytes 43 14 1 0                      | ok ok ok ok 0A ok ok ok ok ok ok ok
+43/13, or any other function               | 1 | bytes 43 13 1 0                      | 01 01 01 01 0A 01 01 01 01 01 01 01";
+
+/// A PDU as the tables write it: `3 2100 11` is a function with words, `3 = 5000 2500` has the registers that were read,
+/// `2000 <- 1 0` writes registers, `3 ! 2` is an exception, and `bytes 43 14` are bytes.
+fn pdu(text: &str) -> Vec<u8> {
+    let numbers = |text: &str| -> Vec<u16> {
+        let all = text.split_whitespace().map(|part| match part.split_once("..") {
+            Some((first, end)) => (number(first)..number(end)).collect(),
+            None => vec![number(part)],
+        });
+        all.flatten().collect()
+    };
+    if let Some(bytes) = text.strip_prefix("bytes") {
+        numbers(bytes).iter().map(|byte| *byte as u8).collect()
+    } else if let Some((function, values)) = text.split_once('=') {
+        registers(number(function) as u8, &numbers(values))
+    } else if let Some((start, values)) = text.split_once("<-") {
+        write(number(start), &numbers(values))
+    } else if let Some((function, code)) = text.split_once('!') {
+        vec![number(function) as u8 | 0x80, number(code) as u8]
+    } else {
+        let all = numbers(text);
+        words(all[0] as u8, &all[1..])
+    }
 }
 
 /// A gateway in that state, with a client.
@@ -385,7 +215,7 @@ fn outcome(request: &[u8], answer: &[u8]) -> String {
 
 #[tokio::test]
 async fn every_request_in_every_state() {
-    let kinds = kinds();
+    let kinds = rows::<4>(KINDS);
     let mut found: Vec<Vec<String>> = vec![Vec::new(); kinds.len()];
     for (state, _, _) in STATES {
         let (rig, mut client) = scene(state).await;
@@ -394,8 +224,9 @@ async fn every_request_in_every_state() {
         } else {
             Vec::new()
         };
-        for ((_, unit, request, _), row) in kinds.iter().zip(&mut found) {
-            row.push(outcome(request, &client.ask(*unit, request).await));
+        for ([_, unit, request, _], row) in kinds.iter().zip(&mut found) {
+            let request = pdu(request);
+            row.push(outcome(&request, &client.ask(unit.parse().unwrap(), &request).await));
         }
         rig.buses.iter().for_each(|bus| bus.pause(false));
         drop(waiting);
@@ -407,7 +238,7 @@ async fn every_request_in_every_state() {
     }
     table.push_str("\n|---|");
     STATES.iter().for_each(|_| table.push_str("---|"));
-    for ((what, _, _, wanted), row) in kinds.iter().zip(&found) {
+    for ([what, _, _, wanted], row) in kinds.iter().zip(&found) {
         let cells = row.join(" ");
         if cells != *wanted {
             let _ = writeln!(wrong, "{what}: found {cells}, wanted {wanted}");
@@ -422,313 +253,101 @@ async fn every_request_in_every_state() {
     documented("answers", &table);
 }
 
-/// Single requests to the plant of these tests and their answers, byte by byte.
-fn examples() -> Vec<(&'static str, u8, Vec<u8>, Vec<u8>)> {
-    let common = [
-        0x80A3, 3, 0, 5000, 2500, 1440, 123, 455, 387, 2301, 540, 420, 0xFFFF, 0xFFFF, 0xFFFF, 0xFFFF, 5000, 2500,
-    ];
-    let (no_function, no_address, no_value) = (1, 2, 3);
-    let refused = |function: u8, code: u8| vec![function | 0x80, code];
-    vec![
-        ("process data", 1, words(3, &[2100, 11]), registers(3, &PROCESS_DATA)),
-        (
-            "input is holding",
-            1,
-            words(4, &[2100, 11]),
-            registers(4, &PROCESS_DATA),
-        ),
-        ("part of a poll", 1, words(3, &[2102, 2]), registers(3, &[5000, 2500])),
-        ("status, state", 1, words(3, &[0x8000, 2]), registers(3, &common[..2])),
-        ("fault code on", 1, words(4, &[0x8003, 16]), registers(4, &common[2..])),
-        (
-            "command block",
-            1,
-            words(3, &[0x8100, 4]),
-            registers(3, &[1, 5000, 2500, 0]),
-        ),
-        ("float", 1, words(4, &[0x8200, 2]), registers(4, &[0x4248, 0])),
-        ("monitored drive", 2, words(3, &[0x8004, 1]), registers(3, &[5000])),
-        ("forwarded", 1, words(3, &[500, 3]), registers(3, &[500, 501, 502])),
-        (
-            "forwarded, limit",
-            1,
-            words(3, &[500, 30]),
-            registers(3, &(500..530).collect::<Vec<u16>>()),
-        ),
-        (
-            "forwarded, partly polled",
-            1,
-            words(3, &[7, 3]),
-            registers(3, &[7, 8, 9]),
-        ),
-        ("discrete inputs", 4, words(2, &[3, 2]), vec![2, 1, 0b01]),
-        ("coil", 4, words(1, &[7, 1]), vec![1, 1, 1]),
-        ("forwarded bits", 4, words(1, &[9, 10]), vec![1, 2, 0b0100_1001, 0b10]),
-        ("input", 4, words(4, &[5, 1]), registers(4, &[77])),
-        (
-            "common model of a meter",
-            4,
-            words(3, &[0x8000, 1]),
-            registers(3, &[0x8002]),
-        ),
-        ("write coil", 4, words(5, &[7, 0xFF00]), words(5, &[7, 0xFF00])),
-        ("write coils", 4, vec![15, 0, 7, 0, 2, 1, 3], words(15, &[7, 2])),
-        ("raw write", 1, words(6, &[2002, 5000]), words(6, &[2002, 5000])),
-        ("raw writes", 1, write(2000, &[1, 0, 5000]), words(16, &[2000, 3])),
-        ("command", 1, words(6, &[0x8100, 1]), words(6, &[0x8100, 1])),
-        (
-            "commands",
-            1,
-            write(0x8100, &[1, 2500, 0xFFFF, 9]),
-            words(16, &[0x8100, 4]),
-        ),
-        ("heartbeat", 1, words(6, &[0x8103, 9]), words(6, &[0x8103, 9])),
-        ("no such unit", 9, words(3, &[0, 1]), refused(3, 0x0A)),
-        ("no such unit 0", 0, words(3, &[0x8000, 1]), refused(3, 0x0A)),
-        (
-            "no such unit, unknown function",
-            254,
-            vec![0x41, 1],
-            refused(0x41, 0x0A),
-        ),
-        ("unknown function", 1, vec![0x41, 1], refused(0x41, no_function)),
-        ("diagnostics", 1, words(8, &[0, 0]), refused(8, no_function)),
-        ("exception as function", 1, vec![0x83, 1], refused(0x83, no_function)),
-        (
-            "coils on a drive without",
-            1,
-            words(1, &[0, 1]),
-            refused(1, no_function),
-        ),
-        (
-            "inputs on a drive without",
-            1,
-            words(2, &[0, 0]),
-            refused(2, no_function),
-        ),
-        (
-            "coil write without coils",
-            1,
-            words(5, &[0, 0xFF00]),
-            refused(5, no_function),
-        ),
-        ("mask write", 1, words(22, &[2000, 0, 0]), refused(22, no_function)),
-        (
-            "read and write",
-            1,
-            vec![23, 8, 0x34, 0, 1, 7, 0xD0, 0, 1, 2, 0, 1],
-            refused(23, no_function),
-        ),
-        ("quantity 0", 1, words(3, &[2100, 0]), refused(3, no_value)),
-        ("quantity 126", 1, words(3, &[2100, 126]), refused(3, no_value)),
-        ("quantity 65535", 1, words(4, &[0, 65_535]), refused(4, no_value)),
-        ("short read", 1, vec![3, 0, 0, 0], refused(3, no_value)),
-        ("long read", 1, vec![3, 0, 0, 0, 1, 0], refused(3, no_value)),
-        ("function only", 1, vec![3], refused(3, no_value)),
-        (
-            "past the last address",
-            1,
-            words(3, &[0xFFFF, 2]),
-            refused(3, no_address),
-        ),
-        ("out of the raw view", 1, words(3, &[0x7FFF, 2]), refused(3, no_address)),
-        (
-            "out of the common model",
-            1,
-            words(3, &[0x8014, 2]),
-            refused(3, no_address),
-        ),
-        (
-            "after the common model",
-            1,
-            words(3, &[0x8015, 1]),
-            refused(3, no_address),
-        ),
-        (
-            "out of the command block",
-            1,
-            words(3, &[0x8103, 2]),
-            refused(3, no_address),
-        ),
-        (
-            "out of the float block",
-            1,
-            words(4, &[0x8219, 2]),
-            refused(4, no_address),
-        ),
-        (
-            "beyond the drive's limit",
-            1,
-            words(3, &[500, 31]),
-            refused(3, no_value),
-        ),
-        (
-            "beyond the limit of process data",
-            1,
-            words(3, &[2100, 21]),
-            refused(3, no_value),
-        ),
-        ("beyond the limit of bits", 4, words(1, &[9, 17]), refused(1, no_value)),
-        (
-            "write to a monitored drive",
-            2,
-            words(6, &[0x8100, 1]),
-            refused(6, no_function),
-        ),
-        ("same, raw", 2, words(6, &[2000, 1]), refused(6, no_function)),
-        (
-            "same, wrong address",
-            2,
-            words(6, &[0x8000, 1]),
-            refused(6, no_function),
-        ),
-        (
-            "same, wrong count",
-            2,
-            vec![16, 0x81, 0, 0, 1, 3, 0, 0, 0],
-            refused(16, no_function),
-        ),
-        ("same, heartbeat", 2, words(6, &[0x8103, 1]), refused(6, no_function)),
-        (
-            "write to the common model",
-            1,
-            words(6, &[0x8000, 1]),
-            refused(6, no_address),
-        ),
-        (
-            "write to the float block",
-            1,
-            write(0x8200, &[0, 0]),
-            refused(16, no_address),
-        ),
-        (
-            "write past the command block",
-            1,
-            write(0x8103, &[0, 0]),
-            refused(16, no_address),
-        ),
-        (
-            "write into the command block from below",
-            1,
-            write(0x80FF, &[0, 0]),
-            refused(16, no_address),
-        ),
-        (
-            "raw write into the blocks",
-            1,
-            write(0x7FFF, &[0, 0]),
-            refused(16, no_address),
-        ),
-        (
-            "write to the status word",
-            1,
-            words(6, &[2100, 1]),
-            refused(6, no_address),
-        ),
-        (
-            "write to an unmapped address",
-            1,
-            words(6, &[7000, 1]),
-            refused(6, no_address),
-        ),
-        (
-            "wrong address and value",
-            1,
-            write(2100, &[0xFFFF]),
-            refused(16, no_address),
-        ),
-        (
-            "beyond the range, raw",
-            1,
-            words(6, &[2002, 10_001]),
-            refused(6, no_value),
-        ),
-        ("beyond the range", 1, words(6, &[0x8101, 10_001]), refused(6, no_value)),
-        ("two parameters", 1, write(732, &[1, 2]), refused(16, no_value)),
-        (
-            "maximum frequency, raw",
-            1,
-            words(6, &[101, 10_000]),
-            refused(6, no_address),
-        ),
-        (
-            "general control word alone",
-            1,
-            words(6, &[2001, 0]),
-            refused(6, no_address),
-        ),
-        ("command bits", 1, words(6, &[0x8100, 8]), refused(6, no_value)),
-        ("two references", 1, write(0x8101, &[5000, 2500]), refused(16, no_value)),
-        (
-            "no reference",
-            1,
-            write(0x8101, &[0x8000, 0xFFFF]),
-            refused(16, no_value),
-        ),
-        ("beyond the band", 1, words(6, &[0x8102, 5001]), refused(6, no_value)),
-        ("coil value", 4, words(5, &[7, 1]), refused(5, no_value)),
-        (
-            "odd byte count",
-            1,
-            vec![16, 0x81, 0, 0, 1, 3, 0, 0, 0],
-            refused(16, no_value),
-        ),
-        (
-            "byte count too small",
-            4,
-            vec![15, 0, 0, 0, 100, 1, 0],
-            refused(15, no_value),
-        ),
-        (
-            "write of quantity 0",
-            1,
-            vec![16, 0x81, 0, 0, 0, 0],
-            refused(16, no_value),
-        ),
-        (
-            "write of 124 registers",
-            1,
-            vec![16, 0, 0, 0, 124, 248],
-            refused(16, no_value),
-        ),
-        ("gateway", 255, words(4, &[0, 4]), registers(4, &[1, 3, 2, 500])),
-        (
-            "gateway, holding",
-            255,
-            words(3, &[16, 4]),
-            registers(3, &[1, 1, 1, 500]),
-        ),
-        (
-            "gateway, cycle unknown",
-            255,
-            words(4, &[4, 2]),
-            registers(4, &[0xFFFF, 0xFFFF]),
-        ),
-        ("after the last bus", 255, words(4, &[32, 1]), refused(4, no_address)),
-        (
-            "gateway has no blocks",
-            255,
-            words(4, &[0x8000, 1]),
-            refused(4, no_address),
-        ),
-        (
-            "gateway accepts no writes",
-            255,
-            words(6, &[0, 1]),
-            refused(6, no_function),
-        ),
-        ("gateway has no bits", 255, words(1, &[0, 1]), refused(1, no_function)),
-        ("gateway, quantity 0", 255, words(4, &[0, 0]), refused(4, no_value)),
-    ]
-}
+/// Single requests to the plant of these tests and their answers, byte by byte: what, unit, request, answer.
+const EXAMPLES: &str = "\
+process data                            |   1 | 3 2100 11                            | 3 = 0x0023 0x2000 5000 2500 1440 123 455 387 2301 540 0
+input is holding                        |   1 | 4 2100 11                            | 4 = 0x0023 0x2000 5000 2500 1440 123 455 387 2301 540 0
+part of a poll                          |   1 | 3 2102 2                             | 3 = 5000 2500
+status, state                           |   1 | 3 0x8000 2                           | 3 = 0x80A3 3
+fault code on                           |   1 | 4 0x8003 16                          | 4 = 0 5000 2500 1440 123 455 387 2301 540 420 0xFFFF 0xFFFF 0xFFFF 0xFFFF 5000 2500
+command block                           |   1 | 3 0x8100 4                           | 3 = 1 5000 2500 0
+float                                   |   1 | 4 0x8200 2                           | 4 = 0x4248 0
+monitored drive                         |   2 | 3 0x8004 1                           | 3 = 5000
+forwarded                               |   1 | 3 500 3                              | 3 = 500 501 502
+forwarded, limit                        |   1 | 3 500 30                             | 3 = 500..530
+forwarded, partly polled                |   1 | 3 7 3                                | 3 = 7 8 9
+discrete inputs                         |   4 | 2 3 2                                | bytes 2 1 1
+coil                                    |   4 | 1 7 1                                | bytes 1 1 1
+forwarded bits                          |   4 | 1 9 10                               | bytes 1 2 0x49 2
+input                                   |   4 | 4 5 1                                | 4 = 77
+common model of a meter                 |   4 | 3 0x8000 1                           | 3 = 0x8002
+write coil                              |   4 | 5 7 0xFF00                           | 5 7 0xFF00
+write coils                             |   4 | bytes 15 0 7 0 2 1 3                 | 15 7 2
+raw write                               |   1 | 6 2002 5000                          | 6 2002 5000
+raw writes                              |   1 | 2000 <- 1 0 5000                     | 16 2000 3
+command                                 |   1 | 6 0x8100 1                           | 6 0x8100 1
+commands                                |   1 | 0x8100 <- 1 2500 0xFFFF 9            | 16 0x8100 4
+heartbeat                               |   1 | 6 0x8103 9                           | 6 0x8103 9
+no such unit                            |   9 | 3 0 1                                | 3 ! 0x0A
+no such unit 0                          |   0 | 3 0x8000 1                           | 3 ! 0x0A
+no such unit, unknown function          | 254 | bytes 0x41 1                         | 0x41 ! 0x0A
+unknown function                        |   1 | bytes 0x41 1                         | 0x41 ! 1
+diagnostics                             |   1 | 8 0 0                                | 8 ! 1
+exception as function                   |   1 | bytes 0x83 1                         | 0x83 ! 1
+coils on a drive without                |   1 | 1 0 1                                | 1 ! 1
+inputs on a drive without               |   1 | 2 0 0                                | 2 ! 1
+coil write without coils                |   1 | 5 0 0xFF00                           | 5 ! 1
+mask write                              |   1 | 22 2000 0 0                          | 22 ! 1
+read and write                          |   1 | bytes 23 8 0x34 0 1 7 0xD0 0 1 2 0 1 | 23 ! 1
+quantity 0                              |   1 | 3 2100 0                             | 3 ! 3
+quantity 126                            |   1 | 3 2100 126                           | 3 ! 3
+quantity 65535                          |   1 | 4 0 65535                            | 4 ! 3
+short read                              |   1 | bytes 3 0 0 0                        | 3 ! 3
+long read                               |   1 | bytes 3 0 0 0 1 0                    | 3 ! 3
+function only                           |   1 | bytes 3                              | 3 ! 3
+past the last address                   |   1 | 3 0xFFFF 2                           | 3 ! 2
+out of the raw view                     |   1 | 3 0x7FFF 2                           | 3 ! 2
+out of the common model                 |   1 | 3 0x8014 2                           | 3 ! 2
+after the common model                  |   1 | 3 0x8015 1                           | 3 ! 2
+out of the command block                |   1 | 3 0x8103 2                           | 3 ! 2
+out of the float block                  |   1 | 4 0x8219 2                           | 4 ! 2
+beyond the drive's limit                |   1 | 3 500 31                             | 3 ! 3
+beyond the limit of process data        |   1 | 3 2100 21                            | 3 ! 3
+beyond the limit of bits                |   4 | 1 9 17                               | 1 ! 3
+write to a monitored drive              |   2 | 6 0x8100 1                           | 6 ! 1
+same, raw                               |   2 | 6 2000 1                             | 6 ! 1
+same, wrong address                     |   2 | 6 0x8000 1                           | 6 ! 1
+same, wrong count                       |   2 | bytes 16 0x81 0 0 1 3 0 0 0          | 16 ! 1
+same, heartbeat                         |   2 | 6 0x8103 1                           | 6 ! 1
+write to the common model               |   1 | 6 0x8000 1                           | 6 ! 2
+write to the float block                |   1 | 0x8200 <- 0 0                        | 16 ! 2
+write past the command block            |   1 | 0x8103 <- 0 0                        | 16 ! 2
+write into the command block from below |   1 | 0x80FF <- 0 0                        | 16 ! 2
+raw write into the blocks               |   1 | 0x7FFF <- 0 0                        | 16 ! 2
+write to the status word                |   1 | 6 2100 1                             | 6 ! 2
+write to an unmapped address            |   1 | 6 7000 1                             | 6 ! 2
+wrong address and value                 |   1 | 2100 <- 0xFFFF                       | 16 ! 2
+beyond the range, raw                   |   1 | 6 2002 10001                         | 6 ! 3
+beyond the range                        |   1 | 6 0x8101 10001                       | 6 ! 3
+two parameters                          |   1 | 732 <- 1 2                           | 16 ! 3
+maximum frequency, raw                  |   1 | 6 101 10000                          | 6 ! 2
+general control word alone              |   1 | 6 2001 0                             | 6 ! 2
+command bits                            |   1 | 6 0x8100 8                           | 6 ! 3
+two references                          |   1 | 0x8101 <- 5000 2500                  | 16 ! 3
+no reference                            |   1 | 0x8101 <- 0x8000 0xFFFF              | 16 ! 3
+beyond the band                         |   1 | 6 0x8102 5001                        | 6 ! 3
+coil value                              |   4 | 5 7 1                                | 5 ! 3
+odd byte count                          |   1 | bytes 16 0x81 0 0 1 3 0 0 0          | 16 ! 3
+byte count too small                    |   4 | bytes 15 0 0 0 100 1 0               | 15 ! 3
+write of quantity 0                     |   1 | bytes 16 0x81 0 0 0 0                | 16 ! 3
+write of 124 registers                  |   1 | bytes 16 0 0 0 124 248               | 16 ! 3
+gateway                                 | 255 | 4 0 4                                | 4 = 1 3 2 500
+gateway, holding                        | 255 | 3 16 4                               | 3 = 1 1 1 500
+gateway, cycle unknown                  | 255 | 4 4 2                                | 4 = 0xFFFF 0xFFFF
+after the last bus                      | 255 | 4 32 1                               | 4 ! 2
+gateway has no blocks                   | 255 | 4 0x8000 1                           | 4 ! 2
+gateway accepts no writes               | 255 | 6 0 1                                | 6 ! 1
+gateway has no bits                     | 255 | 1 0 1                                | 1 ! 1
+gateway, quantity 0                     | 255 | 4 0 0                                | 4 ! 3";
 
 #[tokio::test]
 async fn answers_byte_by_byte() {
     let rig = Rig::new().await;
     let mut client = rig.client().await;
-    let examples = examples();
-    for (what, unit, request, answer) in &examples {
-        assert_eq!(client.ask(*unit, request).await, *answer, "{what}");
+    let examples = rows::<4>(EXAMPLES);
+    for [what, unit, request, answer] in &examples {
+        let answered = client.ask(unit.parse().unwrap(), &pdu(request)).await;
+        assert_eq!(answered, pdu(answer), "{what}");
     }
     let counted: u64 = rig.stats.modbus_tcp.requests().iter().map(|(_, _, n)| n).sum();
     assert_eq!(counted, examples.len() as u64);

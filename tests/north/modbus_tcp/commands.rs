@@ -167,12 +167,9 @@ async fn pipelined_writes_reach_the_bus_in_their_order() {
     answered.sort_unstable();
     assert_eq!(answered, values, "one answer each");
     let written: Vec<Order> = rig.buses[0].orders();
-    let wanted = values.iter().map(|v| {
-        Order::Write(drivegate::codec::RequestPdu::WriteRegister {
-            address: 2003,
-            value: *v,
-        })
-    });
+    let wanted = values
+        .iter()
+        .map(|v| Order::Write(drivegate::codec::RequestPdu::write_register(2003, *v)));
     assert!(written.into_iter().eq(wanted));
     rig.end().await;
 }

@@ -3,13 +3,13 @@
 
 use std::fmt::Write as _;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
-use drivegate::command::CommandQueue;
 use drivegate::config::Settings;
 use drivegate::drive::profile::Profiles;
-use drivegate::plant::{BusHandle, Plant};
-use drivegate::process_image::{BusImage, DriveImage, Link};
+use drivegate::plant::Plant;
+use drivegate::process_image::DriveImage;
+use drivegate_testkit as testkit;
 use serde_json::Value;
 
 use super::rig::{Rig, options, words};
@@ -46,22 +46,10 @@ fn plant(settings: &Settings) -> Plant {
             .map(|d| Arc::new(DriveImage::new(d.clone(), bus.spec.slow_cycle)))
             .collect();
         for drive in &drives {
-            drive.update(|s| {
-                s.link = Link::Online(SystemTime::now());
-                s.fast_at = Some(now);
-                for read in &drive.plan.reads {
-                    // Rising values, so that a lowest frequency lies below its highest.
-                    let words: Vec<u16> = (read.start..).take(read.count.into()).collect();
-                    s.store(read.table, read.start, &words, now);
-                }
-            });
+            // Rising values, so that a lowest frequency lies below its highest.
+            testkit::read_all(drive, now, |address| address);
         }
-        let image = BusImage::new(bus.spec.clone(), drives);
-        image.update_health(|h| h.up = true);
-        BusHandle {
-            image: Arc::new(image),
-            queue: Arc::new(CommandQueue::new().unwrap()),
-        }
+        testkit::up(testkit::bus(bus.spec.clone(), drives))
     });
     Plant::new(settings.gateway.clone(), Duration::from_secs(3600), buses.collect())
 }

@@ -8,21 +8,21 @@ use drivegate::codec::{RequestPdu, Table};
 use drivegate::command::{Authority, Command, Order};
 use drivegate::north::modbus_tcp::Offline;
 use drivegate::plant::{Plant, SharedPlant};
+use drivegate_testkit::take_next;
 
 use super::rig::{acknowledge, frame, n2_plant, options, plant, registers, words};
-use crate::north::plant::take_next;
 
-struct Bench {
+struct OfflineClient {
     plant: SharedPlant,
     client: Offline,
     now: Instant,
 }
 
-impl Bench {
-    fn of(plant: Plant) -> Bench {
+impl OfflineClient {
+    fn of(plant: Plant) -> OfflineClient {
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let peer = ([10, 0, 0, 9], 4711).into();
-        Bench {
+        OfflineClient {
             client: Offline::new(options(), plant.clone(), Arc::default(), peer, Authority::Write),
             plant,
             // No clock of this machine is there yet.
@@ -49,82 +49,76 @@ impl Bench {
 
 #[test]
 fn orders_are_queued_when_the_call_returns_and_end_by_the_time_that_is_told() {
-    let mut bench = Bench::of(plant());
+    let mut session = OfflineClient::of(plant());
     let mut batch = frame(1, 1, &words(6, &[0x8101, 1000]));
     batch.extend(frame(2, 1, &words(6, &[0x8100, 1])));
     batch.extend(frame(3, 1, &words(3, &[2102, 1])));
     let read = frame(3, 1, &registers(3, &[5000]));
-    assert_eq!(bench.receive(&batch), read, "the process image answers at once");
-    assert_eq!(bench.plant.load().buses[0].queue.lock().len(), 2);
-    let first = bench.pop().unwrap();
+    assert_eq!(session.receive(&batch), read, "the process image answers at once");
+    assert_eq!(session.plant.load().buses[0].queue.lock().len(), 2);
+    let first = session.pop().unwrap();
     assert_eq!(first.ticket.client(), "modbus_tcp 10.0.0.9");
-    assert_eq!(first.expires, bench.now + Duration::from_secs(2));
+    assert_eq!(first.expires, session.now + Duration::from_secs(2));
     let outcome = acknowledge(&first);
-    first.ticket.answer(outcome, bench.now);
-    assert_eq!(bench.receive(&[]), frame(1, 1, &words(6, &[0x8101, 1000])));
-    bench.now += Duration::from_secs(2);
-    assert!(bench.pop().is_none());
-    assert_eq!(bench.receive(&[]), frame(2, 1, &[0x86, 0x0B]));
-    assert!(!bench.client.is_waiting());
+    first.ticket.answer(outcome, session.now);
+    assert_eq!(session.receive(&[]), frame(1, 1, &words(6, &[0x8101, 1000])));
+    session.now += Duration::from_secs(2);
+    assert!(session.pop().is_none());
+    assert_eq!(session.receive(&[]), frame(2, 1, &[0x86, 0x0B]));
+    assert!(!session.client.is_waiting());
 }
 
 #[test]
 fn the_next_piece_of_a_read_is_queued_when_the_last_one_is_finished() {
-    let mut bench = Bench::of(n2_plant());
-    assert!(bench.receive(&frame(7, 1, &words(2, &[5, 4]))).is_empty());
-    let piece = |start| {
-        Order::Read(RequestPdu::Read {
-            table: Table::DiscreteInput,
-            start,
-            count: 1,
-        })
-    };
-    assert_eq!(bench.serve(), piece(7));
-    assert!(bench.pop().is_none(), "one at a time");
-    bench.now += Duration::from_secs(1);
-    assert!(bench.receive(&[]).is_empty());
-    let second = bench.pop().unwrap();
+    let mut session = OfflineClient::of(n2_plant());
+    assert!(session.receive(&frame(7, 1, &words(2, &[5, 4]))).is_empty());
+    let piece = |start| Order::Read(RequestPdu::read(Table::DiscreteInput, start, 1));
+    assert_eq!(session.serve(), piece(7));
+    assert!(session.pop().is_none(), "one at a time");
+    session.now += Duration::from_secs(1);
+    assert!(session.receive(&[]).is_empty());
+    let second = session.pop().unwrap();
     assert_eq!(second.order, piece(8));
     assert_eq!(
         second.expires,
-        bench.now + Duration::from_secs(2),
+        session.now + Duration::from_secs(2),
         "each has its own time"
     );
     let outcome = acknowledge(&second);
-    second.ticket.answer(outcome, bench.now);
-    assert_eq!(bench.receive(&[]), frame(7, 1, &[2, 1, 0b0011]));
+    second.ticket.answer(outcome, session.now);
+    assert_eq!(session.receive(&[]), frame(7, 1, &[2, 1, 0b0011]));
 }
 
 #[test]
 fn clients_of_one_server_share_the_command_word() {
-    let mut bench = Bench::of(plant());
-    let mut other = bench
+    let mut session = OfflineClient::of(plant());
+    let mut other = session
         .client
         .beside(([10, 0, 0, 10], 4711).into(), None, Authority::Write);
-    bench.receive(&frame(1, 1, &words(6, &[0x8100, 0])));
-    bench.serve();
+    session.receive(&frame(1, 1, &words(6, &[0x8100, 0])));
+    session.serve();
     let reset = frame(2, 1, &words(6, &[0x8100, 4]));
-    bench.receive(&reset);
+    session.receive(&reset);
     for points in [2, 1] {
-        let Order::Points(part) = bench.serve() else {
+        let Order::Points(part) = session.serve() else {
             panic!("a command")
         };
         assert_eq!(part.len(), points, "the stop, then the reset");
     }
-    assert!(other.receive(&reset, bench.now).is_empty());
-    let second = bench.pop().unwrap();
+    assert!(other.receive(&reset, session.now).is_empty());
+    let second = session.pop().unwrap();
     assert_eq!(second.ticket.client(), "modbus_tcp 10.0.0.10");
     let Order::Points(second) = second.order else {
         panic!("a command")
     };
     assert_eq!(second.len(), 2);
-    assert!(bench.pop().is_none(), "the reset was given by the first client");
+    assert!(session.pop().is_none(), "the reset was given by the first client");
 }
 
 #[test]
 fn a_start_that_arrives_in_pieces_does_not_run_behind_a_stop() {
-    let mut bench = Bench::of(plant());
-    let mut other = bench
+    let mut session = OfflineClient::of(plant());
+    let mut other = session
         .client
         .beside(([10, 0, 0, 8], 4711).into(), None, Authority::Write);
     // By the model and raw: the stop comes between the two halves.
@@ -132,24 +126,24 @@ fn a_start_that_arrives_in_pieces_does_not_run_behind_a_stop() {
         let start = frame(7, 1, &words(6, start));
         let refused = [0, 7, 0, 0, 0, 3, 1, 0x86, 6];
         for cut in [1, 6, 11] {
-            assert!(bench.receive(&start[..cut]).is_empty());
-            bench.now += Duration::from_millis(20);
+            assert!(session.receive(&start[..cut]).is_empty());
+            session.now += Duration::from_millis(20);
             assert!(
                 other
-                    .receive(&frame(8, 1, &words(6, &[0x8100, 0])), bench.now)
+                    .receive(&frame(8, 1, &words(6, &[0x8100, 0])), session.now)
                     .is_empty()
             );
-            bench.serve();
-            assert!(!other.receive(&[], bench.now).is_empty(), "acknowledged");
-            bench.now += Duration::from_millis(20);
-            assert_eq!(bench.receive(&start[cut..]), refused, "{cut}");
+            session.serve();
+            assert!(!other.receive(&[], session.now).is_empty(), "acknowledged");
+            session.now += Duration::from_millis(20);
+            assert_eq!(session.receive(&start[cut..]), refused, "{cut}");
         }
         // Sent again it is taken; what comes behind in the same piece has its own time.
-        bench.now += Duration::from_millis(20);
-        assert!(bench.receive(&start[..3]).is_empty());
-        bench.now += Duration::from_millis(20);
-        assert!(bench.receive(&start[3..]).is_empty());
-        bench.serve();
-        assert_eq!(bench.receive(&[]), start);
+        session.now += Duration::from_millis(20);
+        assert!(session.receive(&start[..3]).is_empty());
+        session.now += Duration::from_millis(20);
+        assert!(session.receive(&start[3..]).is_empty());
+        session.serve();
+        assert_eq!(session.receive(&[]), start);
     }
 }

@@ -185,7 +185,7 @@ async fn forwarded_reads_are_the_clients_own() {
     let mut client = rig.client().await;
     client.ask(1, &words(4, &[500, 2])).await;
     client.ask(1, &words(3, &[20_000, 125])).await;
-    let read = |table, start, count| Order::Read(RequestPdu::Read { table, start, count });
+    let read = |table, start, count| Order::Read(RequestPdu::read(table, start, count));
     assert_eq!(
         rig.buses[0].orders(),
         [read(Table::Input, 500, 2), read(Table::Holding, 20_000, 125)],
@@ -198,7 +198,7 @@ async fn forwarded_reads_are_the_clients_own() {
 async fn an_n2_drive_is_asked_object_by_object_for_what_is_not_polled() {
     let rig = Rig::of(n2_plant(), options()).await;
     let mut client = rig.client().await;
-    let read = |table, start, count| Order::Read(RequestPdu::Read { table, start, count });
+    let read = |table, start, count| Order::Read(RequestPdu::read(table, start, count));
     // BI 6 and 7 are polled, BI 8 to 10 never; the simulated bus says that every third bit is set.
     assert_eq!(client.ask(1, &words(2, &[5, 5])).await, [2, 1, 0b1_0011]);
     let asked: Vec<Order> = (7..10).map(|at| read(Table::DiscreteInput, at, 1)).collect();

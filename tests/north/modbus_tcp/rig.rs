@@ -10,18 +10,17 @@ use arc_swap::ArcSwap;
 use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
 use drivegate::command::{Command, CommandQueue, Order, Outcome};
 use drivegate::drive::RawWrites;
-use drivegate::drive::profile::{Profile, Profiles};
+use drivegate::drive::profile::Profile;
 use drivegate::north::modbus_tcp::{self, Listener, Options, Server, Uncached};
 use drivegate::north::{NorthState, ServerError};
 use drivegate::north::{Reconfigure as _, Server as _};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
-use drivegate::process_image::{Access, DriveImage, DriveSpec, LeaseAction, Link, Supervision};
+use drivegate::process_image::{Access, BusSpec, DriveImage, DriveSpec, LeaseAction, Link, Supervision};
+use drivegate_testkit::{bus_spec, monitored, nx, profile, take_next};
 use rustix::event::{PollFd, PollFlags, poll};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio_util::sync::CancellationToken;
-
-use crate::north::plant::{self, nx, spec, take_next};
 
 pub(crate) use crate::support::process::PATIENCE;
 
@@ -202,12 +201,17 @@ fn supervised(name: &str, bus: &str, unit: u8, profile: &Arc<Profile>, access: A
             action: LeaseAction::Hold,
             adopt: false,
         }),
-        ..spec(bus, name, unit, profile)
+        ..monitored(name, bus, unit, profile)
     }
 }
 
 fn bus(name: &str, protocol: Protocol, drives: Vec<DriveSpec>) -> BusHandle {
-    let bus = plant::bus(name, protocol, drives.into_iter().map(plant::image).collect());
+    let spec = BusSpec {
+        protocol,
+        ..bus_spec(name)
+    };
+    let images = drives.into_iter().map(drivegate_testkit::image).collect();
+    let bus = drivegate_testkit::bus(spec, images);
     bus.image.update_health(|h| (h.up, h.load) = (true, Some(0.5)));
     bus
 }
@@ -272,14 +276,12 @@ pub(crate) fn plant_where(change: impl Fn(&mut DriveSpec)) -> Plant {
 }
 
 fn plant_of(buses: Vec<BusHandle>) -> Plant {
-    plant::plant("pump-house", HOUR, buses)
+    Plant::new("pump-house", HOUR, buses)
 }
 
 /// Unit 1 is a Vacon NX with an N2 board of which BI 6 and BI 7 and AI 2 were read.
 pub(crate) fn n2_plant() -> Plant {
-    let profiles = Profiles::built_in();
-    let profile = profiles.get("vacon-nx-n2").unwrap();
-    let drives = vec![supervised("fan-1", "n2", 1, profile, Access::Control)];
+    let drives = vec![supervised("fan-1", "n2", 1, &profile("vacon-nx-n2"), Access::Control)];
     let n2 = bus("n2", Protocol::N2, drives);
     n2.image.drives[0].update(|s| {
         let now = Instant::now();

@@ -65,7 +65,7 @@ fn encoded(request: Request<'static>) -> Vec<u8> {
 fn meant(request: &Request<'static>) -> Option<RequestPdu> {
     let read = |table: Table, start: u16, count: u16| {
         let fits = (1..=table.max_read()).contains(&count) && u32::from(start) + u32::from(count) <= 65_536;
-        fits.then_some(RequestPdu::Read { table, start, count })
+        fits.then_some(RequestPdu::read(table, start, count))
     };
     let fits = |start: u16, count: usize| usize::from(start) + count <= 65_536;
     match request {
@@ -77,10 +77,7 @@ fn meant(request: &Request<'static>) -> Option<RequestPdu> {
             address: *address,
             on: *on,
         }),
-        Request::WriteSingleRegister(address, value) => Some(RequestPdu::WriteRegister {
-            address: *address,
-            value: *value,
-        }),
+        Request::WriteSingleRegister(address, value) => Some(RequestPdu::write_register(*address, *value)),
         Request::WriteMultipleCoils(start, bits) => fits(*start, bits.len()).then(|| RequestPdu::WriteCoils {
             start: *start,
             bits: bits.to_vec(),

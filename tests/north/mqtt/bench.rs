@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{BufRead, BufReader, Write as _};
+use std::io::Write as _;
 use std::net::{SocketAddr, TcpStream as StdStream};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -10,20 +10,21 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::codec::{Protocol, Reply, Table};
+use drivegate::codec::Reply;
 use drivegate::command::{Order, Outcome};
 use drivegate::drive::{PointIndex, Value};
 use drivegate::event::{Event, EventKind};
 use drivegate::north::NorthState;
 use drivegate::north::mqtt::{self, History, Mqtt, Options, Qos, Telemetry};
 use drivegate::plant::{Plant, SharedPlant};
-use drivegate::process_image::{Access, DriveSpec, Link};
+use drivegate::process_image::Access;
+use drivegate_testkit::{bus, bus_spec, controlled, image, nx, read_nx, take_next, up};
 use tempfile::TempDir;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Runtime;
 use tokio_util::sync::CancellationToken;
 
-use crate::north::plant::{self, take_next};
+use crate::support::mqtt::{Subscriber, client};
 use crate::support::tools::tool;
 
 pub(crate) use crate::support::process::{PATIENCE as DEADLINE, free_port, until as wait_for};
@@ -69,10 +70,6 @@ fn keep_log() {
         .try_init();
 }
 
-fn program(name: &str) -> Command {
-    Command::new(tool(name))
-}
-
 /// A Mosquitto of our own.
 pub(crate) struct Broker {
     pub(crate) port: u16,
@@ -103,7 +100,7 @@ impl Broker {
     }
 
     pub(crate) fn up(&mut self) {
-        let mut command = program("mosquitto");
+        let mut command = Command::new(tool("mosquitto"));
         command.arg("-c").arg(self.dir.path().join("mosquitto.conf"));
         command.stdout(Stdio::null()).stderr(Stdio::null());
         let mut child = command.spawn().unwrap();
@@ -142,11 +139,8 @@ impl Broker {
 
     /// Publishes each of `payloads` on one topic over one connection, QoS 1, as fast as it goes.
     pub(crate) fn publish_all(&self, topic: &str, payloads: &[&str]) {
-        let port = self.port.to_string();
-        let mut command = program("mosquitto_pub");
-        command
-            .args(["-V", "5", "-h", "127.0.0.1", "-p", &port, "-q", "1", "-t", topic, "-l"])
-            .stdin(Stdio::piped());
+        let mut command = client("mosquitto_pub", self.port);
+        command.args(["-q", "1", "-t", topic, "-l"]).stdin(Stdio::piped());
         let mut client = command.spawn().unwrap();
         let lines = payloads.join("\n") + "\n";
         client.stdin.take().unwrap().write_all(lines.as_bytes()).unwrap();
@@ -155,12 +149,7 @@ impl Broker {
 
     /// Runs a client to its end.
     pub(crate) fn run(&self, name: &str, arguments: &[&str]) -> Output {
-        let port = self.port.to_string();
-        let mut command = program(name);
-        command
-            .args(["-V", "5", "-h", "127.0.0.1", "-p", &port])
-            .args(arguments);
-        command.output().unwrap()
+        client(name, self.port).args(arguments).output().unwrap()
     }
 
     /// The retained message of a topic, with `mosquitto_sub`.
@@ -201,7 +190,7 @@ static MARKERS: AtomicU64 = AtomicU64::new(0);
 
 /// `mosquitto_sub`, and all that it saw.
 pub(crate) struct Watcher {
-    child: Child,
+    _client: Subscriber,
     seen: Arc<(Mutex<Vec<Seen>>, Condvar)>,
 }
 
@@ -212,51 +201,32 @@ impl Watcher {
     }
 
     pub(crate) fn with(broker: &Broker, filter: &str, more: &[&str]) -> Watcher {
-        let mut command = program("mosquitto_sub");
-        let port = broker.port.to_string();
+        let mut command = client("mosquitto_sub", broker.port);
         let marker = format!("marker/{}", MARKERS.fetch_add(1, Ordering::SeqCst));
-        command.args([
-            "-V",
-            "5",
-            "-h",
-            "127.0.0.1",
-            "-p",
-            &port,
-            "-q",
-            "1",
-            "-t",
-            filter,
-            "-t",
-            &marker,
-        ]);
-        command.args(["-F", "%r|%q|%t|%p"]).args(more);
-        let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
-        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        command.args(["-q", "1", "-t", filter, "-t", &marker, "-F", "%r|%q|%t|%p"]);
         let seen: Arc<(Mutex<Vec<Seen>>, Condvar)> = Arc::default();
         let stands = Arc::new(AtomicBool::new(false));
         let (writer, arrived, own_marker) = (seen.clone(), stands.clone(), marker.clone());
-        std::thread::spawn(move || {
-            for line in lines.map_while(Result::ok) {
-                let parts: Vec<&str> = line.splitn(4, '|').collect();
-                let &[retain, qos, topic, payload] = parts.as_slice() else {
-                    panic!("unexpected line of mosquitto_sub: {line}");
-                };
-                if topic.starts_with("marker/") {
-                    if topic == own_marker {
-                        arrived.store(true, Ordering::SeqCst);
-                    }
-                    continue;
+        let _client = Subscriber::start(command.args(more), move |line| {
+            let parts: Vec<&str> = line.splitn(4, '|').collect();
+            let &[retain, qos, topic, payload] = parts.as_slice() else {
+                panic!("unexpected line of mosquitto_sub: {line}");
+            };
+            if topic.starts_with("marker/") {
+                if topic == own_marker {
+                    arrived.store(true, Ordering::SeqCst);
                 }
-                writer.0.lock().unwrap().push(Seen {
-                    retain: retain == "1",
-                    qos: qos.parse().unwrap(),
-                    topic: topic.to_string(),
-                    payload: payload.to_string(),
-                });
-                writer.1.notify_all();
+                return;
             }
+            writer.0.lock().unwrap().push(Seen {
+                retain: retain == "1",
+                qos: qos.parse().unwrap(),
+                topic: topic.to_string(),
+                payload: payload.to_string(),
+            });
+            writer.1.notify_all();
         });
-        let watcher = Watcher { child, seen };
+        let watcher = Watcher { _client, seen };
         wait_for("the subscription of mosquitto_sub", || {
             broker.publish(&marker, "?", more_login(more));
             stands.load(Ordering::SeqCst).then_some(())
@@ -315,13 +285,6 @@ fn more_login<'a>(more: &'a [&'a str]) -> &'a [&'a str] {
         more
     } else {
         &[]
-    }
-}
-
-impl Drop for Watcher {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 
@@ -523,29 +486,22 @@ async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
 
 /// Process data of an NX: running, ready, at reference; output frequency in 0.01 Hz.
 pub(crate) fn fill(plant: &Plant, drive: &str, frequency: u16) {
-    let now = Instant::now();
-    plant.drive(drive).unwrap().image.update(|s| {
-        s.link = Link::Online(SystemTime::now());
-        s.fast_at = Some(now);
-        let words = [0x0023, 0, 5000, frequency, 750, 12, 300, 280, 2300, 540, 0];
-        s.store(Table::Holding, 2100, &words, now);
-    });
+    read_nx(plant, drive, 0x0023, frequency, Instant::now());
 }
 
 /// A plant `hall` with a bus `line1`; drives whose name begins with `m` are only monitored. Samples stay good for an hour.
 pub(crate) fn plant(drives: &[&str]) -> Plant {
-    let specs = drives.iter().zip(1..).map(|(name, address)| DriveSpec {
-        access: if name.starts_with('m') {
-            Access::Monitor
-        } else {
-            Access::Control
-        },
-        limits: BTreeMap::from([("speed_reference".to_string(), 0.0..=80.0)]),
-        ..plant::spec("line1", name, address, &plant::nx())
+    let nx = nx();
+    let images = drives.iter().zip(1..).map(|(name, address)| {
+        let mut spec = controlled(name, "line1", address, &nx);
+        spec.limits = BTreeMap::from([("speed_reference".to_string(), 0.0..=80.0)]);
+        if name.starts_with('m') {
+            spec.access = Access::Monitor;
+        }
+        image(spec)
     });
-    let bus = plant::bus("line1", Protocol::ModbusRtu, specs.map(plant::image).collect());
-    bus.image.update_health(|h| h.up = true);
-    let plant = plant::plant("hall", Duration::from_secs(3600), vec![bus]);
+    let bus = up(bus(bus_spec("line1"), images.collect()));
+    let plant = Plant::new("hall", Duration::from_secs(3600), vec![bus]);
     for drive in drives {
         fill(&plant, drive, 2500);
     }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
 
+use drivegate_testkit::rows;
 use rustls::crypto::ring;
 use rustls::server::{ClientHello, ResolvesServerCert, ServerConfig};
 use rustls::sign::CertifiedKey;
@@ -123,59 +124,25 @@ fn a_certificate_that_is_itself_named_is_accepted() {
     gateway.stop();
 }
 
+/// Certificate of the broker, certificate that is trusted, what `mosquitto_pub` does, and what the gateway says.
+const REFUSED: &str = "\
+first     | ca        | accept | X.509 version 1, which has no names and usages; have it reissued as version 3
+nameless  | ca        | accept | does not name the host `127.0.0.1` (it has no subjectAltName); have it reissued with subjectAltName = IP:127.0.0.1
+authority | ca        | accept | a CA certificate (basicConstraints CA:TRUE)
+large     | large     | accept | such as P-521
+signed521 | ca521     | accept | has a key of P-521, which the gateway does not support
+late      | late      | refuse | its certificate expired on 20
+elsewhere | elsewhere | refuse | is for `broker.local`, `10.0.0.5`, not for `127.0.0.1`; connect by a name in it
+client    | client    | refuse | is not valid for use by a server; have it reissued with extendedKeyUsage = serverAuth
+ordinary  | ca        | refuse | its certificate `broker` is signed by itself, and not among the certificates of mqtt.ca
+signed    | leaf      | refuse | its certificate `127.0.0.1` is signed by `works-ca`, which is not among the certificates of mqtt.ca";
+
 #[test]
 fn a_refused_certificate_is_told_with_cause_and_remedy() {
     let site = Site::new();
-    for (server, ca, others_accept, said) in [
-        (
-            "first",
-            "ca",
-            true,
-            "X.509 version 1, which has no names and usages; have it reissued as version 3",
-        ),
-        (
-            "nameless",
-            "ca",
-            true,
-            "does not name the host `127.0.0.1` (it has no subjectAltName); have it reissued with subjectAltName = \
-             IP:127.0.0.1",
-        ),
-        ("authority", "ca", true, "a CA certificate (basicConstraints CA:TRUE)"),
-        ("large", "large", true, "such as P-521"),
-        (
-            "signed521",
-            "ca521",
-            true,
-            "has a key of P-521, which the gateway does not support",
-        ),
-        ("late", "late", false, "its certificate expired on 20"),
-        (
-            "elsewhere",
-            "elsewhere",
-            false,
-            "is for `broker.local`, `10.0.0.5`, not for `127.0.0.1`; connect by a name in it",
-        ),
-        (
-            "client",
-            "client",
-            false,
-            "is not valid for use by a server; have it reissued with extendedKeyUsage = serverAuth",
-        ),
-        (
-            "ordinary",
-            "ca",
-            false,
-            "its certificate `broker` is signed by itself, and not among the certificates of mqtt.ca",
-        ),
-        (
-            "signed",
-            "leaf",
-            false,
-            "its certificate `127.0.0.1` is signed by `works-ca`, which is not among the certificates of mqtt.ca",
-        ),
-    ] {
+    for [server, ca, others, said] in rows(REFUSED) {
         let broker = site.broker(server, "");
-        assert_eq!(site.others_accept(&broker, ca), others_accept, "{server}");
+        assert_eq!(site.others_accept(&broker, ca), others == "accept", "{server}");
         let gateway = site.gateway(broker.port, ca);
         wait_log(broker.port, said);
         assert!(!gateway.connected(), "{server}");

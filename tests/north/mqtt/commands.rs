@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use drivegate::drive::Value;
 use drivegate::event::EventKind;
+use drivegate_testkit::rows;
 
 use super::bench::*;
 
@@ -11,26 +12,26 @@ const SET: &str = "drivegate/hall/drive/p1/set";
 const RESULT: &str = "drivegate/hall/drive/p1/result";
 const EVENT: &str = "drivegate/hall/drive/p1/event";
 
-struct Bench {
+struct CommandedGateway {
     broker: Broker,
     gateway: Gateway,
     watcher: Watcher,
 }
 
 /// Drives `p1`, which may be commanded, and `m1`, which may not; connected.
-fn bench() -> Bench {
+fn rig() -> CommandedGateway {
     let broker = Broker::start();
     let watcher = Watcher::new(&broker, "#");
     let gateway = Gateway::start(options(broker.port), plant(&["p1", "m1"]));
     watcher.wait_payload("drivegate/hall/status", "online");
-    Bench {
+    CommandedGateway {
         broker,
         gateway,
         watcher,
     }
 }
 
-impl Bench {
+impl CommandedGateway {
     /// The result of one message.
     fn result(&self, topic: &str, payload: &str, more: &[&str]) -> serde_json::Value {
         self.watcher.clear();
@@ -43,12 +44,12 @@ impl Bench {
 
 #[test]
 fn an_object_becomes_one_order() {
-    let bench = bench();
-    let result = bench.result(SET, r#"{"id": "a7", "run": true, "speed_reference": 50}"#, &[]);
+    let rig = rig();
+    let result = rig.result(SET, r#"{"id": "a7", "run": true, "speed_reference": 50}"#, &[]);
     assert_eq!((&result["id"], &result["ok"]), (&"a7".into(), &true.into()));
     assert_eq!(result["result"], "acknowledged");
     assert!(result["latency_ms"].as_f64().is_some_and(|ms| ms >= 0.0) && result.get("error").is_none());
-    let orders = bench.gateway.ordered();
+    let orders = rig.gateway.ordered();
     assert_eq!(orders.len(), 1, "one command: {orders:?}");
     let expected = [
         ("run".to_string(), Value::Bool(true)),
@@ -56,33 +57,33 @@ fn an_object_becomes_one_order() {
     ];
     assert_eq!((orders[0].0, orders[0].1.as_slice()), (0, expected.as_slice()));
     assert!(orders[0].2 <= Duration::from_secs(2), "2 s by default");
-    bench.gateway.stop();
+    rig.gateway.stop();
 }
 
 #[test]
 fn bare_values_set_one_point() {
-    let bench = bench();
+    let rig = rig();
     for (point, payload, value) in [
         ("run", "true", Value::Bool(true)),
         ("run", "0", Value::Bool(false)),
         ("fault_reset", "1", Value::Bool(true)),
         ("speed_reference", "33.3", Value::Number(33.3)),
     ] {
-        let result = bench.result(&format!("{SET}/{point}"), payload, &[]);
+        let result = rig.result(&format!("{SET}/{point}"), payload, &[]);
         assert_eq!((&result["ok"], &result["id"]), (&true.into(), &serde_json::Value::Null));
-        assert_eq!(bench.gateway.ordered().last().unwrap().1, [(point.to_string(), value)]);
+        assert_eq!(rig.gateway.ordered().last().unwrap().1, [(point.to_string(), value)]);
     }
-    bench.gateway.stop();
+    rig.gateway.stop();
 }
 
 #[test]
 fn messages_of_a_topic_keep_their_order() {
-    let bench = bench();
+    let rig = rig();
     let run = format!("{SET}/run");
     let pairs = ["true", "false"].repeat(40);
-    bench.gateway.while_held(|| bench.broker.publish_all(&run, &pairs));
-    bench.watcher.wait_count(RESULT, 80);
-    let orders: Vec<bool> = bench
+    rig.gateway.while_held(|| rig.broker.publish_all(&run, &pairs));
+    rig.watcher.wait_count(RESULT, 80);
+    let orders: Vec<bool> = rig
         .gateway
         .ordered()
         .iter()
@@ -97,18 +98,18 @@ fn messages_of_a_topic_keep_their_order() {
         !orders.windows(2).any(|pair| pair == [true, true]),
         "each run had its stop: {orders:?}"
     );
-    bench.gateway.stop();
+    rig.gateway.stop();
 }
 
 #[test]
 fn references_of_a_topic_keep_their_order() {
-    let bench = bench();
+    let rig = rig();
     let values: Vec<String> = (1..=79).map(|percent| percent.to_string()).collect();
     let payloads: Vec<&str> = values.iter().map(String::as_str).collect();
     let topic = format!("{SET}/speed_reference");
-    bench.gateway.while_held(|| bench.broker.publish_all(&topic, &payloads));
-    bench.watcher.wait_count(RESULT, 79);
-    let written: Vec<f64> = bench
+    rig.gateway.while_held(|| rig.broker.publish_all(&topic, &payloads));
+    rig.watcher.wait_count(RESULT, 79);
+    let written: Vec<f64> = rig
         .gateway
         .ordered()
         .iter()
@@ -123,13 +124,13 @@ fn references_of_a_topic_keep_their_order() {
         Some(&79.0),
         "the last one published is the last one written"
     );
-    bench.gateway.stop();
+    rig.gateway.stop();
 }
 
 #[test]
 fn a_response_topic_gets_the_result_with_its_correlation() {
-    let bench = bench();
-    let output = bench.broker.run(
+    let rig = rig();
+    let output = rig.broker.run(
         "mosquitto_rr",
         &[
             "-t",
@@ -153,103 +154,70 @@ fn a_response_topic_gets_the_result_with_its_correlation() {
     assert_eq!(parts[..2], ["clients/7/answers", "c-0815"], "{text}");
     let result: serde_json::Value = serde_json::from_str(parts[2]).unwrap();
     assert_eq!((&result["id"], &result["ok"]), (&9.into(), &true.into()));
-    bench.watcher.wait("the answer", |m| m.topic == "clients/7/answers");
-    assert!(bench.watcher.payloads(RESULT).is_empty(), "it goes there, not here");
-    bench.gateway.stop();
+    rig.watcher.wait("the answer", |m| m.topic == "clients/7/answers");
+    assert!(rig.watcher.payloads(RESULT).is_empty(), "it goes there, not here");
+    rig.gateway.stop();
 }
 
 #[test]
 fn expiry_by_field_and_by_message() {
-    let bench = bench();
-    bench.result(SET, r#"{"run": true, "expires_ms": 30000}"#, &[]);
-    let life = bench.gateway.ordered().last().unwrap().2;
+    let rig = rig();
+    rig.result(SET, r#"{"run": true, "expires_ms": 30000}"#, &[]);
+    let life = rig.gateway.ordered().last().unwrap().2;
     assert!(life > Duration::from_secs(3), "{life:?}");
-    bench.result(
+    rig.result(
         SET,
         r#"{"run": true, "expires_ms": 30000}"#,
         &["-D", "PUBLISH", "message-expiry-interval", "3"],
     );
-    let life = bench.gateway.ordered().last().unwrap().2;
+    let life = rig.gateway.ordered().last().unwrap().2;
     assert!(life <= Duration::from_secs(3), "{life:?}");
-    bench.gateway.stop();
+    rig.gateway.stop();
 }
+
+/// Below `drivegate/hall/drive`: topic, payload, code of the refusal, and a part of its text.
+const REFUSED: &str = r#"p1/set                 | run                             | bad_value    | is not JSON
+p1/set                 |                                 | bad_value    | is not JSON
+p1/set                 | [true]                          | bad_value    | is not a JSON object
+p1/set                 | {}                              | bad_value    | names no point
+p1/set                 | {"sped_reference": 10}          | not_writable | did you mean `speed_reference`?
+p1/set                 | {"run": true, "ready": true}    | not_writable | `ready` is read-only
+p1/set                 | {"speed_reference": "10"}       | bad_value    | remove the quotes
+p1/set                 | {"speed_reference": 80.1}       | bad_value    | outside the limits 0 to 80
+p1/set                 | {"speed_reference": NaN}        | bad_value    | is not JSON
+p1/set                 | {"run": true, "expires_ms": -1} | bad_value    | `expires_ms` = -1
+p1/set/speed_reference | nan                             | bad_value    | not true, false or a number
+p1/set/spedreference   | 1                               | not_writable | did you mean
+m1/set                 | {"run": true}                   | not_allowed  | only monitored"#;
 
 #[test]
 fn what_is_wrong_is_refused_and_told_and_nothing_is_written() {
-    let bench = bench();
+    let rig = rig();
     let long = format!(r#"{{"run": true, "id": "{}"}}"#, "x".repeat(70_000));
-    let file = bench.broker.dir.path().join("long");
+    let file = rig.broker.dir.path().join("long");
     std::fs::write(&file, long).unwrap();
-    for (topic, payload, code, text) in [
-        (SET, "run", "bad_value", "is not JSON"),
-        (SET, "", "bad_value", "is not JSON"),
-        (SET, "[true]", "bad_value", "is not a JSON object"),
-        (SET, "{}", "bad_value", "names no point"),
-        (
-            SET,
-            r#"{"sped_reference": 10}"#,
-            "not_writable",
-            "did you mean `speed_reference`?",
-        ),
-        (
-            SET,
-            r#"{"run": true, "ready": true}"#,
-            "not_writable",
-            "`ready` is read-only",
-        ),
-        (SET, r#"{"speed_reference": "10"}"#, "bad_value", "remove the quotes"),
-        (
-            SET,
-            r#"{"speed_reference": 80.1}"#,
-            "bad_value",
-            "outside the limits 0 to 80",
-        ),
-        (SET, r#"{"speed_reference": NaN}"#, "bad_value", "is not JSON"),
-        (
-            SET,
-            r#"{"run": true, "expires_ms": -1}"#,
-            "bad_value",
-            "`expires_ms` = -1",
-        ),
-        (
-            "drivegate/hall/drive/p1/set/speed_reference",
-            "nan",
-            "bad_value",
-            "not true, false or a number",
-        ),
-        (
-            "drivegate/hall/drive/p1/set/spedreference",
-            "1",
-            "not_writable",
-            "did you mean",
-        ),
-        (
-            "drivegate/hall/drive/m1/set",
-            r#"{"run": true}"#,
-            "not_allowed",
-            "only monitored",
-        ),
-    ] {
-        let result = bench.result(topic, payload, &[]);
+    for [topic, payload, code, text] in rows(REFUSED) {
+        let topic = &format!("drivegate/hall/drive/{topic}");
+        let result = rig.result(topic, payload, &[]);
         assert_eq!(result["ok"], false);
         assert_eq!(result["error"]["code"], code, "{payload}: {result}");
         let message = result["error"]["message"].as_str().unwrap();
         assert!(message.contains(text), "{payload}: {message}");
-        let event = bench.watcher.wait("the event", |m| m.topic.ends_with("/event"));
+        let event = rig.watcher.wait("the event", |m| m.topic.ends_with("/event"));
         assert_eq!(event.json()["event"], "refused_command");
         assert!(event.json()["text"].as_str().unwrap().contains(topic));
     }
-    let unknown = bench.result("drivegate/hall/drive/p2/set", r#"{"run": true}"#, &[]);
+    let unknown = rig.result("drivegate/hall/drive/p2/set", r#"{"run": true}"#, &[]);
     assert_eq!(
         (&unknown["error"]["code"], &unknown["drive"]),
         (&"unknown_drive".into(), &"p2".into())
     );
-    bench.watcher.clear();
-    let output = bench
+    rig.watcher.clear();
+    let output = rig
         .broker
         .run("mosquitto_pub", &["-q", "1", "-t", SET, "-f", file.to_str().unwrap()]);
     assert!(output.status.success(), "{output:?}");
-    let result = bench.watcher.wait("the result", |m| m.topic == RESULT).json();
+    let result = rig.watcher.wait("the result", |m| m.topic == RESULT).json();
     assert!(
         result["error"]["message"]
             .as_str()
@@ -257,8 +225,8 @@ fn what_is_wrong_is_refused_and_told_and_nothing_is_written() {
             .contains("65536 are allowed"),
         "{result}"
     );
-    assert_eq!(bench.gateway.ordered(), []);
-    bench.gateway.stop();
+    assert_eq!(rig.gateway.ordered(), []);
+    rig.gateway.stop();
 }
 
 #[test]
@@ -317,24 +285,24 @@ fn without_commands_nothing_is_listened_to() {
 
 #[test]
 fn many_commands_are_all_answered() {
-    let bench = bench();
+    let rig = rig();
     let lines: String = (0..200).map(|n| format!("{{\"id\": {n}, \"run\": true}}\n")).collect();
-    let file = bench.broker.dir.path().join("lines");
+    let file = rig.broker.dir.path().join("lines");
     std::fs::write(&file, lines).unwrap();
-    let port = bench.broker.port.to_string();
+    let port = rig.broker.port.to_string();
     let mut child = std::process::Command::new("mosquitto_pub")
         .args(["-V", "5", "-h", "127.0.0.1", "-p", &port, "-q", "1", "-t", SET, "-l"])
         .stdin(std::fs::File::open(&file).unwrap())
         .spawn()
         .unwrap();
     assert!(child.wait().unwrap().success());
-    let results = bench.watcher.wait_count(RESULT, 200);
+    let results = rig.watcher.wait_count(RESULT, 200);
     let mut ids: Vec<u64> = results.iter().map(|r| r.json()["id"].as_u64().unwrap()).collect();
     ids.sort_unstable();
     assert_eq!(ids, (0..200).collect::<Vec<_>>());
     let done = results.iter().filter(|r| r.json()["ok"] == true).count();
-    assert_eq!(bench.gateway.ordered().len(), done, "one order for each that was taken");
-    bench.gateway.stop();
+    assert_eq!(rig.gateway.ordered().len(), done, "one order for each that was taken");
+    rig.gateway.stop();
 }
 
 #[test]
@@ -354,22 +322,20 @@ fn a_flood_of_refused_commands_is_answered_to_the_last() {
 
 #[test]
 fn ids_and_commands_that_are_too_large_come_back() {
-    let bench = bench();
+    let rig = rig();
     let big = "123456789012345678901234567890";
-    bench
-        .broker
-        .publish(SET, &format!("{{\"id\": {big}, \"sped\": 1}}"), &[]);
-    let seen = bench.watcher.wait("the result", |m| m.topic == RESULT);
+    rig.broker.publish(SET, &format!("{{\"id\": {big}, \"sped\": 1}}"), &[]);
+    let seen = rig.watcher.wait("the result", |m| m.topic == RESULT);
     assert!(seen.payload.contains(&format!("\"id\":{big},")), "{seen:?}");
-    bench.watcher.clear();
-    let file = bench.broker.dir.path().join("large");
+    rig.watcher.clear();
+    let file = rig.broker.dir.path().join("large");
     std::fs::write(&file, format!("{{\"id\": 77, \"pad\": \"{}\"}}", "x".repeat(1 << 20))).unwrap();
     let arguments = ["-q", "1", "-t", SET, "-f", file.to_str().unwrap()];
-    assert!(bench.broker.run("mosquitto_pub", &arguments).status.success());
-    let result = bench.watcher.wait("the result", |m| m.topic == RESULT).json();
+    assert!(rig.broker.run("mosquitto_pub", &arguments).status.success());
+    let result = rig.watcher.wait("the result", |m| m.topic == RESULT).json();
     assert_eq!(
         (&result["id"], &result["error"]["code"]),
         (&77.into(), &"bad_value".into())
     );
-    bench.gateway.stop();
+    rig.gateway.stop();
 }

@@ -7,6 +7,7 @@ use drivegate::north::mqtt::{Buffer, History};
 use tempfile::TempDir;
 
 use super::bench::*;
+use crate::support::mqtt::next_message;
 
 const EVENT: &str = "drivegate/hall/drive/p1/event";
 
@@ -313,18 +314,12 @@ fn a_mosquitto_without_qos_1_or_retained_messages_is_served() {
         wait_log(broker.port, said);
         // With QoS 0, since the clients of mosquitto refuse more themselves.
         let port = broker.port;
-        let seen = std::thread::spawn(move || {
-            let port = port.to_string();
-            let arguments = ["-V", "5", "-h", "127.0.0.1", "-p", &port, "-t", EVENT, "-C", "1"];
-            std::process::Command::new(crate::support::tools::tool("mosquitto_sub"))
-                .args(arguments)
-                .output()
-        });
+        let seen = std::thread::spawn(move || next_message(port, EVENT, &["-W", "240"]));
         while !seen.is_finished() {
             gateway.publish_event("p1", EventKind::Fault, "there");
             std::thread::sleep(Duration::from_millis(50));
         }
-        let output = seen.join().unwrap().unwrap();
+        let output = seen.join().unwrap();
         assert!(String::from_utf8_lossy(&output.stdout).contains("there"), "{output:?}");
         gateway.stop();
     }

@@ -1,11 +1,12 @@
 //! A broker that refuses, limits and takes over: what it does to one topic or connection, the gateway survives.
 
 use std::collections::HashMap;
-use std::io::{Read, Write};
+use std::io::Write;
 use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
 
 use drivegate::event::EventKind;
+use drivegate_testkit::mqtt as packets;
 
 use super::bench::*;
 
@@ -31,6 +32,14 @@ struct Manners {
     no_will: bool,
     /// It refuses filters with wildcards.
     no_wildcards: bool,
+}
+
+/// A broker with these properties of its CONNACK.
+fn with(properties: Vec<u8>) -> Manners {
+    Manners {
+        properties,
+        ..Manners::default()
+    }
 }
 
 #[derive(Default)]
@@ -123,22 +132,9 @@ impl Session {
     }
 
     fn packet(&mut self) -> Option<(u8, Vec<u8>)> {
-        let mut byte = [0];
-        self.stream.read_exact(&mut byte).ok()?;
-        let kind = byte[0];
-        let (mut length, mut shift) = (0, 0);
-        loop {
-            self.stream.read_exact(&mut byte).ok()?;
-            length |= usize::from(byte[0] & 0x7F) << shift;
-            shift += 7;
-            if byte[0] & 0x80 == 0 {
-                break;
-            }
-        }
-        let mut body = vec![0; length];
-        self.stream.read_exact(&mut body).ok()?;
+        let (kind, body) = packets::read_packet(&mut self.stream)?;
         let mut seen = self.seen.lock().unwrap();
-        seen.longest = seen.longest.max(length + 5);
+        seen.longest = seen.longest.max(body.len() + 5);
         Some((kind, body))
     }
 
@@ -162,17 +158,14 @@ impl Session {
                 }
                 8 if self.manners.deaf => {}
                 8 => {
-                    // Packet id, properties (none), then filters with a byte of options each.
-                    let (mut rest, mut codes) = (&body[3..], Vec::new());
-                    while rest.len() > 2 {
-                        let (filter, next) = rest[2..].split_at(number(rest));
-                        let filter = String::from_utf8(filter.to_vec()).unwrap();
-                        let refused = self.manners.no_wildcards && filter.contains(['+', '#']);
-                        codes.push(if refused { 0xA2 } else { 1 });
-                        self.seen.lock().unwrap().filters.push(filter);
-                        rest = &next[1..];
-                    }
-                    self.send(0x90, &[&body[..2], &[0], &codes].concat())?;
+                    let filters = packets::filters(&body);
+                    let refused = |filter: &String| self.manners.no_wildcards && filter.contains(['+', '#']);
+                    let codes: Vec<u8> = filters
+                        .iter()
+                        .map(|filter| if refused(filter) { 0xA2 } else { 1 })
+                        .collect();
+                    self.seen.lock().unwrap().filters.extend(filters);
+                    self.send(0x90, &packets::subscribed(&body, &codes))?;
                 }
                 3 => self.publish(kind, &body)?,
                 12 => self.send(0xD0, &[])?,
@@ -277,13 +270,7 @@ fn serves(broker: &Hostile, gateway: &Gateway, count: usize) {
 fn odd_brokers_are_served() {
     let window = |n: u16| [&[0x21][..], &n.to_be_bytes()].concat();
     let cases: [(&str, Manners); 9] = [
-        (
-            "receive maximum 1",
-            Manners {
-                properties: window(1),
-                ..Manners::default()
-            },
-        ),
+        ("receive maximum 1", with(window(1))),
         (
             "receive maximum 20, acknowledged backwards",
             Manners {
@@ -292,40 +279,16 @@ fn odd_brokers_are_served() {
                 ..Manners::default()
             },
         ),
-        (
-            "QoS 0 only",
-            Manners {
-                properties: vec![0x24, 0],
-                ..Manners::default()
-            },
-        ),
-        (
-            "no retained messages",
-            Manners {
-                properties: vec![0x25, 0],
-                ..Manners::default()
-            },
-        ),
-        (
-            "topic aliases",
-            Manners {
-                properties: vec![0x22, 0, 5],
-                ..Manners::default()
-            },
-        ),
+        ("QoS 0 only", with(vec![0x24, 0])),
+        ("no retained messages", with(vec![0x25, 0])),
+        ("topic aliases", with(vec![0x22, 0, 5])),
         (
             "no topic aliases, a keep-alive interval of its own",
-            Manners {
-                properties: vec![0x22, 0, 0, 0x13, 0, 60],
-                ..Manners::default()
-            },
+            with(vec![0x22, 0, 0, 0x13, 0, 60]),
         ),
         (
             "a client id assigned by the broker",
-            Manners {
-                properties: vec![0x12, 0, 3, b'x', b'y', b'z'],
-                ..Manners::default()
-            },
+            with(vec![0x12, 0, 3, b'x', b'y', b'z']),
         ),
         (
             "packets in single bytes",
@@ -450,10 +413,7 @@ fn a_status_that_is_refused_is_repeated_until_the_broker_takes_it() {
 
 #[test]
 fn packets_beyond_the_limit_are_not_sent() {
-    let broker = Hostile::start(Manners {
-        properties: vec![0x27, 0, 0, 1, 0],
-        ..Manners::default()
-    });
+    let broker = Hostile::start(with(vec![0x27, 0, 0, 1, 0]));
     let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
     serves(&broker, &gateway, 5);
     wait_for("a point", || {

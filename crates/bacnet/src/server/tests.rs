@@ -140,7 +140,7 @@ fn device(instance: u32, station: Option<u8>, more: u32) -> Arc<Device> {
 }
 
 /// A server at 10.0.0.1 with itself, 100, and the devices 101 to 103 behind it, and its clients.
-struct Bench {
+struct ServerWithClients {
     server: Server,
     plant: Plant,
     now: Instant,
@@ -149,12 +149,12 @@ struct Bench {
 /// A message that came out: where to, network and station of the device, the APDU.
 type Out = (To, Option<(u16, Mac, u8)>, Option<u8>, Vec<u8>);
 
-impl Bench {
-    fn new() -> Bench {
-        Bench::of(3, 0)
+impl ServerWithClients {
+    fn new() -> ServerWithClients {
+        ServerWithClients::of(3, 0)
     }
 
-    fn of(drives: u8, more: u32) -> Bench {
+    fn of(drives: u8, more: u32) -> ServerWithClients {
         let now = Instant::now();
         let options = Options {
             address: "10.0.0.1:47808".parse().unwrap(),
@@ -166,7 +166,7 @@ impl Bench {
         };
         let drives = (1..=drives).map(|unit| device(100 + u32::from(unit), Some(unit), more));
         let devices = [device(100, None, 0)].into_iter().chain(drives).collect();
-        Bench {
+        ServerWithClients {
             server: Server::new(options, devices, now),
             plant: Plant::default(),
             now,
@@ -187,7 +187,8 @@ impl Bench {
     }
 
     fn datagram(&mut self, from: u8, bytes: &[u8]) {
-        self.server.receive(Bench::client(from), bytes, &self.plant, self.now);
+        self.server
+            .receive(ServerWithClients::client(from), bytes, &self.plant, self.now);
     }
 
     /// A message to a station of the virtual network, or to the gateway itself.

@@ -15,7 +15,7 @@ mod elsewhere;
 mod functions;
 mod on_change;
 
-struct Bench {
+struct ObedientDrive {
     profile: Arc<Profile>,
     words: KnownWords,
     now: Instant,
@@ -24,10 +24,10 @@ struct Bench {
     running: bool,
 }
 
-impl Bench {
-    fn new(control_word: u16) -> Bench {
+impl ObedientDrive {
+    fn new(control_word: u16) -> ObedientDrive {
         let drive = BTreeMap::from([(2000, control_word), (2002, 0)]);
-        Bench {
+        ObedientDrive {
             profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
             words: KnownWords::default(),
             now: Instant::now(),
@@ -97,7 +97,7 @@ impl Bench {
 
 #[test]
 fn bits_of_others_are_kept_and_the_word_is_read_first() {
-    let mut bench = Bench::new(0x0800);
+    let mut bench = ObedientDrive::new(0x0800);
     let (mut run, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
     assert!(asks(&sends(&bench, &mut run)));
     assert_eq!(bench.run(&mut run), [(0, 2000, 0x0801)]);
@@ -106,7 +106,7 @@ fn bits_of_others_are_kept_and_the_word_is_read_first() {
 
 #[test]
 fn safe_order() {
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     let (mut start, _a) = bench.begin(
         &[("run", 1.0), ("reverse", 1.0), ("speed_reference", 50.0)],
         Urgency::Command,
@@ -126,20 +126,20 @@ fn safe_order() {
 
 #[test]
 fn reset_is_a_pulse_whatever_the_level_and_starts_nothing() {
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
     assert_eq!(bench.run(&mut reset), [(0, 2000, 4), (20, 2000, 0)]);
     // The bit is set already, and so is the run bit of a motor that stands with a fault.
-    let mut bench = Bench::new(0x0005);
+    let mut bench = ObedientDrive::new(0x0005);
     let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
     assert_eq!(bench.run(&mut reset), [(0, 2000, 0), (20, 2000, 4), (40, 2000, 0)]);
     // A motor that runs keeps its run bit.
-    let mut bench = Bench::new(0x0001);
+    let mut bench = ObedientDrive::new(0x0001);
     bench.running = true;
     let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
     assert_eq!(bench.run(&mut reset), [(0, 2000, 5), (20, 2000, 1)]);
     // Reset and run in one command: a new edge after the pulse.
-    let mut bench = Bench::new(0x0001);
+    let mut bench = ObedientDrive::new(0x0001);
     let (mut both, _a) = bench.begin(&[("run", 1.0), ("fault_reset", 1.0)], Urgency::Command);
     assert_eq!(
         bench.run(&mut both),
@@ -149,7 +149,7 @@ fn reset_is_a_pulse_whatever_the_level_and_starts_nothing() {
 
 #[test]
 fn a_stop_purges_what_was_begun() {
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     bench.words.learn(Table::Holding, 2000, 0);
     let points = [("run", 1.0), ("speed_reference", 50.0)];
     let (mut start, _a) = bench.begin(&points, Urgency::Command);
@@ -176,7 +176,7 @@ fn a_stop_purges_what_was_begun() {
 
 #[test]
 fn what_was_begun_and_runs_out_of_time_is_not_told_to_be_unsent() {
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     bench.words.learn(Table::Holding, 2000, 0);
     let late = bench.now + Duration::from_secs(1);
     for (on_the_wire, outcome) in [
@@ -197,7 +197,7 @@ fn what_was_begun_and_runs_out_of_time_is_not_told_to_be_unsent() {
 
 #[test]
 fn who_is_abandoned_is_told_whether_it_was_sent() {
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     bench.words.learn(Table::Holding, 2000, 0);
     for (on_the_wire, outcome) in [
         (false, Outcome::BusDown),
@@ -215,7 +215,7 @@ fn who_is_abandoned_is_told_whether_it_was_sent() {
 
 #[test]
 fn a_command_that_was_held_up_asks_again_for_the_word() {
-    let mut bench = Bench::new(1);
+    let mut bench = ObedientDrive::new(1);
     bench.running = true;
     let (mut reverse, _a) = bench.begin(&[("reverse", 1.0)], Urgency::Command);
     let read = sends(&bench, &mut reverse);
@@ -230,7 +230,7 @@ fn a_command_that_was_held_up_asks_again_for_the_word() {
 
 #[test]
 fn a_stop_lets_a_pulse_end() {
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     bench.words.learn(Table::Holding, 2000, 0);
     let (mut both, _a) = bench.begin(&[("run", 1.0), ("fault_reset", 1.0)], Urgency::Command);
     let high = word(4);
@@ -244,7 +244,7 @@ fn a_stop_lets_a_pulse_end() {
 
 #[test]
 fn exceptions_and_silence_end_it() {
-    let bench = Bench::new(0);
+    let bench = ObedientDrive::new(0);
     let mut words = KnownWords::default();
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     let sent = reference(100);
@@ -266,7 +266,7 @@ fn exceptions_and_silence_end_it() {
 }
 
 /// What the command sends next.
-fn sends(bench: &Bench, command: &mut CommandRun) -> Step {
+fn sends(bench: &ObedientDrive, command: &mut CommandRun) -> Step {
     match command.next(&bench.words, &bench.profile, bench.running, bench.now) {
         Next::Send(step) => step,
         other => panic!("{other:?}"),
@@ -299,7 +299,7 @@ fn asks(step: &Step) -> bool {
 
 #[test]
 fn a_stop_does_not_depend_on_a_read() {
-    let mut bench = Bench::new(1);
+    let mut bench = ObedientDrive::new(1);
     bench.running = true;
     let refused = Reply::Exception(Exception::BUSY);
     for answer in [Some(refused), None] {
@@ -317,7 +317,7 @@ fn a_stop_does_not_depend_on_a_read() {
 
 #[test]
 fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     let refused = || Reply::Exception(Exception::ADDRESS);
     let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
     let read = sends(&bench, &mut start);
@@ -330,7 +330,7 @@ fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
         "known from the acknowledged write on"
     );
     // A read that is never answered: after the tries.
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
     assert_eq!(start.failed(&read, Outcome::TimedOut, 1), None);
     assert_eq!(sends(&bench, &mut start), read);
@@ -348,7 +348,7 @@ fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
 
 /// The drive is too busy for the write of a command, which is tried again: how long after its beginning, and how it ends.
 fn busy(points: &[(&str, f64)], urgency: Urgency, times: usize) -> (Vec<u128>, Outcome) {
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     bench.words.learn(Table::Holding, 2000, 1);
     let (mut run, _a) = bench.begin(points, urgency);
     let (start, mut tries) = (bench.now, Vec::new());
@@ -382,7 +382,7 @@ fn a_drive_that_is_busy_is_written_again_until_the_time_of_the_command_is_over()
         assert_eq!(outcome, Outcome::Exception(Exception::BUSY), "it did not take it");
     }
     // What was sent before and not answered may have been taken.
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     let (mut run, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     let sent = sends(&bench, &mut run);
     run.sent(&sent);
@@ -398,7 +398,7 @@ fn a_drive_that_is_busy_is_written_again_until_the_time_of_the_command_is_over()
 
 #[test]
 fn the_end_of_a_pulse_is_tried_again_too_but_not_for_ever() {
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     bench.words.learn(Table::Holding, 2000, 0);
     let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
     let high = sends(&bench, &mut reset);
@@ -426,7 +426,7 @@ fn the_end_of_a_pulse_is_tried_again_too_but_not_for_ever() {
 
 #[test]
 fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
-    let mut bench = Bench::new(1);
+    let mut bench = ObedientDrive::new(1);
     bench.running = true;
     let refused = || Reply::Exception(Exception::ADDRESS);
     for points in [&[("reverse", 1.0)][..], &[("run", 1.0)], &[("fault_reset", 1.0)]] {
@@ -453,7 +453,7 @@ fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
 fn what_cannot_be_sent_is_no_success() {
     let refused = |run: &CommandRun| matches!(run.success(), Outcome::Refused(_));
     // Its place is that of another point, which is not named.
-    let mut bench = Bench::new(0);
+    let mut bench = ObedientDrive::new(0);
     let (mut derived, _a) = bench.begin(&[("run", 1.0), ("frequency_reference", 20.0)], Urgency::Command);
     assert_eq!(bench.run(&mut derived), [], "not a part of it either");
     assert!(refused(&derived), "{:?}", derived.success());
@@ -461,7 +461,7 @@ fn what_cannot_be_sent_is_no_success() {
     assert_eq!(bench.run(&mut large), []);
     assert!(refused(&large), "{:?}", large.success());
     // Of a stop goes out what can.
-    let mut bench = Bench::new(1);
+    let mut bench = ObedientDrive::new(1);
     let (mut stop, _a) = bench.begin(&[("frequency_reference", 0.0), ("run", 0.0)], Urgency::Stop);
     assert_eq!(bench.run(&mut stop), [(0, 2000, 0)]);
     assert!(refused(&stop), "{:?}", stop.success());

@@ -1,15 +1,14 @@
-use drivegate_testkit::audited;
+use drivegate_testkit::{audited, controlled, online, ticket};
 use std::sync::Arc;
 
 use proptest::prelude::*;
 
 use super::*;
 use crate::codec::{Reply, RequestPdu, Table};
-use crate::command::{Origin, Outcome, SourceKind, Ticket, WriteStats};
-use crate::drive::profile::Profiles;
-use crate::process_image::{Access, DriveImage, DriveSpec, Link};
+use crate::command::{Outcome, WriteStats};
+use crate::process_image::{DriveImage, DriveSpec};
 
-struct Bench {
+struct CommandedDrive {
     drive: DriveImage,
     stats: Arc<WriteStats>,
     confirmations: Confirmations,
@@ -18,33 +17,31 @@ struct Bench {
     now: Instant,
 }
 
-impl Bench {
-    fn new() -> Bench {
-        Bench::of("vacon-nx")
+impl CommandedDrive {
+    fn new() -> CommandedDrive {
+        CommandedDrive::of("vacon-nx")
     }
 
-    fn of(profile: &str) -> Bench {
+    fn of(profile: &str) -> CommandedDrive {
         let spec = DriveSpec {
-            access: Access::Control,
             turnaround: Duration::ZERO,
-            ..DriveSpec::new("d", "b", 1, Profiles::built_in().get(profile).unwrap().clone())
+            ..controlled("d", "b", 1, &drivegate_testkit::profile(profile))
         };
         let drive = DriveImage::new(spec, Duration::from_secs(1));
-        drive.update(|s| s.link = Link::Online(std::time::SystemTime::now()));
-        let mut bench = Bench {
+        online(&drive);
+        let mut rig = CommandedDrive {
             drive,
             stats: Arc::default(),
             confirmations: Confirmations::default(),
             confirmation: None,
             now: Instant::now(),
         };
-        bench.read(2100, &[0]);
-        bench
+        rig.read(2100, &[0]);
+        rig
     }
 
     fn receipt(&mut self) -> Receipt {
-        let origin = Origin::new(SourceKind::Mqtt, "t");
-        let (mut ticket, _) = Ticket::new(origin, "d", "it".to_string(), true, self.now, self.stats.clone());
+        let (mut ticket, _) = ticket(&self.stats, self.now);
         self.confirmation = Some(ticket.confirmation());
         ticket.acknowledge(Outcome::Acknowledged(Reply::Written), self.now)
     }
@@ -95,17 +92,17 @@ impl Bench {
 
 #[test]
 fn only_a_read_after_the_acknowledgement_confirms() {
-    let mut bench = Bench::new();
-    bench.read(2100, &[2]);
-    bench.set("run", Value::Bool(true));
-    let reading_before = bench.drive.reading(bench.now, Duration::from_secs(1));
-    let now = bench.now;
-    bench.confirmations.look(&reading_before, now);
-    assert!(bench.results().is_empty(), "the old sample proves nothing");
-    bench.read(2100, &[2]);
-    assert_eq!(bench.results(), ["confirmed"]);
-    assert_eq!(audited(bench.stats.audit())[0]["confirmed_ms"], 10.0);
-    assert!(bench.expired().is_empty());
+    let mut rig = CommandedDrive::new();
+    rig.read(2100, &[2]);
+    rig.set("run", Value::Bool(true));
+    let reading_before = rig.drive.reading(rig.now, Duration::from_secs(1));
+    let now = rig.now;
+    rig.confirmations.look(&reading_before, now);
+    assert!(rig.results().is_empty(), "the old sample proves nothing");
+    rig.read(2100, &[2]);
+    assert_eq!(rig.results(), ["confirmed"]);
+    assert_eq!(audited(rig.stats.audit())[0]["confirmed_ms"], 10.0);
+    assert!(rig.expired().is_empty());
 }
 
 #[test]
@@ -119,13 +116,13 @@ fn a_stop_is_confirmed_when_the_motor_does_not_run_or_stands() {
         (&[2, 0, 0, 0_u16.wrapping_sub(1000)], false),
         (&[0, 0, 4000, 2000], true),
     ] {
-        let mut bench = Bench::new();
-        bench.speed(50.0);
-        bench.set("run", Value::Bool(false));
-        bench.read(2100, words);
-        assert_eq!(!bench.results().is_empty(), confirmed, "{words:?}");
+        let mut rig = CommandedDrive::new();
+        rig.speed(50.0);
+        rig.set("run", Value::Bool(false));
+        rig.read(2100, words);
+        assert_eq!(!rig.results().is_empty(), confirmed, "{words:?}");
         if confirmed {
-            assert_eq!(bench.results(), ["confirmed"]);
+            assert_eq!(rig.results(), ["confirmed"]);
         }
     }
 }
@@ -133,144 +130,144 @@ fn a_stop_is_confirmed_when_the_motor_does_not_run_or_stands() {
 /// From 10 Hz down the speed in percent of the band from 10 Hz says nothing any more.
 #[test]
 fn below_the_minimum_frequency_the_motor_still_slows_down() {
-    let mut bench = Bench::new();
-    bench.read(2100, &[2, 0, 0, 1000]);
-    bench.set("run", Value::Bool(false));
+    let mut rig = CommandedDrive::new();
+    rig.read(2100, &[2, 0, 0, 1000]);
+    rig.set("run", Value::Bool(false));
     for hundredths in (1..1000).rev() {
-        bench.read(2100, &[2, 0, 0, hundredths]);
-        assert!(bench.expired().is_empty(), "at {hundredths} x 0.01 Hz");
+        rig.read(2100, &[2, 0, 0, hundredths]);
+        assert!(rig.expired().is_empty(), "at {hundredths} x 0.01 Hz");
     }
-    bench.read(2100, &[2, 0, 0, 0]);
-    assert!(bench.confirmations.is_empty() && bench.expired().is_empty());
-    assert_eq!(bench.results(), ["acknowledged"], "nobody waited for 10 s");
+    rig.read(2100, &[2, 0, 0, 0]);
+    assert!(rig.confirmations.is_empty() && rig.expired().is_empty());
+    assert_eq!(rig.results(), ["acknowledged"], "nobody waited for 10 s");
 }
 
 #[test]
 fn a_ripple_of_the_speed_does_not_confirm_a_stop_that_the_drive_ignores() {
-    let mut bench = Bench::new();
-    bench.speed(50.0);
-    bench.set("run", Value::Bool(false));
+    let mut rig = CommandedDrive::new();
+    rig.speed(50.0);
+    rig.set("run", Value::Bool(false));
     let mut reported = Vec::new();
     for round in 0..400 {
-        bench.speed(if round % 2 == 0 { 49.4 } else { 50.6 });
-        reported.append(&mut bench.expired());
-        assert!(!bench.results().contains(&"confirmed".into()));
+        rig.speed(if round % 2 == 0 { 49.4 } else { 50.6 });
+        reported.append(&mut rig.expired());
+        assert!(!rig.results().contains(&"confirmed".into()));
     }
     assert_eq!(reported.len(), 1, "{reported:?}");
     assert!(reported[0].ends_with("the motor does not stop"), "{reported:?}");
-    assert_eq!(bench.results(), ["acknowledged"]);
-    assert!(bench.confirmations.is_empty());
+    assert_eq!(rig.results(), ["acknowledged"]);
+    assert!(rig.confirmations.is_empty());
 }
 
 #[test]
 fn a_drive_that_was_not_read_since_is_not_said_to_run_on() {
-    let mut bench = Bench::new();
-    bench.speed(50.0);
-    bench.set("run", Value::Bool(false));
-    bench.now += Duration::from_secs(3);
-    assert!(bench.expired().is_empty(), "nothing was read since");
-    assert_eq!(bench.results(), ["acknowledged"], "nobody waits that long");
-    bench.read(2100, &[0, 0, 0]);
-    assert!(bench.expired().is_empty() && bench.confirmations.is_empty());
+    let mut rig = CommandedDrive::new();
+    rig.speed(50.0);
+    rig.set("run", Value::Bool(false));
+    rig.now += Duration::from_secs(3);
+    assert!(rig.expired().is_empty(), "nothing was read since");
+    assert_eq!(rig.results(), ["acknowledged"], "nobody waits that long");
+    rig.read(2100, &[0, 0, 0]);
+    assert!(rig.expired().is_empty() && rig.confirmations.is_empty());
 
-    bench.set("run", Value::Bool(true));
-    bench.now += Duration::from_secs(3);
-    bench.read(2100, &[0, 0, 0]);
-    let reports = bench.expired();
+    rig.set("run", Value::Bool(true));
+    rig.now += Duration::from_secs(3);
+    rig.read(2100, &[0, 0, 0]);
+    let reports = rig.expired();
     assert!(reports[0].ends_with("the motor does not run"), "{reports:?}");
 
-    bench.set("run", Value::Bool(true));
-    bench.now += Duration::from_secs(30);
-    let reports = bench.expired();
+    rig.set("run", Value::Bool(true));
+    rig.now += Duration::from_secs(30);
+    let reports = rig.expired();
     assert!(reports[0].contains("was not read within 10s"), "{reports:?}");
 }
 
 /// A busy line reads the motor in every round and the control word now and then.
 #[test]
 fn what_is_read_seldom_is_not_missing_before_it_was_read() {
-    let order = |bench: &mut Bench, reverse: bool| {
+    let order = |rig: &mut CommandedDrive, reverse: bool| {
         let points = [("run", true), ("reverse", reverse)];
-        let index = |name: &str| bench.drive.spec.profile.point_index(name).unwrap();
+        let index = |name: &str| rig.drive.spec.profile.point_index(name).unwrap();
         let values = points.map(|(name, on)| (index(name), Value::Bool(on)));
-        bench.acknowledge(&Order::Points(values.to_vec()));
+        rig.acknowledge(&Order::Points(values.to_vec()));
     };
-    let mut bench = Bench::new();
-    order(&mut bench, false);
-    bench.read(2100, &[2]);
-    bench.now += Duration::from_secs(3);
-    assert!(bench.expired().is_empty(), "its direction was not read since");
-    bench.now += Duration::from_secs(4);
-    bench.read(2000, &[1]);
-    assert!(bench.expired().is_empty() && bench.confirmations.is_empty());
+    let mut rig = CommandedDrive::new();
+    order(&mut rig, false);
+    rig.read(2100, &[2]);
+    rig.now += Duration::from_secs(3);
+    assert!(rig.expired().is_empty(), "its direction was not read since");
+    rig.now += Duration::from_secs(4);
+    rig.read(2000, &[1]);
+    assert!(rig.expired().is_empty() && rig.confirmations.is_empty());
 
     // What was read is told in time, and what is read later then.
-    order(&mut bench, true);
-    bench.read(2100, &[0]);
-    bench.now += Duration::from_secs(2);
-    let reports = bench.expired();
+    order(&mut rig, true);
+    rig.read(2100, &[0]);
+    rig.now += Duration::from_secs(2);
+    let reports = rig.expired();
     assert!(reports[0].ends_with("within 2s: the motor does not run"), "{reports:?}");
-    bench.now += Duration::from_secs(4);
-    bench.read(2000, &[1]);
-    let reports = bench.expired();
+    rig.now += Duration::from_secs(4);
+    rig.read(2000, &[1]);
+    let reports = rig.expired();
     assert!(
         reports[0].ends_with("within 6s: `reverse` does not read true"),
         "{reports:?}"
     );
-    assert!(bench.confirmations.is_empty());
+    assert!(rig.confirmations.is_empty());
 
     // Never read: not known, once.
-    order(&mut bench, true);
-    bench.read(2100, &[2]);
-    bench.now += Duration::from_secs(9);
-    assert!(bench.expired().is_empty());
-    bench.now += Duration::from_secs(2);
-    let reports = bench.expired();
+    order(&mut rig, true);
+    rig.read(2100, &[2]);
+    rig.now += Duration::from_secs(9);
+    assert!(rig.expired().is_empty());
+    rig.now += Duration::from_secs(2);
+    let reports = rig.expired();
     assert!(reports[0].contains("was not read within 10s"), "{reports:?}");
-    bench.now += Duration::from_secs(60);
-    assert!(bench.expired().is_empty() && bench.confirmations.is_empty());
+    rig.now += Duration::from_secs(60);
+    assert!(rig.expired().is_empty() && rig.confirmations.is_empty());
 }
 
 #[test]
 fn while_the_motor_slows_down_nobody_waits_any_longer_and_nothing_is_told() {
-    let mut bench = Bench::new();
-    bench.speed(90.0);
-    bench.set("run", Value::Bool(false));
-    let since = bench.now;
+    let mut rig = CommandedDrive::new();
+    rig.speed(90.0);
+    rig.set("run", Value::Bool(false));
+    let since = rig.now;
     // 10 % a second: at zero after 9 s.
     loop {
-        let passed = (bench.now - since).as_secs_f64();
+        let passed = (rig.now - since).as_secs_f64();
         let speed = 90.0 - 10.0 * passed;
         if speed <= 0.5 {
             break;
         }
-        bench.speed(speed);
-        assert!(bench.expired().is_empty(), "at {speed} %");
-        let in_time = bench.now - since < Duration::from_secs(2);
+        rig.speed(speed);
+        assert!(rig.expired().is_empty(), "at {speed} %");
+        let in_time = rig.now - since < Duration::from_secs(2);
         let wanted: &[&str] = if in_time { &[] } else { &["acknowledged"] };
-        assert_eq!(bench.results(), wanted, "after {passed} s");
+        assert_eq!(rig.results(), wanted, "after {passed} s");
     }
-    bench.speed(0.0);
-    assert!(bench.confirmations.is_empty(), "it stands");
-    bench.now += Duration::from_secs(60);
-    assert!(bench.expired().is_empty());
-    assert_eq!(bench.results(), ["acknowledged"], "answered once");
+    rig.speed(0.0);
+    assert!(rig.confirmations.is_empty(), "it stands");
+    rig.now += Duration::from_secs(60);
+    assert!(rig.expired().is_empty());
+    assert_eq!(rig.results(), ["acknowledged"], "answered once");
 }
 
 #[test]
 fn a_fall_that_ceases_above_zero_is_told() {
-    let mut bench = Bench::new();
-    bench.speed(90.0);
-    bench.set("run", Value::Bool(false));
-    let since = bench.now;
+    let mut rig = CommandedDrive::new();
+    rig.speed(90.0);
+    rig.set("run", Value::Bool(false));
+    let since = rig.now;
     let mut reported = Vec::new();
     let mut at = None;
-    while bench.now < since + Duration::from_secs(12) {
-        let passed = (bench.now - since).as_secs_f64();
+    while rig.now < since + Duration::from_secs(12) {
+        let passed = (rig.now - since).as_secs_f64();
         // It falls to 40 % within 5 s and stays there.
-        bench.speed((90.0 - 10.0 * passed).max(40.0));
-        reported.append(&mut bench.expired());
+        rig.speed((90.0 - 10.0 * passed).max(40.0));
+        reported.append(&mut rig.expired());
         if reported.len() == 1 {
-            at.get_or_insert(bench.now - since);
+            at.get_or_insert(rig.now - since);
         }
     }
     assert_eq!(reported.len(), 1, "{reported:?}");
@@ -279,81 +276,78 @@ fn a_fall_that_ceases_above_zero_is_told() {
         (6.9..7.1).contains(&at),
         "the profile's time after the fall ceased: {at} s"
     );
-    assert_eq!(bench.results(), ["acknowledged"]);
+    assert_eq!(rig.results(), ["acknowledged"]);
 }
 
 #[test]
 fn all_who_joined_a_stop_are_told_that_it_is_confirmed() {
-    let mut bench = Bench::new();
-    bench.speed(50.0);
-    let (a, b) = (bench.receipt(), bench.receipt());
-    let effects = effects(&bench.drive.spec.profile, &bench.order("run", Value::Bool(false)));
-    let reading = bench.drive.reading(bench.now, Duration::from_secs(1));
-    bench.confirmations.watch(effects, vec![a, b], &reading, bench.now);
-    bench.read(2100, &[0]);
-    assert_eq!(bench.results(), ["confirmed", "confirmed"]);
+    let mut rig = CommandedDrive::new();
+    rig.speed(50.0);
+    let (a, b) = (rig.receipt(), rig.receipt());
+    let effects = effects(&rig.drive.spec.profile, &rig.order("run", Value::Bool(false)));
+    let reading = rig.drive.reading(rig.now, Duration::from_secs(1));
+    rig.confirmations.watch(effects, vec![a, b], &reading, rig.now);
+    rig.read(2100, &[0]);
+    assert_eq!(rig.results(), ["confirmed", "confirmed"]);
 }
 
 #[test]
 fn references_and_raw_writes_are_read_back() {
-    let mut bench = Bench::new();
-    bench.set("speed_reference", Value::Number(33.333));
-    bench.read(2002, &[0]);
-    assert!(bench.results().is_empty());
-    bench.read(2002, &[3333]);
-    assert_eq!(bench.results(), ["confirmed"]);
-    bench.acknowledge(&Order::Write(RequestPdu::WriteRegisters {
-        start: 2000,
-        values: vec![1, 0, 2000],
-    }));
-    bench.read(2000, &[1, 0, 2000]);
+    let mut rig = CommandedDrive::new();
+    rig.set("speed_reference", Value::Number(33.333));
+    rig.read(2002, &[0]);
+    assert!(rig.results().is_empty());
+    rig.read(2002, &[3333]);
+    assert_eq!(rig.results(), ["confirmed"]);
+    rig.acknowledge(&Order::Write(RequestPdu::write_registers(2000, &[1, 0, 2000])));
+    rig.read(2000, &[1, 0, 2000]);
     assert_eq!(
-        bench.results().len(),
+        rig.results().len(),
         1,
         "the run bit was read back, the motor does not run yet"
     );
-    bench.read(2100, &[2]);
-    assert_eq!(bench.results(), ["confirmed", "confirmed"]);
+    rig.read(2100, &[2]);
+    assert_eq!(rig.results(), ["confirmed", "confirmed"]);
 }
 
 #[test]
 fn what_shows_too_late_is_not_confirmed() {
-    let mut bench = Bench::new();
-    bench.set("run", Value::Bool(true));
-    bench.now += Duration::from_secs(2);
-    bench.read(2100, &[2]);
-    assert_eq!(bench.results(), ["acknowledged"]);
-    assert!(bench.expired().is_empty(), "the first read since shows it");
+    let mut rig = CommandedDrive::new();
+    rig.set("run", Value::Bool(true));
+    rig.now += Duration::from_secs(2);
+    rig.read(2100, &[2]);
+    assert_eq!(rig.results(), ["acknowledged"]);
+    assert!(rig.expired().is_empty(), "the first read since shows it");
 }
 
 #[test]
 fn what_is_not_waited_for_any_more_stays_acknowledged() {
-    let mut bench = Bench::new();
-    bench.set("run", Value::Bool(true));
-    bench.confirmations.clear();
-    assert_eq!(bench.results(), ["acknowledged"]);
-    bench.read(2100, &[2]);
-    assert!(bench.expired().is_empty() && bench.results().len() == 1);
+    let mut rig = CommandedDrive::new();
+    rig.set("run", Value::Bool(true));
+    rig.confirmations.clear();
+    assert_eq!(rig.results(), ["acknowledged"]);
+    rig.read(2100, &[2]);
+    assert!(rig.expired().is_empty() && rig.results().len() == 1);
 }
 
 #[test]
 fn what_does_not_show_is_told_once_and_what_was_overtaken_is_not() {
-    let mut bench = Bench::new();
-    bench.set("fault_reset", Value::Bool(true));
-    bench.set("run", Value::Bool(true));
-    bench.set("run", Value::Bool(false));
-    assert_eq!(bench.results(), ["acknowledged"], "the stop overtook the run");
-    bench.read(2100, &[8]);
-    assert_eq!(bench.results(), ["acknowledged", "confirmed"], "it stands");
-    bench.now += Duration::from_secs(2);
-    let reported = bench.expired();
+    let mut rig = CommandedDrive::new();
+    rig.set("fault_reset", Value::Bool(true));
+    rig.set("run", Value::Bool(true));
+    rig.set("run", Value::Bool(false));
+    assert_eq!(rig.results(), ["acknowledged"], "the stop overtook the run");
+    rig.read(2100, &[8]);
+    assert_eq!(rig.results(), ["acknowledged", "confirmed"], "it stands");
+    rig.now += Duration::from_secs(2);
+    let reported = rig.expired();
     assert_eq!(reported.len(), 1);
     assert_eq!(
         reported[0],
-        "acknowledged it but did not show it within 2s: the fault is still active"
+        "acknowledged run=true but did not show it within 2s: the fault is still active"
     );
-    assert_eq!(bench.results(), ["acknowledged", "confirmed", "acknowledged"]);
-    assert!(bench.expired().is_empty() && bench.confirmations.is_empty());
+    assert_eq!(rig.results(), ["acknowledged", "confirmed", "acknowledged"]);
+    assert!(rig.expired().is_empty() && rig.confirmations.is_empty());
 }
 
 proptest! {
@@ -363,32 +357,32 @@ proptest! {
     fn a_stop_is_confirmed_or_told_or_neither(
         reads in proptest::collection::vec((1u64..900, any::<bool>(), 0u16..5_000), 1..60),
     ) {
-        let mut bench = Bench::new();
-        bench.speed(100.0);
-        bench.set("run", Value::Bool(false));
-        let since = bench.now;
+        let mut rig = CommandedDrive::new();
+        rig.speed(100.0);
+        rig.set("run", Value::Bool(false));
+        let since = rig.now;
         let (mut stood, mut stood_in_time, mut reported) = (false, false, Vec::new());
         for (pause, runs, output) in reads {
             let output = output.saturating_sub(250);
-            bench.now += Duration::from_millis(pause);
-            bench.read(2100, &[if runs { 2 } else { 0 }, 0, 2 * output, output]);
+            rig.now += Duration::from_millis(pause);
+            rig.read(2100, &[if runs { 2 } else { 0 }, 0, 2 * output, output]);
             let shows = !runs || output == 0;
             stood |= shows;
-            stood_in_time |= shows && bench.now - since < Duration::from_secs(2);
-            reported.append(&mut bench.expired());
+            stood_in_time |= shows && rig.now - since < Duration::from_secs(2);
+            reported.append(&mut rig.expired());
             if shows {
-                prop_assert!(bench.confirmations.is_empty());
+                prop_assert!(rig.confirmations.is_empty());
             }
-            let confirmed = bench.results() == ["confirmed"];
+            let confirmed = rig.results() == ["confirmed"];
             prop_assert!(confirmed || !stood_in_time);
             prop_assert!(stood || !confirmed);
             prop_assert!(reported.is_empty() || (reported.len() == 1 && !confirmed));
         }
         // A fall ends some day.
-        bench.now += Duration::from_secs(3);
-        reported.append(&mut bench.expired());
-        prop_assert!(bench.confirmations.is_empty() && reported.len() <= 1);
-        prop_assert_eq!(bench.results().len(), 1);
+        rig.now += Duration::from_secs(3);
+        reported.append(&mut rig.expired());
+        prop_assert!(rig.confirmations.is_empty() && reported.len() <= 1);
+        prop_assert_eq!(rig.results().len(), 1);
     }
 }
 
@@ -400,29 +394,29 @@ fn a_stop_is_not_confirmed_while_the_motor_may_be_fed_past_the_drive() {
     const BYPASS: u16 = 1 << 6;
     const FIRE_MODE: u16 = 1 << 7;
     for (past, point) in [(BYPASS, "bypass_active"), (FIRE_MODE, "fire_mode_active")] {
-        let mut bench = Bench::of("eaton-hvx");
-        bench.read(2100, &[RUNS, 0]);
-        bench.set("run", Value::Bool(false));
-        let mut confirmation = bench.confirmation.take().unwrap();
+        let mut rig = CommandedDrive::of("eaton-hvx");
+        rig.read(2100, &[RUNS, 0]);
+        rig.set("run", Value::Bool(false));
+        let mut confirmation = rig.confirmation.take().unwrap();
         for _ in 0..600 {
-            bench.read(2100, &[past, 0]);
+            rig.read(2100, &[past, 0]);
         }
-        assert_eq!(bench.results(), ["acknowledged"], "{point}");
+        assert_eq!(rig.results(), ["acknowledged"], "{point}");
         let why = confirmation.try_recv().unwrap().unwrap_err();
         assert!(why.contains(point), "{why}");
-        let told = bench.expired();
+        let told = rig.expired();
         assert!(
             told.len() == 1 && told[0].contains("is unknown") && told[0].contains(point),
             "{told:?}"
         );
-        let audited = audited(bench.stats.audit())[0]["text"].to_string();
+        let audited = audited(rig.stats.audit())[0]["text"].to_string();
         assert!(audited.contains(point), "{audited}");
     }
-    let mut bench = Bench::of("eaton-hvx");
-    bench.read(2100, &[RUNS, 0]);
-    bench.set("run", Value::Bool(false));
-    bench.read(2100, &[BYPASS, 0]);
-    assert_eq!(bench.results(), [""; 0]);
-    bench.read(2100, &[0, 0]);
-    assert_eq!(bench.results(), ["confirmed"], "it is off in time");
+    let mut rig = CommandedDrive::of("eaton-hvx");
+    rig.read(2100, &[RUNS, 0]);
+    rig.set("run", Value::Bool(false));
+    rig.read(2100, &[BYPASS, 0]);
+    assert_eq!(rig.results(), [""; 0]);
+    rig.read(2100, &[0, 0]);
+    assert_eq!(rig.results(), ["confirmed"], "it is off in time");
 }

@@ -4,11 +4,7 @@ use crate::codec::Table;
 const DEADLINE: Duration = Duration::from_millis(105);
 
 fn read(start: u16, count: u16) -> RequestPdu {
-    RequestPdu::Read {
-        table: Table::Holding,
-        start,
-        count,
-    }
+    RequestPdu::read(Table::Holding, start, count)
 }
 
 #[test]
@@ -19,7 +15,7 @@ fn only_what_could_be_mistaken_waits() {
     assert_eq!(late.blocks(&read(2100, 11), now), None, "the same request");
     assert_eq!(late.blocks(&read(2000, 3), now), None, "another length");
     assert_eq!(
-        late.blocks(&RequestPdu::WriteRegister { address: 0, value: 1 }, now),
+        late.blocks(&RequestPdu::write_register(0, 1), now),
         None,
         "another function"
     );
@@ -35,36 +31,10 @@ fn only_what_could_be_mistaken_waits() {
 fn echoes_of_writes() {
     let now = Instant::now();
     let mut late = LateReplies::default();
-    late.given_up(
-        &RequestPdu::WriteRegister {
-            address: 2000,
-            value: 1,
-        },
-        now - DEADLINE,
-        now,
-    );
-    assert_eq!(
-        late.blocks(
-            &RequestPdu::WriteRegister {
-                address: 2000,
-                value: 0
-            },
-            now
-        ),
-        None
-    );
-    late.given_up(
-        &RequestPdu::WriteRegisters {
-            start: 2000,
-            values: vec![1, 2],
-        },
-        now - DEADLINE,
-        now,
-    );
-    let other = RequestPdu::WriteRegisters {
-        start: 2000,
-        values: vec![0, 2],
-    };
+    late.given_up(&RequestPdu::write_register(2000, 1), now - DEADLINE, now);
+    assert_eq!(late.blocks(&RequestPdu::write_register(2000, 0), now), None);
+    late.given_up(&RequestPdu::write_registers(2000, &[1, 2]), now - DEADLINE, now);
+    let other = RequestPdu::write_registers(2000, &[0, 2]);
     assert!(late.blocks(&other, now).is_some());
 }
 

@@ -2,7 +2,7 @@ use super::*;
 use crate::codec::{RequestPdu, Table, rtu};
 
 /// A line at 9600 baud on which every reply could be the last one once more.
-struct Bench {
+struct DoublingLine {
     line: LineState,
     protocol: Protocol,
     now: Instant,
@@ -10,16 +10,16 @@ struct Bench {
     at_once: bool,
 }
 
-impl Bench {
-    fn new() -> Bench {
-        Bench::of(Protocol::ModbusRtu)
+impl DoublingLine {
+    fn new() -> DoublingLine {
+        DoublingLine::of(Protocol::ModbusRtu)
     }
 
-    fn of(protocol: Protocol) -> Bench {
+    fn of(protocol: Protocol) -> DoublingLine {
         let now = Instant::now();
         let format = LineFormat::new(9600, "8N1").unwrap();
         let silence = Duration::from_millis(4);
-        Bench {
+        DoublingLine {
             line: LineState::new(protocol, format, silence, now),
             protocol,
             now,
@@ -42,11 +42,7 @@ impl Bench {
             Protocol::N2 => Table::DiscreteInput,
             Protocol::ModbusRtu | Protocol::ModbusAscii => Table::Holding,
         };
-        let pdu = RequestPdu::Read {
-            table,
-            start: 0,
-            count: 1,
-        };
+        let pdu = RequestPdu::read(table, 0, 1);
         let request = Request::new(1, pdu);
         let mut frame = Vec::new();
         self.protocol.encode(&request, &mut frame);
@@ -85,22 +81,22 @@ const REGULAR: Duration = Duration::from_millis(10);
 
 #[test]
 fn a_reply_that_comes_twice_now_and_then_is_never_believed() {
-    let mut bench = Bench::new();
+    let mut rig = DoublingLine::new();
     for _ in 0..100 {
-        assert!(!bench.believes(EARLY), "it came once more");
+        assert!(!rig.believes(EARLY), "it came once more");
         for _ in 0..40 {
-            assert!(bench.believes(REGULAR), "which takes the weight back");
+            assert!(rig.believes(REGULAR), "which takes the weight back");
         }
     }
 }
 
 #[test]
 fn replies_that_come_twice_before_others_that_are_mangled_are_never_believed() {
-    let mut bench = Bench::new();
+    let mut rig = DoublingLine::new();
     let (reply, foreign) = (reply(), reply().iter().map(|byte| byte ^ 4).collect::<Vec<_>>());
     for _ in 0..100 {
         assert!(
-            !bench.answers(&[(EARLY, &reply), (REGULAR, &foreign)]),
+            !rig.answers(&[(EARLY, &reply), (REGULAR, &foreign)]),
             "it came once more"
         );
     }
@@ -108,35 +104,35 @@ fn replies_that_come_twice_before_others_that_are_mangled_are_never_believed() {
 
 #[test]
 fn the_reply_behind_an_early_one_shows_a_wire() {
-    let mut bench = Bench::new();
+    let mut rig = DoublingLine::new();
     let reply = reply();
     for _ in 0..100 {
-        assert!(!bench.believes(EARLY), "the next one was lost");
-        assert!(bench.answers(&[(EARLY, &reply), (REGULAR, &reply)]));
+        assert!(!rig.believes(EARLY), "the next one was lost");
+        assert!(rig.answers(&[(EARLY, &reply), (REGULAR, &reply)]));
     }
 }
 
 #[test]
 fn early_replies_again_and_again_show_a_line_without_wire_time() {
-    let mut bench = Bench::new();
+    let mut rig = DoublingLine::new();
     for _ in 0..2 {
-        assert!(!bench.believes(EARLY));
+        assert!(!rig.believes(EARLY));
     }
     for _ in 0..100 {
-        assert!(bench.believes(EARLY), "no wire");
+        assert!(rig.believes(EARLY), "no wire");
     }
     for _ in 0..MOST_WEIGHT {
-        assert!(bench.believes(REGULAR));
+        assert!(rig.believes(REGULAR));
     }
-    assert!(!bench.believes(EARLY), "a wire all the same");
+    assert!(!rig.believes(EARLY), "a wire all the same");
 }
 
 /// A simulated drive on a busy machine: some of its replies are early, some are not.
 #[test]
 fn a_line_on_which_some_replies_are_early_loses_few_of_them() {
     for early_in_ten in 2..10u32 {
-        let mut bench = Bench::new();
-        let believed = |n: &u32| bench.believes(if n * 7 % 10 < early_in_ten { EARLY } else { REGULAR });
+        let mut rig = DoublingLine::new();
+        let believed = |n: &u32| rig.believes(if n * 7 % 10 < early_in_ten { EARLY } else { REGULAR });
         let lost = 1_000 - (0..1_000).filter(believed).count();
         assert!(lost <= 4, "{early_in_ten} in ten are early: {lost} lost");
     }
@@ -144,27 +140,27 @@ fn a_line_on_which_some_replies_are_early_loses_few_of_them() {
 
 #[test]
 fn a_request_waits_for_silence_but_not_for_ever() {
-    let mut bench = Bench::new();
-    let since = bench.now;
+    let mut rig = DoublingLine::new();
+    let since = rig.now;
     let mut now = since;
-    assert_eq!(bench.line.clear_at(since), since + Duration::from_millis(4));
-    while !bench.line.babbles(since) {
+    assert_eq!(rig.line.clear_at(since), since + Duration::from_millis(4));
+    while !rig.line.babbles(since) {
         now += Duration::from_millis(2);
-        assert!(bench.line.heard(&[0x55], now).is_none());
-        assert!(bench.line.clear_at(since) > now || bench.line.babbles(since));
+        assert!(rig.line.heard(&[0x55], now).is_none());
+        assert!(rig.line.clear_at(since) > now || rig.line.babbles(since));
     }
-    assert!(bench.line.clear_at(since) <= now + Duration::from_millis(4));
+    assert!(rig.line.clear_at(since) <= now + Duration::from_millis(4));
     assert!(now <= since + BABBLE + Duration::from_millis(4));
 }
 
 /// Every tenth reply comes twice and the one behind it is lost: its copy is alone in its exchange.
 #[test]
 fn an_n2_line_that_doubles_replies_and_loses_others_keeps_its_protection() {
-    let mut bench = Bench::of(Protocol::N2);
+    let mut rig = DoublingLine::of(Protocol::N2);
     for _ in 0..100 {
-        assert!(!bench.believes(EARLY), "it came once more");
+        assert!(!rig.believes(EARLY), "it came once more");
         for _ in 0..9 {
-            assert!(bench.believes(REGULAR));
+            assert!(rig.believes(REGULAR));
         }
     }
 }
@@ -173,22 +169,22 @@ fn an_n2_line_that_doubles_replies_and_loses_others_keeps_its_protection() {
 #[test]
 fn a_line_without_wire_time_is_taken_as_long_as_the_gateway_leaves_it_alone() {
     for protocol in [Protocol::ModbusRtu, Protocol::N2] {
-        let mut bench = Bench::of(protocol);
+        let mut rig = DoublingLine::of(protocol);
         for _ in 0..200 {
-            bench.believes(EARLY);
+            rig.believes(EARLY);
         }
-        bench.at_once = true;
-        assert!(bench.believes(EARLY), "{protocol:?}");
+        rig.at_once = true;
+        assert!(rig.believes(EARLY), "{protocol:?}");
     }
 }
 
 #[test]
 fn an_n2_line_without_wire_time_is_believed_after_three_replies() {
-    let mut bench = Bench::of(Protocol::N2);
+    let mut rig = DoublingLine::of(Protocol::N2);
     for _ in 0..3 {
-        assert!(!bench.believes(EARLY));
+        assert!(!rig.believes(EARLY));
     }
     for _ in 0..100 {
-        assert!(bench.believes(EARLY), "no wire");
+        assert!(rig.believes(EARLY), "no wire");
     }
 }

@@ -3,18 +3,16 @@
 use std::collections::BTreeMap;
 use std::time::SystemTime;
 
+use drivegate_testkit::{bus, bus_spec, controlled, image};
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
 use crate::codec::wire::Silence;
-use crate::codec::{Exception, LineFormat, Reply, Table};
-use crate::command::{Answer, Authority, Command, CommandQueue, NO_DRIVE, Order, Ticket, admit};
-use crate::drive::profile::Profiles;
+use crate::codec::{Exception, Reply, Table};
+use crate::command::{Answer, Authority, Command, NO_DRIVE, Order, Ticket, admit};
 use crate::drive::{DriveIndex, ModelPoint, PollClass, Value};
 use crate::line::LineOptions;
-use crate::process_image::{
-    Access, BusImage, BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings,
-};
+use crate::process_image::{BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings};
 use crate::transaction::MAY_BE_LATE;
 
 mod background;
@@ -124,9 +122,8 @@ impl Rig {
         cycle: Duration,
         other: impl Fn(DriveSpec) -> DriveSpec,
     ) -> Rig {
-        let profile = Profiles::built_in().get(profile).unwrap().clone();
-        let spec = |address| DriveSpec {
-            access: Access::Control,
+        let profile = drivegate_testkit::profile(profile);
+        let spec = |address: u8| DriveSpec {
             turnaround: Duration::ZERO,
             on_shutdown: OnShutdown::Stop,
             supervision: Some(Settings {
@@ -134,22 +131,15 @@ impl Rig {
                 action: LeaseAction::Stop,
                 adopt: false,
             }),
-            ..DriveSpec::new(&format!("d{address}"), "b", address, profile.clone())
+            ..controlled(&format!("d{address}"), "b", address, &profile)
         };
-        let images =
-            (1..=drives).map(|address| Arc::new(DriveImage::new(other(spec(address)), Duration::from_secs(1))));
-        let bus = BusSpec {
-            name: "b".to_string(),
-            port: "none".to_string(),
+        let images = (1..=drives).map(|address| image(other(spec(address))));
+        let line = BusSpec {
             protocol,
-            format: LineFormat::new(38_400, "8N1").unwrap(),
             cycle,
-            slow_cycle: Duration::from_secs(1),
+            ..bus_spec("b")
         };
-        let bus = BusHandle {
-            image: Arc::new(BusImage::new(bus, images.collect())),
-            queue: Arc::new(CommandQueue::new().unwrap()),
-        };
+        let bus = bus(line, images.collect());
         let options = BusOptions {
             response_timeout: Duration::from_millis(100),
             retries: 1,
@@ -254,6 +244,19 @@ impl Rig {
 
     fn switch(&self, drive: usize, who: &str, run: bool) -> Receiver<Answer> {
         self.order(drive, who, ModelPoint::Run, Value::Bool(run))
+    }
+
+    /// The gateway shuts down: the drives that did not acknowledge their stop.
+    fn shut_down(&mut self) -> Vec<String> {
+        let deadline = self.now + Duration::from_secs(5);
+        let mut missing = self.bus.queue.begin_shutdown(deadline, self.now);
+        loop {
+            self.step();
+            if let Ok(missing) = missing.try_recv() {
+                return missing.iter().map(ToString::to_string).collect();
+            }
+            assert!(self.now < deadline + TIMEOUT * 2, "{:?}", self.wire);
+        }
     }
 
     fn runs(&self, drive: usize) -> bool {
@@ -475,20 +478,11 @@ fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
     }
     rig.drives[7].silent = true;
     let (from, begin) = (rig.wire.len(), rig.now);
-    let deadline = begin + Duration::from_secs(5);
-    let mut missing = rig.bus.queue.begin_shutdown(deadline, begin);
-    let missing = loop {
-        rig.step();
-        if let Ok(missing) = missing.try_recv() {
-            break missing;
-        }
-        assert!(rig.now < deadline + TIMEOUT * 2);
+    let missing = rig.shut_down();
+    let [missing] = missing.as_slice() else {
+        panic!("{missing:?}")
     };
-    assert_eq!(missing.len(), 1);
-    assert!(
-        missing[0].to_string().starts_with("`d8` did not acknowledge its stop"),
-        "{missing:?}"
-    );
+    assert!(missing.starts_with("`d8` did not acknowledge its stop"), "{missing}");
     let running: Vec<usize> = (0..20).filter(|drive| rig.runs(*drive)).collect();
     assert_eq!(running, [7]);
     let poll = |turn: &Turn| matches!(turn.purpose, Purpose::Poll(_));
@@ -504,15 +498,7 @@ fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
 /// Times, after the begin, of the frames of a shutdown: the broadcast and the first single stop.
 fn shutdown_of(rig: &mut Rig) -> (Option<Duration>, Duration) {
     let (from, begin) = (rig.wire.len(), rig.now);
-    let deadline = begin + Duration::from_secs(5);
-    let mut missing = rig.bus.queue.begin_shutdown(deadline, begin);
-    let missing = loop {
-        rig.step();
-        if let Ok(missing) = missing.try_recv() {
-            break missing;
-        }
-        assert!(rig.now < deadline + TIMEOUT * 2, "{:?}", rig.wire.get(from..));
-    };
+    let missing = rig.shut_down();
     assert!(missing.is_empty(), "{missing:?}");
     let first = |broadcast: bool| {
         let mut sent = rig.wire[from..].iter();
@@ -567,20 +553,11 @@ fn a_drive_that_fell_silent_with_the_shutdown_keeps_no_stop_from_those_that_are_
     rig.drives[1].silent = false;
     rig.drives[1].holding.insert(2000, 1);
     rig.drives[0].silent = true;
-    let deadline = rig.now + Duration::from_secs(5);
-    let mut missing = rig.bus.queue.begin_shutdown(deadline, rig.now);
-    let missing = loop {
-        rig.step();
-        if let Ok(missing) = missing.try_recv() {
-            break missing;
-        }
-        assert!(rig.now < deadline + TIMEOUT * 2);
+    let missing = rig.shut_down();
+    let [missing] = missing.as_slice() else {
+        panic!("{missing:?}")
     };
-    assert_eq!(missing.len(), 1);
-    assert!(
-        missing[0].to_string().starts_with("`d1` did not acknowledge its stop"),
-        "{missing:?}"
-    );
+    assert!(missing.starts_with("`d1` did not acknowledge its stop"), "{missing}");
     assert!(!rig.runs(1));
 }
 

@@ -7,13 +7,13 @@ const IDENTIFY: Session = Session::Identify;
 const POLL: Session = Session::Poll { again: false };
 const AGAIN: Session = Session::Poll { again: true };
 
-struct Bench {
+struct N2Drive {
     sessions: N2Sessions,
     now: Instant,
 }
 
-fn bench() -> Bench {
-    Bench {
+fn rig() -> N2Drive {
+    N2Drive {
         sessions: N2Sessions::new([N2Options::DEFAULT]),
         now: Instant::now(),
     }
@@ -35,7 +35,7 @@ fn restarted() -> Ended {
     Ended::Reply(Reply::Exception(Exception::N2_RESTARTED))
 }
 
-impl Bench {
+impl N2Drive {
     fn before(&mut self, command: Option<Urgency>) -> Option<Session> {
         self.sessions.before(DriveIndex::new(0), command, self.now)
     }
@@ -45,46 +45,46 @@ impl Bench {
     }
 
     /// Identified, its report taken, and read once.
-    fn ready() -> Bench {
-        let mut bench = bench();
-        bench.done(IDENTIFY, &identity());
-        bench.done(POLL, &changes(b""));
-        bench.sessions.heard(DriveIndex::new(0), &value());
-        assert_eq!(bench.before(None), None);
-        bench
+    fn ready() -> N2Drive {
+        let mut rig = rig();
+        rig.done(IDENTIFY, &identity());
+        rig.done(POLL, &changes(b""));
+        rig.sessions.heard(DriveIndex::new(0), &value());
+        assert_eq!(rig.before(None), None);
+        rig
     }
 }
 
 #[test]
 fn identify_report_read() {
-    let mut bench = bench();
-    assert_eq!(bench.before(None), Some(IDENTIFY));
-    assert_eq!(bench.before(Some(Urgency::Stop)), Some(IDENTIFY), "it would answer N00");
-    assert_eq!(bench.done(IDENTIFY, &identity()), Progress::Going);
-    assert_eq!(bench.before(Some(Urgency::Stop)), None, "a stop waits for no report");
-    assert_eq!(bench.before(None), Some(POLL));
-    assert_eq!(bench.done(POLL, &changes(b"102404248")), Progress::Going);
-    assert_eq!(bench.before(None), Some(AGAIN));
-    assert_eq!(bench.done(AGAIN, &changes(b"")), Progress::Changed);
-    assert_eq!(bench.before(None), None);
-    bench.now += N2Options::DEFAULT.poll;
-    assert_eq!(bench.before(Some(Urgency::Command)), None);
+    let mut rig = rig();
+    assert_eq!(rig.before(None), Some(IDENTIFY));
+    assert_eq!(rig.before(Some(Urgency::Stop)), Some(IDENTIFY), "it would answer N00");
+    assert_eq!(rig.done(IDENTIFY, &identity()), Progress::Going);
+    assert_eq!(rig.before(Some(Urgency::Stop)), None, "a stop waits for no report");
+    assert_eq!(rig.before(None), Some(POLL));
+    assert_eq!(rig.done(POLL, &changes(b"102404248")), Progress::Going);
+    assert_eq!(rig.before(None), Some(AGAIN));
+    assert_eq!(rig.done(AGAIN, &changes(b"")), Progress::Changed);
+    assert_eq!(rig.before(None), None);
+    rig.now += N2Options::DEFAULT.poll;
+    assert_eq!(rig.before(Some(Urgency::Command)), None);
     assert_eq!(
-        bench.before(None),
+        rig.before(None),
         Some(POLL),
         "a drive that is not polled takes itself for alone"
     );
-    assert_eq!(bench.done(POLL, &changes(b"")), Progress::Going);
-    assert_eq!(bench.before(None), None);
+    assert_eq!(rig.done(POLL, &changes(b"")), Progress::Going);
+    assert_eq!(rig.before(None), None);
 }
 
 #[test]
 fn a_report_that_never_ends() {
-    let mut bench = bench();
-    bench.done(IDENTIFY, &identity());
+    let mut rig = rig();
+    rig.done(IDENTIFY, &identity());
     let mut polls = 0;
-    while let Some(step) = bench.before(None) {
-        bench.done(step, &changes(b"10240"));
+    while let Some(step) = rig.before(None) {
+        rig.done(step, &changes(b"10240"));
         polls += 1;
     }
     assert_eq!(polls, MOST_POLLS);
@@ -115,24 +115,24 @@ fn who_is_not_asked_is_polled_all_the_same() {
 
 #[test]
 fn a_restart_begins_anew() {
-    let mut bench = Bench::ready();
+    let mut rig = N2Drive::ready();
     assert_eq!(
-        bench.sessions.heard(DriveIndex::new(0), &restarted()),
+        rig.sessions.heard(DriveIndex::new(0), &restarted()),
         Progress::Restarted
     );
-    assert_eq!(bench.before(Some(Urgency::Stop)), Some(IDENTIFY));
-    assert_eq!(bench.done(IDENTIFY, &identity()), Progress::Going);
-    assert_eq!(bench.before(None), Some(POLL));
-    assert_eq!(bench.done(POLL, &restarted()), Progress::Failed, "identified in vain");
-    assert_eq!(bench.before(None), Some(IDENTIFY));
+    assert_eq!(rig.before(Some(Urgency::Stop)), Some(IDENTIFY));
+    assert_eq!(rig.done(IDENTIFY, &identity()), Progress::Going);
+    assert_eq!(rig.before(None), Some(POLL));
+    assert_eq!(rig.done(POLL, &restarted()), Progress::Failed, "identified in vain");
+    assert_eq!(rig.before(None), Some(IDENTIFY));
 }
 
 #[test]
 fn a_drive_that_is_no_vendors_device_is_told_once() {
-    let mut bench = bench();
+    let mut rig = rig();
     let other = Ended::Reply(Reply::Identified(0x11));
-    assert_eq!(bench.done(IDENTIFY, &other), Progress::Unlike(0x11));
-    assert_eq!(bench.done(IDENTIFY, &other), Progress::Going);
+    assert_eq!(rig.done(IDENTIFY, &other), Progress::Unlike(0x11));
+    assert_eq!(rig.done(IDENTIFY, &other), Progress::Going);
 }
 
 #[test]
@@ -142,17 +142,17 @@ fn drives_that_are_not_to_be_identified() {
         poll: Duration::from_secs(60),
         ..N2Options::DEFAULT
     };
-    let mut bench = Bench {
+    let mut rig = N2Drive {
         sessions: N2Sessions::new([options]),
         now: Instant::now(),
     };
-    assert_eq!(bench.before(None), Some(POLL));
-    bench.done(POLL, &changes(b""));
-    bench.sessions.heard(DriveIndex::new(0), &Ended::Silent);
-    assert_eq!(bench.before(None), None);
-    bench.sessions.heard(DriveIndex::new(0), &value());
-    bench.sessions.heard(DriveIndex::new(0), &restarted());
-    assert_eq!(bench.before(None), Some(IDENTIFY), "it asked for it");
+    assert_eq!(rig.before(None), Some(POLL));
+    rig.done(POLL, &changes(b""));
+    rig.sessions.heard(DriveIndex::new(0), &Ended::Silent);
+    assert_eq!(rig.before(None), None);
+    rig.sessions.heard(DriveIndex::new(0), &value());
+    rig.sessions.heard(DriveIndex::new(0), &restarted());
+    assert_eq!(rig.before(None), Some(IDENTIFY), "it asked for it");
 }
 
 #[test]

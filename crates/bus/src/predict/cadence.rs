@@ -42,21 +42,16 @@ pub fn carried(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Option
 mod tests {
     use super::*;
     use crate::codec::{LineFormat, Protocol};
-    use crate::drive::profile::Profiles;
+    use drivegate_testkit::{bus_spec, monitored};
 
     fn carried_by(protocol: Protocol, baud: u32, profiles: &[&str]) -> Option<(u128, u128)> {
         let spec = BusSpec {
-            name: "b".into(),
-            port: "/dev/null".into(),
             protocol,
             format: LineFormat::new(baud, "8N1").unwrap(),
-            cycle: Duration::from_millis(10),
-            slow_cycle: Duration::from_secs(1),
+            ..bus_spec("b")
         };
-        let drive = |(address, profile): (u8, &&str)| {
-            let profile = Profiles::built_in().get(profile).unwrap().clone();
-            DriveSpec::new("d", "b", address, profile)
-        };
+        let drive =
+            |(address, profile): (u8, &&str)| monitored("d", "b", address, &drivegate_testkit::profile(profile));
         let drives: Vec<DriveSpec> = (1..).zip(profiles).map(drive).collect();
         let (cycle, slow_cycle) = carried(&spec, Silence::Spec, &drives)?;
         let found = BusSpec {

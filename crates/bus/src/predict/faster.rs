@@ -36,24 +36,25 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::codec::{LineFormat, Protocol};
+    use crate::codec::LineFormat;
     use crate::drive::plan::Plan;
-    use crate::drive::profile::Profiles;
     use crate::drive::{ModelPoint, PollClass};
+    use drivegate_testkit as testkit;
 
     fn line(cycle: u64, profiles: &[&str]) -> Option<Vec<DriveSpec>> {
         let spec = BusSpec {
-            name: "line1".to_string(),
-            port: "/dev/null".to_string(),
-            protocol: Protocol::ModbusRtu,
             format: LineFormat::new(9600, "8N2").unwrap(),
             cycle: Duration::from_millis(cycle),
             slow_cycle: Duration::from_secs(30),
+            ..testkit::bus_spec("line1")
         };
-        let built_in = Profiles::built_in();
         let drive = |(number, name): (usize, &&str)| {
-            let profile = built_in.get(name).unwrap().clone();
-            DriveSpec::new(&format!("d{number}"), "line1", 1 + number as u8, profile)
+            testkit::monitored(
+                &format!("d{number}"),
+                "line1",
+                1 + number as u8,
+                &testkit::profile(name),
+            )
         };
         let drives: Vec<DriveSpec> = profiles.iter().enumerate().map(drive).collect();
         faster_points(&spec, Silence::Spec, &drives)
@@ -76,8 +77,7 @@ mod tests {
             let plan = Plan::of(&drive.profile);
             plan.reads.iter().filter(|read| read.class == PollClass::Fast).count()
         };
-        let slow = Profiles::built_in().get("vacon-cx").unwrap().clone();
-        let slow = DriveSpec::new("d", "line1", 1, slow);
+        let slow = testkit::monitored("d", "line1", 1, &testkit::profile("vacon-cx"));
         assert_eq!(fast(&drives[0]), fast(&slow) + 1, "one read more in a round");
     }
 

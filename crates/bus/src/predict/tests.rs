@@ -1,9 +1,10 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use drivegate_testkit::{bus_spec, monitored};
+
 use super::super::schedule::{Cadence, Decision, Polled, Schedule};
 use super::*;
-use crate::codec::Protocol;
 use crate::drive::{DriveIndex, Profile};
 
 /// A family whose drives are read by one fast request of 11 registers, and by slow ones of 10 each.
@@ -29,22 +30,17 @@ fn profile(bauds: &str, slow: usize) -> Arc<Profile> {
 }
 
 fn drives(profile: &Arc<Profile>, count: u8) -> Vec<DriveSpec> {
-    let drive = |address| DriveSpec {
-        limits: Default::default(),
-        turnaround: profile.turnaround,
-        ..DriveSpec::new(&format!("d{address}"), "b", address, profile.clone())
-    };
-    (1..=count).map(drive).collect()
+    (1..=count)
+        .map(|address| monitored(&format!("d{address}"), "b", address, profile))
+        .collect()
 }
 
 fn spec(baud: u32, cycle_ms: u64, slow_ms: u64) -> BusSpec {
     BusSpec {
-        name: "b".into(),
-        port: "/dev/null".into(),
-        protocol: Protocol::ModbusRtu,
         format: LineFormat::new(baud, "8N1").unwrap(),
         cycle: Duration::from_millis(cycle_ms),
         slow_cycle: Duration::from_millis(slow_ms),
+        ..bus_spec("b")
     }
 }
 

@@ -1,27 +1,16 @@
 //! What a reader on another thread sees while the image changes.
 
+use drivegate_testkit::{bus_spec, monitored, nx};
+
 use super::*;
-use crate::codec::{LineFormat, Protocol};
 use crate::confirm::Unconfirmed;
 use crate::drive::DriveIndex;
-use crate::drive::profile::Profiles;
-use crate::process_image::{BusSpec, DriveSpec, LeaseAction};
+use crate::process_image::{DriveSpec, LeaseAction};
 
 fn image(drives: u8) -> Arc<BusImage> {
-    let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
-    let drive = |address| {
-        let spec = DriveSpec::new(&format!("d{address}"), "b", address, profile.clone());
-        Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
-    };
-    let bus = BusSpec {
-        name: "b".to_string(),
-        port: "none".to_string(),
-        protocol: Protocol::ModbusRtu,
-        format: LineFormat::new(38_400, "8N1").unwrap(),
-        cycle: Duration::from_millis(10),
-        slow_cycle: Duration::from_secs(1),
-    };
-    Arc::new(BusImage::new(bus, (1..=drives).map(drive).collect()))
+    let profile = nx();
+    let drive = |address| drivegate_testkit::image(monitored(&format!("d{address}"), "b", address, &profile));
+    Arc::new(BusImage::new(bus_spec("b"), (1..=drives).map(drive).collect()))
 }
 
 fn options() -> BusOptions {

@@ -35,7 +35,7 @@ fn plan() -> Plan {
 }
 
 /// A line in virtual time: every exchange takes `COST`, a dead drive ten times that.
-struct Bench {
+struct PolledLine {
     schedule: Schedule,
     now: Instant,
     dead: Vec<usize>,
@@ -43,8 +43,8 @@ struct Bench {
     offline: Vec<usize>,
 }
 
-impl Bench {
-    fn new(drives: usize, cycle: Duration) -> Bench {
+impl PolledLine {
+    fn new(drives: usize, cycle: Duration) -> PolledLine {
         let plan = plan();
         let plans: Vec<&Plan> = (0..drives).map(|_| &plan).collect();
         let now = Instant::now();
@@ -54,7 +54,7 @@ impl Bench {
             retries: 1,
         };
         let schedule = Schedule::new(cadence, &plans, |_, _| COST, now);
-        Bench {
+        PolledLine {
             schedule,
             now,
             dead: Vec::new(),
@@ -111,16 +111,16 @@ impl Bench {
 
 #[test]
 fn a_saturated_line_is_never_idle_and_fair() {
-    let mut bench = Bench::new(10, Duration::from_millis(10));
-    bench.run(Duration::from_secs(1));
-    bench.log.clear();
-    bench.run(Duration::from_secs(20));
-    assert!(bench.log.iter().all(|(_, d)| !matches!(d, Decision::Idle(_))));
-    let fast = bench.polls(PollClass::Fast);
+    let mut rig = PolledLine::new(10, Duration::from_millis(10));
+    rig.run(Duration::from_secs(1));
+    rig.log.clear();
+    rig.run(Duration::from_secs(20));
+    assert!(rig.log.iter().all(|(_, d)| !matches!(d, Decision::Idle(_))));
+    let fast = rig.polls(PollClass::Fast);
     let (least, most) = (fast.values().min().unwrap(), fast.values().max().unwrap());
     assert!(most - least <= 1, "{fast:?}");
     // Ten slow polls a second would be 12 %; they get 5 %.
-    let slow: usize = bench.polls(PollClass::Slow).values().sum();
+    let slow: usize = rig.polls(PollClass::Slow).values().sum();
     let share = slow as f64 * COST.as_secs_f64() / 20.0;
     assert!((0.045..0.07).contains(&share), "{share}");
 }
@@ -128,11 +128,11 @@ fn a_saturated_line_is_never_idle_and_fair() {
 #[test]
 fn slow_polls_get_their_share_where_the_idle_time_fits_none() {
     // Two fast polls take 24 of 30 ms: no slow one fits behind them. They would take 2.4 % of the line, which has room.
-    let mut bench = Bench::new(2, Duration::from_millis(30));
-    bench.run(Duration::from_secs(5));
-    bench.log.clear();
-    bench.run(Duration::from_secs(60));
-    let (slow, fast) = (bench.polls(PollClass::Slow), bench.polls(PollClass::Fast));
+    let mut rig = PolledLine::new(2, Duration::from_millis(30));
+    rig.run(Duration::from_secs(5));
+    rig.log.clear();
+    rig.run(Duration::from_secs(60));
+    let (slow, fast) = (rig.polls(PollClass::Slow), rig.polls(PollClass::Fast));
     assert!(slow.values().all(|n| (59..=61).contains(n)), "{slow:?}");
     assert!(fast.values().all(|n| (1990..=2001).contains(n)), "{fast:?}");
 }
@@ -140,27 +140,27 @@ fn slow_polls_get_their_share_where_the_idle_time_fits_none() {
 #[test]
 fn slow_polls_that_fit_into_idle_time_delay_no_round() {
     // Six slow polls are due at once each second; two of them fit behind the six fast ones of a round.
-    let mut bench = Bench::new(6, Duration::from_millis(100));
-    bench.run(Duration::from_secs(5));
-    let begin = bench.now;
-    bench.log.clear();
-    bench.run(Duration::from_secs(60));
+    let mut rig = PolledLine::new(6, Duration::from_millis(100));
+    rig.run(Duration::from_secs(5));
+    let begin = rig.now;
+    rig.log.clear();
+    rig.run(Duration::from_secs(60));
     let first = |d: &Decision| matches!(d, Decision::Poll(p) if p.read.class == PollClass::Fast && p.drive == 0);
-    let rounds: Vec<Instant> = bench.log.iter().filter(|(_, d)| first(d)).map(|(at, _)| *at).collect();
+    let rounds: Vec<Instant> = rig.log.iter().filter(|(_, d)| first(d)).map(|(at, _)| *at).collect();
     let cycles: Vec<Duration> = rounds.windows(2).map(|w| w[1] - w[0]).collect();
     assert!(cycles.iter().all(|c| *c == Duration::from_millis(100)), "{cycles:?}");
     assert!(
-        bench.polls(PollClass::Slow).values().all(|n| *n >= 59),
+        rig.polls(PollClass::Slow).values().all(|n| *n >= 59),
         "{:?}",
-        bench.now - begin
+        rig.now - begin
     );
 }
 
 #[test]
 fn the_grid_is_kept_without_drift() {
-    let mut bench = Bench::new(1, Duration::from_millis(30));
-    bench.run(Duration::from_secs(30));
-    let fast: Vec<Instant> = bench
+    let mut rig = PolledLine::new(1, Duration::from_millis(30));
+    rig.run(Duration::from_secs(30));
+    let fast: Vec<Instant> = rig
         .log
         .iter()
         .filter(|(_, d)| matches!(d, Decision::Poll(p) if p.read.class == PollClass::Fast && !p.probe))
@@ -177,14 +177,14 @@ fn the_grid_is_kept_without_drift() {
 #[test]
 fn a_stall_does_not_move_the_grid() {
     let cycle = Duration::from_millis(30);
-    let mut bench = Bench::new(1, cycle);
-    bench.run(Duration::from_secs(2));
-    let start = bench.schedule.round_due;
+    let mut rig = PolledLine::new(1, cycle);
+    rig.run(Duration::from_secs(2));
+    let start = rig.schedule.round_due;
     for stall in [7, 31, 95, 1000, 12_345] {
-        bench.now += Duration::from_millis(stall);
-        bench.log.clear();
-        bench.run(cycle * 20);
-        let fast: Vec<Instant> = bench
+        rig.now += Duration::from_millis(stall);
+        rig.log.clear();
+        rig.run(cycle * 20);
+        let fast: Vec<Instant> = rig
             .log
             .iter()
             .filter(|(_, d)| matches!(d, Decision::Poll(p) if p.read.class == PollClass::Fast))

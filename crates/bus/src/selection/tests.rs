@@ -1,14 +1,10 @@
 //! Rules of the comparison; the whole of it with a drive is in the seeded world.
 
-use std::sync::Arc;
+use drivegate_testkit::nx;
 
 use super::*;
 use crate::drive::profile::Profiles;
 use crate::drive::{PointIndex, PollClass};
-
-fn nx() -> Arc<crate::drive::Profile> {
-    Profiles::built_in().get("vacon-nx").unwrap().clone()
-}
 
 fn pair<'p>(profile: &'p crate::drive::Profile, name: &str) -> (&'p Point, &'p Point) {
     let point = profile.points.iter().find(|point| point.name == name).unwrap();

@@ -1,13 +1,13 @@
-use drivegate_testkit::{audited, next_command};
+use drivegate_testkit::{audited, bus_spec, controlled, next_command, nx, online};
 use std::sync::Arc;
 use std::time::SystemTime;
 
 use super::*;
 use crate::codec::n2::Session;
-use crate::codec::{Exception, LineFormat, Protocol, Reply, RequestPdu, Table};
+use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{
-    Authority, Command, CommandQueue, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket,
-    Urgency, WriteStats, admit, written,
+    Authority, Command, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats,
+    admit, written,
 };
 use crate::command_run::{CommandRun, Next, Step};
 use crate::drive::profile::Profiles;
@@ -16,7 +16,7 @@ use crate::drive_state::{DriveState, Wanted};
 use crate::master::supervise;
 use crate::n2_late_replies::N2LateReplies;
 use crate::plant::BusHandle;
-use crate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
+use crate::process_image::{Access, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
 
 mod begins;
 mod chance;
@@ -27,15 +27,12 @@ mod unknown;
 /// A drive that answers.
 fn image(spec: DriveSpec) -> DriveImage {
     let drive = DriveImage::new(spec, Duration::from_secs(1));
-    drive.update(|s| s.link = Link::Online(SystemTime::now()));
+    online(&drive);
     drive
 }
 
 fn handle(spec: BusSpec, drive: DriveImage) -> BusHandle {
-    BusHandle {
-        image: Arc::new(BusImage::new(spec, vec![Arc::new(drive)])),
-        queue: Arc::new(CommandQueue::new().unwrap()),
-    }
+    drivegate_testkit::bus(spec, vec![Arc::new(drive)])
 }
 
 fn acknowledged() -> Outcome {
@@ -43,7 +40,7 @@ fn acknowledged() -> Outcome {
 }
 
 /// One drive, whose lease is looked at as the master does.
-struct Bench {
+struct SupervisedDrive {
     bus: BusHandle,
     drive: DriveState,
     stats: Arc<WriteStats>,
@@ -51,32 +48,23 @@ struct Bench {
     now: Instant,
 }
 
-impl Bench {
-    fn new(action: LeaseAction) -> Bench {
-        Bench::of(Profiles::built_in().get("vacon-nx").unwrap(), action)
+impl SupervisedDrive {
+    fn new(action: LeaseAction) -> SupervisedDrive {
+        SupervisedDrive::of(&nx(), action)
     }
 
-    fn of(profile: &Arc<Profile>, action: LeaseAction) -> Bench {
+    fn of(profile: &Arc<Profile>, action: LeaseAction) -> SupervisedDrive {
         let spec = DriveSpec {
-            access: Access::Control,
             supervision: Some(Settings {
                 timeout: Duration::from_secs(5),
                 action,
                 adopt: false,
             }),
             turnaround: Duration::ZERO,
-            ..DriveSpec::new("d", "b", 1, profile.clone())
+            ..controlled("d", "b", 1, profile)
         };
-        let bus = BusSpec {
-            name: "b".to_string(),
-            port: "none".to_string(),
-            protocol: Protocol::ModbusRtu,
-            format: LineFormat::new(38_400, "8N1").unwrap(),
-            cycle: Duration::from_millis(10),
-            slow_cycle: Duration::from_secs(1),
-        };
-        Bench {
-            bus: handle(bus, image(spec)),
+        SupervisedDrive {
+            bus: handle(bus_spec("b"), image(spec)),
             drive: DriveState::new(Duration::ZERO),
             stats: Arc::default(),
             news: Vec::new(),
@@ -118,7 +106,7 @@ impl Bench {
         next_command(&mut self.bus.queue.lock(), Urgency::Read, self.now)
     }
 
-    /// As [`Bench::look`]: the action that is written then, and where its answer goes.
+    /// As [`SupervisedDrive::look`]: the action that is written then, and where its answer goes.
     fn after(&mut self, ms: u64, runs: bool) -> Option<Command> {
         self.look(ms, runs);
         assert!(self.bus.queue.lock().len() <= 1, "one at a time");
@@ -229,41 +217,41 @@ fn the_action_is_written_once_and_again_until_it_is_acknowledged() {
         (LeaseAction::Stop, Urgency::Stop),
         (LeaseAction::SpeedReference(20.0), Urgency::Command),
     ] {
-        let mut bench = Bench::new(action);
-        assert!(bench.after(60_000, true).is_none(), "nobody commanded it");
-        bench.heartbeat();
-        assert!(bench.after(4_900, true).is_none());
+        let mut rig = SupervisedDrive::new(action);
+        assert!(rig.after(60_000, true).is_none(), "nobody commanded it");
+        rig.heartbeat();
+        assert!(rig.after(4_900, true).is_none());
         for failed in [
             Outcome::TimedOut,
             Outcome::Exception(Exception::BUSY),
             Outcome::QueueFull,
         ] {
-            let command = bench.after(1_000, true).expect("the action");
+            let command = rig.after(1_000, true).expect("the action");
             assert_eq!(command.urgency, urgency);
-            assert!(bench.after(10, true).is_none(), "not while its answer is waited for");
-            command.answer(&failed, bench.now);
-            assert!(bench.after(10, true).is_none(), "a pause first");
+            assert!(rig.after(10, true).is_none(), "not while its answer is waited for");
+            command.answer(&failed, rig.now);
+            assert!(rig.after(10, true).is_none(), "a pause first");
         }
         // Also when the drive was seen to stand meanwhile: nobody knows why.
-        let command = bench.after(1_000, false).expect("the action");
-        command.answer(&acknowledged(), bench.now);
+        let command = rig.after(1_000, false).expect("the action");
+        command.answer(&acknowledged(), rig.now);
         for _ in 0..20 {
-            assert!(bench.after(1_000, true).is_none(), "once");
+            assert!(rig.after(1_000, true).is_none(), "once");
         }
-        assert_eq!(bench.reported(), 1);
+        assert_eq!(rig.reported(), 1);
     }
 }
 
 #[test]
 fn a_drive_that_stands_and_one_that_is_held_are_left_alone() {
-    let mut bench = Bench::new(LeaseAction::Stop);
-    bench.heartbeat();
-    assert!(bench.after(10_000, false).is_none());
-    assert_eq!(bench.reported(), 0);
-    let mut bench = Bench::new(LeaseAction::Hold);
-    bench.heartbeat();
-    assert!(bench.after(10_000, true).is_none());
-    assert_eq!(bench.reported(), 1);
+    let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+    rig.heartbeat();
+    assert!(rig.after(10_000, false).is_none());
+    assert_eq!(rig.reported(), 0);
+    let mut rig = SupervisedDrive::new(LeaseAction::Hold);
+    rig.heartbeat();
+    assert!(rig.after(10_000, true).is_none());
+    assert_eq!(rig.reported(), 1);
 }
 
 /// What a command writes to a drive that has the run command: the point that takes it, and its value there.
@@ -316,16 +304,16 @@ fn every_family_is_written_its_action() {
     for profile in Profiles::built_in().iter().filter(is_commanded) {
         for action in [LeaseAction::Stop, LeaseAction::SpeedReference(20.0)] {
             let stop = action == LeaseAction::Stop;
-            let mut bench = Bench::of(profile, action);
+            let mut rig = SupervisedDrive::of(profile, action);
             let spec = DriveSpec {
                 frequency_range: Some(0.0..=50.0),
-                ..bench.spec()
+                ..rig.spec()
             };
-            bench.reload(spec);
-            bench.heartbeat();
-            let command = bench.after(6_000, true).expect("the action");
+            rig.reload(spec);
+            rig.heartbeat();
+            let command = rig.after(6_000, true).expect("the action");
             assert_eq!(command.urgency == Urgency::Stop, stop, "{}", profile.name);
-            let sets = writes(profile, command, bench.now);
+            let sets = writes(profile, command, rig.now);
             let wanted: &[(&str, Value)] = if stop {
                 &[("run", Value::Bool(false))]
             } else {
@@ -349,18 +337,18 @@ fn every_family_is_written_its_action() {
 
 #[test]
 fn an_action_that_fails_is_told_once_for_each_reason_and_counted_each_time() {
-    let mut bench = Bench::new(LeaseAction::Stop);
-    bench.heartbeat();
-    assert!(bench.after(4_900, true).is_none());
+    let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+    rig.heartbeat();
+    assert!(rig.after(4_900, true).is_none());
     let refused = Outcome::Exception(Exception::DEVICE_FAILURE);
     for failed in [&refused, &refused, &Outcome::TimedOut, &refused, &Outcome::Purged] {
-        let command = bench.after(1_000, true).expect("the stop");
-        command.answer(failed, bench.now);
-        bench.look(10, true);
+        let command = rig.after(1_000, true).expect("the stop");
+        command.answer(failed, rig.now);
+        rig.look(10, true);
     }
-    let command = bench.after(1_000, true).expect("the stop");
-    command.answer(&acknowledged(), bench.now);
-    bench.look(10, true);
+    let command = rig.after(1_000, true).expect("the stop");
+    command.answer(&acknowledged(), rig.now);
+    rig.look(10, true);
     let failed = |why: Option<&Outcome>| News::ActionFailed {
         drive: DriveIndex::new(0),
         why: why.map(Outcome::to_string),
@@ -377,169 +365,169 @@ fn an_action_that_fails_is_told_once_for_each_reason_and_counted_each_time() {
         failed(None),
         taken,
     ];
-    assert_eq!(bench.news, expected, "a client's own stop is no failure");
+    assert_eq!(rig.news, expected, "a client's own stop is no failure");
 }
 
 #[test]
 fn an_action_that_cannot_be_written_is_told_once_and_stays_due() {
     let profiles = Profiles::built_in();
-    let mut bench = Bench::of(profiles.get("vacon-cx").unwrap(), LeaseAction::SpeedReference(20.0));
-    bench.heartbeat();
+    let mut rig = SupervisedDrive::of(profiles.get("vacon-cx").unwrap(), LeaseAction::SpeedReference(20.0));
+    rig.heartbeat();
     for _ in 0..10 {
-        assert!(bench.after(5_000, true).is_none(), "the frequency range is not known");
+        assert!(rig.after(5_000, true).is_none(), "the frequency range is not known");
     }
-    let [News::LeaseRanOut(_), News::ActionRefused { refusal, .. }] = &bench.news[..] else {
-        panic!("{:?}", bench.news)
+    let [News::LeaseRanOut(_), News::ActionRefused { refusal, .. }] = &rig.news[..] else {
+        panic!("{:?}", rig.news)
     };
     assert!(refusal.to_string().contains("frequency_range"), "{refusal}");
-    assert_eq!(bench.own_results(), ["not_writable"]);
-    bench.knows("maximum_frequency", Value::Number(50.0));
-    let command = bench.after(1_000, true).expect("the drive reports its range now");
-    command.answer(&acknowledged(), bench.now);
-    assert!(bench.after(1_000, true).is_none());
+    assert_eq!(rig.own_results(), ["not_writable"]);
+    rig.knows("maximum_frequency", Value::Number(50.0));
+    let command = rig.after(1_000, true).expect("the drive reports its range now");
+    command.answer(&acknowledged(), rig.now);
+    assert!(rig.after(1_000, true).is_none());
     // A client that is back has its own reference.
-    let mut bench = Bench::of(profiles.get("vacon-cx").unwrap(), LeaseAction::SpeedReference(20.0));
-    bench.heartbeat();
-    assert!(bench.after(5_000, true).is_none());
-    bench.heartbeat();
-    bench.knows("maximum_frequency", Value::Number(50.0));
-    assert!(bench.after(2_000, true).is_none(), "it commands the drive");
-    bench.knows("maximum_frequency", Value::Number(50.0));
-    assert!(bench.after(3_000, true).is_some(), "until it falls silent again");
+    let mut rig = SupervisedDrive::of(profiles.get("vacon-cx").unwrap(), LeaseAction::SpeedReference(20.0));
+    rig.heartbeat();
+    assert!(rig.after(5_000, true).is_none());
+    rig.heartbeat();
+    rig.knows("maximum_frequency", Value::Number(50.0));
+    assert!(rig.after(2_000, true).is_none(), "it commands the drive");
+    rig.knows("maximum_frequency", Value::Number(50.0));
+    assert!(rig.after(3_000, true).is_some(), "until it falls silent again");
 }
 
 #[test]
 fn an_action_that_is_due_outlives_the_bus() {
-    let mut bench = Bench::new(LeaseAction::Stop);
-    bench.heartbeat();
-    let command = bench.after(5_000, true).expect("the stop");
-    command.answer(&Outcome::TimedOut, bench.now);
-    bench.reload(bench.spec());
-    let command = bench.after(10, true).expect("the stop is due still");
+    let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+    rig.heartbeat();
+    let command = rig.after(5_000, true).expect("the stop");
+    command.answer(&Outcome::TimedOut, rig.now);
+    rig.reload(rig.spec());
+    let command = rig.after(10, true).expect("the stop is due still");
     assert_eq!(command.urgency, Urgency::Stop);
     // The bus ends while the stop is on its way.
     drop(command);
-    bench.reload(bench.spec());
-    let command = bench.after(10, false).expect("the stop is due still");
-    command.answer(&acknowledged(), bench.now);
-    bench.reload(bench.spec());
+    rig.reload(rig.spec());
+    let command = rig.after(10, false).expect("the stop is due still");
+    command.answer(&acknowledged(), rig.now);
+    rig.reload(rig.spec());
     assert!(
-        bench.after(5_000, true).is_none(),
+        rig.after(5_000, true).is_none(),
         "what was acknowledged last is not due again"
     );
-    assert_eq!(bench.reported(), 1);
+    assert_eq!(rig.reported(), 1);
     // Nothing is due to a drive that is only monitored from now on, nor where nothing is to be written.
     for change in [
         (|spec: &mut DriveSpec| spec.access = Access::Monitor) as fn(&mut DriveSpec),
         |spec| spec.supervision = None,
         |spec| spec.supervision.as_mut().unwrap().action = LeaseAction::Hold,
     ] {
-        let mut bench = Bench::new(LeaseAction::Stop);
-        bench.heartbeat();
-        drop(bench.after(5_000, true).expect("the stop"));
-        let mut spec = bench.spec();
+        let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+        rig.heartbeat();
+        drop(rig.after(5_000, true).expect("the stop"));
+        let mut spec = rig.spec();
         change(&mut spec);
-        bench.reload(spec);
-        assert!(bench.after(5_000, true).is_none());
+        rig.reload(spec);
+        assert!(rig.after(5_000, true).is_none());
     }
 }
 
 #[test]
 fn a_lease_that_runs_outlives_the_bus() {
-    let mut bench = Bench::new(LeaseAction::Stop);
-    bench.heartbeat();
-    assert!(bench.after(3_000, true).is_none());
-    bench.reload(bench.spec());
-    assert!(bench.after(1_900, true).is_none());
-    assert!(bench.after(100, true).is_some());
+    let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+    rig.heartbeat();
+    assert!(rig.after(3_000, true).is_none());
+    rig.reload(rig.spec());
+    assert!(rig.after(1_900, true).is_none());
+    assert!(rig.after(100, true).is_some());
 }
 
 #[test]
 fn an_action_waits_for_a_drive_that_does_not_answer() {
-    let mut bench = Bench::new(LeaseAction::Stop);
-    bench.heartbeat();
-    let command = bench.after(5_000, true).expect("the stop");
-    command.answer(&Outcome::TimedOut, bench.now);
-    let link = |bench: &Bench, link| bench.image().update(|s| s.link = link);
-    link(&bench, Link::Offline(SystemTime::now()));
+    let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+    rig.heartbeat();
+    let command = rig.after(5_000, true).expect("the stop");
+    command.answer(&Outcome::TimedOut, rig.now);
+    let link = |rig: &SupervisedDrive, link| rig.image().update(|s| s.link = link);
+    link(&rig, Link::Offline(SystemTime::now()));
     for _ in 0..10 {
-        assert!(bench.after(1_000, true).is_none());
+        assert!(rig.after(1_000, true).is_none());
     }
-    link(&bench, Link::Online(SystemTime::now()));
-    assert!(bench.after(1, false).is_some(), "at once when it is back");
+    link(&rig, Link::Online(SystemTime::now()));
+    assert!(rig.after(1, false).is_some(), "at once when it is back");
 }
 
 #[test]
 fn a_motor_that_may_start_by_itself_gets_its_action() {
-    let mut bench = Bench::new(LeaseAction::Stop);
-    bench.heartbeat();
+    let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+    rig.heartbeat();
     // A fault, or a status that never changes, with the run command left in the drive's word.
-    bench.shows(ModelPoint::Run, Value::Bool(true));
-    assert!(bench.after(4_900, false).is_none());
-    bench.shows(ModelPoint::Run, Value::Bool(true));
-    assert!(bench.after(100, false).is_some(), "it may start by it, or run");
-    assert_eq!(bench.reported(), 1);
+    rig.shows(ModelPoint::Run, Value::Bool(true));
+    assert!(rig.after(4_900, false).is_none());
+    rig.shows(ModelPoint::Run, Value::Bool(true));
+    assert!(rig.after(100, false).is_some(), "it may start by it, or run");
+    assert_eq!(rig.reported(), 1);
     // A family that does not report it: as it was written.
     let profiles = Profiles::built_in();
     for (word, acts) in [(Some(1), true), (Some(0), false), (None, false)] {
-        let mut bench = Bench::of(profiles.get("eaton-hvx").unwrap(), LeaseAction::Stop);
-        let raw = bench.image();
+        let mut rig = SupervisedDrive::of(profiles.get("eaton-hvx").unwrap(), LeaseAction::Stop);
+        let raw = rig.image();
         let raw = raw
             .spec
             .profile
             .model_point(ModelPoint::Run)
             .and_then(|point| point.raw())
             .unwrap();
-        assert!(bench.image().spec.profile.model_point(ModelPoint::Run).is_some());
-        bench.heartbeat();
+        assert!(rig.image().spec.profile.model_point(ModelPoint::Run).is_some());
+        rig.heartbeat();
         if let Some(word) = word {
-            bench.drive.words.learn(raw.table, raw.address, word);
+            rig.drive.words.learn(raw.table, raw.address, word);
         }
-        let acted = (0..100).any(|_| bench.after(100, false).is_some());
+        let acted = (0..100).any(|_| rig.after(100, false).is_some());
         assert_eq!(acted, acts, "{word:?}");
     }
     // The run command was taken away.
-    let mut bench = Bench::new(LeaseAction::Stop);
-    bench.heartbeat();
-    bench.shows(ModelPoint::Run, Value::Bool(true));
-    assert!(bench.after(4_900, false).is_none());
-    bench.shows(ModelPoint::Run, Value::Bool(false));
-    assert!(bench.after(100, false).is_none());
-    assert!(bench.after(10, true).is_none(), "started by someone else");
-    assert_eq!(bench.reported(), 0);
+    let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+    rig.heartbeat();
+    rig.shows(ModelPoint::Run, Value::Bool(true));
+    assert!(rig.after(4_900, false).is_none());
+    rig.shows(ModelPoint::Run, Value::Bool(false));
+    assert!(rig.after(100, false).is_none());
+    assert!(rig.after(10, true).is_none(), "started by someone else");
+    assert_eq!(rig.reported(), 0);
 }
 
 #[test]
 fn a_drive_that_runs_without_a_lease_is_told_once_and_adopted_where_that_is_wanted() {
-    let mut bench = Bench::new(LeaseAction::Stop);
-    assert!(bench.after(100, false).is_none());
-    assert_eq!(bench.news, [], "it stands");
+    let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+    assert!(rig.after(100, false).is_none());
+    assert_eq!(rig.news, [], "it stands");
     for _ in 0..100 {
-        assert!(bench.after(1_000, true).is_none(), "nobody commanded it");
+        assert!(rig.after(1_000, true).is_none(), "nobody commanded it");
     }
-    assert_eq!(bench.news, [News::RunsUnsupervised(DriveIndex::new(0), Adopted::No)]);
-    assert!(bench.image().is_unsupervised());
-    bench.reload(bench.spec());
-    assert!(bench.after(1_000, true).is_none());
-    assert!(bench.image().is_unsupervised(), "after a reload too");
-    assert_eq!(bench.news.len(), 1, "reported once");
-    bench.heartbeat();
-    assert!(bench.after(4_900, true).is_none());
-    assert!(!bench.image().is_unsupervised());
-    assert!(bench.after(100, true).is_some());
+    assert_eq!(rig.news, [News::RunsUnsupervised(DriveIndex::new(0), Adopted::No)]);
+    assert!(rig.image().is_unsupervised());
+    rig.reload(rig.spec());
+    assert!(rig.after(1_000, true).is_none());
+    assert!(rig.image().is_unsupervised(), "after a reload too");
+    assert_eq!(rig.news.len(), 1, "reported once");
+    rig.heartbeat();
+    assert!(rig.after(4_900, true).is_none());
+    assert!(!rig.image().is_unsupervised());
+    assert!(rig.after(100, true).is_some());
 
-    let mut bench = Bench::new(LeaseAction::Stop);
-    let mut spec = bench.spec();
+    let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+    let mut spec = rig.spec();
     spec.supervision.as_mut().unwrap().adopt = true;
-    bench.reload(spec);
-    assert!(bench.after(10_000, false).is_none());
-    assert!(bench.after(100, true).is_none(), "the clock only");
-    assert!(bench.after(4_900, true).is_none());
-    assert_eq!(bench.news, [News::RunsUnsupervised(DriveIndex::new(0), Adopted::Yes)]);
-    assert_eq!(bench.after(100, true).expect("the stop").urgency, Urgency::Stop);
+    rig.reload(spec);
+    assert!(rig.after(10_000, false).is_none());
+    assert!(rig.after(100, true).is_none(), "the clock only");
+    assert!(rig.after(4_900, true).is_none());
+    assert_eq!(rig.news, [News::RunsUnsupervised(DriveIndex::new(0), Adopted::Yes)]);
+    assert_eq!(rig.after(100, true).expect("the stop").urgency, Urgency::Stop);
     // Whoever commands it before it is seen to run has his lease.
-    let mut bench = Bench::new(LeaseAction::Stop);
-    bench.heartbeat();
-    assert!(bench.after(100, true).is_none());
-    assert_eq!(bench.news, []);
+    let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+    rig.heartbeat();
+    assert!(rig.after(100, true).is_none());
+    assert_eq!(rig.news, []);
 }

@@ -8,11 +8,7 @@ mod chance;
 mod n2;
 
 fn request() -> (Request, Vec<u8>) {
-    let pdu = RequestPdu::Read {
-        table: Table::Holding,
-        start: 732,
-        count: 1,
-    };
+    let pdu = RequestPdu::read(Table::Holding, 732, 1);
     let request = Request::new(1, pdu);
     let mut frame = Vec::new();
     rtu::encode_request(&request, &mut frame);
@@ -107,13 +103,7 @@ fn echo_is_dropped_even_where_it_looks_like_a_reply() {
 
 #[test]
 fn a_known_echo_does_not_acknowledge_a_write() {
-    let request = Request::new(
-        1,
-        RequestPdu::WriteRegister {
-            address: 2000,
-            value: 1,
-        },
-    );
+    let request = Request::new(1, RequestPdu::write_register(2000, 1));
     let mut frame = Vec::new();
     rtu::encode_request(&request, &mut frame);
     let now = Instant::now();
@@ -203,10 +193,7 @@ fn a_reply_behind_noise_is_found_but_no_exception_and_no_echo() {
     rtu::encode_frame(1, &[0x83, 2], &mut exception);
     let mut transaction = start(&request, &frame, now);
     assert!(matches!(transaction.on_bytes(now, &exception), Step::Wait(_)));
-    let pdu = RequestPdu::WriteRegister {
-        address: 2000,
-        value: 1,
-    };
+    let pdu = RequestPdu::write_register(2000, 1);
     let write = Request::new(1, pdu);
     let mut bytes = vec![0x37];
     rtu::encode_request(&write, &mut bytes);

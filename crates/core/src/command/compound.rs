@@ -132,10 +132,10 @@ pub fn joined(stop: Option<Outcome>, rest: Option<Outcome>) -> Option<Outcome> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drive::profile::Profiles;
+    use crate::testkit;
 
     fn parts(profile: &str, points: &[(&str, f64)]) -> (Vec<String>, Vec<String>) {
-        let profile = Profiles::built_in().get(profile).unwrap().clone();
+        let profile = testkit::profile(profile);
         let values = points.iter().map(|(name, value)| {
             let index = profile.point_index(name).unwrap();
             (index, Value::Number(*value))
@@ -187,16 +187,13 @@ mod tests {
 
     #[test]
     fn a_block_with_a_stop_is_sent_behind_its_control_word() {
-        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+        let profile = testkit::nx();
         let raw = profile.run_place().unwrap();
         let block = |word: u16| RequestPdu::WriteRegisters {
             start: raw.address,
             values: vec![word, 0, 5000],
         };
-        let stop = RequestPdu::WriteRegister {
-            address: raw.address,
-            value: 0,
-        };
+        let stop = RequestPdu::write_register(raw.address, 0);
         let two = Parts::Two(Order::Write(stop.clone()), Order::Write(block(0)));
         assert_eq!(Parts::of(Order::Write(block(0)), &profile), two);
         for whole in [block(1), stop] {

@@ -175,14 +175,7 @@ mod tests {
     use crate::codec::{Table, ascii, rtu};
 
     fn request() -> Request {
-        Request::new(
-            5,
-            RequestPdu::Read {
-                table: Table::Holding,
-                start: 2100,
-                count: 2,
-            },
-        )
+        Request::new(5, RequestPdu::read(Table::Holding, 2100, 2))
     }
 
     fn modbus(protocol: Protocol) -> (Vec<u8>, Vec<u8>) {

@@ -1,8 +1,8 @@
 use std::time::{Duration, SystemTime};
 
 use super::*;
-use crate::drive::profile::Profiles;
 use crate::process_image::{DriveSpec, LeaseAction, Supervision};
+use crate::testkit;
 
 fn machine(address: u8) -> Machine {
     Machine {
@@ -59,7 +59,7 @@ fn files_of_others_are_refused_with_a_reason() {
 
 #[test]
 fn a_silent_client_stops_what_has_supervision() {
-    let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let profile = testkit::nx();
     let mut spec = DriveSpec::new("p", "b", 1, profile);
     assert_eq!(ways(&spec), [], "it is monitored only");
     spec.access = Access::Control;
@@ -70,7 +70,7 @@ fn a_silent_client_stops_what_has_supervision() {
         adopt: false,
     });
     assert_eq!(ways(&spec), Kind::ALL);
-    spec.profile = Profiles::built_in().get("lenze-i550").unwrap().clone();
+    spec.profile = testkit::profile("lenze-i550");
     assert_eq!(ways(&spec), [], "nothing starts it");
 }
 

@@ -346,10 +346,10 @@ pub(super) mod tests {
 
     use super::*;
     use crate::drive::parameters::RawValue;
-    use crate::drive::profile::Profiles;
+    use crate::testkit;
 
     pub(crate) fn profile() -> std::sync::Arc<Profile> {
-        Profiles::built_in().get("vacon-nx").unwrap().clone()
+        testkit::nx()
     }
 
     pub(crate) fn write(id: u16, from: u16, to: u16) -> ParameterWrite {

@@ -71,13 +71,13 @@ mod tests {
 
     use super::*;
     use crate::codec::Table;
-    use crate::drive::profile::Profiles;
-    use crate::process_image::{DriveImage, DriveSpec, Link};
+    use crate::process_image::Link;
+    use crate::testkit;
 
     /// A CX that runs or not, with an output frequency read now and a motor speed read `age` before, 1 rpm and 0.01 Hz.
     fn contradicted(running: u16, hertz: u16, rpm: u16, age: Duration) -> bool {
-        let profile = Profiles::built_in().get("vacon-cx").unwrap().clone();
-        let image = DriveImage::new(DriveSpec::new("d", "b", 1, profile.clone()), Duration::from_secs(1));
+        let profile = testkit::profile("vacon-cx");
+        let image = testkit::image(testkit::monitored("d", "b", 1, &profile));
         let now = Instant::now() + age;
         image.update(|s| {
             s.link = Link::Online(SystemTime::now());

@@ -2,13 +2,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::*;
-use crate::codec::{LineFormat, Protocol, RequestPdu, Table};
+use crate::codec::{RequestPdu, Table};
 use crate::command::{
     BackgroundRequest, Effect, NO_DRIVE, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind, Ticket, Touched,
 };
 use crate::drive::DriveIndex;
-use crate::drive::profile::Profiles;
-use crate::process_image::{Access, BusSpec, DriveImage, DriveSpec, Link};
+use crate::process_image::{BusSpec, DriveImage, DriveSpec, Link};
+use crate::testkit::{bus_spec, controlled, image, nx, profile, read};
 
 const SECOND: Duration = Duration::from_secs(1);
 const RUN: Effect = Effect {
@@ -19,7 +19,7 @@ const RUN: Effect = Effect {
 };
 
 /// Drives `d1` to `d3` of a family on one bus; `d1` and `d2` have the guard.
-struct Bench {
+struct GuardedDrives {
     shared: Arc<Guards>,
     bus: BusSpec,
     images: Vec<Arc<DriveImage>>,
@@ -27,32 +27,22 @@ struct Bench {
     start: Instant,
 }
 
-impl Bench {
-    fn of(guard: Guard, interlocks: Vec<Interlock>) -> Bench {
-        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
-        let bus = BusSpec {
-            name: "b".to_string(),
-            port: "/dev/b".to_string(),
-            protocol: Protocol::ModbusRtu,
-            format: LineFormat::new(38_400, "8N1").unwrap(),
-            cycle: Duration::from_millis(10),
-            slow_cycle: SECOND,
-        };
+impl GuardedDrives {
+    fn of(guard: Guard, interlocks: Vec<Interlock>) -> GuardedDrives {
+        let (profile, bus) = (nx(), bus_spec("b"));
         let drive = |address: u8| {
-            let spec = DriveSpec {
-                access: Access::Control,
+            image(DriveSpec {
                 guard: (address < 3).then_some(guard),
                 interlocks: if address == 1 { interlocks.clone() } else { Vec::new() },
                 staggers: !guard.stagger.is_zero(),
-                ..DriveSpec::new(&format!("d{address}"), "b", address, profile.clone())
-            };
-            Arc::new(DriveImage::new(spec, SECOND))
+                ..controlled(&format!("d{address}"), "b", address, &profile)
+            })
         };
         let images: Vec<Arc<DriveImage>> = (1..=3).map(drive).collect();
         let shared = Arc::new(Guards::default());
         let guards = BusGuards::of(&shared, &bus, images.iter().map(|image| &image.spec)).unwrap();
         shared.watch(images.iter().cloned(), SECOND);
-        Bench {
+        GuardedDrives {
             shared,
             bus,
             images,
@@ -68,13 +58,9 @@ impl Bench {
     /// The drive is read: it runs, or stands.
     fn read(&self, drive: usize, running: bool, seconds: f64) {
         let (image, at) = (&self.images[drive], self.at(seconds));
-        image.update(|snapshot| {
-            snapshot.link = Link::Online(SystemTime::now());
-            snapshot.fast_at = Some(at);
-            // The status word: running, or at zero speed; then the output frequency.
-            let words = if running { [0x03, 0, 0, 2500] } else { [0x41, 0, 0, 0] };
-            snapshot.store(Table::Holding, 2100, &words, at);
-        });
+        // The status word: running, or at zero speed; then the output frequency.
+        let words = if running { [0x03, 0, 0, 2500] } else { [0x41, 0, 0, 0] };
+        read(image, 2100, &words, at);
         self.guards.look(DriveIndex::new(drive), &image.reading(at, SECOND));
     }
 
@@ -100,10 +86,7 @@ impl Bench {
         let (ticket, _) = Ticket::new(origin, "d", String::new(), true, now, Arc::default());
         let request = BackgroundRequest {
             drive: NO_DRIVE,
-            pdu: RequestPdu::WriteRegister {
-                address: 2000,
-                value: 1,
-            },
+            pdu: RequestPdu::write_register(2000, 1),
             pace: Pace::Brisk,
             expires: now + 2 * SECOND,
             ticket,
@@ -152,14 +135,14 @@ fn per_hour(most: u32) -> Guard {
 
 #[test]
 fn the_window_of_an_hour_slides() {
-    let bench = Bench::of(per_hour(3), Vec::new());
-    bench.read(0, false, 0.0);
+    let rig = GuardedDrives::of(per_hour(3), Vec::new());
+    rig.read(0, false, 0.0);
     for (number, seconds) in [(1, 10.0), (2, 600.0), (3, 1200.0)] {
-        bench.start_and_stop(0, number, seconds);
+        rig.start_and_stop(0, number, seconds);
     }
-    assert_eq!(bench.refused(0, 1300.0), Some("starts_per_hour"));
-    assert_eq!(bench.refused(1, 1300.0), None, "each drive for itself");
-    let Some(Refusal::Guarded(wait)) = bench.guards.refuses(DriveIndex::new(0), RUN, None, bench.at(1300.0)) else {
+    assert_eq!(rig.refused(0, 1300.0), Some("starts_per_hour"));
+    assert_eq!(rig.refused(1, 1300.0), None, "each drive for itself");
+    let Some(Refusal::Guarded(wait)) = rig.guards.refuses(DriveIndex::new(0), RUN, None, rig.at(1300.0)) else {
         unreachable!()
     };
     assert_eq!(
@@ -172,68 +155,66 @@ fn the_window_of_an_hour_slides() {
         wait.why.contains("3 starts within the last hour") && wait.why.contains("39 min"),
         "{wait}"
     );
-    assert_eq!(bench.refused(0, 3609.9), Some("starts_per_hour"));
-    assert_eq!(bench.refused(0, 3610.0), None);
-    bench.start_and_stop(0, 4, 3610.0);
+    assert_eq!(rig.refused(0, 3609.9), Some("starts_per_hour"));
+    assert_eq!(rig.refused(0, 3610.0), None);
+    rig.start_and_stop(0, 4, 3610.0);
     assert_eq!(
-        bench.refused(0, 4199.0),
+        rig.refused(0, 4199.0),
         Some("starts_per_hour"),
         "the second one counts until 4200 s"
     );
-    assert_eq!(bench.refused(0, 4200.0), None);
-    let counted = bench.guards.refused(DriveIndex::new(0));
+    assert_eq!(rig.refused(0, 4200.0), None);
+    let counted = rig.guards.refused(DriveIndex::new(0));
     assert_eq!(counted.get(&Reason::StartsPerHour), Some(&4), "{counted:?}");
 }
 
 #[test]
 fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
-    let bench = Bench::of(per_hour(1), Vec::new());
-    bench.read(0, false, 0.0);
-    assert_eq!(bench.clear(&[0], 1, 1.0), Clearance::Go);
-    bench
-        .guards
-        .start_written(DriveIndex::new(0), 1, &Arc::from("c"), bench.at(1.0));
-    assert_eq!(bench.refused(0, 1.05), Some("starts_per_hour"), "not seen to run yet");
-    bench.read(0, true, 1.1);
-    assert_eq!(bench.refused(0, 1.2), None, "it runs");
-    assert_eq!(bench.clear(&[0], 2, 1.2), Clearance::Go);
-    bench
-        .guards
-        .start_written(DriveIndex::new(0), 2, &Arc::from("c"), bench.at(1.2));
-    bench.guards.stop_written(DriveIndex::new(0), bench.at(2.0));
+    let rig = GuardedDrives::of(per_hour(1), Vec::new());
+    rig.read(0, false, 0.0);
+    assert_eq!(rig.clear(&[0], 1, 1.0), Clearance::Go);
+    rig.guards
+        .start_written(DriveIndex::new(0), 1, &Arc::from("c"), rig.at(1.0));
+    assert_eq!(rig.refused(0, 1.05), Some("starts_per_hour"), "not seen to run yet");
+    rig.read(0, true, 1.1);
+    assert_eq!(rig.refused(0, 1.2), None, "it runs");
+    assert_eq!(rig.clear(&[0], 2, 1.2), Clearance::Go);
+    rig.guards
+        .start_written(DriveIndex::new(0), 2, &Arc::from("c"), rig.at(1.2));
+    rig.guards.stop_written(DriveIndex::new(0), rig.at(2.0));
     assert_eq!(
-        bench.refused(0, 2.01),
+        rig.refused(0, 2.01),
         Some("starts_per_hour"),
         "what was read before the stop says nothing"
     );
     // It coasts down: it may stand by the time that the order reaches it.
-    bench.read(0, true, 2.1);
-    assert_eq!(bench.refused(0, 2.2), Some("starts_per_hour"));
+    rig.read(0, true, 2.1);
+    assert_eq!(rig.refused(0, 2.2), Some("starts_per_hour"));
     // The drive did not take the stop, or somebody else started it again.
-    bench.images[0].update(|snapshot| snapshot.store(Table::Holding, 2000, &[1, 0, 0], bench.at(2.3)));
-    bench.read(0, true, 2.4);
-    assert_eq!(bench.refused(0, 2.5), None);
-    bench.read(0, false, 3.0);
-    assert_eq!(bench.refused(0, 3.1), Some("starts_per_hour"));
+    rig.images[0].update(|snapshot| snapshot.store(Table::Holding, 2000, &[1, 0, 0], rig.at(2.3)));
+    rig.read(0, true, 2.4);
+    assert_eq!(rig.refused(0, 2.5), None);
+    rig.read(0, false, 3.0);
+    assert_eq!(rig.refused(0, 3.1), Some("starts_per_hour"));
     // A run that was cleared while the motor ran does not start it when it has stopped since.
-    assert!(bench.guards.may_write(DriveIndex::new(0), 2, bench.at(3.1)).is_err());
-    assert!(bench.guards.may_write(DriveIndex::new(0), 1, bench.at(3.1)).is_ok());
+    assert!(rig.guards.may_write(DriveIndex::new(0), 2, rig.at(3.1)).is_err());
+    assert!(rig.guards.may_write(DriveIndex::new(0), 1, rig.at(3.1)).is_ok());
 }
 
 #[test]
 fn starts_at_the_panel_count_and_those_of_orders_count_once() {
-    let bench = Bench::of(per_hour(2), Vec::new());
-    bench.read(0, false, 0.0);
-    bench.start_and_stop(0, 1, 1.0);
-    assert_eq!(bench.refused(0, 5.0), None, "one of two");
-    bench.read(0, true, 6.0);
-    bench.read(0, false, 7.0);
-    assert_eq!(bench.refused(0, 8.0), Some("starts_per_hour"), "the panel started it");
+    let rig = GuardedDrives::of(per_hour(2), Vec::new());
+    rig.read(0, false, 0.0);
+    rig.start_and_stop(0, 1, 1.0);
+    assert_eq!(rig.refused(0, 5.0), None, "one of two");
+    rig.read(0, true, 6.0);
+    rig.read(0, false, 7.0);
+    assert_eq!(rig.refused(0, 8.0), Some("starts_per_hour"), "the panel started it");
     // One that runs when it is first read was not seen to start.
-    bench.read(1, true, 0.0);
-    bench.read(1, false, 1.0);
-    bench.start_and_stop(1, 2, 2.0);
-    assert_eq!(bench.refused(1, 5.0), None);
+    rig.read(1, true, 0.0);
+    rig.read(1, false, 1.0);
+    rig.start_and_stop(1, 2, 2.0);
+    assert_eq!(rig.refused(1, 5.0), None);
 }
 
 #[test]
@@ -242,68 +223,51 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
         min_off: 30 * SECOND,
         ..Guard::default()
     };
-    let bench = Bench::of(guard, Vec::new());
-    assert_eq!(bench.refused(0, 0.0), Some("min_off"), "never read");
-    bench.read(0, false, 1.0);
-    bench.read(0, false, 20.0);
-    assert_eq!(
-        (bench.refused(0, 30.9), bench.refused(0, 31.0)),
-        (Some("min_off"), None)
-    );
-    bench.start_and_stop(0, 1, 40.0);
-    assert_eq!(
-        (bench.refused(0, 70.9), bench.refused(0, 71.0)),
-        (Some("min_off"), None)
-    );
+    let rig = GuardedDrives::of(guard, Vec::new());
+    assert_eq!(rig.refused(0, 0.0), Some("min_off"), "never read");
+    rig.read(0, false, 1.0);
+    rig.read(0, false, 20.0);
+    assert_eq!((rig.refused(0, 30.9), rig.refused(0, 31.0)), (Some("min_off"), None));
+    rig.start_and_stop(0, 1, 40.0);
+    assert_eq!((rig.refused(0, 70.9), rig.refused(0, 71.0)), (Some("min_off"), None));
     // A start and a stop between two reads: it is to be seen to stand anew.
-    assert_eq!(bench.clear(&[0], 2, 71.0), Clearance::Go);
-    bench
-        .guards
-        .start_written(DriveIndex::new(0), 2, &Arc::from("c"), bench.at(71.0));
-    bench.read(0, false, 71.0);
-    bench.guards.stop_written(DriveIndex::new(0), bench.at(71.1));
-    bench.read(0, false, 71.2);
-    bench.read(0, false, 72.5);
-    assert_eq!(
-        (bench.refused(0, 102.4), bench.refused(0, 102.5)),
-        (Some("min_off"), None)
-    );
+    assert_eq!(rig.clear(&[0], 2, 71.0), Clearance::Go);
+    rig.guards
+        .start_written(DriveIndex::new(0), 2, &Arc::from("c"), rig.at(71.0));
+    rig.read(0, false, 71.0);
+    rig.guards.stop_written(DriveIndex::new(0), rig.at(71.1));
+    rig.read(0, false, 71.2);
+    rig.read(0, false, 72.5);
+    assert_eq!((rig.refused(0, 102.4), rig.refused(0, 102.5)), (Some("min_off"), None));
     // Stops to a motor that stands change nothing.
-    bench.guards.stop_written(DriveIndex::new(0), bench.at(102.6));
-    bench.read(0, false, 102.7);
-    assert_eq!(bench.refused(0, 102.8), None);
+    rig.guards.stop_written(DriveIndex::new(0), rig.at(102.6));
+    rig.read(0, false, 102.7);
+    assert_eq!(rig.refused(0, 102.8), None);
     // Away, it may have run meanwhile.
-    bench.images[0].update(|snapshot| snapshot.link = Link::Offline(SystemTime::now()));
-    bench
-        .guards
-        .look(DriveIndex::new(0), &bench.images[0].reading(bench.at(180.0), SECOND));
-    assert_eq!(bench.refused(0, 180.0), Some("min_off"));
-    bench.read(0, false, 190.0);
-    assert_eq!(
-        (bench.refused(0, 219.0), bench.refused(0, 220.0)),
-        (Some("min_off"), None)
-    );
+    rig.images[0].update(|snapshot| snapshot.link = Link::Offline(SystemTime::now()));
+    rig.guards
+        .look(DriveIndex::new(0), &rig.images[0].reading(rig.at(180.0), SECOND));
+    assert_eq!(rig.refused(0, 180.0), Some("min_off"));
+    rig.read(0, false, 190.0);
+    assert_eq!((rig.refused(0, 219.0), rig.refused(0, 220.0)), (Some("min_off"), None));
     // One that waits is taken in if it can go in time.
-    bench.read(1, false, 200.0);
-    let until = |seconds| Some(bench.at(seconds));
+    rig.read(1, false, 200.0);
+    let until = |seconds| Some(rig.at(seconds));
     assert!(
-        bench
-            .guards
-            .refuses(DriveIndex::new(1), RUN, until(229.0), bench.at(220.0))
+        rig.guards
+            .refuses(DriveIndex::new(1), RUN, until(229.0), rig.at(220.0))
             .is_some()
     );
     assert_eq!(
-        bench
-            .guards
-            .refuses(DriveIndex::new(1), RUN, until(231.0), bench.at(220.0)),
+        rig.guards.refuses(DriveIndex::new(1), RUN, until(231.0), rig.at(220.0)),
         None
     );
     assert_eq!(
-        bench.clear_waiting(&[1], 9, true, 229.0),
-        Clearance::Wait(bench.at(230.0)),
+        rig.clear_waiting(&[1], 9, true, 229.0),
+        Clearance::Wait(rig.at(230.0)),
         "it goes at its time"
     );
-    assert_eq!(bench.clear_waiting(&[1], 9, true, 230.0), Clearance::Go);
+    assert_eq!(rig.clear_waiting(&[1], 9, true, 230.0), Clearance::Go);
 }
 
 #[test]
@@ -312,38 +276,26 @@ fn drives_of_a_group_start_one_after_the_other() {
         stagger: 5 * SECOND,
         ..Guard::default()
     };
-    let bench = Bench::of(guard, Vec::new());
-    (0..3).for_each(|drive| bench.read(drive, false, 0.0));
-    assert_eq!(
-        reason(bench.clear(&[0, 1], 1, 1.0)),
-        "stagger",
-        "never two by one order"
-    );
-    assert_eq!(bench.clear(&[0], 2, 2.0), Clearance::Go);
+    let rig = GuardedDrives::of(guard, Vec::new());
+    (0..3).for_each(|drive| rig.read(drive, false, 0.0));
+    assert_eq!(reason(rig.clear(&[0, 1], 1, 1.0)), "stagger", "never two by one order");
+    assert_eq!(rig.clear(&[0], 2, 2.0), Clearance::Go);
     // Cleared and not written: it may be at any time.
-    assert_eq!(reason(bench.clear(&[1], 3, 7.5)), "stagger");
-    bench
-        .guards
-        .start_written(DriveIndex::new(0), 2, &Arc::from("c"), bench.at(8.0));
+    assert_eq!(reason(rig.clear(&[1], 3, 7.5)), "stagger");
+    rig.guards
+        .start_written(DriveIndex::new(0), 2, &Arc::from("c"), rig.at(8.0));
     assert_eq!(
-        (reason(bench.clear(&[1], 3, 12.9)), bench.clear(&[1], 3, 13.0)),
+        (reason(rig.clear(&[1], 3, 12.9)), rig.clear(&[1], 3, 13.0)),
         ("stagger", Clearance::Go)
     );
     // What was cleared and not written counts from when it was.
-    bench.guards.settle(DriveIndex::new(1), 3);
-    assert_eq!(
-        (bench.refused(0, 17.9), bench.refused(0, 18.0)),
-        (Some("stagger"), None)
-    );
+    rig.guards.settle(DriveIndex::new(1), 3);
+    assert_eq!((rig.refused(0, 17.9), rig.refused(0, 18.0)), (Some("stagger"), None));
     // A drive without a guard is not held back, and its starts count for the others.
-    assert_eq!(bench.clear(&[2], 4, 18.0), Clearance::Go);
-    bench
-        .guards
-        .start_written(DriveIndex::new(2), 4, &Arc::from("c"), bench.at(18.0));
-    assert_eq!(
-        (bench.refused(0, 22.9), bench.refused(0, 23.0)),
-        (Some("stagger"), None)
-    );
+    assert_eq!(rig.clear(&[2], 4, 18.0), Clearance::Go);
+    rig.guards
+        .start_written(DriveIndex::new(2), 4, &Arc::from("c"), rig.at(18.0));
+    assert_eq!((rig.refused(0, 22.9), rig.refused(0, 23.0)), (Some("stagger"), None));
 }
 
 #[test]
@@ -354,9 +306,9 @@ fn only_a_good_point_holds_an_interlock() {
         is,
         trip: false,
     };
-    let bench = Bench::of(Guard::default(), vec![interlock("d3", true)]);
-    bench.read(0, false, 0.0);
-    let text = |seconds| match bench.guards.refuses(DriveIndex::new(0), RUN, None, bench.at(seconds)) {
+    let rig = GuardedDrives::of(Guard::default(), vec![interlock("d3", true)]);
+    rig.read(0, false, 0.0);
+    let text = |seconds| match rig.guards.refuses(DriveIndex::new(0), RUN, None, rig.at(seconds)) {
         Some(refusal @ Refusal::Interlocked(_)) => refusal.to_string(),
         other => format!("{other:?}"),
     };
@@ -365,45 +317,45 @@ fn only_a_good_point_holds_an_interlock() {
         "{}",
         text(0.0)
     );
-    bench.read(2, false, 1.0);
+    rig.read(2, false, 1.0);
     assert!(text(1.0).contains("must be true, but is false"), "{}", text(1.0));
-    bench.read(2, true, 2.0);
-    assert_eq!(bench.refused(0, 2.5), None);
+    rig.read(2, true, 2.0);
+    assert_eq!(rig.refused(0, 2.5), None);
     assert!(text(3.5).contains("is stale: read 1.5 s ago"), "{}", text(3.5));
-    bench.read(2, true, 4.0);
-    assert_eq!(bench.clear(&[0], 1, 4.5), Clearance::Go);
+    rig.read(2, true, 4.0);
+    assert_eq!(rig.clear(&[0], 1, 4.5), Clearance::Go);
     // It does not hold any more when the word is to be written.
-    assert!(bench.guards.may_write(DriveIndex::new(0), 1, bench.at(4.9)).is_ok());
-    assert!(bench.guards.may_write(DriveIndex::new(0), 1, bench.at(5.5)).is_err());
+    assert!(rig.guards.may_write(DriveIndex::new(0), 1, rig.at(4.9)).is_ok());
+    assert!(rig.guards.may_write(DriveIndex::new(0), 1, rig.at(5.5)).is_err());
     assert_eq!(
-        bench.guards.unmet(DriveIndex::new(0), true, bench.at(5.5)),
+        rig.guards.unmet(DriveIndex::new(0), true, rig.at(5.5)),
         [],
         "it stops no motor"
     );
-    let bench = Bench::of(Guard::default(), vec![interlock("d9", true)]);
-    bench.read(0, false, 0.0);
-    assert_eq!(bench.refused(0, 0.0), Some("interlock"), "no such drive");
-    let bench = Bench::of(Guard::default(), vec![interlock("d3", false)]);
-    bench.read(0, false, 0.0);
-    assert_eq!(bench.refused(0, 0.0), Some("interlock"), "not known is not false");
-    bench.read(2, false, 1.0);
-    assert_eq!(bench.refused(0, 1.0), None);
+    let rig = GuardedDrives::of(Guard::default(), vec![interlock("d9", true)]);
+    rig.read(0, false, 0.0);
+    assert_eq!(rig.refused(0, 0.0), Some("interlock"), "no such drive");
+    let rig = GuardedDrives::of(Guard::default(), vec![interlock("d3", false)]);
+    rig.read(0, false, 0.0);
+    assert_eq!(rig.refused(0, 0.0), Some("interlock"), "not known is not false");
+    rig.read(2, false, 1.0);
+    assert_eq!(rig.refused(0, 1.0), None);
 }
 
 #[test]
 fn a_start_waits_until_it_is_on_disk() {
-    let bench = Bench::of(per_hour(3), Vec::new());
+    let rig = GuardedDrives::of(per_hour(3), Vec::new());
     let time = SystemTime::now();
-    bench.shared.keep(&Saved::default(), bench.start, time);
-    bench.read(0, false, 0.0);
-    assert_eq!(reason(bench.clear(&[0], 1, 1.0)), "wait");
-    let (generation, saved) = bench.shared.to_write(bench.at(1.0), time).unwrap();
-    assert_eq!(reason(bench.clear(&[0], 1, 1.1)), "wait");
-    bench.shared.wrote(generation, Ok(()));
-    assert_eq!(bench.clear(&[0], 1, 1.2), Clearance::Go);
-    assert_eq!(bench.shared.to_write(bench.at(1.2), time), None);
+    rig.shared.keep(&Saved::default(), rig.start, time);
+    rig.read(0, false, 0.0);
+    assert_eq!(reason(rig.clear(&[0], 1, 1.0)), "wait");
+    let (generation, saved) = rig.shared.to_write(rig.at(1.0), time).unwrap();
+    assert_eq!(reason(rig.clear(&[0], 1, 1.1)), "wait");
+    rig.shared.wrote(generation, Ok(()));
+    assert_eq!(rig.clear(&[0], 1, 1.2), Clearance::Go);
+    assert_eq!(rig.shared.to_write(rig.at(1.2), time), None);
     // Killed before it wrote anything, the next run knows of it.
-    let next = Bench::of(per_hour(1), Vec::new());
+    let next = GuardedDrives::of(per_hour(1), Vec::new());
     let saved = Saved::from_json(&saved.to_json()).unwrap();
     next.shared.keep(&saved, next.start, time + 60 * SECOND);
     next.read(0, false, 0.0);
@@ -412,7 +364,7 @@ fn a_start_waits_until_it_is_on_disk() {
         (Some("starts_per_hour"), None)
     );
     // A clock that was set back makes nothing older.
-    let next = Bench::of(per_hour(1), Vec::new());
+    let next = GuardedDrives::of(per_hour(1), Vec::new());
     next.shared.keep(&saved, next.start, time - 7200 * SECOND);
     next.read(0, false, 0.0);
     assert_eq!(
@@ -423,52 +375,52 @@ fn a_start_waits_until_it_is_on_disk() {
 
 #[test]
 fn a_start_that_cannot_be_counted_is_refused_and_is_none() {
-    let bench = Bench::of(per_hour(1), Vec::new());
+    let rig = GuardedDrives::of(per_hour(1), Vec::new());
     let time = SystemTime::now();
-    bench.shared.keep(&Saved::default(), bench.start, time);
-    bench.read(0, false, 0.0);
-    assert_eq!(reason(bench.clear(&[0], 1, 1.0)), "wait");
-    let (generation, _) = bench.shared.to_write(bench.at(1.0), time).unwrap();
-    bench.shared.wrote(generation, Err("starts.json: no space".to_string()));
-    let refused = bench.clear(&[0], 1, 1.1);
+    rig.shared.keep(&Saved::default(), rig.start, time);
+    rig.read(0, false, 0.0);
+    assert_eq!(reason(rig.clear(&[0], 1, 1.0)), "wait");
+    let (generation, _) = rig.shared.to_write(rig.at(1.0), time).unwrap();
+    rig.shared.wrote(generation, Err("starts.json: no space".to_string()));
+    let refused = rig.clear(&[0], 1, 1.1);
     let Clearance::Refused(refusal) = &refused else {
         unreachable!("{refused:?}")
     };
     assert!(refusal.to_string().contains("starts.json: no space"), "{refusal}");
     // A disk that hangs is not waited for.
-    assert_eq!(reason(bench.clear(&[0], 2, 2.0)), "wait");
-    assert_eq!(reason(bench.clear(&[0], 2, 2.9)), "wait");
-    assert_eq!(reason(bench.clear(&[0], 2, 3.0)), "state_file");
+    assert_eq!(reason(rig.clear(&[0], 2, 2.0)), "wait");
+    assert_eq!(reason(rig.clear(&[0], 2, 2.9)), "wait");
+    assert_eq!(reason(rig.clear(&[0], 2, 3.0)), "state_file");
     // It works again.
-    let (generation, _) = bench.shared.to_write(bench.at(4.0), time).unwrap();
-    bench.shared.wrote(generation, Ok(()));
-    assert_eq!(reason(bench.clear(&[0], 3, 5.0)), "wait");
-    let (generation, _) = bench.shared.to_write(bench.at(5.0), time).unwrap();
-    bench.shared.wrote(generation, Ok(()));
-    assert_eq!(bench.clear(&[0], 3, 5.1), Clearance::Go);
+    let (generation, _) = rig.shared.to_write(rig.at(4.0), time).unwrap();
+    rig.shared.wrote(generation, Ok(()));
+    assert_eq!(reason(rig.clear(&[0], 3, 5.0)), "wait");
+    let (generation, _) = rig.shared.to_write(rig.at(5.0), time).unwrap();
+    rig.shared.wrote(generation, Ok(()));
+    assert_eq!(rig.clear(&[0], 3, 5.1), Clearance::Go);
 }
 
 #[test]
 fn counters_belong_to_the_machine_over_a_reload() {
-    let bench = Bench::of(per_hour(1), Vec::new());
-    bench.read(0, false, 0.0);
-    bench.start_and_stop(0, 1, 1.0);
+    let rig = GuardedDrives::of(per_hour(1), Vec::new());
+    rig.read(0, false, 0.0);
+    rig.start_and_stop(0, 1, 1.0);
     // Renamed, and at another place of the bus.
-    let mut specs: Vec<DriveSpec> = bench.images.iter().map(|image| image.spec.clone()).collect();
+    let mut specs: Vec<DriveSpec> = rig.images.iter().map(|image| image.spec.clone()).collect();
     specs[0].name = "other".to_string();
     specs.reverse();
-    let after = BusGuards::of(&bench.shared, &bench.bus, &specs).unwrap();
-    assert!(after.refuses(DriveIndex::new(2), RUN, None, bench.at(10.0)).is_some());
-    assert!(after.refuses(DriveIndex::new(1), RUN, None, bench.at(10.0)).is_none());
+    let after = BusGuards::of(&rig.shared, &rig.bus, &specs).unwrap();
+    assert!(after.refuses(DriveIndex::new(2), RUN, None, rig.at(10.0)).is_some());
+    assert!(after.refuses(DriveIndex::new(1), RUN, None, rig.at(10.0)).is_none());
     // Another machine at its address has none.
-    specs[2].profile = Profiles::built_in().get("vacon-cx").unwrap().clone();
-    let after = BusGuards::of(&bench.shared, &bench.bus, &specs).unwrap();
-    assert!(after.refuses(DriveIndex::new(2), RUN, None, bench.at(10.0)).is_none());
+    specs[2].profile = profile("vacon-cx");
+    let after = BusGuards::of(&rig.shared, &rig.bus, &specs).unwrap();
+    assert!(after.refuses(DriveIndex::new(2), RUN, None, rig.at(10.0)).is_none());
     specs
         .iter_mut()
         .for_each(|spec| (spec.guard, spec.staggers) = (None, false));
     assert!(
-        BusGuards::of(&bench.shared, &bench.bus, &specs).is_none(),
+        BusGuards::of(&rig.shared, &rig.bus, &specs).is_none(),
         "nothing to look after"
     );
 }
@@ -479,41 +431,33 @@ fn min_run_delays_the_first_stop_of_the_client_that_started_the_motor() {
         min_run: 20 * SECOND,
         ..Guard::default()
     };
-    let bench = Bench::of(guard, Vec::new());
-    bench.read(0, false, 0.0);
+    let rig = GuardedDrives::of(guard, Vec::new());
+    rig.read(0, false, 0.0);
+    assert!(!rig.guards.is_ordinary_stop(DriveIndex::new(0), "c", None), "it stands");
+    assert_eq!(rig.clear(&[0], 1, 1.0), Clearance::Go);
+    rig.guards
+        .start_written(DriveIndex::new(0), 1, &Arc::from("c"), rig.at(1.0));
+    let waits = |seconds| rig.guards.stop_waits(DriveIndex::new(0), rig.at(seconds));
+    assert_eq!(waits(1.5), Some(rig.at(21.0)), "not read since");
+    rig.read(0, true, 2.0);
+    assert!(rig.guards.is_ordinary_stop(DriveIndex::new(0), "c", None));
     assert!(
-        !bench.guards.is_ordinary_stop(DriveIndex::new(0), "c", None),
-        "it stands"
-    );
-    assert_eq!(bench.clear(&[0], 1, 1.0), Clearance::Go);
-    bench
-        .guards
-        .start_written(DriveIndex::new(0), 1, &Arc::from("c"), bench.at(1.0));
-    let waits = |seconds| bench.guards.stop_waits(DriveIndex::new(0), bench.at(seconds));
-    assert_eq!(waits(1.5), Some(bench.at(21.0)), "not read since");
-    bench.read(0, true, 2.0);
-    assert!(bench.guards.is_ordinary_stop(DriveIndex::new(0), "c", None));
-    assert!(
-        bench
-            .guards
-            .is_ordinary_stop(DriveIndex::new(0), "c", Some(bench.at(0.5))),
+        rig.guards.is_ordinary_stop(DriveIndex::new(0), "c", Some(rig.at(0.5))),
         "a stop before the start"
     );
     assert!(
-        !bench
-            .guards
-            .is_ordinary_stop(DriveIndex::new(0), "c", Some(bench.at(2.0))),
+        !rig.guards.is_ordinary_stop(DriveIndex::new(0), "c", Some(rig.at(2.0))),
         "a second stop"
     );
-    assert!(!bench.guards.is_ordinary_stop(DriveIndex::new(0), "another", None));
-    assert_eq!((waits(10.0), waits(21.0)), (Some(bench.at(21.0)), None));
+    assert!(!rig.guards.is_ordinary_stop(DriveIndex::new(0), "another", None));
+    assert_eq!((waits(10.0), waits(21.0)), (Some(rig.at(21.0)), None));
     // It is seen to stand, or not seen at all: nothing is waited for.
-    bench.read(0, false, 12.0);
+    rig.read(0, false, 12.0);
     assert_eq!(waits(12.1), None);
-    bench.read(1, false, 0.0);
-    bench.read(1, true, 5.0);
+    rig.read(1, false, 0.0);
+    rig.read(1, true, 5.0);
     assert!(
-        !bench.guards.is_ordinary_stop(DriveIndex::new(1), "c", None),
+        !rig.guards.is_ordinary_stop(DriveIndex::new(1), "c", None),
         "the panel started it"
     );
 }

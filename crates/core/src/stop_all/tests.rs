@@ -1,43 +1,28 @@
 use super::*;
 use std::sync::Arc;
 
-use crate::codec::{LineFormat, Protocol};
-use crate::command::{CommandQueue, SourceKind};
-use crate::drive::profile::Profiles;
-use crate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec};
+use crate::command::SourceKind;
+use crate::process_image::{BusImage, DriveSpec};
+use crate::testkit::{STALE_AFTER, bus, bus_spec, image, monitored, nx, up};
 
 /// Buses `a` and `b`, each with a controlled drive in the group `pumps` and a monitored one in none.
 fn plant() -> Plant {
-    let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let profile = nx();
     let bus = |name: &str| {
-        let drive = |address: u8, access, group: Option<&str>| {
-            let spec = DriveSpec {
+        let drive = |address, access, group: Option<&str>| {
+            image(DriveSpec {
                 access,
                 group: group.map(str::to_string),
-                ..DriveSpec::new(&format!("{name}{address}"), name, address, profile.clone())
-            };
-            Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
+                ..monitored(&format!("{name}{address}"), name, address, &profile)
+            })
         };
         let drives = vec![
             drive(1, Access::Control, Some("pumps")),
             drive(2, Access::Monitor, None),
         ];
-        let spec = BusSpec {
-            name: name.to_string(),
-            port: format!("/dev/{name}"),
-            protocol: Protocol::ModbusRtu,
-            format: LineFormat::new(38_400, "8N1").unwrap(),
-            cycle: Duration::from_millis(10),
-            slow_cycle: Duration::from_secs(1),
-        };
-        let bus = BusHandle {
-            image: Arc::new(BusImage::new(spec, drives)),
-            queue: Arc::new(CommandQueue::new().unwrap()),
-        };
-        bus.image.update_health(|health| health.up = true);
-        bus
+        up(bus(bus_spec(name), drives))
     };
-    Plant::new("g", Duration::from_secs(1), vec![bus("a"), bus("b")])
+    Plant::new("g", STALE_AFTER, vec![bus("a"), bus("b")])
 }
 
 fn waiting(plant: &Plant) -> [usize; 2] {

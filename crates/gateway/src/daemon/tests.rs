@@ -1,3 +1,5 @@
+use drivegate_testkit::mqtt as packets;
+
 use super::*;
 use crate::event::EventKind;
 
@@ -50,18 +52,13 @@ fn first_packet(listener: &std::net::TcpListener, wanted: &'static str) -> std::
             let sender = sender.clone();
             std::thread::spawn(move || {
                 let mut stream = stream;
-                while let Some((kind, body)) = packet(&mut stream) {
+                while let Some((kind, body)) = packets::read_packet(&mut stream) {
                     let answer = match kind >> 4 {
                         1 => vec![0x20, 3, 0, 0, 0],
                         8 => {
-                            // Packet id, no properties, filters with a byte of options each.
-                            let (mut rest, mut codes) = (&body[3..], Vec::new());
-                            while let [high, low, after @ ..] = rest {
-                                rest = &after[usize::from(u16::from_be_bytes([*high, *low])) + 1..];
-                                codes.push(1);
-                            }
-                            let length = u8::try_from(3 + codes.len()).unwrap();
-                            [&[0x90, length, body[0], body[1], 0][..], &codes].concat()
+                            let codes = vec![1; packets::filters(&body).len()];
+                            let answer = packets::subscribed(&body, &codes);
+                            [&[0x90, u8::try_from(answer.len()).unwrap()][..], &answer].concat()
                         }
                         3 if body.windows(wanted.len()).any(|part| part == wanted.as_bytes()) => {
                             let _ = sender.send(body);
@@ -75,24 +72,6 @@ fn first_packet(listener: &std::net::TcpListener, wanted: &'static str) -> std::
         }
         found.recv_timeout(std::time::Duration::from_secs(60)).unwrap()
     })
-}
-
-/// The next packet of MQTT: its first byte and its body.
-fn packet(stream: &mut impl std::io::Read) -> Option<(u8, Vec<u8>)> {
-    let mut byte = [0];
-    stream.read_exact(&mut byte).ok()?;
-    let (kind, mut length, mut shift) = (byte[0], 0, 0);
-    loop {
-        stream.read_exact(&mut byte).ok()?;
-        length |= usize::from(byte[0] & 0x7F) << shift;
-        shift += 7;
-        if byte[0] & 0x80 == 0 {
-            break;
-        }
-    }
-    let mut body = vec![0; length];
-    stream.read_exact(&mut body).ok()?;
-    Some((kind, body))
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -291,11 +291,7 @@ mod tests {
     #[test]
     fn an_ascii_exchange_by_hand() {
         let format = LineFormat::new(9600, "7E1").unwrap();
-        let pdu = RequestPdu::Read {
-            table: Table::Holding,
-            start: 0x20,
-            count: 16,
-        };
+        let pdu = RequestPdu::read(Table::Holding, 0x20, 16);
         let time = WireTime::of(Protocol::ModbusAscii, &format, &pdu);
         let us = |time: Duration| time.as_micros();
         assert_eq!(
@@ -440,11 +436,7 @@ mod tests {
         // by 3.5 characters of silence: 87.4 and 241.2 reads a second.
         for (baud, rate) in [(38_400, 87.4), (115_200, 241.2)] {
             let format = LineFormat::new(baud, "8N1").unwrap();
-            let pdu = RequestPdu::Read {
-                table: Table::Holding,
-                start: 2100,
-                count: 11,
-            };
+            let pdu = RequestPdu::read(Table::Holding, 2100, 11);
             let time = WireTime::of(Protocol::ModbusRtu, &format, &pdu);
             let total = time
                 .total(Duration::from_micros(500), format.silence_chars())

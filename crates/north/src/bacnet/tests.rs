@@ -2,20 +2,16 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use drivegate_bacnet::{Application as _, Data, Datum, Error, Job, ObjectId, ObjectType, PropertyId, Reliability};
-use drivegate_testkit::next_command;
+use drivegate_testkit::{STALE_AFTER, bus, bus_spec, controlled, image, profile, read_all, take_next};
 
 use super::view::View;
 use super::writes::{Begun, Waiting};
 use super::*;
-use crate::codec::{LineFormat, Protocol, Reply, Table};
-use crate::command::{
-    Authority, CommandQueue, Commanded, Follows, Order, Origin, Outcome, Refusal, Settled, SlotWrite, SourceKind,
-    Urgency,
-};
-use crate::drive::profile::Profiles;
+use crate::codec::{Reply, Table};
+use crate::command::{Authority, Commanded, Follows, Order, Origin, Outcome, Refusal, Settled, SlotWrite, SourceKind};
 use crate::drive::{ModelPoint, PointIndex, Value};
-use crate::plant::{BusHandle, DriveHandle, Plant};
-use crate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link};
+use crate::plant::{DriveHandle, Plant};
+use crate::process_image::{DriveSpec, Link};
 
 mod objects;
 mod orders;
@@ -25,24 +21,11 @@ const SPEED: ObjectId = ObjectId::new(ObjectType::ANALOG_VALUE, 1);
 const FREQUENCY: ObjectId = ObjectId::new(ObjectType::ANALOG_VALUE, 2);
 const DEVICE: u32 = 101;
 
-fn bus_spec() -> BusSpec {
-    BusSpec {
-        name: "line1".to_string(),
-        port: "/dev/null".to_string(),
-        protocol: Protocol::ModbusRtu,
-        format: LineFormat::new(38_400, "8N1").unwrap(),
-        cycle: Duration::from_millis(10),
-        slow_cycle: Duration::from_secs(1),
-    }
-}
-
-fn spec(profile: &str) -> DriveSpec {
-    let profile = Profiles::built_in().get(profile).unwrap().clone();
+fn spec(name: &str) -> DriveSpec {
     DriveSpec {
-        access: Access::Control,
         limits: [("speed_reference".to_string(), 0.0..=80.0)].into(),
         frequency_range: Some(0.0..=50.0),
-        ..DriveSpec::new("p1", "line1", 1, profile)
+        ..controlled("p1", "line1", 1, &profile(name))
     }
 }
 
@@ -66,27 +49,23 @@ fn options() -> Options {
 }
 
 /// A controlled Vacon NX that answers, and clients.
-struct Bench {
+struct ControlledDrive {
     view: View,
     now: Instant,
 }
 
-impl Bench {
-    fn new() -> Bench {
-        let image = Arc::new(DriveImage::new(spec("vacon-nx"), Duration::from_secs(1)));
-        let bus = Arc::new(BusImage::new(bus_spec(), vec![image]));
-        bus.update_health(|health| (health.up, health.tried) = (true, true));
-        let handle = BusHandle {
-            image: bus,
-            queue: Arc::new(CommandQueue::new().unwrap()),
-        };
-        let plant = Plant::new("hall", Duration::from_secs(1), vec![handle]);
-        let bench = Bench {
+impl ControlledDrive {
+    fn new() -> ControlledDrive {
+        let bus = bus(bus_spec("line1"), vec![image(spec("vacon-nx"))]);
+        bus.image
+            .update_health(|health| (health.up, health.tried) = (true, true));
+        let plant = Plant::new("hall", STALE_AFTER, vec![bus]);
+        let rig = ControlledDrive {
             view: View::new(Arc::new(plant), Arc::new(options())),
             now: Instant::now(),
         };
-        bench.read(0);
-        bench
+        rig.read(0);
+        rig
     }
 
     fn drive(&self) -> DriveHandle {
@@ -95,14 +74,7 @@ impl Bench {
 
     /// Everything that is planned was read just now, each register that value.
     fn read(&self, word: u16) {
-        let drive = self.drive();
-        drive.image.update(|snapshot| {
-            snapshot.link = Link::Online(std::time::SystemTime::now());
-            snapshot.fast_at = Some(self.now);
-            for read in &drive.image.plan.reads {
-                snapshot.store(read.table, read.start, &vec![word; usize::from(read.count)], self.now);
-            }
-        });
+        read_all(&self.drive().image, self.now, |_| word);
         self.view.look(self.now);
     }
 
@@ -163,7 +135,7 @@ impl Bench {
     /// The bus takes the next order, which ends so.
     fn carry_out(&self, outcome: Outcome) -> String {
         let drive = self.drive();
-        let command = next_command(&mut drive.bus.queue.lock(), Urgency::Read, self.now).expect("an order");
+        let command = take_next(&drive.bus.queue, self.now).expect("an order");
         let Order::Points(values) = &command.order else {
             panic!("{:?}", command.order)
         };

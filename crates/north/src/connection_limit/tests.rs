@@ -6,16 +6,16 @@ fn host(n: u8) -> IpAddr {
     IpAddr::from([10, 0, 0, n])
 }
 
-/// Places as a test opens and closes them.
-struct Bench {
+/// LimitedPlaces as a test opens and closes them.
+struct LimitedPlaces {
     limit: Arc<ConnectionLimit>,
     cancel: CancellationToken,
     now: Instant,
 }
 
-impl Bench {
-    fn new(limits: Limits) -> Bench {
-        Bench {
+impl LimitedPlaces {
+    fn new(limits: Limits) -> LimitedPlaces {
+        LimitedPlaces {
             limit: ConnectionLimit::new(limits),
             cancel: CancellationToken::new(),
             now: Instant::now(),
@@ -61,17 +61,17 @@ fn is_displaced(permit: &ConnectionPermit) -> bool {
 
 #[test]
 fn an_address_keeps_what_it_uses_and_yields_what_it_does_not() {
-    let mut bench = Bench::new(Limits::new(8, 2));
-    let (first, _) = bench.reader(1).unwrap();
-    let (second, _) = bench.reader(1).unwrap();
-    bench.in_use(&first);
-    let (third, displaced) = bench.reader(1).unwrap();
+    let mut rig = LimitedPlaces::new(Limits::new(8, 2));
+    let (first, _) = rig.reader(1).unwrap();
+    let (second, _) = rig.reader(1).unwrap();
+    rig.in_use(&first);
+    let (third, displaced) = rig.reader(1).unwrap();
     assert_eq!(displaced, Some(host(1)));
     assert!(is_displaced(&second) && !is_displaced(&first), "the silent one yields");
-    bench.in_use(&third);
+    rig.in_use(&third);
     let full = NoPlace::Limit(LimitReached::Address(2));
-    assert_eq!(bench.reader(1).unwrap_err(), full);
-    let (_operator, displaced) = bench.operator(1).unwrap();
+    assert_eq!(rig.reader(1).unwrap_err(), full);
+    let (_operator, displaced) = rig.operator(1).unwrap();
     assert_eq!(
         displaced,
         Some(host(1)),
@@ -82,16 +82,15 @@ fn an_address_keeps_what_it_uses_and_yields_what_it_does_not() {
 
 #[test]
 fn of_those_that_came_in_one_millisecond_the_first_yields() {
-    let bench = Bench::new(Limits::new(8, 8));
+    let rig = LimitedPlaces::new(Limits::new(8, 8));
     let newcomer = Newcomer {
         address: host(1),
         listener: 0,
-        cancel: &bench.cancel,
+        cancel: &rig.cancel,
     };
     let connect = |_| {
-        bench
-            .limit
-            .acquire(newcomer, bench.now, || Some(Authority::Write))
+        rig.limit
+            .acquire(newcomer, rig.now, || Some(Authority::Write))
             .unwrap()
             .0
     };
@@ -102,43 +101,43 @@ fn of_those_that_came_in_one_millisecond_the_first_yields() {
 
 #[test]
 fn the_longest_idle_connection_of_the_largest_holder_yields() {
-    let mut bench = Bench::new(Limits::new(4, 3));
-    let permits: Vec<_> = [1, 1, 1, 2].map(|n| bench.reader(n).unwrap().0).into();
+    let mut rig = LimitedPlaces::new(Limits::new(4, 3));
+    let permits: Vec<_> = [1, 1, 1, 2].map(|n| rig.reader(n).unwrap().0).into();
     for permit in [&permits[0], &permits[2], &permits[1], &permits[3]] {
-        bench.in_use(permit);
+        rig.in_use(permit);
     }
-    bench.in_use(&permits[0]);
-    let (newcomer, displaced) = bench.reader(3).unwrap();
+    rig.in_use(&permits[0]);
+    let (newcomer, displaced) = rig.reader(3).unwrap();
     assert_eq!(displaced, Some(host(1)));
     assert!(is_displaced(&permits[2]), "its third was used before the others");
-    bench.in_use(&newcomer);
+    rig.in_use(&newcomer);
     assert_eq!(
-        bench.reader(1).unwrap_err(),
+        rig.reader(1).unwrap_err(),
         NoPlace::Limit(LimitReached::Total(4)),
         "nobody has more than it"
     );
     drop(newcomer);
-    assert_eq!(bench.reader(3).unwrap().1, None, "the place is free again");
+    assert_eq!(rig.reader(3).unwrap().1, None, "the place is free again");
 }
 
 #[test]
 fn operators_have_places_and_keep_them() {
-    let mut bench = Bench::new(Limits::new(16, 16).with_reserve());
+    let mut rig = LimitedPlaces::new(Limits::new(16, 16).with_reserve());
     let mut readers = Vec::new();
     for n in 0..100 {
-        readers.extend(bench.reader(n).ok());
+        readers.extend(rig.reader(n).ok());
     }
-    let (operator, displaced) = bench.operator(200).unwrap();
+    let (operator, displaced) = rig.operator(200).unwrap();
     assert_eq!(displaced, None, "two of sixteen places are reserved");
-    let (other, displaced) = bench.operator(201).unwrap();
+    let (other, displaced) = rig.operator(201).unwrap();
     assert_eq!(displaced, None);
     for n in 0..=255 {
-        readers.extend(bench.reader(n).ok());
+        readers.extend(rig.reader(n).ok());
     }
     assert!(!is_displaced(&operator) && !is_displaced(&other));
     // Displaced connections are closed before more are displaced.
     readers.retain(|(permit, _)| !is_displaced(permit));
-    let (_third, displaced) = bench.operator(202).unwrap();
+    let (_third, displaced) = rig.operator(202).unwrap();
     assert!(displaced.is_some(), "a reader yields to an operator beyond the reserve");
 }
 
@@ -146,28 +145,27 @@ fn operators_have_places_and_keep_them() {
 fn closing_connections_are_bounded() {
     for total in [1, MAX_CLOSING + 8] {
         let limits = Limits::new(total, 1);
-        let mut bench = Bench::new(limits);
+        let mut rig = LimitedPlaces::new(limits);
         let mut permits = Vec::new();
         for n in 0..limits.files() as u8 {
-            permits.push(bench.reader(n).unwrap());
+            permits.push(rig.reader(n).unwrap());
         }
         let full = NoPlace::Limit(LimitReached::Total(total));
-        assert_eq!(bench.reader(200).unwrap_err(), full);
+        assert_eq!(rig.reader(200).unwrap_err(), full);
         permits.remove(0);
-        assert!(bench.reader(200).is_ok(), "one of them has closed");
+        assert!(rig.reader(200).is_ok(), "one of them has closed");
     }
 }
 
 #[test]
 fn a_review_changes_rights_and_closes() {
-    let mut bench = Bench::new(Limits::new(4, 4));
-    let (stays, _) = bench.operator(1).unwrap();
-    let (goes, _) = bench.operator(2).unwrap();
+    let mut rig = LimitedPlaces::new(Limits::new(4, 4));
+    let (stays, _) = rig.operator(1).unwrap();
+    let (goes, _) = rig.operator(2).unwrap();
     let rights = stays.place().rights().clone();
-    bench.limit.review(1, |_| None);
+    rig.limit.review(1, |_| None);
     assert_eq!(rights.authority(), Authority::Write, "of another listener");
-    bench
-        .limit
+    rig.limit
         .review(0, |place| (place.address() == host(1)).then_some(Authority::ReadOnly));
     assert_eq!(rights.authority(), Authority::ReadOnly);
     assert!(!stays.place().closing().is_cancelled());
@@ -175,9 +173,9 @@ fn a_review_changes_rights_and_closes() {
     let newcomer = Newcomer {
         address: host(3),
         listener: 0,
-        cancel: &bench.cancel,
+        cancel: &rig.cancel,
     };
-    let refused = bench.limit.acquire(newcomer, bench.now, || None).unwrap_err();
+    let refused = rig.limit.acquire(newcomer, rig.now, || None).unwrap_err();
     assert_eq!(refused, NoPlace::NotAllowed);
 }
 
@@ -197,7 +195,7 @@ proptest! {
     /// Whoever comes and goes in whatever order, no limit is exceeded, and nobody yields who must not.
     #[test]
     fn limits_hold_and_operators_stay(limits in limits(), newcomers in prop::collection::vec(newcomer(), 1..200)) {
-        let mut bench = Bench::new(limits);
+        let mut rig = LimitedPlaces::new(limits);
         let mut permits: Vec<(ConnectionPermit, Authority)> = Vec::new();
         for (n, writes, then) in newcomers {
             let authority = if writes { Authority::Write } else { Authority::ReadOnly };
@@ -211,7 +209,7 @@ proptest! {
                 *held.entry(permit.place().address()).or_default() += 1;
                 held
             });
-            match bench.connect(host(n), authority) {
+            match rig.connect(host(n), authority) {
                 Ok((permit, displaced)) => {
                     let gone = permits.iter().position(|(permit, _)| is_displaced(permit));
                     prop_assert_eq!(displaced.is_some(), gone.is_some());
@@ -224,7 +222,7 @@ proptest! {
                         prop_assert!(!writes || operators >= limits.reserved || own >= limits.per_address);
                     }
                     if then == 1 {
-                        bench.in_use(&permit);
+                        rig.in_use(&permit);
                     }
                     permits.push((permit, authority));
                 }
@@ -249,12 +247,12 @@ proptest! {
         limits in limits().prop_filter("one place for an operator", |l| l.reserved > 0),
         silent in prop::collection::vec(1..=255_u8, 0..300),
     ) {
-        let mut bench = Bench::new(limits);
+        let mut rig = LimitedPlaces::new(limits);
         let mut permits = Vec::new();
         for n in silent {
-            permits.extend(bench.reader(n).ok());
+            permits.extend(rig.reader(n).ok());
             permits.retain(|(permit, _)| !is_displaced(permit));
-            let (_operator, displaced) = bench.operator(0).unwrap();
+            let (_operator, displaced) = rig.operator(0).unwrap();
             prop_assert_eq!(displaced, None);
         }
     }

@@ -49,21 +49,21 @@ impl ConnectionHandler for Recorder {
     }
 }
 
-struct Bench {
+struct OnePlaceServer {
     events: mpsc::UnboundedReceiver<&'static str>,
     handler: Arc<Recorder>,
     stats: Arc<NorthState>,
     stop: CancellationToken,
 }
 
-impl Bench {
-    fn new() -> Bench {
+impl OnePlaceServer {
+    fn new() -> OnePlaceServer {
         let (sender, events) = mpsc::unbounded_channel();
         let handler = Arc::new(Recorder {
             events: sender,
             taken: Mutex::default(),
         });
-        Bench {
+        OnePlaceServer {
             events,
             handler,
             stats: Arc::default(),
@@ -100,7 +100,7 @@ impl Bench {
 async fn accept_errors_do_not_end_a_server() {
     let socket = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = socket.local_addr().unwrap();
-    let mut bench = Bench::new();
+    let mut rig = OnePlaceServer::new();
     let errors = [
         io::ErrorKind::Other,
         io::ErrorKind::ConnectionAborted,
@@ -108,22 +108,22 @@ async fn accept_errors_do_not_end_a_server() {
     ];
     let socket = Failing(errors.map(io::Error::from).into(), socket);
     let never = || -> io::Result<Failing> { panic!("the socket is not lost") };
-    let server = tokio::spawn(bench.accept_loop(address).run(Some(socket), never));
+    let server = tokio::spawn(rig.accept_loop(address).run(Some(socket), never));
     let first = TcpStream::connect(address).await.unwrap();
-    assert_eq!(bench.next().await, "served");
+    assert_eq!(rig.next().await, "served");
     let _second = TcpStream::connect(address).await.unwrap();
-    assert_eq!(bench.next().await, "refused");
+    assert_eq!(rig.next().await, "refused");
     drop(first);
-    assert_eq!(bench.next().await, "ended");
+    assert_eq!(rig.next().await, "ended");
     let _third = TcpStream::connect(address).await.unwrap();
-    assert_eq!(bench.next().await, "served", "the place is free again");
-    bench.stop.cancel();
+    assert_eq!(rig.next().await, "served", "the place is free again");
+    rig.stop.cancel();
     server.await.unwrap();
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_lost_socket_is_bound_again_and_reported_meanwhile() {
-    let mut bench = Bench::new();
+    let mut rig = OnePlaceServer::new();
     let [first, second] = [(); 2].map(|()| bind("127.0.0.1:0".parse().unwrap()).unwrap());
     let address = second.local_addr().unwrap();
     let lost = io::Error::from_raw_os_error(rustix::io::Errno::INVAL.raw_os_error());
@@ -131,7 +131,7 @@ async fn a_lost_socket_is_bound_again_and_reported_meanwhile() {
     let taken = || Err(io::Error::from(io::ErrorKind::AddrInUse));
     let second = Failing(Vec::new(), TcpListener::from_std(second).unwrap());
     let attempts = Mutex::new(VecDeque::from([taken(), taken(), Ok(second)]));
-    let stats = bench.stats.clone();
+    let stats = rig.stats.clone();
     let seen = Arc::new(Mutex::new(Vec::new()));
     let rebind = {
         let (stats, seen) = (stats.clone(), seen.clone());
@@ -140,9 +140,9 @@ async fn a_lost_socket_is_bound_again_and_reported_meanwhile() {
             attempts.lock().unwrap().pop_front().unwrap()
         }
     };
-    let server = tokio::spawn(bench.accept_loop(address).run(Some(first), rebind));
+    let server = tokio::spawn(rig.accept_loop(address).run(Some(first), rebind));
     let _client = TcpStream::connect(address).await.unwrap();
-    assert_eq!(bench.next().await, "served");
+    assert_eq!(rig.next().await, "served");
     assert_eq!(stats.listeners.reasons(), Vec::<String>::new());
     let seen = std::mem::take(&mut *seen.lock().unwrap());
     assert_eq!(seen.len(), 3, "{seen:?}");
@@ -151,24 +151,24 @@ async fn a_lost_socket_is_bound_again_and_reported_meanwhile() {
         "{seen:?}"
     );
     assert!(seen[2].contains("in use"), "{seen:?}");
-    bench.stop.cancel();
+    rig.stop.cancel();
     server.await.unwrap();
 }
 
 /// A server that starts: it has the listeners that there can be, and the others when their addresses come.
 #[tokio::test]
 async fn an_address_that_is_not_there_yet_is_tried_again_and_an_error_in_a_reload() {
-    let mut bench = Bench::new();
-    let (mut listeners, handler) = (bench.listeners(), bench.handler.clone());
+    let mut rig = OnePlaceServer::new();
+    let (mut listeners, handler) = (rig.listeners(), rig.handler.clone());
     let (here, nowhere) = (free_address(), SocketAddr::from(([203, 0, 113, 1], 7999)));
-    let states = bench.stats.listeners.clone();
+    let states = rig.stats.listeners.clone();
     reload(&mut listeners, &handler, &[nowhere, here]).await.unwrap();
     assert_eq!(listeners.addresses(false), [nowhere, here]);
     let reason = format!("HTTP does not listen on {nowhere}: Cannot assign requested address (os error 99); retrying");
     assert_eq!(states.reasons(), [reason]);
     assert_eq!(states.up(), [(ServerKind::Http, false)]);
     let _client = TcpStream::connect(here).await.unwrap();
-    assert_eq!(bench.next().await, "served", "the other listener serves");
+    assert_eq!(rig.next().await, "served", "the other listener serves");
     let elsewhere = SocketAddr::from(([203, 0, 113, 2], 7999));
     let refused = reload(&mut listeners, &handler, &[nowhere, elsewhere]).await;
     assert!(refused.unwrap_err().to_string().contains("does not have that address"));
@@ -178,27 +178,27 @@ async fn an_address_that_is_not_there_yet_is_tried_again_and_an_error_in_a_reloa
         tokio::task::yield_now().await;
     }
     assert_eq!(states.up(), [(ServerKind::Http, true)]);
-    bench.stop.cancel();
+    rig.stop.cancel();
 }
 
 #[tokio::test(start_paused = true)]
 async fn an_address_that_comes_is_listened_on() {
-    let mut bench = Bench::new();
+    let mut rig = OnePlaceServer::new();
     let socket = bind("127.0.0.1:0".parse().unwrap()).unwrap();
     let address = socket.local_addr().unwrap();
     let not_yet = || Err(io::Error::from(io::ErrorKind::AddrNotAvailable));
     let come = Failing(Vec::new(), TcpListener::from_std(socket).unwrap());
     let attempts = Mutex::new(VecDeque::from([not_yet(), not_yet(), Ok(come)]));
-    let server = bench.accept_loop(address);
+    let server = rig.accept_loop(address);
     let server = tokio::spawn(server.run(None, move || attempts.lock().unwrap().pop_front().unwrap()));
-    let states = bench.stats.listeners.clone();
+    let states = rig.stats.listeners.clone();
     while states.up() == [(ServerKind::Http, true)] {
         tokio::task::yield_now().await;
     }
     let _client = TcpStream::connect(address).await.unwrap();
-    assert_eq!(bench.next().await, "served");
+    assert_eq!(rig.next().await, "served");
     assert_eq!(states.up(), [(ServerKind::Http, true)]);
-    bench.stop.cancel();
+    rig.stop.cancel();
     server.await.unwrap();
     assert_eq!(states.up(), [], "a server that ended has no listener");
 }
@@ -237,30 +237,30 @@ fn free_address() -> SocketAddr {
 
 #[tokio::test]
 async fn sockets_stay_while_they_are_wanted() {
-    let mut bench = Bench::new();
-    let (mut listeners, handler) = (bench.listeners(), bench.handler.clone());
+    let mut rig = OnePlaceServer::new();
+    let (mut listeners, handler) = (rig.listeners(), rig.handler.clone());
     let [stays, goes, comes] = [(); 3].map(|()| free_address());
     reload(&mut listeners, &handler, &[stays, goes]).await.unwrap();
     let client = TcpStream::connect(stays).await.unwrap();
-    assert_eq!(bench.next().await, "served");
+    assert_eq!(rig.next().await, "served");
     reload(&mut listeners, &handler, &[comes, stays]).await.unwrap();
     assert_eq!(listeners.addresses(false), [comes, stays]);
     let _refused = TcpStream::connect(comes).await.unwrap();
-    assert_eq!(bench.next().await, "refused", "the first client is still there");
+    assert_eq!(rig.next().await, "refused", "the first client is still there");
     until_closed(goes).await;
     let taken = std::net::TcpListener::bind(goes).unwrap();
     let error = reload(&mut listeners, &handler, &[stays, goes]).await.unwrap_err();
     assert!(error.to_string().contains("Address already in use"), "{error}");
     assert_eq!(listeners.addresses(false), [comes, stays], "nothing has changed");
     drop((taken, client));
-    assert_eq!(bench.next().await, "ended");
-    bench.stop.cancel();
+    assert_eq!(rig.next().await, "ended");
+    rig.stop.cancel();
 }
 
 #[tokio::test]
 async fn a_socket_that_overlaps_a_new_one_is_closed_for_it_or_comes_back() {
-    let bench = Bench::new();
-    let (mut listeners, handler) = (bench.listeners(), bench.handler.clone());
+    let rig = OnePlaceServer::new();
+    let (mut listeners, handler) = (rig.listeners(), rig.handler.clone());
     let narrow = free_address();
     let wide = SocketAddr::new([0, 0, 0, 0].into(), narrow.port());
     reload(&mut listeners, &handler, &[narrow]).await.unwrap();
@@ -274,14 +274,14 @@ async fn a_socket_that_overlaps_a_new_one_is_closed_for_it_or_comes_back() {
     reload(&mut listeners, &handler, &refused).await.unwrap_err();
     assert_eq!(listeners.addresses(false), [narrow]);
     TcpStream::connect(narrow).await.unwrap();
-    bench.stop.cancel();
+    rig.stop.cancel();
 }
 
 /// A process that was forked has all sockets until it executes its program, as this test has copies of them.
 #[tokio::test]
 async fn an_address_is_free_as_soon_as_its_listener_is_closed() {
-    let bench = Bench::new();
-    let (mut listeners, handler) = (bench.listeners(), bench.handler.clone());
+    let rig = OnePlaceServer::new();
+    let (mut listeners, handler) = (rig.listeners(), rig.handler.clone());
     let [address, other] = [(); 2].map(|()| free_address());
     let mut copies = Vec::new();
     for tls in [false, true, false] {
@@ -299,7 +299,7 @@ async fn an_address_is_free_as_soon_as_its_listener_is_closed() {
     copies.extend(new.wanted[1].1.bound().map(|socket| socket.try_clone().unwrap()));
     listeners.abort(new);
     bind(other).unwrap();
-    bench.stop.cancel();
+    rig.stop.cancel();
 }
 
 async fn until_closed(address: SocketAddr) {

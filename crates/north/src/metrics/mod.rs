@@ -176,36 +176,20 @@ mod tests {
     use std::sync::Arc;
     use std::time::Duration;
 
+    use drivegate_testkit::{STALE_AFTER, bus, bus_spec, image, monitored, nx};
+
     use super::*;
-    use crate::codec::{LineFormat, Protocol};
-    use crate::command::CommandQueue;
-    use crate::drive::profile::Profiles;
-    use crate::plant::BusHandle;
-    use crate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, LeaseAction, Supervision};
+    use crate::process_image::{DriveImage, DriveSpec, LeaseAction, Supervision};
 
     fn drive(name: &str, supervision: Option<Supervision>) -> Arc<DriveImage> {
-        let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
-        let spec = DriveSpec {
+        image(DriveSpec {
             supervision,
-            ..DriveSpec::new(name, "line1", 1, nx)
-        };
-        Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
+            ..monitored(name, "line1", 1, &nx())
+        })
     }
 
     fn plant(drives: Vec<Arc<DriveImage>>) -> Plant {
-        let spec = BusSpec {
-            name: "line1".to_string(),
-            port: "/dev/ttyUSB0".to_string(),
-            protocol: Protocol::ModbusRtu,
-            format: LineFormat::new(38_400, "8N1").unwrap(),
-            cycle: Duration::from_millis(10),
-            slow_cycle: Duration::from_secs(1),
-        };
-        let bus = BusHandle {
-            image: Arc::new(BusImage::new(spec, drives)),
-            queue: Arc::new(CommandQueue::new().unwrap()),
-        };
-        Plant::new("pump-house", Duration::from_secs(1), vec![bus])
+        Plant::new("pump-house", STALE_AFTER, vec![bus(bus_spec("line1"), drives)])
     }
 
     #[test]

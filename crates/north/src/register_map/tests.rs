@@ -1,24 +1,18 @@
 use std::time::{Duration, Instant, SystemTime};
 
+use drivegate_testkit::{STALE_AFTER, controlled, profile};
+
 use super::*;
 use crate::codec::Table;
-use crate::drive::profile::Profiles;
 use crate::drive::{PointIndex, Profile};
-use crate::process_image::{Access, DriveImage, DriveSpec, Link, Snapshot};
-
-const STALE_AFTER: Duration = Duration::from_secs(1);
+use crate::process_image::{DriveImage, Link, Snapshot};
 
 fn nx() -> Profile {
-    Profile::clone(Profiles::built_in().get("vacon-nx").unwrap())
+    Profile::clone(&profile("vacon-nx"))
 }
 
 fn image(profile: Profile) -> DriveImage {
-    let spec = DriveSpec {
-        access: Access::Control,
-        turnaround: Duration::from_millis(2),
-        ..DriveSpec::new("pump-1", "line1", 1, profile.into())
-    };
-    DriveImage::new(spec, Duration::from_secs(1))
+    DriveImage::new(controlled("pump-1", "line1", 1, &profile.into()), STALE_AFTER)
 }
 
 /// A drive that runs at half speed, all classes read at `now`.
@@ -200,7 +194,7 @@ fn states_and_status_bits() {
 #[test]
 fn bits_that_are_not_known() {
     let now = Instant::now();
-    let cx = Profile::clone(Profiles::built_in().get("vacon-cx").unwrap());
+    let cx = Profile::clone(&profile("vacon-cx"));
     let image = image(cx);
     image.update(|s| {
         (s.link, s.fast_at) = (Link::Online(SystemTime::now()), Some(now));

@@ -105,7 +105,7 @@ mod tests {
 
     fn read(start: u16, count: u16) -> RequestPdu {
         let table = Table::Holding;
-        RequestPdu::Read { table, start, count }
+        RequestPdu::read(table, start, count)
     }
 
     fn asks(address: u8, start: u16, count: u16) -> Said {
@@ -201,11 +201,7 @@ mod tests {
 
         let mut framing = self::framing(Protocol::N2);
         framing.add(b">0111020388\r\n", now);
-        let input = RequestPdu::Read {
-            table: Table::Input,
-            start: 2,
-            count: 2,
-        };
+        let input = RequestPdu::read(Table::Input, 2, 2);
         let said = all(&mut framing, now);
         assert!(
             matches!(&said[..], [Said::Request(ToolRequest { address: 1, meaning: Meaning::Read(pdu), .. })] if *pdu == input),

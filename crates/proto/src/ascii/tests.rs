@@ -13,28 +13,15 @@ fn to(address: u8, pdu: RequestPdu) -> Request {
 }
 
 fn read(start: u16, count: u16) -> Request {
-    to(
-        1,
-        RequestPdu::Read {
-            table: Table::Holding,
-            start,
-            count,
-        },
-    )
+    to(1, RequestPdu::read(Table::Holding, start, count))
 }
 
 fn set(address: u16, value: u16) -> Request {
-    to(1, RequestPdu::WriteRegister { address, value })
+    to(1, RequestPdu::write_register(address, value))
 }
 
 fn write(start: u16, values: &[u16]) -> Request {
-    to(
-        1,
-        RequestPdu::WriteRegisters {
-            start,
-            values: values.to_vec(),
-        },
-    )
+    to(1, RequestPdu::write_registers(start, values))
 }
 
 fn loop_test() -> Request {
@@ -68,15 +55,8 @@ fn replied(request: &Request, reply: &Reply) -> Vec<u8> {
 /// Worked requests of reference/drives.md 7.3 and 7.4.
 #[test]
 fn requests_of_the_reference() {
-    let broadcast = |address, value| to(0, RequestPdu::WriteRegister { address, value });
-    let input = to(
-        1,
-        RequestPdu::Read {
-            table: Table::Input,
-            start: 0x20,
-            count: 1,
-        },
-    );
+    let broadcast = |address, value| to(0, RequestPdu::write_register(address, value));
+    let input = to(1, RequestPdu::read(Table::Input, 0x20, 1));
     for (request, text) in [
         (loop_test(), ":01080000AA55F8"),
         (read(2, 1), ":010300020001F9"),
@@ -110,14 +90,7 @@ fn requests_of_the_reference() {
 /// Worked replies of reference/drives.md 7.3 and 7.4.
 fn replies() -> Vec<(Request, &'static str, Reply)> {
     let refused = |code| Reply::Exception(Exception(code));
-    let input = to(
-        1,
-        RequestPdu::Read {
-            table: Table::Input,
-            start: 0x20,
-            count: 1,
-        },
-    );
+    let input = to(1, RequestPdu::read(Table::Input, 0x20, 1));
     vec![
         (loop_test(), ":01080000AA55F8", Reply::Diagnostics(0xAA55)),
         (read(2, 1), ":010302177073", Reply::Registers(vec![6000])),

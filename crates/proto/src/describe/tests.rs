@@ -81,11 +81,7 @@ fn the_other_requests() {
             "device identification: code 1 from object 0",
         ),
         (
-            RequestPdu::Read {
-                table: Table::Holding,
-                start: u16::MAX,
-                count: 2,
-            },
+            RequestPdu::read(Table::Holding, u16::MAX, 2),
             "read holding 65535..65536",
         ),
     ] {
@@ -299,10 +295,7 @@ proptest! {
 #[test]
 fn n2_in_the_words_of_its_objects() {
     let read = |table, start, count| RequestPdu::Read { table, start, count };
-    let ao = RequestPdu::WriteRegisters {
-        start: 0,
-        values: vec![0x4248, 0],
-    };
+    let ao = RequestPdu::write_registers(0, &[0x4248, 0]);
     let bo = RequestPdu::WriteCoil { address: 0, on: true };
     let (table, address) = (Table::Holding, 0);
     let cases = [

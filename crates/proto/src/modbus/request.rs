@@ -85,6 +85,24 @@ pub enum RequestPdu {
 }
 
 impl RequestPdu {
+    /// Functions 1 to 4: `count` items of a table from PDU address `start`.
+    pub const fn read(table: Table, start: u16, count: u16) -> RequestPdu {
+        RequestPdu::Read { table, start, count }
+    }
+
+    /// Function 6: one holding register.
+    pub const fn write_register(address: u16, value: u16) -> RequestPdu {
+        RequestPdu::WriteRegister { address, value }
+    }
+
+    /// Function 16: holding registers from PDU address `start`.
+    pub fn write_registers(start: u16, values: &[u16]) -> RequestPdu {
+        RequestPdu::WriteRegisters {
+            start,
+            values: values.to_vec(),
+        }
+    }
+
     /// The function code; 0, which is none, for what is not of Modbus.
     pub fn function(&self) -> u8 {
         match self {

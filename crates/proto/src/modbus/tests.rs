@@ -41,11 +41,7 @@ fn refused_requests() {
 
 #[test]
 fn a_refusal_with_00_is_the_lines_and_no_answer() {
-    let read = RequestPdu::Read {
-        table: Table::Holding,
-        start: 0x20,
-        count: 1,
-    };
+    let read = RequestPdu::read(Table::Holding, 0x20, 1);
     assert_eq!(Reply::decode(&read, &[0x83, 0]), Err(Misfit));
     assert_eq!(Reply::decode(&read, &[0x83, 1]), Ok(Reply::Exception(Exception(1))));
 }

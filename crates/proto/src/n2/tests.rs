@@ -90,7 +90,7 @@ fn asked(pdu: RequestPdu) -> Request {
 }
 
 fn reading(table: Table, start: u16, count: u16) -> Request {
-    asked(RequestPdu::Read { table, start, count })
+    asked(RequestPdu::read(table, start, count))
 }
 
 fn answered(request: &Request, text: &str) -> Decoded {
@@ -148,10 +148,7 @@ fn requests_of_the_master() {
     assert_eq!(read(Table::Input, 2, 2), ">0111020388\r");
     assert_eq!(read(Table::DiscreteInput, 1, 1), ">0112020288\r");
     assert_eq!(read(Table::Input, 0x4000, 1), ">011601028B\r");
-    let ao = RequestPdu::WriteRegisters {
-        start: 0,
-        values: vec![0x4248, 0],
-    };
+    let ao = RequestPdu::write_registers(0, &[0x4248, 0]);
     assert_eq!(frame(ao.clone()), ">017203014248000020\r");
     let mut out = Vec::new();
     let narrow = Request {
@@ -182,7 +179,7 @@ fn requests_of_the_master() {
     ] {
         assert_eq!(read(table, start, count), "", "{table} {start} {count}");
     }
-    assert_eq!(frame(RequestPdu::WriteRegister { address: 0, value: 1 }), "");
+    assert_eq!(frame(RequestPdu::write_register(0, 1)), "");
     assert_eq!(
         frame(RequestPdu::Diagnostics {
             subfunction: 0,

@@ -1,63 +1,34 @@
 //! Families by hand: their words from the figures of the manuals, not from their profiles.
 
+use drivegate_testkit::Order::{Single, Word};
+use drivegate_testkit::{Family, Order, families, number, orders, rows};
 use proptest::prelude::*;
 
 use super::*;
 use crate::drive::profile::Profiles;
 use crate::simulated_drive::{DriveOptions, ModelOptions, SimulatedDrive};
 
-/// What a master sends.
-#[derive(Debug, Clone, Copy)]
-enum Order {
-    /// A register by function 06.
-    Word(u16, u16),
-    /// One by function 16.
-    Single(u16, u16),
-    /// Two registers by function 16.
-    Pair(u16, u16, u16),
-    Coil(u16, bool),
-}
-
-use Order::{Coil, Pair, Single, Word};
-
-impl Order {
-    fn pdu(self) -> RequestPdu {
-        match self {
-            Word(address, value) => RequestPdu::WriteRegister { address, value },
-            Single(start, value) => RequestPdu::WriteRegisters {
-                start,
-                values: vec![value],
-            },
-            Pair(start, high, low) => RequestPdu::WriteRegisters {
-                start,
-                values: vec![high, low],
-            },
-            Coil(address, on) => RequestPdu::WriteCoil { address, on },
-        }
-    }
-}
-
-struct Bench {
+struct ProfiledDrive {
     drive: SimulatedDrive,
     trip_address: u16,
     now: SimTime,
 }
 
-impl Bench {
-    fn of(profile: &Arc<Profile>) -> Bench {
+impl ProfiledDrive {
+    fn of(profile: &Arc<Profile>) -> ProfiledDrive {
         let mut model = ModelOptions::of_profile(profile).unwrap();
         assert!(matches!(model, ModelOptions::Profile(_)), "{}", profile.name);
         model.set_trip_register(true);
         let trip_address = model.trip_address();
-        Bench {
+        ProfiledDrive {
             drive: SimulatedDrive::new(DriveOptions::new(1, model), SimTime::ZERO),
             trip_address,
             now: SimTime::ZERO,
         }
     }
 
-    fn named(name: &str) -> Bench {
-        Bench::of(Profiles::built_in().get(name).unwrap())
+    fn named(name: &str) -> ProfiledDrive {
+        ProfiledDrive::of(Profiles::built_in().get(name).unwrap())
     }
 
     fn ask(&mut self, request: &RequestPdu) -> Reply {
@@ -82,336 +53,151 @@ impl Bench {
     }
 
     fn register(&mut self, table: Table, address: u16) -> u16 {
-        let request = RequestPdu::Read {
-            table,
-            start: address,
-            count: 1,
-        };
+        let request = RequestPdu::read(table, address, 1);
         self.ask(&request)
             .into_words()
             .unwrap_or_else(|| panic!("{table:?} {address}"))[0]
     }
 }
 
+/// A family, and what its drives show.
 struct Case {
-    profile: &'static str,
-    /// Half of 50 Hz.
-    reference: &'static [Order],
-    start: &'static [Order],
-    stop: &'static [Order],
-    reverse: &'static [Order],
-    reset: &'static [Order],
-    /// Each alone, at standstill: they start nothing.
-    idle: &'static [Order],
+    family: Family,
+    reset: Vec<Order>,
     /// The status register while it runs forward: address, bits that count and what they are, from the manuals.
-    runs: (u16, u16, u16),
-    fault: (u16, u16, u16),
+    runs: [u16; 3],
+    fault: [u16; 3],
+    /// Each alone, at standstill: they start nothing.
+    idle: Vec<Order>,
 }
 
-const CASES: &[Case] = &[
-    Case {
-        profile: "abb-acs550",
-        reference: &[Word(1, 10_000)],
-        start: &[Word(0, 0x047E), Word(0, 0x047F)],
-        stop: &[Word(0, 0x047E)],
-        reverse: &[Word(1, 0xD8F0), Word(0, 0x047F)],
-        reset: &[Word(0, 0x047E), Word(0, 0x04FE), Word(0, 0x047E)],
-        idle: &[
-            Word(0, 0x047F),
-            Word(0, 0x0001),
-            Word(0, 0x0477),
-            Word(0, 0x04FF),
-            Word(0, 0x007F),
-            Word(0, 0x04FE),
-        ],
-        runs: (3, 0x000F, 0x0007),
-        fault: (3, 0x000C, 0x0008),
-    },
-    Case {
-        profile: "abb-acs580",
-        reference: &[Word(1, 10_000)],
-        start: &[Word(0, 0x047E), Word(0, 0x047F)],
-        stop: &[Word(0, 0x047E)],
-        reverse: &[Word(1, 0xD8F0), Word(0, 0x047F)],
-        reset: &[Word(0, 0x047E), Word(0, 0x04FE), Word(0, 0x047E)],
-        idle: &[Word(0, 0x047F), Word(0, 0x0001)],
-        runs: (3, 0x000F, 0x0007),
-        fault: (3, 0x000C, 0x0008),
-    },
-    Case {
-        profile: "danfoss-fc",
-        reference: &[Word(50_009, 0x2000)],
-        start: &[Word(49_999, 0x047C)],
-        stop: &[Word(49_999, 0x043C)],
-        reverse: &[Word(49_999, 0x847C)],
-        reset: &[Word(49_999, 0x043C), Word(49_999, 0x04BC), Word(49_999, 0x043C)],
-        idle: &[
-            Word(49_999, 0x007C),
-            Word(49_999, 0x0474),
-            Word(49_999, 0x045C),
-            Word(49_999, 0x046C),
-            Word(49_999, 0x04BC),
-        ],
-        runs: (50_199, 0x080B, 0x0803),
-        fault: (50_199, 0x0808, 0x0008),
-    },
-    Case {
-        profile: "siemens-v20",
-        reference: &[Word(100, 0x2000)],
-        start: &[Word(99, 0x047E), Word(99, 0x047F)],
-        stop: &[Word(99, 0x047E)],
-        reverse: &[Word(99, 0x0C7F)],
-        reset: &[Word(99, 0x047E), Word(99, 0x04FE), Word(99, 0x047E)],
-        idle: &[Word(99, 0x047F), Word(99, 0x007F), Word(99, 0x047D), Word(99, 0x047B)],
-        runs: (109, 0x000F, 0x0007),
-        fault: (109, 0x000C, 0x0008),
-    },
-    Case {
-        profile: "siemens-g120",
-        reference: &[Word(100, 0x2000)],
-        start: &[Word(99, 0x047E), Word(99, 0x047F)],
-        stop: &[Word(99, 0x047E)],
-        reverse: &[Word(100, 0xE000), Word(99, 0x047F)],
-        reset: &[Word(99, 0x047E), Word(99, 0x04FE), Word(99, 0x047E)],
-        idle: &[Word(99, 0x047F), Word(99, 0x0077)],
-        runs: (109, 0x000F, 0x0007),
-        fault: (109, 0x000C, 0x0008),
-    },
-    Case {
-        profile: "schneider-altivar",
-        reference: &[Word(8502, 250)],
-        start: &[Word(8501, 6), Word(8501, 7), Word(8501, 15)],
-        stop: &[Word(8501, 7)],
-        reverse: &[Word(8501, 0x080F)],
-        reset: &[Word(8501, 0), Word(8501, 0x80), Word(8501, 0)],
-        idle: &[
-            Word(8501, 15),
-            Word(8501, 7),
-            Word(8501, 0x80),
-            Word(8501, 6),
-            Word(8501, 3),
-        ],
-        runs: (3201, 0x006F, 0x0027),
-        fault: (3201, 0x004F, 0x0008),
-    },
-    Case {
-        profile: "yaskawa-v1000",
-        reference: &[Single(2, 2500)],
-        start: &[Single(1, 1)],
-        stop: &[Single(1, 0)],
-        reverse: &[Single(1, 2)],
-        reset: &[Single(1, 0), Single(1, 8), Single(1, 0)],
-        idle: &[Single(1, 3), Single(1, 8), Single(1, 0x10)],
-        runs: (0x4B, 0x0081, 0x0001),
-        fault: (0x4B, 0x0081, 0x0080),
-    },
-    Case {
-        profile: "delta-ms300",
-        reference: &[Word(0x2001, 2500)],
-        start: &[Word(0x2000, 0x12)],
-        stop: &[Word(0x2000, 1)],
-        reverse: &[Word(0x2000, 0x22)],
-        reset: &[Word(0x2002, 2), Word(0x2002, 0)],
-        idle: &[Word(0x2000, 0), Word(0x2000, 0x10), Word(0x2002, 2), Word(0x2000, 3)],
-        runs: (0x2101, 0x001B, 0x0003),
-        fault: (0x2100, 0x00FF, 0x0004),
-    },
-    Case {
-        profile: "invt-goodrive",
-        reference: &[Word(0x2001, 2500)],
-        start: &[Word(0x2000, 1)],
-        stop: &[Word(0x2000, 5)],
-        reverse: &[Word(0x2000, 2)],
-        reset: &[Word(0x2000, 7)],
-        idle: &[Word(0x2000, 0), Word(0x2000, 6), Word(0x2000, 7)],
-        runs: (0x2100, 0xFFFF, 1),
-        fault: (0x2102, 0xFFFF, 4),
-    },
-    Case {
-        profile: "mitsubishi-d700",
-        reference: &[Word(13, 2500)],
-        start: &[Word(8, 2)],
-        stop: &[Word(8, 0)],
-        reverse: &[Word(8, 4)],
-        reset: &[],
-        idle: &[Word(8, 6), Word(8, 1), Word(8, 8)],
-        runs: (8, 0x0081, 0x0001),
-        fault: (8, 0x0081, 0x0080),
-    },
-    Case {
-        profile: "invertek-optidrive",
-        reference: &[Word(1, 250)],
-        start: &[Word(0, 1)],
-        stop: &[Word(0, 0)],
-        reverse: &[],
-        reset: &[Word(0, 0), Word(0, 4), Word(0, 0)],
-        idle: &[Word(0, 9), Word(0, 4), Word(0, 2)],
-        runs: (5, 0x0003, 0x0001),
-        fault: (5, 0x0003, 0x0002),
-    },
-    Case {
-        profile: "weg-cfw",
-        reference: &[Word(683, 4096)],
-        start: &[Word(682, 0x17)],
-        stop: &[Word(682, 0x16)],
-        reverse: &[Word(682, 0x13)],
-        reset: &[Word(682, 0x16), Word(682, 0x96), Word(682, 0x16)],
-        idle: &[Word(682, 0x07), Word(682, 0x15), Word(682, 0x96), Word(682, 0x57)],
-        runs: (680, 0x8100, 0x0100),
-        fault: (680, 0x8100, 0x8000),
-    },
-    Case {
-        profile: "fuji-frenic",
-        reference: &[Word(0x0705, 2500)],
-        start: &[Word(0x0706, 1)],
-        stop: &[Word(0x0706, 0)],
-        reverse: &[Word(0x0706, 2)],
-        reset: &[Word(0x0706, 0), Word(0x0706, 0x8000), Word(0x0706, 0)],
-        idle: &[Word(0x0706, 3), Word(0x0706, 0x8000), Word(0x0706, 4)],
-        runs: (0x080E, 0x0809, 0x0001),
-        fault: (0x080E, 0x0800, 0x0800),
-    },
-    Case {
-        profile: "hitachi-wj200",
-        reference: &[Pair(0, 0, 2500)],
-        start: &[Coil(1, false), Coil(0, true)],
-        stop: &[Coil(0, false)],
-        reverse: &[Coil(1, true), Coil(0, true)],
-        reset: &[Coil(0, false), Coil(3, true), Coil(3, false)],
-        idle: &[Coil(1, true), Coil(3, true)],
-        runs: (0x1001, 0xFFFF, 2500),
-        fault: (0x1001, 0xFFFF, 0),
-    },
-    Case {
-        profile: "toshiba-vf-s15",
-        reference: &[Word(0xFA01, 2500)],
-        start: &[Word(0xFA00, 0xC400)],
-        stop: &[Word(0xFA00, 0xC000)],
-        reverse: &[Word(0xFA00, 0xC600)],
-        reset: &[Word(0xFA00, 0xC000), Word(0xFA00, 0xE000), Word(0xFA00, 0xC000)],
-        idle: &[Word(0xFA00, 0x0400), Word(0xFA00, 0xCC00), Word(0xFA00, 0xE000)],
-        runs: (0xFD01, 0x0602, 0x0400),
-        fault: (0xFD01, 0x0402, 0x0002),
-    },
-    Case {
-        profile: "ls-g100",
-        reference: &[Word(4, 2500)],
-        start: &[Word(5, 2)],
-        stop: &[Word(5, 1)],
-        reverse: &[Word(5, 4)],
-        reset: &[Word(5, 8)],
-        idle: &[Word(5, 0), Word(5, 6), Word(5, 8), Word(5, 0x12)],
-        runs: (13, 0x000E, 0x0002),
-        fault: (13, 0x000E, 0x0008),
-    },
-    Case {
-        profile: "teco-f510",
-        reference: &[Word(0x2502, 2500)],
-        start: &[Word(0x2501, 1)],
-        stop: &[Word(0x2501, 0)],
-        reverse: &[Word(0x2501, 3)],
-        reset: &[Word(0x2501, 0), Word(0x2501, 8), Word(0x2501, 0)],
-        idle: &[Word(0x2501, 2), Word(0x2501, 8), Word(0x2501, 0x10)],
-        runs: (0x2520, 0x000B, 0x0001),
-        fault: (0x2520, 0x0009, 0x0008),
-    },
-    Case {
-        profile: "vacon-10",
-        reference: &[Word(2002, 5000)],
-        start: &[Word(2000, 1)],
-        stop: &[Word(2000, 0)],
-        reverse: &[Word(2000, 3)],
-        reset: &[Word(2000, 0), Word(2000, 4), Word(2000, 0)],
-        idle: &[Word(2000, 2), Word(2000, 4)],
-        runs: (2100, 0x000E, 0x0002),
-        fault: (2100, 0x000A, 0x0008),
-    },
-];
+/// Profile, reset, status register while it runs and with a fault, words that start nothing.
+const CASES: &str = "\
+abb-acs550         | 0=0x47E,0x4FE,0x47E         | 3 0x000F 0x0007      | 3 0x000C 0x0008      | 0=0x47F,0x1,0x477,0x4FF,0x7F,0x4FE
+abb-acs580         | 0=0x47E,0x4FE,0x47E         | 3 0x000F 0x0007      | 3 0x000C 0x0008      | 0=0x47F,0x1
+danfoss-fc         | 49999=0x43C,0x4BC,0x43C     | 50199 0x080B 0x0803  | 50199 0x0808 0x0008  | 49999=0x7C,0x474,0x45C,0x46C,0x4BC
+siemens-v20        | 99=0x47E,0x4FE,0x47E        | 109 0x000F 0x0007    | 109 0x000C 0x0008    | 99=0x47F,0x7F,0x47D,0x47B
+siemens-g120       | 99=0x47E,0x4FE,0x47E        | 109 0x000F 0x0007    | 109 0x000C 0x0008    | 99=0x47F,0x77
+schneider-altivar  | 8501=0,0x80,0               | 3201 0x006F 0x0027   | 3201 0x004F 0x0008   | 8501=15,7,0x80,6,3
+yaskawa-v1000      | 1=[0] 1=[8] 1=[0]           | 0x4B 0x0081 0x0001   | 0x4B 0x0081 0x0080   | 1=[3] 1=[8] 1=[0x10]
+delta-ms300        | 0x2002=2,0                  | 0x2101 0x001B 0x0003 | 0x2100 0x00FF 0x0004 | 0x2000=0,0x10 0x2002=2 0x2000=3
+invt-goodrive      | 0x2000=7                    | 0x2100 0xFFFF 1      | 0x2102 0xFFFF 4      | 0x2000=0,6,7
+mitsubishi-d700    |                             | 8 0x0081 0x0001      | 8 0x0081 0x0080      | 8=6,1,8
+invertek-optidrive | 0=0,4,0                     | 5 0x0003 0x0001      | 5 0x0003 0x0002      | 0=9,4,2
+weg-cfw            | 682=0x16,0x96,0x16          | 680 0x8100 0x0100    | 680 0x8100 0x8000    | 682=0x7,0x15,0x96,0x57
+fuji-frenic        | 0x0706=0,0x8000,0           | 0x080E 0x0809 0x0001 | 0x080E 0x0800 0x0800 | 0x0706=3,0x8000,4
+hitachi-wj200      | 0=off 3=on 3=off            | 0x1001 0xFFFF 2500   | 0x1001 0xFFFF 0      | 1=on 3=on
+toshiba-vf-s15     | 0xFA00=0xC000,0xE000,0xC000 | 0xFD01 0x0602 0x0400 | 0xFD01 0x0402 0x0002 | 0xFA00=0x400,0xCC00,0xE000
+ls-g100            | 5=8                         | 13 0x000E 0x0002     | 13 0x000E 0x0008     | 5=0,6,8,0x12
+teco-f510          | 0x2501=0,8,0                | 0x2520 0x000B 0x0001 | 0x2520 0x0009 0x0008 | 0x2501=2,8,0x10
+vacon-10           | 2000=0,4,0                  | 2100 0x000E 0x0002   | 2100 0x000A 0x0008   | 2000=2,4";
 
-/// A bench whose motor turns forward at 25 Hz.
-fn running(case: &Case) -> Bench {
-    let mut bench = Bench::named(case.profile);
-    bench.send(case.reference);
-    bench.send(case.start);
-    bench.wait(5000);
+/// All of them, in the order of [`families`].
+fn cases() -> Vec<Case> {
+    let register = |text: &str| -> [u16; 3] {
+        let numbers: Vec<u16> = text.split_whitespace().map(number).collect();
+        numbers.try_into().unwrap()
+    };
+    let rows = rows::<5>(CASES).into_iter();
+    let case = |(family, [profile, reset, runs, fault, idle]): (Family, [&str; 5])| {
+        assert_eq!(family.profile, profile);
+        Case {
+            family,
+            reset: orders(reset),
+            runs: register(runs),
+            fault: register(fault),
+            idle: orders(idle),
+        }
+    };
+    let families = families();
+    assert_eq!(families.len(), rows.len());
+    families.into_iter().zip(rows).map(case).collect()
+}
+
+/// A rig whose motor turns forward at 25 Hz.
+fn running(case: &Case) -> ProfiledDrive {
+    let mut rig = ProfiledDrive::named(case.family.profile);
+    rig.send(&case.family.reference);
+    rig.send(&case.family.start);
+    rig.wait(5000);
     assert!(
-        (bench.output() - 25.0).abs() < 0.01,
+        (rig.output() - 25.0).abs() < 0.01,
         "{}: {}",
-        case.profile,
-        bench.output()
+        case.family.profile,
+        rig.output()
     );
-    bench
+    rig
 }
 
 #[test]
 fn every_family_starts_turns_and_stops_by_its_words() {
-    for case in CASES {
-        let name = case.profile;
-        let mut bench = running(case);
-        let (address, mask, is) = case.runs;
-        assert_eq!(bench.register(Table::Holding, address) & mask, is, "{name}");
-        bench.send(case.stop);
-        assert!(bench.output() > 20.0, "{name}: the motor ramps");
-        bench.wait(5000);
-        assert_eq!(bench.output(), 0.0, "{name}");
-        assert_ne!(bench.register(Table::Holding, address) & mask, is, "{name}");
-        if !case.reverse.is_empty() {
-            bench.send(case.start);
-            bench.wait(3000);
-            bench.send(case.reverse);
-            bench.wait(8000);
-            assert!((bench.output() + 25.0).abs() < 0.01, "{name}: {}", bench.output());
-            bench.send(case.stop);
-            bench.wait(5000);
-            assert_eq!(bench.output(), 0.0, "{name}");
+    for case in &cases() {
+        let name = case.family.profile;
+        let mut rig = running(case);
+        let [address, mask, is] = case.runs;
+        assert_eq!(rig.register(Table::Holding, address) & mask, is, "{name}");
+        rig.send(&case.family.stop);
+        assert!(rig.output() > 20.0, "{name}: the motor ramps");
+        rig.wait(5000);
+        assert_eq!(rig.output(), 0.0, "{name}");
+        assert_ne!(rig.register(Table::Holding, address) & mask, is, "{name}");
+        if !case.family.reverse.is_empty() {
+            rig.send(&case.family.start);
+            rig.wait(3000);
+            rig.send(&case.family.reverse);
+            rig.wait(8000);
+            assert!((rig.output() + 25.0).abs() < 0.01, "{name}: {}", rig.output());
+            rig.send(&case.family.stop);
+            rig.wait(5000);
+            assert_eq!(rig.output(), 0.0, "{name}");
         }
     }
 }
 
 #[test]
 fn words_that_start_nothing() {
-    for case in CASES {
-        for order in case.idle {
-            let mut bench = Bench::named(case.profile);
-            bench.send(case.reference);
-            let _refused = bench.ask(&order.pdu());
-            bench.wait(1000);
-            assert!(!bench.drive.state().running, "{}: {order:?}", case.profile);
+    for case in &cases() {
+        for order in &case.idle {
+            let mut rig = ProfiledDrive::named(case.family.profile);
+            rig.send(&case.family.reference);
+            let _refused = rig.ask(&order.pdu());
+            rig.wait(1000);
+            assert!(!rig.drive.state().running, "{}: {order:?}", case.family.profile);
         }
         // Without the first word of its sequence a drive does not run.
-        if case.start.len() > 1 && case.profile != "hitachi-wj200" {
-            let mut bench = Bench::named(case.profile);
-            bench.send(case.reference);
-            bench.send(&case.start[1..]);
-            bench.wait(1000);
-            assert!(!bench.drive.state().running, "{}", case.profile);
+        if case.family.start.len() > 1 && case.family.profile != "hitachi-wj200" {
+            let mut rig = ProfiledDrive::named(case.family.profile);
+            rig.send(&case.family.reference);
+            rig.send(&case.family.start[1..]);
+            rig.wait(1000);
+            assert!(!rig.drive.state().running, "{}", case.family.profile);
         }
     }
 }
 
 #[test]
 fn faults_are_reset_and_start_nothing() {
-    for case in CASES {
-        let name = case.profile;
-        let mut bench = running(case);
-        let trip = Word(bench.trip_address, 4);
-        bench.send(&[trip]);
-        assert_eq!((bench.drive.state().fault, bench.output()), (4, 0.0), "{name}");
-        let (address, mask, is) = case.fault;
-        assert_eq!(bench.register(Table::Holding, address) & mask, is, "{name}");
-        bench.send(case.start);
-        bench.wait(1000);
-        assert!(!bench.drive.state().running, "{name}: with a fault");
+    for case in &cases() {
+        let name = case.family.profile;
+        let mut rig = running(case);
+        let trip = Word(rig.trip_address, 4);
+        rig.send(&[trip]);
+        assert_eq!((rig.drive.state().fault, rig.output()), (4, 0.0), "{name}");
+        let [address, mask, is] = case.fault;
+        assert_eq!(rig.register(Table::Holding, address) & mask, is, "{name}");
+        rig.send(&case.family.start);
+        rig.wait(1000);
+        assert!(!rig.drive.state().running, "{name}: with a fault");
         if case.reset.is_empty() {
             continue;
         }
-        bench.send(case.reset);
-        bench.wait(1000);
-        assert_eq!((bench.drive.state().fault, bench.output()), (0, 0.0), "{name}");
-        bench.send(case.stop);
-        bench.send(case.start);
-        bench.wait(5000);
-        assert!((bench.output() - 25.0).abs() < 0.01, "{name}: runs anew");
+        rig.send(&case.reset);
+        rig.wait(1000);
+        assert_eq!((rig.drive.state().fault, rig.output()), (0, 0.0), "{name}");
+        rig.send(&case.family.stop);
+        rig.send(&case.family.start);
+        rig.wait(5000);
+        assert!((rig.output() - 25.0).abs() < 0.01, "{name}: runs anew");
     }
 }
 
@@ -423,12 +209,12 @@ fn a_reset_with_a_run_command() {
         ("vacon-10", [Word(2000, 1), Word(2000, 5)], false),
         ("weg-cfw", [Word(682, 0x17), Word(682, 0x97)], false),
     ] {
-        let mut bench = Bench::named(name);
-        bench.send(&[Word(bench.trip_address, 1)]);
-        bench.send(&orders);
-        bench.wait(1000);
+        let mut rig = ProfiledDrive::named(name);
+        rig.send(&[Word(rig.trip_address, 1)]);
+        rig.send(&orders);
+        rig.wait(1000);
         assert_eq!(
-            (bench.drive.state().fault, bench.drive.state().running),
+            (rig.drive.state().fault, rig.drive.state().running),
             (0, starts),
             "{name}"
         );
@@ -438,37 +224,40 @@ fn a_reset_with_a_run_command() {
 /// The panel: the motor stops, the bus is not obeyed, and a command that came meanwhile does not start it afterwards.
 #[test]
 fn a_drive_at_its_panel_does_not_obey_the_bus() {
-    for case in CASES {
-        let mut bench = running(case);
-        let panel = bench.trip_address + 1;
-        bench.send(&[Word(panel, 1)]);
-        bench.wait(5000);
+    for case in &cases() {
+        let mut rig = running(case);
+        let panel = rig.trip_address + 1;
+        rig.send(&[Word(panel, 1)]);
+        rig.wait(5000);
         assert_eq!(
-            (bench.output(), bench.drive.state().remote),
+            (rig.output(), rig.drive.state().remote),
             (0.0, false),
             "{}",
-            case.profile
+            case.family.profile
         );
-        bench.send(case.start);
-        bench.send(&[Word(panel, 0)]);
-        bench.wait(1000);
-        assert!(!bench.drive.state().running, "{}", case.profile);
-        bench.send(case.stop);
-        bench.send(case.start);
-        bench.wait(1000);
-        assert!(bench.drive.state().running, "{}", case.profile);
+        rig.send(&case.family.start);
+        rig.send(&[Word(panel, 0)]);
+        rig.wait(1000);
+        assert!(!rig.drive.state().running, "{}", case.family.profile);
+        rig.send(&case.family.stop);
+        rig.send(&case.family.start);
+        rig.wait(1000);
+        assert!(rig.drive.state().running, "{}", case.family.profile);
     }
 }
 
 /// A Delta drive shows for how long the motor comes down.
 #[test]
 fn a_motor_that_comes_down() {
-    let delta = CASES.iter().find(|case| case.profile == "delta-ms300").unwrap();
-    let mut bench = running(delta);
-    bench.send(delta.stop);
-    assert_eq!(bench.register(Table::Holding, 0x2101) & 3, 1);
-    bench.wait(5000);
-    assert_eq!(bench.register(Table::Holding, 0x2101) & 3, 0);
+    let delta = cases()
+        .into_iter()
+        .find(|case| case.family.profile == "delta-ms300")
+        .unwrap();
+    let mut rig = running(&delta);
+    rig.send(&delta.family.stop);
+    assert_eq!(rig.register(Table::Holding, 0x2101) & 3, 1);
+    rig.wait(5000);
+    assert_eq!(rig.register(Table::Holding, 0x2101) & 3, 0);
 }
 
 /// Every profile without a simulator of its own answers each of its points and nothing else, and as its limits say.
@@ -481,15 +270,11 @@ fn every_profile_answers_its_points() {
             continue;
         };
         seen += 1;
-        let mut bench = Bench::of(profile);
+        let mut rig = ProfiledDrive::of(profile);
         for point in &profile.points {
             let Some(raw) = point.raw() else { continue };
-            let read = RequestPdu::Read {
-                table: raw.table,
-                start: raw.address,
-                count: raw.form.items(),
-            };
-            let words = bench
+            let read = RequestPdu::read(raw.table, raw.address, raw.form.items());
+            let words = rig
                 .ask(&read)
                 .into_words()
                 .unwrap_or_else(|| panic!("{} {}", profile.name, point.name));
@@ -515,16 +300,16 @@ fn every_profile_answers_its_points() {
             .find(|address| profile.range(range.table, *address).is_none())
             .unwrap();
         assert_eq!(
-            bench.ask(&read(unknown, 1)),
+            rig.ask(&read(unknown, 1)),
             Reply::Exception(Exception::ADDRESS),
             "{}",
             profile.name
         );
         assert_eq!(
-            bench.ask(&read(*range.addresses.start(), 0)),
+            rig.ask(&read(*range.addresses.start(), 0)),
             Reply::Exception(Exception::VALUE)
         );
-        assert!(bench.drive.state().ready && !bench.drive.state().running);
+        assert!(rig.drive.state().ready && !rig.drive.state().running);
     }
     assert!(seen >= 19, "{seen}");
 }
@@ -544,16 +329,12 @@ fn request(profile: Arc<Profile>) -> impl Strategy<Value = RequestPdu> {
     let table = prop::sample::select(vec![Table::Coil, Table::DiscreteInput, Table::Input, Table::Holding]);
     (address, table, value(), prop::collection::vec(value(), 0..6), 0..6u8).prop_map(
         |(address, table, value, values, kind)| match kind {
-            0 => RequestPdu::Read {
-                table,
-                start: address,
-                count: value % 40,
-            },
+            0 => RequestPdu::read(table, address, value % 40),
             1 => RequestPdu::WriteCoil {
                 address,
                 on: value & 1 == 1,
             },
-            2 => RequestPdu::WriteRegister { address, value },
+            2 => RequestPdu::write_register(address, value),
             3 => RequestPdu::WriteRegisters { start: address, values },
             4 => RequestPdu::WriteCoils {
                 start: address,
@@ -582,14 +363,14 @@ proptest! {
     /// Whatever a drive is asked, its reply fits, and it turns only where nothing is wrong.
     #[test]
     fn every_reply_fits_its_request((profile, requests) in any_bench()) {
-        let mut bench = Bench::of(&profile);
+        let mut rig = ProfiledDrive::of(&profile);
         for (request, milliseconds) in requests {
-            let reply = bench.ask(&request);
+            let reply = rig.ask(&request);
             let mut pdu = Vec::new();
             reply.encode(&request, &mut pdu);
             prop_assert_eq!(Reply::decode(&request, &pdu), Ok(reply), "{} {:?}", profile.name, request);
-            bench.wait(milliseconds);
-            let state = bench.drive.state();
+            rig.wait(milliseconds);
+            let state = rig.drive.state();
             prop_assert!(state.fault == 0 || !state.running && !state.ready, "{}: {state:?}", profile.name);
             prop_assert!(state.running || state.output == 0.0, "{}: {state:?}", profile.name);
         }
@@ -619,39 +400,39 @@ fn a_profile_of_ones_own() {
     );
     let text =
         text.replace(RANGE, "").replace("[ranges]\nsingle_write = 16\n", "") + "[ranges]\nsingle_write = 16\n" + RANGE;
-    let mut bench = Bench::of(&profile(&text));
-    let refused = bench.ask(&Word(0, 0x0406).pdu());
+    let mut rig = ProfiledDrive::of(&profile(&text));
+    let refused = rig.ask(&Word(0, 0x0406).pdu());
     assert_eq!(refused, Reply::Exception(Exception::FUNCTION), "function 16 only");
-    let status = |bench: &mut Bench| bench.register(Table::Holding, 3) & 0x6F;
-    bench.send(&[Single(1, 250), Single(0, 0x040F), Single(0, 0x0407)]);
-    assert!(!bench.drive.state().running, "not prepared");
-    assert_ne!(status(&mut bench), 0x21);
-    assert_eq!(bench.ask(&Single(0, 0x0406).pdu()), Reply::Written);
-    bench.wait(10);
-    assert_ne!(status(&mut bench), 0x21, "that takes a while");
-    bench.wait(30);
-    assert_eq!(status(&mut bench), 0x21);
+    let status = |rig: &mut ProfiledDrive| rig.register(Table::Holding, 3) & 0x6F;
+    rig.send(&[Single(1, 250), Single(0, 0x040F), Single(0, 0x0407)]);
+    assert!(!rig.drive.state().running, "not prepared");
+    assert_ne!(status(&mut rig), 0x21);
+    assert_eq!(rig.ask(&Single(0, 0x0406).pdu()), Reply::Written);
+    rig.wait(10);
+    assert_ne!(status(&mut rig), 0x21, "that takes a while");
+    rig.wait(30);
+    assert_eq!(status(&mut rig), 0x21);
     // The second step ends by time: what comes earlier is too early.
-    bench.send(&[Single(0, 0x0407), Single(0, 0x040F)]);
-    assert!(!bench.drive.state().running);
-    bench.wait(200);
-    bench.send(&[Single(0, 0x0006)]);
-    assert!(!bench.drive.state().running, "a word without bit 10 is no step");
-    bench.send(&[Single(0, 0x0406), Single(0, 0x0407)]);
-    bench.wait(200);
-    bench.send(&[Single(0, 0x0C0F)]);
-    bench.wait(3000);
-    assert_eq!((bench.output(), status(&mut bench)), (-25.0, 0x27));
-    assert_eq!(bench.register(Table::Holding, 4) as i16, -250);
-    bench.send(&[Word(bench.trip_address, 9)].map(|order| match order {
+    rig.send(&[Single(0, 0x0407), Single(0, 0x040F)]);
+    assert!(!rig.drive.state().running);
+    rig.wait(200);
+    rig.send(&[Single(0, 0x0006)]);
+    assert!(!rig.drive.state().running, "a word without bit 10 is no step");
+    rig.send(&[Single(0, 0x0406), Single(0, 0x0407)]);
+    rig.wait(200);
+    rig.send(&[Single(0, 0x0C0F)]);
+    rig.wait(3000);
+    assert_eq!((rig.output(), status(&mut rig)), (-25.0, 0x27));
+    assert_eq!(rig.register(Table::Holding, 4) as i16, -250);
+    rig.send(&[Word(rig.trip_address, 9)].map(|order| match order {
         Word(address, value) => Single(address, value),
         other => other,
     }));
-    assert_eq!(bench.drive.state().fault, 9);
-    assert_eq!(bench.register(Table::Holding, 3) & 0x4F, 0x08);
-    bench.send(&[Single(0, 0x0480)]);
-    assert_eq!(bench.drive.state().fault, 0);
-    assert!(!bench.drive.state().running);
+    assert_eq!(rig.drive.state().fault, 9);
+    assert_eq!(rig.register(Table::Holding, 3) & 0x4F, 0x08);
+    rig.send(&[Single(0, 0x0480)]);
+    assert_eq!(rig.drive.state().fault, 0);
+    assert!(!rig.drive.state().running);
 }
 
 /// A meter: values as given, settings within their range, texts, a scale in another register.
@@ -674,11 +455,7 @@ fn a_meter_holds_what_it_was_given() {
     options.values.insert(index("power"), Given::Number(12.3));
     options.values.insert(index("serial"), Given::Text("AB12".to_string()));
     let mut drive = ProfileDrive::new(options, SimTime::ZERO);
-    let read = RequestPdu::Read {
-        table: Table::Holding,
-        start: 0,
-        count: 8,
-    };
+    let read = RequestPdu::read(Table::Holding, 0, 8);
     let words = drive.answer(&read, SimTime::ZERO).unwrap().into_words().unwrap();
     assert_eq!(words[..2], [0x4367, 0x8000], "231.5 as IEEE 754");
     assert_eq!(words[2..4], [0xFFFF, 123]);

@@ -366,7 +366,7 @@ impl Board {
 fn fetch(place: Backing, model: Model<'_>) -> Option<f64> {
     let mut word = |table, address| {
         let (start, count) = (address, 1);
-        match model(&RequestPdu::Read { table, start, count })? {
+        match model(&RequestPdu::read(table, start, count))? {
             Reply::Registers(words) => words.first().copied(),
             // The drive does not have it: it is at rest.
             _ => Some(0),
@@ -385,7 +385,7 @@ fn set_bit(place: Backing, on: bool, model: Model<'_>) -> Result<(), u8> {
         return Err(TYPE);
     };
     let (start, count) = (address, 1);
-    let old = match model(&RequestPdu::Read { table, start, count }) {
+    let old = match model(&RequestPdu::read(table, start, count)) {
         Some(Reply::Registers(words)) => words.first().copied().unwrap_or(0),
         Some(Reply::Exception(exception)) => return Err(code_of(exception)),
         _ => 0,
@@ -395,7 +395,7 @@ fn set_bit(place: Backing, on: bool, model: Model<'_>) -> Result<(), u8> {
 }
 
 fn store(address: u16, value: u16, model: Model<'_>) -> Result<(), u8> {
-    match model(&RequestPdu::WriteRegister { address, value }) {
+    match model(&RequestPdu::write_register(address, value)) {
         Some(Reply::Exception(exception)) => Err(code_of(exception)),
         _ => Ok(()),
     }

@@ -2,14 +2,14 @@ use super::super::nx::NxOptions;
 use super::super::simulated_drive::{DriveOptions, ModelOptions, SimulatedDrive};
 use super::*;
 
-struct Bench {
+struct NxWithBoard {
     drive: SimulatedDrive,
     board: Board,
     now: SimTime,
 }
 
-impl Bench {
-    fn new(map: &'static Map) -> Bench {
+impl NxWithBoard {
+    fn new(map: &'static Map) -> NxWithBoard {
         let nx = NxOptions {
             trip_register: true,
             ..NxOptions::default()
@@ -19,7 +19,7 @@ impl Bench {
             model: ModelOptions::Nx(nx),
             autopilot: None,
         };
-        Bench {
+        NxWithBoard {
             drive: SimulatedDrive::new(options, SimTime::ZERO),
             board: Board::new(map, SimTime::ZERO),
             now: SimTime::ZERO,
@@ -27,12 +27,12 @@ impl Bench {
     }
 
     /// Identified, its report taken.
-    fn ready(map: &'static Map) -> Bench {
-        let mut bench = Bench::new(map);
-        assert_eq!(bench.ask("01F"), "A1061");
-        bench.ask("0104");
-        while bench.ask("0105") != "A" {}
-        bench
+    fn ready(map: &'static Map) -> NxWithBoard {
+        let mut rig = NxWithBoard::new(map);
+        assert_eq!(rig.ask("01F"), "A1061");
+        rig.ask("0104");
+        while rig.ask("0105") != "A" {}
+        rig
     }
 
     /// The answer to the frame around that text, CRs left out.
@@ -45,7 +45,7 @@ impl Bench {
 
     fn command(&mut self, command: &Result<Command, u8>) -> String {
         let mut out = Vec::new();
-        let Bench { drive, board, now } = self;
+        let NxWithBoard { drive, board, now } = self;
         board.answer(command, *now, &mut |request| drive.answer(request, *now), &mut out);
         String::from_utf8(out).unwrap().trim_end().to_string()
     }
@@ -59,39 +59,36 @@ impl Bench {
 /// The script of reference/drives.md 6.8, in an order in which the drive comes to its states.
 #[test]
 fn the_frames_of_the_reference() {
-    let mut bench = Bench::new(&maps::NX);
-    assert_eq!(bench.ask("01110203"), "N00");
-    assert_eq!(bench.ask("01F"), "A1061");
-    assert!(bench.ask("0104").len() > 100, "all there is");
-    while bench.ask("0105") != "A" {}
-    assert_eq!(bench.ask("01120202"), "A0060");
-    assert_eq!(bench.ask("0172030142480000"), "A");
-    assert_eq!(bench.ask("01730301"), "A");
-    assert_eq!(bench.ask("0172040101"), "A");
-    bench.later(Duration::from_secs(10));
-    assert_eq!(bench.ask("01110203"), "A41C80000A0", "25 Hz");
-    assert_eq!(bench.ask("01120202"), "A4064", "runs");
-    bench.board.options.leading_byte = true;
-    assert_eq!(bench.ask("01130103"), "A0042480000F2", "50 %");
-    bench.board.options.leading_byte = false;
-    let trip = RequestPdu::WriteRegister {
-        address: 1998,
-        value: 53,
-    };
-    bench.drive.answer(&trip, bench.now);
-    assert_eq!(bench.ask("01160102"), "A0035C8");
+    let mut rig = NxWithBoard::new(&maps::NX);
+    assert_eq!(rig.ask("01110203"), "N00");
+    assert_eq!(rig.ask("01F"), "A1061");
+    assert!(rig.ask("0104").len() > 100, "all there is");
+    while rig.ask("0105") != "A" {}
+    assert_eq!(rig.ask("01120202"), "A0060");
+    assert_eq!(rig.ask("0172030142480000"), "A");
+    assert_eq!(rig.ask("01730301"), "A");
+    assert_eq!(rig.ask("0172040101"), "A");
+    rig.later(Duration::from_secs(10));
+    assert_eq!(rig.ask("01110203"), "A41C80000A0", "25 Hz");
+    assert_eq!(rig.ask("01120202"), "A4064", "runs");
+    rig.board.options.leading_byte = true;
+    assert_eq!(rig.ask("01130103"), "A0042480000F2", "50 %");
+    rig.board.options.leading_byte = false;
+    let trip = RequestPdu::write_register(1998, 53);
+    rig.drive.answer(&trip, rig.now);
+    assert_eq!(rig.ask("01160102"), "A0035C8");
 }
 
 #[test]
 fn reports_come_in_pieces_until_they_are_acknowledged() {
-    let mut bench = Bench::new(&maps::NX);
-    bench.ask("01F");
-    let first = bench.ask("0104");
-    assert_eq!(bench.ask("0104"), first, "not acknowledged");
+    let mut rig = NxWithBoard::new(&maps::NX);
+    rig.ask("01F");
+    let first = rig.ask("0104");
+    assert_eq!(rig.ask("0104"), first, "not acknowledged");
     let mut polls = 1;
     let mut longest = first.len();
     loop {
-        let next = bench.ask("0105");
+        let next = rig.ask("0105");
         if next == "A" {
             break;
         }
@@ -101,89 +98,89 @@ fn reports_come_in_pieces_until_they_are_acknowledged() {
     }
     assert!((2..=16).contains(&polls), "{polls}");
     assert!(longest <= 1 + LONGEST_REPORT + 2);
-    assert_eq!(bench.ask("0104"), "A");
-    bench.ask("01F");
-    assert_eq!(bench.ask("0104"), first, "a full report after each Identify");
-    bench.ask("01F");
+    assert_eq!(rig.ask("0104"), "A");
+    rig.ask("01F");
+    assert_eq!(rig.ask("0104"), first, "a full report after each Identify");
+    rig.ask("01F");
     assert_eq!(
-        bench.ask("0105"),
+        rig.ask("0105"),
         first,
         "what was sent before is not what is acknowledged"
     );
-    while bench.ask("0105") != "A" {}
+    while rig.ask("0105") != "A" {}
     // BI 2 reports its changes once that is switched on.
-    assert_eq!(bench.ask("0121020101"), "A");
-    assert_eq!(bench.ask("0122020101"), "A");
-    bench.ask("0104");
-    bench.ask("0105");
-    assert_eq!(bench.ask("0104"), "A");
-    bench.ask("0172040101");
-    bench.later(Duration::from_secs(1));
-    assert_eq!(bench.ask("0104"), "A20240F8", "region, number, status");
+    assert_eq!(rig.ask("0121020101"), "A");
+    assert_eq!(rig.ask("0122020101"), "A");
+    rig.ask("0104");
+    rig.ask("0105");
+    assert_eq!(rig.ask("0104"), "A");
+    rig.ask("0172040101");
+    rig.later(Duration::from_secs(1));
+    assert_eq!(rig.ask("0104"), "A20240F8", "region, number, status");
 }
 
 #[test]
 fn outputs_are_clamped_within_their_type() {
-    let mut bench = Bench::ready(&maps::NX);
+    let mut rig = NxWithBoard::ready(&maps::NX);
     let speed = |value: f32| format!("01720301{:08X}", value.to_bits());
-    assert_eq!(bench.ask(&speed(150.0)), "A");
-    assert_eq!(bench.ask("01130103"), {
+    assert_eq!(rig.ask(&speed(150.0)), "A");
+    assert_eq!(rig.ask("01130103"), {
         let digits = format!("{:08X}", 100.0f32.to_bits());
         format!("A{digits}{:02X}", checksum(digits.as_bytes()))
     });
-    assert_eq!(bench.ask(&speed(400.0)), "N10");
-    assert_eq!(bench.ask(&speed(f32::NAN)), "N10");
-    assert_eq!(bench.ask("0172030142"), "N05");
-    assert_eq!(bench.ask("0172040102"), "N10", "neither 0 nor 1");
-    assert_eq!(bench.ask("01721901"), "N05");
-    assert_eq!(bench.ask("0172036342480000"), "N10", "no AO 99");
-    assert_eq!(bench.ask("01730401"), "A");
-    assert_eq!(bench.ask("0108"), "N01", "no warm reset");
+    assert_eq!(rig.ask(&speed(400.0)), "N10");
+    assert_eq!(rig.ask(&speed(f32::NAN)), "N10");
+    assert_eq!(rig.ask("0172030142"), "N05");
+    assert_eq!(rig.ask("0172040102"), "N10", "neither 0 nor 1");
+    assert_eq!(rig.ask("01721901"), "N05");
+    assert_eq!(rig.ask("0172036342480000"), "N10", "no AO 99");
+    assert_eq!(rig.ask("01730401"), "A");
+    assert_eq!(rig.ask("0108"), "N01", "no warm reset");
 }
 
 #[test]
 fn overridden_inputs_fool_the_bus_only() {
-    let mut bench = Bench::ready(&maps::NX);
-    assert_eq!(bench.ask("0172020201"), "A");
-    assert_eq!(bench.ask("01120202"), "A6066", "state and override");
-    assert_eq!(bench.ask("01730202"), "A");
-    assert_eq!(bench.ask("01120202"), "A0060");
-    bench.ask("0172020201");
-    bench.later(ALONE + Duration::from_secs(1));
-    assert_eq!(bench.ask("01120202"), "A0060", "alone for 10 minutes");
-    assert_eq!(bench.ask("017206010007"), "A");
-    assert_eq!(bench.ask("01160102"), "A0007C7");
+    let mut rig = NxWithBoard::ready(&maps::NX);
+    assert_eq!(rig.ask("0172020201"), "A");
+    assert_eq!(rig.ask("01120202"), "A6066", "state and override");
+    assert_eq!(rig.ask("01730202"), "A");
+    assert_eq!(rig.ask("01120202"), "A0060");
+    rig.ask("0172020201");
+    rig.later(ALONE + Duration::from_secs(1));
+    assert_eq!(rig.ask("01120202"), "A0060", "alone for 10 minutes");
+    assert_eq!(rig.ask("017206010007"), "A");
+    assert_eq!(rig.ask("01160102"), "A0007C7");
 }
 
 #[test]
 fn attributes() {
-    let mut bench = Bench::ready(&maps::NX);
-    assert_eq!(bench.ask("0121020B42700000"), "A");
-    assert_eq!(bench.ask("0111020B"), "A427000008D");
-    assert_eq!(bench.ask("01110208"), "A7FC00000B0", "switched off");
-    assert_eq!(bench.ask("0121020342700000"), "N11", "a value is overridden");
-    assert_eq!(bench.ask("0121020B42"), "N05");
-    assert_eq!(bench.ask("01220203"), "N11");
-    assert_eq!(bench.ask("0111024D"), "N11");
-    assert_eq!(bench.ask("01240103000A"), "A");
-    assert_eq!(bench.ask("01140103"), "A000AD1");
-    assert_eq!(bench.ask("0100ABC"), "A", "time");
-    assert_eq!(bench.ask("0101"), "N01");
-    assert_eq!(bench.ask("0177"), "A");
+    let mut rig = NxWithBoard::ready(&maps::NX);
+    assert_eq!(rig.ask("0121020B42700000"), "A");
+    assert_eq!(rig.ask("0111020B"), "A427000008D");
+    assert_eq!(rig.ask("01110208"), "A7FC00000B0", "switched off");
+    assert_eq!(rig.ask("0121020342700000"), "N11", "a value is overridden");
+    assert_eq!(rig.ask("0121020B42"), "N05");
+    assert_eq!(rig.ask("01220203"), "N11");
+    assert_eq!(rig.ask("0111024D"), "N11");
+    assert_eq!(rig.ask("01240103000A"), "A");
+    assert_eq!(rig.ask("01140103"), "A000AD1");
+    assert_eq!(rig.ask("0100ABC"), "A", "time");
+    assert_eq!(rig.ask("0101"), "N01");
+    assert_eq!(rig.ask("0177"), "A");
 }
 
 #[test]
 fn another_board_behaves_otherwise() {
-    let mut bench = Bench::ready(&maps::TECO);
-    assert_eq!(bench.ask("0172020201"), "A", "without action");
-    assert_eq!(bench.ask("01120202"), "A0060");
-    assert_eq!(bench.ask("0121020B42700000"), "N11", "no limits");
-    assert_eq!(bench.ask(&format!("01720301{:08X}", 200.0f32.to_bits())), "N10");
-    assert_eq!(bench.ask("0108"), "A", "warm reset");
-    assert_eq!(bench.ask("01120202"), "N00");
-    bench.board.options.nak_checksum = true;
-    assert_eq!(bench.ask("01120202"), "N0060");
-    assert_eq!(bench.command(&Err(CHECKSUM)), "N0262");
+    let mut rig = NxWithBoard::ready(&maps::TECO);
+    assert_eq!(rig.ask("0172020201"), "A", "without action");
+    assert_eq!(rig.ask("01120202"), "A0060");
+    assert_eq!(rig.ask("0121020B42700000"), "N11", "no limits");
+    assert_eq!(rig.ask(&format!("01720301{:08X}", 200.0f32.to_bits())), "N10");
+    assert_eq!(rig.ask("0108"), "A", "warm reset");
+    assert_eq!(rig.ask("01120202"), "N00");
+    rig.board.options.nak_checksum = true;
+    assert_eq!(rig.ask("01120202"), "N0060");
+    assert_eq!(rig.command(&Err(CHECKSUM)), "N0262");
 }
 
 #[test]
@@ -201,10 +198,10 @@ fn every_object_is_there_once_and_can_be_read() {
         let places: std::collections::BTreeSet<_> = map.entries.iter().map(|e| (e.region, e.number)).collect();
         assert_eq!(places.len(), map.entries.len());
     }
-    let mut bench = Bench::ready(&maps::NX);
+    let mut rig = NxWithBoard::ready(&maps::NX);
     for entry in maps::NX.entries {
         let attribute = entry.region.value_attribute();
-        let answer = bench.ask(&format!(
+        let answer = rig.ask(&format!(
             "011{:X}{:02X}{attribute:02X}",
             entry.region as u8, entry.number
         ));

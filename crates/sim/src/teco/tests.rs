@@ -4,80 +4,37 @@ use super::super::model::ReadOnly;
 use super::super::motor::Load;
 use super::options::{DetectionLevels, Digits};
 use super::*;
-use crate::codec::{Table, lrc};
+use crate::codec::{Exception, Table, lrc};
+use crate::in_time::InTime;
 use std::time::Duration;
 
-const VALUE: u8 = 0x21;
-const MODE: u8 = 0x22;
+const VALUE: Exception = Exception(0x21);
+const MODE: Exception = Exception(0x22);
 
-/// A drive and its clock.
-struct Bench {
-    drive: TecoDrive,
-    now: SimTime,
-}
+type TecoInTime = InTime<TecoDrive>;
 
-impl Bench {
-    fn new(options: TecoOptions) -> Bench {
-        Bench {
-            drive: TecoDrive::new(options, SimTime::ZERO),
-            now: SimTime::ZERO,
-        }
+impl TecoInTime {
+    fn new(options: TecoOptions) -> TecoInTime {
+        InTime::of(TecoDrive::new(options, SimTime::ZERO))
     }
 
-    fn plain() -> Bench {
-        Bench::new(TecoOptions::default())
+    fn plain() -> TecoInTime {
+        TecoInTime::new(TecoOptions::default())
     }
 
-    fn with_parameters(parameters: &[(u16, u16)]) -> Bench {
-        Bench::new(TecoOptions {
+    fn with_parameters(parameters: &[(u16, u16)]) -> TecoInTime {
+        TecoInTime::new(TecoOptions {
             parameters: parameters.to_vec(),
             ..TecoOptions::default()
         })
     }
 
-    fn wait(&mut self, milliseconds: u64) -> &mut Bench {
-        self.now += Duration::from_millis(milliseconds);
-        self.drive.advance(self.now);
-        self
-    }
-
-    fn ask(&mut self, request: RequestPdu) -> Reply {
-        self.drive.answer(&request, self.now).unwrap()
-    }
-
-    fn read(&mut self, start: u16, count: u16) -> Result<Vec<u16>, u8> {
-        let request = RequestPdu::Read {
-            table: Table::Holding,
-            start,
-            count,
-        };
-        match self.ask(request) {
-            Reply::Registers(values) => Ok(values),
-            Reply::Exception(exception) => Err(exception.0),
-            other => panic!("{other:?}"),
-        }
+    fn read(&mut self, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
+        self.registers(Table::Holding, start, count)
     }
 
     fn one(&mut self, address: u16) -> u16 {
         self.read(address, 1).unwrap()[0]
-    }
-
-    fn write(&mut self, start: u16, values: &[u16]) -> Result<(), u8> {
-        let request = match values {
-            [value] => RequestPdu::WriteRegister {
-                address: start,
-                value: *value,
-            },
-            _ => RequestPdu::WriteRegisters {
-                start,
-                values: values.to_vec(),
-            },
-        };
-        match self.ask(request) {
-            Reply::Written => Ok(()),
-            Reply::Exception(exception) => Err(exception.0),
-            other => panic!("{other:?}"),
-        }
     }
 
     /// Operation signals and frequency, and time to settle.
@@ -168,49 +125,49 @@ fn worked_frames() {
 
 #[test]
 fn start_stop_and_direction() {
-    let mut bench = Bench::plain();
-    assert_eq!(bench.read(0x20, 2), Ok(vec![0x0044, 0]), "ready, DO1 shows zero speed");
-    assert_eq!((bench.one(0x2C), bench.one(0x40)), (0x0042, 10));
-    bench.command(1, 3000);
-    assert_eq!(bench.one(0x20), 0x00A5, "running, ready, R2A and R1A on");
-    assert_eq!((bench.one(0x2C), bench.one(0x2D)), (0x0055, 0b101));
-    assert_eq!(bench.read(0x23, 2), Ok(vec![3000, 3000]));
-    assert_eq!(bench.read(0x27, 2), Ok(vec![12, 220]));
-    assert_eq!(bench.one(0x31), 594);
-    bench.command(3, 3000);
-    assert_eq!((bench.one(0x20), bench.one(0x24)), (0x00A7, 3000));
-    assert_eq!(bench.drive.state().output, -30.0);
-    bench.write(1, &[0]).unwrap();
-    bench.wait(200);
-    assert_eq!(bench.one(0x20) & 1, 1, "still brought down");
-    bench.wait(5000);
-    assert_eq!((bench.one(0x20), bench.one(0x24)), (0x0044, 0));
+    let mut rig = TecoInTime::plain();
+    assert_eq!(rig.read(0x20, 2), Ok(vec![0x0044, 0]), "ready, DO1 shows zero speed");
+    assert_eq!((rig.one(0x2C), rig.one(0x40)), (0x0042, 10));
+    rig.command(1, 3000);
+    assert_eq!(rig.one(0x20), 0x00A5, "running, ready, R2A and R1A on");
+    assert_eq!((rig.one(0x2C), rig.one(0x2D)), (0x0055, 0b101));
+    assert_eq!(rig.read(0x23, 2), Ok(vec![3000, 3000]));
+    assert_eq!(rig.read(0x27, 2), Ok(vec![12, 220]));
+    assert_eq!(rig.one(0x31), 594);
+    rig.command(3, 3000);
+    assert_eq!((rig.one(0x20), rig.one(0x24)), (0x00A7, 3000));
+    assert_eq!(rig.drive.state().output, -30.0);
+    rig.write(1, &[0]).unwrap();
+    rig.wait(200);
+    assert_eq!(rig.one(0x20) & 1, 1, "still brought down");
+    rig.wait(5000);
+    assert_eq!((rig.one(0x20), rig.one(0x24)), (0x0044, 0));
 }
 
 #[test]
 fn order_of_refusals() {
-    let mut bench = Bench::plain();
-    assert_eq!(bench.read(0xFFFF, 17), Err(3), "count before address");
-    assert_eq!(bench.read(0xFFFF, 2), Err(2));
-    assert_eq!(bench.write(0x0201, &[1801; 17]), Err(3));
-    assert_eq!(bench.write(0x023E, &[9999, 0]), Err(2), "address before mode");
-    assert_eq!(bench.write(0x0201, &[9999]), Err(MODE), "mode before value");
-    assert_eq!(bench.write(0x0400, &[18_001]), Err(VALUE));
-    assert_eq!(bench.write(0x0500, &[100, 60_001]), Err(VALUE));
-    assert_eq!(bench.one(0x0500), 30, "nothing of a refused message is taken");
+    let mut rig = TecoInTime::plain();
+    assert_eq!(rig.read(0xFFFF, 17), Err(Exception::VALUE), "count before address");
+    assert_eq!(rig.read(0xFFFF, 2), Err(Exception::ADDRESS));
+    assert_eq!(rig.write(0x0201, &[1801; 17]), Err(Exception::VALUE));
+    assert_eq!(
+        rig.write(0x023E, &[9999, 0]),
+        Err(Exception::ADDRESS),
+        "address before mode"
+    );
+    assert_eq!(rig.write(0x0201, &[9999]), Err(MODE), "mode before value");
+    assert_eq!(rig.write(0x0400, &[18_001]), Err(VALUE));
+    assert_eq!(rig.write(0x0500, &[100, 60_001]), Err(VALUE));
+    assert_eq!(rig.one(0x0500), 30, "nothing of a refused message is taken");
     for address in [
         0x0000, 0x0010, 0x001F, 0x003E, 0x003F, 0x0041, 0x0100, 0x0127, 0x0409, 0x0900, 0x09FF,
     ] {
-        assert_eq!(bench.read(address, 1), Err(2), "{address:04X}");
+        assert_eq!(rig.read(address, 1), Err(Exception::ADDRESS), "{address:04X}");
     }
-    assert_eq!(bench.write(0x0020, &[0]), Err(2), "a monitor register");
-    assert_eq!(bench.read(0x0020, 16).map(|v| v.len()), Ok(16));
+    assert_eq!(rig.write(0x0020, &[0]), Err(Exception::ADDRESS), "a monitor register");
+    assert_eq!(rig.read(0x0020, 16).map(|v| v.len()), Ok(16));
     for request in [
-        RequestPdu::Read {
-            table: Table::Input,
-            start: 0x20,
-            count: 99,
-        },
+        RequestPdu::read(Table::Input, 0x20, 99),
         RequestPdu::WriteCoil { address: 0, on: true },
         RequestPdu::MaskWrite {
             address: 1,
@@ -222,9 +179,9 @@ fn order_of_refusals() {
             data: 0,
         },
     ] {
-        assert_eq!(bench.ask(request), Reply::Exception(Exception::FUNCTION));
+        assert_eq!(rig.ask(&request), Some(Reply::Exception(Exception::FUNCTION)));
     }
-    let mut lenient = Bench::new(TecoOptions {
+    let mut lenient = TecoInTime::new(TecoOptions {
         read_only: ReadOnly::Ignored,
         locked: vec![0x0501],
         ..TecoOptions::default()
@@ -237,10 +194,10 @@ fn order_of_refusals() {
 /// reference/drives.md 5.6 and 9.8: silence, function, count, in that order.
 #[test]
 fn messages_that_are_none() {
-    let mut bench = Bench::plain();
+    let mut rig = TecoInTime::plain();
     let mut refused = |pdu: &[u8]| {
         let exception = RequestPdu::decode(pdu).unwrap_err();
-        bench.drive.malformed(pdu, exception, SimTime::ZERO).map(|code| code.0)
+        rig.drive.malformed(pdu, exception, SimTime::ZERO).map(|code| code.0)
     };
     assert_eq!(refused(&[0x07]), Some(1));
     assert_eq!(refused(&[0x01, 0]), Some(1));
@@ -258,142 +215,139 @@ fn messages_that_are_none() {
     );
     assert_eq!(refused(&[0x10, 0, 1, 0, 0, 0]), Some(3));
     assert_eq!(refused(&[0x10, 0xFF, 0xFF, 0, 2, 4, 0, 0, 0, 0]), Some(2));
-    assert_eq!(bench.drive.malformed(&[], Exception::FUNCTION, SimTime::ZERO), None);
+    assert_eq!(rig.drive.malformed(&[], Exception::FUNCTION, SimTime::ZERO), None);
 }
 
 #[test]
 fn write_rules_by_mode() {
-    let mut bench = Bench::plain();
-    assert_eq!(
-        (bench.write(0x0400, &[100]), bench.write(0x0519, &[1])),
-        (Ok(()), Ok(()))
-    );
+    let mut rig = TecoInTime::plain();
+    assert_eq!((rig.write(0x0400, &[100]), rig.write(0x0519, &[1])), (Ok(()), Ok(())));
     for address in [0x0101, 0x011C, 0x0201, 0x0303, 0x0317] {
-        assert_eq!(bench.write(address, &[0]), Err(MODE), "{address:04X} in DRIVE");
-        assert!(bench.read(address, 1).is_ok());
+        assert_eq!(rig.write(address, &[0]), Err(MODE), "{address:04X} in DRIVE");
+        assert!(rig.read(address, 1).is_ok());
     }
-    bench.drive.set_mode(Mode::Program);
-    assert_eq!(bench.one(0x20) & 4, 0, "not ready");
-    assert_eq!(bench.write(0x011C, &[7]), Ok(()));
-    assert_eq!(bench.one(0x011C), 0, "reserved");
-    assert_eq!(bench.write(0x0003, &[7]), Ok(()));
-    assert_eq!(bench.one(0x0003), 0, "reserved");
-    assert_eq!(bench.write(0x0201, &[500]), Ok(()));
-    assert_eq!(bench.write(0x0113, &[13]), Err(VALUE));
-    bench.command(1, 3000);
-    assert_eq!(bench.one(0x24), 0, "PRGM does not run");
-    bench.drive.set_mode(Mode::Drive);
-    bench.wait(1000);
-    assert_eq!(bench.one(0x24), 0, "needs a new run command");
-    bench.command(0, 3000);
-    bench.command(1, 6000);
-    assert_eq!(bench.one(0x24), 5000, "the new maximum frequency");
-    assert_eq!(bench.write(0x0002, &[18_001]), Err(VALUE));
+    rig.drive.set_mode(Mode::Program);
+    assert_eq!(rig.one(0x20) & 4, 0, "not ready");
+    assert_eq!(rig.write(0x011C, &[7]), Ok(()));
+    assert_eq!(rig.one(0x011C), 0, "reserved");
+    assert_eq!(rig.write(0x0003, &[7]), Ok(()));
+    assert_eq!(rig.one(0x0003), 0, "reserved");
+    assert_eq!(rig.write(0x0201, &[500]), Ok(()));
+    assert_eq!(rig.write(0x0113, &[13]), Err(VALUE));
+    rig.command(1, 3000);
+    assert_eq!(rig.one(0x24), 0, "PRGM does not run");
+    rig.drive.set_mode(Mode::Drive);
+    rig.wait(1000);
+    assert_eq!(rig.one(0x24), 0, "needs a new run command");
+    rig.command(0, 3000);
+    rig.command(1, 6000);
+    assert_eq!(rig.one(0x24), 5000, "the new maximum frequency");
+    assert_eq!(rig.write(0x0002, &[18_001]), Err(VALUE));
 }
 
 #[test]
 fn ram_and_eeprom() {
-    let mut bench = Bench::plain();
-    bench.drive.set_mode(Mode::Program);
-    bench.write(0x0400, &[1111]).unwrap();
-    bench.write(0x0313, &[22]).unwrap();
-    bench.write(0x0312, &[33]).unwrap();
-    bench.power_cycle();
-    assert_eq!(bench.one(0x0400), 0, "written to RAM only");
-    bench.drive.set_mode(Mode::Program);
-    bench.write(0x0400, &[1111]).unwrap();
-    bench.write(0x0313, &[22]).unwrap();
-    bench.write(0x0312, &[33]).unwrap();
-    assert_eq!(bench.write(0x0900, &[0]), Ok(()));
-    assert_eq!(bench.one(0x0313), 22);
-    bench.write(0x0400, &[2222]).unwrap();
-    bench.power_cycle();
-    assert_eq!((bench.one(0x0400), bench.one(0x0312)), (1111, 33));
-    assert_eq!(bench.one(0x0313), 0, "On-20 is not saved");
-    bench.command(1, 3000);
-    assert_eq!(bench.write(0x0900, &[0]), Err(MODE), "not while running");
-    bench.command(0, 3000);
-    assert_eq!(bench.write(0x0900, &[1]), Ok(()));
+    let mut rig = TecoInTime::plain();
+    rig.drive.set_mode(Mode::Program);
+    rig.write(0x0400, &[1111]).unwrap();
+    rig.write(0x0313, &[22]).unwrap();
+    rig.write(0x0312, &[33]).unwrap();
+    rig.power_cycle();
+    assert_eq!(rig.one(0x0400), 0, "written to RAM only");
+    rig.drive.set_mode(Mode::Program);
+    rig.write(0x0400, &[1111]).unwrap();
+    rig.write(0x0313, &[22]).unwrap();
+    rig.write(0x0312, &[33]).unwrap();
+    assert_eq!(rig.write(0x0900, &[0]), Ok(()));
+    assert_eq!(rig.one(0x0313), 22);
+    rig.write(0x0400, &[2222]).unwrap();
+    rig.power_cycle();
+    assert_eq!((rig.one(0x0400), rig.one(0x0312)), (1111, 33));
+    assert_eq!(rig.one(0x0313), 0, "On-20 is not saved");
+    rig.command(1, 3000);
+    assert_eq!(rig.write(0x0900, &[0]), Err(MODE), "not while running");
+    rig.command(0, 3000);
+    assert_eq!(rig.write(0x0900, &[1]), Ok(()));
 }
 
 #[test]
 fn faults_and_their_reset() {
-    let mut bench = Bench::plain();
-    bench.command(1, 6000);
-    bench.drive.trip(fault::OVERHEAT | 0x8000);
-    bench.drive.trip(fault::POWER);
-    bench.wait(20);
-    assert_eq!(bench.read(0x20, 2).unwrap(), [0x0048, fault::OVERHEAT]);
-    assert_eq!(bench.one(0x2C), 0x4002);
-    bench.write(1, &[9]).unwrap();
-    bench.wait(1000);
+    let mut rig = TecoInTime::plain();
+    rig.command(1, 6000);
+    rig.drive.trip(fault::OVERHEAT | 0x8000);
+    rig.drive.trip(fault::POWER);
+    rig.wait(20);
+    assert_eq!(rig.read(0x20, 2).unwrap(), [0x0048, fault::OVERHEAT]);
+    assert_eq!(rig.one(0x2C), 0x4002);
+    rig.write(1, &[9]).unwrap();
+    rig.wait(1000);
     assert_eq!(
-        bench.read(0x20, 2),
+        rig.read(0x20, 2),
         Ok(vec![0x0044, 0]),
         "reset, and needs a new run command"
     );
-    bench.drive.trip(fault::POWER);
-    bench.write(1, &[9]).unwrap();
-    assert_eq!(bench.one(0x21), fault::POWER, "a bit that stays set resets nothing");
-    assert_eq!(bench.one(0x2C) & 0x4080, 0x4080);
-    bench.command(0, 6000);
-    bench.command(8, 6000);
-    bench.command(1, 6000);
-    assert_eq!(bench.one(0x20), 0x00A5);
-    bench.drive.trip(0x8000);
-    assert_eq!(bench.one(0x21), 0, "no such fault");
+    rig.drive.trip(fault::POWER);
+    rig.write(1, &[9]).unwrap();
+    assert_eq!(rig.one(0x21), fault::POWER, "a bit that stays set resets nothing");
+    assert_eq!(rig.one(0x2C) & 0x4080, 0x4080);
+    rig.command(0, 6000);
+    rig.command(8, 6000);
+    rig.command(1, 6000);
+    assert_eq!(rig.one(0x20), 0x00A5);
+    rig.drive.trip(0x8000);
+    assert_eq!(rig.one(0x21), 0, "no such fault");
 }
 
 #[test]
 fn external_fault_from_bus_and_terminal() {
-    let mut bench = Bench::plain();
-    bench.command(1, 3000);
-    bench.write(1, &[5]).unwrap();
-    assert_eq!(bench.read(0x20, 2).unwrap()[1], fault::EXTERNAL);
-    bench.write(1, &[4 + 8]).unwrap();
-    assert_eq!(bench.one(0x21), fault::EXTERNAL, "while the bit is on");
-    bench.write(1, &[0]).unwrap();
-    bench.write(1, &[8]).unwrap();
-    assert_eq!(bench.one(0x21), 0);
-    bench.drive.set_terminals(0b100);
-    assert_eq!((bench.one(0x21), bench.one(0x2B)), (fault::EXTERNAL, 0b100));
+    let mut rig = TecoInTime::plain();
+    rig.command(1, 3000);
+    rig.write(1, &[5]).unwrap();
+    assert_eq!(rig.read(0x20, 2).unwrap()[1], fault::EXTERNAL);
+    rig.write(1, &[4 + 8]).unwrap();
+    assert_eq!(rig.one(0x21), fault::EXTERNAL, "while the bit is on");
+    rig.write(1, &[0]).unwrap();
+    rig.write(1, &[8]).unwrap();
+    assert_eq!(rig.one(0x21), 0);
+    rig.drive.set_terminals(0b100);
+    assert_eq!((rig.one(0x21), rig.one(0x2B)), (fault::EXTERNAL, 0b100));
 }
 
 #[test]
 fn sources_of_run_and_frequency() {
     for digits in [Digits::Bits, Digits::Decimal, Digits::Hexadecimal] {
-        let mut bench = Bench::new(TecoOptions {
+        let mut rig = TecoInTime::new(TecoOptions {
             digits,
             parameters: vec![(0x0400, 1000), (0x0108, digits.register([true, true, false, true]))],
             ..TecoOptions::default()
         });
-        bench.command(1, 3000);
-        assert_eq!(bench.read(0x23, 2), Ok(vec![1000, 1000]), "An-01");
-        assert_eq!(bench.one(0x2C) >> 9 & 0b11, 0b01);
-        bench.drive.set_mode(Mode::Program);
-        bench.wait(5000);
+        rig.command(1, 3000);
+        assert_eq!(rig.read(0x23, 2), Ok(vec![1000, 1000]), "An-01");
+        assert_eq!(rig.one(0x2C) >> 9 & 0b11, 0b01);
+        rig.drive.set_mode(Mode::Program);
+        rig.wait(5000);
         let run_by_terminals = digits.register([true, true, true, false]);
-        bench.write(0x0108, &[run_by_terminals]).unwrap();
-        bench.drive.set_mode(Mode::Drive);
-        bench.command(0, 3000);
-        bench.command(1, 3000);
-        assert_eq!(bench.one(0x24), 0, "0001H does not run it");
-        assert_eq!(bench.one(0x2C) >> 9 & 0b11, 0b10);
-        bench.drive.set_terminals(0b10);
-        bench.wait(8000);
+        rig.write(0x0108, &[run_by_terminals]).unwrap();
+        rig.drive.set_mode(Mode::Drive);
+        rig.command(0, 3000);
+        rig.command(1, 3000);
+        assert_eq!(rig.one(0x24), 0, "0001H does not run it");
+        assert_eq!(rig.one(0x2C) >> 9 & 0b11, 0b10);
+        rig.drive.set_terminals(0b10);
+        rig.wait(8000);
         assert_eq!(
-            bench.drive.state().output,
+            rig.drive.state().output,
             -30.0,
             "terminal 2, and the frequency of 0002H"
         );
-        assert!(!bench.drive.state().remote);
+        assert!(!rig.drive.state().remote);
     }
 }
 
 #[test]
 fn multifunction_references() {
     let steps = [(0x0401, 1500), (0x0402, 2000), (0x0403, 2500), (0x0408, 600)];
-    let mut bench = Bench::with_parameters(&steps);
+    let mut rig = TecoInTime::with_parameters(&steps);
     for (bits, terminals, hundredths) in [
         (0x00, 0, 5000),
         (0x10, 0, 1500),
@@ -403,46 +357,46 @@ fn multifunction_references() {
         (0x40, 0, 600),
         (0x70, 0, 600),
     ] {
-        bench.drive.set_terminals(terminals);
-        bench.command(bits | 1, 5000);
-        assert_eq!(bench.one(0x24), hundredths, "{bits:02X} {terminals:02X}");
+        rig.drive.set_terminals(terminals);
+        rig.command(bits | 1, 5000);
+        assert_eq!(rig.one(0x24), hundredths, "{bits:02X} {terminals:02X}");
     }
-    bench.command(0x81, 5000);
-    assert_eq!(bench.one(0x2C) & 0x0141, 0x0100, "baseblock: neither running nor ready");
-    bench.command(0x01, 5000);
-    assert_eq!(bench.one(0x20) & 0b101, 0b101);
+    rig.command(0x81, 5000);
+    assert_eq!(rig.one(0x2C) & 0x0141, 0x0100, "baseblock: neither running nor ready");
+    rig.command(0x01, 5000);
+    assert_eq!(rig.one(0x20) & 0b101, 0b101);
 }
 
 #[test]
 fn bounds_and_detection() {
-    let mut bench = Bench::with_parameters(&[(0x020D, 50), (0x020E, 20), (0x0214, 250), (0x0215, 10)]);
-    bench.command(1, 6000);
-    assert_eq!(bench.one(0x24), 3000, "Cn-14");
-    assert_eq!(bench.one(0x2C) & 0x3C, 0x14);
-    bench.command(1, 2450);
+    let mut rig = TecoInTime::with_parameters(&[(0x020D, 50), (0x020E, 20), (0x0214, 250), (0x0215, 10)]);
+    rig.command(1, 6000);
+    assert_eq!(rig.one(0x24), 3000, "Cn-14");
+    assert_eq!(rig.one(0x2C) & 0x3C, 0x14);
+    rig.command(1, 2450);
     assert_eq!(
-        bench.one(0x2C) & 0x3C,
+        rig.one(0x2C) & 0x3C,
         0x3C,
         "within the hysteresis of detection 1, and below its level"
     );
-    bench.command(1, 0);
-    assert_eq!((bench.one(0x24), bench.one(0x2C) & 0x3C), (1200, 0x24), "Cn-15");
-    bench.command(1, 2550);
-    assert_eq!(bench.one(0x2C) & 0x3C, 0x3C);
-    let mut bench = Bench::new(TecoOptions {
+    rig.command(1, 0);
+    assert_eq!((rig.one(0x24), rig.one(0x2C) & 0x3C), (1200, 0x24), "Cn-15");
+    rig.command(1, 2550);
+    assert_eq!(rig.one(0x2C) & 0x3C, 0x3C);
+    let mut rig = TecoInTime::new(TecoOptions {
         detection_levels: DetectionLevels::Cn32AndCn33,
         parameters: vec![(0x021F, 400), (0x0220, 200)],
         ..TecoOptions::default()
     });
-    bench.command(1, 3000);
-    assert_eq!(bench.one(0x2C) & 0x30, 0);
-    bench.command(1, 4100);
-    assert_eq!(bench.one(0x2C) & 0x30, 0x10);
+    rig.command(1, 3000);
+    assert_eq!(rig.one(0x2C) & 0x30, 0);
+    rig.command(1, 4100);
+    assert_eq!(rig.one(0x2C) & 0x30, 0x10);
 }
 
 #[test]
 fn overtorque() {
-    let mut bench = Bench::new(TecoOptions {
+    let mut rig = TecoInTime::new(TecoOptions {
         load: Load {
             full_torque: 120.0,
             ..Load::default()
@@ -450,67 +404,56 @@ fn overtorque() {
         parameters: vec![(0x0219, 100), (0x021A, 10), (0x0500, 300)],
         ..TecoOptions::default()
     });
-    bench.write(1, &[1, 6000]).unwrap();
-    bench.wait(30_200);
-    assert_eq!(bench.one(0x2C) & 1 << 11, 1 << 11, "above 100 % for 1 s");
+    rig.write(1, &[1, 6000]).unwrap();
+    rig.wait(30_200);
+    assert_eq!(rig.one(0x2C) & 1 << 11, 1 << 11, "above 100 % for 1 s");
 }
 
 #[test]
 fn outputs_by_register() {
-    let mut bench = Bench::with_parameters(&[(0x0114, 15), (0x0115, 15), (0x0116, 15)]);
-    assert_eq!(bench.one(0x2D), 0);
-    bench.write(0x0009, &[0xFFFA]).unwrap();
-    bench.write(0x000A, &[255, 128]).unwrap();
-    assert_eq!((bench.one(0x2D), bench.one(0x20)), (0b010, 0x0044));
-    assert_eq!(bench.read(0x0009, 3), Ok(vec![0xFFFA, 255, 128]));
+    let mut rig = TecoInTime::with_parameters(&[(0x0114, 15), (0x0115, 15), (0x0116, 15)]);
+    assert_eq!(rig.one(0x2D), 0);
+    rig.write(0x0009, &[0xFFFA]).unwrap();
+    rig.write(0x000A, &[255, 128]).unwrap();
+    assert_eq!((rig.one(0x2D), rig.one(0x20)), (0b010, 0x0044));
+    assert_eq!(rig.read(0x0009, 3), Ok(vec![0xFFFA, 255, 128]));
 }
 
 /// reference/drives.md 9.9.
 #[test]
 fn broadcasts_reach_two_registers_only() {
-    let mut bench = Bench::plain();
-    let now = bench.now;
-    let both = RequestPdu::WriteRegisters {
-        start: 1,
-        values: vec![1, 3000],
-    };
-    bench.drive.broadcast(&both, now);
-    assert_eq!(bench.read(1, 2), Ok(vec![1, 3000]));
+    let mut rig = TecoInTime::plain();
+    let now = rig.now;
+    let both = RequestPdu::write_registers(1, &[1, 3000]);
+    rig.drive.broadcast(&both, now);
+    assert_eq!(rig.read(1, 2), Ok(vec![1, 3000]));
     for (start, values) in [(1, vec![0, 0, 0]), (0x0400, vec![5]), (0, vec![0, 0])] {
-        bench
-            .drive
-            .broadcast(&RequestPdu::WriteRegisters { start, values }, now);
+        rig.drive.broadcast(&RequestPdu::WriteRegisters { start, values }, now);
     }
-    bench.drive.broadcast(
-        &RequestPdu::WriteRegister {
-            address: 0x0500,
-            value: 9,
-        },
-        now,
-    );
-    assert_eq!(bench.read(1, 2), Ok(vec![1, 3000]));
-    assert_eq!((bench.one(0x0400), bench.one(0x0500)), (0, 30));
+    rig.drive.broadcast(&RequestPdu::write_register(0x0500, 9), now);
+    assert_eq!(rig.read(1, 2), Ok(vec![1, 3000]));
+    assert_eq!((rig.one(0x0400), rig.one(0x0500)), (0, 30));
 }
 
 /// Cn-31 supervises the link between the drive and its card only.
 #[test]
 fn a_lost_master_changes_nothing() {
-    let mut bench = Bench::plain();
-    bench.command(1, 6000);
-    bench.wait(3_600_000);
-    let state = bench.drive.state();
+    let mut rig = TecoInTime::plain();
+    rig.command(1, 6000);
+    rig.wait(3_600_000);
+    let state = rig.drive.state();
     assert_eq!((state.output, state.fault), (60.0, 0));
 }
 
 #[test]
 fn the_simulators_own_trip_register() {
-    let mut bench = Bench::new(TecoOptions {
+    let mut rig = TecoInTime::new(TecoOptions {
         trip_register: true,
         ..TecoOptions::default()
     });
-    bench.write(TecoOptions::TRIP_ADDRESS, &[fault::OVERVOLTAGE]).unwrap();
+    rig.write(TecoOptions::TRIP_ADDRESS, &[fault::OVERVOLTAGE]).unwrap();
     assert_eq!(
-        (bench.one(0x21), bench.one(TecoOptions::TRIP_ADDRESS)),
+        (rig.one(0x21), rig.one(TecoOptions::TRIP_ADDRESS)),
         (fault::OVERVOLTAGE, 0)
     );
 }

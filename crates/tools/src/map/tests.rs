@@ -1,33 +1,22 @@
 use std::time::Duration;
 
+use drivegate_testkit::{STALE_AFTER, bus, bus_spec, image, monitored, nx};
+
 use super::export::quoted;
 use super::*;
-use crate::codec::{LineFormat, Protocol};
-use crate::drive::profile::Profiles;
-use crate::process_image::{Access, BusSpec};
+use crate::process_image::Access;
 
 fn plant() -> Plant {
-    let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let profile = nx();
     let drive = |name: &str, unit, access| {
-        let spec = DriveSpec {
+        image(DriveSpec {
             access,
             turnaround: Duration::ZERO,
-            ..DriveSpec::new(name, "line1", unit, profile.clone())
-        };
-        Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
-    };
-    let spec = BusSpec {
-        name: "line1".to_string(),
-        port: "/dev/null".to_string(),
-        protocol: Protocol::ModbusRtu,
-        format: LineFormat::new(38_400, "8N1").unwrap(),
-        cycle: Duration::from_millis(10),
-        slow_cycle: Duration::from_secs(1),
+            ..monitored(name, "line1", unit, &profile)
+        })
     };
     let drives = vec![drive("pump-1", 1, Access::Control), drive("pump-2", 2, Access::Monitor)];
-    let image = Arc::new(BusImage::new(spec, drives));
-    let queue = Arc::new(CommandQueue::new().unwrap());
-    Plant::new("pump-house", Duration::from_secs(1), vec![BusHandle { image, queue }])
+    Plant::new("pump-house", STALE_AFTER, vec![bus(bus_spec("line1"), drives)])
 }
 
 #[test]

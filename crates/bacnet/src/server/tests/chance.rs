@@ -43,18 +43,18 @@ proptest! {
     #[test]
     fn nothing_panics_and_what_comes_out_is_sound(frames in prop::collection::vec(
         prop_oneof![nearly(), prop::collection::vec(any::<u8>(), 0..60)], 1..60)) {
-        let mut bench = Bench::of(2, 3);
+        let mut rig = ServerWithClients::of(2, 3);
         for frame in frames {
-            bench.datagram(5, &frame);
-            while let Some(job) = bench.server.take_job() {
-                bench.server.written(job.token, Ok(()), &bench.plant, bench.now);
+            rig.datagram(5, &frame);
+            while let Some(job) = rig.server.take_job() {
+                rig.server.written(job.token, Ok(()), &rig.plant, rig.now);
             }
-            for (_, bytes) in std::iter::from_fn(|| bench.server.transmit()) {
+            for (_, bytes) in std::iter::from_fn(|| rig.server.transmit()) {
                 prop_assert!(bvlc::decode(&bytes).is_some());
                 prop_assert!(bytes.len() <= 1497);
             }
         }
-        bench.later(Duration::from_secs(1));
+        rig.later(Duration::from_secs(1));
     }
 }
 
@@ -178,26 +178,26 @@ fn requests() -> Vec<Vec<u8>> {
 fn frames_by_chance_harm_nothing() {
     let count: u64 = std::env::var("FRAMES").map_or(30_000, |text| text.parse().unwrap());
     let (frames, mut dice) = (requests(), Dice(0x9E37_79B9_7F4A_7C15));
-    let mut bench = Bench::of(2, 3);
+    let mut rig = ServerWithClients::of(2, 3);
     let (mut came, mut left) = (0, 0);
     for number in 0..count {
         let frame = dice.mangled(&frames);
         came += frame.len();
-        bench.datagram(2 + dice.below(4) as u8, &frame);
-        while let Some(job) = bench.server.take_job() {
+        rig.datagram(2 + dice.below(4) as u8, &frame);
+        while let Some(job) = rig.server.take_job() {
             let result = [Ok(()), Err(Error::TIMEOUT)][dice.below(2)];
-            bench.server.written(job.token, result, &bench.plant, bench.now);
+            rig.server.written(job.token, result, &rig.plant, rig.now);
         }
-        while let Some((to, bytes)) = bench.server.transmit() {
+        while let Some((to, bytes)) = rig.server.transmit() {
             assert!(bvlc::decode(&bytes).is_some() && bytes.len() <= 1497, "{frame:?}");
             left += if to == To::Broadcast { 0 } else { bytes.len() };
         }
         if number % 50 == 0 {
-            bench.shows(101, 0, Datum::Number(number as f64));
-            bench.later(Duration::from_millis(100));
+            rig.shows(101, 0, Datum::Number(number as f64));
+            rig.later(Duration::from_millis(100));
         }
     }
-    let counters = bench.server.counters();
+    let counters = rig.server.counters();
     assert!(
         counters.done > count / 50 && counters.refused > count / 50,
         "{counters:?}"

@@ -25,7 +25,7 @@ fn present(out: &[Out]) -> Vec<(u32, To, Option<u8>)> {
 
 #[test]
 fn who_is_concerns_those_that_it_is_for() {
-    let mut bench = Bench::new();
+    let mut rig = ServerWithClients::new();
     let all = Some((npdu::GLOBAL, Mac::ALL));
     let network = Some((NETWORK, Mac::ALL));
     type Case<'c> = (Option<(u16, Mac)>, Option<(u64, u64)>, &'c [u32]);
@@ -39,8 +39,8 @@ fn who_is_concerns_those_that_it_is_for() {
         (network, Some((0, 4_194_303)), &[101, 102, 103]),
     ];
     for (to, range, wanted) in cases {
-        bench.datagram(5, &bvlc::broadcast(&who_is(to, None, range)));
-        let heard = present(&bench.out());
+        rig.datagram(5, &bvlc::broadcast(&who_is(to, None, range)));
+        let heard = present(&rig.out());
         assert_eq!(
             heard.iter().map(|(instance, ..)| *instance).collect::<Vec<_>>(),
             wanted,
@@ -48,69 +48,71 @@ fn who_is_concerns_those_that_it_is_for() {
         );
         assert!(heard.iter().all(|(instance, to, station)| *to == To::Broadcast
             && station.map_or(100, |unit| 100 + u32::from(unit)) == *instance));
-        bench.later(Duration::from_secs(1));
+        rig.later(Duration::from_secs(1));
     }
-    bench.plant.silent.borrow_mut().insert(102);
-    bench.datagram(5, &bvlc::unicast(&who_is(all, None, None)));
-    let heard = present(&bench.out());
+    rig.plant.silent.borrow_mut().insert(102);
+    rig.datagram(5, &bvlc::unicast(&who_is(all, None, None)));
+    let heard = present(&rig.out());
     assert_eq!(heard.len(), 3, "one that is away says nothing");
     assert!(
-        heard.iter().all(|(_, to, _)| *to == To::Host(Bench::client(5))),
+        heard
+            .iter()
+            .all(|(_, to, _)| *to == To::Host(ServerWithClients::client(5))),
         "to the asker"
     );
 }
 
 #[test]
 fn a_question_from_behind_a_router_is_answered_there() {
-    let mut bench = Bench::new();
+    let mut rig = ServerWithClients::new();
     let from = Some((7, Mac::new(&[0x0A]).unwrap()));
-    bench.datagram(
+    rig.datagram(
         5,
         &bvlc::unicast(&who_is(Some((NETWORK, Mac::ALL)), from, Some((101, 101)))),
     );
-    let (to, remote, station, _) = bench.out().remove(0);
-    assert_eq!((to, station), (To::Host(Bench::client(5)), Some(1)));
+    let (to, remote, station, _) = rig.out().remove(0);
+    assert_eq!((to, station), (To::Host(ServerWithClients::client(5)), Some(1)));
     assert_eq!(remote, Some((7, Mac::new(&[0x0A]).unwrap(), 255)));
-    bench.datagram(
+    rig.datagram(
         5,
         &bvlc::broadcast(&who_is(Some((npdu::GLOBAL, Mac::ALL)), from, Some((101, 101)))),
     );
-    let (to, remote, ..) = bench.out().remove(0);
+    let (to, remote, ..) = rig.out().remove(0);
     assert_eq!((to, remote), (To::Broadcast, Some((7, Mac::ALL, 255))));
     // Nobody on this network is behind the network of the drives.
     let forged = Some((NETWORK, Mac::new(&[1]).unwrap()));
-    bench.datagram(5, &bvlc::unicast(&who_is(None, forged, None)));
-    assert!(bench.out().is_empty());
+    rig.datagram(5, &bvlc::unicast(&who_is(None, forged, None)));
+    assert!(rig.out().is_empty());
 }
 
 #[test]
 fn routers_ask_and_are_refused_other_networks() {
-    let mut bench = Bench::new();
+    let mut rig = ServerWithClients::new();
     let message =
         |kind: u8, content: &[u8]| bvlc::unicast(&npdu::encode(None, None, false, Payload::Network(kind, content)));
     for asked in [&[][..], &NETWORK.to_be_bytes()] {
-        bench.datagram(5, &message(0, asked));
-        assert_eq!(bench.out()[0].3, [0xFF, 1, 3, 0xE9]);
+        rig.datagram(5, &message(0, asked));
+        assert_eq!(rig.out()[0].3, [0xFF, 1, 3, 0xE9]);
     }
-    bench.datagram(5, &message(0, &[0, 9]));
-    assert!(bench.out().is_empty());
-    bench.datagram(5, &message(6, &[0]));
-    assert_eq!(bench.out()[0].3, [0xFF, 7, 1, 3, 0xE9, 1, 0]);
+    rig.datagram(5, &message(0, &[0, 9]));
+    assert!(rig.out().is_empty());
+    rig.datagram(5, &message(6, &[0]));
+    assert_eq!(rig.out()[0].3, [0xFF, 7, 1, 3, 0xE9, 1, 0]);
     let to_other = npdu::encode(Some((77, Mac::ALL)), None, true, Payload::Application(&WHO_IS));
-    bench.datagram(5, &bvlc::unicast(&to_other));
-    assert_eq!(bench.out()[0].3, [0xFF, 3, 1, 0, 77]);
-    bench.datagram(5, &bvlc::broadcast(&to_other));
-    assert!(bench.out().is_empty(), "a broadcast is not refused");
+    rig.datagram(5, &bvlc::unicast(&to_other));
+    assert_eq!(rig.out()[0].3, [0xFF, 3, 1, 0, 77]);
+    rig.datagram(5, &bvlc::broadcast(&to_other));
+    assert!(rig.out().is_empty(), "a broadcast is not refused");
     let mut tired = who_is(Some((NETWORK, Mac::ALL)), None, None);
     let hops = tired.iter().rposition(|octet| *octet == 255).unwrap();
     tired[hops] = 0;
-    bench.datagram(5, &bvlc::unicast(&tired));
-    assert!(bench.out().is_empty(), "the hops end at 0");
+    rig.datagram(5, &bvlc::unicast(&tired));
+    assert!(rig.out().is_empty(), "the hops end at 0");
 }
 
 #[test]
 fn who_has_by_number_and_by_name() {
-    let mut bench = Bench::new();
+    let mut rig = ServerWithClients::new();
     let sought = |write: &dyn Fn(&mut Writer)| {
         let apdu = [vec![0x10, 7], written(|w| write(w))].concat();
         bvlc::unicast(&npdu::encode(
@@ -120,89 +122,83 @@ fn who_has_by_number_and_by_name() {
             Payload::Application(&apdu),
         ))
     };
-    bench.datagram(
+    rig.datagram(
         5,
         &sought(&|w| {
             w.context_object(2, RUN);
         }),
     );
-    assert_eq!(bench.out().len(), 3);
+    assert_eq!(rig.out().len(), 3);
     let name = |text: &'static str| {
         sought(&move |w| {
             w.context_octets(3, &[&[0], text.as_bytes()].concat());
         })
     };
-    bench.datagram(5, &name("speed"));
-    let out = bench.out();
+    rig.datagram(5, &name("speed"));
+    let out = rig.out();
     assert!(
         out.len() == 3
             && out
                 .iter()
                 .all(|(.., apdu)| apdu.starts_with(&[0x10, 1]) && apdu.ends_with(b"speed"))
     );
-    bench.datagram(5, &name("device-102"));
-    assert_eq!(bench.out().len(), 1);
-    bench.datagram(5, &name("nothing"));
-    assert!(bench.out().is_empty());
+    rig.datagram(5, &name("device-102"));
+    assert_eq!(rig.out().len(), 1);
+    rig.datagram(5, &name("nothing"));
+    assert!(rig.out().is_empty());
 }
 
 #[test]
 fn bbmd_requests_are_refused_and_those_not_allowed_hear_nothing() {
-    let mut bench = Bench::new();
+    let mut rig = ServerWithClients::new();
     for (request, code) in [
         (bvlc::register(60), 0x30),
         (vec![0x81, 2, 0, 4], 0x20),
         (vec![0x81, 1, 0, 4], 0x10),
     ] {
-        bench.datagram(5, &request);
-        assert_eq!(bench.server.transmit().unwrap().1, bvlc::result(code));
+        rig.datagram(5, &request);
+        assert_eq!(rig.server.transmit().unwrap().1, bvlc::result(code));
     }
     // An own broadcast that comes back is nothing that came.
-    let before = bench.server.counters();
-    let own = bench.server.options.address;
-    bench
-        .server
-        .receive(own, &bvlc::broadcast(&[1, 0]), &bench.plant, bench.now);
-    assert_eq!(bench.server.counters(), before);
+    let before = rig.server.counters();
+    let own = rig.server.options.address;
+    rig.server.receive(own, &bvlc::broadcast(&[1, 0]), &rig.plant, rig.now);
+    assert_eq!(rig.server.counters(), before);
     let stranger = "192.0.2.9:47808".parse().unwrap();
     let all = who_is(Some((npdu::GLOBAL, Mac::ALL)), None, None);
     let mut forwarded = vec![0x81, 4];
     forwarded.extend(u16::try_from(all.len() + 10).unwrap().to_be_bytes());
-    let heard = |bench: &mut Bench, from: SocketAddrV4, origin: [u8; 4]| {
+    let heard = |rig: &mut ServerWithClients, from: SocketAddrV4, origin: [u8; 4]| {
         let datagram = [&forwarded[..], &origin, &[0xBA, 0xC0], &all].concat();
-        bench.server.receive(from, &datagram, &bench.plant, bench.now);
-        let heard = bench.out().len();
-        bench.later(Duration::from_secs(1));
+        rig.server.receive(from, &datagram, &rig.plant, rig.now);
+        let heard = rig.out().len();
+        rig.later(Duration::from_secs(1));
         heard
     };
-    bench
-        .server
-        .receive(stranger, &bvlc::unicast(&all), &bench.plant, bench.now);
-    bench
-        .server
-        .receive(stranger, &bvlc::register(1), &bench.plant, bench.now);
-    assert!(bench.out().is_empty());
+    rig.server.receive(stranger, &bvlc::unicast(&all), &rig.plant, rig.now);
+    rig.server.receive(stranger, &bvlc::register(1), &rig.plant, rig.now);
+    assert!(rig.out().is_empty());
     assert_eq!(
-        heard(&mut bench, Bench::client(5), [10, 9, 9, 9]),
+        heard(&mut rig, ServerWithClients::client(5), [10, 9, 9, 9]),
         4,
         "a BBMD of this subnet"
     );
     assert_eq!(
-        heard(&mut bench, Bench::client(5), [192, 0, 2, 1]),
+        heard(&mut rig, ServerWithClients::client(5), [192, 0, 2, 1]),
         0,
         "the originator is not allowed"
     );
     let far = "10.9.0.1:47808".parse().unwrap();
-    assert_eq!(heard(&mut bench, far, [10, 9, 9, 9]), 0, "of another subnet");
-    bench.server.set_bbmd(Some(far), bench.now);
-    bench.later(Duration::from_millis(100));
-    assert_eq!(bench.server.transmit(), Some((To::Host(far), bvlc::register(60))));
-    bench.server.receive(far, &bvlc::result(0), &bench.plant, bench.now);
-    assert_eq!(bench.server.registration(), Registration::Registered);
-    assert_eq!(bench.server.registration(), Registration::Registered);
+    assert_eq!(heard(&mut rig, far, [10, 9, 9, 9]), 0, "of another subnet");
+    rig.server.set_bbmd(Some(far), rig.now);
+    rig.later(Duration::from_millis(100));
+    assert_eq!(rig.server.transmit(), Some((To::Host(far), bvlc::register(60))));
+    rig.server.receive(far, &bvlc::result(0), &rig.plant, rig.now);
+    assert_eq!(rig.server.registration(), Registration::Registered);
+    assert_eq!(rig.server.registration(), Registration::Registered);
     let datagram = [&forwarded[..], &[10, 9, 9, 9], &[0xBA, 0xC0], &all].concat();
-    bench.server.receive(far, &datagram, &bench.plant, bench.now);
-    let out: Vec<(To, Vec<u8>)> = std::iter::from_fn(|| bench.server.transmit()).collect();
+    rig.server.receive(far, &datagram, &rig.plant, rig.now);
+    let out: Vec<(To, Vec<u8>)> = std::iter::from_fn(|| rig.server.transmit()).collect();
     let to_bbmd = out
         .iter()
         .filter(|(to, bytes)| *to == To::Host(far) && bytes[1] == 9)

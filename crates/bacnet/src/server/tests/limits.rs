@@ -2,7 +2,7 @@ use super::*;
 
 #[test]
 fn a_flood_of_who_is_is_answered_within_bounds() {
-    let mut bench = Bench::of(250, 0);
+    let mut rig = ServerWithClients::of(250, 0);
     let all = npdu::encode(
         Some((npdu::GLOBAL, Mac::ALL)),
         None,
@@ -12,18 +12,18 @@ fn a_flood_of_who_is_is_answered_within_bounds() {
     let mut left = 0;
     for _ in 0..100 {
         for _ in 0..100 {
-            bench.datagram(5, &bvlc::broadcast(&all));
+            rig.datagram(5, &bvlc::broadcast(&all));
         }
-        bench.later(Duration::from_millis(100));
-        left += bench.out().len();
+        rig.later(Duration::from_millis(100));
+        left += rig.out().len();
     }
     assert!((900..=1200).contains(&left), "{left} broadcasts in 10 s");
     let asked = bvlc::unicast(&all);
     let (mut came, mut left) = (0, 0);
     for _ in 0..1000 {
         came += asked.len();
-        bench.datagram(6, &asked);
-        left += std::iter::from_fn(|| bench.server.transmit())
+        rig.datagram(6, &asked);
+        left += std::iter::from_fn(|| rig.server.transmit())
             .map(|(_, bytes)| bytes.len())
             .sum::<usize>();
     }
@@ -32,7 +32,7 @@ fn a_flood_of_who_is_is_answered_within_bounds() {
 
 #[test]
 fn a_long_answer_is_not_bought_with_a_short_question() {
-    let mut bench = Bench::of(1, 60);
+    let mut rig = ServerWithClients::of(1, 60);
     let own = ObjectId::new(ObjectType::DEVICE, 101);
     let asked = written(|w| {
         w.context_object(0, own)
@@ -42,8 +42,7 @@ fn a_long_answer_is_not_bought_with_a_short_question() {
     });
     let mut left = 0;
     for n in 0..1000 {
-        bench
-            .ask(5, Some(1), n as u8, c::READ_PROPERTY_MULTIPLE, &asked)
+        rig.ask(5, Some(1), n as u8, c::READ_PROPERTY_MULTIPLE, &asked)
             .iter()
             .for_each(|apdu| left += apdu.len());
     }

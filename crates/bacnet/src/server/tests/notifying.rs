@@ -27,7 +27,7 @@ fn notified(out: &[Vec<u8>]) -> Vec<Option<Data>> {
         .collect()
 }
 
-impl Bench {
+impl ServerWithClients {
     fn change(&mut self, value: f64) -> Vec<Option<Data>> {
         self.shows(101, 0, Datum::Number(value));
         self.server.changed(101, &self.plant, self.now);
@@ -38,43 +38,43 @@ impl Bench {
 
 #[test]
 fn the_first_at_once_then_by_the_increment() {
-    let mut bench = Bench::new();
-    bench.shows(101, 0, Datum::Number(10.0));
-    let answers = bench.ask(5, Some(1), 1, c::SUBSCRIBE_COV, &subscribe(SPEED, false, 60));
+    let mut rig = ServerWithClients::new();
+    rig.shows(101, 0, Datum::Number(10.0));
+    let answers = rig.ask(5, Some(1), 1, c::SUBSCRIBE_COV, &subscribe(SPEED, false, 60));
     assert_eq!(answers[0], apdu::simple_ack(1, c::SUBSCRIBE_COV));
     assert_eq!(notified(&answers[1..]), [Some(Data::Real(10.0))]);
-    assert!(bench.change(10.05).is_empty());
-    assert_eq!(bench.change(10.2), [Some(Data::Real(10.2))]);
-    bench.plant.values.borrow_mut().get_mut(&(101, 0)).unwrap().reliability = Reliability::CommunicationFailure;
-    bench.later(Duration::from_millis(100));
-    assert_eq!(bench.out().len(), 1, "the flags changed, found by time alone");
+    assert!(rig.change(10.05).is_empty());
+    assert_eq!(rig.change(10.2), [Some(Data::Real(10.2))]);
+    rig.plant.values.borrow_mut().get_mut(&(101, 0)).unwrap().reliability = Reliability::CommunicationFailure;
+    rig.later(Duration::from_millis(100));
+    assert_eq!(rig.out().len(), 1, "the flags changed, found by time alone");
     let own = ObjectId::new(ObjectType::DEVICE, 101);
-    let listed = bench.ask(5, Some(1), 1, c::READ_PROPERTY, &read(own, 152)).remove(0);
+    let listed = rig.ask(5, Some(1), 1, c::READ_PROPERTY, &read(own, 152)).remove(0);
     assert!(listed.len() > 40);
-    bench.later(Duration::from_secs(61));
-    assert!(bench.change(50.0).is_empty(), "its time is over");
-    assert_eq!(bench.server.counters().subscriptions, 0);
+    rig.later(Duration::from_secs(61));
+    assert!(rig.change(50.0).is_empty(), "its time is over");
+    assert_eq!(rig.server.counters().subscriptions, 0);
 }
 
 #[test]
 fn confirmed_ones_go_one_by_one_with_the_newest_value() {
-    let mut bench = Bench::new();
-    bench.shows(101, 0, Datum::Number(10.0));
-    let answers = bench.ask(5, Some(1), 1, c::SUBSCRIBE_COV, &subscribe(SPEED, true, 0));
+    let mut rig = ServerWithClients::new();
+    rig.shows(101, 0, Datum::Number(10.0));
+    let answers = rig.ask(5, Some(1), 1, c::SUBSCRIBE_COV, &subscribe(SPEED, true, 0));
     assert_eq!(notified(&answers[1..]), [Some(Data::Real(10.0))]);
     let invoke = answers[1][2];
-    assert!(bench.change(20.0).is_empty() && bench.change(30.0).is_empty());
-    bench.later(Duration::from_secs(3));
-    assert_eq!(bench.out().len(), 1, "again");
-    bench.tell(5, Some(1), &apdu::simple_ack(invoke, 1));
-    let out: Vec<Vec<u8>> = bench.out().into_iter().map(|(.., apdu)| apdu).collect();
+    assert!(rig.change(20.0).is_empty() && rig.change(30.0).is_empty());
+    rig.later(Duration::from_secs(3));
+    assert_eq!(rig.out().len(), 1, "again");
+    rig.tell(5, Some(1), &apdu::simple_ack(invoke, 1));
+    let out: Vec<Vec<u8>> = rig.out().into_iter().map(|(.., apdu)| apdu).collect();
     assert_eq!(notified(&out), [Some(Data::Real(30.0))], "merged");
 }
 
 #[test]
 fn any_property_of_any_object_and_no_other() {
-    let mut bench = Bench::new();
-    bench.shows(101, 0, Datum::Number(0.0));
+    let mut rig = ServerWithClients::new();
+    rig.shows(101, 0, Datum::Number(0.0));
     for object in [
         SPEED,
         RUN,
@@ -83,7 +83,7 @@ fn any_property_of_any_object_and_no_other() {
         ObjectId::new(ObjectType::DEVICE, 101),
         ObjectId::new(ObjectType::NETWORK_PORT, 1),
     ] {
-        let answers = bench.ask(5, Some(1), 1, c::SUBSCRIBE_COV, &subscribe(object, false, 60));
+        let answers = rig.ask(5, Some(1), 1, c::SUBSCRIBE_COV, &subscribe(object, false, 60));
         assert_eq!((answers.len(), answers[0][0]), (2, 0x20), "{object}");
     }
     let of_property = |property: u64| {
@@ -95,13 +95,13 @@ fn any_property_of_any_object_and_no_other() {
             w.open(4).context_unsigned(0, property).close(4).context_real(5, 5.0);
         })
     };
-    let answers = bench.ask(5, Some(1), 1, c::SUBSCRIBE_COV_PROPERTY, &of_property(PV.into()));
+    let answers = rig.ask(5, Some(1), 1, c::SUBSCRIBE_COV_PROPERTY, &of_property(PV.into()));
     assert_eq!(answers.len(), 2);
-    assert_eq!(bench.change(3.0).len(), 1, "by 0.1, not by 5");
-    assert_eq!(bench.change(9.0).len(), 2);
-    let answers = bench.ask(5, Some(1), 1, c::SUBSCRIBE_COV_PROPERTY, &of_property(87));
+    assert_eq!(rig.change(3.0).len(), 1, "by 0.1, not by 5");
+    assert_eq!(rig.change(9.0).len(), 2);
+    let answers = rig.ask(5, Some(1), 1, c::SUBSCRIBE_COV_PROPERTY, &of_property(87));
     assert_eq!(answers, [apdu::error(1, 28, Error::UNKNOWN_PROPERTY)]);
-    let answers = bench.ask(
+    let answers = rig.ask(
         5,
         Some(1),
         1,
@@ -112,15 +112,15 @@ fn any_property_of_any_object_and_no_other() {
     let cancel = written(|w| {
         w.context_unsigned(0, 7).context_object(1, SPEED);
     });
-    bench.ask(5, Some(1), 1, c::SUBSCRIBE_COV, &cancel);
-    assert_eq!(bench.server.counters().subscriptions, 6);
-    bench.server.set_devices(vec![device(100, None, 0)]);
-    assert_eq!(bench.server.counters().subscriptions, 0, "its device is there no more");
+    rig.ask(5, Some(1), 1, c::SUBSCRIBE_COV, &cancel);
+    assert_eq!(rig.server.counters().subscriptions, 6);
+    rig.server.set_devices(vec![device(100, None, 0)]);
+    assert_eq!(rig.server.counters().subscriptions, 0, "its device is there no more");
 }
 
 #[test]
 fn clocks_and_what_does_not_fit_are_not_subscribed_to() {
-    let mut bench = Bench::of(1, 240);
+    let mut rig = ServerWithClients::of(1, 240);
     let own = ObjectId::new(ObjectType::DEVICE, 101);
     let of_property = |property: PropertyId| {
         written(|w| {
@@ -138,12 +138,12 @@ fn clocks_and_what_does_not_fit_are_not_subscribed_to() {
         PropertyId::OBJECT_LIST,
         PropertyId::ALL,
     ] {
-        let answers = bench.ask(5, Some(1), 1, c::SUBSCRIBE_COV_PROPERTY, &of_property(property));
+        let answers = rig.ask(5, Some(1), 1, c::SUBSCRIBE_COV_PROPERTY, &of_property(property));
         assert_eq!(answers, [apdu::error(1, 28, Error::NOT_COV_PROPERTY)], "{property:?}");
     }
-    bench.later(Duration::from_secs(2));
-    assert_eq!((bench.out().len(), bench.server.counters().subscriptions), (0, 0));
-    let answers = bench.ask(
+    rig.later(Duration::from_secs(2));
+    assert_eq!((rig.out().len(), rig.server.counters().subscriptions), (0, 0));
+    let answers = rig.ask(
         5,
         Some(1),
         2,

@@ -10,7 +10,7 @@ fn run(on: u32, priority: u64) -> Vec<u8> {
     })
 }
 
-impl Bench {
+impl ServerWithClients {
     fn write(&mut self, from: u8, invoke: u8, content: &[u8]) -> Vec<Vec<u8>> {
         self.ask(from, Some(1), invoke, c::WRITE_PROPERTY, content)
     }
@@ -28,77 +28,77 @@ impl Bench {
 
 #[test]
 fn an_acknowledgement_waits_for_whoever_carries_it_out() {
-    let mut bench = Bench::new();
-    assert!(bench.write(5, 3, &run(1, 8)).is_empty());
-    let job = bench.job().unwrap();
+    let mut rig = ServerWithClients::new();
+    assert!(rig.write(5, 3, &run(1, 8)).is_empty());
+    let job = rig.job().unwrap();
     assert_eq!(
         (job.device, job.object, job.value.clone(), job.priority),
         (101, RUN, Some(Datum::Bool(true)), Some(8))
     );
-    assert!(bench.server.is_busy() && bench.job().is_none());
-    assert_eq!(bench.done(&job, Ok(())), [ack(3)]);
-    assert!(!bench.server.is_busy());
-    assert!(bench.done(&job, Ok(())).is_empty(), "answered once");
-    bench.write(5, 4, &run(1, 8));
-    let job = bench.job().unwrap();
+    assert!(rig.server.is_busy() && rig.job().is_none());
+    assert_eq!(rig.done(&job, Ok(())), [ack(3)]);
+    assert!(!rig.server.is_busy());
+    assert!(rig.done(&job, Ok(())).is_empty(), "answered once");
+    rig.write(5, 4, &run(1, 8));
+    let job = rig.job().unwrap();
     assert_eq!(
-        bench.done(&job, Err(Error::TIMEOUT)),
+        rig.done(&job, Err(Error::TIMEOUT)),
         [apdu::error(4, 15, Error::TIMEOUT)]
     );
 }
 
 #[test]
 fn what_comes_twice_is_done_once() {
-    let mut bench = Bench::new();
-    bench.write(5, 3, &run(1, 8));
-    let job = bench.job().unwrap();
+    let mut rig = ServerWithClients::new();
+    rig.write(5, 3, &run(1, 8));
+    let job = rig.job().unwrap();
     assert!(
-        bench.write(5, 3, &run(1, 8)).is_empty() && bench.job().is_none(),
+        rig.write(5, 3, &run(1, 8)).is_empty() && rig.job().is_none(),
         "it joins"
     );
-    assert_eq!(bench.done(&job, Ok(())), [ack(3)]);
-    assert_eq!(bench.write(5, 3, &run(1, 8)), [ack(3)], "from memory");
-    assert!(bench.job().is_none());
-    bench.plant.orders.set(99);
+    assert_eq!(rig.done(&job, Ok(())), [ack(3)]);
+    assert_eq!(rig.write(5, 3, &run(1, 8)), [ack(3)], "from memory");
+    assert!(rig.job().is_none());
+    rig.plant.orders.set(99);
     let denied = apdu::error(3, 15, Error::SERVICE_REQUEST_DENIED);
     assert_eq!(
-        bench.write(5, 3, &run(1, 8)),
+        rig.write(5, 3, &run(1, 8)),
         [denied],
         "somebody else ordered something since"
     );
-    assert!(bench.job().is_none());
-    bench.ask(5, Some(1), 4, c::READ_PROPERTY, &read(SPEED, PV));
-    bench.write(5, 3, &run(1, 8));
-    let job = bench.job().expect("a new request, behind another one");
-    bench.done(&job, Ok(()));
-    bench.later(Duration::from_secs(11));
-    bench.write(5, 3, &run(1, 8));
-    let job = bench.job().expect("forgotten");
-    bench.done(&job, Ok(()));
+    assert!(rig.job().is_none());
+    rig.ask(5, Some(1), 4, c::READ_PROPERTY, &read(SPEED, PV));
+    rig.write(5, 3, &run(1, 8));
+    let job = rig.job().expect("a new request, behind another one");
+    rig.done(&job, Ok(()));
+    rig.later(Duration::from_secs(11));
+    rig.write(5, 3, &run(1, 8));
+    let job = rig.job().expect("forgotten");
+    rig.done(&job, Ok(()));
     // A stop is carried out again.
-    bench.write(5, 5, &run(0, 8));
-    let job = bench.job().unwrap();
-    bench.write(5, 5, &run(0, 8));
-    assert!(bench.job().is_none(), "while it is under way");
-    bench.done(&job, Ok(()));
-    bench.write(5, 5, &run(0, 8));
-    assert!(bench.job().is_some());
+    rig.write(5, 5, &run(0, 8));
+    let job = rig.job().unwrap();
+    rig.write(5, 5, &run(0, 8));
+    assert!(rig.job().is_none(), "while it is under way");
+    rig.done(&job, Ok(()));
+    rig.write(5, 5, &run(0, 8));
+    assert!(rig.job().is_some());
 }
 
 #[test]
 fn another_request_by_the_same_number_gets_the_one_answer() {
-    let mut bench = Bench::new();
-    bench.write(5, 3, &run(1, 8));
-    let first = bench.job().unwrap();
-    bench.write(5, 3, &run(0, 8));
-    let second = bench.job().unwrap();
-    assert!(bench.done(&first, Ok(())).is_empty(), "its client does not wait for it");
-    assert_eq!(bench.done(&second, Ok(())), [ack(3)]);
+    let mut rig = ServerWithClients::new();
+    rig.write(5, 3, &run(1, 8));
+    let first = rig.job().unwrap();
+    rig.write(5, 3, &run(0, 8));
+    let second = rig.job().unwrap();
+    assert!(rig.done(&first, Ok(())).is_empty(), "its client does not wait for it");
+    assert_eq!(rig.done(&second, Ok(())), [ack(3)]);
 }
 
 #[test]
 fn values_are_judged_by_what_the_object_is() {
-    let mut bench = Bench::new();
+    let mut rig = ServerWithClients::new();
     let real = |number: f32| {
         move |w: &mut Writer| {
             w.real(number);
@@ -132,8 +132,8 @@ fn values_are_judged_by_what_the_object_is() {
         ),
     ];
     for (content, error) in cases {
-        assert_eq!(bench.write(5, 1, &content), [apdu::error(1, 15, error)], "{content:?}");
-        assert!(bench.job().is_none());
+        assert_eq!(rig.write(5, 1, &content), [apdu::error(1, 15, error)], "{content:?}");
+        assert!(rig.job().is_none());
     }
     let of = |object: ObjectId, property: u64, real: f32| {
         written(|w| {
@@ -145,19 +145,19 @@ fn values_are_judged_by_what_the_object_is() {
         })
     };
     assert_eq!(
-        bench.write(5, 1, &of(SPEED, 81, 0.0)),
+        rig.write(5, 1, &of(SPEED, 81, 0.0)),
         [apdu::error(1, 15, Error::WRITE_ACCESS_DENIED)],
         "Out_Of_Service"
     );
     assert_eq!(
-        bench.write(5, 1, &of(SPEED, 999, 0.0)),
+        rig.write(5, 1, &of(SPEED, 999, 0.0)),
         [apdu::error(1, 15, Error::UNKNOWN_PROPERTY)]
     );
-    assert_eq!(bench.write(5, 1, &of(SPEED, 22, 2.5)), [ack(1)], "COV_Increment");
-    let answer = bench.ask(5, Some(1), 1, c::READ_PROPERTY, &read(SPEED, 22)).remove(0);
+    assert_eq!(rig.write(5, 1, &of(SPEED, 22, 2.5)), [ack(1)], "COV_Increment");
+    let answer = rig.ask(5, Some(1), 1, c::READ_PROPERTY, &read(SPEED, 22)).remove(0);
     assert_eq!(value(&answer), Some(Data::Real(2.5)));
-    bench.write(5, 2, &write(REFERENCE, None, real(33.3)));
-    let job = bench.job().unwrap();
+    rig.write(5, 2, &write(REFERENCE, None, real(33.3)));
+    let job = rig.job().unwrap();
     assert_eq!(
         (job.value, job.priority),
         (Some(Datum::Number(33.3)), Some(16)),
@@ -167,19 +167,19 @@ fn values_are_judged_by_what_the_object_is() {
 
 #[test]
 fn those_that_may_not_write_are_refused_and_a_silent_device_can_be_stopped() {
-    let mut bench = Bench::new();
+    let mut rig = ServerWithClients::new();
     assert_eq!(
-        bench.write(200, 1, &run(1, 8)),
+        rig.write(200, 1, &run(1, 8)),
         [apdu::error(1, 15, Error::WRITE_ACCESS_DENIED)]
     );
-    assert!(bench.job().is_none());
-    bench.plant.silent.borrow_mut().insert(101);
-    assert!(bench.write(5, 1, &run(1, 8)).is_empty() && bench.job().is_none());
-    assert!(bench.ask(5, Some(1), 2, c::READ_PROPERTY, &read(SPEED, PV)).is_empty());
-    bench.write(5, 3, &run(0, 8));
-    let job = bench.job().unwrap();
+    assert!(rig.job().is_none());
+    rig.plant.silent.borrow_mut().insert(101);
+    assert!(rig.write(5, 1, &run(1, 8)).is_empty() && rig.job().is_none());
+    assert!(rig.ask(5, Some(1), 2, c::READ_PROPERTY, &read(SPEED, PV)).is_empty());
+    rig.write(5, 3, &run(0, 8));
+    let job = rig.job().unwrap();
     assert_eq!(
-        bench.done(&job, Err(Error::TIMEOUT)),
+        rig.done(&job, Err(Error::TIMEOUT)),
         [apdu::error(3, 15, Error::TIMEOUT)]
     );
 }
@@ -203,53 +203,52 @@ fn several(items: &[(ObjectId, f32)]) -> Vec<u8> {
 
 #[test]
 fn of_several_writes_a_stop_waits_for_none_and_outlives_all() {
-    let mut bench = Bench::new();
-    let begin = |bench: &mut Bench, items: &[(ObjectId, f32)]| {
+    let mut rig = ServerWithClients::new();
+    let begin = |rig: &mut ServerWithClients, items: &[(ObjectId, f32)]| {
         assert!(
-            bench
-                .ask(5, Some(1), 1, c::WRITE_PROPERTY_MULTIPLE, &several(items))
+            rig.ask(5, Some(1), 1, c::WRITE_PROPERTY_MULTIPLE, &several(items))
                 .is_empty()
         );
     };
-    begin(&mut bench, &[(REFERENCE, 50.0), (RUN, 0.0)]);
-    let stop = bench.job().unwrap();
+    begin(&mut rig, &[(REFERENCE, 50.0), (RUN, 0.0)]);
+    let stop = rig.job().unwrap();
     assert_eq!(stop.object, RUN, "the stop goes first");
-    assert!(bench.done(&stop, Ok(())).is_empty());
-    let reference = bench.job().unwrap();
-    assert_eq!(bench.done(&reference, Ok(())), [apdu::simple_ack(1, 16)]);
-    begin(&mut bench, &[(RUN, 1.0), (REFERENCE, 50.0), (RUN, 0.0)]);
-    let start = bench.job().unwrap();
+    assert!(rig.done(&stop, Ok(())).is_empty());
+    let reference = rig.job().unwrap();
+    assert_eq!(rig.done(&reference, Ok(())), [apdu::simple_ack(1, 16)]);
+    begin(&mut rig, &[(RUN, 1.0), (REFERENCE, 50.0), (RUN, 0.0)]);
+    let start = rig.job().unwrap();
     assert_eq!(
         start.value,
         Some(Datum::Bool(true)),
         "but not before what its client wrote to the same object"
     );
-    bench.done(&start, Err(Error::SERVICE_REQUEST_DENIED));
-    let stop = bench.job().unwrap();
+    rig.done(&start, Err(Error::SERVICE_REQUEST_DENIED));
+    let stop = rig.job().unwrap();
     assert_eq!(
         (stop.object, stop.value.clone()),
         (RUN, Some(Datum::Bool(false))),
         "the rest is not carried out, the stop is"
     );
-    let answer = bench.done(&stop, Ok(())).remove(0);
+    let answer = rig.done(&stop, Ok(())).remove(0);
     let failed = written(|w| {
         w.raw(&[0x50, 1, 16]).open(0).enumerated(5).enumerated(29).close(0);
         w.open(1).context_object(0, RUN).context_unsigned(1, PV.into()).close(1);
     });
     assert_eq!(answer, failed);
-    assert!(bench.job().is_none());
+    assert!(rig.job().is_none());
 }
 
 #[test]
 fn writes_under_way_are_bounded_and_stops_find_room() {
-    let mut bench = Bench::new();
+    let mut rig = ServerWithClients::new();
     let taken = (0..=255_u8).filter(|n| {
-        let answers = bench.write(5, *n, &run(1, 8));
+        let answers = rig.write(5, *n, &run(1, 8));
         answers.is_empty()
     });
     assert_eq!(taken.count(), 64);
-    let jobs = std::iter::from_fn(|| bench.job()).count();
+    let jobs = std::iter::from_fn(|| rig.job()).count();
     assert_eq!(jobs, 64);
-    assert!(bench.write(6, 1, &run(1, 8)).is_empty(), "another client has its own");
-    assert!(bench.write(5, 200, &run(0, 8)).is_empty() && bench.job().is_some() && bench.job().is_some());
+    assert!(rig.write(6, 1, &run(1, 8)).is_empty(), "another client has its own");
+    assert!(rig.write(5, 200, &run(0, 8)).is_empty() && rig.job().is_some() && rig.job().is_some());
 }

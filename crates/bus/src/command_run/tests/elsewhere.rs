@@ -3,14 +3,14 @@
 use super::*;
 
 /// A drive whose word the gateway knows from when it ran.
-fn bench(word: u16) -> Bench {
-    let mut bench = Bench::new(word);
+fn bench(word: u16) -> ObedientDrive {
+    let mut bench = ObedientDrive::new(word);
     bench.running = true;
     bench.words.learn(Table::Holding, 2000, 1);
     bench
 }
 
-fn reverse(bench: &Bench) -> CommandRun {
+fn reverse(bench: &ObedientDrive) -> CommandRun {
     bench.begin(&[("reverse", 1.0)], Urgency::Command).0
 }
 
@@ -91,7 +91,7 @@ fn a_drive_that_does_not_tell_keeps_its_run_bit_while_its_motor_runs() {
 fn each_try_of_the_write_has_a_read_of_its_own_and_there_are_no_more_of_them() {
     let mut bench = bench(1);
     let mut command = reverse(&bench);
-    let report = |command: &mut CommandRun, bench: &mut Bench, has: u16| {
+    let report = |command: &mut CommandRun, bench: &mut ObedientDrive, has: u16| {
         let read = sends(bench, command);
         assert!(asks(&read));
         let reported = Reply::Registers(vec![has]);

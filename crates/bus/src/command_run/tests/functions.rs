@@ -41,7 +41,7 @@ impl Drive {
     }
 
     /// Lets it answer a command to its end; what it was asked meanwhile.
-    fn carries_out(&mut self, bench: &mut Bench, mut run: CommandRun) -> (Vec<(u8, u16)>, Outcome) {
+    fn carries_out(&mut self, bench: &mut ObedientDrive, mut run: CommandRun) -> (Vec<(u8, u16)>, Outcome) {
         self.asked.clear();
         for _ in 0..20 {
             match run.next(&bench.words, &bench.profile, bench.running, bench.now) {
@@ -65,13 +65,13 @@ fn profile(text: &str) -> Arc<Profile> {
     Arc::new(Profile::parse("own.toml", &format!("{head}{text}"), false).unwrap())
 }
 
-fn stop(bench: &Bench) -> CommandRun {
+fn stop(bench: &ObedientDrive) -> CommandRun {
     bench.begin(&[("run", 0.0)], Urgency::Stop).0
 }
 
 #[test]
 fn a_drive_that_takes_only_function_16_is_stopped_and_remembered() {
-    let (mut bench, mut drive) = (Bench::new(1), Drive::new(&[16]));
+    let (mut bench, mut drive) = (ObedientDrive::new(1), Drive::new(&[16]));
     drive.word = 1;
     let run = stop(&bench);
     let (asked, outcome) = drive.carries_out(&mut bench, run);
@@ -98,7 +98,7 @@ fn a_drive_that_takes_only_function_16_is_stopped_and_remembered() {
 
 #[test]
 fn a_drive_that_takes_neither_is_asked_once_each() {
-    let (mut bench, mut drive) = (Bench::new(1), Drive::new(&[]));
+    let (mut bench, mut drive) = (ObedientDrive::new(1), Drive::new(&[]));
     bench.words.learn(Table::Holding, 2000, 1);
     for _ in 0..2 {
         let run = stop(&bench);
@@ -110,7 +110,7 @@ fn a_drive_that_takes_neither_is_asked_once_each() {
 
 #[test]
 fn the_profile_may_say_it() {
-    let (mut bench, mut drive) = (Bench::new(1), Drive::new(&[16]));
+    let (mut bench, mut drive) = (ObedientDrive::new(1), Drive::new(&[16]));
     bench.profile = profile("ranges = { single_write = 16 }");
     drive.word = 1;
     let run = stop(&bench);
@@ -128,8 +128,8 @@ fn the_profile_may_say_it() {
     assert_eq!(drive.carries_out(&mut bench, run).0, [(15, 0)]);
 }
 
-fn settings(more: &str) -> Bench {
-    let mut bench = Bench::new(0);
+fn settings(more: &str) -> ObedientDrive {
+    let mut bench = ObedientDrive::new(0);
     let point =
         format!("[[point]]\nname = \"restarts\"\nat = \"holding {SETTINGS}.2\"\nclass = \"once\"\nwrite = true\n");
     bench.profile = profile(&format!("{more}\n{point}"));
@@ -138,7 +138,7 @@ fn settings(more: &str) -> Bench {
     bench
 }
 
-fn sets(bench: &Bench, on: f64) -> CommandRun {
+fn sets(bench: &ObedientDrive, on: f64) -> CommandRun {
     bench.begin(&[("restarts", on)], Urgency::Command).0
 }
 

@@ -6,10 +6,10 @@ use crate::codec::n2::Session;
 /// 50 % as the float of AO 1.
 const HALF: [u16; 2] = [0x4248, 0x0000];
 
-fn bench() -> Bench {
-    Bench {
+fn bench() -> ObedientDrive {
+    ObedientDrive {
         profile: Profiles::built_in().get("vacon-nx-n2").unwrap().clone(),
-        ..Bench::new(0)
+        ..ObedientDrive::new(0)
     }
 }
 
@@ -37,12 +37,12 @@ fn coil(address: u16, on: bool) -> Step {
 }
 
 /// AO 1 was something else when it was read last.
-fn changed(bench: &mut Bench) {
+fn changed(bench: &mut ObedientDrive) {
     bench.words.learn(Table::Holding, 0, 0);
     bench.words.learn(Table::Holding, 1, HALF[1]);
 }
 
-fn reference(bench: &Bench) -> CommandRun {
+fn reference(bench: &ObedientDrive) -> CommandRun {
     bench.begin(&[("speed_reference", 50.0)], Urgency::Command).0
 }
 

@@ -17,11 +17,7 @@ impl Rig {
         let (ticket, answer) = Ticket::new(origin, "d", String::new(), false, self.now, self.stats.clone());
         let request = BackgroundRequest {
             drive: DriveIndex::new(drive),
-            pdu: RequestPdu::Read {
-                table: Table::Holding,
-                start: REGISTER,
-                count,
-            },
+            pdu: RequestPdu::read(Table::Holding, REGISTER, count),
             pace,
             expires: self.now + Duration::from_secs(60),
             ticket,

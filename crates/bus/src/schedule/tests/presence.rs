@@ -3,7 +3,7 @@
 use super::*;
 use crate::drive::DriveIndex;
 
-impl Bench {
+impl PolledLine {
     /// Lets the schedule ask for `time`; every poll takes `COST` and is answered by `answer`. What changed.
     fn answer(&mut self, time: Duration, mut answer: impl FnMut(&Poll, Instant) -> Polled) -> Vec<Change> {
         let (end, mut changes) = (self.now + time, Vec::new());
@@ -31,16 +31,16 @@ fn refused_if(refused: bool) -> Polled {
 
 #[test]
 fn dead_drives_cost_two_percent_each() {
-    let mut all = Bench::new(7, Duration::from_millis(10));
-    let mut some = Bench::new(10, Duration::from_millis(10));
+    let mut all = PolledLine::new(7, Duration::from_millis(10));
+    let mut some = PolledLine::new(10, Duration::from_millis(10));
     some.dead = vec![2, 5, 9];
-    for bench in [&mut all, &mut some] {
+    for rig in [&mut all, &mut some] {
         // The first probes may cost more.
-        bench.run(Duration::from_secs(10));
-        bench.log.clear();
-        bench.run(Duration::from_secs(60));
+        rig.run(Duration::from_secs(10));
+        rig.log.clear();
+        rig.run(Duration::from_secs(60));
     }
-    let total = |bench: &Bench| bench.polls(PollClass::Fast).values().sum::<usize>() as f64;
+    let total = |rig: &PolledLine| rig.polls(PollClass::Fast).values().sum::<usize>() as f64;
     let ratio = total(&some) / total(&all);
     assert!(ratio >= 0.94, "{ratio}");
     assert_eq!(some.offline, [2, 5, 9], "reported once each");
@@ -59,43 +59,43 @@ fn dead_drives_cost_two_percent_each() {
 
 #[test]
 fn a_drive_that_dies_is_offline_after_the_retries() {
-    let mut bench = Bench::new(2, Duration::from_millis(10));
-    bench.run(Duration::from_secs(1));
-    bench.dead = vec![1];
-    let died = bench.now;
-    while bench.offline.is_empty() {
-        bench.step(None);
+    let mut rig = PolledLine::new(2, Duration::from_millis(10));
+    rig.run(Duration::from_secs(1));
+    rig.dead = vec![1];
+    let died = rig.now;
+    while rig.offline.is_empty() {
+        rig.step(None);
     }
-    assert!(bench.now - died <= COST * 10 * 2 + COST * 3, "two tries");
-    assert!(!bench.schedule.is_online(DriveIndex::new(1)) && bench.schedule.is_online(DriveIndex::new(0)));
+    assert!(rig.now - died <= COST * 10 * 2 + COST * 3, "two tries");
+    assert!(!rig.schedule.is_online(DriveIndex::new(1)) && rig.schedule.is_online(DriveIndex::new(0)));
 }
 
 #[test]
 fn a_drive_that_was_silent_for_a_moment_is_back_after_half_a_second() {
-    let mut bench = Bench::new(2, Duration::from_millis(10));
-    bench.run(Duration::from_secs(1));
-    bench.dead = vec![1];
-    while bench.offline.is_empty() {
-        bench.step(None);
+    let mut rig = PolledLine::new(2, Duration::from_millis(10));
+    rig.run(Duration::from_secs(1));
+    rig.dead = vec![1];
+    while rig.offline.is_empty() {
+        rig.step(None);
     }
-    let away = bench.now;
-    bench.dead.clear();
-    while !bench.schedule.is_online(DriveIndex::new(1)) {
-        bench.step(None);
+    let away = rig.now;
+    rig.dead.clear();
+    while !rig.schedule.is_online(DriveIndex::new(1)) {
+        rig.step(None);
     }
     assert!(
-        bench.now - away <= Duration::from_millis(500) + COST * 3,
+        rig.now - away <= Duration::from_millis(500) + COST * 3,
         "{:?}",
-        bench.now - away
+        rig.now - away
     );
 }
 
 #[test]
 fn refused_blocks_are_split_joined_and_retried_slowly() {
-    let mut bench = Bench::new(1, Duration::from_millis(10));
+    let mut rig = PolledLine::new(1, Duration::from_millis(10));
     let bad = 2105;
     let mut asked = Vec::new();
-    let changes = bench.answer(Duration::from_secs(30), |poll, _| {
+    let changes = rig.answer(Duration::from_secs(30), |poll, _| {
         asked.push((poll.read.start, poll.read.count));
         refused_if(poll.read.covers(Table::Holding, bad))
     });
@@ -115,15 +115,15 @@ fn refused_blocks_are_split_joined_and_retried_slowly() {
         tail.iter().all(|read| **read == (2100, 5) || **read == (2106, 5)),
         "{tail:?}"
     );
-    assert!(bench.schedule.is_online(DriveIndex::new(0)));
+    assert!(rig.schedule.is_online(DriveIndex::new(0)));
 }
 
 #[test]
 fn what_a_starting_drive_refuses_is_there_soon() {
-    let mut bench = Bench::new(1, Duration::from_millis(10));
-    let starts = bench.now;
+    let mut rig = PolledLine::new(1, Duration::from_millis(10));
+    let starts = rig.now;
     let mut asked = Vec::new();
-    bench.answer(Duration::from_secs(40), |poll, now| {
+    rig.answer(Duration::from_secs(40), |poll, now| {
         asked.push((now - starts, poll.read.start, poll.read.count));
         refused_if(now - starts < Duration::from_millis(1500))
     });
@@ -136,10 +136,10 @@ fn what_a_starting_drive_refuses_is_there_soon() {
 
 #[test]
 fn what_a_drive_never_has_is_asked_ever_more_seldom() {
-    let mut bench = Bench::new(1, Duration::from_millis(10));
-    let starts = bench.now;
+    let mut rig = PolledLine::new(1, Duration::from_millis(10));
+    let starts = rig.now;
     let mut asked = Vec::new();
-    bench.answer(Duration::from_secs(200), |poll, now| {
+    rig.answer(Duration::from_secs(200), |poll, now| {
         let refused = poll.read.covers(Table::Holding, 2105);
         if refused && poll.read.count == 1 {
             asked.push((now - starts).as_secs());
@@ -152,9 +152,9 @@ fn what_a_drive_never_has_is_asked_ever_more_seldom() {
 
 #[test]
 fn a_request_that_is_never_answered_does_not_take_the_drive_away() {
-    let mut bench = Bench::new(1, Duration::from_millis(10));
+    let mut rig = PolledLine::new(1, Duration::from_millis(10));
     let mut mute = 0;
-    let changes = bench.answer(Duration::from_secs(30), |poll, _| {
+    let changes = rig.answer(Duration::from_secs(30), |poll, _| {
         let silent = poll.read.class == PollClass::Once;
         mute += usize::from(silent);
         if silent { Polled::Failed } else { Polled::Ok }
@@ -165,13 +165,13 @@ fn a_request_that_is_never_answered_does_not_take_the_drive_away() {
 
 #[test]
 fn many_dead_drives_at_start_do_not_keep_the_others_waiting() {
-    let mut bench = Bench::new(31, Duration::from_millis(10));
-    bench.dead = (3..31).collect();
-    bench.run(Duration::from_secs(10));
+    let mut rig = PolledLine::new(31, Duration::from_millis(10));
+    rig.dead = (3..31).collect();
+    rig.run(Duration::from_secs(10));
     for drive in 0..3 {
         let mut last = None;
         let mut longest = Duration::ZERO;
-        for (at, decision) in &bench.log {
+        for (at, decision) in &rig.log {
             if matches!(decision, Decision::Poll(p) if p.drive == drive && p.read.class == PollClass::Fast) {
                 longest = longest.max(last.map_or(Duration::ZERO, |before| *at - before));
                 last = Some(*at);
@@ -180,16 +180,16 @@ fn many_dead_drives_at_start_do_not_keep_the_others_waiting() {
         // A round, one probe between two fast polls, and first reads.
         assert!(longest < Duration::from_millis(700), "drive {drive}: {longest:?}");
     }
-    assert_eq!(bench.offline.len(), 28);
+    assert_eq!(rig.offline.len(), 28);
 }
 
 #[test]
 fn a_block_refused_once_by_mistake_is_whole_again_after_a_minute() {
-    let mut bench = Bench::new(1, Duration::from_millis(10));
-    bench.run(Duration::from_secs(1));
+    let mut rig = PolledLine::new(1, Duration::from_millis(10));
+    rig.run(Duration::from_secs(1));
     let mut refuse = 1;
     let mut asked = Vec::new();
-    bench.answer(Duration::from_secs(70), |poll, _| {
+    rig.answer(Duration::from_secs(70), |poll, _| {
         if poll.read.class == PollClass::Fast {
             asked.push((poll.read.start, poll.read.count));
         }
@@ -203,10 +203,10 @@ fn a_block_refused_once_by_mistake_is_whole_again_after_a_minute() {
 
 #[test]
 fn a_bad_point_that_is_sound_again_is_read_with_its_neighbours() {
-    let mut bench = Bench::new(1, Duration::from_millis(10));
-    let healed = bench.now + Duration::from_secs(30);
+    let mut rig = PolledLine::new(1, Duration::from_millis(10));
+    let healed = rig.now + Duration::from_secs(30);
     let mut asked = Vec::new();
-    bench.answer(Duration::from_secs(200), |poll, now| {
+    rig.answer(Duration::from_secs(200), |poll, now| {
         if poll.read.class == PollClass::Fast {
             asked.push((poll.read.start, poll.read.count));
         }
@@ -221,17 +221,17 @@ fn a_bad_point_that_is_sound_again_is_read_with_its_neighbours() {
 
 #[test]
 fn garbled_answers_do_not_take_a_drive_away_at_once_but_at_last() {
-    let mut bench = Bench::new(1, Duration::from_millis(10));
-    bench.run(Duration::from_secs(1));
+    let mut rig = PolledLine::new(1, Duration::from_millis(10));
+    rig.run(Duration::from_secs(1));
     let mut garbled = 0;
     loop {
-        let Decision::Poll(poll) = bench.schedule.next(bench.now, None) else {
-            bench.now += Duration::from_millis(1);
+        let Decision::Poll(poll) = rig.schedule.next(rig.now, None) else {
+            rig.now += Duration::from_millis(1);
             continue;
         };
-        bench.now += COST;
+        rig.now += COST;
         garbled += 1;
-        if bench.schedule.poll_done(&poll, Polled::Garbled, COST, bench.now) == Change::Offline {
+        if rig.schedule.poll_done(&poll, Polled::Garbled, COST, rig.now) == Change::Offline {
             break;
         }
         assert!(garbled < 100);
@@ -241,47 +241,47 @@ fn garbled_answers_do_not_take_a_drive_away_at_once_but_at_last() {
 
 #[test]
 fn a_drive_that_answers_a_command_is_probed_at_once() {
-    let mut bench = Bench::new(2, Duration::from_millis(10));
-    bench.dead = vec![1];
-    bench.run(Duration::from_secs(30));
-    bench.dead.clear();
-    bench.log.clear();
-    bench.schedule.seen(DriveIndex::new(1), bench.now);
-    let answered = bench.now;
-    bench.run(COST * 3);
-    assert!(bench.schedule.is_online(DriveIndex::new(1)));
+    let mut rig = PolledLine::new(2, Duration::from_millis(10));
+    rig.dead = vec![1];
+    rig.run(Duration::from_secs(30));
+    rig.dead.clear();
+    rig.log.clear();
+    rig.schedule.seen(DriveIndex::new(1), rig.now);
+    let answered = rig.now;
+    rig.run(COST * 3);
+    assert!(rig.schedule.is_online(DriveIndex::new(1)));
     let probe = |d: &Decision| matches!(d, Decision::Poll(poll) if poll.drive == 1 && poll.probe);
-    let probed = bench.log.iter().find(|(_, d)| probe(d)).map(|(at, _)| *at - answered);
+    let probed = rig.log.iter().find(|(_, d)| probe(d)).map(|(at, _)| *at - answered);
     assert!(probed.is_some_and(|after| after <= COST), "{probed:?}");
 }
 
 #[test]
 fn a_command_in_vain_is_as_good_as_a_probe() {
     let probed_after = |in_vain: bool| {
-        let mut bench = Bench::new(2, Duration::from_millis(10));
-        bench.run(Duration::from_secs(1));
-        bench.dead = vec![1];
-        while bench.offline.is_empty() {
-            bench.step(None);
+        let mut rig = PolledLine::new(2, Duration::from_millis(10));
+        rig.run(Duration::from_secs(1));
+        rig.dead = vec![1];
+        while rig.offline.is_empty() {
+            rig.step(None);
         }
-        bench.log.clear();
-        bench.now += Duration::from_millis(400);
-        let from = bench.now;
+        rig.log.clear();
+        rig.now += Duration::from_millis(400);
+        let from = rig.now;
         if in_vain {
-            bench.schedule.probed_in_vain(DriveIndex::new(1), COST * 10, bench.now);
+            rig.schedule.probed_in_vain(DriveIndex::new(1), COST * 10, rig.now);
         }
-        bench.run(Duration::from_secs(15));
+        rig.run(Duration::from_secs(15));
         let probe = |d: &Decision| matches!(d, Decision::Poll(poll) if poll.drive == 1);
-        bench.log.iter().find(|(_, d)| probe(d)).map(|(at, _)| *at - from)
+        rig.log.iter().find(|(_, d)| probe(d)).map(|(at, _)| *at - from)
     };
     assert!(probed_after(false).unwrap() < Duration::from_millis(150));
     let after = probed_after(true).unwrap();
     assert!((COST * 10..COST * 15).contains(&after), "{after:?}");
     // A drive that answers is not sent away by it.
-    let mut bench = Bench::new(1, Duration::from_millis(10));
-    bench.run(Duration::from_secs(1));
-    bench.schedule.probed_in_vain(DriveIndex::new(0), COST * 10, bench.now);
-    assert!(bench.schedule.is_online(DriveIndex::new(0)));
+    let mut rig = PolledLine::new(1, Duration::from_millis(10));
+    rig.run(Duration::from_secs(1));
+    rig.schedule.probed_in_vain(DriveIndex::new(0), COST * 10, rig.now);
+    assert!(rig.schedule.is_online(DriveIndex::new(0)));
 }
 
 /// Times after the first failure at which a drive that stays away is probed, each probe taking `took`.

@@ -2,10 +2,11 @@
 
 use std::time::Duration;
 
+use drivegate_testkit::profile;
+
 use super::super::*;
 use crate::codec::Table;
 use crate::drive::DriveIndex;
-use crate::drive::profile::Profiles;
 
 /// What a drive does with a read of several bits.
 #[derive(Clone, Copy, PartialEq)]
@@ -17,7 +18,7 @@ enum Does {
 
 /// The reads of a CX in the last second of half a minute, and how often it went away.
 fn half_a_minute(does: Does) -> (Vec<u16>, u32) {
-    let cx = Profiles::built_in().get("vacon-cx").unwrap().clone();
+    let cx = profile("vacon-cx");
     let plan = Plan::of(&cx);
     let cadence = Cadence {
         fast: Duration::from_millis(200),

@@ -44,29 +44,29 @@ impl Client {
         (self.heard, self.acted) = (Some(now), false);
     }
 
-    fn acts(&mut self, bench: &mut Bench, event: Event) {
-        let now = bench.now;
+    fn acts(&mut self, rig: &mut SupervisedDrive, event: Event) {
+        let now = rig.now;
         self.queued = self.queued.filter(|until| *until > now);
         match (event, self.queued, self.begun) {
             (Event::Heartbeat, ..) => {
-                bench.heartbeat();
+                rig.heartbeat();
                 self.heard(now);
             }
             (Event::Order, ..) => {
-                drop(bench.order());
+                drop(rig.order());
                 self.queued = Some(now + DEFAULT_EXPIRY);
             }
             (Event::Send, _, Some((until, false))) if until > now => {
-                bench.send();
+                rig.send();
                 self.begun = Some((until, true));
                 self.heard(now);
             }
             (Event::Send, Some(until), None) => {
-                bench.begin();
+                rig.begin();
                 (self.queued, self.begun) = (None, Some((until, false)));
             }
             (Event::End(ok), _, Some((_, sent))) => {
-                bench.end(if ok && sent {
+                rig.end(if ok && sent {
                     &Outcome::TimedOut
                 } else {
                     &Outcome::Expired
@@ -95,18 +95,18 @@ proptest! {
     fn the_action_comes_when_the_client_falls_silent_and_only_then(
         events in proptest::collection::vec((1u64..1500, event()), 1..200),
     ) {
-        let mut bench = Bench::new(LeaseAction::Stop);
+        let mut rig = SupervisedDrive::new(LeaseAction::Stop);
         let mut client = Client::default();
         for (ms, event) in events {
-            bench.now += Duration::from_millis(ms);
-            client.acts(&mut bench, event);
-            let due = client.is_silent(bench.now);
-            bench.look(0, true);
-            let action = next_command(&mut bench.bus.queue.lock(), Urgency::Stop, bench.now);
+            rig.now += Duration::from_millis(ms);
+            client.acts(&mut rig, event);
+            let due = client.is_silent(rig.now);
+            rig.look(0, true);
+            let action = next_command(&mut rig.bus.queue.lock(), Urgency::Stop, rig.now);
             prop_assert_eq!(action.is_some(), due, "{:?}", event);
             if let Some(action) = action {
-                action.answer(&acknowledged(), bench.now);
-                bench.look(0, true);
+                action.answer(&acknowledged(), rig.now);
+                rig.look(0, true);
                 client.acted = true;
             }
         }

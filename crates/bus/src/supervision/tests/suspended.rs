@@ -5,31 +5,31 @@ use super::*;
 const ACTIONS: [LeaseAction; 2] = [LeaseAction::Stop, LeaseAction::SpeedReference(20.0)];
 
 /// The lease of a drive has run out, and its action waits.
-fn ran_out(action: LeaseAction) -> Bench {
-    let mut bench = Bench::new(action);
-    bench.heartbeat();
-    bench.look(5_000, true);
-    assert_eq!((bench.reported(), bench.bus.queue.lock().len()), (1, 1));
-    bench
+fn ran_out(action: LeaseAction) -> SupervisedDrive {
+    let mut rig = SupervisedDrive::new(action);
+    rig.heartbeat();
+    rig.look(5_000, true);
+    assert_eq!((rig.reported(), rig.bus.queue.lock().len()), (1, 1));
+    rig
 }
 
 #[test]
 fn an_order_that_reaches_the_wire_takes_the_place_of_an_action_that_waits() {
     for action in ACTIONS {
-        let mut bench = ran_out(action);
-        let mut order = bench.order();
-        bench.look(10, true);
-        assert_eq!(bench.own_results(), ["withdrawn"]);
-        bench.look(1_000, true);
-        bench.begin();
-        bench.look(10, true);
-        let (urgency, step) = bench.send();
-        let ended = bench.drive.answered(urgency, &step, Reply::Written);
-        bench.end(&ended.expect("the end"));
+        let mut rig = ran_out(action);
+        let mut order = rig.order();
+        rig.look(10, true);
+        assert_eq!(rig.own_results(), ["withdrawn"]);
+        rig.look(1_000, true);
+        rig.begin();
+        rig.look(10, true);
+        let (urgency, step) = rig.send();
+        let ended = rig.drive.answered(urgency, &step, Reply::Written);
+        rig.end(&ended.expect("the end"));
         assert_eq!(order.try_recv().unwrap().outcome, acknowledged());
-        assert!(bench.after(4_900, true).is_none(), "it commands the drive");
-        assert!(bench.after(100, true).is_some(), "until it falls silent again");
-        assert_eq!(bench.reported(), 2);
+        assert!(rig.after(4_900, true).is_none(), "it commands the drive");
+        assert!(rig.after(100, true).is_some(), "until it falls silent again");
+        assert_eq!(rig.reported(), 2);
     }
 }
 
@@ -37,37 +37,37 @@ fn an_order_that_reaches_the_wire_takes_the_place_of_an_action_that_waits() {
 fn the_action_is_due_again_when_the_order_ends_without_reaching_the_wire() {
     for action in ACTIONS {
         for begun in [false, true] {
-            let mut bench = ran_out(action.clone());
-            let mut order = bench.order();
-            bench.look(10, true);
-            assert_eq!(bench.own_results(), ["withdrawn"]);
+            let mut rig = ran_out(action.clone());
+            let mut order = rig.order();
+            rig.look(10, true);
+            assert_eq!(rig.own_results(), ["withdrawn"]);
             if begun {
-                bench.begin();
-                bench.look(10, true);
-                bench.end(&Outcome::Offline);
+                rig.begin();
+                rig.look(10, true);
+                rig.end(&Outcome::Offline);
             } else {
-                bench.look(1_980, true);
-                assert_eq!(bench.bus.queue.lock().len(), 1, "suspended");
-                bench.look(10, true);
+                rig.look(1_980, true);
+                assert_eq!(rig.bus.queue.lock().len(), 1, "suspended");
+                rig.look(10, true);
             }
-            bench.look(10, true);
-            let again = bench.take().expect("the action");
+            rig.look(10, true);
+            let again = rig.take().expect("the action");
             assert!(is_action(&again) && order.try_recv().is_ok());
-            assert_eq!(bench.reported(), 1, "the lease ran out once");
+            assert_eq!(rig.reported(), 1, "the lease ran out once");
         }
     }
 }
 
 #[test]
 fn an_action_that_failed_is_not_tried_again_while_a_client_is_back() {
-    let mut bench = ran_out(LeaseAction::Stop);
-    let action = bench.take().expect("the stop");
-    action.answer(&Outcome::TimedOut, bench.now);
-    let _order = bench.order();
+    let mut rig = ran_out(LeaseAction::Stop);
+    let action = rig.take().expect("the stop");
+    action.answer(&Outcome::TimedOut, rig.now);
+    let _order = rig.order();
     for _ in 0..19 {
-        bench.look(100, true);
-        assert_eq!(bench.bus.queue.lock().len(), 1, "the order alone");
+        rig.look(100, true);
+        assert_eq!(rig.bus.queue.lock().len(), 1, "the order alone");
     }
-    bench.look(1_000, true);
-    assert!(is_action(&bench.take().expect("the stop")));
+    rig.look(1_000, true);
+    assert!(is_action(&rig.take().expect("the stop")));
 }

@@ -3,13 +3,13 @@
 use super::*;
 use crate::drive::DriveIndex;
 
-fn cx() -> Bench {
-    let bench = Bench::of(Profiles::built_in().get("vacon-cx").unwrap(), LeaseAction::Stop);
-    bench.heartbeat();
-    bench
+fn cx() -> SupervisedDrive {
+    let rig = SupervisedDrive::of(&drivegate_testkit::profile("vacon-cx"), LeaseAction::Stop);
+    rig.heartbeat();
+    rig
 }
 
-impl Bench {
+impl SupervisedDrive {
     fn refuses_running(&self) {
         let image = self.image();
         let raw = image
@@ -40,84 +40,84 @@ impl Bench {
 #[test]
 fn where_the_drive_refuses_to_tell_its_run_command_stands_for_it() {
     for (run, acts) in [(Some(true), true), (Some(false), false), (None, true)] {
-        let mut bench = cx();
-        bench.refuses_running();
-        assert!(bench.later(4_900).is_none());
+        let mut rig = cx();
+        rig.refuses_running();
+        assert!(rig.later(4_900).is_none());
         if let Some(run) = run {
-            bench.shows(ModelPoint::Run, Value::Bool(run));
+            rig.shows(ModelPoint::Run, Value::Bool(run));
         }
-        let action = bench.later(100);
+        let action = rig.later(100);
         assert_eq!(action.map(|a| a.urgency), acts.then_some(Urgency::Stop), "{run:?}");
-        let unknown = bench
+        let unknown = rig
             .news
             .iter()
             .filter(|n| **n == News::RunningUnknown(DriveIndex::new(0)));
-        assert_eq!((unknown.count(), bench.reported()), (1, usize::from(acts)), "{run:?}");
+        assert_eq!((unknown.count(), rig.reported()), (1, usize::from(acts)), "{run:?}");
     }
 }
 
 #[test]
 fn a_run_command_that_is_known_only_from_a_write_counts() {
     for (word, acts) in [(0, false), (1, true)] {
-        let mut bench = cx();
-        bench.refuses_running();
-        bench.drive.words.learn(Table::Coil, 0, word);
-        assert_eq!(bench.later(5_000).is_some(), acts, "{word}");
+        let mut rig = cx();
+        rig.refuses_running();
+        rig.drive.words.learn(Table::Coil, 0, word);
+        assert_eq!(rig.later(5_000).is_some(), acts, "{word}");
     }
 }
 
 #[test]
 fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
-    let mut bench = cx();
+    let mut rig = cx();
     for _ in 0..6 {
-        assert!(bench.later(1_000).is_none());
+        assert!(rig.later(1_000).is_none());
     }
-    assert_eq!(bench.news, []);
-    assert!(bench.after(10, true).is_some());
+    assert_eq!(rig.news, []);
+    assert!(rig.after(10, true).is_some());
     // But not for ever, if it answers and this is not read again, whatever comes instead.
-    let mut bench = cx();
-    bench.look(0, true);
-    bench.heartbeat();
-    let action = (0..100).find_map(|_| bench.later(100));
+    let mut rig = cx();
+    rig.look(0, true);
+    rig.heartbeat();
+    let action = (0..100).find_map(|_| rig.later(100));
     assert!(action.is_some(), "the stop");
-    assert!(bench.now - bench.heard() <= Duration::from_millis(7_200));
+    assert!(rig.now - rig.heard() <= Duration::from_millis(7_200));
     assert_eq!(
-        bench.news,
+        rig.news,
         [
             News::RunningUnknown(DriveIndex::new(0)),
             News::LeaseRanOut(DriveIndex::new(0))
         ]
     );
     // The time in which it answers is what counts: it may come and go.
-    let mut bench = cx();
-    bench.look(0, true);
-    bench.heartbeat();
+    let mut rig = cx();
+    rig.look(0, true);
+    rig.heartbeat();
     let mut online = Duration::ZERO;
-    while bench.later(100).is_none() {
-        let is_late = bench.now - bench.heard() > Duration::from_secs(5);
-        let comes = bench.image().snapshot().link.is_online();
+    while rig.later(100).is_none() {
+        let is_late = rig.now - rig.heard() > Duration::from_secs(5);
+        let comes = rig.image().snapshot().link.is_online();
         online += if comes && is_late {
             Duration::from_millis(100)
         } else {
             Duration::ZERO
         };
-        assert!(bench.now - bench.heard() < Duration::from_secs(20));
+        assert!(rig.now - rig.heard() < Duration::from_secs(20));
         let link = if comes {
             Link::Offline(SystemTime::now())
         } else {
             Link::Online(SystemTime::now())
         };
-        bench.image().update(|s| s.link = link);
+        rig.image().update(|s| s.link = link);
     }
     assert!(online >= Duration::from_millis(1_800), "{online:?}");
     // So does one that does not answer at all, though it refused before.
-    let mut bench = cx();
-    bench.refuses_running();
-    bench.image().update(|s| s.link = Link::Offline(SystemTime::now()));
-    assert!(bench.later(10_000).is_none());
-    assert_eq!(bench.news, []);
-    bench.image().update(|s| s.link = Link::Online(SystemTime::now()));
-    assert!(bench.later(10).is_some());
+    let mut rig = cx();
+    rig.refuses_running();
+    rig.image().update(|s| s.link = Link::Offline(SystemTime::now()));
+    assert!(rig.later(10_000).is_none());
+    assert_eq!(rig.news, []);
+    rig.image().update(|s| s.link = Link::Online(SystemTime::now()));
+    assert!(rig.later(10).is_some());
 }
 
 const START: &str = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n\

@@ -4,11 +4,7 @@ use super::*;
 
 /// A read of two registers in Modbus ASCII, its frame and its reply.
 pub(super) fn in_ascii() -> (Request, Vec<u8>, &'static [u8]) {
-    let pdu = RequestPdu::Read {
-        table: Table::Holding,
-        start: 0x20,
-        count: 2,
-    };
+    let pdu = RequestPdu::read(Table::Holding, 0x20, 2);
     let request = Request::new(1, pdu);
     let mut frame = Vec::new();
     Protocol::ModbusAscii.encode(&request, &mut frame);
@@ -102,7 +98,7 @@ fn an_ascii_echo_is_dropped_behind_noise_too() {
         assert_eq!(transaction.on_bytes(now, &bytes), Step::Done(answered.clone()));
         assert_eq!((transaction.echoes(&answered), transaction.foreign()), (Some(true), 0));
     }
-    let write = Request::new(1, RequestPdu::WriteRegister { address: 1, value: 1 });
+    let write = Request::new(1, RequestPdu::write_register(1, 1));
     let mut frame = Vec::new();
     Protocol::ModbusAscii.encode(&write, &mut frame);
     let mut transaction = start_ascii(&write, &frame, now, true);

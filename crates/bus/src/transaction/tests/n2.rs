@@ -7,11 +7,7 @@ use crate::n2_late_replies::{Asked, N2LateReplies};
 const WINDOW: Duration = Duration::from_millis(750);
 
 fn state(start: u16) -> RequestPdu {
-    RequestPdu::Read {
-        table: Table::DiscreteInput,
-        start,
-        count: 1,
-    }
+    RequestPdu::read(Table::DiscreteInput, start, 1)
 }
 
 /// An exchange that begins while the reply to the read of a state may still come.
@@ -44,11 +40,7 @@ fn behind_late_state(pdu: RequestPdu, now: Instant) -> Transaction {
 fn a_drive_that_started_anew_is_believed_unless_another_answer_comes() {
     let now = Instant::now();
     let soon = now + Duration::from_millis(20);
-    let float = RequestPdu::Read {
-        table: Table::Input,
-        start: 0,
-        count: 2,
-    };
+    let float = RequestPdu::read(Table::Input, 0, 2);
     let mut alone = behind_late_state(float.clone(), now);
     let Step::Wait(until) = alone.on_bytes(soon, b"N00\r") else {
         panic!("it may be a late one")

@@ -9,9 +9,10 @@ use crate::drive::RawWrites;
 use crate::drive::profile::Profiles;
 use crate::drive::{PointIndex, Profile};
 use crate::process_image::{DriveImage, DriveSpec, Link};
+use crate::testkit;
 
 fn drive(access: Access) -> DriveImage {
-    let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let profile = testkit::nx();
     let spec = DriveSpec {
         access,
         limits: BTreeMap::from([("speed_reference".to_string(), 0.0..=80.0)]),
@@ -46,7 +47,7 @@ fn set(points: &[(&str, f64)]) -> Result<Admitted, Refusal> {
 }
 
 fn write(address: u16, value: u16) -> Order {
-    Order::Write(RequestPdu::WriteRegister { address, value })
+    Order::Write(RequestPdu::write_register(address, value))
 }
 
 #[test]
@@ -65,11 +66,7 @@ fn authority_comes_first() {
     }
     assert!(
         admit(
-            Order::Read(RequestPdu::Read {
-                table: Table::Holding,
-                start: 0,
-                count: 1
-            }),
+            Order::Read(RequestPdu::read(Table::Holding, 0, 1)),
             &reading,
             Authority::ReadOnly
         )
@@ -243,10 +240,7 @@ fn a_limit_on_one_name_of_a_reference_holds_for_every_way_to_write_it() {
                 let write = |percent| {
                     let words = raw.encode(Value::Number(figure(register, percent)), 0).unwrap();
                     Order::Write(match words.as_slice() {
-                        [value] => RequestPdu::WriteRegister {
-                            address: raw.address,
-                            value: *value,
-                        },
+                        [value] => RequestPdu::write_register(raw.address, *value),
                         _ => RequestPdu::WriteRegisters {
                             start: raw.address,
                             values: words,
@@ -294,12 +288,7 @@ fn stops_are_known_as_such() {
 
 #[test]
 fn addresses_and_counts() {
-    let many = |start, count| {
-        Order::Write(RequestPdu::WriteRegisters {
-            start,
-            values: vec![0; count],
-        })
-    };
+    let many = |start, count| Order::Write(RequestPdu::write_registers(start, &vec![0; count]));
     assert_eq!(
         try_order(write(2100, 1)).unwrap_err().exception(),
         Exception::ADDRESS,
@@ -395,7 +384,7 @@ fn no_command_rests_on_an_old_parameter() {
 
 /// A TECO drive, whose reference is a frequency, written elsewhere than it is read, with a limit in percent.
 fn in_hertz(maximum: Option<u16>, order: impl Fn(&dyn Fn(&str) -> PointIndex) -> Order) -> Result<Admitted, Refusal> {
-    let profile = Profiles::built_in().get("teco-7300pa").unwrap().clone();
+    let profile = testkit::profile("teco-7300pa");
     let mut spec = drive(Access::Control).spec;
     spec.profile = Arc::clone(&profile);
     let image = DriveImage::new(spec, Duration::from_secs(1));
@@ -465,12 +454,7 @@ fn registers_without_a_writable_point_need_the_configuration() {
         let reading = image.reading(Instant::now(), Duration::from_secs(1));
         admit(order, &reading, Authority::Write).map(|admitted| admitted.urgency)
     };
-    let block = |start, values: &[u16]| {
-        Order::Write(RequestPdu::WriteRegisters {
-            start,
-            values: values.to_vec(),
-        })
-    };
+    let block = |start, values: &[u16]| Order::Write(RequestPdu::write_registers(start, values));
     let refused = asked(&image, write(101, 10_000)).unwrap_err();
     assert_eq!(
         (refused.exception(), refused.code()),
@@ -496,7 +480,7 @@ fn registers_without_a_writable_point_need_the_configuration() {
 
 #[test]
 fn a_write_on_n2_is_one_whole_object() {
-    let profile = Profiles::built_in().get("eaton-hvx-n2").unwrap().clone();
+    let profile = testkit::profile("eaton-hvx-n2");
     let spec = DriveSpec {
         access: Access::Control,
         raw_writes: RawWrites::All,
@@ -521,13 +505,13 @@ fn a_write_on_n2_is_one_whole_object() {
         (registers(14, &float), None),
         (registers(0, &float[..1]), value),
         (registers(14, &float[..1]), value),
-        (RequestPdu::WriteRegister { address: 14, value: 1 }, value),
+        (RequestPdu::write_register(14, 1), value),
         (registers(0, &ao1_ao2), value),
         (registers(12, &ao1_ao2), value),
         (registers(1, &float), address),
         (registers(13, &float), address),
         (registers(1, &float[..1]), address),
-        (RequestPdu::WriteRegister { address: 15, value: 1 }, address),
+        (RequestPdu::write_register(15, 1), address),
         (registers(13, &ao1_ao2[..3]), address),
         (registers(14, &ao1_ao2), address),
         (registers(16, &float), address),

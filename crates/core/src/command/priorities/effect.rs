@@ -144,10 +144,7 @@ mod tests {
                         address: raw.address,
                         on: on != invert,
                     },
-                    _ => RequestPdu::WriteRegister {
-                        address: raw.address,
-                        value,
-                    },
+                    _ => RequestPdu::write_register(raw.address, value),
                 };
                 assert_eq!(
                     Effect::of(&Order::Write(pdu), profile).run,

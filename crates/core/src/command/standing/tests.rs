@@ -4,13 +4,13 @@ use std::time::Duration;
 use super::super::{Authority, Refusal, admit};
 use super::*;
 use crate::codec::{Protocol, RequestPdu};
-use crate::drive::profile::Profiles;
 use crate::drive::{PointIndex, RawWrites};
 use crate::process_image::{Access, DriveImage, DriveSpec, Link};
+use crate::testkit;
 
 /// A drive with that limit of a point, whose registers were read so long ago.
 fn drive(profile: &str, limit: (&str, f64), words: &[(Table, u16, &[u16])], ago: Duration) -> DriveImage {
-    let profile = Profiles::built_in().get(profile).unwrap().clone();
+    let profile = testkit::profile(profile);
     let spec = DriveSpec {
         access: Access::Control,
         raw_writes: RawWrites::All,
@@ -79,10 +79,7 @@ fn what_a_limit_rests_on_is_judged_with_the_reference_that_stands() {
 fn a_raw_write_is_judged_alike() {
     let image = on_n2(80.0, Duration::ZERO);
     let raw = |value| {
-        let pdu = RequestPdu::WriteRegisters {
-            start: 6,
-            values: float(value).to_vec(),
-        };
+        let pdu = RequestPdu::write_registers(6, &float(value));
         let reading = image.reading(Instant::now(), Duration::from_secs(60));
         admit(Order::Write(pdu), &reading, Authority::Write).map(|_| ())
     };
@@ -106,7 +103,7 @@ fn a_limit_in_percent_rests_on_the_frequency_range_too() {
         .address;
     image.update(|snapshot| snapshot.store(Table::Holding, address, &[50], Instant::now()));
     let raw = |image: &DriveImage, value| {
-        let pdu = RequestPdu::WriteRegister { address, value };
+        let pdu = RequestPdu::write_register(address, value);
         let reading = image.reading(Instant::now(), Duration::from_secs(60));
         admit(Order::Write(pdu), &reading, Authority::Write).map(|_| ())
     };

@@ -10,13 +10,12 @@ use super::assemble::assemble;
 use super::recorder::{Note, NoteBody};
 use super::recording::Recording;
 use super::*;
-use crate::codec::{LineFormat, Protocol, Table};
-use crate::drive::profile::Profiles;
+use crate::codec::{LineFormat, Table};
 use crate::drive::{DriveIndex, ModelPoint};
 use crate::process_image::{
-    BusImage, BusSpec, DriveImage, DriveSpec, Link, Outcome, PointTrigger, TapedFrame, TapedRead, Taping, TriggerLimit,
-    Verdict,
+    BusImage, BusSpec, DriveSpec, Link, Outcome, PointTrigger, TapedFrame, TapedRead, Taping, TriggerLimit, Verdict,
 };
+use crate::testkit::{self, bus_spec, monitored, nx};
 
 const POLL: Duration = Duration::from_millis(10);
 const STALE_AFTER: Duration = Duration::from_secs(1);
@@ -46,23 +45,20 @@ pub(super) struct Rig {
 
 impl Rig {
     pub(super) fn new(options: RecorderOptions, drives: usize, triggers: &[PointTrigger]) -> Rig {
-        let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
+        let nx = nx();
         let image = |number: usize| {
             let spec = DriveSpec {
                 triggers: triggers.to_vec(),
-                ..DriveSpec::new(&format!("pump-{number}"), "line1", number as u8, nx.clone())
+                ..monitored(&format!("pump-{number}"), "line1", number as u8, &nx)
             };
-            let image = DriveImage::new(spec, Duration::from_secs(1));
+            let image = testkit::image(spec);
             image.update(|s| s.link = Link::Online(SystemTime::UNIX_EPOCH));
-            Arc::new(image)
+            image
         };
         let spec = BusSpec {
-            name: "line1".to_string(),
-            port: "/dev/null".to_string(),
-            protocol: Protocol::ModbusRtu,
             format: LineFormat::new(115_200, "8N1").unwrap(),
             cycle: POLL,
-            slow_cycle: Duration::from_secs(1),
+            ..bus_spec("line1")
         };
         let bus = Arc::new(BusImage::new(spec, (1..=drives).map(image).collect()));
         let clock = Clock {
@@ -209,7 +205,7 @@ fn warnings_make_recordings_only_where_that_is_wanted() {
 
 #[test]
 fn a_point_beyond_its_limit_for_its_time_makes_one_recording() {
-    let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let nx = testkit::nx();
     let above = PointTrigger {
         point: nx.point_index("motor_current").unwrap(),
         limit: TriggerLimit::Above(120.0),

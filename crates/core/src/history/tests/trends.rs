@@ -114,7 +114,7 @@ fn a_reload_keeps_counters_for_ever_and_trends_of_the_same_drive() {
             address,
             ..rig.bus.drives[0].spec.clone()
         };
-        let drive = Arc::new(DriveImage::new(spec, SECOND));
+        let drive = testkit::image(spec);
         rig.bus = Arc::new(BusImage::new(rig.bus.spec.clone(), vec![drive]));
         rig.recorder
             .adopt(std::slice::from_ref(&rig.bus), STALE_AFTER, rig.clock);

@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use proptest::prelude::*;
 
 use super::*;
-use crate::drive::profile::Profiles;
+use crate::testkit;
 
 const SECOND: Duration = Duration::from_secs(1);
 
@@ -25,9 +25,8 @@ struct Rig {
 impl Rig {
     fn new() -> Rig {
         let clock = clock();
-        let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
         Rig {
-            trend: DriveTrend::new(&nx, Reach::FULL, clock),
+            trend: DriveTrend::new(&testkit::nx(), Reach::FULL, clock),
             clock,
             fed: Vec::new(),
         }
@@ -240,7 +239,7 @@ fn labels_are_whole_steps_and_what_is_asked_for_is_what_comes() {
 #[test]
 fn memory_is_as_stated_and_only_for_what_is_read() {
     let mut rig = Rig::new();
-    let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let nx = testkit::nx();
     assert_eq!(rig.trend.points().map(|(_, bytes)| bytes).sum::<usize>(), 0);
     rig.feed(1.0, SECOND);
     assert_eq!(rig.trend.points().map(|(_, bytes)| bytes).sum::<usize>(), POINT_BYTES);
@@ -250,7 +249,7 @@ fn memory_is_as_stated_and_only_for_what_is_read() {
 
 #[test]
 fn many_drives_share_the_memory_and_what_they_keep_is_right() {
-    let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let nx = testkit::nx();
     let of = |drives| Reach::of(std::iter::repeat_n(&*nx, drives));
     assert_eq!(of(152), Reach::FULL);
     let reach = of(992);

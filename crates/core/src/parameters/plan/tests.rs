@@ -8,9 +8,10 @@ use super::super::names::Names;
 use super::*;
 use crate::drive::parameters::{Limit, Parameter, ParameterList};
 use crate::drive::profile::Profiles;
+use crate::testkit;
 
 fn family(name: &str) -> Arc<Profile> {
-    Profiles::built_in().get(name).unwrap().clone()
+    testkit::profile(name)
 }
 
 fn with_parameters() -> Vec<Arc<Profile>> {

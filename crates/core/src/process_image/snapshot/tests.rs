@@ -1,25 +1,21 @@
 use super::*;
-use crate::drive::profile::Profiles;
-use crate::process_image::DriveImage;
+use crate::testkit::{STALE_AFTER, image, monitored, nx, online, profile};
 
 /// What rests on the drive's frequency range is no worse than the figures that it rests on.
 #[test]
 fn a_value_within_a_band_is_as_good_as_the_band() {
-    let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let profile = nx();
     let index = |name: &str| profile.point_index(name).unwrap();
     let reference = index("frequency_reference");
-    let image = DriveImage::new(
-        DriveSpec::new("pump-1", "line1", 1, profile.clone()),
-        Duration::from_secs(1),
-    );
+    let image = image(monitored("pump-1", "line1", 1, &profile));
     let now = Instant::now();
-    let sample = || image.reading(now, Duration::from_secs(1)).sample(reference);
+    let sample = || image.reading(now, STALE_AFTER).sample(reference);
     let store = |name: &str, value: f64| {
         let raw = profile.points.get(index(name)).unwrap().raw().unwrap().clone();
         let words = raw.encode(Value::Number(value), 0).unwrap();
         image.update(|s| s.store(raw.table, raw.address, &words, now));
     };
-    image.update(|s| s.link = Link::Online(SystemTime::now()));
+    online(&image);
     store("speed_reference", 50.0);
     assert_eq!(sample(), Sample::NONE, "no range is known");
     store("minimum_frequency", 10.0);
@@ -35,11 +31,11 @@ fn a_value_within_a_band_is_as_good_as_the_band() {
 /// The state rests on fault, running and ready, in that order, as far as it needs them.
 #[test]
 fn a_state_is_known_only_when_what_decides_it_is() {
-    let cx = Profiles::built_in().get("vacon-cx").unwrap().clone();
-    let image = DriveImage::new(DriveSpec::new("fan-1", "line1", 1, cx), Duration::from_secs(1));
+    let cx = profile("vacon-cx");
+    let image = image(monitored("fan-1", "line1", 1, &cx));
     let now = Instant::now();
     let seen = || {
-        let reading = image.reading(now, Duration::from_secs(1));
+        let reading = image.reading(now, STALE_AFTER);
         (reading.state(), reading.overall())
     };
     let bit = |address, word| image.update(|s| s.store(Table::DiscreteInput, address, &[word], now));
@@ -79,13 +75,13 @@ fn a_state_is_known_only_when_what_decides_it_is() {
 /// Somebody may have changed them while it was away.
 #[test]
 fn parameters_from_before_a_drive_went_away_are_not_believed() {
-    let cx = Profiles::built_in().get("vacon-cx").unwrap().clone();
+    let cx = profile("vacon-cx");
     let maximum = cx.point_index("maximum_frequency").unwrap();
     let program = cx.point_index("control_program").unwrap();
-    let image = DriveImage::new(DriveSpec::new("fan-1", "line1", 1, cx), Duration::from_secs(1));
+    let image = image(monitored("fan-1", "line1", 1, &cx));
     let now = Instant::now();
     let seen = || {
-        let reading = image.reading(now, Duration::from_secs(1));
+        let reading = image.reading(now, STALE_AFTER);
         let band = reading.band_for_commands(Bound::Fixed(0.0), Bound::Point(maximum));
         (reading.sample(maximum).quality, reading.sample(program).quality, band)
     };
@@ -107,17 +103,14 @@ fn what_a_family_lacks_decides_nothing() {
     let source = "name = \"m\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\n\
          [[point]]\nname = \"running\"\nat = \"holding 1.0\"\nclass = \"fast\"\n";
     let profile = crate::drive::Profile::parse("m.toml", source, false).unwrap();
-    let image = DriveImage::new(
-        DriveSpec::new("m", "line1", 1, Arc::new(profile)),
-        Duration::from_secs(1),
-    );
+    let image = image(monitored("m", "line1", 1, &Arc::new(profile)));
     let now = Instant::now();
     for (word, state) in [(1, State::Running), (0, State::NotReady)] {
         image.update(|s| {
             (s.link, s.fast_at) = (Link::Online(SystemTime::now()), Some(now));
             s.store(Table::Holding, 1, &[word], now);
         });
-        let reading = image.reading(now, Duration::from_secs(1));
+        let reading = image.reading(now, STALE_AFTER);
         assert_eq!((reading.state(), reading.overall()), (Some(state), Quality::Good));
     }
 }
@@ -125,8 +118,8 @@ fn what_a_family_lacks_decides_nothing() {
 /// Another master that reads register after register, then other drives for six seconds.
 #[test]
 fn what_counts_is_the_pause_between_reads_of_the_same_registers() {
-    let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
-    let image = DriveImage::new(DriveSpec::new("fan-1", "line1", 1, nx), Duration::from_secs(1));
+    let nx = nx();
+    let image = image(monitored("fan-1", "line1", 1, &nx));
     let read = image
         .plan
         .reads
@@ -137,7 +130,7 @@ fn what_counts_is_the_pause_between_reads_of_the_same_registers() {
     assert!(addresses.len() > 3, "more than one");
     image.update(|s| (s.link, s.heard) = (Link::Online(SystemTime::now()), Some(Cadence::default())));
     let mut now = Instant::now();
-    let is_stale = |now| image.reading(now, Duration::from_secs(1)).is_stale();
+    let is_stale = |now| image.reading(now, STALE_AFTER).is_stale();
     for _ in 0..4 {
         for address in &addresses {
             now += Duration::from_millis(50);
@@ -163,10 +156,7 @@ fn a_scale_in_another_register() {
         .map(|(_, n)| n.to_string())
         .collect();
     assert_eq!(names, ["motor_current", "power", "count"], "hidden ones are not shown");
-    let image = DriveImage::new(
-        DriveSpec::new("pump-1", "line1", 1, profile.clone()),
-        Duration::from_secs(1),
-    );
+    let image = image(monitored("pump-1", "line1", 1, &profile));
     let (now, seconds) = (Instant::now(), Duration::from_secs);
     let seen = |name: &str, after| {
         let sample = image
@@ -176,7 +166,7 @@ fn a_scale_in_another_register() {
     };
     let store =
         |start, words: &[u16], after| image.update(|s| s.store(Table::Holding, start, words, now + seconds(after)));
-    image.update(|s| s.link = Link::Online(SystemTime::now()));
+    online(&image);
     store(0, &[1234, 0x0020, 0, 0, 1], 0);
     assert_eq!(seen("power", 0), (None, Quality::Bad), "the scale was not read");
     assert_eq!(

@@ -3,6 +3,8 @@
 use std::path::Path;
 use std::process::Command;
 
+use drivegate_testkit::rows;
+
 use super::load;
 
 const MAKE: &str = r#"
@@ -61,6 +63,25 @@ fn messages(sections: &str) -> Vec<String> {
     all.filter(of_files).collect()
 }
 
+/// Certificate, key, what is said of them, and the remedy.
+const UNUSABLE: &str = "\
+good.crt    | encrypted.key     | it is encrypted, and there is nobody                | openssl pkey -in
+good.crt    | encrypted-old.key | it is encrypted, and there is nobody                | openssl pkey -in
+good.crt    | good.crt          | contains no private key, but a certificate          | are certificate and key swapped?
+good.key    | good.key          | contains no certificate, but a private key          | are certificate and key swapped?
+good.crt    | other.key         | the key does not match the certificate              | specify the key of the certificate
+good.crt    | public.key        | contains no private key, but a public key           | specify a PEM file
+good.crt    | ssh.key           | a key in the format of OpenSSH                      | ssh-keygen -p -m PKCS8
+good.crt    | binary.key        | it is binary                                        | openssl pkcs12 -nocerts
+binary.crt  | good.key          | it is binary                                        | openssl x509 -in
+trusted.crt | good.key          | a TRUSTED CERTIFICATE of OpenSSL                    | openssl x509 -in
+bundle.crt  | good.key          | a bundle of PKCS#7                                  | openssl pkcs7 -print_certs
+old.csr     | old.key           | a request for one                                   | the CA issued
+nothing.pem | good.key          | nothing.pem contains no certificate;                | specify a PEM file
+large.crt   | large.key         | certificate `large` has a key of P-521              | use P-256
+short.crt   | short.key         | certificate `short` has a key of RSA with 1024 bits | use P-256
+old.crt     | old.key           | certificate `old` is of X.509 version 1             | -extfile with a subjectAltName";
+
 #[test]
 fn a_file_that_holds_something_else_is_told_with_what_it_holds() {
     let dir = made();
@@ -68,89 +89,7 @@ fn a_file_that_holds_something_else_is_told_with_what_it_holds() {
     for found in said(dir, "good.crt", "good.key") {
         assert_eq!(found, [""; 0]);
     }
-    for (certificate, key, what, remedy) in [
-        (
-            "good.crt",
-            "encrypted.key",
-            "it is encrypted, and there is nobody",
-            "openssl pkey -in",
-        ),
-        (
-            "good.crt",
-            "encrypted-old.key",
-            "it is encrypted, and there is nobody",
-            "openssl pkey -in",
-        ),
-        (
-            "good.crt",
-            "good.crt",
-            "contains no private key, but a certificate",
-            "are certificate and key swapped?",
-        ),
-        (
-            "good.key",
-            "good.key",
-            "contains no certificate, but a private key",
-            "are certificate and key swapped?",
-        ),
-        (
-            "good.crt",
-            "other.key",
-            "the key does not match the certificate",
-            "specify the key of the certificate",
-        ),
-        (
-            "good.crt",
-            "public.key",
-            "contains no private key, but a public key",
-            "specify a PEM file",
-        ),
-        (
-            "good.crt",
-            "ssh.key",
-            "a key in the format of OpenSSH",
-            "ssh-keygen -p -m PKCS8",
-        ),
-        ("good.crt", "binary.key", "it is binary", "openssl pkcs12 -nocerts"),
-        ("binary.crt", "good.key", "it is binary", "openssl x509 -in"),
-        (
-            "trusted.crt",
-            "good.key",
-            "a TRUSTED CERTIFICATE of OpenSSL",
-            "openssl x509 -in",
-        ),
-        (
-            "bundle.crt",
-            "good.key",
-            "a bundle of PKCS#7",
-            "openssl pkcs7 -print_certs",
-        ),
-        ("old.csr", "old.key", "a request for one", "the CA issued"),
-        (
-            "nothing.pem",
-            "good.key",
-            "nothing.pem contains no certificate; ",
-            "specify a PEM file",
-        ),
-        (
-            "large.crt",
-            "large.key",
-            "certificate `large` has a key of P-521",
-            "use P-256",
-        ),
-        (
-            "short.crt",
-            "short.key",
-            "certificate `short` has a key of RSA with 1024 bits",
-            "use P-256",
-        ),
-        (
-            "old.crt",
-            "old.key",
-            "certificate `old` is of X.509 version 1",
-            "-extfile with a subjectAltName",
-        ),
-    ] {
+    for [certificate, key, what, remedy] in rows(UNUSABLE) {
         for found in said(dir, certificate, key) {
             let [text] = found.as_slice() else {
                 panic!("{certificate}, {key}: {found:#?}")

@@ -95,107 +95,66 @@ x = "y"
 }
 
 /// One mistake each: the keys of a point named `a` in line 11, and the problem.
+const POINT_MISTAKES: &str = r#"
+at = "holding"                                           -> m:12, point[0].at; write table and PDU address
+at = "holding 70000"                                     -> m:12, point[0].at; write table
+at = "holding 1.8-4"                                     -> m:12, point[0].at; write table
+at = "register 1"                                        -> unknown table `register`; m:12
+at = "input 1"                                           -> is not in any [[range]] of the profile; m:12
+at = "holding 99" / type = "u32"                         -> exceeds its [[range]]; m:12, point[0].at; extend the range
+at = "holding 1.3" / type = "u16"                        -> a bit has no type; m:13, point[0].type
+at = "holding 1" / words = "low-first" / type = "i16"    -> has no word order; m:13, point[0].words
+at = "holding 1" / type = "u32" / words = "little"       -> unknown word order `little`; m:14
+at = "holding 1" / invert = true                         -> only a bit or `equals` can be inverted; m:13, point[0].invert
+at = "holding 1" / scale = 0                             -> a scale of 0 loses every value; m:13, point[0].scale
+at = "holding 1" / scale = nan                           -> NaN is not a finite number; m:13, point[0].scale
+at = "holding 1" / offset = inf                          -> inf is not a finite number; m:13, point[0].offset
+at = "holding 1.3" / scale = 2                           -> has no scale; m:13, point[0].scale; leave the key out
+at = "holding 1" / offset = 2 / [point.texts] / 1 = "on" -> has no scale; m:13, point[0].offset
+at = "holding 1" / class = "quick"                       -> unknown poll class `quick`; m:13, point[0].class
+at = "holding 1" / range = [5, 1]                        -> expected two values, the lower one first; m:13
+at = "holding 1" / pulse = true / write = true           -> only a bit can be a pulse; m:13
+at = "holding 1.1" / pulse = true                        -> only a writable point can be a pulse; m:13
+at = "holding 1" / on_change = true                      -> only a writable point is written on change; m:13, point[0].on_change
+at = "holding 1" / write_to = "b"                        -> there is no point `b`; m:13, point[0].write_to
+at = "holding 1" / write = true / write_to = "a"         -> does not accept commands itself; m:14
+at = "holding 1" / [point.texts] / on = "on"             -> `on` is not a whole number; m:14, point[0].texts.on
+derive = "sum"                                           -> unknown derivation `sum`; m:12, point[0].derive; known: band, percent
+derive = "zero"                                          -> `of` is missing; m:10
+derive = "zero" / of = "b"                               -> there is no point `b`; m:13, point[0].of
+derive = "zero" / of = "a"                               -> `a` is derived itself; m:12, point[0].derive
+derive = "band" / of = "a"                               -> `maximum` is missing; m:10"#;
+
+/// The lines of a profile on the left of `->`, with ` / ` between them, and the problem on the right.
+fn mistakes_of(table: &'static str) -> impl Iterator<Item = (String, &'static str)> {
+    let rows = table.trim_start().lines();
+    let sides = rows.map(|row| row.split_once(" -> ").unwrap());
+    sides.map(|(lines, wanted)| (lines.trim_end().replace(" / ", "\n"), wanted))
+}
+
 #[test]
 fn each_mistake_of_a_point() {
-    let cases = [
-        ("at = \"holding\"", "m:12, point[0].at; write table and PDU address"),
-        ("at = \"holding 70000\"", "m:12, point[0].at; write table"),
-        ("at = \"holding 1.8-4\"", "m:12, point[0].at; write table"),
-        ("at = \"register 1\"", "unknown table `register`; m:12"),
-        ("at = \"input 1\"", "is not in any [[range]] of the profile; m:12"),
-        (
-            "at = \"holding 99\"\ntype = \"u32\"",
-            "exceeds its [[range]]; m:12, point[0].at; extend the range",
-        ),
-        (
-            "at = \"holding 1.3\"\ntype = \"u16\"",
-            "a bit has no type; m:13, point[0].type",
-        ),
-        (
-            "at = \"holding 1\"\nwords = \"low-first\"\ntype = \"i16\"",
-            "has no word order; m:13, point[0].words",
-        ),
-        (
-            "at = \"holding 1\"\ntype = \"u32\"\nwords = \"little\"",
-            "unknown word order `little`; m:14",
-        ),
-        (
-            "at = \"holding 1\"\ninvert = true",
-            "only a bit or `equals` can be inverted; m:13, point[0].invert",
-        ),
-        (
-            "at = \"holding 1\"\nscale = 0",
-            "a scale of 0 loses every value; m:13, point[0].scale",
-        ),
-        (
-            "at = \"holding 1\"\nscale = nan",
-            "NaN is not a finite number; m:13, point[0].scale",
-        ),
-        (
-            "at = \"holding 1\"\noffset = inf",
-            "inf is not a finite number; m:13, point[0].offset",
-        ),
-        (
-            "at = \"holding 1.3\"\nscale = 2",
-            "has no scale; m:13, point[0].scale; leave the key out",
-        ),
-        (
-            "at = \"holding 1\"\noffset = 2\n[point.texts]\n1 = \"on\"",
-            "has no scale; m:13, point[0].offset",
-        ),
-        (
-            "at = \"holding 1\"\nclass = \"quick\"",
-            "unknown poll class `quick`; m:13, point[0].class",
-        ),
-        (
-            "at = \"holding 1\"\nrange = [5, 1]",
-            "expected two values, the lower one first; m:13",
-        ),
-        (
-            "at = \"holding 1\"\npulse = true\nwrite = true",
-            "only a bit can be a pulse; m:13",
-        ),
-        (
-            "at = \"holding 1.1\"\npulse = true",
-            "only a writable point can be a pulse; m:13",
-        ),
-        (
-            "at = \"holding 1\"\non_change = true",
-            "only a writable point is written on change; m:13, point[0].on_change",
-        ),
-        (
-            "at = \"holding 1\"\nwrite_to = \"b\"",
-            "there is no point `b`; m:13, point[0].write_to",
-        ),
-        (
-            "at = \"holding 1\"\nwrite = true\nwrite_to = \"a\"",
-            "does not accept commands itself; m:14",
-        ),
-        (
-            "at = \"holding 1\"\n[point.texts]\non = \"on\"",
-            "`on` is not a whole number; m:14, point[0].texts.on",
-        ),
-        (
-            "derive = \"sum\"",
-            "unknown derivation `sum`; m:12, point[0].derive; known: band, percent",
-        ),
-        ("derive = \"zero\"", "`of` is missing; m:10"),
-        (
-            "derive = \"zero\"\nof = \"b\"",
-            "there is no point `b`; m:13, point[0].of",
-        ),
-        (
-            "derive = \"zero\"\nof = \"a\"",
-            "`a` is derived itself; m:12, point[0].derive",
-        ),
-        ("derive = \"band\"\nof = \"a\"", "`maximum` is missing; m:10"),
-    ];
-    for (lines, wanted) in cases {
+    for (lines, wanted) in mistakes_of(POINT_MISTAKES) {
         let all = mistakes("m", &format!("{HEAD}[[point]]\nname = \"a\"\n{lines}\n"));
         assert!(all.contains(wanted), "{lines}\n{wanted} is missing in\n{all}");
         assert_eq!(all.lines().count(), 1, "{lines}\n{all}");
     }
 }
+
+/// One mistake each: the line above the name, and the problem.
+const TOP_MISTAKES: &str = r#"
+base = "vacon"                    -> there is no valid profile `vacon`; m:2, base
+addresses = [0, 5]                -> the first address is 0 or above the last; m:2, addresses
+addresses = [1]                   -> expected two values, the lower one first; m:2, addresses
+turnaround = "5"                  -> m:2, turnaround
+address_offset = { holding = 2 }  -> 2 is out of range; m:2, address_offset.holding
+address_offset = { hold = 1 }     -> unknown key `hold`; m:2, address_offset.hold
+address_offset = { holding = -1 } -> holding 0 shifted by -1 is not an address; m:7, range[0].first
+remove = ["b"]                    -> there is no point `b`; m:2, remove
+remove = "a"                      -> not a list; m:2, remove
+points.b.scale = 2                -> there is no point `b`; m:2, points.b
+points.a.scael = 2                -> unknown key `scael`; m:2, point[0].scael; did you mean `scale`?
+speed_reference.signed = true     -> no register for a reference in percent; m:2, speed_reference"#;
 
 #[test]
 fn each_mistake_of_the_whole() {
@@ -219,39 +178,6 @@ fn each_mistake_of_the_whole() {
         (
             HEAD.to_string() + &range("").replace("200", "50"),
             "the range overlaps the one from 0 to 99; m:12, range[1].first",
-        ),
-        (top("base = \"vacon\""), "there is no valid profile `vacon`; m:2, base"),
-        (
-            top("addresses = [0, 5]"),
-            "the first address is 0 or above the last; m:2, addresses",
-        ),
-        (
-            top("addresses = [1]"),
-            "expected two values, the lower one first; m:2, addresses",
-        ),
-        (top("turnaround = \"5\""), "m:2, turnaround"),
-        (
-            top("address_offset = { holding = 2 }"),
-            "2 is out of range; m:2, address_offset.holding",
-        ),
-        (
-            top("address_offset = { hold = 1 }"),
-            "unknown key `hold`; m:2, address_offset.hold",
-        ),
-        (
-            top("address_offset = { holding = -1 }"),
-            "holding 0 shifted by -1 is not an address; m:7, range[0].first",
-        ),
-        (top("remove = [\"b\"]"), "there is no point `b`; m:2, remove"),
-        (top("remove = \"a\""), "not a list; m:2, remove"),
-        (top("points.b.scale = 2"), "there is no point `b`; m:2, points.b"),
-        (
-            top("points.a.scael = 2"),
-            "unknown key `scael`; m:2, point[0].scael; did you mean `scale`?",
-        ),
-        (
-            top("speed_reference.signed = true"),
-            "no register for a reference in percent; m:2, speed_reference",
         ),
         (
             top("").replace("[\"modbus-rtu\"]", "[\"modbus-rtu\", \"n2\"]"),
@@ -282,7 +208,8 @@ fn each_mistake_of_the_whole() {
             "the text of `a` is shown as `a_text`, which is also a point; m:11, point[0].name",
         ),
     ];
-    for (source, wanted) in cases {
+    let tops = mistakes_of(TOP_MISTAKES).map(|(line, wanted)| (top(&line), wanted));
+    for (source, wanted) in tops.chain(cases) {
         let all = mistakes("m", &source);
         assert!(all.contains(wanted), "{source}\n{wanted} is missing in\n{all}");
     }

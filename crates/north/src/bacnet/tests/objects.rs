@@ -1,4 +1,6 @@
 use super::*;
+use crate::drive::profile::Profiles;
+use crate::process_image::Access;
 use drivegate_bacnet::{Kind, Mac};
 use std::collections::{BTreeMap, HashSet};
 
@@ -72,17 +74,17 @@ fn a_number_means_the_same_point_at_every_family_and_names_are_unique() {
 
 #[test]
 fn quality_is_told_and_never_better_than_it_is() {
-    let mut bench = Bench::new();
-    let speed = bench.place(ObjectId::new(ObjectType::ANALOG_INPUT, 1));
-    let reliability = |bench: &Bench| bench.view.sample(DEVICE, speed).reliability;
-    assert_eq!(reliability(&bench), Reliability::NoFault);
-    assert!(bench.view.sample(DEVICE, speed).at.is_some() && bench.view.answers(DEVICE));
-    bench.now += Duration::from_secs(5);
-    bench.view.look(bench.now);
-    assert_eq!(reliability(&bench), Reliability::CommunicationFailure, "stale");
-    bench.read(1);
-    assert_eq!(reliability(&bench), Reliability::NoFault);
-    let drive = bench.drive();
+    let mut rig = ControlledDrive::new();
+    let speed = rig.place(ObjectId::new(ObjectType::ANALOG_INPUT, 1));
+    let reliability = |rig: &ControlledDrive| rig.view.sample(DEVICE, speed).reliability;
+    assert_eq!(reliability(&rig), Reliability::NoFault);
+    assert!(rig.view.sample(DEVICE, speed).at.is_some() && rig.view.answers(DEVICE));
+    rig.now += Duration::from_secs(5);
+    rig.view.look(rig.now);
+    assert_eq!(reliability(&rig), Reliability::CommunicationFailure, "stale");
+    rig.read(1);
+    assert_eq!(reliability(&rig), Reliability::NoFault);
+    let drive = rig.drive();
     let Some(raw) = drive
         .image
         .spec
@@ -97,20 +99,20 @@ fn quality_is_told_and_never_better_than_it_is() {
     drive
         .image
         .update(|snapshot| snapshot.refuse(raw.table, raw.address, 1, crate::codec::Exception::ADDRESS));
-    assert_eq!(reliability(&bench), Reliability::UnreliableOther, "refused");
-    bench.read(1);
+    assert_eq!(reliability(&rig), Reliability::UnreliableOther, "refused");
+    rig.read(1);
     drive
         .image
         .update(|snapshot| snapshot.link = Link::Offline(std::time::SystemTime::now()));
-    assert_eq!(reliability(&bench), Reliability::CommunicationFailure);
-    assert!(!bench.view.answers(DEVICE), "away");
+    assert_eq!(reliability(&rig), Reliability::CommunicationFailure);
+    assert!(!rig.view.answers(DEVICE), "away");
     assert_eq!(raw.table, Table::Holding);
 }
 
 #[test]
 fn the_tables_for_the_integrator_are_whole() {
     let drives = [spec("vacon-nx")];
-    let bus = bus_spec();
+    let bus = bus_spec("line1");
     let devices = listing::devices("hall", &options(), [(&bus, &drives[..])].into_iter());
     assert_eq!(
         devices.iter().map(|shown| shown.device.instance).collect::<Vec<_>>(),
@@ -159,18 +161,18 @@ fn the_tables_for_the_integrator_are_whole() {
 
 #[test]
 fn buses_and_hosts_are_those_of_the_configuration() {
-    let bench = Bench::new();
-    assert!(bench.view.admits("127.0.0.1".parse().unwrap()) && !bench.view.admits("10.0.0.1".parse().unwrap()));
+    let rig = ControlledDrive::new();
+    assert!(rig.view.admits("127.0.0.1".parse().unwrap()) && !rig.view.admits("10.0.0.1".parse().unwrap()));
     let none = Options {
         buses: Some(vec!["other".to_string()]),
         ..options()
     };
-    let view = View::new(bench.view.plant.clone(), Arc::new(none));
+    let view = View::new(rig.view.plant.clone(), Arc::new(none));
     assert_eq!(view.devices().len(), 1, "the gateway alone");
     let off = Options {
         commands: false,
         ..options()
     };
-    let view = View::new(bench.view.plant.clone(), Arc::new(off));
+    let view = View::new(rig.view.plant.clone(), Arc::new(off));
     assert!(!view.may_write("127.0.0.1".parse().unwrap()));
 }

@@ -4,65 +4,65 @@ const NULL: Option<Datum> = None;
 
 #[test]
 fn a_slot_that_governs_is_an_order_and_stands_when_the_drive_took_it() {
-    let bench = Bench::new();
+    let rig = ControlledDrive::new();
     assert_eq!(
-        bench.order("127.0.0.5", RUN, 8, on(true), done()),
+        rig.order("127.0.0.5", RUN, 8, on(true), done()),
         "run=true by bacnet 127.0.0.5"
     );
-    assert_eq!(bench.slots(RUN), [(8, Datum::Bool(true))]);
-    assert_eq!(bench.shown(RUN), Datum::Bool(true));
+    assert_eq!(rig.slots(RUN), [(8, Datum::Bool(true))]);
+    assert_eq!(rig.shown(RUN), Datum::Bool(true));
     assert_eq!(
-        bench.at_once("127.0.0.6", RUN, 10, on(false)),
+        rig.at_once("127.0.0.6", RUN, 10, on(false)),
         Ok(()),
         "it does not govern"
     );
     assert_eq!(
-        bench.order("127.0.0.7", RUN, 5, on(false), done()),
+        rig.order("127.0.0.7", RUN, 5, on(false), done()),
         "run=false by bacnet 127.0.0.7"
     );
     assert_eq!(
-        bench.order("127.0.0.7", RUN, 5, NULL, done()),
+        rig.order("127.0.0.7", RUN, 5, NULL, done()),
         "run=true by bacnet 127.0.0.5",
         "an order of its owner"
     );
     assert_eq!(
-        bench.order("127.0.0.5", RUN, 8, NULL, done()),
+        rig.order("127.0.0.5", RUN, 8, NULL, done()),
         "run=false by bacnet 127.0.0.6"
     );
     assert_eq!(
-        bench.order("127.0.0.6", RUN, 10, NULL, done()),
+        rig.order("127.0.0.6", RUN, 10, NULL, done()),
         "run=false by bacnet 127.0.0.6",
         "the last one: a stop"
     );
-    assert_eq!(bench.slots(RUN), []);
-    assert_eq!(bench.at_once("127.0.0.6", RUN, 10, NULL), Ok(()), "was empty");
+    assert_eq!(rig.slots(RUN), []);
+    assert_eq!(rig.at_once("127.0.0.6", RUN, 10, NULL), Ok(()), "was empty");
 }
 
 #[test]
 fn what_failed_leaves_the_slot_and_what_is_unknown_leaves_what_is_read() {
-    let mut bench = Bench::new();
-    bench.order("127.0.0.5", RUN, 8, on(true), done());
-    bench.order(
+    let mut rig = ControlledDrive::new();
+    rig.order("127.0.0.5", RUN, 8, on(true), done());
+    rig.order(
         "127.0.0.5",
         RUN,
         8,
         on(false),
         Outcome::Exception(crate::codec::Exception::DEVICE_FAILURE),
     );
-    assert_eq!(bench.slots(RUN), [(8, Datum::Bool(true))]);
-    bench.order("127.0.0.5", RUN, 8, on(false), Outcome::TimedOut);
-    assert_eq!(bench.slots(RUN), []);
-    bench.now += Duration::from_millis(50);
-    bench.read(0);
-    let drive = bench.drive();
-    let reading = drive.reading(bench.now);
+    assert_eq!(rig.slots(RUN), [(8, Datum::Bool(true))]);
+    rig.order("127.0.0.5", RUN, 8, on(false), Outcome::TimedOut);
+    assert_eq!(rig.slots(RUN), []);
+    rig.now += Duration::from_millis(50);
+    rig.read(0);
+    let drive = rig.drive();
+    let reading = drive.reading(rig.now);
     drive.priorities(|all| {
         all.resolve(|what, since| {
             let sample = reading.model(what.point());
             sample.good().filter(|_| sample.at.is_some_and(|at| at > since))
         });
     });
-    assert_eq!(bench.slots(RUN), [(8, Datum::Bool(false))], "the drive shows the stop");
+    assert_eq!(rig.slots(RUN), [(8, Datum::Bool(false))], "the drive shows the stop");
 }
 
 #[test]
@@ -95,119 +95,113 @@ fn errors_say_what_happened() {
     for (outcome, error) in cases {
         assert_eq!(writes::error(&outcome), Err(error), "{outcome:?}");
     }
-    let bench = Bench::new();
+    let rig = ControlledDrive::new();
     assert_eq!(
-        bench.at_once("127.0.0.5", SPEED, 8, number(80.5)),
+        rig.at_once("127.0.0.5", SPEED, 8, number(80.5)),
         Err(Error::VALUE_OUT_OF_RANGE),
         "the limits"
     );
     assert_eq!(
-        bench.at_once("127.0.0.5", RUN, 6, on(false)),
+        rig.at_once("127.0.0.5", RUN, 6, on(false)),
         Err(Error::WRITE_ACCESS_DENIED),
         "minimum on and off times"
     );
-    assert_eq!(bench.slots(SPEED), []);
+    assert_eq!(rig.slots(SPEED), []);
 }
 
 #[test]
 fn both_references_are_one_thing_and_each_shows_its_unit() {
-    let bench = Bench::new();
+    let rig = ControlledDrive::new();
     assert_eq!(
-        bench.order("127.0.0.5", SPEED, 8, number(50.0), done()),
+        rig.order("127.0.0.5", SPEED, 8, number(50.0), done()),
         "speed_reference=50 by bacnet 127.0.0.5"
     );
     assert_eq!(
-        (bench.shown(SPEED), bench.shown(FREQUENCY)),
+        (rig.shown(SPEED), rig.shown(FREQUENCY)),
         (Datum::Number(50.0), Datum::Number(25.0))
     );
-    assert_eq!(bench.at_once("127.0.0.6", FREQUENCY, 9, number(10.0)), Ok(()));
-    let order = bench.order("127.0.0.6", FREQUENCY, 7, number(20.0), done());
+    assert_eq!(rig.at_once("127.0.0.6", FREQUENCY, 9, number(10.0)), Ok(()));
+    let order = rig.order("127.0.0.6", FREQUENCY, 7, number(20.0), done());
     assert_eq!(order, "speed_reference=40 by bacnet 127.0.0.6");
     assert_eq!(
-        (bench.shown(SPEED), bench.shown(FREQUENCY)),
+        (rig.shown(SPEED), rig.shown(FREQUENCY)),
         (Datum::Number(40.0), Datum::Number(20.0))
     );
     assert_eq!(
-        bench.order("127.0.0.6", FREQUENCY, 7, NULL, done()),
+        rig.order("127.0.0.6", FREQUENCY, 7, NULL, done()),
         "speed_reference=50 by bacnet 127.0.0.5"
     );
 }
 
 #[test]
 fn a_stop_elsewhere_withdraws_and_a_slot_that_protects_refuses() {
-    let bench = Bench::new();
-    bench.order("127.0.0.5", RUN, 8, on(true), done());
-    assert_eq!(bench.elsewhere(ModelPoint::Run, Value::Bool(false)), None);
-    assert_eq!(bench.slots(RUN), []);
-    bench.carry_out(done());
-    bench.order("127.0.0.5", RUN, 3, on(false), done());
-    let refused = bench.elsewhere(ModelPoint::Run, Value::Bool(true)).unwrap();
+    let rig = ControlledDrive::new();
+    rig.order("127.0.0.5", RUN, 8, on(true), done());
+    assert_eq!(rig.elsewhere(ModelPoint::Run, Value::Bool(false)), None);
+    assert_eq!(rig.slots(RUN), []);
+    rig.carry_out(done());
+    rig.order("127.0.0.5", RUN, 3, on(false), done());
+    let refused = rig.elsewhere(ModelPoint::Run, Value::Bool(true)).unwrap();
     assert_eq!(refused.code(), "held_by_other");
     assert!(
         refused.to_string().contains("127.0.0.5") && refused.to_string().contains("priority 3"),
         "{refused}"
     );
     assert_eq!(
-        bench.elsewhere(ModelPoint::Run, Value::Bool(false)),
+        rig.elsewhere(ModelPoint::Run, Value::Bool(false)),
         None,
         "a stop passes"
     );
-    bench.carry_out(done());
-    assert_eq!(bench.slots(RUN), [(3, Datum::Bool(false))]);
-    bench.order("127.0.0.5", RUN, 3, NULL, done());
-    assert_eq!(bench.elsewhere(ModelPoint::Run, Value::Bool(true)), None);
+    rig.carry_out(done());
+    assert_eq!(rig.slots(RUN), [(3, Datum::Bool(false))]);
+    rig.order("127.0.0.5", RUN, 3, NULL, done());
+    assert_eq!(rig.elsewhere(ModelPoint::Run, Value::Bool(true)), None);
 }
 
 #[test]
 fn who_comes_to_govern_is_judged_anew_and_gives_its_slot_back_when_refused() {
-    let bench = Bench::new();
-    bench.order("127.0.0.5", RUN, 8, on(true), done());
-    bench.order("127.0.0.7", RUN, 5, on(false), done());
-    let drive = bench.drive();
+    let rig = ControlledDrive::new();
+    rig.order("127.0.0.5", RUN, 8, on(true), done());
+    rig.order("127.0.0.7", RUN, 5, on(false), done());
+    let drive = rig.drive();
     drive
         .image
         .hold
         .set(Some("its parameters are being restored".to_string()));
-    let order = bench.order("127.0.0.7", RUN, 5, NULL, done());
+    let order = rig.order("127.0.0.7", RUN, 5, NULL, done());
     assert_eq!(
         order, "run=false by bacnet 127.0.0.7",
         "nothing is left, so it is a stop"
     );
-    assert_eq!(bench.slots(RUN), []);
+    assert_eq!(rig.slots(RUN), []);
 }
 
 #[test]
 fn a_stop_between_plan_and_acceptance_keeps_the_next_slot_from_starting() {
-    let bench = Bench::new();
-    bench.order("127.0.0.5", RUN, 8, on(true), done());
-    bench.order("127.0.0.7", RUN, 5, on(false), done());
-    let drive = bench.drive();
+    let rig = ControlledDrive::new();
+    rig.order("127.0.0.5", RUN, 8, on(true), done());
+    rig.order("127.0.0.7", RUN, 5, on(false), done());
+    let drive = rig.drive();
     let null = SlotWrite::new(Commanded::Run, 5, None);
     let Follows::Order(_, entry) = drive.priorities(|all| all.plan(&null)) else {
         panic!("no order")
     };
-    assert_eq!(bench.elsewhere(ModelPoint::Run, Value::Bool(false)), None);
-    bench.carry_out(done());
+    assert_eq!(rig.elsewhere(ModelPoint::Run, Value::Bool(false)), None);
+    rig.carry_out(done());
     let run = drive.image.spec.profile.model_index(ModelPoint::Run).unwrap();
     let order = Order::Points(vec![(run, entry.value)]);
     let null = null.in_favour_of(&entry);
-    let mut placed = drive.place_slot(
-        order,
-        null,
-        entry.origin,
-        Duration::from_secs(2),
-        (bench.now, bench.now),
-    );
+    let mut placed = drive.place_slot(order, null, entry.origin, Duration::from_secs(2), (rig.now, rig.now));
     let outcome = placed.answer().expect("refused at once").outcome;
     assert_eq!(outcome, Outcome::Replaced);
     assert_eq!(writes::error(&outcome), Err(Error::SERVICE_REQUEST_DENIED));
-    assert_eq!(bench.slots(RUN), [(5, Datum::Bool(false))]);
+    assert_eq!(rig.slots(RUN), [(5, Datum::Bool(false))]);
 }
 
 #[test]
 fn what_hands_over_to_an_active_is_no_stop() {
     use drivegate_bacnet::services::{PropertyRef, WriteItem};
-    let bench = Bench::new();
+    let rig = ControlledDrive::new();
     let stops = |priority: u32, value: Data| {
         let property = PropertyRef {
             property: PropertyId::PRESENT_VALUE,
@@ -219,11 +213,11 @@ fn what_hands_over_to_an_active_is_no_stop() {
             value: Some(value),
             priority: Some(priority),
         };
-        bench.view.stops(DEVICE, &item)
+        rig.view.stops(DEVICE, &item)
     };
     assert!(stops(8, Data::Null) && stops(16, Data::Enumerated(0)));
-    bench.order("127.0.0.5", RUN, 8, on(true), done());
-    bench.order("127.0.0.7", RUN, 5, on(false), done());
+    rig.order("127.0.0.5", RUN, 8, on(true), done());
+    rig.order("127.0.0.7", RUN, 5, on(false), done());
     assert!(!stops(5, Data::Null), "the active at 8 would start the motor");
     assert!(!stops(9, Data::Enumerated(0)), "it does not govern");
     assert!(stops(3, Data::Enumerated(0)) && !stops(300, Data::Enumerated(0)));
@@ -231,12 +225,12 @@ fn what_hands_over_to_an_active_is_no_stop() {
 
 #[test]
 fn a_pulse_leaves_nothing_behind() {
-    let bench = Bench::new();
+    let rig = ControlledDrive::new();
     let reset = ObjectId::new(ObjectType::BINARY_VALUE, 3);
     assert_eq!(
-        bench.order("127.0.0.5", reset, 8, on(true), done()),
+        rig.order("127.0.0.5", reset, 8, on(true), done()),
         "fault_reset=true by bacnet 127.0.0.5"
     );
-    assert_eq!((bench.slots(reset), bench.shown(reset)), (vec![], Datum::Bool(false)));
-    assert_eq!(bench.at_once("127.0.0.5", reset, 8, on(false)), Ok(()));
+    assert_eq!((rig.slots(reset), rig.shown(reset)), (vec![], Datum::Bool(false)));
+    assert_eq!(rig.at_once("127.0.0.5", reset, 8, on(false)), Ok(()));
 }

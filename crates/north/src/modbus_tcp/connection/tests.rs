@@ -18,7 +18,7 @@ use crate::plant::Plant;
 const REQUEST: [u8; 12] = [0, 1, 0, 0, 0, 6, 255, 4, 0, 0, 0, 1];
 const ANSWER: [u8; 9] = [0, 1, 0, 0, 0, 3, 255, 0x84, 2];
 
-struct Bench {
+struct PipedClient {
     client: DuplexStream,
     server: JoinHandle<()>,
     stats: Arc<NorthState>,
@@ -27,11 +27,11 @@ struct Bench {
 }
 
 /// A connection over a pipe that holds `pipe` bytes each way.
-fn bench(pipe: usize) -> Bench {
-    bench_with(pipe, None)
+fn rig(pipe: usize) -> PipedClient {
+    rig_with(pipe, None)
 }
 
-fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
+fn rig_with(pipe: usize, idle_timeout: Option<Duration>) -> PipedClient {
     let options = Options {
         listeners: Vec::new(),
         tls: None,
@@ -61,7 +61,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
     let server = tokio::spawn(async move {
         serve(end, session, idle_timeout, permit.place(), &CancellationToken::new()).await;
     });
-    Bench {
+    PipedClient {
         client,
         server,
         stats,
@@ -70,7 +70,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
     }
 }
 
-impl Bench {
+impl PipedClient {
     async fn send(&mut self, bytes: &[u8]) {
         self.client.write_all(bytes).await.unwrap();
     }
@@ -91,65 +91,65 @@ impl Bench {
 
 #[tokio::test(start_paused = true)]
 async fn an_incomplete_frame_times_out_after_ten_seconds() {
-    let mut bench = bench(1024);
-    bench.send(&REQUEST).await;
-    assert_eq!(bench.receive(9).await, ANSWER);
+    let mut rig = rig(1024);
+    rig.send(&REQUEST).await;
+    assert_eq!(rig.receive(9).await, ANSWER);
     let begin = Instant::now();
     for byte in &REQUEST[..5] {
         // Single bytes do not extend the time limit.
-        bench.send(&[*byte]).await;
+        rig.send(&[*byte]).await;
         tokio::time::sleep(Duration::from_secs(1)).await;
     }
-    assert_eq!(bench.rest().await, b"");
+    assert_eq!(rig.rest().await, b"");
     assert_eq!(begin.elapsed(), FRAME_TIMEOUT);
-    bench.server.await.unwrap();
-    assert_eq!(bench.stats.modbus_tcp.connections(), 0);
+    rig.server.await.unwrap();
+    assert_eq!(rig.stats.modbus_tcp.connections(), 0);
 }
 
 #[tokio::test(start_paused = true)]
 async fn silent_and_slow_clients_stay_connected() {
-    let mut bench = bench(1024);
+    let mut rig = rig(1024);
     tokio::time::sleep(Duration::from_secs(100_000)).await;
     // There is always an incomplete frame, but each is completed in time.
-    bench.send(&REQUEST[..5]).await;
+    rig.send(&REQUEST[..5]).await;
     for _ in 0..5 {
         tokio::time::sleep(FRAME_TIMEOUT - Duration::from_secs(1)).await;
-        bench.send(&REQUEST[5..]).await;
-        bench.send(&REQUEST[..5]).await;
-        assert_eq!(bench.receive(9).await, ANSWER);
+        rig.send(&REQUEST[5..]).await;
+        rig.send(&REQUEST[..5]).await;
+        assert_eq!(rig.receive(9).await, ANSWER);
     }
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_client_that_reads_no_answers_is_disconnected() {
-    let mut bench = bench(64);
+    let mut rig = rig(64);
     let begin = Instant::now();
     let mut sent = 0usize;
     // The client keeps writing and reads nothing: the server must stop reading, then close.
-    while bench.client.write_all(&REQUEST).await.is_ok() {
+    while rig.client.write_all(&REQUEST).await.is_ok() {
         sent += 1;
         assert!(sent < 10_000, "the server never stops reading");
     }
     assert_eq!(begin.elapsed(), WRITE_TIMEOUT);
-    bench.server.await.unwrap();
-    assert_eq!(bench.stats.modbus_tcp.connections(), 0);
+    rig.server.await.unwrap();
+    assert_eq!(rig.stats.modbus_tcp.connections(), 0);
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_stopped_client_does_not_delay_shutdown() {
-    let mut bench = bench(16);
+    let mut rig = rig(16);
     let flood: Vec<u8> = REQUEST.iter().copied().cycle().take(12 * 20).collect();
-    let _ = tokio::time::timeout(Duration::from_secs(1), bench.send(&flood)).await;
+    let _ = tokio::time::timeout(Duration::from_secs(1), rig.send(&flood)).await;
     let begin = Instant::now();
-    bench.cancel.cancel();
-    bench.server.await.unwrap();
+    rig.cancel.cancel();
+    rig.server.await.unwrap();
     assert!(begin.elapsed() <= CLOSE_TIMEOUT, "{:?}", begin.elapsed());
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_batch_is_answered_however_it_is_segmented() {
     for piece in [1, 2, 5, 7, 11, 12, 13, 100, 4096] {
-        let mut bench = bench(4096);
+        let mut rig = rig(4096);
         let requests: Vec<u8> = (0..100u16)
             .flat_map(|n| {
                 let mut request = REQUEST;
@@ -158,12 +158,12 @@ async fn a_batch_is_answered_however_it_is_segmented() {
             })
             .collect();
         for bytes in requests.chunks(piece) {
-            bench.send(bytes).await;
+            rig.send(bytes).await;
         }
         for n in 0..100u16 {
             let mut answer = ANSWER;
             answer[..2].copy_from_slice(&n.to_be_bytes());
-            assert_eq!(bench.receive(9).await, answer, "pieces of {piece}");
+            assert_eq!(rig.receive(9).await, answer, "pieces of {piece}");
         }
     }
 }
@@ -176,49 +176,49 @@ async fn requests_before_invalid_data_are_answered() {
         &[0, 2, 0, 0, 0xFF, 0xFF, 255, 4],
         &[0, 2, 0, 1],
     ] {
-        let mut bench = bench(1024);
-        bench.send(&[&REQUEST, nonsense, &REQUEST].concat()).await;
-        assert_eq!(bench.rest().await, ANSWER);
-        bench.server.await.unwrap();
+        let mut rig = rig(1024);
+        rig.send(&[&REQUEST, nonsense, &REQUEST].concat()).await;
+        assert_eq!(rig.rest().await, ANSWER);
+        rig.server.await.unwrap();
     }
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_half_closed_connection_gets_its_answers() {
-    let mut bench = bench(1024);
-    bench.send(&REQUEST).await;
-    bench.client.shutdown().await.unwrap();
-    assert_eq!(bench.rest().await, ANSWER);
-    bench.server.await.unwrap();
+    let mut rig = rig(1024);
+    rig.send(&REQUEST).await;
+    rig.client.shutdown().await.unwrap();
+    assert_eq!(rig.rest().await, ANSWER);
+    rig.server.await.unwrap();
 }
 
 #[tokio::test(start_paused = true)]
 async fn an_idle_client_is_disconnected() {
     let timeout = Duration::from_secs(60);
-    let mut bench = bench_with(1024, Some(timeout));
+    let mut rig = rig_with(1024, Some(timeout));
     for _ in 0..5 {
         tokio::time::sleep(timeout - Duration::from_secs(1)).await;
-        bench.send(&REQUEST).await;
-        assert_eq!(bench.receive(9).await, ANSWER);
+        rig.send(&REQUEST).await;
+        assert_eq!(rig.receive(9).await, ANSWER);
     }
     let begin = Instant::now();
-    assert_eq!(bench.rest().await, b"");
+    assert_eq!(rig.rest().await, b"");
     assert_eq!(begin.elapsed(), timeout);
-    bench.server.await.unwrap();
-    assert_eq!(bench.stats.modbus_tcp.connections(), 0);
+    rig.server.await.unwrap();
+    assert_eq!(rig.stats.modbus_tcp.connections(), 0);
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_connection_is_in_use_once_it_has_asked_and_ends_when_its_place_is_taken() {
-    let mut bench = bench(1024);
-    bench.send(&REQUEST[..5]).await;
+    let mut rig = rig(1024);
+    rig.send(&REQUEST[..5]).await;
     tokio::time::sleep(Duration::from_secs(1)).await;
-    assert!(!bench.place.is_in_use());
-    bench.send(&REQUEST[5..]).await;
-    assert_eq!(bench.receive(9).await, ANSWER);
-    assert!(bench.place.is_in_use());
-    bench.place.close(CloseReason::Displaced);
-    assert_eq!(bench.rest().await, b"");
-    bench.server.await.unwrap();
-    assert_eq!(bench.stats.modbus_tcp.connections(), 0);
+    assert!(!rig.place.is_in_use());
+    rig.send(&REQUEST[5..]).await;
+    assert_eq!(rig.receive(9).await, ANSWER);
+    assert!(rig.place.is_in_use());
+    rig.place.close(CloseReason::Displaced);
+    assert_eq!(rig.rest().await, b"");
+    rig.server.await.unwrap();
+    assert_eq!(rig.stats.modbus_tcp.connections(), 0);
 }

@@ -10,7 +10,7 @@ use crate::command::{Order, Outcome, Receipt, Urgency};
 use crate::command_json::REMEMBERED;
 use crate::drive::Value;
 
-struct Bench {
+struct SetTopics {
     plant: Plant,
     commands: Commands,
     memory: SharedMemory,
@@ -18,12 +18,12 @@ struct Bench {
     events: tokio::sync::broadcast::Receiver<Arc<crate::event::Event>>,
 }
 
-impl Bench {
-    fn new() -> Bench {
+impl SetTopics {
+    fn new() -> SetTopics {
         let plant = fixture::plant(&["p1"]);
         fixture::read(&plant, "p1", 1, 0, Instant::now());
         let memory = SharedMemory::default();
-        Bench {
+        SetTopics {
             events: plant.events.subscribe(),
             commands: commands(&memory),
             memory,
@@ -116,7 +116,7 @@ fn set(topic: &str, payload: &str) -> Incoming {
 
 #[test]
 fn a_command_is_executed_and_answered() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     assert_eq!(bench.take(set("p1/set", r#"{"id": 5, "run": true}"#)), None);
     let result = bench.acknowledge();
     assert_eq!(result["id"], 5);
@@ -130,7 +130,7 @@ fn a_command_is_executed_and_answered() {
 
 #[test]
 fn a_response_topic_gets_the_result_and_the_correlation() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let request = Incoming {
         response_topic: Some("client/7".to_string()),
         correlation: Some(vec![1, 0, 255]),
@@ -154,7 +154,7 @@ fn a_response_topic_gets_the_result_and_the_correlation() {
 
 #[test]
 fn refusals_are_reported_audited_and_answered_and_nothing_is_queued() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     for (incoming, code) in [
         (set("p1/set", "{"), "bad_value"),
         (set("p1/set", r#"{"ready": true}"#), "not_writable"),
@@ -202,7 +202,7 @@ fn refusals_are_reported_audited_and_answered_and_nothing_is_queued() {
 
 #[test]
 fn commands_outside_the_limits_are_refused() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let result = json(&bench.take(set("p1/set/speed_reference", "101")).unwrap());
     assert_eq!(result["error"]["code"], "bad_value");
     let result = json(&bench.take(set("p1/set", "{}")).unwrap());
@@ -213,7 +213,7 @@ fn commands_outside_the_limits_are_refused() {
 
 #[test]
 fn a_repetition_gets_the_previous_result() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let first = set("p1/set", r#"{"id": 1, "run": true}"#);
     assert_eq!(bench.take(first.clone()), None);
     let repeated = Incoming {
@@ -279,7 +279,7 @@ fn a_repetition_gets_the_previous_result() {
 
 #[test]
 fn a_repetition_is_known_after_a_reload() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let run = |id: u32| set("p1/set", &format!(r#"{{"id": {id}, "run": true}}"#));
     assert_eq!(bench.take(run(1)), None);
     let result = bench.acknowledge();
@@ -301,7 +301,7 @@ fn a_repetition_is_known_after_a_reload() {
 
 #[test]
 fn a_command_that_waits_over_a_reload_is_answered_once_by_the_client_that_comes_after() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let run = |id: u32| set("p1/set", &format!(r#"{{"id": {id}, "run": true}}"#));
     assert_eq!(bench.take(run(1)), None);
     bench.succeed_client();
@@ -322,7 +322,7 @@ fn a_command_that_waits_over_a_reload_is_answered_once_by_the_client_that_comes_
 
 #[test]
 fn a_repeated_stop_is_executed_again() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let stop = set("p1/set", r#"{"id": 2, "run": false}"#);
     for _ in 0..2 {
         assert_eq!(bench.take(stop.clone()), None);
@@ -332,7 +332,7 @@ fn a_repeated_stop_is_executed_again() {
 
 #[test]
 fn commands_are_queued_in_the_order_of_their_messages() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let set_points = [
         ("run", "1"),
         ("reverse", "0"),
@@ -340,7 +340,7 @@ fn commands_are_queued_in_the_order_of_their_messages() {
         ("run", "true"),
         ("fault_reset", "1"),
     ];
-    let taken = |bench: &Bench| bench.take_order().map(|(order, _)| order);
+    let taken = |bench: &SetTopics| bench.take_order().map(|(order, _)| order);
     for (point, value) in set_points {
         assert_eq!(bench.take(set(&format!("p1/set/{point}"), value)), None);
     }
@@ -358,7 +358,7 @@ fn commands_are_queued_in_the_order_of_their_messages() {
 
 #[test]
 fn topics_of_one_broker_are_one_client() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     for point in ["speed_reference", "run"] {
         bench.take(set(&format!("p1/set/{point}"), "1"));
         let command = next_command(&mut bench.plant.buses[0].queue.lock(), Urgency::Read, bench.now).unwrap();
@@ -371,9 +371,9 @@ fn topics_of_one_broker_are_one_client() {
 }
 
 /// `buses` lines with 40 drives each that were read.
-fn halls(buses: usize) -> (Bench, Vec<String>) {
+fn halls(buses: usize) -> (SetTopics, Vec<String>) {
     let names: Vec<String> = (0..buses * 40).map(|i| format!("d{i}")).collect();
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     bench.plant.buses = names
         .chunks(40)
         .flat_map(|chunk| fixture::plant(&chunk.iter().map(String::as_str).collect::<Vec<_>>()).buses)
@@ -447,7 +447,7 @@ fn messages_beyond_the_limit_stay_with_the_broker() {
 
 #[test]
 fn a_refusal_of_the_queue_has_its_reason() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let results: Vec<Json> = (0..crate::command::CAPACITY + 2)
         .filter_map(|_| bench.take(set("p1/set/run", "1")))
         .map(|message| json(&message))
@@ -461,7 +461,7 @@ fn a_refusal_of_the_queue_has_its_reason() {
 
 #[test]
 fn a_repetition_of_what_has_no_result_yet_is_answered_with_that() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let run = set("p1/set", r#"{"id": 1, "run": true}"#);
     assert_eq!(bench.take(run.clone()), None);
     assert_eq!(bench.take(set("p1/set", r#"{"id": 2, "run": false}"#)), None);
@@ -470,7 +470,7 @@ fn a_repetition_of_what_has_no_result_yet_is_answered_with_that() {
 }
 
 /// A run, which it returns, and a stop after it.
-fn run_and_stop(bench: &mut Bench) -> Incoming {
+fn run_and_stop(bench: &mut SetTopics) -> Incoming {
     let run = set("p1/set", r#"{"id": 1, "run": true}"#);
     for command in [run.clone(), set("p1/set", r#"{"id": 2, "run": false}"#)] {
         assert_eq!(bench.take(command), None);
@@ -481,7 +481,7 @@ fn run_and_stop(bench: &mut Bench) -> Incoming {
 
 #[test]
 fn a_repetition_after_a_stop_is_refused() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let run = run_and_stop(&mut bench);
     let again = json(&bench.take(Incoming { dup: true, ..run }).expect("an answer at once"));
     assert_eq!(again["error"]["code"], "not_allowed", "{again}");
@@ -490,7 +490,7 @@ fn a_repetition_after_a_stop_is_refused() {
 
 #[test]
 fn a_repetition_after_the_drive_was_removed_and_added_is_refused() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let run = run_and_stop(&mut bench);
     for _ in 0..2 {
         bench.remove_and_add();
@@ -508,7 +508,7 @@ fn a_repetition_after_the_drive_was_removed_and_added_is_refused() {
 
 #[test]
 fn a_loop_of_old_commands_starts_nothing() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let starts: Vec<_> = (0..5000)
         .map(|n| set("p1/set", &format!(r#"{{"id": {n}, "run": true}}"#)))
         .collect();
@@ -524,7 +524,7 @@ fn a_loop_of_old_commands_starts_nothing() {
 
 #[test]
 fn a_repetition_to_another_address_is_answered_there_though_the_result_is_to_come() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let run = set("p1/set", r#"{"id": 1, "run": true}"#);
     assert_eq!(bench.take(run.clone()), None);
     let elsewhere = Incoming {
@@ -538,7 +538,7 @@ fn a_repetition_to_another_address_is_answered_there_though_the_result_is_to_com
 
 #[test]
 fn where_an_id_is_required_only_stops_do_without() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     bench.commands.rules.require_id = true;
     for (topic, payload) in [("p1/set", r#"{"run": true}"#), ("p1/set/run", "1")] {
         let refused = json(&bench.take(set(topic, payload)).unwrap());
@@ -556,7 +556,7 @@ fn where_an_id_is_required_only_stops_do_without() {
 
 #[test]
 fn commands_whose_results_find_no_room_are_refused_and_stops_are_not() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let mut crowded = |payload: &str| {
         let crowded = |topic: &str| topic == "drivegate/hall/drive/p1/result";
         let incoming = set("p1/set", payload);
@@ -575,7 +575,7 @@ fn commands_whose_results_find_no_room_are_refused_and_stops_are_not() {
 
 #[test]
 fn the_audit_names_the_client_that_the_broker_names() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let run = Incoming {
         who: Some("alice\n".to_string()),
         ..set("p1/set/run", "1")
@@ -587,7 +587,7 @@ fn the_audit_names_the_client_that_the_broker_names() {
 }
 
 /// The drive acknowledges the stop of a command, and nothing else of it was queued; the result.
-fn stop_alone(bench: &mut Bench, payload: &str) -> Json {
+fn stop_alone(bench: &mut SetTopics, payload: &str) -> Json {
     assert_eq!(bench.take(set("p1/set", payload)), None, "{payload}");
     assert_eq!(bench.queued(), 1, "{payload}");
     let (order, receipt) = bench.take_order().unwrap();
@@ -602,7 +602,7 @@ fn stop_alone(bench: &mut Bench, payload: &str) -> Json {
 
 #[test]
 fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     for (payload, code, text) in [
         (
             r#"{"id": 1, "run": false, "speed_reference": 1000}"#,
@@ -640,7 +640,7 @@ fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
 
 #[test]
 fn of_a_repeated_command_that_stops_and_does_more_only_the_stop_is_repeated() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let payload = r#"{"id": 9, "run": false, "speed_reference": 10}"#;
     assert_eq!(bench.take(set("p1/set", payload)), None);
     assert_eq!(bench.queued(), 2);
@@ -656,7 +656,7 @@ fn of_a_repeated_command_that_stops_and_does_more_only_the_stop_is_repeated() {
 
 #[test]
 fn a_start_that_came_before_a_stop_and_is_taken_behind_it_is_not_executed() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let mut start = set("p1/set", r#"{"id": 1, "run": true}"#);
     start.asked = Some(bench.now);
     bench.now += Duration::from_millis(20);

@@ -5,16 +5,16 @@ use super::*;
 use crate::codec::{Exception, Table};
 use crate::process_image::Link;
 
-struct Bench {
+struct PublishedPlant {
     plant: Plant,
     publisher: Publisher,
     now: Instant,
     wall: SystemTime,
 }
 
-impl Bench {
+impl PublishedPlant {
     /// Drives `p1` (running at 25 Hz) and `p2` (never read); 100 ms to 60 s.
-    fn new() -> Bench {
+    fn new() -> PublishedPlant {
         let plant = fixture::plant(&["p1", "p2"]);
         let topics = Topics::new("drivegate", "hall");
         let telemetry = Telemetry {
@@ -25,7 +25,7 @@ impl Bench {
         let intervals = (Duration::from_millis(100), Duration::from_secs(60));
         let mut publisher = Publisher::new(topics, intervals, telemetry, Arc::default());
         publisher.adopt(&plant, Vec::new());
-        let bench = Bench {
+        let bench = PublishedPlant {
             plant,
             publisher,
             now: Instant::now(),
@@ -67,7 +67,7 @@ fn topics(updates: &[(String, String)]) -> Vec<&str> {
 
 #[test]
 fn the_state_object_has_values_quality_and_time() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     let all = bench.after(20);
     let state: Json = serde_json::from_str(payload(&all, "drive/p1/state").unwrap()).unwrap();
     assert_eq!(state["state"], "running");
@@ -92,7 +92,7 @@ fn the_state_object_has_values_quality_and_time() {
 
 #[test]
 fn point_topics_carry_bare_values_and_nothing_that_is_not_good() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     let all = bench.after(0);
     for (point, value) in [
         ("running", "true"),
@@ -127,7 +127,7 @@ fn point_topics_carry_bare_values_and_nothing_that_is_not_good() {
 
 #[test]
 fn changes_wait_for_min_interval() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     bench.after(0);
     bench.read(0x0023, 2501);
     assert_eq!(topics(&bench.after(99)), Vec::<&str>::new());
@@ -145,7 +145,7 @@ fn changes_wait_for_min_interval() {
 
 #[test]
 fn good_values_are_repeated_after_max_interval() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     bench.after(0);
     bench.now += Duration::from_secs(60);
     bench.read(0x0023, 2500);
@@ -158,7 +158,7 @@ fn good_values_are_repeated_after_max_interval() {
 
 #[test]
 fn an_offline_drive_has_no_values() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     bench.after(0);
     let drive = bench.plant.drive("p1").unwrap();
     drive.image.update(|s| s.link = Link::Offline(SystemTime::now()));
@@ -175,7 +175,7 @@ fn an_offline_drive_has_no_values() {
 
 #[test]
 fn a_refused_point_is_bad_while_the_drive_is_good() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     let drive = bench.plant.drive("p1").unwrap();
     drive
         .image
@@ -189,7 +189,7 @@ fn a_refused_point_is_bad_while_the_drive_is_good() {
 
 #[test]
 fn bus_changes_are_published_at_once_and_figures_every_second() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     let first: Json = serde_json::from_str(payload(&bench.after(0), "bus/line1").unwrap()).unwrap();
     assert_eq!(
         (&first["state"], &first["drives"], &first["online"]),
@@ -211,7 +211,7 @@ fn bus_changes_are_published_at_once_and_figures_every_second() {
 
 #[test]
 fn after_a_restart_everything_comes_again() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     let first = topics(&bench.after(0)).len();
     bench.publisher.restart(usize::MAX);
     let again = bench.after(1);
@@ -220,7 +220,7 @@ fn after_a_restart_everything_comes_again() {
 
 #[test]
 fn vanished_drives_are_cleared_until_they_come_back() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     bench.after(0);
     bench.publisher.adopt(&fixture::plant(&["p1", "p3"]), Vec::new());
     let all = bench.after(10);
@@ -242,7 +242,7 @@ fn vanished_drives_are_cleared_until_they_come_back() {
 
 #[test]
 fn a_new_sample_is_published_at_once_and_says_when_to_look_again() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     bench.after(0);
     bench.after(150);
     bench.read(0x0023, 2501);
@@ -260,7 +260,7 @@ fn a_new_sample_is_published_at_once_and_says_when_to_look_again() {
 
 #[test]
 fn an_update_wakes_the_client() {
-    let bench = Bench::new();
+    let bench = PublishedPlant::new();
     let notified = bench.publisher.fresh.notified();
     bench.read(0x0023, 2501);
     let mut notified = std::pin::pin!(notified);
@@ -272,7 +272,7 @@ fn an_update_wakes_the_client() {
 fn many_drives_are_looked_at_a_few_at_a_time() {
     let names: Vec<String> = (0..100).map(|n| format!("d{n}")).collect();
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     bench.plant = fixture::plant(&names);
     bench.publisher.adopt(&bench.plant, Vec::new());
     let mut states = 0;
@@ -294,7 +294,7 @@ fn many_drives_are_looked_at_a_few_at_a_time() {
 #[test]
 fn only_what_is_wanted_is_published() {
     for (state, points) in [(true, false), (false, true)] {
-        let mut bench = Bench::new();
+        let mut bench = PublishedPlant::new();
         bench.publisher.telemetry.state = state;
         bench.publisher.telemetry.points = points;
         bench.publisher.adopt(&bench.plant, Vec::new());
@@ -312,7 +312,7 @@ fn only_what_is_wanted_is_published() {
 
 #[test]
 fn topics_of_an_earlier_run_are_cleared_until_the_broker_has_it() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     let old = ["old/hall/drive/p1/state", "drivegate/hall/drive/p1/state"];
     bench.publisher.clear(old.map(Arc::from));
     assert_eq!(bench.publisher.cleared(), [Arc::from(old[0])]);
@@ -327,7 +327,7 @@ fn topics_of_an_earlier_run_are_cleared_until_the_broker_has_it() {
 #[test]
 fn the_values_of_an_outage_are_recorded() {
     for (mode, expected) in [(History::All, 6), (History::Changes, 3), (History::Off, 0)] {
-        let mut bench = Bench::new();
+        let mut bench = PublishedPlant::new();
         bench.publisher.telemetry.history = mode;
         // The broker goes after this.
         bench.after(20);
@@ -379,7 +379,7 @@ fn every_client_that_observes_a_drive_is_woken_once() {
 
 #[test]
 fn a_state_that_is_too_large_for_the_broker_goes_without_its_last_points() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     let whole = bench.after(0);
     let whole: Json = serde_json::from_str(payload(&whole, "drive/p1/state").unwrap()).unwrap();
     let most = 400;
@@ -417,7 +417,7 @@ fn a_state_that_is_too_large_for_the_broker_goes_without_its_last_points() {
 
 #[test]
 fn arrays_of_the_history_fit_into_the_packets_of_the_broker() {
-    let mut bench = Bench::new();
+    let mut bench = PublishedPlant::new();
     let most = 2000;
     bench.publisher.restart(most);
     let mut arrays = Vec::new();

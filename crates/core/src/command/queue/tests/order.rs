@@ -8,7 +8,7 @@ use crate::drive::{DriveIndex, PointIndex};
 const START: u16 = 1;
 const STOP: u16 = 0;
 
-impl Bench {
+impl Clients {
     /// A broadcast that a tool passes on to drives 1 and 2.
     fn broadcast(&mut self, value: u16) -> Receiver<Answer> {
         let origin = Origin::new(SourceKind::Slot, "tool");
@@ -17,7 +17,7 @@ impl Bench {
         std::mem::forget(wanted);
         let request = BackgroundRequest {
             drive: NO_DRIVE,
-            pdu: RequestPdu::WriteRegister { address: 2000, value },
+            pdu: RequestPdu::write_register(2000, value),
             pace: Pace::Brisk,
             expires: self.now + EXPIRY,
             ticket,
@@ -66,25 +66,25 @@ fn reference(percent: f64) -> Order {
 
 #[test]
 fn a_newer_reference_keeps_behind_an_order_that_sets_the_same() {
-    let mut bench = Bench::new();
-    let give = |bench: &mut Bench, order: Order, only: bool| {
-        bench.give((SourceKind::Mqtt, "t"), 1, Urgency::Command, order, only)
+    let mut rig = Clients::new();
+    let give = |rig: &mut Clients, order: Order, only: bool| {
+        rig.give((SourceKind::Mqtt, "t"), 1, Urgency::Command, order, only)
     };
-    let mut first = give(&mut bench, reference(10.0), true);
+    let mut first = give(&mut rig, reference(10.0), true);
     let both = Order::Points(vec![
         (PointIndex::new(1), Value::Bool(true)),
         (PointIndex::new(7), Value::Number(20.0)),
     ]);
-    let _both = give(&mut bench, both.clone(), false);
-    let mut second = give(&mut bench, reference(30.0), true);
+    let _both = give(&mut rig, both.clone(), false);
+    let mut second = give(&mut rig, reference(30.0), true);
     assert_eq!((outcome(&mut first), outcome(&mut second)), (None, None));
     // Behind that order the newest takes the place of the one before.
-    let _third = give(&mut bench, reference(40.0), true);
+    let _third = give(&mut rig, reference(40.0), true);
     assert_eq!(outcome(&mut second), Some(Outcome::Replaced));
     // What does not touch it changes nothing.
-    let _other = give(&mut bench, points(&[8]), false);
-    let _fourth = give(&mut bench, reference(50.0), true);
-    let sent: Vec<Order> = std::iter::from_fn(|| bench.take()).map(|c| c.order).collect();
+    let _other = give(&mut rig, points(&[8]), false);
+    let _fourth = give(&mut rig, reference(50.0), true);
+    let sent: Vec<Order> = std::iter::from_fn(|| rig.take()).map(|c| c.order).collect();
     assert_eq!(sent, [reference(10.0), both, reference(50.0), points(&[8])]);
 }
 
@@ -106,31 +106,31 @@ fn a_newer_reference_keeps_behind_what_it_rests_on() {
 
 #[test]
 fn a_stop_drops_a_broadcast_that_reaches_its_drive_but_for_one_that_stops_it() {
-    let mut bench = Bench::new();
-    let (mut start, mut stops) = (bench.broadcast(START), bench.broadcast(STOP));
-    let _stop = bench.push(2, Urgency::Stop, &[1], false);
+    let mut rig = Clients::new();
+    let (mut start, mut stops) = (rig.broadcast(START), rig.broadcast(STOP));
+    let _stop = rig.push(2, Urgency::Stop, &[1], false);
     assert_eq!(outcome(&mut start), Some(Outcome::Purged));
     assert_eq!(outcome(&mut stops), None);
     // Held up at the tool meanwhile.
-    let asked = bench.now;
-    bench.now += Duration::from_millis(5);
-    let _stop = bench.push(1, Urgency::Stop, &[1], false);
-    let later = std::mem::replace(&mut bench.now, asked);
-    let mut held = bench.broadcast(START);
+    let asked = rig.now;
+    rig.now += Duration::from_millis(5);
+    let _stop = rig.push(1, Urgency::Stop, &[1], false);
+    let later = std::mem::replace(&mut rig.now, asked);
+    let mut held = rig.broadcast(START);
     assert_eq!(outcome(&mut held), Some(Outcome::Purged));
-    bench.now = later;
-    assert_eq!(outcome(&mut bench.broadcast(START)), None);
+    rig.now = later;
+    assert_eq!(outcome(&mut rig.broadcast(START)), None);
 }
 
 #[test]
 fn a_broadcast_has_its_place_among_the_orders_of_each_drive() {
-    let mut bench = Bench::new();
-    let _before = bench.push_from("a", 1, &[1]);
-    let _broadcast = bench.broadcast(START);
-    assert!(!bench.passes_on(), "an older order waits for drive 1");
-    let _behind = bench.push_from("a", 2, &[2]);
-    let _beside = bench.push_from("a", 3, &[3]);
-    let order: Vec<usize> = std::iter::from_fn(|| bench.take()).map(|c| c.drive.place()).collect();
+    let mut rig = Clients::new();
+    let _before = rig.push_from("a", 1, &[1]);
+    let _broadcast = rig.broadcast(START);
+    assert!(!rig.passes_on(), "an older order waits for drive 1");
+    let _behind = rig.push_from("a", 2, &[2]);
+    let _beside = rig.push_from("a", 3, &[3]);
+    let order: Vec<usize> = std::iter::from_fn(|| rig.take()).map(|c| c.drive.place()).collect();
     let place = |drive| order.iter().position(|d| *d == drive);
     assert!(
         place(1) < place(NO_DRIVE.place()) && place(NO_DRIVE.place()) < place(2),
@@ -138,38 +138,38 @@ fn a_broadcast_has_its_place_among_the_orders_of_each_drive() {
     );
     assert_eq!(order.len(), 4);
     // Where nothing waits behind it, it waits for time that is left over.
-    let _broadcast = bench.broadcast(STOP);
-    assert_eq!(bench.pop(), None);
-    assert!(bench.passes_on());
+    let _broadcast = rig.broadcast(STOP);
+    assert_eq!(rig.pop(), None);
+    assert!(rig.passes_on());
 }
 
 #[test]
 fn a_broadcast_that_was_not_sent_is_not_put_back_behind_a_stop() {
-    let mut bench = Bench::new();
-    let mut broadcast = bench.broadcast(START);
-    let chosen = bench.pending.next_passed_on(bench.now, |_| true).unwrap();
-    let taken = bench.pending.take(chosen).unwrap();
-    bench.pending.put_back(taken, bench.now);
+    let mut rig = Clients::new();
+    let mut broadcast = rig.broadcast(START);
+    let chosen = rig.pending.next_passed_on(rig.now, |_| true).unwrap();
+    let taken = rig.pending.take(chosen).unwrap();
+    rig.pending.put_back(taken, rig.now);
     assert_eq!(outcome(&mut broadcast), None);
-    let chosen = bench.pending.next_passed_on(bench.now, |_| true).unwrap();
-    let taken = bench.pending.take(chosen).unwrap();
-    let _stop = bench.push(1, Urgency::Stop, &[1], false);
-    bench.pending.put_back(taken, bench.now);
+    let chosen = rig.pending.next_passed_on(rig.now, |_| true).unwrap();
+    let taken = rig.pending.take(chosen).unwrap();
+    let _stop = rig.push(1, Urgency::Stop, &[1], false);
+    rig.pending.put_back(taken, rig.now);
     assert_eq!(outcome(&mut broadcast), Some(Outcome::Purged));
 }
 
 #[test]
 fn what_was_asked_for_before_a_stop_does_not_go_behind_it() {
-    let mut bench = Bench::new();
-    let asked = bench.now;
-    bench.now += Duration::from_millis(50);
-    let _stop = bench.push(1, Urgency::Stop, &[1], false);
-    assert_eq!(bench.pop(), Some((1, Urgency::Stop)));
-    bench.now += Duration::from_millis(50);
-    assert_eq!(outcome(&mut bench.run_asked(1, asked)), Some(Outcome::Purged));
-    assert_eq!(outcome(&mut bench.run_asked(2, asked)), None, "another drive");
-    let now = bench.now;
-    assert_eq!(outcome(&mut bench.run_asked(1, now)), None, "asked for since");
+    let mut rig = Clients::new();
+    let asked = rig.now;
+    rig.now += Duration::from_millis(50);
+    let _stop = rig.push(1, Urgency::Stop, &[1], false);
+    assert_eq!(rig.pop(), Some((1, Urgency::Stop)));
+    rig.now += Duration::from_millis(50);
+    assert_eq!(outcome(&mut rig.run_asked(1, asked)), Some(Outcome::Purged));
+    assert_eq!(outcome(&mut rig.run_asked(2, asked)), None, "another drive");
+    let now = rig.now;
+    assert_eq!(outcome(&mut rig.run_asked(1, now)), None, "asked for since");
 }
 
 #[test]
@@ -207,7 +207,7 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
     old.close(Outcome::ShuttingDown, now);
     assert_eq!(outcome(&mut gone), Some(Outcome::ShuttingDown), "nobody takes it over");
     let mut sent = Vec::new();
-    while let Some(stop) = new.lock().pop(Urgency::Read, now) {
+    while let Some(stop) = crate::testkit::take_next(&new, now) {
         sent.push(stop.drive);
         stop.answer(&Outcome::Acknowledged(Reply::Written), now);
     }

@@ -48,24 +48,24 @@ fn order(kind: SourceKind, drive: usize, run: bool, now: Instant) -> (Command, R
 
 #[test]
 fn a_start_is_judged_when_it_is_accepted_and_a_stop_passes() {
-    let mut bench = Bench::new();
-    let now = bench.now;
-    stand(&mut bench.pending, 1, 3, false, now);
+    let mut rig = Clients::new();
+    let now = rig.now;
+    stand(&mut rig.pending, 1, 3, false, now);
     let (start, mut answer) = order(SourceKind::Mqtt, 1, true, now);
-    bench.pending.push(start, now);
+    rig.pending.push(start, now);
     let refused = outcome(&mut answer).unwrap();
     assert_eq!(refused.code(), "held_by_other");
     assert!(refused.to_string().contains("10.0.0.5"), "{refused}");
     let (elsewhere, mut answer) = order(SourceKind::Mqtt, 2, true, now);
-    bench.pending.push(elsewhere, now);
+    rig.pending.push(elsewhere, now);
     assert_eq!(outcome(&mut answer), None, "another drive");
     for kind in [SourceKind::Mqtt, SourceKind::Supervision] {
         let (stop, mut answer) = order(kind, 1, false, now);
-        bench.pending.push(stop, now);
+        rig.pending.push(stop, now);
         assert_eq!(outcome(&mut answer), None);
     }
     assert_eq!(
-        bench.pending.priorities(DriveIndex::new(1)).orders(),
+        rig.pending.priorities(DriveIndex::new(1)).orders(),
         2,
         "what was refused is no order"
     );
@@ -73,15 +73,15 @@ fn a_start_is_judged_when_it_is_accepted_and_a_stop_passes() {
 
 #[test]
 fn what_a_tool_sends_to_all_is_refused_for_one_and_its_stop_withdraws() {
-    let mut bench = Bench::new();
-    let now = bench.now;
-    stand(&mut bench.pending, 1, 3, false, now);
-    stand(&mut bench.pending, 2, 8, true, now);
+    let mut rig = Clients::new();
+    let now = rig.now;
+    stand(&mut rig.pending, 1, 3, false, now);
+    stand(&mut rig.pending, 2, 8, true, now);
     let broadcast = |run: bool| {
         let (ticket, answer) = ticket(&Arc::default(), now);
         let request = BackgroundRequest {
             drive: NO_DRIVE,
-            pdu: RequestPdu::WriteRegister { address: 1, value: 0 },
+            pdu: RequestPdu::write_register(1, 0),
             pace: Pace::Brisk,
             expires: now + EXPIRY,
             ticket,
@@ -102,14 +102,14 @@ fn what_a_tool_sends_to_all_is_refused_for_one_and_its_stop_withdraws() {
         (request.into_command(Touched::Anything), answer)
     };
     let (start, mut answer) = broadcast(true);
-    bench.pending.push(start, now);
+    rig.pending.push(start, now);
     assert_eq!(outcome(&mut answer).unwrap().code(), "held_by_other");
-    assert_eq!(stands(&mut bench.pending, 2), [8]);
+    assert_eq!(stands(&mut rig.pending, 2), [8]);
     let (stop, mut answer) = broadcast(false);
-    bench.pending.push(stop, now);
+    rig.pending.push(stop, now);
     assert_eq!(outcome(&mut answer), None);
     assert_eq!(
-        (stands(&mut bench.pending, 1), stands(&mut bench.pending, 2)),
+        (stands(&mut rig.pending, 1), stands(&mut rig.pending, 2)),
         (vec![3], vec![])
     );
 }

@@ -18,19 +18,19 @@ fn operator(user: &str, login: &str) -> Operator {
 }
 
 /// A plant whose drive `p1` is read at `now`, a user, and the time.
-struct Bench {
+struct OperatedPlant {
     operating: Operating,
     plant: Plant,
     now: Instant,
 }
 
-impl Bench {
-    fn new() -> Bench {
+impl OperatedPlant {
+    fn new() -> OperatedPlant {
         let (plant, now) = (fixture::plant(&["p1", "p2"]), Instant::now());
         for drive in ["p1", "p2"] {
             fixture::read(&plant, drive, 0b11, 0, now);
         }
-        Bench {
+        OperatedPlant {
             operating: Operating::new(Arc::default()),
             plant,
             now,
@@ -63,86 +63,81 @@ fn refused(progress: Progress) -> (StatusCode, String) {
 
 #[test]
 fn no_stop_is_refused_for_what_waits() {
-    let bench = Bench::new();
+    let rig = OperatedPlant::new();
     let alice = operator("alice", "alice#1");
     let mut kept = Vec::new();
     for number in 0..IN_PROGRESS {
-        kept.push(bench.take(&alice, "p2", &format!("{{\"speed_reference\": {}}}", number % 90)));
+        kept.push(rig.take(&alice, "p2", &format!("{{\"speed_reference\": {}}}", number % 90)));
     }
-    let (status, body) = refused(bench.take(&alice, "p2", "{\"speed_reference\": 1}"));
+    let (status, body) = refused(rig.take(&alice, "p2", "{\"speed_reference\": 1}"));
     assert_eq!(status, StatusCode::FORBIDDEN);
     assert!(
         body.contains("too many commands are waiting for their results; nothing was written"),
         "{body}"
     );
     for _ in 0..100 {
-        let stop = bench.take(&alice, "p1", "{\"run\": false}");
+        let stop = rig.take(&alice, "p1", "{\"run\": false}");
         assert!(matches!(stop, Progress::Placed(Waiting { shared: None, .. })));
     }
-    assert!(bench.waiting() >= 1);
+    assert!(rig.waiting() >= 1);
 }
 
 #[test]
 fn a_repetition_is_recognised_by_user_drive_and_content() {
-    let mut bench = Bench::new();
+    let mut rig = OperatedPlant::new();
     let (alice, again, bob) = (
         operator("alice", "alice#1"),
         operator("alice", "alice#2"),
         operator("bob", "bob#3"),
     );
     let body = "{\"id\": 1, \"speed_reference\": 10}";
-    let _first = bench.take(&alice, "p1", body);
-    assert!(matches!(bench.take(&alice, "p1", body), Progress::Repeated(_)));
+    let _first = rig.take(&alice, "p1", body);
+    assert!(matches!(rig.take(&alice, "p1", body), Progress::Repeated(_)));
     assert!(
-        matches!(bench.take(&again, "p1", body), Progress::Repeated(_)),
+        matches!(rig.take(&again, "p1", body), Progress::Repeated(_)),
         "the same user"
     );
     let others = [
-        bench.take(&bob, "p1", body),
-        bench.take(&alice, "p2", body),
-        bench.take(&alice, "p1", "{\"id\": 1, \"speed_reference\": 11}"),
-        bench.take(&alice, "p1", "{\"speed_reference\": 10}"),
-        bench.take(&alice, "p1", "{\"speed_reference\": 10}"),
+        rig.take(&bob, "p1", body),
+        rig.take(&alice, "p2", body),
+        rig.take(&alice, "p1", "{\"id\": 1, \"speed_reference\": 11}"),
+        rig.take(&alice, "p1", "{\"speed_reference\": 10}"),
+        rig.take(&alice, "p1", "{\"speed_reference\": 10}"),
     ];
     assert!(others.iter().all(|one| matches!(one, Progress::Placed(_))));
-    let (status, text) = refused(bench.take(&alice, "p1", body));
+    let (status, text) = refused(rig.take(&alice, "p1", body));
     assert!(
         status == StatusCode::FORBIDDEN && text.contains("`id` was used for another command"),
         "{text}"
     );
-    bench.now += 2 * command_json::REMEMBERED;
-    fixture::read(&bench.plant, "p1", 0b11, 0, bench.now);
+    rig.now += 2 * command_json::REMEMBERED;
+    fixture::read(&rig.plant, "p1", 0b11, 0, rig.now);
     assert!(
-        matches!(bench.take(&alice, "p1", body), Progress::Placed(_)),
+        matches!(rig.take(&alice, "p1", body), Progress::Placed(_)),
         "it is forgotten"
     );
 }
 
 #[test]
 fn a_repetition_is_known_to_the_server_that_a_reload_starts() {
-    let mut bench = Bench::new();
+    let mut rig = OperatedPlant::new();
     let alice = operator("alice", "alice#1");
     let body = "{\"id\": 1, \"speed_reference\": 10}";
-    let _first = bench.take(&alice, "p1", body);
-    bench.operating = Operating::new(bench.operating.north.clone());
-    assert!(matches!(bench.take(&alice, "p1", body), Progress::Repeated(_)));
+    let _first = rig.take(&alice, "p1", body);
+    rig.operating = Operating::new(rig.operating.north.clone());
+    assert!(matches!(rig.take(&alice, "p1", body), Progress::Repeated(_)));
 }
 
 #[test]
 fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
-    let bench = Bench::new();
+    let rig = OperatedPlant::new();
     let alice = operator("alice", "alice#1");
-    let drive = bench.plant.drive("p1").unwrap();
-    assert!(
-        renew(&drive, &alice, bench.now)
-            .unwrap_err()
-            .contains("no `supervision`")
-    );
+    let drive = rig.plant.drive("p1").unwrap();
+    assert!(renew(&drive, &alice, rig.now).unwrap_err().contains("no `supervision`"));
     assert_eq!(drive.commander(), None);
-    let _placed = bench.take(&alice, "p1", "{\"speed_reference\": 10}");
+    let _placed = rig.take(&alice, "p1", "{\"speed_reference\": 10}");
     assert_eq!(drive.commander().as_deref(), Some("alice#1"));
-    let Progress::Placed(mut refused) = bench.take(&operator("bob", "bob#2"), "p1", "{\"speed_reference\": 1000}")
-    else {
+    let Progress::Placed(mut refused) = rig.take(&operator("bob", "bob#2"), "p1", "{\"speed_reference\": 1000}") else {
         panic!("its limits are those of the order");
     };
     assert_eq!(refused.placed.answer().unwrap().outcome.code(), "bad_value");
@@ -161,7 +156,7 @@ fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
         origin,
         crate::command::Authority::Write,
         Duration::from_secs(1),
-        bench.now,
+        rig.now,
     );
     assert_eq!(drive.commander(), None, "another client");
 }
@@ -169,7 +164,7 @@ fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
 #[test]
 fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
     use crate::command::Urgency;
-    let bench = Bench::new();
+    let rig = OperatedPlant::new();
     let alice = operator("alice", "alice#1");
     let bodies = [
         "{\"run\": false, \"speed_reference\": 1000}",
@@ -178,11 +173,11 @@ fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
         "{\"id\": 7, \"run\": false, \"speed_reference\": 5}",
     ];
     for (body, rest) in bodies.into_iter().zip(["bad_value", "not_writable", "", "not_allowed"]) {
-        let Progress::Placed(mut waiting) = bench.take(&alice, "p1", body) else {
+        let Progress::Placed(mut waiting) = rig.take(&alice, "p1", body) else {
             panic!("{body}");
         };
-        while let Some(command) = next_command(&mut bench.plant.buses[0].queue.lock(), Urgency::Read, bench.now) {
-            command.answer(&Outcome::Acknowledged(crate::codec::Reply::Written), bench.now);
+        while let Some(command) = next_command(&mut rig.plant.buses[0].queue.lock(), Urgency::Read, rig.now) {
+            command.answer(&Outcome::Acknowledged(crate::codec::Reply::Written), rig.now);
         }
         let answer = waiting.placed.answer().unwrap();
         let code = match &answer.outcome {
@@ -202,25 +197,25 @@ fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
 
 #[test]
 fn a_start_whose_body_comes_late_does_not_run_behind_a_stop() {
-    let mut bench = Bench::new();
+    let mut rig = OperatedPlant::new();
     let (alice, time) = (operator("alice", "alice#1"), SystemTime::UNIX_EPOCH);
-    let asked = bench.now;
-    bench.now += Duration::from_millis(20);
-    let _stop = bench.take(&operator("bob", "bob#2"), "p1", "{\"run\": false}");
-    bench.now += Duration::from_millis(30);
-    let times = (asked, bench.now, time);
+    let asked = rig.now;
+    rig.now += Duration::from_millis(20);
+    let _stop = rig.take(&operator("bob", "bob#2"), "p1", "{\"run\": false}");
+    rig.now += Duration::from_millis(30);
+    let times = (asked, rig.now, time);
     let outcome = |progress: Progress| match progress {
         Progress::Placed(mut waiting) => waiting.placed.answer().map(|answer| answer.outcome),
         _ => panic!("not placed"),
     };
     let start = b"{\"run\": true}";
-    let late = bench.operating.take(&bench.plant, &alice, "p1", start, times);
+    let late = rig.operating.take(&rig.plant, &alice, "p1", start, times);
     assert_eq!(outcome(late), Some(Outcome::Purged));
     assert_eq!(status(&Outcome::Purged), StatusCode::CONFLICT);
-    let other = bench.operating.take(&bench.plant, &alice, "p2", start, times);
+    let other = rig.operating.take(&rig.plant, &alice, "p2", start, times);
     assert_eq!(outcome(other), None, "nobody stopped that drive");
     assert_eq!(
-        outcome(bench.take(&alice, "p1", "{\"run\": true}")),
+        outcome(rig.take(&alice, "p1", "{\"run\": true}")),
         None,
         "asked for since"
     );

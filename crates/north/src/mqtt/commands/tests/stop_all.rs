@@ -11,7 +11,7 @@ fn stop(payload: &str) -> Incoming {
     }
 }
 
-impl Bench {
+impl SetTopics {
     /// The drive acknowledges the stop that waits, and a read shows the motor standing.
     fn stand(&mut self) {
         let (order, _) = self.take_order().expect("a stop");
@@ -25,7 +25,7 @@ impl Bench {
 #[test]
 fn is_answered_once_all_stand() {
     for payload in ["", "{}", "{\"bus\": \"line1\"}"] {
-        let mut bench = Bench::new();
+        let mut bench = SetTopics::new();
         assert_eq!(bench.take(stop(payload)), None);
         assert!(bench.commands.try_finished().is_none() && !bench.commands.is_idle());
         // A reload meanwhile loses no answer.
@@ -44,7 +44,7 @@ fn is_answered_once_all_stand() {
 
 #[test]
 fn a_drive_that_is_not_proven_to_stand_is_named() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     assert_eq!(bench.take(stop("{\"wait_s\": 2}")), None);
     drop(bench.take_order().expect("a stop"));
     bench.now += Duration::from_millis(1900);
@@ -66,7 +66,7 @@ fn a_drive_that_is_not_proven_to_stand_is_named() {
 
 #[test]
 fn what_is_retained_or_not_understood_stops_nothing_and_says_so() {
-    let mut bench = Bench::new();
+    let mut bench = SetTopics::new();
     let retained = Incoming {
         retain: true,
         ..stop("{}")

@@ -8,7 +8,7 @@ use crate::mqtt::sparkplug::session::Rules;
 use crate::mqtt::sparkplug::topics::Topics;
 use drivegate_testkit::{audited, next_command};
 
-struct Bench {
+struct OrderedDrive {
     orders: Orders,
     plant: Plant,
     session: Session,
@@ -16,7 +16,7 @@ struct Bench {
     now: Instant,
 }
 
-fn bench() -> Bench {
+fn bench() -> OrderedDrive {
     let plant = fixture::plant(&["p1"]);
     let now = Instant::now();
     fixture::read(&plant, "p1", 1, 0, now);
@@ -28,7 +28,7 @@ fn bench() -> Bench {
         min_interval: Duration::ZERO,
     });
     session.adopt(Vec::new(), vec![("p1".to_string(), definitions)]);
-    Bench {
+    OrderedDrive {
         orders: Orders::new(SharedMemory::default(), None),
         plant,
         session,
@@ -58,7 +58,7 @@ fn message(timestamp: u64, metrics: Vec<Metric>) -> Incoming {
     }
 }
 
-impl Bench {
+impl OrderedDrive {
     fn take(&mut self, message: &Incoming, device: &str) -> Option<Finished> {
         let target = (device == "p1").then_some((0, &self.drive));
         self.orders
@@ -88,7 +88,7 @@ impl Bench {
 #[test]
 fn a_command_is_one_order() {
     let mut bench = bench();
-    let alias = |bench: &Bench, name| {
+    let alias = |bench: &OrderedDrive, name| {
         let place = bench.session.metric(0, Some(name), None).unwrap();
         (1..)
             .find(|alias| bench.session.metric(0, None, Some(*alias)) == Some(place))

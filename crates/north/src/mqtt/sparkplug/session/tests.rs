@@ -39,7 +39,7 @@ fn sample(number: f64, time: u64) -> Sample {
 }
 
 /// A session with a clock, and a host that watches it.
-struct Bench {
+struct SessionWithHost {
     session: Session,
     start: Instant,
     /// ms since the start.
@@ -176,9 +176,9 @@ fn bd_seq(payload: &Payload) -> u8 {
     }
 }
 
-impl Bench {
-    fn new(rules: Rules, devices: usize) -> Bench {
-        let mut bench = Bench {
+impl SessionWithHost {
+    fn new(rules: Rules, devices: usize) -> SessionWithHost {
+        let mut bench = SessionWithHost {
             session: Session::new(rules),
             start: Instant::now(),
             time: 1_000,
@@ -259,7 +259,7 @@ fn of(kind: Kind, device: &str) -> (Kind, String) {
 
 #[test]
 fn births_come_first_and_only_of_devices_that_are_there() {
-    let mut bench = Bench::new(live(), 3);
+    let mut bench = SessionWithHost::new(live(), 3);
     bench.tell(0, true, 1.0);
     bench.tell(2, true, 2.0);
     assert_eq!(bench.send(9), 0, "there is no connection");
@@ -302,7 +302,7 @@ fn births_come_first_and_only_of_devices_that_are_there() {
 
 #[test]
 fn changes_keep_their_distance() {
-    let mut bench = Bench::new(live(), 1);
+    let mut bench = SessionWithHost::new(live(), 1);
     bench.tell(0, true, 1.0);
     bench.connect(0);
     bench.session.subscribed();
@@ -334,7 +334,7 @@ fn changes_keep_their_distance() {
 
 #[test]
 fn a_rebirth_stops_data_and_repeats_all_births() {
-    let mut bench = Bench::new(live(), 2);
+    let mut bench = SessionWithHost::new(live(), 2);
     bench.tell(0, true, 1.0);
     bench.tell(1, true, 1.0);
     bench.connect(3);
@@ -368,7 +368,7 @@ fn a_rebirth_stops_data_and_repeats_all_births() {
 
 #[test]
 fn the_primary_host_opens_and_ends_the_session() {
-    let mut bench = Bench::new(rules("scada"), 1);
+    let mut bench = SessionWithHost::new(rules("scada"), 1);
     bench.tell(0, true, 1.0);
     bench.connect(0);
     assert!(!bench.state(false, 100));
@@ -411,7 +411,7 @@ fn the_primary_host_opens_and_ends_the_session() {
 
 #[test]
 fn an_outage_is_told_afterwards_in_order() {
-    let mut bench = Bench::new(rules(""), 2);
+    let mut bench = SessionWithHost::new(rules(""), 2);
     bench.tell(0, true, 0.0);
     bench.tell(1, true, 0.0);
     bench.connect(0);
@@ -450,14 +450,14 @@ fn an_outage_is_told_afterwards_in_order() {
 
 #[test]
 fn what_there_is_no_room_for_is_counted() {
-    let mut bench = Bench::new(rules(""), HISTORY / 5);
+    let mut bench = SessionWithHost::new(rules(""), HISTORY / 5);
     for step in 0..10u32 {
         bench.time += 100;
         bench.tell(0, true, f64::from(step));
     }
     // Two metrics at first, then one at a time; five are kept.
     assert_eq!((bench.waiting(), bench.session.take_lost()), (5, 6));
-    let mut off = Bench::new(
+    let mut off = SessionWithHost::new(
         Rules {
             history: false,
             ..rules("")
@@ -470,7 +470,7 @@ fn what_there_is_no_room_for_is_counted() {
 
 #[test]
 fn a_reload_keeps_aliases_and_bears_anew() {
-    let mut bench = Bench::new(live(), 2);
+    let mut bench = SessionWithHost::new(live(), 2);
     bench.tell(0, true, 1.0);
     bench.tell(1, true, 1.0);
     bench.connect(0);
@@ -516,7 +516,7 @@ fn a_reload_keeps_aliases_and_bears_anew() {
 
 #[test]
 fn names_replace_aliases_where_they_are_off() {
-    let mut bench = Bench::new(
+    let mut bench = SessionWithHost::new(
         Rules {
             alias: false,
             ..rules("")
@@ -564,7 +564,7 @@ impl Dice {
 fn a_thousand_connections() {
     for seed in 0..4 {
         let mut dice = Dice(seed);
-        let mut bench = Bench::new(rules(if seed % 2 == 0 { "" } else { "scada" }), 5);
+        let mut bench = SessionWithHost::new(rules(if seed % 2 == 0 { "" } else { "scada" }), 5);
         let mut present = [true; 5];
         let (mut requested, mut number) = (0, 0.0);
         for connection in 0..250u32 {
@@ -703,7 +703,7 @@ fn births_wait_for_their_time_after_the_host_came_online() {
         history: false,
         ..rules("scada")
     };
-    let mut bench = Bench::new(rules, 1);
+    let mut bench = SessionWithHost::new(rules, 1);
     (bench.births_after, bench.time) = (1_500, 10_000);
     bench.tell(0, true, 1.0);
     bench.connect(0);

@@ -1,0 +1,40 @@
+//! Commands without a client, and what became of them.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use drivegate_core::command::{
+    Answer, Audit, Command, CommandQueue, Origin, Pending, SourceKind, Ticket, Urgency, WriteStats,
+};
+use serde_json::Value;
+use tokio::sync::oneshot::Receiver;
+
+/// All records of the audit that are kept, oldest first. What cannot be read as JSON is null.
+pub fn audited(audit: &Audit) -> Vec<Value> {
+    let lines = audit.recent(None);
+    lines
+        .iter()
+        .map(|line| serde_json::from_str(line).unwrap_or_default())
+        .collect()
+}
+
+/// Takes the next command of that rank or a higher one, where every drive is free and no stop is redundant.
+pub fn next_command(pending: &mut Pending, lowest: Urgency, now: Instant) -> Option<Command> {
+    let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
+    let chosen = ranks
+        .into_iter()
+        .filter(|rank| *rank <= lowest)
+        .find_map(|rank| pending.next(rank, now, |_| true, |_| false))?;
+    pending.take(chosen)
+}
+
+/// Takes the next command of a queue, whatever its rank.
+pub fn take_next(queue: &CommandQueue, now: Instant) -> Option<Command> {
+    next_command(&mut queue.lock(), Urgency::Read, now)
+}
+
+/// The ticket of a command of an MQTT client to drive `d`, and where its answer arrives.
+pub fn ticket(stats: &Arc<WriteStats>, now: Instant) -> (Ticket, Receiver<Answer>) {
+    let origin = Origin::new(SourceKind::Mqtt, "t");
+    Ticket::new(origin, "d", "run=true".to_string(), true, now, stats.clone())
+}
