@@ -49,7 +49,7 @@ struct Client {
     answers: Vec<Vec<u8>>,
 }
 
-struct Bench {
+struct BacnetWorld {
     rig: Rig,
     server: Offline,
     dice: Random,
@@ -84,8 +84,8 @@ fn write_of(object: ObjectId, value: Option<f64>, priority: u8) -> Vec<u8> {
     })
 }
 
-impl Bench {
-    fn new(seed: u64, faults: &str) -> Bench {
+impl BacnetWorld {
+    fn new(seed: u64, faults: &str) -> BacnetWorld {
         let line = Line {
             cycle: Duration::from_millis(50),
             faults: faults.to_string(),
@@ -116,7 +116,7 @@ impl Bench {
         };
         let server = Offline::new(options, rig.shared_plant(), rig.now);
         let next_poll = rig.now;
-        Bench {
+        BacnetWorld {
             rig,
             server,
             dice: Random::new(seed ^ 0xBAC0),
@@ -348,22 +348,22 @@ const PRIORITIES: [u8; 9] = [1, 3, 5, 6, 7, 8, 10, 12, 16];
 
 /// One seed in which everybody waits for everybody.
 fn one_by_one(seed: u64) {
-    let mut bench = Bench::new(seed, "");
+    let mut world = BacnetWorld::new(seed, "");
     let mut rules = Rules::default();
     for number in 0..ORDERS {
-        let client = bench.dice.within(0..=1) as usize;
-        let priority = PRIORITIES[bench.dice.within(0..=8) as usize];
+        let client = world.dice.within(0..=1) as usize;
+        let priority = PRIORITIES[world.dice.within(0..=8) as usize];
         let place = usize::from(priority - 1);
-        let (ran, had) = (bench.runs(), bench.speed());
-        let leases = bench.rig.drive(DRIVE).image.supervisions();
-        let what = bench.dice.within(0..=13);
+        let (ran, had) = (world.runs(), world.speed());
+        let leases = world.rig.drive(DRIVE).image.supervisions();
+        let what = world.dice.within(0..=13);
         let note = format!("seed {seed}, order {number} ({what}) of client {client} at {priority}: {rules:?}");
         let (mut runs, mut speed) = (ran, had);
         match what {
             0..=6 => {
                 let value = [Some(1.0), Some(1.0), Some(0.0), Some(0.0), None, None, None][what as usize];
                 let before = governs(&rules.run);
-                let done = bench.write(client, RUN, value, priority);
+                let done = world.write(client, RUN, value, priority);
                 assert_eq!(done, if priority == 6 { Err(DENIED) } else { Ok(()) }, "{note}");
                 if priority != 6 {
                     rules.run[place] = value.map(|value| (value, client));
@@ -378,9 +378,9 @@ fn one_by_one(seed: u64) {
                 }
             }
             7..=9 => {
-                let value = (what != 9).then(|| bench.dice.within(1..=80) as f64);
+                let value = (what != 9).then(|| world.dice.within(1..=80) as f64);
                 let before = governs(&rules.speed);
-                let done = bench.write(client, SPEED, value, priority);
+                let done = world.write(client, SPEED, value, priority);
                 assert_eq!(done, if priority == 6 { Err(DENIED) } else { Ok(()) }, "{note}");
                 if priority != 6 {
                     rules.speed[place] = value.map(|value| (value, client));
@@ -392,14 +392,14 @@ fn one_by_one(seed: u64) {
                 }
             }
             10..=12 => {
-                let number = bench.dice.within(1..=80) as f64;
+                let number = world.dice.within(1..=80) as f64;
                 let (points, run, sets) = match what {
                     10 => (vec![("run", 0.0)], Some(false), false),
                     11 => (vec![("run", 1.0)], Some(true), false),
                     _ => (vec![("speed_reference", number)], None, true),
                 };
                 let held = rules.protects(run == Some(true), sets);
-                let outcome = bench.elsewhere(&points);
+                let outcome = world.elsewhere(&points);
                 match (held, outcome) {
                     (true, Outcome::Refused(Refusal::HeldByOther(_))) => {}
                     (false, Outcome::Acknowledged(_)) => {
@@ -415,25 +415,25 @@ fn one_by_one(seed: u64) {
                 let own = governs(&rules.run).map(|(.., client)| client);
                 let other = usize::from(own == Some(0));
                 for _ in 0..10 {
-                    bench.wait(Duration::from_millis(500));
+                    world.wait(Duration::from_millis(500));
                     if rules.run[14].is_none() && own.is_some() {
-                        bench.write(other, RUN, None, 15).unwrap();
+                        world.write(other, RUN, None, 15).unwrap();
                     }
                 }
-                let ended = bench.rig.drive(DRIVE).image.supervisions() > leases;
+                let ended = world.rig.drive(DRIVE).image.supervisions() > leases;
                 assert!(ended || !ran, "{note}: the lease does not end");
             }
         }
-        if bench.rig.drive(DRIVE).image.supervisions() > leases {
+        if world.rig.drive(DRIVE).image.supervisions() > leases {
             rules.silenced();
             runs = false;
         }
-        assert_eq!((bench.runs(), bench.speed()), (runs, speed), "{note}");
-        assert_eq!(bench.array(RUN), values(&rules.run), "{note}");
-        let shown: Vec<Option<f64>> = bench.array(SPEED);
+        assert_eq!((world.runs(), world.speed()), (runs, speed), "{note}");
+        assert_eq!(world.array(RUN), values(&rules.run), "{note}");
+        let shown: Vec<Option<f64>> = world.array(SPEED);
         assert_eq!(shown, values(&rules.speed), "{note}");
         let governing = governs(&rules.run).map(|(priority, ..)| priority as u64);
-        let current = bench.read(RUN, 431).remove(0);
+        let current = world.read(RUN, 431).remove(0);
         assert_eq!(current, governing.map_or(Data::Null, Data::Unsigned), "{note}");
     }
 }
@@ -449,69 +449,69 @@ fn slots_answers_and_the_drive_are_as_the_rules_say() {
 /// One seed in which nobody waits, frames are lost and the drive goes away.
 fn all_at_once(seed: u64) -> (usize, usize) {
     let faults = ["", "drop=0.05", "deaf=0.05,corrupt=0.05"][seed as usize % 3];
-    let mut bench = Bench::new(seed, faults);
+    let mut world = BacnetWorld::new(seed, faults);
     let (mut answered, mut refused) = (0, 0);
     for _ in 0..ORDERS * 2 {
-        let client = bench.dice.within(0..=1) as usize;
-        let priority = PRIORITIES[bench.dice.within(0..=8) as usize];
-        let pause = Duration::from_millis(bench.dice.within(0..=200));
-        match bench.dice.within(0..=15) {
-            0..=9 if bench.clients[client].waits => {
+        let client = world.dice.within(0..=1) as usize;
+        let priority = PRIORITIES[world.dice.within(0..=8) as usize];
+        let pause = Duration::from_millis(world.dice.within(0..=200));
+        match world.dice.within(0..=15) {
+            0..=9 if world.clients[client].waits => {
                 // The answer is late: the same once more. It is no new order, unless the drive was away before.
-                let content = bench.clients[client].last.clone();
-                if !bench.clients[client].taken {
-                    bench.stopped = None;
+                let content = world.clients[client].last.clone();
+                if !world.clients[client].taken {
+                    world.stopped = None;
                 }
-                bench.ask(client, 15, &content, true);
+                world.ask(client, 15, &content, true);
             }
             roll @ 0..=9 => {
-                answered += bench.clients[client].answers.len();
-                assert!(bench.clients[client].answers.len() < 2, "seed {seed}: answered twice");
+                answered += world.clients[client].answers.len();
+                assert!(world.clients[client].answers.len() < 2, "seed {seed}: answered twice");
                 let value = [Some(1.0), Some(0.0), None][roll as usize % 3];
                 if value == Some(1.0) {
-                    bench.stopped = None;
+                    world.stopped = None;
                 }
-                bench.ask(client, 15, &write_of(RUN, value, priority), false);
+                world.ask(client, 15, &write_of(RUN, value, priority), false);
             }
             10..=12 => {
-                let stop = bench.order_elsewhere(&[("run", 0.0)]);
-                bench.stopped = Some(bench.rig.now);
-                bench.elsewhere.push(stop);
+                let stop = world.order_elsewhere(&[("run", 0.0)]);
+                world.stopped = Some(world.rig.now);
+                world.elsewhere.push(stop);
             }
             13 => {
-                let mut start = bench.order_elsewhere(&[("run", 1.0)]);
+                let mut start = world.order_elsewhere(&[("run", 1.0)]);
                 match start.answer().map(|answer| answer.outcome) {
                     Some(_) => refused += 1,
-                    None => bench.stopped = None,
+                    None => world.stopped = None,
                 }
-                bench.elsewhere.push(start);
+                world.elsewhere.push(start);
             }
             14 => {
-                bench.rig.set_alive(DRIVE, false);
-                let away = Duration::from_millis(bench.dice.within(200..=3_000));
-                bench.wait(away);
-                bench.rig.set_alive(DRIVE, true);
+                world.rig.set_alive(DRIVE, false);
+                let away = Duration::from_millis(world.dice.within(200..=3_000));
+                world.wait(away);
+                world.rig.set_alive(DRIVE, true);
             }
-            _ => bench.wait(Duration::from_secs(2)),
+            _ => world.wait(Duration::from_secs(2)),
         }
-        bench.wait(pause);
+        world.wait(pause);
     }
-    bench
+    world
         .rig
         .set_faults(drivegate_world::sim::faults::FaultPlan::new("".parse().unwrap(), 0));
-    bench.wait(Duration::from_secs(20));
-    for client in &mut bench.clients {
+    world.wait(Duration::from_secs(20));
+    for client in &mut world.clients {
         client.waits = false;
     }
     // It works as it did: a stop is done, nothing stands, and it can be started again.
-    assert!(matches!(bench.elsewhere(&[("run", 0.0)]), Outcome::Acknowledged(_)));
-    assert!(!bench.runs() && bench.array(RUN).iter().all(|slot| *slot != Some(1.0)));
+    assert!(matches!(world.elsewhere(&[("run", 0.0)]), Outcome::Acknowledged(_)));
+    assert!(!world.runs() && world.array(RUN).iter().all(|slot| *slot != Some(1.0)));
     for priority in PRIORITIES.into_iter().filter(|priority| *priority != 6) {
-        assert_eq!(bench.write(0, RUN, None, priority), Ok(()), "seed {seed}");
+        assert_eq!(world.write(0, RUN, None, priority), Ok(()), "seed {seed}");
     }
-    bench.stopped = None;
-    assert_eq!(bench.write(1, RUN, Some(1.0), 8), Ok(()), "seed {seed}");
-    assert!(bench.runs());
+    world.stopped = None;
+    assert_eq!(world.write(1, RUN, Some(1.0), 8), Ok(()), "seed {seed}");
+    assert!(world.runs());
     (answered, refused)
 }
 
@@ -531,14 +531,14 @@ fn nothing_starts_behind_a_stop_and_nobody_is_answered_twice() {
 
 #[test]
 fn a_late_duplicate_starts_nothing() {
-    let mut bench = Bench::new(1, "");
-    assert_eq!(bench.write(0, RUN, Some(1.0), 8), Ok(()));
-    let content = bench.clients[0].last.clone();
-    assert!(matches!(bench.elsewhere(&[("run", 0.0)]), Outcome::Acknowledged(_)));
-    bench.stopped = Some(bench.rig.now);
-    bench.ask(0, 15, &content, true);
-    let answer = bench.answer(0).unwrap();
+    let mut world = BacnetWorld::new(1, "");
+    assert_eq!(world.write(0, RUN, Some(1.0), 8), Ok(()));
+    let content = world.clients[0].last.clone();
+    assert!(matches!(world.elsewhere(&[("run", 0.0)]), Outcome::Acknowledged(_)));
+    world.stopped = Some(world.rig.now);
+    world.ask(0, 15, &content, true);
+    let answer = world.answer(0).unwrap();
     assert_eq!(answer[3..], [0x91, REFUSED.0, 0x91, REFUSED.1]);
-    bench.wait(Duration::from_secs(3));
-    assert!(!bench.runs());
+    world.wait(Duration::from_secs(3));
+    assert!(!world.runs());
 }

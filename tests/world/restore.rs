@@ -48,7 +48,7 @@ const FAULTS: [&str; 5] = [
 /// The gateway was killed.
 struct Cut;
 
-struct Bench {
+struct RestoreWorld {
     rig: Rig,
     dice: Random,
     /// The journal on disk.
@@ -88,8 +88,8 @@ fn held(rig: &mut Rig, address: u8) -> ParameterFile {
     reading.file("d0", "none", "2026-03-02T07:40:12Z", &Names::default())
 }
 
-impl Bench {
-    fn new(seed: u64) -> Bench {
+impl RestoreWorld {
+    fn new(seed: u64) -> RestoreWorld {
         let mut dice = Random::new(seed);
         let (family, protocol, baud) = FAMILIES[seed as usize % FAMILIES.len()];
         let line = Line {
@@ -123,7 +123,7 @@ impl Bench {
             rig.set_faults(FaultPlan::new(faults.parse().unwrap(), seed));
         }
         let next = rig.now;
-        Bench {
+        RestoreWorld {
             rig,
             dice,
             disk: None,
@@ -468,13 +468,13 @@ impl Bench {
 }
 
 fn one(seed: u64, cuts: u64) -> (usize, usize, usize, usize) {
-    let mut bench = Bench::new(seed);
-    let before = held(&mut bench.rig, DRIVE);
-    let done = bench.restore(cuts);
-    bench.troubled = false;
-    bench.mend();
-    let after = held(&mut bench.rig, DRIVE);
-    for write in &bench.plan.writes {
+    let mut world = RestoreWorld::new(seed);
+    let before = held(&mut world.rig, DRIVE);
+    let done = world.restore(cuts);
+    world.troubled = false;
+    world.mend();
+    let after = held(&mut world.rig, DRIVE);
+    for write in &world.plan.writes {
         let expected = if done { write.to } else { write.from };
         assert_eq!(
             after.values[&write.id].value,
@@ -483,7 +483,7 @@ fn one(seed: u64, cuts: u64) -> (usize, usize, usize, usize) {
             write.line
         );
     }
-    let written: BTreeSet<_> = bench.plan.writes.iter().map(|write| &write.id).collect();
+    let written: BTreeSet<_> = world.plan.writes.iter().map(|write| &write.id).collect();
     let others = differences(&before, &after);
     let others: Vec<_> = others.iter().filter(|one| !written.contains(&one.id)).collect();
     assert_eq!(
@@ -492,20 +492,20 @@ fn one(seed: u64, cuts: u64) -> (usize, usize, usize, usize) {
         "seed {seed}"
     );
     if done {
-        let source = held(&mut bench.rig, SOURCE);
-        let left_out: BTreeSet<_> = bench.plan.left_out.iter().map(|(id, _)| id.clone()).collect();
+        let source = held(&mut world.rig, SOURCE);
+        let left_out: BTreeSet<_> = world.plan.left_out.iter().map(|(id, _)| id.clone()).collect();
         let differ = differences(&source, &after);
         assert!(
             differ.iter().all(|one| left_out.contains(&one.id)),
             "seed {seed}: {differ:?}"
         );
     }
-    let records = bench.rig.with_drive(DRIVE, |drive, _| drive.parameter_writes());
+    let records = world.rig.with_drive(DRIVE, |drive, _| drive.parameter_writes());
     let sound = FAULTS[seed as usize / FAMILIES.len() % FAULTS.len()].is_empty();
     for (address, record) in records {
         // Somebody who starts the motor in between is seen above.
         assert!(
-            record.while_fed == 0 || bench.started.is_some(),
+            record.while_fed == 0 || world.started.is_some(),
             "seed {seed}: {address} {record:?}"
         );
         if cuts == 0 && sound {
@@ -516,7 +516,7 @@ fn one(seed: u64, cuts: u64) -> (usize, usize, usize, usize) {
             );
         }
     }
-    (bench.cuts, bench.refused, bench.stopped, bench.writes)
+    (world.cuts, world.refused, world.stopped, world.writes)
 }
 
 #[test]
