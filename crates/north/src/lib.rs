@@ -25,6 +25,7 @@ mod server_trust;
 pub mod slot;
 mod state;
 mod stats;
+mod tcp_server;
 mod tls_words;
 
 use drivegate_core::command;
@@ -58,6 +59,7 @@ pub use stats::{
     BacnetStats, ConnectionRefusal, ModbusTcpStats, MqttKind, MqttStats, RefusalStats, ReloadStats, ServerKind,
     SlotOutcome, SlotStats,
 };
+pub use tcp_server::TcpServer;
 pub use tls_words::{GATEWAY, Peer, explain};
 
 /// Why a server cannot start.
