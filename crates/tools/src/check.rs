@@ -10,6 +10,7 @@ use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
 
+use super::failure::{Failure, Outcome};
 use super::{EXIT_CONFIG, NamedConfig, report};
 use crate::bus::predict::{PredictedRequest, Prediction};
 use crate::bus::proof;
@@ -92,7 +93,7 @@ struct Request<'a> {
     wire_ms: f64,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     let path = args.config.path();
     let mut loaded = Settings::load_proved(path, environment());
     if args.as_service {
@@ -113,8 +114,8 @@ pub(super) fn run(args: &Args) -> ExitCode {
         }
     };
     match loaded.settings {
-        Some(_) => printed,
-        None => ExitCode::from(EXIT_CONFIG),
+        Some(_) => Ok(printed),
+        None => Err(Failure::Reported(EXIT_CONFIG)),
     }
 }
 

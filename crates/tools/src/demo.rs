@@ -10,6 +10,7 @@ use std::process::ExitCode;
 use tokio_util::sync::CancellationToken;
 
 use self::written::Written;
+use super::failure::Outcome;
 use super::report;
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{LogFormat, LogSettings, Settings};
@@ -118,16 +119,14 @@ const MODBUS_TCP: u16 = 1502;
 const HTTP: u16 = 9488;
 
 /// Runs the demo until Ctrl-C.
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     let _log = super::log::start(&LogSettings {
         level: args.log.clone(),
         format: LogFormat::Auto,
     });
     super::block_on(async {
-        match demo(args).await {
-            Ok(()) => ExitCode::SUCCESS,
-            Err(error) => report::failed(&error.to_string()),
-        }
+        demo(args).await?;
+        Ok(ExitCode::SUCCESS)
     })
 }
 

@@ -7,11 +7,11 @@ pub(super) use self::staging::UNPACKED;
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use self::staging::Staging;
 use super::archive::{self, Manifest, Root};
 use super::client::{Asked, Client};
+use super::failure::{Failure, Outcome};
 use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::config::{Loaded, Settings, environment};
 
@@ -53,15 +53,15 @@ impl From<String> for Refused {
     }
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     match restore(args) {
-        Ok(text) => report::print(&text),
+        Ok(text) => Ok(report::print(&text)),
         Err(Refused::Configuration(errors)) => {
             errors.iter().for_each(|error| report::error(error));
             report::note("nothing was restored");
-            ExitCode::from(EXIT_CONFIG)
+            Err(Failure::Reported(EXIT_CONFIG))
         }
-        Err(Refused::Because(why)) => report::failed(&format!("{why}; {}", args.file.display())),
+        Err(Refused::Because(why)) => Err(format!("{why}; {}", args.file.display()).into()),
     }
 }
 
