@@ -53,6 +53,7 @@ use drivegate_core::diagnosis;
 use drivegate_core::drill;
 use drivegate_core::event;
 use drivegate_core::files;
+use drivegate_core::hex;
 use drivegate_core::history;
 use drivegate_core::parameters;
 use drivegate_core::plant;
