@@ -12,6 +12,7 @@ use tokio_util::sync::CancellationToken;
 use self::written::Written;
 use super::failure::Outcome;
 use super::report;
+use super::simulate::Speed;
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{LogFormat, LogSettings, Settings};
 use crate::daemon::Daemon;
@@ -37,15 +38,6 @@ pub(super) struct Args {
     /// Log level: off, error, warn, info, debug, trace, also for each target
     #[arg(long, default_value = "error", value_name = "LEVEL", value_parser = crate::config::parse_level)]
     pub log: String,
-}
-
-/// How fast the simulated lines are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum Speed {
-    /// Every character takes its time.
-    Real,
-    /// No time on the wire.
-    Max,
 }
 
 /// One simulated line of the demo.

@@ -67,6 +67,14 @@ pub struct Settings {
     pub log: LogSettings,
 }
 
+impl Settings {
+    /// All drives, each with its bus.
+    pub fn drives(&self) -> impl Iterator<Item = (&BusSpec, &DriveSpec)> {
+        let buses = self.buses.iter();
+        buses.flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)))
+    }
+}
+
 /// One bus with its drives.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BusSettings {

@@ -7,6 +7,7 @@ use std::path::Path;
 use crate::codec::Table;
 use crate::document::{Finding, Problem, nearest};
 use crate::drive::Profile;
+use crate::parameters::cells;
 
 /// Columns of a list.
 const COLUMNS: [&str; 14] = [
@@ -94,26 +95,7 @@ fn rows(text: &str) -> impl Iterator<Item = (usize, Vec<String>)> {
         .find(|separator| first.contains(*separator));
     let separator = separator.unwrap_or(',');
     let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
-    lines.map(move |(place, line)| (place + 1, cells(line, separator)))
-}
-
-/// Cells of a line; one in quotes may have separators, and duplicate quotes in it.
-fn cells(line: &str, separator: char) -> Vec<String> {
-    let mut cells = vec![String::new()];
-    let (mut quoted, mut chars) = (false, line.chars().peekable());
-    while let Some(c) = chars.next() {
-        let Some(cell) = cells.last_mut() else { break };
-        match c {
-            '"' if quoted && chars.peek() == Some(&'"') => {
-                chars.next();
-                cell.push('"');
-            }
-            '"' => quoted = !quoted,
-            c if c == separator && !quoted => cells.push(String::new()),
-            c => cell.push(c),
-        }
-    }
-    cells
+    lines.map(move |(place, line)| (place + 1, cells(line, |c| c == separator).0))
 }
 
 /// A point of the profile.
