@@ -18,8 +18,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use drivegate::event::{Event, EventKind};
-use drivegate::north::NorthState;
 use drivegate::north::mqtt::{self, History, Options, Telemetry};
+use drivegate::north::{NorthState, Server as _};
 use drivegate::plant::SharedPlant;
 use rumqttc::mqttbytes::QoS;
 use rumqttc::{AsyncClient, MqttOptions, Packet};

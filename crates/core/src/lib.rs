@@ -5,6 +5,7 @@ pub mod diagnosis;
 pub mod drill;
 pub mod event;
 pub mod files;
+pub mod hex;
 pub mod history;
 pub mod parameters;
 pub mod plant;

@@ -5,6 +5,8 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
+
 use crate::codec::{LineFormat, Protocol};
 use crate::drive::{PointIndex, Profile, RawWrites};
 use crate::start_guard::{Guard, Interlock};
@@ -140,7 +142,7 @@ pub struct BusSpec {
 
 /// Which machine a drive is, as far as the configuration says: what a lease, a hold or a journal of it belongs to. The name of
 /// a drive, and that of its bus, may come to mean another one.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Machine {
     /// The port of its bus.
     pub port: String,

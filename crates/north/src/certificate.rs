@@ -7,6 +7,8 @@ use x509_cert::der::asn1::{ObjectIdentifier, Utf8StringRef};
 use x509_cert::der::{self, Decode, Tag, Tagged};
 use x509_cert::name::Name;
 
+use crate::hex;
+
 /// The role of a client (Modbus/TCP Security protocol specification, 8.4).
 const ROLE: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.4.1.50316.802.1");
 const COMMON_NAME: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.4.3");
@@ -64,7 +66,8 @@ pub(super) fn subject_name(certificate: &Certificate) -> String {
 }
 
 fn name_of(certificate: &TbsCertificate) -> String {
-    let serial = || format!("serial {}", hex(certificate.serial_number().as_bytes()));
+    let bytes = certificate.serial_number().as_bytes();
+    let serial = || format!("serial {}", hex::encode(bytes.get(..MAX_NAME / 2).unwrap_or(bytes)));
     common_name(certificate.subject()).map_or_else(serial, |name| printable(&name))
 }
 
@@ -99,11 +102,6 @@ pub(super) fn printable(text: &str) -> String {
         }
     };
     text.chars().take(MAX_NAME).map(safe).collect()
-}
-
-fn hex(bytes: &[u8]) -> String {
-    let shown = bytes.iter().take(MAX_NAME / 2);
-    shown.map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]

@@ -25,6 +25,7 @@ mod server_trust;
 pub mod slot;
 mod state;
 mod stats;
+mod tcp_server;
 mod tls_words;
 
 use drivegate_core::command;
@@ -32,6 +33,7 @@ use drivegate_core::diagnosis;
 use drivegate_core::drill;
 use drivegate_core::event;
 use drivegate_core::files;
+use drivegate_core::hex;
 use drivegate_core::history;
 use drivegate_core::parameters;
 use drivegate_core::plant;
@@ -58,6 +60,7 @@ pub use stats::{
     BacnetStats, ConnectionRefusal, ModbusTcpStats, MqttKind, MqttStats, RefusalStats, ReloadStats, ServerKind,
     SlotOutcome, SlotStats,
 };
+pub use tcp_server::TcpServer;
 pub use tls_words::{GATEWAY, Peer, explain};
 
 /// Why a server cannot start.

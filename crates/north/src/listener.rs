@@ -24,7 +24,7 @@ pub(crate) use self::state::ListenerState;
 pub use self::state::ListenerStates;
 
 /// Handles the connections to one of a server's listeners.
-pub(super) trait ConnectionHandler: Send + Sync + 'static {
+pub(crate) trait ConnectionHandler: Send + Sync + 'static {
     /// The place of a connection; it is given back when this is dropped.
     type Permit: Send;
 
@@ -42,7 +42,7 @@ pub(super) trait ConnectionHandler: Send + Sync + 'static {
 
 /// A listener as configured.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct ListenerSpec {
+pub(crate) struct ListenerSpec {
     pub(super) address: SocketAddr,
     pub(super) tls: bool,
     /// Section of the configuration, in brackets.
@@ -64,7 +64,7 @@ impl ListenerSpec {
 
 /// The listeners of one server.
 #[derive(Debug)]
-pub(super) struct Listeners<H> {
+pub(crate) struct Listeners<H> {
     server: ServerKind,
     stats: Arc<NorthState>,
     /// Where listeners and connections run.
@@ -108,7 +108,7 @@ impl Socket {
 
 /// Sockets for a new configuration, bound but not accepting yet.
 #[derive(Debug, Default)]
-pub(super) struct NewSockets {
+pub(crate) struct NewSockets {
     /// In the order of the configuration.
     wanted: Vec<(ListenerSpec, Socket)>,
     /// Indices of open listeners whose sockets were closed because a new one overlaps them.

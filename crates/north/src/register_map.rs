@@ -45,7 +45,7 @@ const STALE: u16 = 1 << 14;
 const ONLINE: u16 = 1 << 15;
 
 /// Bits 0 to 7 of the status register.
-const STATUS_BITS: [ModelPoint; 8] = [
+pub(crate) const STATUS_BITS: [ModelPoint; 8] = [
     ModelPoint::Ready,
     ModelPoint::Running,
     ModelPoint::Reversed,

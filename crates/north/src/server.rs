@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
-use tokio_util::task::TaskTracker;
 
 use super::{NorthState, ServerError};
 use crate::plant::SharedPlant;
@@ -60,33 +59,4 @@ pub trait Reconfigure: Server {
 
     /// Whether all requests have completed and all clients are gone, after it retired.
     fn is_drained(&self) -> bool;
-}
-
-/// The tasks of a server: they end with the token and not with the last of them, since a reload can replace every listener.
-pub(crate) fn tasks_until(cancel: &CancellationToken) -> TaskTracker {
-    let tasks = TaskTracker::new();
-    tasks.spawn(cancel.clone().cancelled_owned());
-    tasks.close();
-    tasks
-}
-
-/// A server with its first options, which it prepares and commits as all later ones.
-///
-/// # Errors
-/// It cannot run so; its tasks end.
-pub(crate) async fn begun<S: Reconfigure>(
-    mut server: S,
-    options: S::Options,
-    cancel: &CancellationToken,
-) -> Result<S, ServerError> {
-    match server.prepare(options).await {
-        Ok(change) => {
-            server.commit(change);
-            Ok(server)
-        }
-        Err(error) => {
-            cancel.cancel();
-            Err(error)
-        }
-    }
 }

@@ -159,7 +159,8 @@ fn check(body: &[u8]) -> Result<(), &'static str> {
     }
 }
 
-fn digit(nibble: u8) -> u8 {
+/// The digit of a value below 16.
+pub(crate) fn digit(nibble: u8) -> u8 {
     if nibble < 10 { b'0' + nibble } else { b'A' + nibble - 10 }
 }
 

@@ -9,6 +9,8 @@ use ring::digest::{Context, SHA256};
 use serde::{Deserialize, Serialize};
 use tar::{Archive, Builder, EntryType, Header};
 
+use crate::hex;
+
 /// Version of the form; one that is greater cannot be read.
 pub(super) const FORMAT: u32 = 1;
 const MANIFEST: &str = "manifest.json";
@@ -270,11 +272,7 @@ impl<R> Hashed<R> {
 
     /// Bytes that were read, and their hash.
     pub(super) fn finish(self) -> (u64, String) {
-        let digest = self.hash.finish();
-        (
-            self.bytes,
-            digest.as_ref().iter().map(|byte| format!("{byte:02x}")).collect(),
-        )
+        (self.bytes, hex::encode(self.hash.finish().as_ref()))
     }
 }
 

@@ -3,9 +3,9 @@
 use std::fs::File;
 use std::io::{self, BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
-use super::{EXIT_FAILED, report};
+use super::failure::{Outcome, negative};
+use super::report;
 use crate::command::chain::{Hash, Verifier, seq};
 
 /// Longest line that is read, bytes; an entry is far shorter.
@@ -43,16 +43,16 @@ struct Verify {
     last: Option<Hash>,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     let Command::Verify(verify) = &args.command;
     match verify.run() {
-        Ok(text) => report::print(&text),
+        Ok(text) => Ok(report::print(&text)),
         Err(faults) => {
             faults.iter().take(PRINTED).for_each(|fault| report::error(fault));
             if faults.len() > PRINTED {
                 report::note(&format!("{} further findings", faults.len() - PRINTED));
             }
-            ExitCode::from(EXIT_FAILED)
+            negative()
         }
     }
 }

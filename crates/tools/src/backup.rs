@@ -5,12 +5,12 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::time::SystemTime;
 
 use super::archive::{Content, FORMAT, Hashed, LeftOut, Manifest, Member, Root, write};
+use super::failure::Outcome;
 use super::restore::UNPACKED;
-use super::{ConfigFile, EXIT_CONFIG, report};
+use super::{ConfigFile, report};
 use crate::config::{FileKind, NamedFile, Settings, environment, named_files};
 use crate::history::store;
 
@@ -34,21 +34,15 @@ pub(super) struct Args {
     with_keys: bool,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     let path = &args.config.path;
-    let loaded = Settings::load(path, environment());
-    let Some(settings) = loaded.settings else {
-        report::errors(&loaded.errors);
-        return ExitCode::from(EXIT_CONFIG);
-    };
+    let settings = super::settings(path)?;
     let made = collect(path, &settings, args.with_keys).and_then(|sources| {
         let manifest = manifest(path, &settings, &sources);
         save(&args.file, &manifest, &sources).map(|()| manifest)
     });
-    match made {
-        Ok(manifest) => report::print(&summary(&args.file, &manifest)),
-        Err(why) => report::failed(&format!("{why}; {}; no backup was made", args.file.display())),
-    }
+    let manifest = made.map_err(|why| format!("{why}; {}; no backup was made", args.file.display()))?;
+    Ok(report::print(&summary(&args.file, &manifest)))
 }
 
 /// The files of a backup, and what is not in it.

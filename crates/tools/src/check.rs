@@ -10,6 +10,7 @@ use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
 
+use super::failure::{Failure, Outcome};
 use super::{EXIT_CONFIG, NamedConfig, report};
 use crate::bus::predict::{PredictedRequest, Prediction};
 use crate::bus::proof;
@@ -92,7 +93,7 @@ struct Request<'a> {
     wire_ms: f64,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     let path = args.config.path();
     let mut loaded = Settings::load_proved(path, environment());
     if args.as_service {
@@ -113,19 +114,17 @@ pub(super) fn run(args: &Args) -> ExitCode {
         }
     };
     match loaded.settings {
-        Some(_) => printed,
-        None => ExitCode::from(EXIT_CONFIG),
+        Some(_) => Ok(printed),
+        None => Err(Failure::Reported(EXIT_CONFIG)),
     }
 }
 
 /// Restores of parameters that were cut off and belong to no drive of this configuration. A state directory that only the gateway may
 /// read is no fault of the configuration.
 fn orphaned_journals(settings: &Settings) -> Vec<Problem> {
-    let drives = settings
-        .buses
-        .iter()
-        .flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)));
-    let orphans = orphans(&settings.params.dir, drives).unwrap_or_default().into_iter();
+    let orphans = orphans(&settings.params.dir, settings.drives())
+        .unwrap_or_default()
+        .into_iter();
     let problem = |(path, what, remedy): (PathBuf, String, &str)| {
         Problem::of_file(path.display().to_string(), "", Finding::new(what, remedy))
     };
@@ -147,11 +146,8 @@ fn unproven_stops(settings: &Settings) -> Option<Problem> {
             ));
         }
     };
-    let drives = settings
-        .buses
-        .iter()
-        .flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)));
-    let unproven: Vec<String> = drives
+    let unproven: Vec<String> = settings
+        .drives()
         .filter_map(|(bus, drive)| {
             let missing = saved.unproven(&bus.machine(drive), &ways(drive), options.every, SystemTime::now());
             let missing: Vec<&str> = missing.into_iter().map(Kind::name).collect();
@@ -316,8 +312,7 @@ fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
     text += &bacnet(settings);
     let warnings = match warnings {
         0 => "no warnings".to_string(),
-        1 => "1 warning".to_string(),
-        more => format!("{more} warnings"),
+        some => counted(some, "warning", "warnings"),
     };
     let _ = writeln!(
         text,
@@ -369,12 +364,11 @@ fn bus_text(bus: &BusSettings, settings: &Settings, memory: &str) -> String {
 
 /// The functions by which drives that may be commanded are written where they are not the usual ones.
 fn functions(bus: &BusSettings) -> String {
-    let controlled = bus.drives.iter().filter(|drive| drive.access == Access::Control);
     let line = |drive: &DriveSpec| {
         let notes = drive.profile.functions.notes();
         (!notes.is_empty()).then(|| format!("  writes      {}: {}\n", drive.name, notes.join("; ")))
     };
-    controlled.filter_map(line).collect()
+    commanded(bus).filter_map(line).collect()
 }
 
 /// Octets of a notification of a change, with the headers of UDP, IP and Ethernet.

@@ -2,6 +2,7 @@
 
 use std::fs::{File, Metadata, OpenOptions, Permissions, TryLockError, metadata, read_to_string, remove_file, rename};
 use std::io::{self, Write};
+use std::marker::PhantomData;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt, fchown};
 use std::path::{Path, PathBuf};
 use std::thread::sleep;
@@ -14,41 +15,48 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// How often that is looked for.
 const AGAIN: Duration = Duration::from_millis(20);
 
-/// A file of tokens or users.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct CredentialsFile<'p> {
-    /// What it is, in messages.
-    pub(super) what: &'static str,
-    pub(super) path: &'p Path,
+/// What is kept in a file.
+pub(super) trait Filed: Credential + Send + Sync + 'static {
+    /// What the file is, in messages.
+    const FILE: &'static str;
     /// Permissions of a new one; those of an old one stay.
-    pub(super) mode: u32,
+    const MODE: u32;
 }
 
-impl CredentialsFile<'_> {
+/// The option that names a file of tokens or users.
+#[derive(Debug, clap::Args)]
+pub(super) struct CredentialsFile<C: Filed> {
+    #[arg(long = "file", value_name = "FILE", help = format!("The {} file", C::FILE))]
+    pub(super) path: PathBuf,
+    #[arg(skip)]
+    of: PhantomData<C>,
+}
+
+impl<C: Filed> CredentialsFile<C> {
     /// Its text.
     ///
     /// # Errors The fault, as a message.
     fn read(&self) -> Result<String, String> {
-        let (what, shown) = (self.what, self.path.display());
-        read_to_string(self.path)
+        let (what, shown) = (C::FILE, self.path.display());
+        read_to_string(&self.path)
             .map_err(|error| format!("cannot read the {what} file: {error}; {shown}; check the path"))
     }
 
     /// Its content.
     ///
     /// # Errors The fault, as a message.
-    pub(super) fn list<C: Credential>(&self) -> Result<Credentials<C>, String> {
-        parsed(self.path, &self.read()?)
+    pub(super) fn list(&self) -> Result<Credentials<C>, String> {
+        parsed(&self.path, &self.read()?)
     }
 
     /// Adds one, and says whether it took the place of that of the same name, if it may.
     ///
     /// # Errors
     /// It may not, or what is wrong with the file.
-    pub(super) fn put<C: Credential>(&self, new: &C, may_replace: bool) -> Result<bool, String> {
+    pub(super) fn put(&self, new: &C, may_replace: bool) -> Result<bool, String> {
         let (mut is_known, line) = (false, new.to_string());
         self.change(|text| {
-            is_known = parsed::<C>(self.path, text)?.named(new.name()).is_some();
+            is_known = parsed::<C>(&self.path, text)?.named(new.name()).is_some();
             let text = match is_known && may_replace {
                 true => replaced(text, new.name(), Some(&line)),
                 false => with_line(text, &line),
@@ -66,9 +74,9 @@ impl CredentialsFile<'_> {
     ///
     /// # Errors
     /// There is none, or what is wrong with the file.
-    pub(super) fn remove<C: Credential>(&self, name: &str) -> Result<(), String> {
+    pub(super) fn remove(&self, name: &str) -> Result<(), String> {
         let (shown, kind) = (self.path.display(), C::KIND);
-        self.change(|text| match parsed::<C>(self.path, text)?.named(name) {
+        self.change(|text| match parsed::<C>(&self.path, text)?.named(name) {
             Some(_) => Ok(replaced(text, name, None)),
             None => Err(format!(
                 "there is no {kind} `{name}`; {shown}; `drivegate {kind} list` shows them"
@@ -82,7 +90,7 @@ impl CredentialsFile<'_> {
     /// That of `change`, or what the system reports; the file is as it was.
     fn change(&self, change: impl FnOnce(&str) -> Result<String, String>) -> Result<(), String> {
         // A link stays one.
-        let file = self.path.canonicalize().unwrap_or_else(|_| self.path.to_path_buf());
+        let file = self.path.canonicalize().unwrap_or_else(|_| self.path.clone());
         let _lock = self.lock(&file)?;
         let text = match self.path.exists() {
             true => self.read()?,
@@ -93,7 +101,7 @@ impl CredentialsFile<'_> {
 
     /// The directory of the file, locked: the file itself is replaced at each change.
     fn lock(&self, file: &Path) -> Result<File, String> {
-        let (what, shown) = (self.what, self.path.display());
+        let (what, shown) = (C::FILE, self.path.display());
         let failed = |error: io::Error| format!("cannot lock the {what} file: {error}; {shown}; check the directory");
         let dir = match file.parent() {
             Some(dir) if !dir.as_os_str().is_empty() => dir,
@@ -118,7 +126,7 @@ impl CredentialsFile<'_> {
     /// Replaces the file as a whole, so that a gateway that reloads meanwhile reads the old one or the new one. Owner, group
     /// and permissions stay: they are what lets the gateway read it.
     fn write(&self, path: &Path, text: &str) -> Result<(), String> {
-        let (what, shown) = (self.what, self.path.display());
+        let (what, shown) = (C::FILE, self.path.display());
         let failed = |error: io::Error| format!("cannot write the {what} file: {error}; {shown}; check the directory");
         let mut name = path.as_os_str().to_owned();
         name.push(".new");
@@ -130,7 +138,7 @@ impl CredentialsFile<'_> {
         let file = options
             .write(true)
             .create_new(true)
-            .mode(if old.is_some() { 0o600 } else { self.mode })
+            .mode(if old.is_some() { 0o600 } else { C::MODE })
             .open(&new)
             .map_err(failed)?;
         let owned = old.map_or(Ok(()), |old| {
@@ -192,12 +200,12 @@ fn replaced(text: &str, name: &str, by: Option<&str>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::north::http::Token;
 
-    fn file(path: &Path) -> CredentialsFile<'_> {
+    fn file(path: &Path) -> CredentialsFile<Token> {
         CredentialsFile {
-            what: "token",
-            path,
-            mode: 0o640,
+            path: path.to_path_buf(),
+            of: PhantomData,
         }
     }
 

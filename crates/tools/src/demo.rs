@@ -10,7 +10,9 @@ use std::process::ExitCode;
 use tokio_util::sync::CancellationToken;
 
 use self::written::Written;
+use super::failure::Outcome;
 use super::report;
+use super::simulate::Speed;
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{LogFormat, LogSettings, Settings};
 use crate::daemon::Daemon;
@@ -36,15 +38,6 @@ pub(super) struct Args {
     /// Log level: off, error, warn, info, debug, trace, also for each target
     #[arg(long, default_value = "error", value_name = "LEVEL", value_parser = crate::config::parse_level)]
     pub log: String,
-}
-
-/// How fast the simulated lines are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum Speed {
-    /// Every character takes its time.
-    Real,
-    /// No time on the wire.
-    Max,
 }
 
 /// One simulated line of the demo.
@@ -118,16 +111,14 @@ const MODBUS_TCP: u16 = 1502;
 const HTTP: u16 = 9488;
 
 /// Runs the demo until Ctrl-C.
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     let _log = super::log::start(&LogSettings {
         level: args.log.clone(),
         format: LogFormat::Auto,
     });
     super::block_on(async {
-        match demo(args).await {
-            Ok(()) => ExitCode::SUCCESS,
-            Err(error) => report::failed(&error.to_string()),
-        }
+        demo(args).await?;
+        Ok(ExitCode::SUCCESS)
     })
 }
 

@@ -1,11 +1,11 @@
 //! `drivegate diagnose`: shows the verdicts about a line.
 
 use std::fmt::Write;
-use std::process::ExitCode;
 
 use serde::Deserialize;
 
 use super::client::{Gateway, encoded};
+use super::failure::Outcome;
 use super::{printable, report};
 use crate::diagnosis::{Counted, Verdict};
 
@@ -37,8 +37,8 @@ struct Diagnosis {
     drives: Vec<Counted>,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    super::block_on(async { report::outcome(diagnose(args).await) })
+pub(super) fn run(args: &Args) -> Outcome {
+    super::block_on(async { Ok(report::print(&diagnose(args).await?)) })
 }
 
 async fn diagnose(args: &Args) -> Result<String, String> {

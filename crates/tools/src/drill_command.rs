@@ -9,8 +9,10 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::client::{Asked, Client, Gateway, encoded};
+use super::failure::{Failure, Outcome};
 use super::{printable, report};
 use crate::drill::{DrillReport, DrillState, Kind};
+use crate::north::http::messages::DrillWish;
 
 /// How often a drill that is under way is looked at.
 const LOOK: Duration = Duration::from_millis(500);
@@ -75,20 +77,18 @@ struct Wish {
     speed: Option<f64>,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     super::block_on(async {
         match (&args.shown, &args.wish.drive) {
-            (Some(Shown::List { gateway }), _) => report::outcome(list(gateway).await),
-            (Some(Shown::Report { gateway, id }), _) => report::outcome(printed(gateway, id).await),
-            (None, Some(name)) => match drill(name, &args.wish).await {
-                Ok(DrillReport {
-                    state: DrillState::Passed,
-                    ..
-                }) => ExitCode::SUCCESS,
-                Ok(ended) => report::failed(&format!("{}: {}", said(ended.state), ended.text)),
-                Err(why) => report::failed(&why),
+            (Some(Shown::List { gateway }), _) => Ok(report::print(&list(gateway).await?)),
+            (Some(Shown::Report { gateway, id }), _) => Ok(report::print(&printed(gateway, id).await?)),
+            (None, Some(name)) => match drill(name, &args.wish).await? {
+                passed if passed.state == DrillState::Passed => Ok(ExitCode::SUCCESS),
+                ended => Err(format!("{}: {}", said(ended.state), ended.text).into()),
             },
-            (None, None) => report::misused("name the drive, or use `list` or `report ID`"),
+            (None, None) => Err(Failure::Misused(
+                "name the drive, or use `list` or `report ID`".to_string(),
+            )),
         }
     })
 }
@@ -143,7 +143,11 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
         .filter(|(_, wanted)| *wanted)
         .map(|(kind, _)| kind)
         .collect();
-    let body = json!({"drive": name, "kinds": kinds, "speed": wish.speed});
+    let body = DrillWish {
+        drive: name.to_string(),
+        kinds,
+        speed: wish.speed,
+    };
     let armed: DrillReport = asked(&client, &Asked::post("/api/v1/drills", &body)).await?;
     let ways: Vec<&str> = armed.steps.iter().map(|step| step.kind.name()).collect();
     let warning = format!(

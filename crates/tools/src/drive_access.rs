@@ -8,14 +8,14 @@ mod conversation;
 mod direct;
 mod parameters;
 
-use std::process::ExitCode;
 use std::sync::Arc;
 
 use self::conversation::Conversation;
 pub(super) use self::direct::Needs;
 use super::client::{Asked, Client, ClientError, Door, Gateway, NotFound, Reply, encoded};
-use super::{EXIT_CONFIG, report};
-use crate::config::{BusSettings, Settings, environment};
+use super::failure::Failure;
+use super::report;
+use crate::config::{BusSettings, Settings};
 use crate::document::{candidates, nearest};
 use crate::drive::{PointIndex, Profile};
 use crate::north::http::messages::{Expected, ExpectedDrive};
@@ -33,9 +33,9 @@ pub(super) struct OneDrive {
 }
 
 impl OneDrive {
-    /// Runs a command about the drive; what is wrong with its name was reported otherwise.
-    pub(super) fn with(&self, run: impl FnOnce(&Target) -> ExitCode) -> ExitCode {
-        target(&self.gateway, &self.name).map_or_else(|code| code, |target| run(&target))
+    /// The drive, and its gateway.
+    pub(super) fn target(&self) -> Result<Target, Failure> {
+        target(&self.gateway, &self.name)
     }
 }
 
@@ -65,9 +65,8 @@ pub(super) enum Way {
     Direct,
 }
 
-/// The drive, of the configuration unless the gateway is named by its address; an exit code when there is none, which was
-/// reported.
-pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, ExitCode> {
+/// The drive, of the configuration unless the gateway is named by its address.
+pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, Failure> {
     let drive_name = drive.to_string();
     if let Some(client) = gateway.network() {
         return Ok(Target {
@@ -77,9 +76,7 @@ pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, ExitCode>
         });
     }
     let config = gateway.config();
-    let loaded = Settings::load(config, environment());
-    report::errors(&loaded.errors);
-    let settings = loaded.settings.ok_or(ExitCode::from(EXIT_CONFIG))?;
+    let settings = super::settings(config)?;
     let found = settings.buses.iter().find_map(|bus| {
         let spec = bus.drives.iter().find(|spec| spec.name == drive)?;
         Some((bus.clone(), spec.clone()))
@@ -88,7 +85,7 @@ pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, ExitCode>
         let drives = || settings.buses.iter().flat_map(|bus| &bus.drives);
         let names = || drives().map(|spec| spec.name.as_str());
         let file = config.display();
-        return Err(report::misused(&match nearest(drive, names()) {
+        return Err(Failure::Misused(match nearest(drive, names()) {
             Some(near) => format!("there is no drive `{drive}`; {file}; did you mean `{near}`?"),
             None => {
                 let names = names().collect::<Vec<_>>().join(", ");

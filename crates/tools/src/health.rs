@@ -1,11 +1,10 @@
 //! `drivegate health`: whether a running gateway is ready, as an exit code.
 
-use std::process::ExitCode;
-
 use hyper::StatusCode;
 
 use super::client::{Asked, Gateway};
-use super::{EXIT_FAILED, report};
+use super::failure::{Outcome, negative};
+use super::report;
 
 /// Reports whether the running gateway is ready, for containers and scripts.
 ///
@@ -21,14 +20,14 @@ pub(super) struct Args {
     gateway: Gateway,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     super::block_on(async {
         let reasons = unready(&args.gateway).await.unwrap_or_else(|why| vec![why]);
         if reasons.is_empty() {
-            return report::print("ready\n");
+            return Ok(report::print("ready\n"));
         }
         reasons.iter().for_each(|reason| report::error(reason));
-        ExitCode::from(EXIT_FAILED)
+        negative()
     })
 }
 

@@ -1,12 +1,11 @@
 //! `drivegate hold`: who holds a drive, and taking, renewing, releasing and breaking that.
 
-use std::process::ExitCode;
-
 use serde::Deserialize;
-use serde_json::json;
 
 use super::client::{Asked, Gateway, encoded};
+use super::failure::Outcome;
 use super::{printable, report};
+use crate::north::http::messages::HoldAct;
 
 /// Prints who holds a drive: holder, rank and seconds left; or takes, renews, releases or breaks the hold.
 ///
@@ -41,17 +40,13 @@ struct Reason {
     message: String,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     super::block_on(async {
-        match hold(args).await {
-            Ok(hold) => {
-                report::print(&line(&hold));
-                match hold.error {
-                    None => ExitCode::SUCCESS,
-                    Some(reason) => report::failed(&reason.message),
-                }
-            }
-            Err(why) => report::failed(&why),
+        let hold = hold(args).await?;
+        let printed = report::print(&line(&hold));
+        match hold.error {
+            None => Ok(printed),
+            Some(reason) => Err(reason.message.into()),
         }
     })
 }
@@ -62,7 +57,7 @@ async fn hold(args: &Args) -> Result<Hold, String> {
         None => Asked::get(path),
         Some(action) => {
             let lost = "it is unknown whether the hold changed: run it again without an action";
-            Asked::post(path, &json!({ "action": action })).if_lost(lost)
+            Asked::post(path, &HoldAct { action: action.clone() }).if_lost(lost)
         }
     };
     let reply = args.gateway.client()?.ask(&asked).await?;

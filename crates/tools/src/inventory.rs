@@ -3,11 +3,11 @@
 mod yaml;
 
 use std::path::Path;
-use std::process::ExitCode;
 
 use toml::{Table, Value};
 
-use super::{EXIT_CONFIG, NamedConfig, report};
+use super::failure::{Failure, Outcome};
+use super::{NamedConfig, report};
 use crate::config::{Settings, environment};
 use crate::document::{self, Finding, Problem};
 
@@ -31,14 +31,9 @@ pub(super) struct Args {
     config: NamedConfig,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    match inventory(args.config.path()) {
-        Ok(text) => report::print(&text),
-        Err(problems) => {
-            report::errors(&problems);
-            ExitCode::from(EXIT_CONFIG)
-        }
-    }
+pub(super) fn run(args: &Args) -> Outcome {
+    let text = inventory(args.config.path()).map_err(Failure::Invalid)?;
+    Ok(report::print(&text))
 }
 
 fn inventory(path: &Path) -> Result<String, Vec<Problem>> {

@@ -1,6 +1,6 @@
 //! The command line, one file a command.
 //!
-//! A command is a module with `Args` (its options, its help, an example) and `run(&Args) -> ExitCode`, and a
+//! A command is a module with `Args` (its options, its help, an example) and `run(&Args) -> Outcome`, and a
 //! line in `commands!` below.
 
 mod adapters;
@@ -15,6 +15,7 @@ mod demo;
 mod diagnose;
 mod drill_command;
 mod drive_access;
+mod failure;
 mod health;
 mod hold_command;
 mod inventory;
@@ -52,6 +53,7 @@ use drivegate_core::diagnosis;
 use drivegate_core::drill;
 use drivegate_core::event;
 use drivegate_core::files;
+use drivegate_core::hex;
 use drivegate_core::history;
 use drivegate_core::parameters;
 use drivegate_core::plant;
@@ -72,6 +74,10 @@ use std::process::ExitCode;
 use std::sync::LazyLock;
 
 use clap::Parser;
+
+use self::failure::{Failure, Outcome};
+use crate::config::{Settings, environment};
+use crate::drive::profile::Profiles;
 
 /// Exit code of a failure.
 pub const EXIT_FAILED: u8 = 1;
@@ -110,7 +116,7 @@ macro_rules! commands {
         }
 
         impl Command {
-            fn run(&self) -> ExitCode {
+            fn run(&self) -> Outcome {
                 match self {
                     $(Command::$variant(args) => $module::run(args),)*
                 }
@@ -187,7 +193,7 @@ pub fn command_line() -> clap::Command {
 
 /// Runs the command of the command line and returns its exit code.
 pub fn main() -> ExitCode {
-    Cli::parse().command.run()
+    Cli::parse().command.run().unwrap_or_else(Failure::report)
 }
 
 /// The runtime of a command that has one thing to do.
@@ -196,15 +202,36 @@ fn runtime() -> Result<tokio::runtime::Runtime, String> {
         .worker_threads(1)
         .enable_all()
         .build();
-    built.map_err(|why| format!("cannot start: {why}; free memory, threads or file descriptors"))
+    built.map_err(cannot_start)
 }
 
 /// Runs `command` on a runtime of its own.
-pub fn block_on(command: impl Future<Output = ExitCode>) -> ExitCode {
-    match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
-        Ok(runtime) => runtime.block_on(command),
-        Err(why) => report::failed(&format!(
-            "cannot start: {why}; free memory, threads or file descriptors"
-        )),
+fn block_on(command: impl Future<Output = Outcome>) -> Outcome {
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build();
+    runtime.map_err(cannot_start)?.block_on(command)
+}
+
+fn cannot_start(why: std::io::Error) -> String {
+    format!("cannot start: {why}; free memory, threads or file descriptors")
+}
+
+/// The settings of a valid configuration.
+fn settings(path: &Path) -> Result<Settings, Failure> {
+    let loaded = Settings::load(path, environment());
+    loaded.settings.ok_or(Failure::Invalid(loaded.errors))
+}
+
+/// The built-in profiles, and those of these directories.
+fn profiles_of(dirs: &[PathBuf]) -> Result<Profiles, Failure> {
+    let mut profiles = Profiles::built_in();
+    add_profiles(&mut profiles, dirs)?;
+    Ok(profiles)
+}
+
+fn add_profiles(profiles: &mut Profiles, dirs: &[PathBuf]) -> Result<(), Failure> {
+    let problems: Vec<_> = dirs.iter().flat_map(|dir| profiles.load(dir)).collect();
+    match problems.is_empty() {
+        true => Ok(()),
+        false => Err(Failure::Invalid(problems)),
     }
 }

@@ -3,14 +3,14 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use super::adapters::persistent_name;
+use super::failure::{Failure, Outcome};
+use super::report;
 use super::scan::{self, Found, Setting, Snippet, absolute};
-use super::{EXIT_CONFIG, EXIT_FAILED, report};
 use crate::bus::Mode;
 use crate::bus::listener::guess::Guess;
 use crate::bus::listener::n2_survey::N2Survey;
@@ -66,24 +66,13 @@ pub(super) struct Args {
     profile_dir: Vec<PathBuf>,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    let (protocols, formats) = match settings(args) {
-        Ok(settings) => settings,
-        Err(message) => return report::misused(&message),
-    };
-    let mut profiles = Profiles::built_in();
-    let problems: Vec<_> = args.profile_dir.iter().flat_map(|dir| profiles.load(dir)).collect();
-    if !problems.is_empty() {
-        report::errors(&problems);
-        return ExitCode::from(EXIT_CONFIG);
-    }
+pub(super) fn run(args: &Args) -> Outcome {
+    let (protocols, formats) = settings(args).map_err(Failure::Misused)?;
+    let profiles = super::profiles_of(&args.profile_dir)?;
     let stop = Arc::new(AtomicBool::new(false));
     scan::stop_on_signal(stop.clone());
     let ear = Ear { args, stop };
-    match ear.listen(&protocols, &formats, &profiles) {
-        Ok(code) => code,
-        Err(message) => report::failed(&message),
-    }
+    ear.listen(&protocols, &formats, &profiles)
 }
 
 /// Protocols and formats to try, in order.
@@ -129,11 +118,10 @@ struct Ear<'a> {
 }
 
 impl Ear<'_> {
-    fn listen(&self, protocols: &[Protocol], formats: &[LineFormat], profiles: &Profiles) -> Result<ExitCode, String> {
+    fn listen(&self, protocols: &[Protocol], formats: &[LineFormat], profiles: &Profiles) -> Outcome {
         let mut bytes = 0;
         let Some((protocol, format)) = self.find(protocols, formats, &mut bytes)? else {
-            report::error(&nothing(bytes, &self.args.port));
-            return Ok(ExitCode::from(EXIT_FAILED));
+            return Err(nothing(bytes, &self.args.port).into());
         };
         report::note(&format!(
             "{} {format}; listening for {} s",
@@ -159,11 +147,11 @@ impl Ear<'_> {
             })
             .collect();
         if found.is_empty() {
-            report::error(&format!(
+            return Err(format!(
                 "no drive answers the other master; {}; check that both wires of the line reach this port",
                 self.args.port
-            ));
-            return Ok(ExitCode::from(EXIT_FAILED));
+            )
+            .into());
         }
         let directory = |dir: &PathBuf| std::path::absolute(dir).unwrap_or_else(|_| dir.clone());
         let snippet = Snippet {

@@ -8,13 +8,13 @@ mod text;
 use std::io;
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::sync::Arc;
 
 use self::rows::{Row, gateway_rows};
-use super::{DEFAULT_CONFIG, EXIT_CONFIG, report};
+use super::failure::{Failure, Outcome};
+use super::{DEFAULT_CONFIG, report};
 use crate::command::CommandQueue;
-use crate::config::{BusSettings, Settings, environment};
+use crate::config::{BusSettings, Settings};
 use crate::north::modbus_tcp::Role;
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{BusImage, DriveImage, DriveSpec};
@@ -55,12 +55,8 @@ enum Format {
 }
 
 /// Prints the map.
-pub(super) fn run(args: &Args) -> ExitCode {
-    let loaded = Settings::load(&args.config, environment());
-    report::errors(&loaded.errors);
-    let Some(settings) = loaded.settings else {
-        return ExitCode::from(EXIT_CONFIG);
-    };
+pub(super) fn run(args: &Args) -> Outcome {
+    let settings = super::settings(&args.config)?;
     if args.bacnet {
         return bacnet::run(&settings, args.csv, args.ede.as_deref());
     }
@@ -69,7 +65,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
         None => None,
         Some(address) => match listeners.iter().find(|l| l.addresses.contains(&address)) {
             Some(listener) => listener.buses.clone(),
-            None => return unknown_listener(address, &listeners),
+            None => return Err(Failure::Misused(unknown_listener(address, &listeners))),
         },
     };
     let format = match (args.csv, args.json) {
@@ -77,13 +73,11 @@ pub(super) fn run(args: &Args) -> ExitCode {
         (_, true) => Format::Json,
         _ => Format::Text,
     };
-    match plant(&settings) {
-        Ok(plant) => report::print(&render(&plant, &listeners, shown.as_deref(), format)),
-        Err(why) => report::failed(&format!("cannot build the map: {why}; map; free file descriptors")),
-    }
+    let plant = plant(&settings).map_err(|why| format!("cannot build the map: {why}; map; free file descriptors"))?;
+    Ok(report::print(&render(&plant, &listeners, shown.as_deref(), format)))
 }
 
-fn unknown_listener(address: SocketAddr, listeners: &[Listener]) -> ExitCode {
+fn unknown_listener(address: SocketAddr, listeners: &[Listener]) -> String {
     let known: Vec<String> = listeners
         .iter()
         .flat_map(|l| &l.addresses)
@@ -93,7 +87,7 @@ fn unknown_listener(address: SocketAddr, listeners: &[Listener]) -> ExitCode {
         [] => "add [modbus_tcp] to the configuration".to_string(),
         known => format!("write one of {}", known.join(", ")),
     };
-    report::misused(&format!("nothing listens on {address}; --listener; {remedy}"))
+    format!("nothing listens on {address}; --listener; {remedy}")
 }
 
 /// A listener of the Modbus TCP server.

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 
 use super::client::Gateway;
 use super::drive_access::target;
-use super::{EXIT_CONFIG, EXIT_FAILED, report};
-use crate::config::{Settings, environment};
+use super::failure::{Failure, Outcome, negative};
+use super::report;
 use crate::drive::parameters::RawValue;
 use crate::files;
 use crate::north::http::messages::{ParameterReading, ReadParameters};
@@ -110,20 +110,19 @@ struct ReadArgs {
     names: Option<PathBuf>,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     let (gateway, config) = (&args.gateway, args.gateway.config());
-    let done = match &args.action {
+    match &args.action {
         Action::Read(read) => read_drive(gateway, read),
         Action::Diff { before, after } => diff(gateway, before, after),
         Action::Restore(args_of_it) => restore::restore(gateway, args_of_it),
         Action::Clone { from, to, how } => restore::clone(gateway, from, to, how),
         Action::List { drive } => list(config, drive.as_deref()),
         Action::Show { of, names } => show(config, of, names.as_deref()),
-    };
-    done.unwrap_or_else(|code| code)
+    }
 }
 
-fn read_drive(gateway: &Gateway, args: &ReadArgs) -> Result<ExitCode, ExitCode> {
+fn read_drive(gateway: &Gateway, args: &ReadArgs) -> Outcome {
     let names = names(args.names.as_deref())?;
     let (file, profile) = read_from_drive(gateway, &args.drive, args.how())?;
     let file = match names {
@@ -140,10 +139,10 @@ fn read_drive(gateway: &Gateway, args: &ReadArgs) -> Result<ExitCode, ExitCode> 
         return Ok(report::print(&file.text()));
     };
     files::replace(output, file.text().as_bytes()).map_err(|error| {
-        report::failed(&format!(
+        format!(
             "cannot write the file: {error}; {}; name another place",
             output.display()
-        ))
+        )
     })?;
     report::note(&format!(
         "{} of {} are in {}",
@@ -165,7 +164,7 @@ impl ReadArgs {
 
 type Found = (ParameterFile, std::sync::Arc<crate::drive::Profile>);
 
-fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Result<Found, ExitCode> {
+fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Result<Found, Failure> {
     let target = target(gateway, drive)?;
     let mut line = StatusLine::default();
     let text = target.read_parameters(how, |outcome| {
@@ -174,9 +173,7 @@ fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Resul
         }
     });
     line.end();
-    let file = text.map_err(|why| report::failed(&why)).and_then(|text| {
-        ParameterFile::parse(&text).map_err(|why| report::failed(&format!("the gateway's file is invalid: {why}")))
-    })?;
+    let file = ParameterFile::parse(&text?).map_err(|why| format!("the gateway's file is invalid: {why}"))?;
     let profile = match target.profile() {
         Some(profile) => profile.clone(),
         None => built_in(&file.family)?,
@@ -184,14 +181,9 @@ fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Resul
     Ok((file, profile))
 }
 
-fn built_in(family: &str) -> Result<std::sync::Arc<crate::drive::Profile>, ExitCode> {
-    let profiles = crate::drive::profile::Profiles::built_in();
-    let profile = profiles.get(family).cloned();
-    profile.ok_or_else(|| {
-        report::failed(&format!(
-            "profile `{family}` is not built in; --names; name the list in [params]"
-        ))
-    })
+fn built_in(family: &str) -> Result<std::sync::Arc<crate::drive::Profile>, Failure> {
+    let profile = crate::drive::profile::Profiles::built_in().get(family).cloned();
+    Ok(profile.ok_or_else(|| format!("profile `{family}` is not built in; --names; name the list in [params]"))?)
 }
 
 /// Interval of progress lines when the output is not a terminal.
@@ -253,19 +245,23 @@ fn seconds_in_words(seconds: f64) -> String {
     }
 }
 
+/// A file of parameters.
+fn read_written(path: &Path) -> Result<ParameterFile, Failure> {
+    Ok(read_file(path).map_err(|why| format!("{why}; name a file that `params read` wrote"))?)
+}
+
 /// A file where there is one, else the drive of that name, which is read.
-fn file_or_drive(gateway: &Gateway, of: &str) -> Result<ParameterFile, ExitCode> {
+fn file_or_drive(gateway: &Gateway, of: &str) -> Result<ParameterFile, Failure> {
     match Path::new(of).is_file() {
-        true => read_file(Path::new(of))
-            .map_err(|why| report::failed(&format!("{why}; name a file that `params read` wrote"))),
+        true => read_written(Path::new(of)),
         false => Ok(read_from_drive(gateway, of, ReadParameters::default())?.0),
     }
 }
 
-fn diff(gateway: &Gateway, before: &str, after: &str) -> Result<ExitCode, ExitCode> {
+fn diff(gateway: &Gateway, before: &str, after: &str) -> Outcome {
     let (before, after) = (file_or_drive(gateway, before)?, file_or_drive(gateway, after)?);
     if before.family != after.family {
-        return Err(report::misused(&format!(
+        return Err(Failure::Misused(format!(
             "`{}` is of family {}, `{}` of {}; command line; compare drives of one family",
             before.drive, before.family, after.drive, after.family
         )));
@@ -273,28 +269,24 @@ fn diff(gateway: &Gateway, before: &str, after: &str) -> Result<ExitCode, ExitCo
     let found = differences(&before, &after);
     let text: String = found.iter().map(|difference| difference.line() + "\n").collect();
     let printed = report::print(&text);
-    Ok(if found.is_empty() {
-        printed
-    } else {
-        ExitCode::from(EXIT_FAILED)
-    })
+    match found.is_empty() {
+        true => Ok(printed),
+        false => negative(),
+    }
 }
 
 /// The store of the configuration.
-fn store(config: &Path) -> Result<Store, ExitCode> {
-    let loaded = Settings::load(config, environment());
-    report::errors(&loaded.errors);
-    let settings = loaded.settings.ok_or(ExitCode::from(EXIT_CONFIG))?;
-    Ok(Store::new(settings.params.dir))
+fn store(config: &Path) -> Result<Store, Failure> {
+    Ok(Store::new(super::settings(config)?.params.dir))
 }
 
-fn list(config: &Path, drive: Option<&str>) -> Result<ExitCode, ExitCode> {
+fn list(config: &Path, drive: Option<&str>) -> Outcome {
     let store = store(config)?;
     let kept = store.list().map_err(|error| {
-        report::failed(&format!(
+        format!(
             "cannot read the readings: {error}; {}; make it a directory that you may read, or use sudo",
             store.dir().display()
-        ))
+        )
     })?;
     let mut table = report::table(["drive", "time", "family", "application", "missing", "file"]);
     let mut rows = 0;
@@ -321,22 +313,18 @@ fn list(config: &Path, drive: Option<&str>) -> Result<ExitCode, ExitCode> {
     Ok(report::print(&report::lines(&table)))
 }
 
-fn show(config: &Path, of: &str, names: Option<&Path>) -> Result<ExitCode, ExitCode> {
+fn show(config: &Path, of: &str, names: Option<&Path>) -> Outcome {
     let names = self::names(names)?;
-    let is_file = Path::new(of).is_file();
-    let file = match is_file {
-        true => read_file(Path::new(of))
-            .map_err(|why| report::failed(&format!("{why}; name a file that `params read` wrote")))?,
+    let file = match Path::new(of).is_file() {
+        true => read_written(Path::new(of))?,
         false => {
             let store = store(config)?;
-            let last = store
-                .latest(of)
-                .map_err(|why| report::failed(&format!("{why}; correct or remove it")))?;
+            let last = store.latest(of).map_err(|why| format!("{why}; correct or remove it"))?;
             last.ok_or_else(|| {
-                report::failed(&format!(
+                format!(
                     "no reading of `{of}` is stored; {}; read it with `drivegate params read {of}`",
                     store.dir().display()
-                ))
+                )
             })?
         }
     };
@@ -374,12 +362,12 @@ fn show(config: &Path, of: &str, names: Option<&Path>) -> Result<ExitCode, ExitC
     Ok(report::print(&(head + &report::lines(&table))))
 }
 
-fn names(path: Option<&Path>) -> Result<Option<Names>, ExitCode> {
+fn names(path: Option<&Path>) -> Result<Option<Names>, Failure> {
     let Some(path) = path else { return Ok(None) };
     let shown = path.display();
     let text = std::fs::read_to_string(path)
-        .map_err(|error| report::failed(&format!("cannot read the names: {error}; {shown}; name a CSV file")))?;
-    let names = Names::parse(&text)
-        .map_err(|why| report::failed(&format!("{why}; {shown}; write id, name, unit, scale in each row")))?;
+        .map_err(|error| format!("cannot read the names: {error}; {shown}; name a CSV file"))?;
+    let names =
+        Names::parse(&text).map_err(|why| format!("{why}; {shown}; write id, name, unit, scale in each row"))?;
     Ok(Some(names))
 }

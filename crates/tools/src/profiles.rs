@@ -9,12 +9,12 @@ use std::fmt::Write;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
-use super::{EXIT_CONFIG, EXIT_USAGE, printable, report};
+use super::failure::{Failure, Outcome};
+use super::{printable, report};
 use crate::codec::Protocol;
 use crate::codec::n2::ASSUMPTIONS;
-use crate::config::{Settings, environment, unknown_profile};
+use crate::config::unknown_profile;
 use crate::document::{Finding, Problem, format_duration};
 use crate::drive::control::Mask;
 use crate::drive::profile::{AddressRange, Form, Profiles};
@@ -78,67 +78,54 @@ enum What {
     },
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     let mut profiles = match &args.config {
         None => Profiles::built_in(),
-        Some(path) => {
-            let loaded = Settings::load(path, environment());
-            report::errors(&loaded.errors);
-            match loaded.settings {
-                Some(settings) => settings.profiles,
-                None => return ExitCode::from(EXIT_CONFIG),
-            }
-        }
+        Some(path) => super::settings(path)?.profiles,
     };
-    let problems: Vec<Problem> = args.profile_dir.iter().flat_map(|dir| profiles.load(dir)).collect();
-    if !problems.is_empty() {
-        report::errors(&problems);
-        return ExitCode::from(EXIT_CONFIG);
-    }
-    match &args.what {
-        None => report::print(&list(&profiles)),
+    super::add_profiles(&mut profiles, &args.profile_dir)?;
+    let text = match &args.what {
+        None => list(&profiles),
         Some(What::Show { name, toml }) => match profiles.get(name) {
-            Some(profile) if *toml => report::print(&profile.text),
-            Some(profile) => report::print(&show(profile)),
-            None => unknown(name, "NAME", &profiles),
+            Some(profile) if *toml => profile.text.to_string(),
+            Some(profile) => show(profile),
+            None => return Err(unknown(name, "NAME", &profiles)),
         },
-        Some(What::New { name, base }) => begin(name, base.as_deref(), &profiles),
-        Some(What::Check { file }) => check::run(file, &profiles),
-        Some(What::Import { file }) => match read_list(file).and_then(|text| import::profile(file, &text)) {
-            Ok(text) => report::print(&text),
-            Err(problems) => {
-                report::errors(&problems);
-                ExitCode::from(EXIT_CONFIG)
-            }
-        },
-    }
+        Some(What::New { name, base }) => begin(name, base.as_deref(), &profiles)?,
+        Some(What::Check { file }) => return check::run(file, &profiles),
+        Some(What::Import { file }) => read_list(file)
+            .and_then(|text| import::profile(file, &text))
+            .map_err(Failure::Invalid)?,
+    };
+    Ok(report::print(&text))
 }
 
-fn unknown(name: &str, key: &str, profiles: &Profiles) -> ExitCode {
-    let unknown = unknown_profile(name, profiles, false);
-    report::errors(&[Problem::of_file("command line", key, unknown)]);
-    ExitCode::from(EXIT_USAGE)
+fn misused(key: &str, why: Finding) -> Failure {
+    Failure::Misused(Problem::of_file("command line", key, why).to_string())
 }
 
-fn begin(name: &str, base: Option<&str>, profiles: &Profiles) -> ExitCode {
+fn unknown(name: &str, key: &str, profiles: &Profiles) -> Failure {
+    misused(key, unknown_profile(name, profiles, false))
+}
+
+fn begin(name: &str, base: Option<&str>, profiles: &Profiles) -> Result<String, Failure> {
     let text = match base.map(|base| (base, profiles.get(base))) {
         None => new::frame(name),
         Some((_, Some(base))) => new::over(name, base),
-        Some((base, None)) => return unknown(base, "--base", profiles),
+        Some((base, None)) => return Err(unknown(base, "--base", profiles)),
     };
     let is_valid = name.starts_with(|c: char| c.is_ascii_lowercase())
         && name
             .chars()
             .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-');
     if is_valid {
-        return report::print(&text);
+        return Ok(text);
     }
     let invalid = Finding::new(
         format!("`{}` is not a valid name", printable::line(name)),
         "write a-z, 0-9 and -, starting with a letter",
     );
-    report::errors(&[Problem::of_file("command line", "NAME", invalid)]);
-    ExitCode::from(EXIT_USAGE)
+    Err(misused("NAME", invalid))
 }
 
 /// Longest list that is read.

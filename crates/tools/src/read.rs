@@ -1,10 +1,9 @@
 //! `drivegate read`: points of one drive, once.
 
-use std::process::ExitCode;
-
 use super::client::{Asked, encoded};
 use super::drive_access::{Needs, OneDrive, Target, point};
-use super::{EXIT_FAILED, report};
+use super::failure::{Failure, Outcome, negative};
+use super::report;
 use crate::north::http::messages::{PointValue, Word};
 
 /// Reads points of a drive once, through the running gateway or directly.
@@ -26,22 +25,16 @@ pub(super) struct Args {
     json: bool,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    args.drive.with(|target| read(args, target))
-}
-
-fn read(args: &Args, target: &Target) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
+    let target = args.drive.target()?;
     let unknown = |name: &String| {
         let unknown = point(target.profile()?, name).err();
         unknown.filter(|_| Word::of(name).is_none())
     };
     if let Some(message) = args.points.iter().find_map(unknown) {
-        return report::misused(&message);
+        return Err(Failure::Misused(message));
     }
-    match rows(target, &args.points) {
-        Ok(rows) => print(args, &rows),
-        Err(message) => report::failed(&message),
-    }
+    print(args, &rows(&target, &args.points)?)
 }
 
 pub(super) fn rows(target: &Target, points: &[String]) -> Result<Vec<PointValue>, String> {
@@ -54,18 +47,18 @@ pub(super) fn rows(target: &Target, points: &[String]) -> Result<Vec<PointValue>
     Ok(reply.accepted(&asked)?)
 }
 
-fn print(args: &Args, rows: &[PointValue]) -> ExitCode {
+fn print(args: &Args, rows: &[PointValue]) -> Outcome {
     let all = rows.iter().all(PointValue::is_good);
     let none = !rows.iter().any(PointValue::is_good);
     if let Some(why) = only_reason(rows).filter(|_| !args.json) {
-        return report::failed(&format!("no point of `{}` has a value: {why}", args.drive.name));
+        return Err(format!("no point of `{}` has a value: {why}", args.drive.name).into());
     }
     let printed = report::print(&if args.json { json(rows) } else { table(rows) });
     // Points requested by name must have a value.
     if none || (!all && !args.points.is_empty()) {
-        return ExitCode::from(EXIT_FAILED);
+        return negative();
     }
-    printed
+    Ok(printed)
 }
 
 /// The reason why no point has a value, if all of several points have the same one: it is printed once.

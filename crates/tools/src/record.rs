@@ -1,9 +1,8 @@
 //! `drivegate record`: makes the running gateway record a drive.
 
-use std::process::ExitCode;
-
 use super::client::Asked;
-use super::drive_access::{OneDrive, Target};
+use super::drive_access::OneDrive;
+use super::failure::Outcome;
 use super::report;
 use crate::north::http::messages::Recorded;
 
@@ -19,19 +18,11 @@ pub(super) struct Args {
     drive: OneDrive,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    args.drive.with(record)
-}
-
-fn record(target: &Target) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
+    let target = args.drive.target()?;
     let asked = Asked::post(target.path("recordings"), &serde_json::json!({}));
     let asked = asked.if_refused("set max_count of [recordings] above 0 and reload");
-    let reply = target.ask_gateway(&asked);
-    match reply.and_then(|reply| Ok(reply.accepted::<Recorded>(&asked)?)) {
-        Ok(record) => {
-            report::note(&format!("it will be complete in {:.0} s", record.after_s));
-            report::print(&format!("{}\n", record.id))
-        }
-        Err(message) => report::failed(&message),
-    }
+    let record: Recorded = target.ask_gateway(&asked)?.accepted(&asked)?;
+    report::note(&format!("it will be complete in {:.0} s", record.after_s));
+    Ok(report::print(&format!("{}\n", record.id)))
 }

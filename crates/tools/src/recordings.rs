@@ -6,8 +6,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use super::{DEFAULT_CONFIG, EXIT_CONFIG, report};
-use crate::config::{Settings, environment};
+use super::failure::{Failure, Outcome};
+use super::{DEFAULT_CONFIG, report};
 use crate::document::nearest;
 use crate::history::{Entry, Recording, export, pcapng, store};
 
@@ -70,34 +70,25 @@ struct Export {
     output: Option<PathBuf>,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    let done = match &args.action {
+pub(super) fn run(args: &Args) -> Outcome {
+    match &args.action {
         None => list(args, false),
         Some(Action::List { json }) => list(args, *json),
-        Some(Action::Show { id }) => open(args, id).map(|recording| report::print(&show::text(&recording))),
-        Some(Action::Export(form)) => open(args, &form.id).and_then(|recording| export(form, &recording)),
-    };
-    done.unwrap_or_else(|code| code)
+        Some(Action::Show { id }) => Ok(report::print(&show::text(&open(args, id)?))),
+        Some(Action::Export(form)) => export(form, &open(args, &form.id)?),
+    }
 }
 
 /// The directory of the recordings.
-fn directory(args: &Args) -> Result<PathBuf, ExitCode> {
+fn directory(args: &Args) -> Result<PathBuf, Failure> {
     if let Some(dir) = &args.dir {
         return Ok(dir.clone());
     }
-    let loaded = Settings::load(&args.config, environment());
-    report::errors(&loaded.errors);
-    let settings = loaded.settings.ok_or(ExitCode::from(EXIT_CONFIG))?;
-    Ok(settings.recordings.dir)
+    Ok(super::settings(&args.config)?.recordings.dir)
 }
 
-fn entries(dir: &Path) -> Result<Vec<Entry>, ExitCode> {
-    let unreadable = |error| {
-        report::failed(&format!(
-            "cannot read the recordings: {error}; {}; use sudo",
-            dir.display()
-        ))
-    };
+fn entries(dir: &Path) -> Result<Vec<Entry>, Failure> {
+    let unreadable = |error| format!("cannot read the recordings: {error}; {}; use sudo", dir.display());
     let (entries, faults) = store::list(dir).map_err(unreadable)?;
     for fault in faults {
         report::note(&fault.to_string());
@@ -105,7 +96,7 @@ fn entries(dir: &Path) -> Result<Vec<Entry>, ExitCode> {
     Ok(entries)
 }
 
-fn list(args: &Args, json: bool) -> Result<ExitCode, ExitCode> {
+fn list(args: &Args, json: bool) -> Outcome {
     let dir = directory(args)?;
     let entries = entries(&dir)?;
     if json {
@@ -128,35 +119,32 @@ fn list(args: &Args, json: bool) -> Result<ExitCode, ExitCode> {
     Ok(report::print(&report::lines(&table)))
 }
 
-fn open(args: &Args, id: &str) -> Result<Recording, ExitCode> {
+fn open(args: &Args, id: &str) -> Result<Recording, Failure> {
     let path = match id.contains('/') || Path::new(id).is_file() {
         true => PathBuf::from(id),
         false => {
             let dir = directory(args)?;
             let path = store::path_of(&dir, id);
             if !path.is_file() {
-                return Err(unknown(&dir, id));
+                return Err(unknown(&dir, id)?.into());
             }
             path
         }
     };
-    let unreadable = |error| report::failed(&format!("{error}; choose a recording from `drivegate recordings list`"));
-    store::read(&path).map_err(unreadable)
+    let unreadable = |error| format!("{error}; choose a recording from `drivegate recordings list`");
+    Ok(store::read(&path).map_err(unreadable)?)
 }
 
-fn unknown(dir: &Path, id: &str) -> ExitCode {
-    let entries = match entries(dir) {
-        Ok(entries) => entries,
-        Err(code) => return code,
-    };
+fn unknown(dir: &Path, id: &str) -> Result<String, Failure> {
+    let entries = entries(dir)?;
     let remedy = match nearest(id, entries.iter().map(|entry| entry.id.as_str())) {
         Some(near) => format!("did you mean `{near}`?"),
         None => "`drivegate recordings list` lists them".to_string(),
     };
-    report::failed(&format!("there is no recording `{id}`; {}; {remedy}", dir.display()))
+    Ok(format!("there is no recording `{id}`; {}; {remedy}", dir.display()))
 }
 
-fn export(form: &Export, recording: &Recording) -> Result<ExitCode, ExitCode> {
+fn export(form: &Export, recording: &Recording) -> Outcome {
     let bytes = match form {
         Export { csv: true, .. } => export::csv(recording).into_bytes(),
         Export { pcap: true, .. } => pcapng::pcapng(recording),
@@ -164,14 +152,15 @@ fn export(form: &Export, recording: &Recording) -> Result<ExitCode, ExitCode> {
     };
     match &form.output {
         None => Ok(report::print_bytes(&bytes)),
-        Some(path) => match fs::write(path, &bytes) {
-            Ok(()) => Ok(ExitCode::SUCCESS),
-            Err(error) => {
-                let path = path.display();
-                Err(report::failed(&format!(
-                    "cannot write the export: {error}; {path}; name another file"
-                )))
-            }
-        },
+        Some(path) => {
+            let written = fs::write(path, &bytes);
+            written.map_err(|error| {
+                format!(
+                    "cannot write the export: {error}; {}; name another file",
+                    path.display()
+                )
+            })?;
+            Ok(ExitCode::SUCCESS)
+        }
     }
 }

@@ -1,11 +1,11 @@
 //! `drivegate reload`: the running gateway reads its configuration again.
 
 use std::path::Path;
-use std::process::ExitCode;
 
 use hyper::StatusCode;
 
 use super::client::{Asked, Client};
+use super::failure::{Failure, Outcome};
 use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::config::{Settings, environment};
 use crate::north::http::messages::ReloadOutcome;
@@ -22,13 +22,8 @@ pub(super) struct Args {
     config: ConfigFile,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    super::block_on(async {
-        match reload(&args.config.path).await {
-            Ok(outcome) => reported(&outcome),
-            Err(why) => report::failed(&why),
-        }
-    })
+pub(super) fn run(args: &Args) -> Outcome {
+    super::block_on(async { reported(&reload(&args.config.path).await?) })
 }
 
 async fn reload(config: &Path) -> Result<ReloadOutcome, String> {
@@ -47,15 +42,15 @@ async fn reload(config: &Path) -> Result<ReloadOutcome, String> {
     }
 }
 
-fn reported(outcome: &ReloadOutcome) -> ExitCode {
+fn reported(outcome: &ReloadOutcome) -> Outcome {
     outcome.warnings.iter().for_each(|warning| report::warning(warning));
     outcome.errors.iter().for_each(|error| report::error(error));
     if !outcome.errors.is_empty() {
         report::note("the gateway keeps the previous configuration");
-        return ExitCode::from(EXIT_CONFIG);
+        return Err(Failure::Reported(EXIT_CONFIG));
     }
-    report::print(&match outcome.changes.as_slice() {
+    Ok(report::print(&match outcome.changes.as_slice() {
         [] => "reloaded, nothing changed\n".to_string(),
         changes => changes.iter().map(|change| format!("{change}\n")).collect(),
-    })
+    }))
 }

@@ -2,12 +2,12 @@
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tokio::sync::broadcast;
 
+use super::failure::{self, Failure};
 use super::{ConfigFile, EXIT_CONFIG, EXIT_DATA, report};
 use crate::bus::listener::ListenCore;
 use crate::command::{CommandQueue, WriteStats};
@@ -47,20 +47,14 @@ pub(super) struct Args {
     bus: Option<String>,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> failure::Outcome {
     let loaded = Settings::load(&args.config.path, environment());
     let Some(settings) = &loaded.settings else {
         report::problems(&loaded);
-        return ExitCode::from(EXIT_CONFIG);
+        return Err(Failure::Reported(EXIT_CONFIG));
     };
-    let bus = match chosen(settings, args.bus.as_deref()) {
-        Ok(bus) => bus,
-        Err(message) => return report::misused(&message),
-    };
-    let file = match read(&args.capture) {
-        Ok(file) => file,
-        Err(message) => return report::failed(&message),
-    };
+    let bus = chosen(settings, args.bus.as_deref()).map_err(Failure::Misused)?;
+    let file = read(&args.capture)?;
     let packets = match capture::read(&file) {
         Ok(capture) => {
             if let Some(error) = capture.broken {
@@ -76,10 +70,10 @@ pub(super) fn run(args: &Args) -> ExitCode {
                 "cannot read the capture: {error}; {}; make it with `drivegate trace --pcap`, or in the same format",
                 args.capture.display()
             ));
-            return ExitCode::from(EXIT_DATA);
+            return Err(Failure::Reported(EXIT_DATA));
         }
     };
-    report::outcome(play(bus, &packets, settings.stale_after))
+    Ok(report::print(&play(bus, &packets, settings.stale_after)?))
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, String> {

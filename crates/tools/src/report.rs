@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use comfy_table::{CellAlignment, ContentArrangement, Table, TableComponent, presets};
 
-use super::{EXIT_FAILED, EXIT_USAGE, log, printable};
+use super::{EXIT_FAILED, log, printable};
 use crate::config::Loaded;
 use crate::document::{Finding, Problem, parse_duration};
 
@@ -41,20 +41,6 @@ pub(super) fn error(message: &str) {
 pub(super) fn failed(message: &str) -> ExitCode {
     error(message);
     ExitCode::from(EXIT_FAILED)
-}
-
-/// Reports a wrong command line.
-pub(super) fn misused(message: &str) -> ExitCode {
-    error(message);
-    ExitCode::from(EXIT_USAGE)
-}
-
-/// Prints a text, or reports why there is none.
-pub(super) fn outcome(text: Result<String, String>) -> ExitCode {
-    match text {
-        Ok(text) => print(&text),
-        Err(message) => failed(&message),
-    }
 }
 
 /// Prints a warning to stderr.

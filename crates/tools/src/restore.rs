@@ -7,11 +7,11 @@ pub(super) use self::staging::UNPACKED;
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use self::staging::Staging;
 use super::archive::{self, Manifest, Root};
 use super::client::{Asked, Client};
+use super::failure::{Failure, Outcome};
 use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::config::{Loaded, Settings, environment};
 
@@ -39,40 +39,20 @@ pub(super) struct Args {
     force: bool,
 }
 
-/// Why nothing was restored.
-enum Refused {
-    /// In words.
-    Because(String),
-    /// The configuration is invalid: its errors, as if it were in its place.
-    Configuration(Vec<String>),
-}
-
-impl From<String> for Refused {
-    fn from(why: String) -> Refused {
-        Refused::Because(why)
-    }
-}
-
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     match restore(args) {
-        Ok(text) => report::print(&text),
-        Err(Refused::Configuration(errors)) => {
-            errors.iter().for_each(|error| report::error(error));
-            report::note("nothing was restored");
-            ExitCode::from(EXIT_CONFIG)
-        }
-        Err(Refused::Because(why)) => report::failed(&format!("{why}; {}", args.file.display())),
+        Ok(text) => Ok(report::print(&text)),
+        Err(Failure::Failed(why)) => Err(format!("{why}; {}", args.file.display()).into()),
+        Err(failure) => Err(failure),
     }
 }
 
-fn restore(args: &Args) -> Result<String, Refused> {
+fn restore(args: &Args) -> Result<String, Failure> {
     let config = &args.config.path;
-    let name = config.file_name().ok_or("--config names no file".to_string())?;
+    let name = config.file_name().ok_or("--config names no file")?;
     let runtime = super::runtime()?;
     if runtime.block_on(is_running(config)) {
-        return Err(Refused::Because(
-            "the gateway is running: stop it first (systemctl stop drivegate)".to_string(),
-        ));
+        return Err("the gateway is running: stop it first (systemctl stop drivegate)".into());
     }
     let file = File::open(&args.file).map_err(|error| format!("cannot read the backup: {error}"))?;
     let base = match config.parent() {
@@ -96,14 +76,15 @@ fn restore(args: &Args) -> Result<String, Refused> {
     }
     let loaded = check(&staging, name, &manifest, base)?;
     let Some(settings) = &loaded.settings else {
-        let in_place = |text: String| {
-            text.replace(
-                &staging.of(Root::Config).display().to_string(),
-                &base.display().to_string(),
-            )
-        };
-        let errors = loaded.errors.iter().map(|error| in_place(error.to_string()));
-        return Err(Refused::Configuration(errors.collect()));
+        // As if it were in its place.
+        let [aside, base] = [staging.of(Root::Config), base].map(|dir| dir.display().to_string());
+        let errors = loaded
+            .errors
+            .iter()
+            .map(|error| error.to_string().replace(&aside, &base));
+        errors.for_each(|error| report::error(&error));
+        report::note("nothing was restored");
+        return Err(Failure::Reported(EXIT_CONFIG));
     };
     // A relative one is below the directory of the configuration, wherever that is.
     let state_dir = match settings.state_dir.strip_prefix(staging.of(Root::Config)) {
@@ -112,18 +93,17 @@ fn restore(args: &Args) -> Result<String, Refused> {
     };
     let has_state = manifest.members.iter().any(|member| member.name.starts_with("state/"));
     if has_state && absolute(&state_dir) != absolute(&args.state_dir) {
-        return Err(Refused::Because(format!(
+        let why = format!(
             "the configuration in the backup has the state directory {0}; if that is right, add --state-dir {0}",
             state_dir.display()
-        )));
+        );
+        return Err(why.into());
     }
     let exist = staging.existing();
     if !args.force && !exist.is_empty() {
         let shown: Vec<String> = exist.iter().map(|path| path.display().to_string()).collect();
-        return Err(Refused::Because(format!(
-            "these files exist already: {}; --force replaces them",
-            shown.join(", ")
-        )));
+        let shown = shown.join(", ");
+        return Err(format!("these files exist already: {shown}; --force replaces them").into());
     }
     let placed = staging.place()?;
     Ok(summary(&manifest, &placed))

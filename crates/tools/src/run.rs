@@ -13,6 +13,7 @@ use sd_notify::NotifyState;
 use tokio::runtime::{Builder, Runtime};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
+use super::failure::Outcome;
 use super::loading::Loading;
 use super::log::LogHandle;
 use super::{EXIT_CONFIG, VERSION, report};
@@ -29,12 +30,8 @@ pub(super) struct Args {
 }
 
 /// Runs the daemon until SIGTERM or SIGINT.
-pub(super) fn run(args: &Args) -> ExitCode {
-    run_from(args.config.path()).unwrap_or_else(|why| {
-        report::failed(&format!(
-            "cannot start: {why}; free memory, threads or file descriptors"
-        ))
-    })
+pub(super) fn run(args: &Args) -> Outcome {
+    Ok(run_from(args.config.path()).map_err(super::cannot_start)?)
 }
 
 fn run_from(path: &Path) -> io::Result<ExitCode> {

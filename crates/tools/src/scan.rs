@@ -8,7 +8,6 @@ mod snippet;
 pub(super) mod verdict;
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -17,7 +16,8 @@ pub(super) use self::search::{Extent, Heard, Search};
 pub(super) use self::settings::{Options, Setting, parse_port, protocols};
 pub(super) use self::snippet::{Snippet, absolute};
 use super::adapters::persistent_name;
-use super::{EXIT_CONFIG, EXIT_FAILED, report};
+use super::failure::{Failure, Outcome, negative};
+use super::report;
 use crate::bus::Mode;
 use crate::drive::profile::Profiles;
 
@@ -40,12 +40,8 @@ pub(super) struct Args {
     exhaustive: bool,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    let prepared = prepare(&args.options, &args.port);
-    let (settings, profiles) = match prepared {
-        Ok(prepared) => prepared,
-        Err(code) => return code,
-    };
+pub(super) fn run(args: &Args) -> Outcome {
+    let (settings, profiles) = prepare(&args.options, &args.port)?;
     let stop = Arc::new(AtomicBool::new(false));
     stop_on_signal(stop.clone());
     let mut search = Search::new(&args.port, &args.options, profiles, stop);
@@ -58,16 +54,10 @@ pub(super) fn run(args: &Args) -> ExitCode {
     finish(args, &settings, &search, outcome)
 }
 
-/// The settings to try and all profiles, or an exit code; what is wrong was reported.
-pub(super) fn prepare(options: &Options, port: &str) -> Result<(Vec<Setting>, Profiles), ExitCode> {
-    let settings = settings::settings(options, port).map_err(|message| report::misused(&message))?;
-    let mut profiles = Profiles::built_in();
-    let problems: Vec<_> = options.profile_dir.iter().flat_map(|dir| profiles.load(dir)).collect();
-    if !problems.is_empty() {
-        report::errors(&problems);
-        return Err(ExitCode::from(EXIT_CONFIG));
-    }
-    Ok((settings, profiles))
+/// The settings to try, and all profiles.
+pub(super) fn prepare(options: &Options, port: &str) -> Result<(Vec<Setting>, Profiles), Failure> {
+    let settings = settings::settings(options, port).map_err(Failure::Misused)?;
+    Ok((settings, super::profiles_of(&options.profile_dir)?))
 }
 
 /// Ctrl-C ends the scan; what was found is still printed.
@@ -95,15 +85,13 @@ pub(super) fn configuration(port: &str, options: &Options, search: &Search<'_>) 
     snippet.text()
 }
 
-fn finish(args: &Args, tried: &[Setting], search: &Search<'_>, outcome: Result<(), String>) -> ExitCode {
+fn finish(args: &Args, tried: &[Setting], search: &Search<'_>, outcome: Result<(), String>) -> Outcome {
     let printed = if search.found.is_empty() {
-        ExitCode::from(EXIT_FAILED)
+        negative()
     } else {
-        report::print(&configuration(&args.port, &args.options, search))
+        Ok(report::print(&configuration(&args.port, &args.options, search)))
     };
-    if let Err(message) = outcome {
-        return report::failed(&message);
-    }
+    outcome?;
     if search.found.is_empty() {
         report::error(&verdict::nobody_answers(&search.heard, &args.port));
         report::lines_to_stderr(&verdict::at_silent_drives(&search.heard, tried, &search.profiles));

@@ -1,7 +1,6 @@
 //! `drivegate schema`: JSON Schema of the configuration.
 
-use std::process::ExitCode;
-
+use super::failure::Outcome;
 use super::report;
 use crate::config::schema;
 
@@ -12,6 +11,6 @@ use crate::config::schema;
     #:schema ./drivegate.schema.json")]
 pub(super) struct Args {}
 
-pub(super) fn run(_: &Args) -> ExitCode {
-    report::print(&format!("{:#}\n", schema()))
+pub(super) fn run(_: &Args) -> Outcome {
+    Ok(report::print(&format!("{:#}\n", schema())))
 }

@@ -3,6 +3,7 @@
 mod watch;
 
 use super::addresses::{Addresses, parse_addresses};
+use super::failure::{Failure, Outcome};
 use super::{EXIT_CONFIG, report};
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{self, BusSettings, Settings, default_format};
@@ -227,14 +228,14 @@ fn parse_listen(text: &str) -> Result<SocketAddr, String> {
 }
 
 /// The simulated lines of a configuration file, each in the place of its bus's port.
-fn configured(file: &Path) -> Result<Vec<SimulatedBusOptions>, ExitCode> {
+fn configured(file: &Path) -> Result<Vec<SimulatedBusOptions>, Failure> {
     let loaded = Settings::load(file, config::environment());
     report::problems(&loaded);
-    let settings = loaded.settings.ok_or(ExitCode::from(EXIT_CONFIG))?;
+    let settings = loaded.settings.ok_or(Failure::Reported(EXIT_CONFIG))?;
     let lines: Result<Vec<SimulatedBusOptions>, String> = settings.buses.iter().map(line_of).collect();
     lines.map_err(|message| {
         report::error(&message);
-        ExitCode::from(EXIT_CONFIG)
+        Failure::Reported(EXIT_CONFIG)
     })
 }
 
@@ -254,16 +255,10 @@ fn line_of(bus: &BusSettings) -> Result<SimulatedBusOptions, String> {
 }
 
 /// Simulates until Ctrl-C or SIGTERM.
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     let lines = match &args.config {
-        Some(file) => match configured(file) {
-            Ok(lines) => lines,
-            Err(code) => return code,
-        },
-        None => match args.line() {
-            Ok(line) => vec![line],
-            Err(message) => return report::misused(&message),
-        },
+        Some(file) => configured(file)?,
+        None => vec![args.line().map_err(Failure::Misused)?],
     };
     let start = |line: SimulatedBusOptions| {
         let name = line.name.clone();
@@ -275,12 +270,12 @@ pub(super) fn run(args: &Args) -> ExitCode {
             None => format!("cannot simulate: {error}"),
         })
     };
-    let started: Result<Vec<SimulatedBus>, String> = lines.into_iter().map(start).collect();
-    let served = started.and_then(|lines| watch::serve(&lines).map_err(|error| format!("cannot simulate: {error}")));
-    match served {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(message) => report::failed(&message),
-    }
+    let lines = lines
+        .into_iter()
+        .map(start)
+        .collect::<Result<Vec<SimulatedBus>, String>>()?;
+    watch::serve(&lines).map_err(|error| format!("cannot simulate: {error}"))?;
+    Ok(ExitCode::SUCCESS)
 }
 
 impl Args {

@@ -1,11 +1,9 @@
 //! `drivegate stop-all`: stops all drives.
 
-use std::process::ExitCode;
-
-use serde_json::json;
-
 use super::client::{Asked, Gateway};
-use super::{EXIT_FAILED, printable, report};
+use super::failure::{Outcome, negative};
+use super::{printable, report};
+use crate::north::http::messages::StopBody;
 use crate::stop_all::{StopReport, Stopped};
 
 /// Stops every controlled drive through the running gateway, and waits up to 10 s for them to stop.
@@ -27,26 +25,22 @@ pub(super) struct Args {
     group: Option<String>,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     super::block_on(async {
-        match stop_all(args).await {
-            Ok(stopped) => {
-                report::print(&shown(&stopped));
-                match stopped.ok {
-                    true => ExitCode::SUCCESS,
-                    false => ExitCode::from(EXIT_FAILED),
-                }
-            }
-            Err(why) => report::failed(&why),
+        let stopped = stop_all(args).await?;
+        let printed = report::print(&shown(&stopped));
+        match stopped.ok {
+            true => Ok(printed),
+            false => negative(),
         }
     })
 }
 
 async fn stop_all(args: &Args) -> Result<StopReport, String> {
-    let scope = match (&args.bus, &args.group) {
-        (Some(bus), _) => json!({ "bus": bus }),
-        (None, Some(group)) => json!({ "group": group }),
-        (None, None) => json!({}),
+    let scope = StopBody {
+        bus: args.bus.clone(),
+        group: args.group.clone(),
+        wait_s: None,
     };
     let asked = Asked::post("/api/v1/stop", &scope).if_lost("it is unknown whether the drives stopped: check them");
     let reply = args.gateway.client()?.ask(&asked).await?;

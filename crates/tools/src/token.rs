@@ -1,9 +1,7 @@
 //! `drivegate token`: the access tokens of the HTTP server.
 
-use std::path::PathBuf;
-use std::process::ExitCode;
-
-use super::credentials_file::CredentialsFile;
+use super::credentials_file::{CredentialsFile, Filed};
+use super::failure::Outcome;
 use super::report;
 use crate::north::http::{Scope, Token};
 
@@ -52,41 +50,32 @@ enum Action {
     },
 }
 
-#[derive(Debug, clap::Args)]
-struct TokenFile {
-    /// The token file.
-    #[arg(long = "file", value_name = "FILE")]
-    path: PathBuf,
+type TokenFile = CredentialsFile<Token>;
+
+impl Filed for Token {
+    const FILE: &'static str = "token";
+    const MODE: u32 = 0o640;
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    report::outcome(match &args.action {
+pub(super) fn run(args: &Args) -> Outcome {
+    let text = match &args.action {
         Action::Add { file, scopes, name } => add(file, name, scopes),
         Action::List { file } => list(file),
-        Action::Remove { file, name } => file.open().remove::<Token>(name).map(|()| String::new()),
-    })
-}
-
-impl TokenFile {
-    fn open(&self) -> CredentialsFile<'_> {
-        CredentialsFile {
-            what: "token",
-            path: &self.path,
-            mode: 0o640,
-        }
-    }
+        Action::Remove { file, name } => file.remove(name).map(|()| String::new()),
+    };
+    Ok(report::print(&text?))
 }
 
 fn add(file: &TokenFile, name: &str, scopes: &[Scope]) -> Result<String, String> {
     let (token, secret) = Token::generate(name, scopes.to_vec())
         .map_err(|error| format!("{error}; {}; choose another name", file.path.display()))?;
-    file.open().put(&token, false)?;
+    file.put(&token, false)?;
     Ok(format!("{secret}\n"))
 }
 
 fn list(file: &TokenFile) -> Result<String, String> {
     let mut table = report::table(["name", "scopes"]);
-    for token in file.open().list::<Token>()?.list() {
+    for token in file.list()?.list() {
         let scopes: Vec<&str> = token.scopes.iter().map(|scope| scope.name()).collect();
         table.add_row([token.name.clone(), scopes.join(", ")]);
     }

@@ -13,7 +13,8 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use self::pcap::Capture;
 use super::client::{EventStream, Gateway, encoded};
-use super::{printable, report};
+use super::failure::Outcome;
+use super::printable;
 use crate::process_image::Direction;
 
 /// Interval at which the capture is flushed.
@@ -43,12 +44,10 @@ pub(super) struct Args {
     count: Option<u64>,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
     super::block_on(async {
-        match trace(args).await {
-            Ok(()) => ExitCode::SUCCESS,
-            Err(message) => report::failed(&message),
-        }
+        trace(args).await?;
+        Ok(ExitCode::SUCCESS)
     })
 }
 

@@ -4,7 +4,6 @@ mod dialog;
 mod serving;
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -13,6 +12,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use self::dialog::{check_new, choose_port};
+use super::failure::{Failure, Outcome, negative};
 use super::scan::{self, Extent, Options, Search, parse_port, verdict};
 use super::{EXIT_FAILED, report};
 
@@ -75,22 +75,19 @@ impl Stop {
     }
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    match Stop::on_signals() {
-        Ok(stop) => attempt(args, &stop).unwrap_or_else(|code| code),
-        Err(message) => report::failed(&message),
-    }
+pub(super) fn run(args: &Args) -> Outcome {
+    attempt(args, &Stop::on_signals()?)
 }
 
 /// The end before anything was found.
-fn stopped() -> ExitCode {
+fn stopped() -> Failure {
     report::note("stopped; nothing was written");
-    ExitCode::from(EXIT_FAILED)
+    Failure::Reported(EXIT_FAILED)
 }
 
-fn attempt(args: &Args, stop: &Stop) -> Result<ExitCode, ExitCode> {
+fn attempt(args: &Args, stop: &Stop) -> Outcome {
     if let Some(file) = &args.write {
-        check_new(file).map_err(|message| report::misused(&message))?;
+        check_new(file).map_err(Failure::Misused)?;
     }
     let port = match &args.port {
         Some(port) => port.clone(),
@@ -110,14 +107,14 @@ fn attempt(args: &Args, stop: &Stop) -> Result<ExitCode, ExitCode> {
         None if stop.is_wanted() => Ok(()),
         None => search.run(&settings, Extent::OneSetting),
     });
-    outcome.map_err(|message| report::failed(&message))?;
+    outcome?;
     if stop.is_wanted() {
         return Err(stopped());
     }
     if search.found.is_empty() {
-        let code = report::failed(&verdict::nobody_answers(&search.heard, &port));
+        report::error(&verdict::nobody_answers(&search.heard, &port));
         report::lines_to_stderr(&verdict::at_silent_drives(&search.heard, &settings, &search.profiles));
-        return Err(code);
+        return negative();
     }
     serving::serve(args, stop, &scan::configuration(&port, &args.options, &search))
 }

@@ -1,12 +1,11 @@
 //! `drivegate user`: the users who may command over HTTP.
 
 use std::io::{self, BufRead, IsTerminal, Read, Write};
-use std::path::PathBuf;
-use std::process::ExitCode;
 
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
 
-use super::credentials_file::CredentialsFile;
+use super::credentials_file::{CredentialsFile, Filed};
+use super::failure::Outcome;
 use super::report;
 use crate::north::http::{MAX_PASSWORD, User};
 
@@ -51,49 +50,40 @@ enum Action {
     },
 }
 
-#[derive(Debug, clap::Args)]
-struct UsersFile {
-    /// The users file.
-    #[arg(long = "file", value_name = "FILE")]
-    path: PathBuf,
+type UsersFile = CredentialsFile<User>;
+
+impl Filed for User {
+    const FILE: &'static str = "users";
+    const MODE: u32 = 0o600;
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    report::outcome(match &args.action {
+pub(super) fn run(args: &Args) -> Outcome {
+    let text = match &args.action {
         Action::Add { file, name } => add(file, name),
         Action::List { file } => list(file),
         Action::Remove { file, name } => {
-            let removed = file.open().remove::<User>(name);
+            let removed = file.remove(name);
             removed.map(|()| format!("{name} was removed; reload the gateway\n"))
         }
-    })
-}
-
-impl UsersFile {
-    fn open(&self) -> CredentialsFile<'_> {
-        CredentialsFile {
-            what: "users",
-            path: &self.path,
-            mode: 0o600,
-        }
-    }
+    };
+    Ok(report::print(&text?))
 }
 
 fn add(file: &UsersFile, name: &str) -> Result<String, String> {
     if file.path.exists() {
         // Before the password prompt.
-        file.open().list::<User>()?;
+        file.list()?;
     }
     let user =
         User::new(name, &password()?).map_err(|error| format!("{error}; {}; choose another", file.path.display()))?;
-    Ok(match file.open().put(&user, true)? {
+    Ok(match file.put(&user, true)? {
         true => format!("{name} has a new password; reload the gateway\n"),
         false => format!("{name} was added; reload the gateway\n"),
     })
 }
 
 fn list(file: &UsersFile) -> Result<String, String> {
-    let users = file.open().list::<User>()?;
+    let users = file.list()?;
     Ok(users.list().iter().map(|user| format!("{}\n", user.name)).collect())
 }
 

@@ -1,10 +1,10 @@
 //! `drivegate verify`: the form by which someone who has the drive confirms its profile.
 
 use std::fmt::Write as _;
-use std::process::ExitCode;
 use std::time::SystemTime;
 
 use super::drive_access::{OneDrive, Target};
+use super::failure::Outcome;
 use super::{printable, profiles, read, report};
 use crate::drive::{ModelPoint, Profile};
 use crate::north::http::messages::PointValue;
@@ -21,8 +21,8 @@ pub(super) struct Args {
     drive: OneDrive,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    args.drive.with(|target| report::outcome(form(target)))
+pub(super) fn run(args: &Args) -> Outcome {
+    Ok(report::print(&form(&args.drive.target()?)?))
 }
 
 fn form(target: &Target) -> Result<String, String> {

@@ -8,6 +8,7 @@ use serde_json::Value;
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::client::{Client, Gateway};
+use super::failure::Outcome;
 use super::{printable, report};
 
 /// Refresh interval.
@@ -29,16 +30,11 @@ pub(super) struct Args {
     once: bool,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    super::block_on(async {
-        match watch(args).await {
-            Ok(code) => code,
-            Err(message) => report::failed(&message),
-        }
-    })
+pub(super) fn run(args: &Args) -> Outcome {
+    super::block_on(watch(args))
 }
 
-async fn watch(args: &Args) -> Result<ExitCode, String> {
+async fn watch(args: &Args) -> Outcome {
     let client = args.gateway.viewer()?;
     let live = !args.once && io::stdout().is_terminal();
     if !live {

@@ -1,11 +1,11 @@
 //! `drivegate why`: why a drive does not run.
 
 use std::fmt::Write;
-use std::process::ExitCode;
 use std::time::Duration;
 
 use super::client::Asked;
 use super::drive_access::{Needs, OneDrive, Target};
+use super::failure::Outcome;
 use super::{printable, report};
 use crate::north::http::messages::Why;
 
@@ -25,12 +25,12 @@ pub(super) struct Args {
     json: bool,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    let shown = |why: Why| match args.json {
+pub(super) fn run(args: &Args) -> Outcome {
+    let why = why(&args.drive.target()?)?;
+    Ok(report::print(&match args.json {
         true => serde_json::to_string_pretty(&why).unwrap_or_default() + "\n",
         false => text(&args.drive.name, &why),
-    };
-    args.drive.with(|target| report::outcome(why(target).map(shown)))
+    }))
 }
 
 fn why(target: &Target) -> Result<Why, String> {

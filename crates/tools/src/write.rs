@@ -1,12 +1,11 @@
 //! `drivegate write`: one command to one drive.
 
-use std::process::ExitCode;
-
 use serde::{Deserialize, Serialize, Serializer};
 use serde_json::Value as Json;
 
 use super::client::Asked;
 use super::drive_access::{Needs, OneDrive, Target, Way, point};
+use super::failure::{Failure, Outcome};
 use super::{printable, report};
 use crate::drive::model::Kind;
 use crate::drive::{Point, Profile, RESTART_COMMUNICATION, Value};
@@ -63,17 +62,12 @@ struct WriteError {
     message: String,
 }
 
-pub(super) fn run(args: &Args) -> ExitCode {
-    args.drive.with(|target| write(args, target))
-}
-
-fn write(args: &Args, target: &Target) -> ExitCode {
+pub(super) fn run(args: &Args) -> Outcome {
+    let target = args.drive.target()?;
     let setting = |text: &String| parse(target.profile().map(|profile| &**profile), text);
     let settings: Result<Vec<Setting>, String> = args.values.iter().map(setting).collect();
-    match settings {
-        Ok(settings) => report::outcome(command(target, &settings)),
-        Err(message) => report::misused(&message),
-    }
+    let settings = settings.map_err(Failure::Misused)?;
+    Ok(report::print(&command(&target, &settings)?))
 }
 
 /// `speed_reference=50`, `run=true`, `mode=auto`.

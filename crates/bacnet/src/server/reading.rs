@@ -15,6 +15,9 @@ const LONGEST: usize = 64 * 1024;
 /// Longest time for which a device says nothing by itself.
 const QUIET: Duration = Duration::from_secs(300);
 
+/// The content of an answer, which may be none.
+type Answered = Result<Option<Vec<u8>>, Failure>;
+
 /// Why a request is not carried out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Failure {
@@ -187,13 +190,7 @@ impl Server {
         }))
     }
 
-    fn read_property(
-        &mut self,
-        device: &Device,
-        data: &[u8],
-        app: &dyn Application,
-        now: Instant,
-    ) -> Result<Option<Vec<u8>>, Failure> {
+    fn read_property(&mut self, device: &Device, data: &[u8], app: &dyn Application, now: Instant) -> Answered {
         let (id, asked) = services::read_property(data)?;
         let content = self.with_object(device, id, app, now, |of| {
             let mut content = Writer::default();
@@ -214,13 +211,7 @@ impl Server {
         }
     }
 
-    fn read_multiple(
-        &mut self,
-        device: &Device,
-        data: &[u8],
-        app: &dyn Application,
-        now: Instant,
-    ) -> Result<Option<Vec<u8>>, Failure> {
+    fn read_multiple(&mut self, device: &Device, data: &[u8], app: &dyn Application, now: Instant) -> Answered {
         let mut content = Writer::default();
         for (id, asked) in services::read_property_multiple(data)? {
             let known = self.with_object(device, id, app, now, |of| {
@@ -274,13 +265,7 @@ impl Server {
     }
 
     /// DeviceCommunicationControl: only what blocks no stop.
-    fn control(
-        &mut self,
-        device: &Device,
-        data: &[u8],
-        app: &dyn Application,
-        now: Instant,
-    ) -> Result<Option<Vec<u8>>, Failure> {
+    fn control(&mut self, device: &Device, data: &[u8], app: &dyn Application, now: Instant) -> Answered {
         let control = services::device_communication_control(data)?;
         if !app.password(control.password.as_deref().unwrap_or("")) {
             return Err(Error::PASSWORD_FAILURE.into());
@@ -309,7 +294,7 @@ impl Server {
         asked: Read<services::Subscribe>,
         app: &dyn Application,
         now: Instant,
-    ) -> Result<Option<Vec<u8>>, Failure> {
+    ) -> Answered {
         self.subscribe_to(from, device, asked?, app, now)?;
         Ok(None)
     }

@@ -245,7 +245,7 @@ impl Drills {
         state
             .proofs
             .iter()
-            .filter(|proof| proof.is_of(machine))
+            .filter(|proof| proof.machine == *machine)
             .cloned()
             .collect()
     }
@@ -259,7 +259,7 @@ impl Drills {
             let proof = state
                 .proofs
                 .iter()
-                .find(|proof| proof.kind == kind && proof.is_of(&machine));
+                .find(|proof| proof.kind == kind && proof.machine == machine);
             let age = proof.map(|proof| proof.age(time));
             let is_good = proof.is_some_and(|proof| proof.passed) && age.is_some_and(|age| age <= every);
             StopProof {
@@ -390,7 +390,8 @@ impl State {
         let (ended, proofs) = run.over();
         let machine = ended.report.machine();
         for proof in proofs {
-            self.proofs.retain(|old| old.kind != proof.kind || !old.is_of(&machine));
+            self.proofs
+                .retain(|old| old.kind != proof.kind || old.machine != machine);
             self.proofs.push(proof);
         }
         self.over(ended);

@@ -159,9 +159,9 @@ pub struct StopProof {
 /// The last completed test of a way to stop on a machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Proof {
-    port: String,
-    address: u8,
-    profile: String,
+    /// Of which machine.
+    #[serde(flatten)]
+    pub machine: Machine,
     /// Which way.
     pub kind: Kind,
     /// When it ended, ms since 1970.
@@ -174,18 +174,11 @@ impl Proof {
     pub(super) fn new(machine: &Machine, kind: Kind, at: SystemTime, passed: bool) -> Proof {
         let since = at.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         Proof {
-            port: machine.port.clone(),
-            address: machine.address,
-            profile: machine.profile.clone(),
+            machine: machine.clone(),
             kind,
             at_ms: u64::try_from(since.as_millis()).unwrap_or(u64::MAX),
             passed,
         }
-    }
-
-    /// Whether it belongs to that machine.
-    pub fn is_of(&self, machine: &Machine) -> bool {
-        self.port == machine.port && self.address == machine.address && self.profile == machine.profile
     }
 
     /// Its age at `time`; 0 if the clock was set back.
@@ -225,7 +218,7 @@ impl SavedDrills {
             let mut proofs = self
                 .proofs
                 .iter()
-                .filter(|proof| proof.kind == **kind && proof.is_of(machine));
+                .filter(|proof| proof.kind == **kind && proof.machine == *machine);
             proofs.any(|proof| proof.passed && proof.age(time) <= every)
         };
         kinds.iter().filter(|kind| !proven(kind)).copied().collect()

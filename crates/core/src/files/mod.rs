@@ -3,7 +3,7 @@
 //! - [`rotated`]: a file of lines with older ones next to it, bounded together.
 //! - [`Keeper`]: the thread that writes some of them.
 //! - [`names`]: what the gateway calls its files.
-//! - [`replace`]: a new content in the place of the old one, never a half of either.
+//! - [`read`]: what one of them has. [`replace`]: a new content in the place of the old one, never a half of either.
 
 mod keeper;
 pub mod names;
@@ -25,6 +25,21 @@ pub fn set_aside(path: &Path, aside: &Path) -> String {
         Ok(()) => format!("it is kept as {}", aside.display()),
         Err(error) => format!("it cannot be renamed ({error})"),
     }
+}
+
+/// The content of a file of at most `longest` bytes; `None` where there is no file.
+///
+/// # Errors
+/// It cannot be read, or is longer and so none of ours.
+pub fn read(path: &Path, longest: u64) -> Result<Option<Vec<u8>>, String> {
+    let length = match fs::metadata(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        metadata => metadata.map_err(|error| error.to_string())?.len(),
+    };
+    if length > longest {
+        return Err(format!("it has {length} bytes, more than {longest}"));
+    }
+    fs::read(path).map(Some).map_err(|error| error.to_string())
 }
 
 /// Puts `bytes` in the place of a file: after a power failure it has the old content or the new one. Makes its directory.

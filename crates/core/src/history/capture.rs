@@ -80,24 +80,22 @@ struct Bytes<'f> {
 }
 
 impl Bytes<'_> {
+    /// The bytes at that offset, the lowest first.
+    fn number<const N: usize>(self, at: usize) -> Result<[u8; N], CaptureError> {
+        let bytes = self.file.get(at..).and_then(|rest| rest.first_chunk());
+        let mut bytes = *bytes.ok_or_else(|| error(at, "the file ends in the middle"))?;
+        if self.big {
+            bytes.reverse();
+        }
+        Ok(bytes)
+    }
+
     fn u32(self, at: usize) -> Result<u32, CaptureError> {
-        let bytes = self.file.get(at..).and_then(|rest| rest.first_chunk::<4>());
-        let bytes = bytes.ok_or_else(|| error(at, "the file ends in the middle"))?;
-        Ok(if self.big {
-            u32::from_be_bytes(*bytes)
-        } else {
-            u32::from_le_bytes(*bytes)
-        })
+        self.number(at).map(u32::from_le_bytes)
     }
 
     fn u16(self, at: usize) -> Result<u16, CaptureError> {
-        let bytes = self.file.get(at..).and_then(|rest| rest.first_chunk::<2>());
-        let bytes = bytes.ok_or_else(|| error(at, "the file ends in the middle"))?;
-        Ok(if self.big {
-            u16::from_be_bytes(*bytes)
-        } else {
-            u16::from_le_bytes(*bytes)
-        })
+        self.number(at).map(u16::from_le_bytes)
     }
 
     /// A plausible length.

@@ -168,7 +168,7 @@ mod hexadecimal {
 
     pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Arc<[u8]>, D::Error> {
         let digits = Cow::<str>::deserialize(deserializer)?;
-        let bytes = super::bytes_of(&digits).map(Arc::from);
+        let bytes = crate::hex::decode(&digits).map(Arc::from);
         bytes.ok_or_else(|| serde::de::Error::custom("the bytes of the frame are not hexadecimal"))
     }
 }
@@ -410,13 +410,4 @@ pub fn hex(bytes: &[u8]) -> String {
         let _ = write!(digits, "{byte:02X}");
     }
     digits
-}
-
-/// The bytes of hexadecimal digits.
-fn bytes_of(hex: &str) -> Option<Vec<u8>> {
-    if !hex.is_ascii() || !hex.len().is_multiple_of(2) {
-        return None;
-    }
-    let pairs = (0..hex.len()).step_by(2).map(|at| hex.get(at..at + 2));
-    pairs.map(|pair| u8::from_str_radix(pair?, 16).ok()).collect()
 }

@@ -22,6 +22,7 @@ use std::fmt::{self, Write as _};
 use ring::digest::{SHA256, digest};
 
 use crate::drive::parameters::RawValue;
+use crate::hex;
 
 /// The first line of every file.
 const HEAD: &str = "# drivegate parameters 1";
@@ -125,7 +126,7 @@ impl ParameterFile {
     /// The application as far as it can be identified: number of parameters, and a mark of the set.
     pub fn application(&self) -> String {
         let ids: String = self.values.keys().map(|id| format!("{id}\n")).collect();
-        let mark: String = hex(digest(&SHA256, ids.as_bytes()).as_ref(), 4);
+        let mark = digest_of(&ids, 4);
         format!("{} parameters, {mark}", self.values.len())
     }
 
@@ -136,7 +137,7 @@ impl ParameterFile {
             // Writing to a string does not fail.
             let _ = writeln!(text, "{id}={}", shown(&entry.value));
         }
-        hex(digest(&SHA256, text.as_bytes()).as_ref(), CHECKSUM)
+        digest_of(&text, CHECKSUM)
     }
 
     /// Parameters that were not read.
@@ -288,8 +289,10 @@ pub(super) fn one_line(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
 }
 
-pub(super) fn hex(bytes: &[u8], count: usize) -> String {
-    bytes.iter().take(count).map(|byte| format!("{byte:02x}")).collect()
+/// The first bytes of the SHA-256 of a text.
+pub(super) fn digest_of(text: &str, count: usize) -> String {
+    let digest = digest(&SHA256, text.as_bytes());
+    hex::encode(digest.as_ref().get(..count).unwrap_or_default())
 }
 
 #[cfg(test)]

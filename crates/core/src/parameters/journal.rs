@@ -29,8 +29,6 @@ pub use on_disk::JournalFile;
 
 use std::fmt::Write as _;
 
-use ring::digest::{SHA256, digest};
-
 use super::file::{self, CHECKSUM, Id};
 use super::plan::{Handling, Need, ParameterWrite, Plan};
 use crate::drive::Profile;
@@ -335,7 +333,7 @@ fn row(line: &str) -> Option<ParameterWrite> {
 }
 
 fn checksum(text: &str) -> String {
-    file::hex(digest(&SHA256, text.as_bytes()).as_ref(), CHECKSUM)
+    file::digest_of(text, CHECKSUM)
 }
 
 #[cfg(test)]

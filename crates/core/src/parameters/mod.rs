@@ -17,7 +17,7 @@ pub use claims::{Claim, Claims, claims};
 pub use difference::{Difference, differences};
 pub use file::{Entry, FileError, Id, ParameterFile};
 pub use journal::{Journal, JournalFile, NO_IDENTIFICATION, Owner, Phase};
-pub use names::Names;
+pub use names::{Names, cells};
 pub use plan::{Handling, NOT_KNOWN, Need, ParameterWrite, Plan, Risk, Wishes, plan};
 pub use reading::{Next, Reading};
 pub use restoration::{End, Restoration, Then, Wanted};

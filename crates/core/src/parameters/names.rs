@@ -27,7 +27,10 @@ impl Names {
             if line.is_empty() || line.starts_with('#') {
                 continue;
             }
-            let fields = fields(line).ok_or_else(|| format!("line {number}: a quote is not closed"))?;
+            let (fields, closed) = cells(line, |c| matches!(c, ',' | ';'));
+            if !closed {
+                return Err(format!("line {number}: a quote is not closed"));
+            }
             let field = |index: usize| fields.get(index).map_or("", |field| field.trim());
             if number == 1 && field(0).eq_ignore_ascii_case("id") {
                 continue;
@@ -59,24 +62,24 @@ impl Names {
     }
 }
 
-/// The fields of a row; nothing where a quote is not closed.
-fn fields(line: &str) -> Option<Vec<String>> {
-    let mut all = vec![String::new()];
-    let mut quoted = false;
-    let mut characters = line.chars().peekable();
-    while let Some(character) = characters.next() {
-        let field = all.last_mut()?;
-        match character {
-            '"' if quoted && characters.peek() == Some(&'"') => {
-                characters.next();
-                field.push('"');
+/// Cells of a line of CSV, and whether all quotes are closed; a cell in quotes may have separators, and duplicate quotes in
+/// it.
+pub fn cells(line: &str, is_separator: impl Fn(char) -> bool) -> (Vec<String>, bool) {
+    let (mut cells, mut cell) = (Vec::new(), String::new());
+    let (mut quoted, mut chars) = (false, line.chars().peekable());
+    while let Some(c) = chars.next() {
+        match c {
+            '"' if quoted && chars.peek() == Some(&'"') => {
+                chars.next();
+                cell.push('"');
             }
             '"' => quoted = !quoted,
-            ',' | ';' if !quoted => all.push(String::new()),
-            other => field.push(other),
+            c if is_separator(c) && !quoted => cells.push(std::mem::take(&mut cell)),
+            c => cell.push(c),
         }
     }
-    (!quoted).then_some(all)
+    cells.push(cell);
+    (cells, !quoted)
 }
 
 #[cfg(test)]

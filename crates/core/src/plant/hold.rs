@@ -10,7 +10,6 @@ use crate::command::{
 use crate::drive::DriveIndex;
 use crate::drive::why::{Cause, Explanation};
 use crate::event::{Event, EventKind, Events};
-use crate::process_image::Machine;
 
 impl BusHandle {
     /// Whether a command of that client renews the lease of a drive.
@@ -243,12 +242,9 @@ impl Plant {
     /// Restores reservations from before the start.
     pub fn restore_reservations(&self, kept: &[KeptReservation], now: Instant, time: SystemTime) {
         for one in kept {
-            let machine = Machine {
-                port: one.port.clone(),
-                address: one.address,
-                profile: one.profile.clone(),
+            let Some(drive) = self.drive_at(&one.machine) else {
+                continue;
             };
-            let Some(drive) = self.drive_at(&machine) else { continue };
             let mut queue = drive.bus.queue.lock();
             let rules = queue.rules().cloned();
             let goes_on = rules.and_then(|rules| one.goes_on(&rules, now, time));

@@ -23,9 +23,8 @@ pub struct Saved {
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 struct SavedMotor {
-    port: String,
-    address: u8,
-    profile: String,
+    #[serde(flatten)]
+    machine: Machine,
     /// Milliseconds since 1970.
     starts: Vec<u64>,
 }
@@ -46,9 +45,7 @@ impl Saved {
             u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
         };
         let motor = |(machine, starts): (Machine, Vec<SystemTime>)| SavedMotor {
-            port: machine.port,
-            address: machine.address,
-            profile: machine.profile,
+            machine,
             starts: starts.into_iter().map(millis).collect(),
         };
         Saved {
@@ -60,17 +57,12 @@ impl Saved {
     /// Each motor with its starts.
     pub(super) fn motors(&self) -> impl Iterator<Item = (Machine, impl Iterator<Item = SystemTime> + '_)> + '_ {
         self.motors.iter().map(|motor| {
-            let machine = Machine {
-                port: motor.port.clone(),
-                address: motor.address,
-                profile: motor.profile.clone(),
-            };
             let at = |millis: &u64| {
                 // As late as the form can say, where the clock cannot.
                 let at = SystemTime::UNIX_EPOCH.checked_add(Duration::from_millis(*millis));
                 at.unwrap_or(SystemTime::UNIX_EPOCH + LATEST)
             };
-            (machine, motor.starts.iter().map(at))
+            (motor.machine.clone(), motor.starts.iter().map(at))
         })
     }
 

@@ -1,6 +1,5 @@
 //! The thread that keeps starts in the state directory. Starts wait for it, stops never.
 
-use std::fs;
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
@@ -59,19 +58,10 @@ fn report(path: &Path, done: &io::Result<()>, failing: &mut bool) {
 
 /// Loads the starts of earlier runs. An unusable file is renamed.
 fn load(path: &Path) -> Saved {
-    let read = || {
-        let length = fs::metadata(path)?.len();
-        if length > LONGEST {
-            let why = format!("it has {length} bytes, more than {LONGEST}");
-            return Err(io::Error::other(why));
-        }
-        fs::read(path)
-    };
-    let found = match read() {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Saved::default(),
-        Err(error) => Err(error.to_string()),
-        Ok(bytes) => Saved::from_json(&bytes),
-    };
+    let found = files::read(path, LONGEST).and_then(|bytes| match bytes {
+        Some(bytes) => Saved::from_json(&bytes),
+        None => Ok(Saved::default()),
+    });
     found.unwrap_or_else(|why| {
         let kept = files::set_aside(path, &path.with_extension("damaged"));
         tracing::error!(

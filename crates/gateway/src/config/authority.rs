@@ -6,13 +6,11 @@ use std::sync::Arc;
 
 use ipnet::IpNet;
 
-pub(super) use crate::command::Mode;
-
-use super::Unusable;
 use super::bus;
 use super::keys::{AUTHORITY, PRINCIPAL};
+use super::settings::Unusable;
 use super::together::Clients;
-use crate::command::{Principal, Rules};
+use crate::command::{Mode, Principal, Rules};
 use crate::document::{Finding, Reader, nearest};
 
 /// Where the system keeps its users.
@@ -22,17 +20,6 @@ const PASSWD: &str = "/etc/passwd";
 pub(super) struct Authority {
     /// None where it is off.
     pub(super) rules: Result<Option<Arc<Rules>>, Unusable>,
-}
-
-pub(super) fn parse_rank(text: &str) -> Result<String, Finding> {
-    let is_name = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
-    match !text.is_empty() && text.len() <= 64 && text.chars().all(is_name) {
-        true => Ok(text.to_string()),
-        false => Err(Finding::new(
-            format!("`{text}` is not a valid rank name"),
-            "use letters, digits, - and _",
-        )),
-    }
 }
 
 pub(super) fn read(reader: &Reader<'_>) -> Authority {

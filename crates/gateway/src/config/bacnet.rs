@@ -4,17 +4,15 @@ use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::path::Path;
 
-use super::Unusable;
 use super::bus::Found;
 use super::keys::{BACNET, DRIVE};
+use super::settings::Unusable;
 use super::{files, mqtt, values};
-use crate::document::{Finding, Place, Reader, nearest};
+use crate::document::{Place, Reader};
 use crate::north::bacnet::{Options, Secret};
 
 /// Highest instance of a device.
 const MAX_INSTANCE: u32 = 4_194_302;
-/// Port of a BBMD that is written without one.
-const PORT: u16 = 47808;
 
 /// `[bacnet]` as read.
 pub(super) struct Bacnet {
@@ -91,20 +89,6 @@ fn ipv4(reader: &Reader<'_>, listen: SocketAddr) -> Option<SocketAddrV4> {
     }
 }
 
-/// The host and port of a BBMD; none for an empty text.
-pub(super) fn parse_bbmd(text: &str) -> Result<Option<(String, u16)>, Finding> {
-    if text.is_empty() {
-        return Ok(None);
-    }
-    let bbmd = values::host_port(text, Some(PORT)).ok_or_else(|| {
-        Finding::new(
-            format!("`{text}` is not a host with a port"),
-            "write for example \"192.168.1.2:47808\", or \"\" for none",
-        )
-    });
-    bbmd.map(Some)
-}
-
 /// The password; none where there is no file.
 fn read_password(reader: &Reader<'_>, base: &Path) -> Result<Option<Secret>, Unusable> {
     let key = &BACNET.dcc_password_file;
@@ -120,17 +104,8 @@ fn read_password(reader: &Reader<'_>, base: &Path) -> Result<Option<Secret>, Unu
 /// The buses that are served; none: all.
 fn read_buses(reader: &Reader<'_>, known: &[&str]) -> Option<Vec<String>> {
     let mut names = BACNET.buses.get(reader);
-    names.retain(|name| {
-        let is_known = known.contains(&name.as_str());
-        if !is_known {
-            let remedy = match nearest(name, known.iter().copied()) {
-                Some(near) => format!("did you mean `{near}`?"),
-                None => "write names of buses, or [] for all".to_string(),
-            };
-            reader.problem(BACNET.buses.name, format!("there is no bus `{name}`"), remedy);
-        }
-        is_known
-    });
+    let remedy = "write names of buses, or [] for all";
+    values::known_buses(reader, BACNET.buses.name, &mut names, known, remedy);
     Some(names).filter(|names| !names.is_empty())
 }
 

@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use super::drive::{self, Surroundings};
 use super::keys::BUS;
-use super::{BusSettings, line, slot, values};
+use super::settings::BusSettings;
+use super::{line, slot, values};
 use crate::bus::predict::faster_points;
 use crate::bus::{BusOptions, Mode};
 use crate::codec::wire::Silence;
@@ -16,8 +17,6 @@ use crate::process_image::{Access, BusSpec, DriveSpec};
 
 /// A longer `response_timeout` causes a warning.
 const LONG_TIMEOUT: Duration = Duration::from_secs(1);
-/// Longest fixed silence.
-const MOST_SILENCE: Duration = Duration::from_secs(1);
 
 /// The settings of a bus, as far as they are valid.
 pub(super) struct Found {
@@ -260,38 +259,6 @@ fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
         );
     }
     Some(format)
-}
-
-/// N2 tries three times (reference/n2.md 4).
-pub(super) fn default_retries(protocol: Protocol) -> u32 {
-    match protocol {
-        Protocol::ModbusRtu | Protocol::ModbusAscii => 1,
-        Protocol::N2 => n2::RETRIES,
-    }
-}
-
-/// Character format of a bus without `format`. That of Modbus ASCII is that of TECO's card with all switches off
-/// (reference/drives.md 2).
-pub fn default_format(protocol: Protocol) -> &'static str {
-    match protocol {
-        Protocol::ModbusAscii => "7N2",
-        Protocol::ModbusRtu | Protocol::N2 => "8N1",
-    }
-}
-
-/// `spec`, `chars` or a duration.
-pub(super) fn parse_silence(text: &str) -> Result<Silence, Finding> {
-    match text.parse::<Silence>() {
-        Ok(Silence::Fixed(time)) if time > MOST_SILENCE => Err(Finding::new(
-            format!("{} of silence is out of range", format_duration(time)),
-            format!("write at most \"{}\"", format_duration(MOST_SILENCE)),
-        )),
-        Ok(silence) => Ok(silence),
-        Err(_) => Err(Finding::new(
-            format!("`{text}` is not a silence"),
-            "write \"spec\", \"chars\" or a duration such as \"2ms\"",
-        )),
-    }
 }
 
 fn read_silence(reader: &Reader<'_>, protocol: Protocol, format: Option<&LineFormat>) -> Silence {

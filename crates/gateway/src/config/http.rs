@@ -6,7 +6,7 @@ use std::time::SystemTime;
 
 use super::keys::HTTP;
 use super::{files, values};
-use crate::document::{Finding, Place, Reader};
+use crate::document::{Place, Reader};
 use crate::north::http::{self, Credential, Credentials, Tokens, Users};
 use crate::north::{ServerIdentity, TlsFile};
 
@@ -51,16 +51,6 @@ pub(super) fn read_http(reader: &Reader<'_>, base: &Path) -> Http {
         options,
         listener: listen.map(|listen| (listen, HTTP.listen.place(reader))),
         commands,
-    }
-}
-
-pub(super) fn parse_host(text: &str) -> Result<String, Finding> {
-    match http::is_host(text) {
-        true => Ok(text.to_string()),
-        false => Err(Finding::new(
-            format!("`{text}` is not a host name or an address"),
-            "write it without scheme and port, such as \"gateway.example.com\"",
-        )),
     }
 }
 

@@ -1,5 +1,5 @@
 //! A key of the configuration: its name, form, default and meaning. The loader reads by it, and the JSON Schema and the
-//! tables of `docs/configuration.md` are made from it. The keys themselves are in [`super::keys`].
+//! tables of `docs/configuration.md` are made from it.
 
 use std::ops::RangeInclusive;
 use std::time::Duration;
@@ -8,12 +8,12 @@ use serde_json::{Map, Value, json};
 
 use super::values::{self, NAME_LENGTH};
 use crate::codec::Protocol;
-use crate::document::{Document, Finding, FromNode, Place, Reader, ValueError, format_duration};
+use crate::document::{Document, Finding, FromNode, Place, Reader, ValueError, format_duration, parse_size};
 
 /// A number and a unit, as [`crate::document::parse_duration`] reads it.
 pub(super) const DURATION: &str = r"^\s*(\d+\.?\d*|\.\d+)\s*(us|µs|ms|s|min|m|h)\s*$";
 /// As [`crate::document::parse_size`] reads it.
-pub(super) const SIZE: &str = r"^\s*\d+\s*(B|KiB|MiB|GiB)\s*$";
+const SIZE: &str = r"^\s*\d+\s*(B|KiB|MiB|GiB)\s*$";
 
 /// A key whose value is a `T`.
 pub(super) struct Key<T: 'static> {
@@ -167,6 +167,14 @@ fn by_protocol(default: fn(Protocol) -> String) -> String {
         }
     }
     text
+}
+
+/// The name of a key whose field is a keyword of Rust is written as `r#name`.
+pub(super) const fn key_name(field: &'static str) -> &'static str {
+    match field.as_bytes() {
+        [b'r', b'#', ..] => field.split_at(2).1,
+        _ => field,
+    }
 }
 
 /// Markdown without the targets of links.
@@ -371,6 +379,41 @@ impl Form<Duration> for Time {
     fn range(&self) -> String {
         let [least, most] = [self.0.start(), self.0.end()].map(|time| format_duration(*time));
         format!("\"{least}\" to \"{most}\"")
+    }
+}
+
+/// A size of the range, bytes.
+pub(super) struct Size(pub(super) RangeInclusive<u64>);
+
+impl Form<u64> for Size {
+    fn read(&self, reader: &Reader<'_>, key: &str) -> Option<u64> {
+        let text: String = of_type(reader, key, &format!("{}, in quotes", self.range()))?;
+        let size = parse_size(&text)
+            .map_err(Finding::from)
+            .and_then(|bytes| match self.0.contains(&bytes) {
+                true => Ok(bytes),
+                false => Err(Finding::new(
+                    format!("{text} is out of range"),
+                    format!("write {}", self.range()),
+                )),
+            });
+        reader.accept(key, size)
+    }
+
+    fn schema(&self) -> Value {
+        json!({ "type": "string", "pattern": SIZE })
+    }
+
+    fn range(&self) -> String {
+        let shown = |bytes: u64| {
+            let units = [(30, "GiB"), (20, "MiB"), (10, "KiB")];
+            let unit = units.into_iter().find(|(shift, _)| bytes >> shift > 0);
+            unit.map_or_else(
+                || format!("{bytes}B"),
+                |(shift, unit)| format!("{}{unit}", bytes >> shift),
+            )
+        };
+        format!("\"{}\" to \"{}\"", shown(*self.0.start()), shown(*self.0.end()))
     }
 }
 

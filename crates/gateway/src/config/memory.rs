@@ -1,6 +1,6 @@
 //! Memory that the gateway takes at most, with every ring full.
 
-use super::{BusSettings, Settings};
+use super::settings::{BusSettings, Settings};
 use crate::history::budget::Budget;
 use crate::history::line;
 use crate::history::trend::Reach;

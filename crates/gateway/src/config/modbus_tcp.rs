@@ -9,9 +9,9 @@ use ipnet::IpNet;
 
 use super::http::Listener as Address;
 use super::key::Key;
-use super::keys::{IDLE, LISTENER, MODBUS_TCP, ROLES, TLS};
+use super::keys::{LISTENER, MODBUS_TCP, ROLES, TLS};
 use super::{files, values};
-use crate::document::{Finding, Place, Reader, nearest, parse_duration};
+use crate::document::{Place, Reader};
 use crate::north::TlsFile;
 use crate::north::modbus_tcp::{self, Identity, Role, Tls};
 
@@ -155,27 +155,12 @@ fn read_listener(reader: &Reader<'_>, inherited: &Inherited<'_>) -> modbus_tcp::
 /// Names of buses, which the file must have.
 fn read_buses(reader: &Reader<'_>, key: &Key<Vec<String>>, known: &[&str]) -> Option<Vec<String>> {
     let mut names = key.read(reader)?;
-    names.retain(|name| {
-        if known.contains(&name.as_str()) {
-            return true;
-        }
-        let remedy = match nearest(name, known.iter().copied()) {
-            Some(near) => format!("did you mean `{near}`?"),
-            None if known.is_empty() => "the file has no bus to serve".to_string(),
-            None => format!("write one of {}", known.join(", ")),
-        };
-        reader.problem(key.name, format!("there is no bus `{name}`"), remedy);
-        false
-    });
+    let remedy = match known {
+        [] => "the file has no bus to serve".to_string(),
+        known => format!("write one of {}", known.join(", ")),
+    };
+    values::known_buses(reader, key.name, &mut names, known, &remedy);
     Some(names)
-}
-
-/// A duration, or `None` for the word `off`.
-pub(super) fn parse_idle(text: &str) -> Result<Option<Duration>, Finding> {
-    match text {
-        "off" => Ok(None),
-        text => IDLE.check(parse_duration(text)?).map(Some),
-    }
 }
 
 /// `[modbus_tcp.tls]`, whose certificates may not be usable.

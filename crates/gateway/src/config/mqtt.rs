@@ -2,49 +2,18 @@
 
 use std::fs::File;
 use std::io::Read;
-use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::key::Key;
-use super::keys::{BUFFER, MQTT, MQTT_HOME_ASSISTANT, MQTT_QOS, PUBLISH, SPARKPLUG};
+use super::keys::{BUFFER, Broker, MQTT, MQTT_HOME_ASSISTANT, MQTT_QOS, PUBLISH, SPARKPLUG, TelemetryTopic};
 use super::{files, values};
-use crate::document::{Finding, FromNode, Reader, format_duration, parse_size};
+use crate::document::{Finding, FromNode, Reader, format_duration};
 use crate::north::mqtt::{self, Buffer, Options, Qos, Secret, Telemetry, sparkplug};
 use crate::north::{ServerIdentity, TlsFile};
 
 /// Most bytes of a secret: a longer file is not a password.
 const SECRET: u64 = 4096;
-
-/// Longest client id, base or id of Sparkplug, bytes: MQTT allows 65,535 for a whole topic, in which names of drives and points
-/// follow, and for a client id, to which `-sparkplug` is added.
-const LONGEST_NAME: usize = 16_384;
-/// Most levels of a base; brokers allow 200 (Mosquitto) or fewer for a whole topic.
-const MOST_LEVELS: usize = 64;
-
-/// What telemetry is published as.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum TelemetryTopic {
-    State,
-    Points,
-}
-
-/// Where a broker is.
-pub(super) struct Broker {
-    host: String,
-    port: u16,
-    tls: bool,
-}
-
-impl Broker {
-    /// Whether it is on this machine.
-    fn is_here(&self) -> bool {
-        let address: Option<IpAddr> = self.host.parse().ok();
-        address.map_or(self.host.eq_ignore_ascii_case("localhost"), |address| {
-            address.is_loopback()
-        })
-    }
-}
 
 /// Most brokers: all of them are tried within 10 s, three a second.
 const MOST_BROKERS: usize = 16;
@@ -164,70 +133,6 @@ fn read_home_assistant(reader: &Reader<'_>) -> Option<String> {
     Some(prefix)
 }
 
-pub(super) fn parse_client_id(text: &str) -> Result<String, Finding> {
-    match text {
-        "" => Err(Finding::new(
-            "the client id is empty",
-            "write a name or leave the key out",
-        )),
-        text => Ok(within_mqtt("the client id", text, LONGEST_NAME)?.to_string()),
-    }
-}
-
-/// A text as brokers take it: they close the connection for others, or must.
-fn within_mqtt<'t>(what: &str, text: &'t str, most: usize) -> Result<&'t str, Finding> {
-    let odd = |c: &char| c.is_control() || matches!(u32::from(*c), 0xFDD0..=0xFDEF) || u32::from(*c) & 0xFFFE == 0xFFFE;
-    if let Some(odd) = text.chars().find(odd) {
-        return Err(Finding::new(
-            format!("{what} contains U+{:04X}, which MQTT does not allow", u32::from(odd)),
-            "write it without control characters",
-        ));
-    }
-    match text.len() {
-        bytes if bytes > most => Err(Finding::new(
-            format!("{what} has {bytes} bytes"),
-            format!("write at most {most} bytes"),
-        )),
-        _ => Ok(text),
-    }
-}
-
-pub(super) fn parse_username(text: &str) -> Result<String, Finding> {
-    Ok(within_mqtt("the user name", text, usize::from(u16::MAX))?.to_string())
-}
-
-pub(super) fn parse_url(text: &str) -> Result<Broker, Finding> {
-    let bad = |why: &str| {
-        Finding::new(
-            format!("`{}` {why}", hidden(text)),
-            "write \"mqtt://host:port\" or \"mqtts://host:port\"",
-        )
-    };
-    let (scheme, rest) = text.split_once("://").ok_or_else(|| bad("has no scheme"))?;
-    let (tls, port) = match scheme {
-        "mqtt" => (false, 1883),
-        "mqtts" => (true, 8883),
-        _ => return Err(bad("is not an MQTT address")),
-    };
-    if rest.contains('@') {
-        return Err(Finding::new(
-            "the address contains a user",
-            "write username and password_file as separate keys",
-        ));
-    }
-    let server = rest.strip_suffix('/').unwrap_or(rest);
-    let (host, port) = values::host_port(server, Some(port)).ok_or_else(|| bad("has no valid host and port"))?;
-    Ok(Broker { host, port, tls })
-}
-
-/// The address without what may be a password.
-fn hidden(url: &str) -> String {
-    match url.rsplit_once('@') {
-        Some((_, host)) => format!("…@{host}"),
-        None => url.to_string(),
-    }
-}
-
 /// `password` or the text of `password_file`; a value from the environment overrides one from the file.
 fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Secret> {
     let (plain, file) = (MQTT.password.read(reader), MQTT.password_file.read(reader));
@@ -326,45 +231,6 @@ fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<(PathBuf, PathBuf)>
     Some((certificate?, key?))
 }
 
-pub(super) fn parse_base(text: &str) -> Result<String, Finding> {
-    let levels = || text.split('/');
-    let bad = text.contains(['+', '#', '\0']) || text.starts_with('$') || levels().any(str::is_empty);
-    if bad {
-        return Err(Finding::new(
-            format!("`{text}` cannot be the start of a topic"),
-            "write levels joined by /, none of them empty, without + and #, not starting with $",
-        ));
-    }
-    if levels().count() > MOST_LEVELS {
-        return Err(Finding::new(
-            format!("the topic has {} levels", levels().count()),
-            format!("write at most {MOST_LEVELS} levels: brokers refuse deeper topics"),
-        ));
-    }
-    Ok(within_mqtt("the topic", text, LONGEST_NAME)?.to_string())
-}
-
-pub(super) fn parse_topic(text: &str) -> Result<TelemetryTopic, Finding> {
-    match text {
-        "state" => Ok(TelemetryTopic::State),
-        "points" => Ok(TelemetryTopic::Points),
-        _ => Err(values::unknown_word(text, ["state", "points"].into_iter())),
-    }
-}
-
-pub(super) fn parse_filter(text: &str) -> Result<String, Finding> {
-    let levels: Vec<&str> = text.split('/').collect();
-    let wild = |level: &&str| level.contains(['+', '#']) && level.len() > 1;
-    let early = levels.iter().rev().skip(1).any(|level| *level == "#");
-    if text.is_empty() || text.contains('\0') || text.starts_with('$') || early || levels.iter().any(wild) {
-        return Err(Finding::new(
-            format!("`{text}` is not a topic filter"),
-            "write levels joined by /, + for any level, # at the end for all below, not starting with $",
-        ));
-    }
-    Ok(text.to_string())
-}
-
 fn read_qos(reader: &Reader<'_>) -> (Qos, Qos) {
     let qos = |level: u8| if level == 0 { Qos::AtMostOnce } else { Qos::AtLeastOnce };
     let Some(table) = MQTT.qos.table(reader) else {
@@ -454,40 +320,6 @@ fn read_sparkplug(reader: &Reader<'_>, gateway: Option<&str>, state_dir: &Path) 
     })
 }
 
-/// An id of Sparkplug is a level of topics.
-pub(super) fn parse_sparkplug_id(text: &str) -> Result<String, Finding> {
-    if text.is_empty() || text.contains(['/', '+', '#', '\0']) {
-        return Err(Finding::new(
-            format!("`{text}` cannot be an id of Sparkplug"),
-            "write one level of a topic, without /, + and #",
-        ));
-    }
-    if text == "STATE" {
-        return Err(Finding::new(
-            "`STATE` is reserved for the state of hosts",
-            "write another id",
-        ));
-    }
-    Ok(within_mqtt("the id", text, LONGEST_NAME)?.to_string())
-}
-
-pub(super) fn parse_primary_host(text: &str) -> Result<String, Finding> {
-    match text {
-        "" => Ok(String::new()),
-        id => parse_sparkplug_id(id),
-    }
-}
-
-pub(super) fn parse_buffer_size(text: &str) -> Result<u64, Finding> {
-    match parse_size(text)? {
-        bytes if ((64 << 10)..=(1 << 40)).contains(&bytes) => Ok(bytes),
-        _ => Err(Finding::new(
-            format!("{text} is out of range"),
-            format!("write {}", BUFFER.max_bytes.form.range()),
-        )),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -518,39 +350,6 @@ mod tests {
                 matches!(errors.as_slice(), [error] if error.to_string().contains(part)),
                 "{mqtt}: {errors:?}"
             );
-        }
-    }
-
-    #[test]
-    fn broker_addresses() {
-        let of = |text| parse_url(text).map(|b| (b.host, b.port, b.tls));
-        assert_eq!(of("mqtt://broker"), Ok(("broker".into(), 1883, false)));
-        assert_eq!(of("mqtts://broker/"), Ok(("broker".into(), 8883, true)));
-        assert_eq!(of("mqtt://[::1]:1884"), Ok(("::1".into(), 1884, false)));
-        for bad in [
-            "",
-            "broker",
-            "tcp://b",
-            "http://b:1",
-            "mqtt://",
-            "mqtt://b:x",
-            "mqtt://b/topic",
-        ] {
-            assert!(of(bad).is_err(), "{bad}");
-        }
-        for url in ["mqtt://me:secret@b", "x://me:secret@b"] {
-            let message = of(url).unwrap_err().to_string();
-            assert!(!message.contains("secret"), "{message}");
-        }
-    }
-
-    #[test]
-    fn topics() {
-        for good in ["drivegate", "plant/hall 2", "ä"] {
-            assert!(parse_base(good).is_ok(), "{good}");
-        }
-        for bad in ["", "/a", "a/", "a//b", "a/+", "#", "$SYS"] {
-            assert!(parse_base(bad).is_err(), "{bad}");
         }
     }
 }

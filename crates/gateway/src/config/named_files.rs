@@ -3,9 +3,10 @@
 
 use std::path::{Path, PathBuf};
 
+use super::key::Key;
 use super::keys::{BACNET, GATEWAY, HTTP, MODBUS_TCP, MQTT, ROOT, TLS};
-use super::{ENVIRONMENT, values};
-use crate::config::key::Key;
+use super::settings::ENVIRONMENT;
+use super::values;
 use crate::document::{self, Document, Reader};
 
 /// The kind of a file.

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::keys::RECORDINGS;
-use crate::document::{Finding, Reader, parse_size};
+use crate::document::Reader;
 use crate::files::names::RECORDINGS as RECORDINGS_DIR;
 use crate::history::RecorderOptions;
 
@@ -18,15 +18,4 @@ pub(super) fn read(reader: &Reader<'_>, state_dir: &Path) -> RecorderOptions {
     };
     reader.finish();
     options
-}
-
-/// Size of all recordings, bytes.
-pub(super) fn parse_size_limit(text: &str) -> Result<u64, Finding> {
-    match parse_size(text)? {
-        bytes if ((1 << 20)..=(1 << 40)).contains(&bytes) => Ok(bytes),
-        _ => Err(Finding::new(
-            format!("{text} is out of range"),
-            format!("write {}", RECORDINGS.max_bytes.form.range()),
-        )),
-    }
 }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::BusSettings;
+use super::settings::BusSettings;
 use crate::bus::stop_of_line::{BROADCAST_PAUSE, stop_of_line};
 use crate::codec::{RequestPdu, Table};
 use crate::document::Finding;

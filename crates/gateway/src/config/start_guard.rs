@@ -1,15 +1,9 @@
 //! `guard` and `interlocks` of a drive.
 
-use std::collections::BTreeSet;
-use std::sync::Arc;
-
-use super::drive::Found;
 use super::keys::{DRIVE, GUARD, INTERLOCK};
-use super::{BusSettings, bus};
-use crate::document::{Document, Place, Reader, nearest};
-use crate::drive::model::Kind;
-use crate::drive::{ModelPoint, Plan, PointIndex, Profile};
-use crate::process_image::{Access, DriveSpec};
+use crate::document::{Place, Reader};
+use crate::drive::{ModelPoint, Profile};
+use crate::process_image::Access;
 use crate::start_guard::{Guard, Interlock};
 
 /// What is configured, with the places of what other drives decide.
@@ -70,77 +64,4 @@ fn read_interlock(table: &Reader<'_>) -> Option<(Interlock, Place, Place)> {
     let ((drive, drive_at), (point, point_at)) = (drive?, point?);
     let interlock = Interlock { drive, point, is, trip };
     Some((interlock, drive_at, point_at))
-}
-
-/// Reports interlocks that can never hold, or say nothing.
-pub(super) fn check(document: &Document, buses: &[bus::Found]) {
-    let drives = || buses.iter().flat_map(|bus| &bus.drives);
-    let name = |found: &Found| found.name.as_ref().map(|(name, _)| name.clone());
-    let names: Vec<String> = drives().filter_map(name).collect();
-    for found in drives() {
-        for (interlock, drive_at, point_at) in &found.guards.interlocks {
-            if name(found).as_ref() == Some(&interlock.drive) {
-                document.problem(
-                    drive_at,
-                    format!("`{}` is an interlock on itself", interlock.drive),
-                    "name another drive; the drive itself enforces what its own points forbid",
-                );
-                continue;
-            }
-            let Some(of) = drives().find(|of| name(of).as_ref() == Some(&interlock.drive)) else {
-                let near = nearest(&interlock.drive, names.iter().map(String::as_str));
-                document.problem(
-                    drive_at,
-                    format!("there is no drive `{}`", interlock.drive),
-                    near.map_or_else(
-                        || format!("known: {}", names.join(", ")),
-                        |near| format!("did you mean `{near}`?"),
-                    ),
-                );
-                continue;
-            };
-            // A drive with a wrong profile is an error already.
-            let Some(profile) = of.spec.as_ref().map(|spec| &spec.profile) else {
-                continue;
-            };
-            if let Some((what, remedy)) = unfit(profile, &interlock.point) {
-                document.problem(point_at, what, remedy);
-            }
-        }
-    }
-}
-
-/// Why a point is not a boolean that is polled.
-fn unfit(profile: &Profile, name: &str) -> Option<(String, String)> {
-    let plan = Plan::of(profile);
-    let is_bit = |index: PointIndex| {
-        let point = profile.points.get(index);
-        point.is_some_and(|point| !point.hidden && point.kind() == Kind::Bool) && plan.shows(profile, index)
-    };
-    if profile.point_index(name).is_some_and(is_bit) {
-        return None;
-    }
-    let bits = profile.points.enumerate().filter(|(index, _)| is_bit(*index));
-    let near = nearest(name, bits.map(|(_, point)| point.name.as_str()));
-    let list = || format!("`drivegate profiles show {}` lists the points", profile.name);
-    Some((
-        format!(
-            "profile `{}` has no point `{name}` that is true or false and polled",
-            profile.name
-        ),
-        near.map_or_else(list, |near| format!("did you mean `{near}`?")),
-    ))
-}
-
-/// Lets the starts of drives count that share a `stagger` with others.
-pub(super) fn note_staggers(buses: &mut [BusSettings]) {
-    let staggers = |drive: &DriveSpec| drive.guard.is_some_and(|guard| !guard.stagger.is_zero());
-    let drives = buses.iter().flat_map(|bus| &bus.drives);
-    let groups: BTreeSet<Arc<str>> = drives
-        .filter(|drive| staggers(drive))
-        .map(DriveSpec::starts_with)
-        .collect();
-    for drive in buses.iter_mut().flat_map(|bus| &mut bus.drives) {
-        drive.staggers = drive.access != Access::Listen && groups.contains(&drive.starts_with());
-    }
 }

@@ -2,10 +2,15 @@
 
 use std::path::Path;
 use std::sync::{Arc, LazyLock};
+use std::time::Duration;
 
+use super::load::parse;
 use super::*;
+use crate::document::Problem;
+use crate::drive::profile::Profiles;
 use crate::drive::{ModelPoint, Profile};
-use crate::process_image::TriggerLimit;
+use crate::north::mqtt as mqtt_client;
+use crate::process_image::{Access, TriggerLimit};
 
 mod certificates;
 mod files;

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::keys::{DRIVE, ROOT};
-use super::{bacnet, bus, http, modbus_tcp, start_guard, unique};
+use super::{bacnet, bus, http, interlocks, modbus_tcp, unique};
 use crate::document::{Finding, Place, Reader};
 use crate::north::mqtt as mqtt_client;
 use crate::process_image::Access;
@@ -25,7 +25,7 @@ pub(super) fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients
         bacnet,
     } = *clients;
     unique::check(reader.document(), buses);
-    start_guard::check(reader.document(), buses);
+    interlocks::check(reader.document(), buses);
     // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
     if let Some(modbus_tcp) = modbus_tcp {
         unique::check_units(reader.document(), buses, &modbus_tcp.selections);

@@ -118,6 +118,19 @@ pub(super) fn both_or_none(reader: &Reader<'_>, names: [&str; 2]) {
     }
 }
 
+/// Reports names of buses that the file does not have, and removes them; `remedy` where none is near.
+pub(super) fn known_buses(reader: &Reader<'_>, key: &str, names: &mut Vec<String>, known: &[&str], remedy: &str) {
+    names.retain(|name| {
+        let is_known = known.contains(&name.as_str());
+        if !is_known {
+            let near = nearest(name, known.iter().copied()).map(|near| format!("did you mean `{near}`?"));
+            let remedy = near.unwrap_or_else(|| remedy.to_string());
+            reader.problem(key, format!("there is no bus `{name}`"), remedy);
+        }
+        is_known
+    });
+}
+
 /// `path` relative to the directory of the configuration file.
 pub(super) fn resolved(base: &Path, path: PathBuf) -> PathBuf {
     if path.is_absolute() { path } else { base.join(path) }

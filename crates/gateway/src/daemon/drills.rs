@@ -51,15 +51,8 @@ pub(super) fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, drills: &Dril
 /// # Errors
 /// It cannot be read, or is none of these.
 pub fn load(path: &Path) -> Result<Option<SavedDrills>, String> {
-    let length = match std::fs::metadata(path) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-        metadata => metadata.map_err(|error| error.to_string())?.len(),
-    };
-    if length > LONGEST {
-        return Err(format!("it has {length} bytes, more than {LONGEST}"));
-    }
-    let bytes = std::fs::read(path).map_err(|error| error.to_string())?;
-    SavedDrills::from_json(&bytes).map(Some)
+    let bytes = files::read(path, LONGEST)?;
+    bytes.map(|bytes| SavedDrills::from_json(&bytes)).transpose()
 }
 
 /// Looks at drills as long as the gateway runs, and keeps the file of them up to date.

@@ -47,11 +47,7 @@ impl Daemon {
 
     /// New drives whose parameters may be half restored take no commands but stops, before their bus starts.
     pub(super) async fn hold_unfinished(&self, settings: &Settings) {
-        let drives = settings
-            .buses
-            .iter()
-            .flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)));
-        hold_unfinished(&self.north.parameters, &self.events, drives).await;
+        hold_unfinished(&self.north.parameters, &self.events, settings.drives()).await;
     }
 
     /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.

@@ -43,15 +43,10 @@ fn path(file: &ReservationsFile) -> Option<PathBuf> {
 }
 
 fn load(path: &Path) -> Result<Vec<KeptReservation>, String> {
-    let length = match std::fs::metadata(path) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
-        metadata => metadata.map_err(|error| error.to_string())?.len(),
-    };
-    if length > LONGEST {
-        return Err(format!("it has {length} bytes, more than {LONGEST}"));
+    match files::read(path, LONGEST)? {
+        Some(text) => serde_json::from_slice(&text).map_err(|error| error.to_string()),
+        None => Ok(Vec::new()),
     }
-    let text = std::fs::read(path).map_err(|error| error.to_string())?;
-    serde_json::from_slice(&text).map_err(|error| error.to_string())
 }
 
 /// Writes them whenever they change.
@@ -66,7 +61,7 @@ pub(super) fn keep(plant: SharedPlant, file: ReservationsFile) -> tokio::task::J
             let kept = plant.load().reservations(Instant::now(), SystemTime::now());
             let now: Seen = kept
                 .iter()
-                .map(|(until, one)| (*until, one.port.clone(), one.address))
+                .map(|(until, one)| (*until, one.machine.port.clone(), one.machine.address))
                 .collect();
             let Some(path) = path(&file).filter(|_| now != seen) else {
                 continue;

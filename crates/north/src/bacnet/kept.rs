@@ -20,22 +20,11 @@ const LONGEST: u64 = 4 << 20;
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct KeptSlot {
-    port: String,
-    address: u8,
-    profile: String,
+    #[serde(flatten)]
+    machine: Machine,
     priority: u8,
     who: String,
     client: String,
-}
-
-impl KeptSlot {
-    fn machine(&self) -> Machine {
-        Machine {
-            port: self.port.clone(),
-            address: self.address,
-            profile: self.profile.clone(),
-        }
-    }
 }
 
 pub(super) fn of_plant(plant: &Plant) -> Vec<KeptSlot> {
@@ -47,9 +36,7 @@ pub(super) fn of_plant(plant: &Plant) -> Vec<KeptSlot> {
         let machine = drive.machine();
         drive.priorities(|priorities| {
             all.extend(priorities.kept().map(|(priority, entry)| KeptSlot {
-                port: machine.port.clone(),
-                address: machine.address,
-                profile: machine.profile.clone(),
+                machine: machine.clone(),
                 priority,
                 who: entry.origin.who.clone(),
                 client: entry.origin.client().to_string(),
@@ -62,7 +49,7 @@ pub(super) fn of_plant(plant: &Plant) -> Vec<KeptSlot> {
 /// Puts them into their slots again, those of drives that are there.
 pub(super) fn restore(plant: &Plant, slots: &[KeptSlot], now: Instant) {
     for slot in slots.iter().filter(|slot| (1..=PROTECTING).contains(&slot.priority)) {
-        let drive = plant.drive_at(&slot.machine());
+        let drive = plant.drive_at(&slot.machine);
         let Some(drive) = drive.filter(|drive| drive.image.spec.access == Access::Control) else {
             continue;
         };
@@ -84,16 +71,10 @@ pub(super) fn restore(plant: &Plant, slots: &[KeptSlot], now: Instant) {
 /// # Errors
 /// It cannot be read, or is none of these.
 pub(super) fn load(path: &Path) -> Result<Vec<KeptSlot>, String> {
-    let length = match std::fs::metadata(path) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
-        Err(error) => return Err(error.to_string()),
-        Ok(metadata) => metadata.len(),
-    };
-    if length > LONGEST {
-        return Err(format!("it has {length} bytes, more than {LONGEST}"));
+    match files::read(path, LONGEST)? {
+        Some(text) => serde_json::from_slice(&text).map_err(|error| error.to_string()),
+        None => Ok(Vec::new()),
     }
-    let text = std::fs::read(path).map_err(|error| error.to_string())?;
-    serde_json::from_slice(&text).map_err(|error| error.to_string())
 }
 
 /// Writes the file.
@@ -115,9 +96,11 @@ mod tests {
         let file = folder.path().join(FILE);
         assert_eq!(load(&file), Ok(Vec::new()));
         let slot = KeptSlot {
-            port: "/dev/ttyUSB0".to_string(),
-            address: 3,
-            profile: "vacon-nx".to_string(),
+            machine: Machine {
+                port: "/dev/ttyUSB0".to_string(),
+                address: 3,
+                profile: "vacon-nx".to_string(),
+            },
             priority: 1,
             who: "10.0.0.5:47808".to_string(),
             client: "bacnet 10.0.0.5".to_string(),

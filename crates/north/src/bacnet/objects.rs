@@ -12,6 +12,7 @@ use crate::drive::model::Kind as Values;
 use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, Point, PointIndex, PollClass, Source, State};
 use crate::process_image::{Access, BusSpec, DriveSpec};
+use crate::register_map::STATUS_BITS;
 
 /// Analog inputs from 1 on.
 const ANALOG: [ModelPoint; 12] = [
@@ -27,17 +28,6 @@ const ANALOG: [ModelPoint; 12] = [
     ModelPoint::Energy,
     ModelPoint::OperatingHours,
     ModelPoint::FaultCode,
-];
-/// Binary inputs from 1 on.
-const BINARY: [ModelPoint; 8] = [
-    ModelPoint::Ready,
-    ModelPoint::Running,
-    ModelPoint::Reversed,
-    ModelPoint::Fault,
-    ModelPoint::Warning,
-    ModelPoint::AtReference,
-    ModelPoint::ZeroSpeed,
-    ModelPoint::Remote,
 ];
 /// Counters: every change is reported.
 const COUNTERS: [ModelPoint; 3] = [ModelPoint::Energy, ModelPoint::OperatingHours, ModelPoint::FaultCode];
@@ -166,7 +156,8 @@ fn model(spec: &DriveSpec, all: &mut Objects) {
             );
         }
     }
-    for (number, point) in (1..).zip(BINARY) {
+    // Binary inputs from 1 on.
+    for (number, point) in (1..).zip(STATUS_BITS) {
         if let Some(index) = index(point) {
             let texts = (point.name(), describe(spec, index));
             let kind = binary(spec.profile.points.get(index));

@@ -14,4 +14,5 @@ pub(super) use self::memory::{Repetition, SharedMemory, Taken};
 pub(super) use self::request::MAX_ID;
 pub(super) use self::request::{Asked, Id, MAX_PAYLOAD, check_size, excerpt, find_id, order, refuse_unknown, resolve};
 pub(super) use self::result::CommandResult;
-pub(super) use self::stop_all::{StopBody, stop_all};
+pub use self::stop_all::StopBody;
+pub(super) use self::stop_all::stop_all;

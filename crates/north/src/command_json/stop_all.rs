@@ -2,20 +2,18 @@
 
 use std::time::Duration;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::excerpt;
 use crate::stop_all::{LONGEST_WAIT, Scope, WAIT};
 
-#[derive(Debug, Default, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct StopBody {
-    #[serde(default)]
-    bus: Option<String>,
-    #[serde(default)]
-    group: Option<String>,
-    #[serde(default)]
-    wait_s: Option<f64>,
+/// Which drives are to be stopped.
+#[derive(Debug, Default, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct StopBody {
+    pub bus: Option<String>,
+    pub group: Option<String>,
+    pub wait_s: Option<f64>,
 }
 
 /// Which drives are to be stopped, and how long the answer waits for them to stand. An empty body stops all.

@@ -7,8 +7,8 @@ use axum::extract::{FromRequest, Request};
 use axum::http::StatusCode;
 use tokio::time::timeout;
 
+use super::reached::Reached;
 use super::replies::{Refused, Replied, refused};
-use super::routes::Reached;
 use crate::command_json::MAX_PAYLOAD;
 
 /// Time limit for the body of a request, from its head on.

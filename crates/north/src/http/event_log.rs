@@ -8,9 +8,9 @@ use axum::extract::{RawQuery, State};
 use axum::response::IntoResponse;
 use serde::Serialize;
 
+use super::app_state::AppState;
 use super::query::{self, QueryError};
 use super::replies::Replied;
-use super::routes::AppState;
 use crate::event::{Before, Event, EventKind, RecordingMade, Search};
 use crate::history::{Entry, Recordings};
 

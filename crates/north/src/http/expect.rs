@@ -6,7 +6,7 @@ use axum::http::{HeaderMap, StatusCode};
 use percent_encoding::percent_decode;
 
 use super::messages::{EXPECT, Expected, ExpectedDrive, port_of};
-use super::routes::Reached;
+use super::reached::Reached;
 use crate::local::absolute;
 use crate::plant::Plant;
 

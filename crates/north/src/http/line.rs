@@ -9,8 +9,8 @@ use axum::response::IntoResponse;
 use serde::Serialize;
 
 use super::api::{self, fine_millis, rounded};
+use super::app_state::AppState;
 use super::replies::{Replied, find_bus};
-use super::routes::AppState;
 use crate::history::Clock;
 use crate::history::line::{Exchanges, Figures, LastHour, LineHistory, STEP};
 use crate::plant::BusHandle;

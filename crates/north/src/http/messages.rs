@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use serde_json::Value as Json;
 
+pub use crate::command_json::StopBody;
+use crate::drill::Kind;
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Point, Quality, Sample};
 use crate::parameters::{Plan, RestoreStage, RestoreStatus, Status};
@@ -29,6 +31,28 @@ impl ErrorReply {
             known: Vec::new(),
         }
     }
+}
+
+/// What to do with the hold of a drive.
+#[derive(Debug, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct HoldAct {
+    /// `take`, `renew`, `release` or `break`.
+    pub action: String,
+}
+
+/// The requested drill.
+#[derive(Debug, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct DrillWish {
+    /// The drive.
+    pub drive: String,
+    /// The ways; all where absent or empty.
+    #[serde(default)]
+    pub kinds: Vec<Kind>,
+    /// Speed at which the motor is stopped, %; `max_speed` of `[drill]` where absent.
+    #[serde(default)]
+    pub speed: Option<f64>,
 }
 
 /// What a client expects, in the header [`EXPECT`]: another gateway replies 421, one with another configuration 412.

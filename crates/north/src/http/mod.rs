@@ -5,21 +5,25 @@
 
 mod access;
 mod api;
+mod app_state;
 mod body;
 mod credentials;
 mod event_log;
 mod expect;
 mod hosts;
 mod in_use;
+mod limits;
 mod line;
 pub mod messages;
 mod offline;
 mod openapi;
 mod operating;
+mod options;
 mod page;
 mod params;
 mod points;
 mod query;
+mod reached;
 mod recordings;
 mod replies;
 mod routes;
@@ -34,7 +38,7 @@ mod views;
 use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use axum::Router;
@@ -52,111 +56,30 @@ use tokio_util::task::TaskTracker;
 
 use self::hosts::Host;
 use self::in_use::InUse;
+use self::limits::{ANSWERED_WITHIN, GRACE, HANDSHAKE, HEALTH, MAX_HEAD, USER_TIMEOUT};
+pub use self::limits::{MAX_CONNECTIONS, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS};
 use self::operating::Operating;
 pub(super) use self::operating::SharedReply;
 pub use self::operating::basic_authorization;
-pub(super) use self::routes::LocalUser;
-use self::routes::Reached;
+pub use self::options::Options;
+pub(super) use self::reached::LocalUser;
+use self::reached::{Client, Coverage, Reached};
 pub use self::socket_door::InProcess;
 pub(super) use self::socket_door::SocketDoor;
 use self::terms::{Terms, Tls};
-use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Limits, Newcomer};
+use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer};
 use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
 use super::log_throttle::LogThrottle;
 use super::refusals::Refusals;
-use super::{NorthState, ServerError, ServerIdentity, ServerKind, tls_words};
+use super::{NorthState, ServerError, ServerKind, tls_words};
 use crate::history::History;
 use crate::plant::{DriveHandle, SharedPlant};
-use crate::server::{self, Reconfigure};
+use crate::tcp_server::{TcpServer, TcpService};
 
 pub use self::credentials::{Credential, CredentialError, Credentials};
 pub use self::offline::Offline;
 pub use self::tokens::{Scope, Token, Tokens};
 pub use self::users::{MAX_PASSWORD, MIN_PASSWORD, User, Users};
-
-/// Maximum number of open connections. A connection whose request is incomplete, and one between two requests, yields to
-/// a newer one.
-pub const MAX_CONNECTIONS: usize = 128;
-
-/// Maximum number of open event streams; each occupies a connection for a long time.
-pub const MAX_LISTENERS: usize = 32;
-
-/// Maximum number of open event streams of one address.
-pub const MAX_LISTENERS_PER_ADDRESS: usize = 16;
-
-/// Connections beyond the limits, which are served `/healthz` and `/readyz` only: whatever the others do, these two answer.
-const HEALTH: Limits = Limits {
-    total: 8,
-    reserved: 0,
-    per_address: 4,
-};
-
-/// Time limit for the head of a request on such a connection.
-const HEALTH_HEAD_TIMEOUT: Duration = Duration::from_secs(5);
-
-/// Time limit for the head of a request, from the connection or from the previous reply on. It bounds slow senders and
-/// idle connections.
-const HEAD_TIMEOUT: Duration = Duration::from_secs(30);
-
-/// Maximum length of the head of a request, bytes.
-const MAX_HEAD: usize = 16 * 1024;
-
-/// Time after which a client that acknowledges nothing or accepts no bytes is disconnected.
-const USER_TIMEOUT: Duration = Duration::from_secs(30);
-
-/// Time limit of a TLS handshake.
-const HANDSHAKE: Duration = Duration::from_secs(10);
-
-/// Time for pending replies when the gateway stops, and for streams when a reload ends their connection.
-const GRACE: Duration = Duration::from_millis(500);
-
-/// Time for the replies to commands when a reload ends their connection: longer than any of them waits for the bus.
-const ANSWERED_WITHIN: Duration = Duration::from_secs(60);
-
-/// Configuration of the HTTP server.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Options {
-    /// Address to listen on.
-    pub listen: SocketAddr,
-    /// Names and addresses under which it is reached, in addition to its own and those of the loopback.
-    pub hosts: Vec<String>,
-    /// The tokens for reading; `None`: everything is open.
-    pub tokens: Option<Tokens>,
-    /// The users who may command; `None`: commands are off.
-    pub users: Option<Users>,
-    /// Certificate and key; `None`: without TLS.
-    pub identity: Option<ServerIdentity>,
-    /// Maximum number of open connections: [`MAX_CONNECTIONS`], or fewer where the system allows fewer open files.
-    pub max_connections: usize,
-}
-
-impl Options {
-    /// Listens on that address, open to everyone, without TLS.
-    pub fn at(listen: SocketAddr) -> Options {
-        Options {
-            listen,
-            hosts: Vec::new(),
-            tokens: None,
-            users: None,
-            identity: None,
-            max_connections: MAX_CONNECTIONS,
-        }
-    }
-
-    /// Files that the connections can have open at one time, with those that are being closed.
-    pub fn files(&self) -> usize {
-        self.limits().files() + HEALTH.files()
-    }
-
-    /// Half of the connections can be those of one address. Where commands are on, some are for addresses of users only.
-    fn limits(&self) -> Limits {
-        let limits = Limits::new(self.max_connections, self.max_connections.div_ceil(2));
-        match self.users {
-            Some(_) => limits.with_reserve(),
-            None => limits,
-        }
-    }
-}
 
 /// Whether `text` can stand in [`Options::hosts`]: a host name or an address, without a port.
 pub fn is_host(text: &str) -> bool {
@@ -164,107 +87,67 @@ pub fn is_host(text: &str) -> bool {
 }
 
 /// The running server.
+pub type Http = TcpServer<HttpService, Options>;
+
+/// What serves the clients of the listener.
 #[derive(Debug)]
-pub struct Http {
-    listeners: Listeners<HttpConnections>,
+pub struct HttpService {
     terms: Arc<ArcSwap<Terms>>,
     plant: SharedPlant,
     stats: Arc<NorthState>,
     operating: Arc<Operating>,
-    tasks: TaskTracker,
     /// Cancelled when the server ends.
     stopping: CancellationToken,
 }
 
-/// A prepared change of options for [`Http::commit`]: everything that can fail is done.
-#[derive(Debug)]
-pub struct Change {
-    options: Options,
-    sockets: NewSockets,
-    terms: Terms,
-}
-
-impl Http {
-    /// The address it listens on, with the port that the system chose if port 0 was configured.
-    pub fn address(&self) -> Option<SocketAddr> {
-        let [plain, tls] = [false, true].map(|tls| self.listeners.addresses(tls));
-        plain.into_iter().chain(tls).next()
-    }
-}
-
-impl server::Server for Http {
+impl TcpService<Options> for HttpService {
     const NAME: &'static str = "HTTP";
-    type Options = Options;
+    const KIND: ServerKind = ServerKind::Http;
+    type Handler = HttpConnections;
+    type Prepared = Terms;
 
-    /// Starts the server. It runs until `cancel`.
-    ///
-    /// # Errors
-    /// The address cannot be bound, or the certificates cannot be used.
-    async fn start(
-        options: Options,
+    fn new(
+        options: &Options,
         plant: SharedPlant,
         stats: Arc<NorthState>,
         cancel: CancellationToken,
-    ) -> Result<Http, ServerError> {
-        let cancel = cancel.child_token();
-        let tasks = server::tasks_until(&cancel);
-        let http = Http {
-            listeners: Listeners::new(ServerKind::Http, stats.clone(), tasks.clone(), cancel.clone()),
-            stopping: cancel.clone(),
-            terms: Arc::new(ArcSwap::from_pointee(Terms::new(&options)?)),
+        _: &TaskTracker,
+    ) -> Result<HttpService, ServerError> {
+        Ok(HttpService {
+            stopping: cancel,
+            terms: Arc::new(ArcSwap::from_pointee(Terms::new(options)?)),
             plant,
             operating: Arc::new(Operating::new(stats.clone())),
             stats,
-            tasks,
-        };
-        server::begun(http, options, &cancel).await
-    }
-
-    /// Takes at most half a second.
-    async fn stopped(self) {
-        self.tasks.wait().await;
-    }
-}
-
-impl Reconfigure for Http {
-    type Change = Change;
-
-    /// Prepares other options: binds a new address and checks new certificates. Nothing changes for any client.
-    ///
-    /// # Errors
-    /// The address cannot be bound, or the certificates cannot be used; everything is as before.
-    async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
-        let terms = Terms::new(&options)?;
-        let spec = ListenerSpec {
-            address: options.listen,
-            tls: options.identity.is_some(),
-            section: "[http]".to_string(),
-        };
-        Ok(Change {
-            sockets: self.listeners.prepare(vec![spec]).await?,
-            terms,
-            options,
         })
     }
 
-    /// Forgets prepared options.
-    fn abort(&mut self, change: Change) {
-        self.listeners.abort(change.sockets);
+    fn listener_specs(options: &Options) -> Vec<ListenerSpec> {
+        vec![ListenerSpec {
+            address: options.listen,
+            tls: options.identity.is_some(),
+            section: "[http]".to_string(),
+        }]
     }
 
-    /// Applies prepared options. Connections and streams end if hosts or tokens change, or the listener is another, those with a
-    /// command behind its reply; new certificates are for new connections.
-    fn commit(&mut self, change: Change) {
-        let Change {
-            options,
-            sockets,
-            terms,
-        } = change;
+    fn prepare(&self, options: &Options) -> Result<Terms, ServerError> {
+        Terms::new(options)
+    }
+
+    /// Connections and streams end if hosts or tokens change, or the listener is another, those with a command behind its
+    /// reply; new certificates are for new connections.
+    fn commit(
+        &mut self,
+        options: Options,
+        terms: Terms,
+        sockets: NewSockets,
+        listeners: &mut Listeners<HttpConnections>,
+    ) {
         terms.replace(&self.terms);
         self.operating.set_users(options.users.clone());
         let (plant, stats, terms, operating) = (&self.plant, &self.stats, &self.terms, &self.operating);
         let stopping = &self.stopping;
-        self.listeners.commit(sockets, |_, open, cancel| {
+        listeners.commit(sockets, |_, open, cancel| {
             let handler = match open {
                 Some(handler) => handler.clone(),
                 None => {
@@ -276,21 +159,11 @@ impl Reconfigure for Http {
             (handler, Handle::current())
         });
     }
-
-    /// Closes the listener and its connections, those with a command behind its reply.
-    async fn retire(&mut self) {
-        self.listeners.close().await;
-    }
-
-    /// Whether no connection is left after [`Http::retire`].
-    fn is_drained(&self) -> bool {
-        self.tasks.len() <= 1
-    }
 }
 
 /// Serves the connections of a listener.
 #[derive(Debug)]
-struct HttpConnections {
+pub(crate) struct HttpConnections {
     router: Router,
     terms: Arc<ArcSwap<Terms>>,
     limit: Arc<ConnectionLimit>,
@@ -304,27 +177,9 @@ struct HttpConnections {
 }
 
 /// The place of a connection, and its coverage.
-struct HttpPermit {
+pub(crate) struct HttpPermit {
     permit: ConnectionPermit,
     coverage: Coverage,
-}
-
-/// What a connection may request.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Coverage {
-    Everything,
-    /// `/healthz`, `/readyz` and commands of users; the rest is refused with 503.
-    Health,
-}
-
-impl Coverage {
-    /// Time limit for the head of a request.
-    fn head_timeout(self) -> Duration {
-        match self {
-            Coverage::Everything => HEAD_TIMEOUT,
-            Coverage::Health => HEALTH_HEAD_TIMEOUT,
-        }
-    }
 }
 
 impl HttpConnections {
@@ -416,7 +271,7 @@ impl HttpConnections {
             local: None,
             place: Some(place.clone()),
         };
-        let client = routes::Client {
+        let client = Client {
             address: peer.ip(),
             coverage,
         };

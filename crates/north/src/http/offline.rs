@@ -11,9 +11,9 @@ use hyper_util::service::TowerToHyperService;
 use tokio::runtime::{Builder, Runtime};
 use tokio_util::sync::CancellationToken;
 
-use super::Coverage;
 use super::operating::Operating;
-use super::routes::{self, Client, Reached};
+use super::reached::{Client, Coverage, Reached};
+use super::routes;
 use crate::plant::SharedPlant;
 
 /// An HTTP server without its socket.

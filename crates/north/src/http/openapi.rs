@@ -15,8 +15,8 @@ use utoipa::openapi::{
     ContentBuilder, InfoBuilder, ObjectBuilder, OpenApiBuilder, Paths, Ref, RefOr, Required, ResponseBuilder,
 };
 
+use super::app_state::AppState;
 use super::messages::ErrorReply;
-use super::routes::AppState;
 
 /// Where the description is.
 pub(super) const PATH: &str = "/api/v1/openapi.json";

@@ -6,11 +6,11 @@ use std::time::{Duration, Instant};
 use axum::Json;
 use axum::extract::{Path, RawQuery, State};
 
+use super::app_state::AppState;
 use super::messages::{PointValue, Word};
 use super::operating::Viewer;
 use super::query;
 use super::replies::{Replied, not_found};
-use super::routes::AppState;
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{self, Authority, Order, Origin};
 use crate::drive::{Point, PointIndex, PollClass, Profile, Quality, Raw, Sample, Source};

@@ -7,9 +7,9 @@ use axum::extract::{Path, RawQuery, State};
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 
+use super::app_state::AppState;
 use super::query::{self, QueryError};
 use super::replies::{Replied, not_found, refused};
-use super::routes::AppState;
 use crate::history::{Recording, export, pcapng};
 
 /// The forms of a recording.

@@ -5,8 +5,7 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 
 use super::messages::ErrorReply;
-use super::routes::AppState;
-use crate::plant::{BusHandle, DriveHandle, Plant};
+use crate::plant::{BusHandle, Plant};
 
 /// A reply that says why not. Boxed: it goes through many results.
 #[derive(Debug)]
@@ -62,15 +61,4 @@ pub(super) fn no_bus(plant: &Plant, name: &str) -> Refused {
 pub(super) fn find_bus<'p>(plant: &'p Plant, name: &str) -> Replied<&'p BusHandle> {
     let found = plant.buses.iter().find(|bus| bus.image.spec.name == name);
     found.ok_or_else(|| no_bus(plant, name))
-}
-
-impl AppState {
-    /// The drive of that name.
-    ///
-    /// # Errors
-    /// The reply where there is none.
-    pub(super) fn drive(&self, name: &str) -> Replied<DriveHandle> {
-        let plant = self.plant.load();
-        plant.drive(name).ok_or_else(|| no_drive(&plant, name))
-    }
 }

@@ -1,136 +1,36 @@
 //! The routes of the HTTP server.
 
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::Instant;
 
 use axum::Router;
 use axum::extract::{Extension, Request, State};
 use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
-use axum::http::{Method, StatusCode, Uri, request};
+use axum::http::{Method, StatusCode, Uri};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
-use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
-use super::access::{Access, AccessError};
-use super::hosts::Hosts;
+use super::access::AccessError;
+use super::app_state::AppState;
 use super::messages::{
-    Health, ParameterReading, PointValue, ReadParameters, Recorded, ReloadOutcome, Restore, RestoreAct, Why,
+    DrillWish, Health, HoldAct, ParameterReading, PointValue, ReadParameters, Recorded, ReloadOutcome, Restore,
+    RestoreAct, Why,
 };
 use super::openapi::{Api, Doc};
-use super::operating::{self, Cookies, Operating};
+use super::operating::{self, Operating};
 use super::params::Parameters;
-use super::replies::Replied;
-use super::{
-    Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, expect, line, page, points, recordings,
-    replies, streams, trend, views,
-};
+use super::reached::{Client, Coverage, Reached};
+use super::{api, event_log, expect, line, page, points, recordings, replies, streams, trend, views};
 use crate::NorthState;
-use crate::command::{Proof, SourceKind};
 use crate::command_json::{CommandResult, HoldReply, StopBody};
-use crate::connection_limit::{ConnectionLimit, ConnectionPlace, Limits};
 use crate::drill::DrillReport;
 use crate::history::Entry;
-use crate::local::control::Control;
-use crate::log_throttle::LogThrottle;
 use crate::plant::SharedPlant;
 use crate::stop_all::StopReport;
 
-/// The state shared by all handlers.
-#[derive(Debug)]
-pub(super) struct AppState {
-    pub(super) plant: SharedPlant,
-    pub(super) north: Arc<NorthState>,
-    pub(super) cancel: CancellationToken,
-    /// Open event streams.
-    pub(super) listeners: Arc<ConnectionLimit>,
-    /// Large replies are rendered one at a time: a client that asks for them without end has its turns like all others,
-    /// and `/healthz` does not wait for it.
-    rendering: Semaphore,
-    /// The permit for reading a recording: what waits for the disk holds up nothing else.
-    pub(super) files: Semaphore,
-    pub(super) operating: Arc<Operating>,
-}
-
-impl AppState {
-    /// A turn to render a large reply.
-    pub(super) async fn turn(&self) -> Option<SemaphorePermit<'_>> {
-        self.rendering.acquire().await.ok()
-    }
-
-    /// The cookies of this gateway, on a connection that came like that.
-    pub(super) fn cookies(&self, reached: &Reached) -> Cookies {
-        Cookies::of(&self.plant.load().gateway, reached.tls)
-    }
-}
-
-/// The client of a request.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Client {
-    pub(super) address: IpAddr,
-    pub(super) coverage: Coverage,
-}
-
-/// A user of the local socket: anyone who may open it may do everything.
-#[derive(Debug, Clone)]
-pub(crate) struct LocalUser {
-    /// The interface, as the audit shows it.
-    pub(crate) kind: SourceKind,
-    /// Likewise, the user.
-    pub(crate) who: Arc<str>,
-    /// The proof from its connection.
-    pub(crate) proof: Proof,
-    /// The gateway itself, where that has a configuration file.
-    pub(crate) control: Option<Control>,
-}
-
-/// How a request arrived, as its extension.
-#[derive(Debug, Clone)]
-pub(super) struct Reached {
-    /// The address of this machine that the client connected to.
-    pub(super) address: IpAddr,
-    pub(super) peer: SocketAddr,
-    pub(super) access: Arc<Access>,
-    /// Limits the log of refused requests.
-    pub(super) refusals: Arc<LogThrottle>,
-    /// The connection has TLS.
-    pub(super) tls: bool,
-    /// The user of the local socket; `None`: over TCP.
-    pub(super) local: Option<LocalUser>,
-    /// The place of the connection; `None` without a socket.
-    pub(super) place: Option<Arc<ConnectionPlace>>,
-}
-
 /// Only at the socket.
 const RELOAD: &str = "/api/v1/reload";
-
-impl Reached {
-    /// How the request with this head came.
-    ///
-    /// # Errors No server has reported it.
-    pub(super) fn of(head: &request::Parts) -> Replied<Reached> {
-        let reached = head.extensions.get().cloned();
-        reached.ok_or(StatusCode::INTERNAL_SERVER_ERROR.into())
-    }
-
-    /// A request of this machine that came over no network: through the local socket, or from a test of the interface.
-    pub(super) fn within(local: Option<LocalUser>, place: Option<Arc<ConnectionPlace>>) -> Reached {
-        let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
-        Reached {
-            address,
-            peer: (address, 0).into(),
-            access: Arc::new(Access {
-                hosts: Hosts::new("", &[]),
-                tokens: None,
-            }),
-            refusals: Arc::default(),
-            tls: false,
-            local,
-            place,
-        }
-    }
-}
 
 /// All routes.
 pub(super) fn router(
@@ -139,15 +39,7 @@ pub(super) fn router(
     operating: Arc<Operating>,
     cancel: CancellationToken,
 ) -> Router {
-    let app = Arc::new(AppState {
-        plant,
-        north,
-        cancel,
-        listeners: ConnectionLimit::new(Limits::new(MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS)),
-        rendering: Semaphore::new(1),
-        files: Semaphore::new(1),
-        operating,
-    });
+    let app = Arc::new(AppState::new(plant, north, operating, cancel));
     described()
         .finished()
         .fallback(views::unknown)
@@ -272,7 +164,7 @@ fn described() -> Api {
         )
         .post(
             "/api/v1/drives/{name}/hold",
-            Doc::object::<HoldReply<'_>>("Takes, renews, releases or breaks the hold").body::<operating::HoldAct>(),
+            Doc::object::<HoldReply<'_>>("Takes, renews, releases or breaks the hold").body::<HoldAct>(),
             operating::hold,
         )
         .get("/api/v1/buses", Doc::list::<api::Bus<'_>>("All buses"), views::buses)
@@ -346,7 +238,7 @@ fn described() -> Api {
         )
         .post(
             "/api/v1/drills",
-            Doc::object::<DrillReport>("Arms a drill; 201").body::<operating::DrillWish>(),
+            Doc::object::<DrillReport>("Arms a drill; 201").body::<DrillWish>(),
             operating::arm_drill,
         )
         .get(

@@ -16,9 +16,10 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use super::in_use::InUse;
+use super::limits::{GRACE, HEAD_TIMEOUT, MAX_HEAD};
 use super::operating::Operating;
-use super::routes::{self, Client, LocalUser, Reached};
-use super::{Coverage, GRACE, HEAD_TIMEOUT, MAX_HEAD};
+use super::reached::{Client, Coverage, LocalUser, Reached};
+use super::routes;
 use crate::NorthState;
 use crate::command::{Authority, Proof, SourceKind};
 use crate::connection_limit::{ConnectionLimit, ConnectionPlace, Limits, Newcomer};

@@ -20,8 +20,9 @@ use tokio::sync::broadcast;
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
 
+use super::app_state::AppState;
+use super::reached::Client;
 use super::replies::{Replied, no_bus};
-use super::routes::{AppState, Client};
 use super::{messages, query};
 use crate::codec::{Protocol, describe};
 use crate::command::Authority;

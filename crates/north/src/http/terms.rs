@@ -6,14 +6,14 @@ use arc_swap::ArcSwap;
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 
-use super::Options;
 use super::access::Access;
 use super::hosts::Hosts;
+use super::options::Options;
 use crate::{ServerError, ServerKind};
 
 /// The present terms; a reload can replace them.
 #[derive(Debug)]
-pub(super) struct Terms {
+pub(crate) struct Terms {
     pub(super) access: Arc<Access>,
     pub(super) tls: Option<Tls>,
     /// Cancelled when others have taken their place.

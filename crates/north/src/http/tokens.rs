@@ -11,6 +11,7 @@ use ring::rand::{SecureRandom, SystemRandom};
 use subtle::ConstantTimeEq;
 
 use super::credentials::{Credential, CredentialError, Credentials, checked_name};
+use crate::hex;
 
 /// Bytes of a token and of its hash.
 const BYTES: usize = 32;
@@ -73,7 +74,7 @@ impl Token {
         SystemRandom::new()
             .fill(&mut bytes)
             .map_err(|_| CredentialError::Random)?;
-        let secret = hex(&bytes);
+        let secret = hex::encode(&bytes);
         let token = Token {
             name: checked_name(name)?,
             scopes,
@@ -86,7 +87,13 @@ impl Token {
 impl fmt::Display for Token {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let scopes: Vec<&str> = self.scopes.iter().map(|scope| scope.name()).collect();
-        write!(f, "{} {} {ALGORITHM}{}", self.name, scopes.join(","), hex(&self.hash))
+        write!(
+            f,
+            "{} {} {ALGORITHM}{}",
+            self.name,
+            scopes.join(","),
+            hex::encode(&self.hash)
+        )
     }
 }
 
@@ -99,10 +106,12 @@ impl FromStr for Token {
         else {
             return Err(FORM);
         };
+        let hash = hash.strip_prefix(ALGORITHM).and_then(hex::decode);
+        let hash = hash.and_then(|bytes| bytes.try_into().ok());
         Ok(Token {
             name: checked_name(name)?,
             scopes: scopes.split(',').map(str::parse).collect::<Result<_, _>>()?,
-            hash: hash.strip_prefix(ALGORITHM).and_then(unhex).ok_or(NOT_A_HASH)?,
+            hash: hash.ok_or(NOT_A_HASH)?,
         })
     }
 }
@@ -135,26 +144,9 @@ impl Tokens {
 
 /// The SHA-256 of a secret.
 pub(super) fn hash(secret: &str) -> [u8; BYTES] {
-    let mut bytes = [0; BYTES];
+    let digest = digest(&SHA256, secret.as_bytes());
     // Both have the length of a SHA-256.
-    bytes.copy_from_slice(digest(&SHA256, secret.as_bytes()).as_ref());
-    bytes
-}
-
-/// Lower-case hexadecimal digits.
-pub(super) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-fn unhex(text: &str) -> Option<[u8; BYTES]> {
-    if text.len() != 2 * BYTES || !text.bytes().all(|byte| byte.is_ascii_hexdigit()) {
-        return None;
-    }
-    let mut bytes = [0; BYTES];
-    for (byte, digits) in bytes.iter_mut().zip(text.as_bytes().chunks(2)) {
-        *byte = u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok()?;
-    }
-    Some(bytes)
+    digest.as_ref().try_into().unwrap_or_default()
 }
 
 #[cfg(test)]

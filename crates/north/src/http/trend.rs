@@ -10,9 +10,9 @@ use axum::http::header;
 use axum::response::IntoResponse;
 use serde::{Serialize, Serializer};
 
+use super::app_state::AppState;
 use super::query::{self, QueryError};
 use super::replies::{Replied, no_drive, not_found};
-use super::routes::AppState;
 use crate::drive::ModelPoint;
 use crate::history::trend::{DriveTrend, POINTS, Part, RANGES, Range, Reach, Step};
 use crate::history::{Clock, DriveHistory};

@@ -10,10 +10,11 @@ use axum::http::header::{self, HeaderMap};
 use axum::http::{Method, StatusCode, Uri};
 use axum::response::{Html, IntoResponse, Response};
 
+use super::app_state::AppState;
 use super::messages::{Health, Why};
 use super::params::Parameters;
+use super::reached::Reached;
 use super::replies::{Replied, find_bus, no_drive, not_found, refused};
-use super::routes::{AppState, Reached};
 use super::{api, page, query};
 use crate::local::control;
 use crate::parameters::ParameterFile;

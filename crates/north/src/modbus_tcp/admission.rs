@@ -77,7 +77,7 @@ impl Policy {
 
 /// Admits clients to one listener.
 #[derive(Debug)]
-pub(super) struct Admission {
+pub(crate) struct Admission {
     /// Number of the listener, unique in the server.
     listener: usize,
     policy: ArcSwap<Policy>,

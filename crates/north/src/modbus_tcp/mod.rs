@@ -39,7 +39,7 @@ use crate::listener::{ListenerSpec, Listeners, NewSockets};
 use crate::log_throttle::LogThrottle;
 use crate::plant::SharedPlant;
 use crate::refusals::Refusals;
-use crate::server::{self, Reconfigure};
+use crate::tcp_server::{TcpServer, TcpService};
 use crate::{NorthState, ServerError, ServerKind, certificate};
 
 pub use self::offline::Offline;
@@ -114,20 +114,6 @@ impl Options {
             limits
         }
     }
-
-    fn listener_specs(&self) -> Vec<ListenerSpec> {
-        let spec = |address: &SocketAddr, tls, section: &str| ListenerSpec {
-            address: *address,
-            tls,
-            section: section.to_string(),
-        };
-        let plain = self.listeners.iter();
-        let plain = plain.flat_map(|l| l.listen.iter().map(move |address| spec(address, false, &l.section)));
-        let tls = self.tls.iter().flat_map(|tls| &tls.listen);
-        plain
-            .chain(tls.map(|address| spec(address, true, TLS_SECTION)))
-            .collect()
-    }
 }
 
 /// A listener without TLS.
@@ -155,10 +141,12 @@ pub enum Uncached {
     Refuse,
 }
 
-/// A running server.
+/// The running server.
+pub type Server = TcpServer<ModbusTcp, Options>;
+
+/// What serves the clients of the listeners.
 #[derive(Debug)]
-pub struct Server {
-    listeners: Listeners<Admission>,
+pub struct ModbusTcp {
     authenticator: Option<Arc<TlsAuthenticator>>,
     state: Arc<ServerState>,
     plant: SharedPlant,
@@ -166,102 +154,68 @@ pub struct Server {
     own: Handle,
     /// Listeners opened so far.
     opened: usize,
-    tasks: TaskTracker,
 }
 
-/// A prepared change of options for [`Server::commit`]: everything that can fail is done.
-#[derive(Debug)]
-pub struct Change {
-    options: Options,
-    sockets: NewSockets,
-    /// For the clients of the TLS listener, if it is new or its certificates, revocations or roles have changed.
-    requirements: Option<Requirements>,
-}
-
-impl Server {
-    /// The addresses without TLS, with the port that the system chose if port 0 was configured.
-    pub fn addresses(&self) -> Vec<SocketAddr> {
-        self.listeners.addresses(false)
-    }
-
-    pub fn tls_addresses(&self) -> Vec<SocketAddr> {
-        self.listeners.addresses(true)
-    }
-}
-
-impl server::Server for Server {
+impl TcpService<Options> for ModbusTcp {
     const NAME: &'static str = "Modbus TCP";
-    type Options = Options;
+    const KIND: ServerKind = ServerKind::ModbusTcp;
+    type Handler = Admission;
+    /// For the clients of the TLS listener, if it is new or its certificates, revocations or roles have changed.
+    type Prepared = Option<Requirements>;
 
-    /// Opens the listeners and serves until `cancel`; then pending requests have half a second to be answered.
-    ///
-    /// # Errors
-    /// An address cannot be bound, the certificates cannot be used, or there is no thread. No socket stays open then.
-    async fn start(
-        options: Options,
+    fn new(
+        options: &Options,
         plant: SharedPlant,
         stats: Arc<NorthState>,
         cancel: CancellationToken,
-    ) -> Result<Server, ServerError> {
-        let cancel = cancel.child_token();
-        // With its tasks the thread ends.
-        let tasks = server::tasks_until(&cancel);
-        let own = start_thread(&tasks)?;
-        let server = Server {
-            listeners: Listeners::new(ServerKind::ModbusTcp, stats.clone(), tasks.clone(), cancel.clone()),
+        tasks: &TaskTracker,
+    ) -> Result<ModbusTcp, ServerError> {
+        Ok(ModbusTcp {
             authenticator: None,
-            state: Arc::new(ServerState::new(options.clone(), stats, cancel.clone())),
+            state: Arc::new(ServerState::new(options.clone(), stats, cancel)),
             plant,
-            own,
+            // With its tasks the thread ends.
+            own: start_thread(tasks)?,
             opened: 0,
-            tasks,
-        };
-        server::begun(server, options, &cancel).await
-    }
-
-    async fn stopped(self) {
-        self.tasks.wait().await;
-    }
-}
-
-impl Reconfigure for Server {
-    type Change = Change;
-
-    /// Prepares other options: binds new addresses and checks new certificates. Nothing changes for any client.
-    ///
-    /// # Errors
-    /// An address cannot be bound, or the certificates cannot be used; everything is as before.
-    async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
-        let before = self.state.options.load_full();
-        let requirements = match (&options.tls, &before.tls) {
-            (Some(tls), Some(before)) if self.authenticator.is_some() && tls.admits_like(before) => None,
-            (Some(tls), _) => {
-                let requirements = Requirements::new(tls);
-                Some(requirements.map_err(|fault| ServerError::Tls(ServerKind::ModbusTcp.title(), fault))?)
-            }
-            (None, _) => None,
-        };
-        Ok(Change {
-            requirements,
-            sockets: self.listeners.prepare(options.listener_specs()).await?,
-            options,
         })
     }
 
-    /// Forgets prepared options.
-    fn abort(&mut self, change: Change) {
-        self.listeners.abort(change.sockets);
+    fn listener_specs(options: &Options) -> Vec<ListenerSpec> {
+        let spec = |address: &SocketAddr, tls, section: &str| ListenerSpec {
+            address: *address,
+            tls,
+            section: section.to_string(),
+        };
+        let plain = options.listeners.iter();
+        let plain = plain.flat_map(|l| l.listen.iter().map(move |address| spec(address, false, &l.section)));
+        let tls = options.tls.iter().flat_map(|tls| &tls.listen);
+        plain
+            .chain(tls.map(|address| spec(address, true, TLS_SECTION)))
+            .collect()
+    }
+
+    fn prepare(&self, options: &Options) -> Result<Option<Requirements>, ServerError> {
+        let before = self.state.options.load_full();
+        match (&options.tls, &before.tls) {
+            (Some(tls), Some(before)) if self.authenticator.is_some() && tls.admits_like(before) => Ok(None),
+            (Some(tls), _) => match Requirements::new(tls) {
+                Ok(requirements) => Ok(Some(requirements)),
+                Err(fault) => Err(ServerError::Tls(ServerKind::ModbusTcp.title(), fault)),
+            },
+            (None, _) => Ok(None),
+        }
     }
 
     /// Applies prepared options. Listeners that stay keep their connections, as far as the options allow them; their
     /// rights are those of the new options from then on. TLS clients whose certificate is not admitted with the same
     /// rights are disconnected.
-    fn commit(&mut self, change: Change) {
-        let Change {
-            options,
-            sockets,
-            requirements,
-        } = change;
+    fn commit(
+        &mut self,
+        options: Options,
+        requirements: Option<Requirements>,
+        sockets: NewSockets,
+        listeners: &mut Listeners<Admission>,
+    ) {
         match (&self.authenticator, requirements) {
             (_, None) if options.tls.is_none() => self.authenticator = None,
             (_, None) => {}
@@ -278,7 +232,7 @@ impl Reconfigure for Server {
         let (plant, state, own, tls) = (&self.plant, &self.state, &self.own, &self.authenticator);
         let mut plain = options.listeners.iter().flat_map(|l| l.listen.iter().map(move |_| l));
         let opened = &mut self.opened;
-        self.listeners.commit(sockets, |spec, open, cancel| {
+        listeners.commit(sockets, |spec, open, cancel| {
             let (policy, buses) = match (spec.tls, tls, &options.tls) {
                 (true, Some(authenticator), Some(tls)) => (
                     Policy {
@@ -308,16 +262,6 @@ impl Reconfigure for Server {
             };
             (admission, runtime)
         });
-    }
-
-    /// Closes all listeners and their connections; requests that wait for the bus are answered.
-    async fn retire(&mut self) {
-        self.listeners.close().await;
-    }
-
-    /// Whether no connection is left after [`Server::retire`].
-    fn is_drained(&self) -> bool {
-        self.tasks.len() <= 1
     }
 }
 

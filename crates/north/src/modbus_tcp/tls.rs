@@ -137,7 +137,7 @@ impl Identity {
 
 /// The requirements for client certificates.
 #[derive(Debug)]
-pub(super) struct Requirements {
+pub(crate) struct Requirements {
     config: Arc<ServerConfig>,
     verifier: Arc<dyn ClientCertVerifier>,
     roles: BTreeMap<String, Role>,

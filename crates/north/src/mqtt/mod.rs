@@ -203,18 +203,6 @@ impl Buffer {
 #[derive(Debug, Default)]
 pub struct Mqtt(Vec<JoinHandle<()>>);
 
-impl Mqtt {
-    /// Waits until the client has ended: at most about half a second after the cancellation, in which it publishes
-    /// `offline` and disconnects.
-    pub async fn stopped(self) {
-        for task in self.0 {
-            if let Err(error) = task.await {
-                tracing::error!(target: "drivegate::north::mqtt", "the MQTT client ended unexpectedly: {error}");
-            }
-        }
-    }
-}
-
 impl server::Server for Mqtt {
     const NAME: &'static str = "MQTT";
     // Commands that are in progress come first: its successor would be another client at the broker.
@@ -230,8 +218,13 @@ impl server::Server for Mqtt {
         Ok(start(options, plant, stats, cancel))
     }
 
+    /// At most about half a second after the cancellation, in which it publishes `offline` and disconnects.
     async fn stopped(self) {
-        self.stopped().await;
+        for task in self.0 {
+            if let Err(error) = task.await {
+                tracing::error!(target: "drivegate::north::mqtt", "the MQTT client ended unexpectedly: {error}");
+            }
+        }
     }
 }
 

@@ -35,7 +35,7 @@ impl Served {
 
 /// The handler of one address.
 #[derive(Debug)]
-pub(super) struct SlotListener {
+pub(crate) struct SlotListener {
     number: usize,
     served: ArcSwapOption<Served>,
     limit: Arc<ConnectionLimit>,

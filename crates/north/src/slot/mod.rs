@@ -31,7 +31,7 @@ use super::refusals::Refusals;
 use super::{NorthState, ServerError, ServerKind};
 use crate::codec::{LineFormat, Protocol};
 use crate::plant::SharedPlant;
-use crate::server::{self, Reconfigure};
+use crate::tcp_server::{TcpServer, TcpService};
 
 pub use self::offline::Offline;
 
@@ -118,17 +118,6 @@ impl Options {
             |slot: &Slot| slot.addresses().count() * (1 + limits().files()) + 2 * usize::from(slot.pty.is_some());
         self.slots.iter().map(files).sum()
     }
-
-    fn listener_specs(&self) -> Vec<ListenerSpec> {
-        let specs = self.slots.iter().flat_map(|slot| {
-            slot.addresses().map(move |(address, _)| ListenerSpec {
-                address,
-                tls: false,
-                section: format!("[[bus.slot]] of bus `{}`", slot.bus),
-            })
-        });
-        specs.collect()
-    }
 }
 
 fn limits() -> Limits {
@@ -136,9 +125,11 @@ fn limits() -> Limits {
 }
 
 /// The running slots.
+pub type Server = TcpServer<Slots, Options>;
+
+/// What serves the tools of the listeners and pseudo-terminals.
 #[derive(Debug)]
-pub struct Server {
-    listeners: Listeners<SlotListener>,
+pub struct Slots {
     ptys: Vec<RunningPty>,
     plant: SharedPlant,
     stats: Arc<NorthState>,
@@ -156,19 +147,7 @@ struct RunningPty {
     cancel: CancellationToken,
 }
 
-/// A prepared change of options for [`Server::commit`]: everything that can fail is done.
-#[derive(Debug)]
-pub struct Change {
-    options: Options,
-    sockets: NewSockets,
-}
-
-impl Server {
-    /// The addresses of the slots, with the port that the system chose if port 0 was configured.
-    pub fn addresses(&self) -> Vec<SocketAddr> {
-        self.listeners.addresses(false)
-    }
-
+impl Slots {
     fn commit_ptys(&mut self, all: &[Arc<Terms>]) {
         let wanted = |slot: &Slot| all.iter().any(|terms| terms.slot == *slot);
         self.ptys.retain(|pty| {
@@ -194,61 +173,48 @@ impl Server {
     }
 }
 
-impl server::Server for Server {
+impl TcpService<Options> for Slots {
     const NAME: &'static str = "the tool slots";
-    type Options = Options;
+    const KIND: ServerKind = ServerKind::Slot;
+    type Handler = SlotListener;
+    type Prepared = ();
 
-    /// Opens the slots and serves until `cancel`.
-    ///
-    /// # Errors
-    /// An address cannot be bound. No socket stays open then.
-    async fn start(
-        options: Options,
+    fn new(
+        _: &Options,
         plant: SharedPlant,
         stats: Arc<NorthState>,
         cancel: CancellationToken,
-    ) -> Result<Server, ServerError> {
-        let cancel = cancel.child_token();
-        let tasks = server::tasks_until(&cancel);
-        let server = Server {
-            listeners: Listeners::new(ServerKind::Slot, stats.clone(), tasks.clone(), cancel.clone()),
+        tasks: &TaskTracker,
+    ) -> Result<Slots, ServerError> {
+        Ok(Slots {
             ptys: Vec::new(),
             plant,
             paces: Arc::default(),
             refusals: Arc::new(Refusals::new(ServerKind::Slot, stats.clone())),
             stats,
             opened: 0,
-            tasks,
-            cancel: cancel.clone(),
-        };
-        server::begun(server, options, &cancel).await
+            tasks: tasks.clone(),
+            cancel,
+        })
     }
 
-    async fn stopped(self) {
-        self.tasks.wait().await;
-    }
-}
-
-impl Reconfigure for Server {
-    type Change = Change;
-
-    /// Prepares other slots: binds new addresses. Nothing changes for any tool.
-    ///
-    /// # Errors
-    /// An address cannot be bound; everything is as before.
-    async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
-        let sockets = self.listeners.prepare(options.listener_specs()).await?;
-        Ok(Change { options, sockets })
+    fn listener_specs(options: &Options) -> Vec<ListenerSpec> {
+        let specs = options.slots.iter().flat_map(|slot| {
+            slot.addresses().map(move |(address, _)| ListenerSpec {
+                address,
+                tls: false,
+                section: format!("[[bus.slot]] of bus `{}`", slot.bus),
+            })
+        });
+        specs.collect()
     }
 
-    /// Forgets prepared slots.
-    fn abort(&mut self, change: Change) {
-        self.listeners.abort(change.sockets);
+    fn prepare(&self, _: &Options) -> Result<(), ServerError> {
+        Ok(())
     }
 
-    /// Applies prepared slots. Tools of a slot that serves as before stay connected.
-    fn commit(&mut self, change: Change) {
-        let Change { options, sockets } = change;
+    /// Tools of a slot that serves as before stay connected.
+    fn commit(&mut self, options: Options, (): (), sockets: NewSockets, listeners: &mut Listeners<SlotListener>) {
         let terms = |slot: &Slot| {
             Arc::new(Terms {
                 slot: slot.clone(),
@@ -268,7 +234,7 @@ impl Reconfigure for Server {
         });
         let (opened, refusals, stopping) = (&mut self.opened, &self.refusals, &self.cancel);
         let mut first = None;
-        self.listeners.commit(sockets, |_, open, cancel| {
+        listeners.commit(sockets, |_, open, cancel| {
             let served = served.next().or_else(|| first.clone());
             first = first.take().or_else(|| served.clone());
             let listener = match (open, served) {
@@ -292,14 +258,7 @@ impl Reconfigure for Server {
         self.commit_ptys(&all);
     }
 
-    /// Closes all slots; pending requests of tools complete.
-    async fn retire(&mut self) {
-        self.listeners.close().await;
+    fn retire(&mut self) {
         self.ptys.drain(..).for_each(|pty| pty.cancel.cancel());
-    }
-
-    /// Whether no tool is left after [`Server::retire`].
-    fn is_drained(&self) -> bool {
-        self.tasks.len() <= 1
     }
 }

@@ -13,6 +13,7 @@ use tokio::net::unix::pipe;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
+use super::connection::sleep_until;
 use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
 use crate::command::Proof;
@@ -144,12 +145,5 @@ impl Port {
         if written < answer.len() {
             self.pty.discard_unread();
         }
-    }
-}
-
-async fn sleep_until(at: Option<Instant>) {
-    match at {
-        Some(at) => tokio::time::sleep_until(at).await,
-        None => std::future::pending().await,
     }
 }

@@ -2,6 +2,7 @@
 
 use super::assumptions::RegionWidth;
 use super::object::{Object, Region};
+use crate::ascii::digit;
 
 /// The drive has restarted and waits for Identify.
 pub const RESTARTED: u8 = 0x00;
@@ -304,10 +305,6 @@ fn put_object(object: Object, width: RegionWidth, out: &mut Vec<u8>) {
 
 fn put(byte: u8, out: &mut Vec<u8>) {
     out.extend([digit(byte >> 4), digit(byte & 0x0F)]);
-}
-
-fn digit(nibble: u8) -> u8 {
-    if nibble < 10 { b'0' + nibble } else { b'A' + nibble - 10 }
 }
 
 /// The value of a digit.

@@ -2,10 +2,10 @@
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use super::export::quoted;
 use crate::config::Settings;
+use crate::failure::{Failure, Outcome};
 use crate::files;
 use crate::north::bacnet::ede::{self, Ede};
 use crate::north::bacnet::listing::{self, COLUMNS, Line};
@@ -20,17 +20,16 @@ pub(crate) fn devices(settings: &Settings) -> Option<Vec<Shown>> {
 }
 
 /// Prints the objects, and writes the tables where they are wanted.
-pub(super) fn run(settings: &Settings, csv: bool, ede: Option<&Path>) -> ExitCode {
+pub(super) fn run(settings: &Settings, csv: bool, ede: Option<&Path>) -> Outcome {
     let Some(devices) = devices(settings) else {
-        return report::misused("no BACnet objects; --bacnet; add [bacnet] to the configuration");
+        let why = "no BACnet objects; --bacnet; add [bacnet] to the configuration";
+        return Err(Failure::Misused(why.to_string()));
     };
-    if let Some(path) = ede
-        && let Err(why) = write(path, &ede::tables(&settings.gateway, &devices))
-    {
-        return report::failed(&why);
+    if let Some(path) = ede {
+        write(path, &ede::tables(&settings.gateway, &devices))?;
     }
     let lines = listing::lines(&devices);
-    report::print(&if csv { as_csv(&lines) } else { as_text(&lines) })
+    Ok(report::print(&if csv { as_csv(&lines) } else { as_text(&lines) }))
 }
 
 fn as_csv(lines: &[Line]) -> String {

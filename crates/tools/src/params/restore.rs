@@ -6,8 +6,9 @@ use std::process::ExitCode;
 
 use super::super::client::Gateway;
 use super::super::drive_access::target;
+use super::super::failure::{Failure, Outcome, negative};
 use super::super::{EXIT_FAILED, EXIT_USAGE, report};
-use super::{StatusLine, read_file, read_from_drive};
+use super::{StatusLine, read_from_drive, read_written};
 use crate::north::http::messages::{ReadParameters, Restore, RestoreAct, Stage};
 use crate::parameters::{Entry, Id, ParameterFile};
 
@@ -52,7 +53,7 @@ pub(super) struct How {
     dry_run: bool,
 }
 
-pub(super) fn restore(gateway: &Gateway, args: &RestoreArgs) -> Result<ExitCode, ExitCode> {
+pub(super) fn restore(gateway: &Gateway, args: &RestoreArgs) -> Outcome {
     let again = [
         (&args.resume, Some(RestoreAct::Resume)),
         (&args.undo, Some(RestoreAct::Undo)),
@@ -66,18 +67,16 @@ pub(super) fn restore(gateway: &Gateway, args: &RestoreArgs) -> Result<ExitCode,
     }
     // clap has made sure of both.
     let (Some(file), Some(drive)) = (&args.file, &args.drive) else {
-        return Err(ExitCode::from(EXIT_USAGE));
+        return Err(Failure::Reported(EXIT_USAGE));
     };
-    let file =
-        read_file(file).map_err(|why| report::failed(&format!("{why}; name a file that `params read` wrote")))?;
-    write(gateway, &file, drive, &args.how)
+    write(gateway, &read_written(file)?, drive, &args.how)
 }
 
 /// Reads one drive and restores that to another.
-pub(super) fn clone(gateway: &Gateway, from: &str, to: &str, how: &How) -> Result<ExitCode, ExitCode> {
+pub(super) fn clone(gateway: &Gateway, from: &str, to: &str, how: &How) -> Outcome {
     if from == to {
         let why = "a drive cannot be cloned to itself; command line; name two drives";
-        return Err(report::misused(why));
+        return Err(Failure::Misused(why.to_string()));
     }
     let brisk = ReadParameters {
         brisk: true,
@@ -87,7 +86,7 @@ pub(super) fn clone(gateway: &Gateway, from: &str, to: &str, how: &How) -> Resul
     write(gateway, &file, to, how)
 }
 
-fn write(gateway: &Gateway, file: &ParameterFile, drive: &str, how: &How) -> Result<ExitCode, ExitCode> {
+fn write(gateway: &Gateway, file: &ParameterFile, drive: &str, how: &How) -> Outcome {
     let act = RestoreAct::Prepare {
         file: without_notes(file).text(),
         only: how.only.clone(),
@@ -109,7 +108,7 @@ fn without_notes(file: &ParameterFile) -> ParameterFile {
     }
 }
 
-fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> Result<ExitCode, ExitCode> {
+fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> Outcome {
     let target = target(gateway, drive)?;
     let line = std::cell::RefCell::new(StatusLine::default());
     let mut refused_to_write = None;
@@ -120,8 +119,8 @@ fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> 
         shown.set(true);
         match agrees(drive, how) {
             Ok(()) => true,
-            Err(code) => {
-                refused_to_write = Some(code);
+            Err(why) => {
+                refused_to_write = Some(why);
                 false
             }
         }
@@ -141,10 +140,10 @@ fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> 
     };
     let ended = target.restore_parameters(act, agreed, progress);
     line.borrow().end();
-    if let Some(code) = refused_to_write {
-        return Ok(code);
+    if let Some(why) = refused_to_write {
+        return Err(why);
     }
-    let ended = ended.map_err(|why| report::failed(&why))?;
+    let ended = ended?;
     let text = ended.text.clone().unwrap_or_default();
     match ended.stage {
         Stage::Done => {
@@ -158,13 +157,13 @@ fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> 
             for reason in &ended.reasons {
                 report::error(reason);
             }
-            Err(ExitCode::from(EXIT_FAILED))
+            negative()
         }
         Stage::Prepared => {
             report::note(&format!("a restore to `{drive}` is prepared, and nothing was written"));
             Ok(ExitCode::SUCCESS)
         }
-        _ => Err(report::failed(&text)),
+        _ => Err(text.into()),
     }
 }
 
@@ -181,19 +180,20 @@ fn told(prepared: &Restore) -> String {
 /// Whether what is prepared is to be written.
 ///
 /// # Errors
-/// The exit code where it is not.
-fn agrees(drive: &str, how: &How) -> Result<(), ExitCode> {
+/// Why it is not; without a message where only the plan was wanted.
+fn agrees(drive: &str, how: &How) -> Result<(), Failure> {
     if how.dry_run {
-        return Err(ExitCode::SUCCESS);
+        return Err(Failure::Reported(0));
     }
     if how.yes {
         return Ok(());
     }
     let (stdin, mut stderr) = (std::io::stdin(), std::io::stderr());
     if !stdin.is_terminal() || !stderr.is_terminal() {
-        return Err(report::failed(
-            "nothing was written: there is no terminal to ask on; command line; add --yes to write, or --dry-run",
-        ));
+        return Err(
+            "nothing was written: there is no terminal to ask on; command line; add --yes to write, or --dry-run"
+                .into(),
+        );
     }
     // A terminal that is gone gives no answer.
     let _ = write!(stderr, "Write that to {drive}? [y/N] ");
@@ -203,7 +203,7 @@ fn agrees(drive: &str, how: &How) -> Result<(), ExitCode> {
         "y" | "Y" | "yes" => Ok(()),
         _ => {
             report::note("nothing was written");
-            Err(ExitCode::from(EXIT_FAILED))
+            Err(Failure::Reported(EXIT_FAILED))
         }
     }
 }

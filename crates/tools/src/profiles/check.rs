@@ -1,31 +1,26 @@
 //! `drivegate profiles check`: whether a profile is valid and its commands are safe.
 
 use std::path::Path;
-use std::process::ExitCode;
 use std::time::Instant;
 
+use super::super::failure::{Failure, Outcome};
 use super::super::{EXIT_CONFIG, report};
 use crate::bus::proof;
 use crate::document;
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
 
-pub(super) fn run(file: &Path, known: &Profiles) -> ExitCode {
+pub(super) fn run(file: &Path, known: &Profiles) -> Outcome {
     let name = file.display().to_string();
     let read = document::read_file(file).map_err(|problem| vec![problem]);
-    let profile = match read.and_then(|text| Profile::parse_over(&name, &text, false, known)) {
-        Ok(profile) => profile,
-        Err(problems) => {
-            report::errors(&problems);
-            return ExitCode::from(EXIT_CONFIG);
-        }
-    };
+    let profile = read.and_then(|text| Profile::parse_over(&name, &text, false, known));
+    let profile = profile.map_err(Failure::Invalid)?;
     for warning in &profile.warnings {
         report::warning(&warning.to_string());
     }
     let began = Instant::now();
     match proof::prove(&profile) {
-        Ok(proof) => report::print(&text(&name, &profile, proof, began)),
+        Ok(proof) => Ok(report::print(&text(&name, &profile, proof, began))),
         Err(counterexample) => {
             report::error(&format!(
                 "commands of profile `{}` are not safe: {}; {name}; correct its [control]",
@@ -36,7 +31,7 @@ pub(super) fn run(file: &Path, known: &Profiles) -> ExitCode {
             for frame in &counterexample.frames {
                 report::note(&format!("frame: {frame}"));
             }
-            ExitCode::from(EXIT_CONFIG)
+            Err(Failure::Reported(EXIT_CONFIG))
         }
     }
 }

@@ -7,6 +7,7 @@ use std::path::Path;
 use crate::codec::Table;
 use crate::document::{Finding, Problem, nearest};
 use crate::drive::Profile;
+use crate::parameters::cells;
 
 /// Columns of a list.
 const COLUMNS: [&str; 14] = [
@@ -26,43 +27,35 @@ const MOST_ROWS: usize = 10_000;
 pub(super) fn profile(path: &Path, text: &str) -> Result<String, Vec<Problem>> {
     let file = path.display().to_string();
     let mut problems: Vec<Problem> = Vec::new();
-    let problem = |line: usize, key: &str, what: String, remedy: &str| {
+    let problem = |line: usize, (key, what, remedy): (&str, String, String)| {
         let mut problem = Problem::of_file(file.clone(), key, Finding::new(what, remedy));
         problem.line = Some(line);
         problem
     };
     let mut rows = rows(text);
     let Some((_, header)) = rows.next() else {
-        problems.push(problem(
-            1,
-            "",
-            "the list is empty".to_string(),
-            "write a header line, such as name,address,type",
-        ));
-        return Err(problems);
+        let remedy = "write a header line, such as name,address,type";
+        return Err(vec![problem(1, mistake("", "the list is empty", remedy))]);
     };
     let header: Vec<String> = header.iter().map(|name| name.trim().to_lowercase()).collect();
     let known = || COLUMNS.into_iter().chain([MAX]);
     for name in header.iter().filter(|name| !known().any(|known| known == *name)) {
         let near = nearest(name, known()).map(|near| format!("did you mean `{near}`?"));
         let remedy = near.unwrap_or_else(|| format!("known: {}", known().collect::<Vec<_>>().join(", ")));
-        problems.push(problem(1, name, format!("unknown column `{name}`"), &remedy));
+        problems.push(problem(1, (name, format!("unknown column `{name}`"), remedy)));
     }
     for needed in ["name", "address"] {
         if !header.iter().any(|name| name == needed) {
-            problems.push(problem(1, needed, format!("there is no column `{needed}`"), "add it"));
+            let missing = mistake(needed, format!("there is no column `{needed}`"), "add it");
+            problems.push(problem(1, missing));
         }
     }
     let mut points = Vec::new();
     let mut names = BTreeSet::new();
     for (line, cells) in rows {
         if points.len() >= MOST_ROWS {
-            problems.push(problem(
-                line,
-                "",
-                format!("more than {MOST_ROWS} lines"),
-                "split the list",
-            ));
+            let long = mistake("", format!("more than {MOST_ROWS} lines"), "split the list");
+            problems.push(problem(line, long));
             break;
         }
         let cells: BTreeMap<&str, &str> = header
@@ -72,15 +65,13 @@ pub(super) fn profile(path: &Path, text: &str) -> Result<String, Vec<Problem>> {
             .collect();
         match point(&cells, &mut names) {
             Ok(point) => points.push((line, point)),
-            Err((key, what, remedy)) => problems.push(problem(line, key, what, &remedy)),
+            Err(mistake) => problems.push(problem(line, mistake)),
         }
     }
     if points.is_empty() && problems.is_empty() {
         problems.push(problem(
             1,
-            "",
-            "the list has no register".to_string(),
-            "write a line for each",
+            mistake("", "the list has no register", "write a line for each"),
         ));
     }
     if !problems.is_empty() {
@@ -104,26 +95,7 @@ fn rows(text: &str) -> impl Iterator<Item = (usize, Vec<String>)> {
         .find(|separator| first.contains(*separator));
     let separator = separator.unwrap_or(',');
     let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
-    lines.map(move |(place, line)| (place + 1, cells(line, separator)))
-}
-
-/// Cells of a line; one in quotes may have separators, and duplicate quotes in it.
-fn cells(line: &str, separator: char) -> Vec<String> {
-    let mut cells = vec![String::new()];
-    let (mut quoted, mut chars) = (false, line.chars().peekable());
-    while let Some(c) = chars.next() {
-        let Some(cell) = cells.last_mut() else { break };
-        match c {
-            '"' if quoted && chars.peek() == Some(&'"') => {
-                chars.next();
-                cell.push('"');
-            }
-            '"' => quoted = !quoted,
-            c if c == separator && !quoted => cells.push(String::new()),
-            c => cell.push(c),
-        }
-    }
-    cells
+    lines.map(move |(place, line)| (place + 1, cells(line, |c| c == separator).0))
 }
 
 /// A point of the profile.
@@ -138,15 +110,15 @@ struct Row {
 /// Key, what is wrong, what to do.
 type Mistake = (&'static str, String, String);
 
+fn mistake(key: &'static str, what: impl Into<String>, remedy: &str) -> Mistake {
+    (key, what.into(), remedy.to_string())
+}
+
 fn point(cells: &BTreeMap<&str, &str>, names: &mut BTreeSet<String>) -> Result<Row, Mistake> {
     let cell = |key: &str| cells.get(key).copied().filter(|cell| !cell.is_empty());
     let name = words(cell("name").unwrap_or_default(), '_');
     if name.is_empty() {
-        return Err((
-            "name",
-            "the register has no name".to_string(),
-            "write one with letters".to_string(),
-        ));
+        return Err(mistake("name", "the register has no name", "write one with letters"));
     }
     let (table, address) = place(cell("address").unwrap_or_default(), cell("table"))?;
     let bit = match cell("bit") {
@@ -172,11 +144,8 @@ fn point(cells: &BTreeMap<&str, &str>, names: &mut BTreeSet<String>) -> Result<R
         None | Some("no" | "n" | "0" | "false" | "r") => false,
         Some("yes" | "y" | "1" | "true" | "rw" | "w") => true,
         Some(other) => {
-            return Err((
-                "write",
-                format!("`{other}` is neither yes nor no"),
-                "write yes or no".to_string(),
-            ));
+            let what = format!("`{other}` is neither yes nor no");
+            return Err(mistake("write", what, "write yes or no"));
         }
     };
     if write {
@@ -188,11 +157,7 @@ fn point(cells: &BTreeMap<&str, &str>, names: &mut BTreeSet<String>) -> Result<R
         }
         (None, None) => {}
         _ => {
-            return Err((
-                "min",
-                "a range has two ends".to_string(),
-                "write min and max, or neither".to_string(),
-            ));
+            return Err(mistake("min", "a range has two ends", "write min and max, or neither"));
         }
     }
     Ok(Row {
@@ -241,11 +206,8 @@ fn place(text: &str, table: Option<&str>) -> Result<(Table, u16), Mistake> {
             "" => "the register has no address".to_string(),
             text => format!("`{text}` is not an address"),
         };
-        (
-            "address",
-            what,
-            "write a PDU address such as 256 or 0x100, or a reference number such as 40257".to_string(),
-        )
+        let remedy = "write a PDU address such as 256 or 0x100, or a reference number such as 40257";
+        mistake("address", what, remedy)
     };
     let digits = text.bytes().all(|byte| byte.is_ascii_digit());
     if let (None, 5 | 6, true) = (table, text.len(), digits) {
@@ -271,8 +233,8 @@ fn place(text: &str, table: Option<&str>) -> Result<(Table, u16), Mistake> {
     };
     let table = table.unwrap_or("holding").to_lowercase();
     let of = Table::from_name(&table).ok_or_else(|| {
-        let known = "write holding, input, coil or discrete-input".to_string();
-        ("table", format!("unknown table `{table}`"), known)
+        let known = "write holding, input, coil or discrete-input";
+        mistake("table", format!("unknown table `{table}`"), known)
     })?;
     Ok((of, address))
 }
@@ -294,13 +256,10 @@ fn number(key: &'static str, text: &str) -> Result<String, Mistake> {
     match (hex, plain) {
         (true, _) => Ok(dotted),
         (false, Ok(whole)) => Ok(whole),
-        (false, Err(_)) => real().ok_or_else(|| {
-            (
-                key,
-                format!("`{text}` is not a number"),
-                "write a number, such as 0.1".to_string(),
-            )
-        }),
+        (false, Err(_)) => {
+            let what = || format!("`{text}` is not a number");
+            real().ok_or_else(|| mistake(key, what(), "write a number, such as 0.1"))
+        }
     }
 }
 

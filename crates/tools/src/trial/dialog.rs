@@ -2,13 +2,13 @@
 
 use std::io::{self, BufRead, IsTerminal, Write};
 use std::path::Path;
-use std::process::ExitCode;
 use std::sync::mpsc;
 use std::time::Duration;
 
 use super::Stop;
 use crate::adapters::{Adapter, adapters};
-use crate::{printable, report};
+use crate::failure::Failure;
+use crate::printable;
 
 /// Whether there is someone to ask.
 pub(super) fn is_terminal() -> bool {
@@ -41,18 +41,19 @@ pub(super) fn ask(question: &str, stop: &Stop) -> Option<String> {
 /// The adapter to use: lists them and asks; `None` after a signal.
 ///
 /// # Errors
-/// An exit code: there is none, or nobody to ask. That was reported.
-pub(super) fn choose_port(stop: &Stop) -> Result<Option<String>, ExitCode> {
+/// There is none, or nobody to ask.
+pub(super) fn choose_port(stop: &Stop) -> Result<Option<String>, Failure> {
     let found = adapters();
     if found.is_empty() {
-        return Err(report::failed(
+        return Err(
             "no serial adapter is plugged in; /dev/serial/by-id and /sys/class/tty; plug one in, or write \
-             --port tcp://host:port for a device server",
-        ));
+             --port tcp://host:port for a device server"
+                .into(),
+        );
     }
     let _ = write!(io::stderr().lock(), "{}", list(&found));
     if !is_terminal() {
-        return Err(report::misused(&format!(
+        return Err(Failure::Misused(format!(
             "no adapter is named, and there is no terminal to ask on; command line; write --port {}",
             found.first().map_or("PORT", |adapter| adapter.port.as_str())
         )));

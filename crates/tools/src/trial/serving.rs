@@ -9,6 +9,7 @@ use super::{Args, Stop};
 use crate::config::{LogFormat, LogSettings, Settings};
 use crate::daemon::Daemon;
 use crate::drive::{ModelPoint, Quality, State};
+use crate::failure::{Failure, Outcome};
 use crate::north::http;
 use crate::north::local::SocketPath;
 use crate::plant::SharedPlant;
@@ -20,32 +21,31 @@ const HTTP: u16 = 9488;
 const FIRST_VALUES: Duration = Duration::from_secs(10);
 
 /// Reads the drives of the configuration `text` and serves the status page until a signal.
-pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Result<ExitCode, ExitCode> {
+pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Outcome {
     let loaded = Settings::parse("drivegate.toml", text, std::iter::empty());
     report::errors(&loaded.errors);
-    let mut settings = loaded.settings.ok_or(ExitCode::from(EXIT_FAILED))?;
+    let mut settings = loaded.settings.ok_or(Failure::Reported(EXIT_FAILED))?;
     if settings.buses.iter().all(|bus| bus.drives.is_empty()) {
         report::print(text);
-        return Err(report::failed(
+        return Err(
             "devices answer, but no profile matches any of them, so there is nothing to show; the configuration above; write a \
-             profile (docs/profiles.md) and pass its directory with --profile-dir",
-        ));
+             profile (docs/profiles.md) and pass its directory with --profile-dir"
+                .into(),
+        );
     }
     // What a gateway keeps on disk, and its socket, are not for a trial.
     settings.socket = SocketPath::Off;
     settings.recordings.max_count = 0;
     settings.keeps_history = false;
-    settings.http = Some(http::Options::at(
-        demo::free_port("the status page", HTTP).map_err(|e| report::failed(&e))?,
-    ));
+    settings.http = Some(http::Options::at(demo::free_port("the status page", HTTP)?));
     let _log = crate::log::start(&LogSettings {
         level: "error".to_string(),
         format: LogFormat::Auto,
     });
-    let runtime = crate::runtime().map_err(|message| report::failed(&message))?;
+    let runtime = crate::runtime()?;
     let daemon = runtime
         .block_on(Daemon::start(settings))
-        .map_err(|error| report::failed(&error.to_string()))?;
+        .map_err(|error| error.to_string())?;
     runtime.block_on(first_values(&daemon.plant(), stop));
     report::print(&values(&daemon.plant()));
     if let Some(address) = daemon.http_address() {
@@ -53,15 +53,13 @@ pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Result<ExitCode, Ex
             "\nStatus page, from this machine only: http://{address}/\nThe drives are only read. Ctrl-C to stop.\n"
         ));
     }
-    let code = match offer(args, stop, text) {
-        Ok(()) => {
-            runtime.block_on(stop.token.cancelled());
-            ExitCode::SUCCESS
-        }
-        Err(message) => report::failed(&message),
-    };
+    let offered = offer(args, stop, text);
+    if offered.is_ok() {
+        runtime.block_on(stop.token.cancelled());
+    }
     runtime.block_on(daemon.stop());
-    Ok(code)
+    offered?;
+    Ok(ExitCode::SUCCESS)
 }
 
 /// Waits until each drive that answers has values.

@@ -9,6 +9,7 @@ use ring::digest::{Context, SHA256, digest};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::AuditRecord;
+use crate::hex;
 
 /// A SHA-256.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -23,18 +24,14 @@ impl Hash {
 
 impl From<ring::digest::Digest> for Hash {
     fn from(digest: ring::digest::Digest) -> Hash {
-        let mut hash = Hash::default();
-        hash.0
-            .iter_mut()
-            .zip(digest.as_ref())
-            .for_each(|(to, from)| *to = *from);
-        hash
+        // Both have the length of a SHA-256.
+        Hash(digest.as_ref().try_into().unwrap_or_default())
     }
 }
 
 impl fmt::Display for Hash {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+        f.write_str(&hex::encode(&self.0))
     }
 }
 
@@ -42,15 +39,8 @@ impl FromStr for Hash {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Hash, String> {
-        let mut hash = Hash::default();
-        let sound = text.len() == 64 && text.bytes().all(|digit| digit.is_ascii_hexdigit());
-        for (place, byte) in hash.0.iter_mut().enumerate().take_while(|_| sound) {
-            let digits = text.get(2 * place..2 * place + 2).unwrap_or_default();
-            *byte = u8::from_str_radix(digits, 16).map_err(|why| why.to_string())?;
-        }
-        sound
-            .then_some(hash)
-            .ok_or_else(|| "a hash has 64 hexadecimal digits".to_string())
+        let bytes = hex::decode(text).and_then(|bytes| bytes.try_into().ok());
+        bytes.map(Hash).ok_or("a hash has 64 hexadecimal digits".to_string())
     }
 }
 

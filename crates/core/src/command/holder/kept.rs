@@ -10,12 +10,9 @@ use crate::process_image::Machine;
 /// A reservation as it is kept.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct KeptReservation {
-    /// Port of the bus of the machine.
-    pub port: String,
-    /// Its address there.
-    pub address: u8,
-    /// Its profile.
-    pub profile: String,
+    /// The machine.
+    #[serde(flatten)]
+    pub machine: Machine,
     /// Who stopped it.
     pub who: String,
     /// The name of its rank then.
@@ -41,9 +38,7 @@ impl KeptReservation {
         lease: Duration,
     ) -> KeptReservation {
         KeptReservation {
-            port: machine.port,
-            address: machine.address,
-            profile: machine.profile,
+            machine,
             who,
             rank,
             stopped_ms: milliseconds(stopped),

@@ -5,9 +5,10 @@ use std::sync::Arc;
 use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
 
+use super::super::app_state::AppState;
+use super::super::reached::Reached;
 use super::super::replies::{Refused, Replied};
-use super::super::routes::{AppState, Reached};
-use super::Operator;
+use super::state::Operator;
 
 /// Who may see what commands are for.
 pub(in crate::http) struct Viewer(pub(in crate::http) Operator);

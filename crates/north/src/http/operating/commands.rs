@@ -12,10 +12,12 @@ use serde::Serialize;
 use serde_json::{Value as Json_, json};
 use tokio::sync::{OwnedSemaphorePermit, watch};
 
+use super::super::app_state::AppState;
 use super::super::body::Payload;
 use super::super::replies::{Replied, refused};
-use super::super::routes::AppState;
-use super::{Commander, Operating, Operator, Viewer, restart};
+use super::asker::{Commander, Viewer};
+use super::restart;
+use super::state::{Operating, Operator};
 use crate::command::{Answer, Origin, Outcome, Refusal, SourceKind};
 use crate::command_json::{self, CommandResult, Id, Repetition, Taken, excerpt, find_id};
 use crate::drive::model::Kind;

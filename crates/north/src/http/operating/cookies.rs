@@ -3,8 +3,8 @@
 use axum::http::header::{self, HeaderMap, HeaderValue};
 use ring::hmac;
 
-use super::super::tokens::hex;
 use super::super::users::User;
+use crate::hex;
 
 /// How long a browser is known, s.
 const KNOWN: u32 = 90 * 86_400;
@@ -50,8 +50,8 @@ impl Cookies {
 
     /// Marks the browser as one from which `user` has logged in.
     pub(super) fn set_known(&self, user: &User, number: &[u8; 16]) -> Option<HeaderValue> {
-        let number = hex(number);
-        let value = format!("{number}.{}", hex(sign(user, &number).as_ref()));
+        let number = hex::encode(number);
+        let value = format!("{number}.{}", hex::encode(sign(user, &number).as_ref()));
         self.set(&self.known, &value, &format!("; Max-Age={KNOWN}"))
     }
 
@@ -66,11 +66,7 @@ impl Cookies {
 /// all browsers unknown, a restart does not.
 pub(super) fn known_as<'m>(mark: &'m str, user: &User) -> Option<&'m str> {
     let (number, tag) = mark.split_once('.')?;
-    let tag = (0..tag.len())
-        .step_by(2)
-        .map(|at| u8::from_str_radix(tag.get(at..at + 2)?, 16).ok())
-        .collect::<Option<Vec<u8>>>()?;
-    hmac::verify(&key(user), number.as_bytes(), &tag).ok()?;
+    hmac::verify(&key(user), number.as_bytes(), &hex::decode(tag)?).ok()?;
     Some(number)
 }
 

@@ -7,27 +7,13 @@ use axum::Json;
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
 use axum::response::IntoResponse;
-use serde::Deserialize;
 
+use super::super::app_state::AppState;
 use super::super::body::Payload;
+use super::super::messages::DrillWish;
 use super::super::replies::{Refused, Replied, not_found, refused};
-use super::super::routes::AppState;
-use super::Commander;
+use super::asker::Commander;
 use crate::drill::{DrillRefusal, DrillReport, Kind};
-
-/// The requested drill.
-#[derive(Debug, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub(in crate::http) struct DrillWish {
-    /// The drive.
-    drive: String,
-    /// The ways; all where absent or empty.
-    #[serde(default)]
-    kinds: Vec<Kind>,
-    /// Speed at which the motor is stopped, %; `max_speed` of `[drill]` where absent.
-    #[serde(default)]
-    speed: Option<f64>,
-}
 
 /// All that are known, the newest first.
 pub(in crate::http) async fn drills(State(app): State<Arc<AppState>>) -> Json<Vec<DrillReport>> {

@@ -7,21 +7,14 @@ use axum::Json;
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
 use axum::response::IntoResponse;
-use serde::Deserialize;
 
+use super::super::app_state::AppState;
 use super::super::body::Payload;
+use super::super::messages::HoldAct;
 use super::super::replies::{Replied, refused};
-use super::super::routes::AppState;
-use super::{Commander, Viewer};
+use super::asker::{Commander, Viewer};
 use crate::command::{Authority, Verb};
 use crate::command_json::HoldReply;
-
-#[derive(Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub(in crate::http) struct HoldAct {
-    /// `take`, `renew`, `release` or `break`.
-    action: String,
-}
 
 /// Who holds the drive.
 pub(in crate::http) async fn hold_of(

@@ -12,13 +12,14 @@ use axum::response::{IntoResponse, Response};
 use ring::rand::{SecureRandom, SystemRandom};
 use serde::Serialize;
 
+use super::super::app_state::AppState;
 use super::super::body;
+use super::super::reached::Reached;
 use super::super::replies::{Refused, Replied, refused};
-use super::super::routes::{AppState, Reached};
 use super::cookies::{Cookies, known_as};
 use super::sessions::Session;
+use super::state::{Credentials, Denied, Operating, is_own_origin};
 use super::throttle::Source;
-use super::{Credentials, Denied, Operating, is_own_origin};
 
 /// Most bytes of a login.
 const MAX_LOGIN: usize = 4096;

@@ -7,11 +7,11 @@ use axum::extract::{Path, State};
 use axum::http::StatusCode;
 use serde::de::DeserializeOwned;
 
+use super::super::app_state::AppState;
 use super::super::body::Payload;
 use super::super::messages::{ParameterReading, ReadParameters, Restore, RestoreAct};
 use super::super::replies::{Refused, Replied, refused};
-use super::super::routes::AppState;
-use super::Commander;
+use super::asker::Commander;
 use crate::command::{Origin, Pace};
 use crate::parameter_jobs::{Again, How, begin_reading, carry_out, prepare, release, take_up};
 use crate::parameters::{Id, ParameterFile, Wishes};

@@ -6,10 +6,10 @@ use axum::Json;
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
 
+use super::super::app_state::AppState;
 use super::super::messages::Recorded;
 use super::super::replies::{Replied, no_drive, refused};
-use super::super::routes::AppState;
-use super::Commander;
+use super::asker::Commander;
 
 /// 200 with the id of the recording, or 409.
 pub(in crate::http) async fn record(

@@ -4,7 +4,8 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::super::tokens::{hash, hex};
+use super::super::tokens::hash;
+use crate::hex;
 
 /// A session ends when its user did nothing for that long. Reading values is nothing, so a page that is left alone ends.
 pub(super) const IDLE: Duration = Duration::from_secs(30 * 60);
@@ -63,11 +64,11 @@ impl Sessions {
         let session = Session {
             user: user.clone(),
             login: format!("{user}#{}", self.logins).into(),
-            csrf: hex(&secrets.csrf),
+            csrf: hex::encode(&secrets.csrf),
             begun: now,
             used: now,
         };
-        let cookie = hex(&secrets.cookie);
+        let cookie = hex::encode(&secrets.cookie);
         self.open.insert(hash(&cookie), session.clone());
         (session, cookie)
     }
@@ -128,7 +129,7 @@ mod tests {
         assert!(sessions.find(&cookie, start + IDLE).is_none());
         sessions.used(&cookie, start + IDLE);
         assert!(sessions.find(&cookie, start + IDLE).is_none(), "it does not come back");
-        assert!(sessions.find(&hex(&[2; 32]), start).is_none() && sessions.find("", start).is_none());
+        assert!(sessions.find(&hex::encode(&[2; 32]), start).is_none() && sessions.find("", start).is_none());
 
         let (_, cookie) = sessions.begin(&"alice".into(), secrets(2), start);
         let mut now = start;

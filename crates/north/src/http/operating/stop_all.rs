@@ -8,10 +8,10 @@ use axum::extract::State;
 use axum::http::StatusCode;
 use axum::response::IntoResponse;
 
+use super::super::app_state::AppState;
 use super::super::body::Payload;
 use super::super::replies::{Replied, not_found, refused};
-use super::super::routes::AppState;
-use super::Commander;
+use super::asker::Commander;
 use crate::command_json::stop_all;
 use crate::stop_all::NothingToStop;
 

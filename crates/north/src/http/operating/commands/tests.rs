@@ -3,7 +3,7 @@ use std::time::Duration;
 use drivegate_testkit::next_command;
 
 use super::*;
-use crate::http::operating::IN_PROGRESS;
+use crate::http::operating::state::IN_PROGRESS;
 use crate::mqtt::fixture;
 
 fn operator(user: &str, login: &str) -> Operator {

@@ -1,5 +1,7 @@
-use super::*;
 use axum::http::HeaderValue;
+
+use super::super::paths::is_operating;
+use super::*;
 
 fn headers(lines: &[(&str, &str)]) -> HeaderMap {
     let mut headers = HeaderMap::new();

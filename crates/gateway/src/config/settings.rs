@@ -1,0 +1,118 @@
+//! What the loader makes of a configuration.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::log::LogSettings;
+use super::params::ParamsSettings;
+use crate::bus::predict::{self, Prediction};
+use crate::bus::{BusOptions, Mode};
+use crate::command::{AuditFileOptions, Rules};
+use crate::drill::DrillOptions;
+use crate::drive::profile::Profiles;
+use crate::history::RecorderOptions;
+use crate::north::local::SocketPath;
+use crate::north::{
+    bacnet as bacnet_server, http as http_server, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client,
+    slot as slot_server,
+};
+use crate::process_image::{BusSpec, DriveSpec};
+
+/// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.
+pub(super) const ENVIRONMENT: &str = "DRIVEGATE";
+
+/// A valid configuration. Parts compare equal when a reload changes nothing in them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// Name of the gateway.
+    pub gateway: String,
+    /// Where `drivegate read` and `drivegate write` reach the gateway.
+    pub socket: SocketPath,
+    /// Directory for stored data.
+    pub state_dir: PathBuf,
+    /// Whether events and counters are kept there: always true as configured, false where something less than a gateway runs.
+    pub keeps_history: bool,
+    /// The settings of the recorder.
+    pub recordings: RecorderOptions,
+    /// How parameters are read and kept.
+    pub params: ParamsSettings,
+    /// Directories of the user's profiles.
+    pub profile_dirs: Vec<PathBuf>,
+    /// Built-in profiles and the user's.
+    pub profiles: Profiles,
+    /// Age from which a sample of process data is stale.
+    pub stale_after: Duration,
+    /// `stale_after` is written, so it applies to slow lines too.
+    pub stale_after_written: bool,
+    /// In the order of the file.
+    pub buses: Vec<BusSettings>,
+    /// Slots of all buses; absent: there is none.
+    pub slots: Option<slot_server::Options>,
+    /// Absent: not started.
+    pub modbus_tcp: Option<modbus_tcp_server::Options>,
+    /// Absent: not started.
+    pub mqtt: Option<mqtt_client::Options>,
+    /// Absent: not started.
+    pub http: Option<http_server::Options>,
+    /// Absent: not started.
+    pub bacnet: Option<bacnet_server::Options>,
+    /// Who holds drives; absent: off.
+    pub authority: Option<Arc<Rules>>,
+    /// How stops are proven; absent: off.
+    pub drill: Option<DrillOptions>,
+    /// File of all commands; absent: not written.
+    pub audit: Option<AuditFileOptions>,
+    /// The settings of the log.
+    pub log: LogSettings,
+}
+
+impl Settings {
+    /// All drives, each with its bus.
+    pub fn drives(&self) -> impl Iterator<Item = (&BusSpec, &DriveSpec)> {
+        let buses = self.buses.iter();
+        buses.flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)))
+    }
+}
+
+/// One bus with its drives.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BusSettings {
+    /// The part used by other crates.
+    pub spec: BusSpec,
+    /// The part used only by the bus itself.
+    pub options: BusOptions,
+    /// In the order of the file.
+    pub drives: Vec<DriveSpec>,
+}
+
+impl BusSettings {
+    /// The fast and slow cadence that staleness is measured by: those of the configuration, or the best the line can
+    /// carry.
+    pub(crate) fn achievable(&self) -> (Duration, Duration) {
+        if self.listens() {
+            return (Duration::ZERO, Duration::ZERO);
+        }
+        let prediction = self.predict();
+        let spec = &self.spec;
+        (
+            spec.cycle.max(prediction.fast_cycle.unwrap_or_default()),
+            spec.slow_cycle.max(prediction.slow_cycle.unwrap_or_default()),
+        )
+    }
+
+    /// Expected wire times, cycles and load; nothing where the gateway sends nothing.
+    pub fn predict(&self) -> Prediction {
+        let asked: &[DriveSpec] = if self.listens() { &[] } else { &self.drives };
+        predict::predict(&self.spec, self.options.silence, asked)
+    }
+
+    /// Whether another master owns the line.
+    pub fn listens(&self) -> bool {
+        self.options.mode == Mode::Listen
+    }
+}
+
+/// What cannot be used, which is reported.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Unusable;

@@ -1,0 +1,69 @@
+//! The state shared by all handlers.
+
+use std::sync::Arc;
+
+use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio_util::sync::CancellationToken;
+
+use super::limits::{MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS};
+use super::operating::cookies::Cookies;
+use super::operating::state::Operating;
+use super::reached::Reached;
+use super::replies::{Replied, no_drive};
+use crate::NorthState;
+use crate::connection_limit::{ConnectionLimit, Limits};
+use crate::plant::{DriveHandle, SharedPlant};
+
+/// The state shared by all handlers.
+#[derive(Debug)]
+pub(super) struct AppState {
+    pub(super) plant: SharedPlant,
+    pub(super) north: Arc<NorthState>,
+    pub(super) cancel: CancellationToken,
+    /// Open event streams.
+    pub(super) listeners: Arc<ConnectionLimit>,
+    /// Large replies are rendered one at a time: a client that asks for them without end has its turns like all others,
+    /// and `/healthz` does not wait for it.
+    rendering: Semaphore,
+    /// The permit for reading a recording: what waits for the disk holds up nothing else.
+    pub(super) files: Semaphore,
+    pub(super) operating: Arc<Operating>,
+}
+
+impl AppState {
+    pub(super) fn new(
+        plant: SharedPlant,
+        north: Arc<NorthState>,
+        operating: Arc<Operating>,
+        cancel: CancellationToken,
+    ) -> AppState {
+        AppState {
+            plant,
+            north,
+            cancel,
+            listeners: ConnectionLimit::new(Limits::new(MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS)),
+            rendering: Semaphore::new(1),
+            files: Semaphore::new(1),
+            operating,
+        }
+    }
+
+    /// A turn to render a large reply.
+    pub(super) async fn turn(&self) -> Option<SemaphorePermit<'_>> {
+        self.rendering.acquire().await.ok()
+    }
+
+    /// The cookies of this gateway, on a connection that came like that.
+    pub(super) fn cookies(&self, reached: &Reached) -> Cookies {
+        Cookies::of(&self.plant.load().gateway, reached.tls)
+    }
+
+    /// The drive of that name.
+    ///
+    /// # Errors
+    /// The reply where there is none.
+    pub(super) fn drive(&self, name: &str) -> Replied<DriveHandle> {
+        let plant = self.plant.load();
+        plant.drive(name).ok_or_else(|| no_drive(&plant, name))
+    }
+}

@@ -1,0 +1,42 @@
+//! Which paths belong to commands.
+
+use axum::http::Method;
+
+/// Whether a path belongs to commands; without them there is nothing at it.
+pub(in crate::http) fn is_operating(path: &str) -> bool {
+    let of_drive = |rest: &str| {
+        rest.split_once('/')
+            .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat" | "hold"))
+    };
+    is_session(path)
+        || path == "/api/v1/stop"
+        || is_drill(path)
+        || path.starts_with("/assets/operate.")
+        || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive)
+}
+
+/// Whether that is about the session of a user.
+pub(in crate::http) fn is_session(path: &str) -> bool {
+    matches!(path, "/api/v1/login" | "/api/v1/logout" | "/api/v1/session")
+}
+
+/// Whether a request may be one of those that change something, while commands are on.
+pub(in crate::http) fn may_change(method: &Method, path: &str) -> bool {
+    let of_drive = |rest: &str| {
+        rest.split_once('/')
+            .is_some_and(|(_, what)| matches!(what, "recordings" | "params/reading" | "params/restore"))
+    };
+    let changes = is_operating(path) || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive);
+    let ends_a_drill = *method == Method::DELETE && is_drill(path);
+    ends_a_drill || (*method == Method::POST && changes)
+}
+
+/// Whether it is about drills.
+fn is_drill(path: &str) -> bool {
+    path == "/api/v1/drills" || path.starts_with("/api/v1/drills/")
+}
+
+/// Whether it is a command: that is served in whatever way the client got in.
+pub(in crate::http) fn is_command(method: &Method, path: &str) -> bool {
+    may_change(method, path) && (path.ends_with("/commands") || path == "/api/v1/stop" || *method == Method::DELETE)
+}

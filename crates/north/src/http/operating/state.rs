@@ -1,0 +1,436 @@
+//! Users who may command, their sessions, and who gave a request.
+
+use std::collections::HashMap;
+use std::hash::{BuildHasher, RandomState};
+use std::net::IpAddr;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use arc_swap::ArcSwapOption;
+use argon2::password_hash::Encoding;
+use axum::http::StatusCode;
+use axum::http::header::{self, HeaderMap};
+use ring::hmac;
+use ring::rand::{SecureRandom, SystemRandom};
+use subtle::ConstantTimeEq;
+use tokio::sync::Semaphore;
+
+use super::super::reached::{LocalUser, Reached};
+use super::super::users::{MAX_PASSWORD, User, Users};
+use super::cookies::Cookies;
+use super::sessions::{IDLE, Secrets, Session, Sessions};
+use super::throttle::{Source, Throttle};
+use super::verifier::Verifier;
+use crate::NorthState;
+use crate::command::{Authority, Proof, SourceKind};
+use crate::log_throttle::LogThrottle;
+/// A password that a program sends with each request is not hashed again for that long.
+const VERIFIED: Duration = Duration::from_secs(300);
+/// Most of them, and most addresses that are known to belong to someone who may command.
+const MOST_REMEMBERED: usize = 256;
+/// Most commands with pending results, except stops.
+pub(super) const IN_PROGRESS: usize = 256;
+
+/// Header with the token of a session.
+const CSRF: &str = "x-csrf-token";
+
+/// The state of commands over HTTP. It outlives reloads and listeners.
+#[derive(Debug)]
+pub(in crate::http) struct Operating {
+    /// `None`: commands are off.
+    pub(super) users: ArcSwapOption<Users>,
+    state: Mutex<State>,
+    verifier: Verifier,
+    /// For names as keys of the throttle.
+    pub(super) hasher: RandomState,
+    /// For passwords in memory; `None` if the system has no random numbers: nothing is kept then.
+    key: Option<hmac::Key>,
+    pub(super) north: Arc<NorthState>,
+    pub(super) in_progress: Arc<Semaphore>,
+    /// Limits the log of failed logins.
+    pub(super) failures: LogThrottle,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct State {
+    pub(super) sessions: Sessions,
+    throttle: Throttle,
+    /// Passwords that were right: their keyed hash, whose they are, and until when they need not be hashed.
+    verified: HashMap<[u8; 32], (Arc<str>, Instant)>,
+    /// Addresses from which a user did something, who and when.
+    operators: HashMap<IpAddr, (Arc<str>, Instant)>,
+}
+
+/// Who gave a request.
+#[derive(Debug, Clone)]
+pub(in crate::http) struct Operator {
+    pub(super) user: Arc<str>,
+    /// See [`crate::command::Origin::with_login`].
+    pub(super) login: Arc<str>,
+    pub(super) address: IpAddr,
+    /// The interface.
+    pub(super) kind: SourceKind,
+    pub(super) proof: Proof,
+    /// The cookie of its session; `None` for a program.
+    pub(super) cookie: Option<String>,
+}
+
+impl Operator {
+    /// A user of the local socket.
+    fn local(local: &LocalUser, address: IpAddr) -> Operator {
+        Operator {
+            login: format!("{} {}", local.kind.name(), local.who).into(),
+            user: local.who.clone(),
+            address,
+            kind: local.kind,
+            proof: local.proof.clone(),
+            cookie: None,
+        }
+    }
+}
+
+/// Why a request is not answered as one of a user.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(in crate::http) enum Denied {
+    /// No session and no password.
+    #[error("log in first: POST /api/v1/login, or send user and password with each request (HTTP Basic)")]
+    NotLoggedIn,
+    /// The session ended, or its cookie was never one.
+    #[error("the session has ended; log in again")]
+    SessionEnded,
+    /// Whichever it is, the answer is the same.
+    #[error("wrong user or password")]
+    Wrong,
+    /// Too many failures.
+    #[error("too many failed logins; try again in {} s", .0.as_secs() + 1)]
+    TooMany(Duration),
+    /// Too many at once.
+    #[error("too many logins at once; try again")]
+    Busy,
+    /// A page of someone else.
+    #[error("the request comes from another origin")]
+    OtherOrigin,
+    /// The token of the session is missing or wrong.
+    #[error("the header X-CSRF-Token does not have the token of this session")]
+    NoToken,
+}
+
+impl Denied {
+    pub(in crate::http) fn status(&self) -> StatusCode {
+        match self {
+            Denied::NotLoggedIn | Denied::SessionEnded | Denied::Wrong => StatusCode::UNAUTHORIZED,
+            Denied::TooMany(_) => StatusCode::TOO_MANY_REQUESTS,
+            Denied::Busy => StatusCode::SERVICE_UNAVAILABLE,
+            Denied::OtherOrigin | Denied::NoToken => StatusCode::FORBIDDEN,
+        }
+    }
+}
+
+/// A user and a password, as a client sent them.
+#[derive(Clone, serde::Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct Credentials {
+    pub(super) user: String,
+    pub(super) password: String,
+}
+
+impl Operating {
+    pub(in crate::http) fn new(north: Arc<NorthState>) -> Operating {
+        Operating {
+            users: ArcSwapOption::empty(),
+            state: Mutex::default(),
+            verifier: Verifier::default(),
+            hasher: RandomState::default(),
+            key: hmac::Key::generate(hmac::HMAC_SHA256, &SystemRandom::new()).ok(),
+            north,
+            in_progress: Arc::new(Semaphore::new(IN_PROGRESS)),
+            failures: LogThrottle::default(),
+        }
+    }
+
+    /// Whether commands are on.
+    pub(in crate::http) fn is_on(&self) -> bool {
+        self.users.load().is_some()
+    }
+
+    /// Sets the users who may command; `None`: commands are off. Sessions of users who were removed, or have a new
+    /// password, end.
+    pub(in crate::http) fn set_users(&self, users: Option<Users>) {
+        let before = self.users.swap(users.map(Arc::new));
+        let after = self.users.load_full();
+        let of = |users: &Option<Arc<Users>>, name: &str| users.as_ref().and_then(|users| users.named(name)).cloned();
+        let stays = |name: &str| {
+            let user: Option<User> = of(&after, name);
+            user.is_some() && user == of(&before, name)
+        };
+        let mut state = self.state();
+        state.sessions.keep(stays);
+        state.verified.retain(|_, (user, _)| stays(user));
+        state.operators.retain(|_, (user, _)| stays(user));
+    }
+
+    /// The authority of connections from an address: those from addresses where a user was recently active do not yield
+    /// to others, and have reserved places.
+    pub(in crate::http) fn authority_at(&self, address: IpAddr, now: Instant) -> Authority {
+        if !self.is_on() {
+            return Authority::ReadOnly;
+        }
+        let state = self.state();
+        let used = state.operators.get(&address).map(|(_, used)| *used);
+        match used.is_some_and(|used| now.saturating_duration_since(used) < IDLE) {
+            true => Authority::Write,
+            false => Authority::ReadOnly,
+        }
+    }
+
+    /// Who gave the request with these headers, by its session or by its password.
+    ///
+    /// # Errors
+    /// Nobody who may command; [`Denied::NotLoggedIn`] if it names nobody.
+    pub(in crate::http) async fn operator(
+        &self,
+        headers: &HeaderMap,
+        cookies: &Cookies,
+        reached: &Reached,
+    ) -> Result<Operator, Denied> {
+        let address = reached.peer.ip();
+        if let Some(local) = &reached.local {
+            return Ok(Operator::local(local, address));
+        }
+        if headers.contains_key(header::AUTHORIZATION) {
+            let credentials = basic(headers).ok_or(Denied::NotLoggedIn)?;
+            let user = self.verified(&credentials, address, Source::of(address)).await?;
+            return Ok(Operator {
+                login: user.clone(),
+                proof: Proof::User(user.clone()),
+                user,
+                address,
+                kind: SourceKind::Http,
+                cookie: None,
+            });
+        }
+        let cookie = cookies.session(headers).ok_or(Denied::NotLoggedIn)?;
+        let session = self.session(&cookie, Instant::now()).ok_or(Denied::SessionEnded)?;
+        Ok(Operator {
+            proof: Proof::User(session.user.clone()),
+            user: session.user,
+            login: session.login,
+            address,
+            kind: SourceKind::Http,
+            cookie: Some(cookie),
+        })
+    }
+
+    pub(super) fn session(&self, cookie: &str, now: Instant) -> Option<Session> {
+        self.is_on().then(|| self.state().sessions.find(cookie, now).cloned())?
+    }
+
+    /// Who may give the request that changes something.
+    ///
+    /// # Errors No user, or the request does not come from this gateway's own page.
+    pub(in crate::http) async fn commander(
+        &self,
+        headers: &HeaderMap,
+        cookies: &Cookies,
+        reached: &Reached,
+    ) -> Result<Operator, Denied> {
+        if reached.local.is_some() {
+            // No browser comes through a socket, and its file says who may.
+            return self.operator(headers, cookies, reached).await;
+        }
+        is_own_origin(headers)?;
+        let operator = self.operator(headers, cookies, reached).await?;
+        if let Some(cookie) = &operator.cookie {
+            self.check_csrf(headers, cookie)?;
+        }
+        self.used(&operator, Instant::now());
+        Ok(operator)
+    }
+
+    /// Whether the request repeats the token of its session.
+    pub(super) fn check_csrf(&self, headers: &HeaderMap, cookie: &str) -> Result<(), Denied> {
+        let session = self.session(cookie, Instant::now()).ok_or(Denied::SessionEnded)?;
+        let given = headers.get(CSRF).map_or(&[][..], |value| value.as_bytes());
+        match bool::from(given.ct_eq(session.csrf.as_bytes())) {
+            true => Ok(()),
+            false => Err(Denied::NoToken),
+        }
+    }
+
+    /// The user did something: its session and the places of its address stay.
+    fn used(&self, operator: &Operator, now: Instant) {
+        let mut state = self.state();
+        if let Some(cookie) = &operator.cookie {
+            state.sessions.used(cookie, now);
+        }
+        let operators = &mut state.operators;
+        operators.retain(|_, (_, used)| now.saturating_duration_since(*used) < IDLE);
+        if operators.len() >= MOST_REMEMBERED
+            && !operators.contains_key(&operator.address)
+            && let Some(oldest) = operators
+                .iter()
+                .min_by_key(|(_, (_, used))| *used)
+                .map(|(address, _)| *address)
+        {
+            operators.remove(&oldest);
+        }
+        operators.insert(operator.address, (operator.user.clone(), now));
+    }
+
+    /// The user whose password this is. A password that was right a short while ago is not hashed again.
+    pub(super) async fn verified(
+        &self,
+        given: &Credentials,
+        address: IpAddr,
+        source: Source,
+    ) -> Result<Arc<str>, Denied> {
+        let Some(users) = self.users.load_full() else {
+            return Err(Denied::NotLoggedIn);
+        };
+        let mark = self.mark(given);
+        let known = mark.and_then(|mark| Some((mark, self.state().verified.get(&mark).cloned()?)));
+        let source = match known {
+            Some((_, (user, until))) if Instant::now() < until => return Ok(user),
+            // It was right before: anyone who else fails at this address does not hold it up.
+            Some((mark, _)) => Source::Known(self.hasher.hash_one(mark)),
+            None => source,
+        };
+        let name = self.hasher.hash_one(&given.user);
+        let failures = self.state().throttle.begin(source, name, Instant::now());
+        let failures = failures.map_err(Denied::TooMany)?;
+        // Whether the user exists must not show, neither by the answer nor by its time.
+        let user = users.named(&given.user);
+        let too_long = given.password.len() > MAX_PASSWORD;
+        let password = if too_long { "" } else { given.password.as_str() };
+        let hashes = users.hashes(&given.user);
+        let right = self.verifier.verify(hashes, password, address, failures).await;
+        let mut state = self.state();
+        match (right, user) {
+            (None, _) => {
+                state.throttle.withdraw(source, name);
+                Err(Denied::Busy)
+            }
+            // A reload may have removed the user meanwhile.
+            (Some(true), Some(user)) if !too_long && self.has(user) => {
+                state.throttle.succeeded(source, name);
+                let name: Arc<str> = user.name.as_str().into();
+                if let Some(mark) = mark {
+                    state.remember(mark, &name, Instant::now());
+                }
+                Ok(name)
+            }
+            _ => Err(Denied::Wrong),
+        }
+    }
+
+    fn has(&self, user: &User) -> bool {
+        let users = self.users.load();
+        users
+            .as_ref()
+            .is_some_and(|users| users.named(&user.name) == Some(user))
+    }
+
+    /// The stored mark of a verified user and password.
+    fn mark(&self, given: &Credentials) -> Option<[u8; 32]> {
+        // A name has no zero byte: a user would not be found.
+        let text = format!("{}\0{}", given.user, given.password);
+        hmac::sign(self.key.as_ref()?, text.as_bytes()).as_ref().try_into().ok()
+    }
+
+    /// Begins a session of a user who logged in; `None` if the system has no random numbers.
+    pub(super) fn begin(&self, user: &Arc<str>, address: IpAddr, now: Instant) -> Option<(Session, String)> {
+        let random = SystemRandom::new();
+        let mut secrets = Secrets {
+            cookie: [0; 32],
+            csrf: [0; 32],
+        };
+        random.fill(&mut secrets.cookie).ok()?;
+        random.fill(&mut secrets.csrf).ok()?;
+        let (session, cookie) = self.state().sessions.begin(user, secrets, now);
+        let operator = Operator {
+            user: user.clone(),
+            login: session.login.clone(),
+            address,
+            kind: SourceKind::Http,
+            proof: Proof::User(user.clone()),
+            cookie: Some(cookie.clone()),
+        };
+        self.used(&operator, now);
+        Some((session, cookie))
+    }
+
+    pub(super) fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn remember(&mut self, mark: [u8; 32], user: &Arc<str>, now: Instant) {
+        // There are no more of them than users, each of which has one password.
+        if self.verified.len() < MOST_REMEMBERED {
+            self.verified.insert(mark, (user.clone(), now + VERIFIED));
+        }
+    }
+}
+
+/// Whether a request may come from a page of this gateway. Browsers say which page a request comes from; programs say
+/// nothing.
+///
+/// # Errors
+/// It comes from a page of someone else.
+pub(super) fn is_own_origin(headers: &HeaderMap) -> Result<(), Denied> {
+    let text = |name| headers.get_all(name).iter().map(|value| value.to_str().unwrap_or("\0"));
+    let host = text(header::HOST).next().unwrap_or_default();
+    let is_host = |origin: &str| {
+        let (scheme, authority) = origin.split_once("://").unwrap_or_default();
+        let port = match scheme {
+            "https" => ":443",
+            "http" => ":80",
+            _ => return false,
+        };
+        let bare = |text: &str| text.strip_suffix(port).unwrap_or(text).to_ascii_lowercase();
+        !authority.is_empty() && bare(authority) == bare(host)
+    };
+    let mut site = text(header::HeaderName::from_static("sec-fetch-site"));
+    match text(header::ORIGIN).all(is_host) && site.all(|site| matches!(site, "same-origin" | "none")) {
+        true => Ok(()),
+        false => Err(Denied::OtherOrigin),
+    }
+}
+
+/// User and password of HTTP Basic.
+fn basic(headers: &HeaderMap) -> Option<Credentials> {
+    let mut given = headers.get_all(header::AUTHORIZATION).iter();
+    let (Some(given), None) = (given.next(), given.next()) else {
+        return None;
+    };
+    let (scheme, text) = given.to_str().ok()?.split_once(' ')?;
+    if !scheme.eq_ignore_ascii_case("basic") {
+        return None;
+    }
+    // A longer one is no password.
+    let mut bytes = [0; 512];
+    let bytes = Encoding::B64
+        .decode(text.trim().trim_end_matches('='), &mut bytes)
+        .ok()?;
+    let text = std::str::from_utf8(bytes).ok()?;
+    let (user, password) = text.split_once(':')?;
+    Some(Credentials {
+        user: user.to_string(),
+        password: password.to_string(),
+    })
+}
+
+/// The header of HTTP Basic for `USER:PASSWORD`.
+pub fn basic_authorization(user_and_password: &str) -> String {
+    let mut text = vec![0; Encoding::B64.encoded_len(user_and_password.as_bytes())];
+    // The buffer fits.
+    let text = Encoding::B64
+        .encode(user_and_password.as_bytes(), &mut text)
+        .unwrap_or_default();
+    let padding = "=".repeat(text.len().next_multiple_of(4) - text.len());
+    format!("Basic {text}{padding}")
+}
+
+#[cfg(test)]
+mod tests;

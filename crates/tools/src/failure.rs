@@ -1,0 +1,51 @@
+//! Why a command ends early.
+
+use std::process::ExitCode;
+
+use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use crate::document::Problem;
+
+/// How a command ends: an exit code, or why it could not do what it should.
+pub(super) type Outcome = Result<ExitCode, Failure>;
+
+/// Why a command ends early.
+#[derive(Debug)]
+pub(super) enum Failure {
+    /// What is wrong; where; what to do.
+    Failed(String),
+    /// The same of the command line.
+    Misused(String),
+    /// What is wrong with a configuration or a profile.
+    Invalid(Vec<Problem>),
+    /// It was reported already.
+    Reported(u8),
+}
+
+impl<T: Into<String>> From<T> for Failure {
+    fn from(message: T) -> Failure {
+        Failure::Failed(message.into())
+    }
+}
+
+impl Failure {
+    /// Prints it to stderr.
+    pub(super) fn report(self) -> ExitCode {
+        match self {
+            Failure::Failed(message) => report::failed(&message),
+            Failure::Misused(message) => {
+                report::error(&message);
+                ExitCode::from(EXIT_USAGE)
+            }
+            Failure::Invalid(problems) => {
+                report::errors(&problems);
+                ExitCode::from(EXIT_CONFIG)
+            }
+            Failure::Reported(code) => ExitCode::from(code),
+        }
+    }
+}
+
+/// The command did what it should, and found something wrong that it has reported.
+pub(super) fn negative() -> Outcome {
+    Ok(ExitCode::from(EXIT_FAILED))
+}
