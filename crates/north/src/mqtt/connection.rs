@@ -23,9 +23,9 @@ use tokio::task::JoinHandle;
 
 use super::broker_limits::{BrokerLimits, Lack};
 use super::dial::{CONNECT_TIMEOUT, Dial};
+use super::keep_alive::{KEEP_ALIVE_S, Silence, Verdict};
 use super::outbox::Message;
 use super::request::Incoming;
-use super::silence::{KEEP_ALIVE_S, Silence, Verdict};
 use super::{Broker, Options};
 use crate::tls_words;
 

@@ -10,7 +10,7 @@
 //! ```
 //!
 //! `payload`, `publisher`, `rounds`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O: they decide
-//! what is published, when, and in which order; `offline` drives `commands` without a broker. `broker_limits`, `silence`,
+//! what is published, when, and in which order; `offline` drives `commands` without a broker. `broker_limits`, `keep_alive`,
 //! `retry` and `takeover` judge what the broker does, without I/O as well, `back_off` chooses the broker. `client` owns
 //! them. `sparkplug` is a client of its own, on a link of its own. `session` is the loop of both: it connects, reconnects,
 //! follows reloads and disconnects. `link` is the way to one of the brokers: it owns the `connection`, which wraps rumqttc,
@@ -29,6 +29,7 @@ mod handover;
 mod history;
 mod home_assistant;
 mod journal;
+mod keep_alive;
 mod link;
 mod offline;
 mod outage_log;
@@ -41,7 +42,6 @@ mod request;
 mod retry;
 mod rounds;
 mod session;
-mod silence;
 pub mod sparkplug;
 mod store;
 mod takeover;

@@ -14,7 +14,7 @@ use crate::north::slot::SlotAccess;
 const MOST_SILENCE: Duration = Duration::from_secs(1);
 /// `response_timeout`: an hour was allowed before. A master that waits so long for an absent drive serves no other
 /// drive.
-const RESPONSE_TIMEOUT: Capped = Capped {
+const RESPONSE_TIMEOUTS: Capped = Capped {
     range: Duration::from_millis(1)..=Duration::from_secs(5),
     before: HOUR,
     why: "is longer than any drive takes to start its reply",
@@ -84,7 +84,7 @@ keys! {
         slow_cycle: Duration = TIMES, default "1s";
         /// Time a drive may take to start its reply; the time on the wire is added. Each attempt to reach an absent
         /// drive takes the line for that time.
-        response_timeout: Duration = RESPONSE_TIMEOUT,
+        response_timeout: Duration = RESPONSE_TIMEOUTS,
             by_protocol |protocol| format!("\"{}\"", format_duration(protocol.usual_timeout()));
         /// Retries after the first attempt before a drive counts as offline.
         retries: u32 = Number(0..=10, None), by_protocol |protocol| default_retries(protocol).to_string();
@@ -156,7 +156,7 @@ fn parse_silence(text: &str) -> Result<Silence, Finding> {
 
 #[cfg(test)]
 mod tests {
-    use super::RESPONSE_TIMEOUT;
+    use super::RESPONSE_TIMEOUTS;
 
     #[test]
     fn a_longer_duration_is_accepted_no_longer_than_was_promised() {
@@ -164,7 +164,7 @@ mod tests {
             let mut parts = text.split('.').map(|part| part.parse().unwrap());
             (parts.next().unwrap(), parts.next().unwrap())
         };
-        let (this, until) = (number(env!("CARGO_PKG_VERSION")), number(RESPONSE_TIMEOUT.until));
-        assert!(this < until, "make RESPONSE_TIMEOUT a plain range");
+        let (this, until) = (number(env!("CARGO_PKG_VERSION")), number(RESPONSE_TIMEOUTS.until));
+        assert!(this < until, "make RESPONSE_TIMEOUTS a plain range");
     }
 }

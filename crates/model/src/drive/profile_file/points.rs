@@ -59,7 +59,9 @@ pub(super) fn read_point(
         reader.problem("name", format!("there are two points `{name}`"), "rename one of them");
     }
     let model = ModelPoint::from_name(&name);
-    if let Some(meant) = misspelt(&name).filter(|_| model.is_none()) {
+    if model.is_none()
+        && let Some(meant) = misspelt(&name)
+    {
         reader.warning(
             "name",
             format!("`{name}` is not a point of the common model, but differs from `{meant}` by one letter"),
@@ -134,7 +136,9 @@ pub(super) fn read_point(
 fn misspelt(name: &str) -> Option<&'static str> {
     let near = |model: &&'static str| {
         let numbered = name.ends_with(|c: char| c.is_ascii_digit());
-        model.len() > 5 && !numbered && strsim::damerau_levenshtein(name, model) == 1
+        // Most names differ more in length than one letter can: they cost no comparison.
+        let near = name.len().abs_diff(model.len()) <= 1;
+        near && model.len() > 5 && !numbered && strsim::damerau_levenshtein(name, model) == 1
     };
     ModelPoint::ALL.iter().map(|point| point.name()).find(near)
 }
