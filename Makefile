@@ -24,8 +24,8 @@ help: ## Show this list
 build: ## Build the optimised binary, target/release/drivegate
 	cargo build --release --locked
 
-# Most tests wait for other programs and for real time, so twice as many as there are cores run at once.
-TEST_THREADS ?= $(shell expr 2 \* "$$(getconf _NPROCESSORS_ONLN)")
+# Most tests wait for other programs and for real time, so three times as many as there are cores run at once.
+TEST_THREADS ?= $(shell expr 3 \* "$$(getconf _NPROCESSORS_ONLN)")
 # What makes the next build after an edit faster takes a gigabyte, and whoever runs everything edits nothing meanwhile.
 test: export CARGO_INCREMENTAL = 0
 # Documentation tests first, so that the output ends with the count of a suite that tests the product.
