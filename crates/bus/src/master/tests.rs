@@ -18,6 +18,8 @@ use crate::transaction::MAY_BE_LATE;
 mod background;
 mod drill;
 mod hold;
+mod late_replies;
+mod shutdown;
 mod stop_all;
 
 /// What an exchange takes.
@@ -471,97 +473,6 @@ fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
 }
 
 #[test]
-fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
-    let mut rig = Rig::new(20);
-    for drive in 0..20 {
-        rig.drives[drive].holding.insert(2000, 1);
-    }
-    rig.drives[7].silent = true;
-    let (from, begin) = (rig.wire.len(), rig.now);
-    let missing = rig.shut_down();
-    let [missing] = missing.as_slice() else {
-        panic!("{missing:?}")
-    };
-    assert!(missing.starts_with("`d8` did not acknowledge its stop"), "{missing}");
-    let running: Vec<usize> = (0..20).filter(|drive| rig.runs(*drive)).collect();
-    assert_eq!(running, [7]);
-    let poll = |turn: &Turn| matches!(turn.purpose, Purpose::Poll(_));
-    assert!(!rig.wire[from..].iter().any(|(_, turn)| poll(turn)), "polls cease");
-    // All but the silent one are stopped before that is tried for long.
-    let last = (0..20).filter(|d| *d != 7).filter_map(|drive| {
-        let stop = |(_, turn): &&(Instant, Turn)| turn.drive == drive && turn.pdu().is_write();
-        rig.wire[from..].iter().find(stop).map(|(at, _)| *at - begin)
-    });
-    assert!(last.max().unwrap() < COST * 60);
-}
-
-/// Times, after the begin, of the frames of a shutdown: the broadcast and the first single stop.
-fn shutdown_of(rig: &mut Rig) -> (Option<Duration>, Duration) {
-    let (from, begin) = (rig.wire.len(), rig.now);
-    let missing = rig.shut_down();
-    assert!(missing.is_empty(), "{missing:?}");
-    let first = |broadcast: bool| {
-        let mut sent = rig.wire[from..].iter();
-        let found = sent.find(|(_, turn)| turn.pdu().is_write() && (turn.drive == NO_DRIVE) == broadcast);
-        found.map(|(at, _)| *at - begin)
-    };
-    (first(true), first(false).expect("each drive has a stop of its own"))
-}
-
-#[test]
-fn one_broadcast_stops_the_line_before_each_drive_has_its_own_stop() {
-    let running = |deaf: bool| {
-        let mut rig = Rig::new(20);
-        rig.deaf = deaf;
-        for drive in &mut rig.drives {
-            drive.holding.insert(2000, 1);
-        }
-        rig
-    };
-    for deaf in [false, true] {
-        let mut rig = running(deaf);
-        let (broadcast, single) = shutdown_of(&mut rig);
-        assert!(broadcast.expect("one broadcast") <= COST, "{broadcast:?}");
-        assert!(single > broadcast.unwrap() && single <= Duration::from_millis(500));
-        // What the broadcast says is not believed.
-        assert!((0..20).all(|drive| !rig.runs(drive)));
-    }
-    // One that is to go on, or that may not be commanded, keeps the others from it.
-    let hold = |spec: DriveSpec| DriveSpec {
-        on_shutdown: if spec.address == 4 {
-            OnShutdown::Hold
-        } else {
-            OnShutdown::Stop
-        },
-        ..spec
-    };
-    let mut rig = Rig::with(20, "vacon-nx", Protocol::ModbusRtu, Duration::from_millis(10), hold);
-    for drive in &mut rig.drives {
-        drive.holding.insert(2000, 1);
-    }
-    let (broadcast, _) = shutdown_of(&mut rig);
-    assert_eq!(broadcast, None);
-    assert!(rig.runs(3) && (0..20).filter(|drive| *drive != 3).all(|drive| !rig.runs(drive)));
-}
-
-#[test]
-fn a_drive_that_fell_silent_with_the_shutdown_keeps_no_stop_from_those_that_are_back() {
-    let mut rig = Rig::new(3);
-    rig.drives[1].silent = true;
-    rig.run(Duration::from_secs(2));
-    assert!(!rig.master.schedule.is_online(DriveIndex::new(1)));
-    rig.drives[1].silent = false;
-    rig.drives[1].holding.insert(2000, 1);
-    rig.drives[0].silent = true;
-    let missing = rig.shut_down();
-    let [missing] = missing.as_slice() else {
-        panic!("{missing:?}")
-    };
-    assert!(missing.starts_with("`d1` did not acknowledge its stop"), "{missing}");
-    assert!(!rig.runs(1));
-}
-
-#[test]
 fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_line() {
     let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
     rig.drives[0].silent = true;
@@ -576,85 +487,6 @@ fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_li
         .count();
     assert!(tries <= 4, "{tries} times Identify for one stop");
     assert_eq!(outcome(&mut stop), Some(Outcome::TimedOut));
-}
-
-#[test]
-fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() {
-    let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
-    let writes = |rig: &Rig, of: usize| -> Vec<Instant> {
-        let of = |(_, turn): &&(Instant, Turn)| turn.drive == of && turn.pdu().is_write();
-        rig.wire.iter().filter(of).map(|(at, _)| *at).collect()
-    };
-    rig.drives[1].next_write = Some(Ended::Silent);
-    let _run = rig.switch(1, "a", true);
-    while writes(&rig, 1).is_empty() {
-        rig.step();
-    }
-    let given_up = rig.now;
-    rig.drives[0].next_write = Some(Ended::Corrupt(MAY_BE_LATE));
-    let mut stop = rig.switch(0, "a", false);
-    rig.run(Duration::from_secs(1));
-    let sent = writes(&rig, 0);
-    assert_eq!(sent.len(), 2);
-    assert!(sent[0] < given_up + COST * 2, "it waits for nobody");
-    // A drive answers in order: once each has answered something else, no late one is to come.
-    let asked = |of: usize| {
-        let between = |at: &Instant| *at > sent[0] && *at < sent[1];
-        rig.wire.iter().any(|(at, turn)| turn.drive == of && between(at))
-    };
-    assert!(asked(0) && asked(1));
-    assert!(sent[1] < sent[0] + rig.master.response_timeout * N2_LATE);
-    assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
-}
-
-/// What an adapter or a repeater sends twice may come mangled first and sound afterwards.
-#[test]
-fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
-    for (mangled, expected) in [(true, true), (false, false)] {
-        let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
-        let read = |rig: &mut Rig| loop {
-            let next = rig.master.next(rig.now, &mut Vec::new());
-            match next {
-                Err(until) => rig.now = until,
-                Ok(turn) if matches!(turn.pdu(), RequestPdu::Read { .. }) => break turn,
-                Ok(turn) => panic!("{turn:?}"),
-            }
-        };
-        let end = |ended| TurnEnd {
-            ended,
-            began: rig.now,
-            took: COST,
-            mangled,
-            frame: Vec::new(),
-        };
-        let garbled = end(Ended::Corrupt("checksum"));
-        let mut turn = read(&mut rig);
-        // The reply before has another form than this one's.
-        let written = RequestPdu::WriteCoil { address: 0, on: true };
-        rig.master.last_answered = Some((turn.drive, written));
-        assert!(!rig.master.sending(&turn, rig.now).could_be_doubled);
-        rig.now += COST;
-        rig.master.done(&turn, garbled, rig.now, &mut Vec::new());
-        turn.drive = DriveIndex::new(1 - turn.drive.place());
-        assert_eq!(rig.master.sending(&turn, rig.now).could_be_doubled, expected);
-    }
-}
-
-#[test]
-fn a_reply_to_a_broken_off_exchange_is_waited_for_by_the_bus_that_comes_after() {
-    for protocol in [(Protocol::ModbusRtu, "vacon-nx"), (Protocol::N2, "vacon-nx-n2")] {
-        let mut rig = Rig::of(1, protocol.1, protocol.0);
-        let (now, deadline) = (rig.now, rig.now + Duration::from_secs(4));
-        let quiet = |handover: Handover| handover.quiet_until.unwrap();
-        let left = quiet(rig.master.ended(Some(deadline), now));
-        let window = match protocol.0 {
-            Protocol::N2 => N2_LATE * rig.master.response_timeout,
-            _ => FORGOTTEN_AFTER,
-        };
-        assert_eq!(left, deadline + window);
-    }
-    let mut rig = Rig::new(1);
-    assert_eq!(rig.master.ended(None, rig.now).quiet_until, Some(rig.now));
 }
 
 /// How an order to the first drive ends that answers its first `times` writes with that exception, and after how many of them.

@@ -1,12 +1,14 @@
 //! Which commands are let through: authority first, then address, then value; and why the others are not, in words.
 //! Codes and exceptions of a `Refusal` are in `command/mod.rs`. Pure.
 
+mod raw_write;
+
+pub use self::raw_write::written;
+use self::raw_write::{raw_write, stops};
 use super::frequency_range::{FrequencyRange, rests_on};
 use super::standing::keeps_limits;
 use super::{Authority, Order, ParameterOrder, Refusal, Urgency};
-use crate::codec::n2::Object;
-use crate::codec::{Protocol, RequestPdu, Table};
-use crate::drive::control::ControlItem;
+use crate::codec::Table;
 use crate::drive::model::Kind;
 use crate::drive::profile::AddressRange;
 use crate::drive::{Derived, ModelPoint, Point, PointIndex, Source, Value};
@@ -448,168 +450,6 @@ fn as_held(drive: &Reading<'_>, (index, value): (PointIndex, Value)) -> Value {
     let held = raw.and_then(|raw| raw.decode(&raw.encode(value, 0).ok()?, Kind::Number));
     held.filter(|held| held.as_f64() == 0.0)
         .map_or(value, |_| Value::Number(0.0))
-}
-
-/// The registers (or coils, as 0 and 1) that a raw write sets, as address and value.
-pub fn written(pdu: &RequestPdu) -> Option<(Table, Vec<(u16, u16)>)> {
-    let many = |start: u16, values: &mut dyn Iterator<Item = u16>| -> Vec<(u16, u16)> {
-        (0u16..)
-            .zip(values)
-            .filter_map(|(i, v)| Some((start.checked_add(i)?, v)))
-            .collect()
-    };
-    match pdu {
-        RequestPdu::WriteRegister { address, value } => Some((Table::Holding, vec![(*address, *value)])),
-        RequestPdu::WriteRegisters { start, values } => {
-            Some((Table::Holding, many(*start, &mut values.iter().copied())))
-        }
-        RequestPdu::WriteCoil { address, on } => Some((Table::Coil, vec![(*address, u16::from(*on))])),
-        RequestPdu::WriteCoils { start, bits } => {
-            Some((Table::Coil, many(*start, &mut bits.iter().map(|b| u16::from(*b)))))
-        }
-        _ => None,
-    }
-}
-
-/// The frequency ranges on which a raw write rests.
-fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<Vec<FrequencyRange>, Refusal> {
-    let profile = &drive.spec.profile;
-    let Some((table, items)) = written(pdu) else {
-        return Err(Refusal::NotAllowed(format!(
-            "function {} cannot be passed on to this drive",
-            pdu.function()
-        )));
-    };
-    let Some((first, _)) = items.first() else {
-        return Err(Refusal::BadValue(
-            "the write names no register; nothing was written".to_string(),
-        ));
-    };
-    let range = profile.range(table, *first).filter(|r| r.write > 0).ok_or_else(|| {
-        Refusal::NotWritable(format!(
-            "{table} {first} of `{}` is read-only or unknown",
-            drive.spec.name
-        ))
-    })?;
-    if let Some((beyond, _)) = items.iter().find(|(address, _)| !range.addresses.contains(address)) {
-        return Err(Refusal::NotWritable(format!(
-            "{table} {beyond} of `{}` is read-only or unknown",
-            drive.spec.name
-        )));
-    }
-    raw_rule(drive, table, &items)?;
-    control_words(drive, table, &items)?;
-    if profile.protocols.contains(&Protocol::N2) {
-        one_object(table, *first, items.len())?;
-    }
-    if items.len() > usize::from(range.write) {
-        let (count, most) = (items.len(), range.write);
-        return Err(Refusal::BadValue(format!(
-            "{count} items in one write, but the drive accepts at most {most}; nothing was written"
-        )));
-    }
-    raw_values(drive, table, &items)
-}
-
-/// The registers beyond those of writable points that the drive's configuration does not admit.
-fn raw_rule(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
-    let spec = drive.spec;
-    let addresses = items.iter().map(|(address, _)| *address);
-    match spec.raw_writes.refused(&spec.profile, table, addresses) {
-        None => Ok(()),
-        Some(address) => Err(Refusal::NotWritable(format!(
-            "{table} {address} of `{}` belongs to no writable point; add [{address}, {address}] to `raw_writes` of the \
-             drive to write it raw",
-            spec.name
-        ))),
-    }
-}
-
-/// A control word that is neither a stop nor clearly a run command is not passed on: its effect is unknown.
-fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
-    let Some(control) = &drive.spec.profile.control else {
-        return Ok(());
-    };
-    let refused = |(address, word): &&(u16, u16)| {
-        !control.admits(
-            ControlItem {
-                table,
-                address: *address,
-            },
-            *word,
-        )
-    };
-    match items.iter().find(refused) {
-        None => Ok(()),
-        Some((address, word)) => Err(Refusal::BadValue(format!(
-            "{word:#06x} at {table} {address} of `{}` neither stops nor runs the drive according to its profile; \
-             nothing was written",
-            drive.spec.name
-        ))),
-    }
-}
-
-/// On N2 a write goes to one object and sets all of it: an address at which none begins is no address, another length
-/// no value.
-fn one_object(table: Table, first: u16, count: usize) -> Result<(), Refusal> {
-    let object = Object::at(table, first)
-        .ok_or_else(|| Refusal::NotWritable(format!("no object starts at {table} {first}; nothing was written")))?;
-    let items = object.items();
-    if count != usize::from(items) {
-        return Err(Refusal::BadValue(format!(
-            "{object} must be written with exactly {items} items; nothing was written"
-        )));
-    }
-    Ok(())
-}
-
-/// The points that a raw write of `items` sets: each whole, and within its limits; and the frequency ranges on which that
-/// rests.
-fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<Vec<FrequencyRange>, Refusal> {
-    let mut ranges = Vec::new();
-    for (index, point) in drive.spec.profile.points.enumerate() {
-        let Some(raw) = point.raw().filter(|raw| raw.table == table) else {
-            continue;
-        };
-        let words: Vec<u16> = raw
-            .addresses()
-            .filter_map(|address| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word))
-            .collect();
-        if words.is_empty() || point.kind() == Kind::Bool {
-            continue;
-        }
-        if words.len() < usize::from(raw.form.items()) {
-            return Err(Refusal::BadValue(format!(
-                "`{}` takes {} registers; write them together; nothing was written",
-                point.name,
-                raw.form.items()
-            )));
-        }
-        match raw.decode(&words, Kind::Number) {
-            Some(value) => {
-                let value = checked(drive, index, point, value)?;
-                related_limits(drive, index, index, value)?;
-                ranges.extend(rests_on(drive, index, (index, value)));
-            }
-            None => {
-                return Err(Refusal::BadValue(format!(
-                    "`{}`: not a number; nothing was written",
-                    point.name
-                )));
-            }
-        }
-    }
-    Ok(ranges)
-}
-
-/// Whether a raw write takes the run command away and does nothing else. One of several items is judged as any other
-/// command: its stop was taken out of it before ([`super::Parts`]).
-fn stops(drive: &Reading<'_>, pdu: &RequestPdu) -> bool {
-    let profile = &drive.spec.profile;
-    written(pdu).is_some_and(|(table, items)| match items.as_slice() {
-        [(address, value)] => profile.is_stop(table, *address, *value),
-        _ => false,
-    })
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::*;
-use crate::codec::Exception;
+use crate::codec::{Exception, RequestPdu};
 use crate::drive::RawWrites;
 use crate::drive::profile::Profiles;
 use crate::drive::{PointIndex, Profile};

@@ -6,6 +6,8 @@ use std::time::UNIX_EPOCH;
 use super::*;
 use crate::mqtt::sparkplug::wire::MetricValue;
 
+mod chance;
+
 const STATE: &str = r#"{"online": ONLINE, "timestamp": TIME}"#;
 
 fn rules(primary_host: &str) -> Rules {
@@ -543,91 +545,6 @@ fn names_replace_aliases_where_they_are_off() {
     );
     assert_eq!(bench.session.metric(0, Some("b"), None), Some(1));
     assert_eq!(bench.session.metric(0, None, Some(1)), None);
-}
-
-/// Numbers by chance, the same for each seed.
-struct Dice(u64);
-
-impl Dice {
-    fn below(&mut self, limit: u64) -> u64 {
-        self.0 = self
-            .0
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 33) % limit
-    }
-}
-
-/// Lost connections, births on request, drives that come and go, reloads, a host that goes offline: a thousand
-/// connections. The watcher checks every message; at the end of each connection the host knows what is.
-#[test]
-fn a_thousand_connections() {
-    for seed in 0..4 {
-        let mut dice = Dice(seed);
-        let mut bench = SessionWithHost::new(rules(if seed % 2 == 0 { "" } else { "scada" }), 5);
-        let mut present = [true; 5];
-        let (mut requested, mut number) = (0, 0.0);
-        for connection in 0..250u32 {
-            bench.connect((connection % 256) as u8);
-            bench.session.subscribed();
-            let births = bench.host.births;
-            let mut alive = !bench.session.is_waiting();
-            for _ in 0..dice.below(40) {
-                bench.time += dice.below(120);
-                let device = dice.below(5) as usize;
-                number += 1.0;
-                match dice.below(12) {
-                    0 => present[device] = !present[device],
-                    1 => {
-                        bench.session.request_birth();
-                        requested += 1;
-                    }
-                    2 if seed % 2 == 1 => {
-                        let online = dice.below(3) > 0;
-                        let ends = bench.state(online, bench.time);
-                        alive |= online;
-                        if ends {
-                            let death = bench.session.end(bench.tick());
-                            bench.host.see(&death);
-                            break;
-                        }
-                    }
-                    3 => {
-                        let names: &[&str] = if dice.below(2) == 0 { &["a", "b"] } else { &["b", "a"] };
-                        let devices = (0..5).map(|n| (format!("p{n}"), definitions(names)));
-                        bench.session.adopt(definitions(&["Bus/line1/load"]), devices.collect());
-                        bench.session.tell_node(vec![sample(number, bench.time)]);
-                        (0..5).for_each(|n| bench.tell(n, present[n], number));
-                    }
-                    _ => {}
-                }
-                bench.tell(device, present[device], number);
-                bench.send(dice.below(6) as usize);
-            }
-            // Everything that is due, and what the pace holds back.
-            for _ in 0..400 {
-                bench.time += 50;
-                bench.send(64);
-            }
-            if alive && bench.session.is_alive() {
-                assert!(bench.host.births > births);
-                let born: Vec<bool> = (0..5).map(|n| bench.host.born.contains(&format!("p{n}"))).collect();
-                assert_eq!(born, present, "seed {seed}, connection {connection}");
-                assert_eq!(
-                    bench.waiting(),
-                    bench
-                        .session
-                        .devices
-                        .iter()
-                        .filter(|d| !d.present)
-                        .map(|d| d.history.len())
-                        .sum::<usize>()
-                );
-            }
-            bench.session.closed();
-        }
-        assert!(requested > 100 && !bench.host.deaths.is_empty() && !bench.host.past.is_empty());
-    }
 }
 
 /// Names and nulls of the metrics of the next message, which is of this kind.

@@ -1,0 +1,82 @@
+//! Replies that may come late.
+
+use super::*;
+
+#[test]
+fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() {
+    let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
+    let writes = |rig: &Rig, of: usize| -> Vec<Instant> {
+        let of = |(_, turn): &&(Instant, Turn)| turn.drive == of && turn.pdu().is_write();
+        rig.wire.iter().filter(of).map(|(at, _)| *at).collect()
+    };
+    rig.drives[1].next_write = Some(Ended::Silent);
+    let _run = rig.switch(1, "a", true);
+    while writes(&rig, 1).is_empty() {
+        rig.step();
+    }
+    let given_up = rig.now;
+    rig.drives[0].next_write = Some(Ended::Corrupt(MAY_BE_LATE));
+    let mut stop = rig.switch(0, "a", false);
+    rig.run(Duration::from_secs(1));
+    let sent = writes(&rig, 0);
+    assert_eq!(sent.len(), 2);
+    assert!(sent[0] < given_up + COST * 2, "it waits for nobody");
+    // A drive answers in order: once each has answered something else, no late one is to come.
+    let asked = |of: usize| {
+        let between = |at: &Instant| *at > sent[0] && *at < sent[1];
+        rig.wire.iter().any(|(at, turn)| turn.drive == of && between(at))
+    };
+    assert!(asked(0) && asked(1));
+    assert!(sent[1] < sent[0] + rig.master.response_timeout * N2_LATE);
+    assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
+}
+
+/// What an adapter or a repeater sends twice may come mangled first and sound afterwards.
+#[test]
+fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
+    for (mangled, expected) in [(true, true), (false, false)] {
+        let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
+        let read = |rig: &mut Rig| loop {
+            let next = rig.master.next(rig.now, &mut Vec::new());
+            match next {
+                Err(until) => rig.now = until,
+                Ok(turn) if matches!(turn.pdu(), RequestPdu::Read { .. }) => break turn,
+                Ok(turn) => panic!("{turn:?}"),
+            }
+        };
+        let end = |ended| TurnEnd {
+            ended,
+            began: rig.now,
+            took: COST,
+            mangled,
+            frame: Vec::new(),
+        };
+        let garbled = end(Ended::Corrupt("checksum"));
+        let mut turn = read(&mut rig);
+        // The reply before has another form than this one's.
+        let written = RequestPdu::WriteCoil { address: 0, on: true };
+        rig.master.last_answered = Some((turn.drive, written));
+        assert!(!rig.master.sending(&turn, rig.now).could_be_doubled);
+        rig.now += COST;
+        rig.master.done(&turn, garbled, rig.now, &mut Vec::new());
+        turn.drive = DriveIndex::new(1 - turn.drive.place());
+        assert_eq!(rig.master.sending(&turn, rig.now).could_be_doubled, expected);
+    }
+}
+
+#[test]
+fn a_reply_to_a_broken_off_exchange_is_waited_for_by_the_bus_that_comes_after() {
+    for protocol in [(Protocol::ModbusRtu, "vacon-nx"), (Protocol::N2, "vacon-nx-n2")] {
+        let mut rig = Rig::of(1, protocol.1, protocol.0);
+        let (now, deadline) = (rig.now, rig.now + Duration::from_secs(4));
+        let quiet = |handover: Handover| handover.quiet_until.unwrap();
+        let left = quiet(rig.master.ended(Some(deadline), now));
+        let window = match protocol.0 {
+            Protocol::N2 => N2_LATE * rig.master.response_timeout,
+            _ => FORGOTTEN_AFTER,
+        };
+        assert_eq!(left, deadline + window);
+    }
+    let mut rig = Rig::new(1);
+    assert_eq!(rig.master.ended(None, rig.now).quiet_until, Some(rig.now));
+}

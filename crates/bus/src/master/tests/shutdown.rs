@@ -1,0 +1,94 @@
+//! The stops of a shutdown.
+
+use super::*;
+
+#[test]
+fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
+    let mut rig = Rig::new(20);
+    for drive in 0..20 {
+        rig.drives[drive].holding.insert(2000, 1);
+    }
+    rig.drives[7].silent = true;
+    let (from, begin) = (rig.wire.len(), rig.now);
+    let missing = rig.shut_down();
+    let [missing] = missing.as_slice() else {
+        panic!("{missing:?}")
+    };
+    assert!(missing.starts_with("`d8` did not acknowledge its stop"), "{missing}");
+    let running: Vec<usize> = (0..20).filter(|drive| rig.runs(*drive)).collect();
+    assert_eq!(running, [7]);
+    let poll = |turn: &Turn| matches!(turn.purpose, Purpose::Poll(_));
+    assert!(!rig.wire[from..].iter().any(|(_, turn)| poll(turn)), "polls cease");
+    // All but the silent one are stopped before that is tried for long.
+    let last = (0..20).filter(|d| *d != 7).filter_map(|drive| {
+        let stop = |(_, turn): &&(Instant, Turn)| turn.drive == drive && turn.pdu().is_write();
+        rig.wire[from..].iter().find(stop).map(|(at, _)| *at - begin)
+    });
+    assert!(last.max().unwrap() < COST * 60);
+}
+
+/// Times, after the begin, of the frames of a shutdown: the broadcast and the first single stop.
+fn shutdown_of(rig: &mut Rig) -> (Option<Duration>, Duration) {
+    let (from, begin) = (rig.wire.len(), rig.now);
+    let missing = rig.shut_down();
+    assert!(missing.is_empty(), "{missing:?}");
+    let first = |broadcast: bool| {
+        let mut sent = rig.wire[from..].iter();
+        let found = sent.find(|(_, turn)| turn.pdu().is_write() && (turn.drive == NO_DRIVE) == broadcast);
+        found.map(|(at, _)| *at - begin)
+    };
+    (first(true), first(false).expect("each drive has a stop of its own"))
+}
+
+#[test]
+fn one_broadcast_stops_the_line_before_each_drive_has_its_own_stop() {
+    let running = |deaf: bool| {
+        let mut rig = Rig::new(20);
+        rig.deaf = deaf;
+        for drive in &mut rig.drives {
+            drive.holding.insert(2000, 1);
+        }
+        rig
+    };
+    for deaf in [false, true] {
+        let mut rig = running(deaf);
+        let (broadcast, single) = shutdown_of(&mut rig);
+        assert!(broadcast.expect("one broadcast") <= COST, "{broadcast:?}");
+        assert!(single > broadcast.unwrap() && single <= Duration::from_millis(500));
+        // What the broadcast says is not believed.
+        assert!((0..20).all(|drive| !rig.runs(drive)));
+    }
+    // One that is to go on, or that may not be commanded, keeps the others from it.
+    let hold = |spec: DriveSpec| DriveSpec {
+        on_shutdown: if spec.address == 4 {
+            OnShutdown::Hold
+        } else {
+            OnShutdown::Stop
+        },
+        ..spec
+    };
+    let mut rig = Rig::with(20, "vacon-nx", Protocol::ModbusRtu, Duration::from_millis(10), hold);
+    for drive in &mut rig.drives {
+        drive.holding.insert(2000, 1);
+    }
+    let (broadcast, _) = shutdown_of(&mut rig);
+    assert_eq!(broadcast, None);
+    assert!(rig.runs(3) && (0..20).filter(|drive| *drive != 3).all(|drive| !rig.runs(drive)));
+}
+
+#[test]
+fn a_drive_that_fell_silent_with_the_shutdown_keeps_no_stop_from_those_that_are_back() {
+    let mut rig = Rig::new(3);
+    rig.drives[1].silent = true;
+    rig.run(Duration::from_secs(2));
+    assert!(!rig.master.schedule.is_online(DriveIndex::new(1)));
+    rig.drives[1].silent = false;
+    rig.drives[1].holding.insert(2000, 1);
+    rig.drives[0].silent = true;
+    let missing = rig.shut_down();
+    let [missing] = missing.as_slice() else {
+        panic!("{missing:?}")
+    };
+    assert!(missing.starts_with("`d1` did not acknowledge its stop"), "{missing}");
+    assert!(!rig.runs(1));
+}
