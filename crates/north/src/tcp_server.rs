@@ -13,7 +13,7 @@ use super::server::{Reconfigure, Server};
 use super::{NorthState, ServerError, ServerKind};
 use crate::plant::SharedPlant;
 
-/// The part of a TCP server that is its own.
+/// What one TCP server does differently from the others.
 pub(crate) trait TcpService<Options>: Debug + Sized {
     /// Name in messages.
     const NAME: &'static str;
@@ -27,7 +27,7 @@ pub(crate) trait TcpService<Options>: Debug + Sized {
     /// A service without listeners; `tasks` end with `cancel`.
     ///
     /// # Errors
-    /// A certificate or a thread cannot be had.
+    /// A certificate cannot be used, or a thread cannot be started.
     fn new(
         options: &Options,
         plant: SharedPlant,
@@ -39,7 +39,7 @@ pub(crate) trait TcpService<Options>: Debug + Sized {
     /// The listeners, in the order of the configuration.
     fn listener_specs(options: &Options) -> Vec<ListenerSpec>;
 
-    /// Does all that can fail, apart from binding; nothing changes for any client.
+    /// Does everything that can fail, except binding; nothing changes for any client.
     ///
     /// # Errors
     /// The certificates cannot be used.
@@ -106,7 +106,7 @@ impl<S: TcpService<O>, O: Clone + PartialEq + Debug> Server for TcpServer<S, O> 
         cancel: CancellationToken,
     ) -> Result<TcpServer<S, O>, ServerError> {
         let cancel = cancel.child_token();
-        // They end with the token and not with the last of them, since a reload can replace every listener.
+        // The server ends with the token, not with its last task: a reload can replace every listener.
         let tasks = TaskTracker::new();
         tasks.spawn(cancel.clone().cancelled_owned());
         tasks.close();
@@ -116,7 +116,7 @@ impl<S: TcpService<O>, O: Clone + PartialEq + Debug> Server for TcpServer<S, O> 
             service: S::new(&options, plant, stats, cancel, &tasks)?,
             tasks,
         };
-        // The first options are prepared and committed as all later ones.
+        // The first options are prepared and committed like all later ones.
         let change = server.prepare(options).await?;
         server.commit(change);
         on_error.disarm();

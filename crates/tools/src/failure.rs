@@ -13,11 +13,11 @@ pub(super) type Outcome = Result<ExitCode, Failure>;
 pub(super) enum Failure {
     /// What is wrong; where; what to do.
     Failed(String),
-    /// The same of the command line.
+    /// The same, about the command line.
     Misused(String),
     /// What is wrong with a configuration or a profile.
     Invalid(Vec<Problem>),
-    /// It was reported already.
+    /// Already reported.
     Reported(u8),
 }
 
@@ -45,7 +45,7 @@ impl Failure {
     }
 }
 
-/// The command did what it should, and found something wrong that it has reported.
+/// The command did its work and has reported what it found wrong.
 pub(super) fn negative() -> Outcome {
     Ok(ExitCode::from(EXIT_FAILED))
 }

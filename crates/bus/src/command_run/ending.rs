@@ -59,7 +59,7 @@ impl CommandRun {
         self.actions.is_empty().then(|| self.success())
     }
 
-    /// Its end sends no stop of its own to a motor that it started.
+    /// Ending it then sends no separate stop to the motor that it started.
     fn leave_motor(&mut self) {
         if self.phase == Phase::MotorStarted {
             self.phase = Phase::Steps;

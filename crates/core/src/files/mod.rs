@@ -30,7 +30,7 @@ pub fn set_aside(path: &Path, aside: &Path) -> String {
 /// The content of a file of at most `longest` bytes; `None` where there is no file.
 ///
 /// # Errors
-/// It cannot be read, or is longer and so none of ours.
+/// It cannot be read, or is longer and so not one of ours.
 pub fn read(path: &Path, longest: u64) -> Result<Option<Vec<u8>>, String> {
     let length = match fs::metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),

@@ -1,4 +1,4 @@
-//! Indexes with types of their own, so that the compiler notices when one is taken for another, and the vectors that they index.
+//! Indexes with types of their own, so that the compiler notices when one is used in place of another, and the vectors that they index.
 
 use std::fmt;
 use std::marker::PhantomData;

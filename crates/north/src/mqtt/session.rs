@@ -1,5 +1,5 @@
 //! The session of a client with its broker, for both clients: it connects and subscribes, gives up what cannot be used,
-//! follows reloads, and ends in order. What is published and received is up to the client.
+//! follows reloads, and disconnects. What is published and received is up to the client.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -81,25 +81,25 @@ pub(super) trait Client {
 
     fn on_message(&mut self, message: Incoming);
 
-    /// What became of a message with an acknowledgement.
+    /// The result of a message that the broker acknowledges.
     fn on_delivery(&mut self, _step: Step) {}
 
-    /// Whether the last will would be true if the broker published it now: others take the client for online.
+    /// Whether the last will would be correct if the broker published it now: subscribers consider the client online.
     fn is_alive(&self) -> bool;
 
-    /// There is no connection any more.
+    /// The connection is closed.
     fn down(&mut self);
 
-    /// Observes this plant from now on: a reload replaced the one before.
+    /// Follows this plant from now on; a reload replaced the previous one.
     fn adopt(&mut self, plant: Arc<Plant>);
 
-    /// What is due besides.
+    /// Whatever else is due.
     fn check(&mut self, now: Instant);
 
     /// Looks at the drives that were updated or are due, and sets when to look again.
     fn look(&mut self);
 
-    /// Publishes what waits, as far as the connection allows.
+    /// Publishes pending messages, as far as the connection allows.
     fn publish(&mut self);
 
     /// Whether the client wants to leave this broker, and how long to wait before the next connection.
@@ -132,7 +132,7 @@ pub(super) async fn run(client: &mut impl Client, cancel: CancellationToken) {
     }
 }
 
-/// Leaves the broker if the client wants to; else publishes what waits.
+/// Leaves the broker if the client wants to; otherwise publishes pending messages.
 async fn follow(client: &mut impl Client) {
     if let Some(wait) = client.leaves() {
         leave(client).await;
@@ -158,7 +158,7 @@ async fn check(client: &mut impl Client, now: Instant) {
     client.look();
 }
 
-/// Observes the plant that a reload put in the place of the one before.
+/// Follows the plant of the last reload.
 pub(super) fn follow_plant(client: &mut impl Client) {
     let plant = client.common().plant.load_full();
     if Arc::ptr_eq(&plant, &client.common().observed) {
