@@ -22,8 +22,10 @@ use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
 use crate::codec::{Exception, Reply, Table};
-use crate::command::{Command, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Touched, Urgency};
-use crate::drive::{DriveIndex, Profile};
+use crate::command::{
+    Command, Intent, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Urgency, Work,
+};
+use crate::drive::Profile;
 
 /// Most stops to a drive that are sent before the end of a started pulse.
 const MOST_STOPS: u32 = 8;
@@ -123,8 +125,8 @@ pub struct CommandRun {
     held_up: bool,
     /// Stops that were done since it was last written.
     overtaken: u32,
-    /// A stop as it was ordered, for a bus that takes the place of this one.
-    stop: Option<Order>,
+    /// The command as it was ordered.
+    intent: Intent,
     /// The start that it causes, of a motor whose starts are counted.
     pub(super) start: Option<Start>,
     /// Supervision follows the client that sent it.
@@ -135,19 +137,18 @@ impl CommandRun {
     /// Arranges the steps in a safe order: a stop first, references before run, a reset before a new run edge. A
     /// command that cannot be sent as a whole is refused; a stop is sent as far as possible.
     pub fn new(command: Command, profile: &Profile) -> CommandRun {
+        let urgency = command.urgency();
         let Command {
-            order,
-            urgency,
-            reference_only,
-            expires,
-            ticket,
-            joined,
-            was_begun,
-            behind,
-            ..
+            intent, work, ticket, ..
         } = command;
+        let order = intent.order.clone();
+        let (reference_only, behind, was_begun, joined) = match work {
+            Work::Stop(stop) => (false, false, stop.was_begun, stop.joined),
+            Work::Set(set) => (set.reference_only, set.behind.is_some(), false, Vec::new()),
+            Work::Read | Work::PassedOn(_) => (false, false, false, Vec::new()),
+        };
+        let expires = intent.window.expires;
         let effects = confirm::effects(profile, &order);
-        let stop = (urgency == Urgency::Stop).then(|| order.clone());
         let scope = Scope {
             whole: matches!(&order, Order::Points(values) if sets_all_bits(profile, values)),
             reference_only,
@@ -176,7 +177,7 @@ impl CommandRun {
                 .collect(),
             Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
             Order::Points(_) if unsendable.is_some() && urgency != Urgency::Stop => VecDeque::new(),
-            Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop, behind.is_some()),
+            Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop, behind),
         };
         let actions = actions
             .into_iter()
@@ -210,7 +211,7 @@ impl CommandRun {
             control: profile.run_place().map(|place| (place.table, place.address)),
             held_up: false,
             overtaken: 0,
-            stop,
+            intent,
             start: None,
             renews: true,
         }
@@ -220,37 +221,27 @@ impl CommandRun {
     ///
     /// # Errors
     /// It is none.
-    pub fn into_stop(mut self, drive: DriveIndex) -> Result<Command, Box<CommandRun>> {
-        let Some(order) = self.stop.clone().filter(|_| self.is_of_client()) else {
+    pub fn into_stop(mut self) -> Result<Command, Box<CommandRun>> {
+        if self.urgency != Urgency::Stop || !self.is_of_client() {
             return Err(Box::new(self));
-        };
+        }
         let Some(ticket) = self.tickets.pop() else {
             return Err(Box::new(self));
         };
         let (expires, was_begun) = (self.expires, self.has_begun());
-        Ok(Command {
-            drive,
-            order,
-            urgency: Urgency::Stop,
-            reference_only: false,
-            ranges: Vec::new(),
-            expires,
-            ticket,
-            joined: self.tickets.into_iter().map(|ticket| (ticket, expires)).collect(),
-            behind: None,
-            overtaken: 0,
-            number: 0,
-            asked: None,
-            touched: Touched::Anything,
-            passed_on: None,
-            was_begun,
-            // They are noted.
-            effects: Vec::new(),
-            slot: None,
-            waits: false,
-            is_ordinary: false,
-            is_urgent: true,
-        })
+        let joined = self.tickets.into_iter().map(|ticket| (ticket, expires)).collect();
+        self.intent.window.expires = expires;
+        Ok(Command::begun_stop(self.intent, was_begun, ticket, joined))
+    }
+
+    /// The command as it was ordered.
+    pub fn intent(&self) -> &Intent {
+        &self.intent
+    }
+
+    /// The ticket of the client that sent it.
+    pub fn first_ticket(&self) -> Option<&Ticket> {
+        self.tickets.first()
     }
 
     /// Rank of the command.

@@ -9,8 +9,8 @@ use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
 use super::vain_stops::VainStops;
 use crate::codec::Reply;
-use crate::command::{Command, Interruption, LastWritten, Origin, Outcome, Refusal, Urgency};
-use crate::drive::{DriveIndex, ModelPoint};
+use crate::command::{Command, Interruption, LastWritten, Origin, Outcome, Urgency};
+use crate::drive::ModelPoint;
 use crate::process_image::{DriveImage, Reading};
 
 /// A status older than this, or than three rounds of the line, does not show whether the motor runs.
@@ -43,7 +43,7 @@ pub(super) struct DriveState {
     /// A start (true) or a stop was acknowledged, and the guards have not taken note of it.
     pub(super) acknowledged: Option<bool>,
     /// Whether `[authority]` is on: then the senders of executed commands are kept.
-    pub(super) guarded: bool,
+    pub(super) has_authority: bool,
     pub(super) carried_out: Vec<Origin>,
     /// Whether its local control place has it; none while that is not known.
     pub(super) local: Option<bool>,
@@ -79,7 +79,7 @@ impl DriveState {
             was_read: false,
             written: LastWritten::default(),
             acknowledged: None,
-            guarded: false,
+            has_authority: false,
             carried_out: Vec::new(),
             local: None,
         }
@@ -188,7 +188,7 @@ impl DriveState {
         if run.is_heard() && run.reached_the_wire() {
             self.supervision.renew(now);
         }
-        if self.guarded && outcome.is_ok() {
+        if self.has_authority && outcome.is_ok() {
             self.carried_out.extend(run.origins().cloned());
         }
         if urgency == Urgency::Stop && run.has_begun() {
@@ -267,18 +267,6 @@ impl DriveState {
         }
     }
 
-    /// Another client took the drive: started commands that `refuses` rejects end.
-    pub(super) fn taken(&mut self, refuses: impl Fn(&Origin) -> Option<Refusal>, image: &DriveImage, now: Instant) {
-        let taken = |run: &mut CommandRun| {
-            let refusal = run.origins().find_map(&refuses)?;
-            run.taken(refusal)
-        };
-        let outcome = self.run(Urgency::Command).and_then(taken);
-        if let Some(outcome) = outcome {
-            self.end(Urgency::Command, &outcome, image, now);
-        }
-    }
-
     /// Withdraws a supervision action that was started but not sent: a client commands the drive again.
     pub(super) fn withdraw_supervision(&mut self, now: Instant) {
         for run in &mut self.runs {
@@ -310,12 +298,12 @@ impl DriveState {
     }
 
     /// A client's started stop, for the bus that replaces this one.
-    pub(super) fn take_stop(&mut self, drive: DriveIndex, now: Instant) -> Option<Command> {
+    pub(super) fn take_stop(&mut self, now: Instant) -> Option<Command> {
         let run = self.runs.get_mut(slot(Urgency::Stop))?.take()?;
         if run.is_heard() && run.reached_the_wire() {
             self.supervision.renew(now);
         }
-        match run.into_stop(drive) {
+        match run.into_stop() {
             Ok(stop) => Some(stop),
             Err(run) => {
                 self.begin(*run);

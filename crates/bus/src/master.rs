@@ -9,6 +9,7 @@ mod background;
 mod choose;
 mod hold;
 mod passed_on;
+mod permission;
 mod remains;
 mod results;
 mod shutdown;
@@ -259,18 +260,16 @@ impl Master {
             shutdown.end(&self.bus);
         }
         let mut queue = self.bus.queue.lock();
-        for (index, drive) in self.drives.enumerate_mut() {
+        for drive in &mut self.drives {
             if queue.is_ending()
-                && let Some(stop) = drive.take_stop(index, now)
+                && let Some(stop) = drive.take_stop(now)
                 && let Err(stop) = queue.give_back(stop)
             {
                 stop.answer(&Outcome::ShuttingDown, now);
             }
         }
+        queue.gate.settle(|_| false);
         drop(queue);
-        if let Some(starts) = &mut self.waits.starts {
-            starts.settle(|_| false);
-        }
         let close = |drive: &mut DriveState| {
             drive.close(&Outcome::ShuttingDown, Interruption::ShuttingDown, now);
             drive.supervision.lease()
@@ -313,6 +312,8 @@ impl Master {
         if let Some(starts) = &mut self.waits.starts {
             news.append(&mut starts.take_told());
         }
+        let denied = self.bus.queue.lock().take_denied();
+        news.extend(denied.into_iter().map(News::Denied));
         next.map_err(|until| until.min(now + LOOK_ROUND))
     }
 
@@ -321,7 +322,7 @@ impl Master {
         let Master {
             bus, drives, writes, ..
         } = self;
-        let guarded = bus.queue.is_guarded();
+        let has_authority = bus.queue.has_authority();
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if !drive.confirmations.is_empty() {
                 if std::mem::take(&mut drive.was_read) {
@@ -330,8 +331,8 @@ impl Master {
                 let late = drive.confirmations.expire(&image.spec.profile, now);
                 news.extend(late.into_iter().map(|late| News::NotConfirmed(index, late)));
             }
-            if drive.guarded || guarded {
-                look_at_hold(bus, index, image, drive, (guarded, writes), now);
+            if drive.has_authority || has_authority {
+                look_at_hold(bus, index, image, drive, (has_authority, writes), now);
             }
             if image.spec.supervision.is_some() {
                 supervise(bus, index, image, drive, writes, now, news);
@@ -362,14 +363,17 @@ impl Master {
                 starts.look_at_interlocks(bus, (index, image), &drive.words, &reading, writes);
             }
         }
-        if starts.has_cleared() {
-            let pending = bus.queue.lock();
-            let passed_on = background.as_ref().map(Begun::number);
+        let mut pending = bus.queue.lock();
+        if pending.gate.has_cleared() {
+            let background = background.as_ref().and_then(Begun::number);
             let begun = drives
                 .iter_mut()
                 .filter_map(|drive| drive.run(Urgency::Command)?.start.as_ref());
-            let begun: Vec<u64> = begun.map(|start| start.number).chain(passed_on).collect();
-            starts.settle(|number| pending.has(number) || begun.contains(&number));
+            let begun: Vec<u64> = begun.map(|start| start.number).chain(background).collect();
+            let waiting: Vec<u64> = pending.numbers().collect();
+            pending
+                .gate
+                .settle(|number| waiting.contains(&number) || begun.contains(&number));
         }
     }
 

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::confirm::Unconfirmed;
 use crate::codec::Exception;
-use crate::command::{Origin, Refusal};
+use crate::command::{Denied, Refusal};
 use crate::drive::{DriveIndex, PlannedRead};
 
 /// One piece of news. Drives are named by their place on the bus.
@@ -64,17 +64,8 @@ pub enum News {
     },
     /// A drive whose lease expired does not report whether it runs.
     RunningUnknown(DriveIndex),
-    /// A waiting or started command is refused: it may not start its motor.
-    StartRefused {
-        /// Which drive.
-        drive: DriveIndex,
-        /// The client that gave it.
-        origin: Origin,
-        /// The command in one line.
-        what: String,
-        /// Why not.
-        refusal: Refusal,
-    },
+    /// A waiting or started command was refused.
+    Denied(Denied),
     /// An interlock does not hold, and the motor is stopped by that.
     Tripped {
         /// Which drive.

@@ -11,7 +11,9 @@ use std::time::{Duration, Instant};
 use self::drive::{Drive, Start};
 use super::command_run::{CommandRun, KnownWords, Next, Step};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Admitted, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats, written};
+use crate::command::{
+    Admitted, Arrival, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, WriteStats, written,
+};
 use crate::drive::control::{Control, ControlItem, OwnWord, Run, Setting};
 use crate::drive::profile::Form;
 use crate::drive::{DriveIndex, ModelPoint, PointIndex, Profile, Raw, Value};
@@ -258,10 +260,13 @@ impl<'p> Case<'p> {
             reference_only: false,
             ranges: Vec::new(),
         };
-        CommandRun::new(
-            Command::new(DriveIndex::new(0), admitted, expires, ticket),
-            self.profile,
-        )
+        let window = Window {
+            arrival: Arrival::now(now),
+            expires,
+            waits: false,
+        };
+        let command = Command::new(DriveIndex::new(0), admitted, self.profile, window, ticket);
+        CommandRun::new(command, self.profile)
     }
 
     /// Runs the command to its end with that event; its requests.

@@ -143,12 +143,7 @@ impl Report {
                 });
             }
             News::RunsUnsupervised(drive, adopted) => self.runs_unsupervised(*drive, *adopted),
-            News::StartRefused {
-                drive,
-                origin,
-                what,
-                refusal,
-            } => self.start_refused(*drive, origin, what, refusal, now),
+            News::Denied(denied) => self.denied(denied, now),
             News::Tripped { drive, why } => self.drive_event(*drive, EventKind::Interlock, None, |name| {
                 format!("an interlock of {name} is not satisfied: {why}; the drive is being stopped")
             }),

@@ -1,5 +1,5 @@
-//! Starts of guarded drives, as the master asks for them: who may go when its turn comes, what was written, what is refused; and
-//! the stops of interlocks that do not hold any more. Pure: time is an argument.
+//! Starts of guarded drives, as the line sees them: what was written, what was read; and the stops of interlocks that do not hold
+//! any more. Pure: time is an argument.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -8,32 +8,26 @@ use tokio::sync::oneshot::Receiver;
 use tokio::sync::oneshot::error::TryRecvError;
 
 use super::command_run::KnownWords;
-use super::drive_state::{DriveState, Wanted};
+use super::drive_state::DriveState;
 use super::news::News;
 use super::supervision::written_run;
 use crate::codec::RequestPdu;
-use crate::command::{
-    Answer, Command, DEFAULT_EXPIRY, Origin, Outcome, Pending, Refusal, SourceKind, Urgency, WriteStats, written,
-};
+use crate::command::{Answer, DEFAULT_EXPIRY, Intent, Origin, Outcome, SourceKind, WriteStats, written};
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, Profile, Value};
 use crate::plant::{BusHandle, turn_away};
 use crate::process_image::{DriveImage, Reading};
-use crate::start_guard::{BusGuards, Clearance};
+use crate::start_guard::BusGuards;
 
 /// First and longest pause before a motor that an interlock stopped and that runs on is stopped again.
 const AGAIN: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
 /// After the start of the bus so long a point that was not read yet stops no motor.
 const FIRST_READ: Duration = Duration::from_secs(10);
 
-/// The guards of the bus, and their starts in progress.
+/// The guards of the bus, and the stops of their interlocks.
 #[derive(Debug)]
 pub(super) struct StartGate {
     guards: Arc<BusGuards>,
     began: Instant,
-    /// Commands that were cleared and are not over, with the drives that they start.
-    cleared: Vec<(u64, Vec<DriveIndex>)>,
-    /// Commands that wait and are to be refused.
-    refused: Vec<(u64, DriveIndex, Refusal)>,
     /// News to report.
     told: Vec<News>,
     trips: PerDrive<Trip>,
@@ -42,7 +36,7 @@ pub(super) struct StartGate {
 /// The start that a command causes.
 #[derive(Debug, Clone)]
 pub(crate) struct Start {
-    /// Its number in the queue.
+    /// The number of the command.
     pub number: u64,
     /// The client that gave it.
     pub client: Arc<str>,
@@ -64,110 +58,18 @@ impl StartGate {
         Some(StartGate {
             guards,
             began: now,
-            cleared: Vec::new(),
-            refused: Vec::new(),
             told: Vec::new(),
             trips,
         })
     }
 
-    /// The start of that drive that a command causes, if its starts are counted.
-    pub(super) fn start_of(&self, command: &Command, drive: DriveIndex) -> Option<Start> {
-        let starts = self.guards.guards(drive) && command.effect(drive).run == Some(true);
+    /// The start of that drive that an order of that client causes, if its starts are counted.
+    pub(super) fn start_of(&self, intent: &Intent, origin: &Origin, drive: DriveIndex) -> Option<Start> {
+        let starts = self.guards.guards(drive) && intent.effects.on(drive).starts();
         starts.then(|| Start {
-            number: command.number,
-            client: command.ticket.origin().client().clone(),
+            number: intent.number,
+            client: origin.client().clone(),
         })
-    }
-
-    /// Whether a command that could start now may start its motor; for a stop, whether it need not wait.
-    ///
-    /// # Errors
-    /// When, if it must wait.
-    pub(super) fn may_go(&mut self, command: &Command, now: Instant) -> Result<bool, Instant> {
-        match command.urgency {
-            Urgency::Read => return Ok(true),
-            Urgency::Stop => {
-                let waits = command.is_ordinary.then(|| self.guards.stop_waits(command.drive, now));
-                return waits.flatten().map_or(Ok(true), Err);
-            }
-            Urgency::Command => {}
-        }
-        let reach = command.reach().iter().copied();
-        let started: Vec<DriveIndex> = reach.filter(|drive| self.start_of(command, *drive).is_some()).collect();
-        let Some(first) = started.first().copied() else {
-            return Ok(true);
-        };
-        let clearance = self.guards.clear(command, now);
-        if !self.cleared.iter().any(|(number, _)| *number == command.number) {
-            self.cleared.push((command.number, started));
-        }
-        match clearance {
-            Clearance::Go => Ok(true),
-            Clearance::Wait(until) => Err(until),
-            Clearance::Refused(refusal) => {
-                self.refused.push((command.number, first, refusal));
-                Ok(false)
-            }
-        }
-    }
-
-    /// Ends the refused commands. Returns whether there were any.
-    pub(super) fn refuse(&mut self, pending: &mut Pending, now: Instant) -> bool {
-        let refused = std::mem::take(&mut self.refused);
-        let any = !refused.is_empty();
-        for (number, drive, refusal) in refused {
-            if let Some((origin, what)) = pending.refuse(number, &refusal, now) {
-                self.told.push(News::StartRefused {
-                    drive,
-                    origin,
-                    what,
-                    refusal,
-                });
-            }
-        }
-        any
-    }
-
-    /// A started command is about to write: if it would start the motor and may no longer do so, it ends.
-    pub(super) fn forbids(&mut self, index: DriveIndex, drive: &mut DriveState, wanted: &Wanted, now: Instant) -> bool {
-        let Wanted::Step(Urgency::Command, step) = wanted else {
-            return false;
-        };
-        let Some(refusal) = self.may_not_write(index, drive, &step.pdu, now) else {
-            return false;
-        };
-        let Some(run) = drive.run(Urgency::Command) else {
-            return false;
-        };
-        self.guards.count_refused(index, &refusal);
-        if let Some((origin, what)) = run.refuse(refusal.clone()) {
-            self.told.push(News::StartRefused {
-                drive: index,
-                origin,
-                what,
-                refusal,
-            });
-        }
-        true
-    }
-
-    /// Why a started command may not write.
-    pub(super) fn may_not_write(
-        &self,
-        index: DriveIndex,
-        drive: &mut DriveState,
-        pdu: &RequestPdu,
-        now: Instant,
-    ) -> Option<Refusal> {
-        let run = drive.run(Urgency::Command).filter(|_| pdu.is_write())?;
-        let start = run.start.as_ref().filter(|_| run.may_write_on())?;
-        self.guards.may_write(index, start.number, now).err()
-    }
-
-    /// Whether a command that was not started here may still start that drive.
-    pub(super) fn may_still_write(&self, drive: DriveIndex, number: u64, now: Instant) -> bool {
-        self.guards.may_write(drive, number, now).is_ok()
     }
 
     /// A write is sent, of a command that starts the motor or of another one.
@@ -184,23 +86,6 @@ impl StartGate {
         } else if let Some(start) = start {
             self.guards.start_written(index, start.number, &start.client, now);
         }
-    }
-
-    /// Commands that were cleared and have ended count as made, whatever they wrote.
-    pub(super) fn settle(&mut self, is_alive: impl Fn(u64) -> bool) {
-        let guards = &self.guards;
-        self.cleared.retain(|(number, drives)| {
-            let alive = is_alive(*number);
-            if !alive {
-                drives.iter().for_each(|drive| guards.settle(*drive, *number));
-            }
-            alive
-        });
-    }
-
-    /// Whether a command was cleared that is not over.
-    pub(super) fn has_cleared(&self) -> bool {
-        !self.cleared.is_empty()
     }
 
     /// Updates the state of a drive.

@@ -1,19 +1,28 @@
 //! Process image, commands, events, history, diagnosis and parameters of drivegate.
 
-pub mod command;
 pub mod diagnosis;
 pub mod drill;
 pub mod event;
 pub mod files;
 pub mod hex;
 pub mod history;
+pub mod order;
 pub mod parameters;
+pub mod permit;
 pub mod plant;
 pub mod process_image;
+pub mod queue;
 pub mod spec;
 pub mod start_guard;
 pub mod stop_all;
 pub mod version;
+
+/// Orders, the rules that judge them, and the queue in which they wait.
+pub mod command {
+    pub use crate::order::*;
+    pub use crate::permit::*;
+    pub use crate::queue::*;
+}
 
 use drivegate_model::drive;
 use drivegate_proto as codec;

@@ -12,16 +12,16 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 
-use crate::command::{Answer, CommandQueue, Origin, Outcome, Priorities, Refusal, WriteStats};
-use crate::drill::Drills;
 use crate::drive::DriveIndex;
 use crate::drive::why::Explanation;
 use crate::event::{Event, Events};
+use crate::order::{Answer, Named, Origin, Outcome, Refusal, WriteStats};
+use crate::permit::Priorities;
 use crate::process_image::{Access, BusImage, DriveImage, Machine, Reading};
-use crate::stop_all::StopAll;
+use crate::queue::CommandQueue;
 
 pub use self::exchange::{Exchange, Question, Target};
-pub use self::orders::turn_away;
+pub use self::orders::{OrderRequest, turn_away};
 pub use self::placed::{Placed, Shown};
 pub use self::why::explain;
 
@@ -54,30 +54,18 @@ impl BusHandle {
                 let same = |image: &Arc<DriveImage>| bus.image.spec.machine(&image.spec) == machine;
                 Some((bus, bus.image.drives.position(same)?))
             });
-            let holding = known.and_then(|(bus, place)| bus.queue.lock().holding(place));
-            let (commander, stops, priorities) = match known {
-                Some((bus, place)) => {
-                    if let Some(image) = bus.image.drives.get(place) {
-                        drive.take_over(image);
-                    }
-                    let mut queue = bus.queue.lock();
-                    let priorities = queue.priorities(place).clone();
-                    (queue.commander(place).cloned(), queue.stops(place), priorities)
-                }
-                None => (
-                    None,
-                    ADDED.fetch_add(STOPS_OF_ONE, Ordering::Relaxed),
-                    Priorities::default(),
-                ),
+            let Some((bus, place)) = known else {
+                let number = ADDED.fetch_add(STOPS_OF_ONE, Ordering::Relaxed);
+                self.queue.lock().gate.count_stops_from(index, number);
+                continue;
             };
-            let mut queue = self.queue.lock();
-            queue.take_over(index, commander, stops, priorities);
-            if let Some(holding) = holding {
-                queue.take_over_holding(index, holding);
+            if let Some(image) = bus.image.drives.get(place) {
+                drive.take_over(image);
             }
-            drop(queue);
+            let inheritance = bus.queue.lock().gate.inheritance(place);
+            self.queue.lock().gate.inherit(index, inheritance);
             // What is only monitored from now on is sent nothing.
-            if let Some((bus, place)) = known.filter(|_| drive.spec.access == Access::Control) {
+            if drive.spec.access == Access::Control {
                 bus.queue.hand_over(place, &self.queue, index, now);
             }
         }
@@ -97,10 +85,6 @@ pub struct Plant {
     pub events: Events,
     /// Counters of commands.
     pub writes: Arc<WriteStats>,
-    /// Commands that stop all drives.
-    pub stop_all: Arc<StopAll>,
-    /// Drills.
-    pub drills: Arc<Drills>,
 }
 
 /// Access to one drive.
@@ -114,19 +98,7 @@ pub struct DriveHandle {
     stale_after: Duration,
     events: Events,
     writes: Arc<WriteStats>,
-    manner: Manner,
-}
-
-/// How commands are placed that guards of starts would refuse or delay.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-enum Manner {
-    /// A start that must wait is refused, an ordinary stop is delayed.
-    #[default]
-    Usual,
-    /// A start that must wait does so.
-    Waits,
-    /// No stop is delayed.
-    AtOnce,
+    named: Named,
 }
 
 impl Plant {
@@ -138,8 +110,6 @@ impl Plant {
             buses,
             events: Events::default(),
             writes: Arc::default(),
-            stop_all: Arc::default(),
-            drills: Arc::default(),
         }
     }
 
@@ -185,29 +155,14 @@ impl Plant {
             stale_after: self.stale_after,
             events: self.events.clone(),
             writes: self.writes.clone(),
-            manner: Manner::default(),
+            named: Named::This,
         }
     }
 }
 
 impl DriveHandle {
-    /// The same, but a command whose start is guarded waits up to its expiry.
-    #[must_use]
-    pub fn waiting(mut self, waits: bool) -> DriveHandle {
-        self.manner = if waits { Manner::Waits } else { Manner::Usual };
-        self
-    }
-
-    /// The same, but no guard delays its stops.
-    #[must_use]
-    pub fn at_once(mut self) -> DriveHandle {
-        self.manner = Manner::AtOnce;
-        self
-    }
-
     /// For how long the stop that waits for the drive still does so, by `min_run`.
     pub fn stop_waits(&self, now: Instant) -> Option<Duration> {
-        self.bus.queue.guards()?;
         let until = self.bus.queue.lock().stop_waits(self.index, now)?;
         Some(until.saturating_duration_since(now))
     }
@@ -225,17 +180,17 @@ impl DriveHandle {
     /// Stops of the drive that were taken in, from some number on; another one when a reload removed and added the drive, or
     /// changed its address.
     pub fn stops(&self) -> u64 {
-        self.bus.queue.lock().stops(self.index)
+        self.bus.queue.lock().gate.stops(self.index)
     }
 
     /// Who gave the last stop that was taken in; none before the first one.
     pub(crate) fn last_stop_by(&self) -> Option<Origin> {
-        self.bus.queue.lock().last_stop_by(self.index).cloned()
+        self.bus.queue.lock().gate.last_stop_by(self.index).cloned()
     }
 
     /// The login that commanded the drive last, unless another client did since.
     pub fn commander(&self) -> Option<Arc<str>> {
-        self.bus.queue.lock().commander(self.index).cloned()
+        self.bus.queue.lock().gate.commander(self.index).cloned()
     }
 
     /// Whether the drive of `reading` runs, and why not.
@@ -256,7 +211,7 @@ impl DriveHandle {
 
     /// Calls `with` for the priority arrays of the drive.
     pub fn priorities<T>(&self, with: impl FnOnce(&mut Priorities) -> T) -> T {
-        with(self.bus.queue.lock().priorities(self.index))
+        with(self.bus.queue.lock().gate.priorities(self.index))
     }
 
     /// Publishes an event of the drive.

@@ -33,7 +33,7 @@ use crate::north::{NorthState, ServerError, bacnet, http, local, modbus_tcp, mqt
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
 use crate::start_guard::{BusGuards, Guards};
-use crate::stop_all::LOOK;
+use crate::stop_all::{LOOK, StopAll};
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
 const STOP_SLACK: Duration = Duration::from_millis(300);
@@ -123,6 +123,7 @@ impl Daemon {
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let reservations = ReservationsFile::default();
         let drills_file = drills::DrillsFile::default();
+        let north = Arc::<NorthState>::default();
         let mut daemon = Daemon {
             plant: shared.clone(),
             settings: settings.clone(),
@@ -130,7 +131,7 @@ impl Daemon {
             parted: Parted::default(),
             events,
             writes,
-            north: Arc::default(),
+            north: north.clone(),
             modbus_tcp: ServerSlot::default(),
             mqtt: ServerSlot::default(),
             http: ServerSlot::default(),
@@ -143,8 +144,8 @@ impl Daemon {
             guards: Arc::default(),
             starts: None,
             reporter: report_refusals(shared.clone()),
-            stopper: stop_all(shared.clone()),
-            driller: drills::watch(shared.clone(), drills_file.clone()),
+            stopper: stop_all(shared.clone(), north.stop_all.clone()),
+            driller: drills::watch(shared.clone(), north.drills.clone(), drills_file.clone()),
             drills: drills_file,
             reserver: reservations::keep(shared, reservations.clone()),
             reservations,
@@ -330,8 +331,6 @@ impl Daemon {
             buses: buses.iter().map(|(_, task)| task.handle().clone()).collect(),
             events: self.events.clone(),
             writes: self.writes.clone(),
-            stop_all: self.plant.load().stop_all.clone(),
-            drills: self.plant.load().drills.clone(),
         }));
         let images = buses
             .iter()
@@ -373,7 +372,14 @@ impl Daemon {
         self.slots.stop().await;
         self.bacnet.stop().await;
         self.modbus_tcp.stop().await;
-        drills::end(&self.plant, &self.drills, "the end of the gateway", |_| true).await;
+        drills::end(
+            &self.plant,
+            &self.north.drills,
+            &self.drills,
+            "the end of the gateway",
+            |_| true,
+        )
+        .await;
         self.driller.abort();
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);
@@ -477,8 +483,7 @@ async fn at_once<T: Send + 'static>(
 }
 
 /// Watches the commands that stop all drives.
-fn stop_all(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
-    let orders = plant.load().stop_all.clone();
+fn stop_all(plant: SharedPlant, orders: Arc<StopAll>) -> tokio::task::JoinHandle<()> {
     tokio::spawn(async move {
         loop {
             orders.begun().await;

@@ -7,8 +7,10 @@ use super::http::SharedReply;
 use super::listener::ListenerStates;
 use super::mqtt::Handover;
 use super::stats::{BacnetStats, ModbusTcpStats, MqttStats, RefusalStats, ReloadStats, SlotStats};
+use crate::drill::Drills;
 use crate::history::{History, Recordings};
 use crate::parameters::Vault;
+use crate::stop_all::StopAll;
 
 /// What the servers share and a reload, which replaces servers, keeps: counters, recent commands, and what is recorded.
 #[derive(Debug, Default)]
@@ -17,6 +19,10 @@ pub struct NorthState {
     pub recordings: Arc<Recordings>,
     /// Readings of parameters, and restores.
     pub parameters: Arc<Vault>,
+    /// Commands that stop all drives.
+    pub stop_all: Arc<StopAll>,
+    /// Drills.
+    pub drills: Arc<Drills>,
     /// Trends, counters and events of the past.
     pub history: Arc<History>,
     /// Of the Modbus TCP server.

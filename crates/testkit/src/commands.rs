@@ -4,8 +4,9 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use drivegate_core::command::{
-    Answer, Audit, Command, CommandQueue, Origin, Pending, SourceKind, Ticket, Urgency, WriteStats,
+    Answer, Audit, Command, CommandQueue, Facts, Origin, Pending, Ready, Seen, SourceKind, Ticket, Urgency, WriteStats,
 };
+use drivegate_model::drive::DriveIndex;
 use serde_json::Value;
 use tokio::sync::oneshot::Receiver;
 
@@ -18,13 +19,23 @@ pub fn audited(audit: &Audit) -> Vec<Value> {
         .collect()
 }
 
+/// Drives of which nothing is seen: no rule refuses an order for what it would see.
+#[derive(Debug)]
+pub struct Unseen;
+
+impl Facts for Unseen {
+    fn seen(&self, _: DriveIndex) -> Option<Seen<'_>> {
+        None
+    }
+}
+
 /// Takes the next command of that rank or a higher one, where every drive is free and no stop is redundant.
 pub fn next_command(pending: &mut Pending, lowest: Urgency, now: Instant) -> Option<Command> {
     let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
     let chosen = ranks
         .into_iter()
         .filter(|rank| *rank <= lowest)
-        .find_map(|rank| pending.next(rank, now, |_| true, |_| false))?;
+        .find_map(|rank| pending.next(rank, now, &Unseen, |_| Ready::Now, |_| false).chosen)?;
     pending.take(chosen)
 }
 

@@ -6,7 +6,7 @@ use super::control::Word;
 use super::steps::{Action, Check};
 use super::{CommandRun, Phase};
 use crate::codec::Exception;
-use crate::command::{Interruption, Origin, Outcome, Receipt, Refusal};
+use crate::command::{Interruption, Outcome, Receipt, Refusal};
 use crate::confirm::Effect;
 
 impl CommandRun {
@@ -22,11 +22,22 @@ impl CommandRun {
         }
     }
 
-    /// Ends it, except for the end of a pulse. Returns who sent it, and what it was.
-    pub fn refuse(&mut self, refusal: Refusal) -> Option<(Origin, String)> {
-        self.cut_off(Outcome::Refused(refusal));
-        let ticket = self.tickets.first()?;
-        Some((ticket.origin().clone(), ticket.what().to_string()))
+    /// It may not go on, and ends so, except for the end of a pulse. A motor that it started is left to the one who has the
+    /// drive now, or who stopped it; else it is stopped.
+    pub fn denied(&mut self, outcome: Outcome) {
+        let outcome = match outcome {
+            Outcome::Refused(refusal @ (Refusal::HeldByOther(_) | Refusal::NeedsTake(_))) => {
+                self.leave_motor();
+                self.unless_begun(Outcome::Refused(refusal), Interruption::Taken)
+            }
+            Outcome::Purged => {
+                self.leave_motor();
+                self.unless_begun(Outcome::Purged, Interruption::Stop)
+            }
+            Outcome::Expired => self.unless_begun(Outcome::Expired, Interruption::Expired),
+            outcome => outcome,
+        };
+        self.cut_off(outcome);
     }
 
     /// Whether it is still pending: nothing of it was sent, or the drive was busy each time.
@@ -48,14 +59,6 @@ impl CommandRun {
         // The stop that came in is on its way.
         self.leave_motor();
         self.cut_off(self.unless_begun(Outcome::Purged, Interruption::Stop));
-        self.actions.is_empty().then(|| self.success())
-    }
-
-    /// Another client took the drive: the command ends, but the motor is left as it is. Returns the outcome if that
-    /// ends it at once.
-    pub fn taken(&mut self, refusal: Refusal) -> Option<Outcome> {
-        self.leave_motor();
-        self.cut_off(self.unless_begun(Outcome::Refused(refusal), Interruption::Taken));
         self.actions.is_empty().then(|| self.success())
     }
 

@@ -2,11 +2,13 @@
 
 use std::time::{Duration, Instant};
 
+use super::permission::AtTurn;
 use super::{Master, Purpose, Turn, TurnEnd};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{
-    BackgroundRequest, Effect, Interruption, NO_DRIVE, Outcome, Pace, SourceKind, Touched, Urgency, written,
+    BackgroundRequest, Command, Interruption, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, SourceKind, Stage,
+    Urgency, Verdict, Work, written,
 };
 use crate::drive::plan::WireTime;
 use crate::drive::{DriveIndex, PlannedRead, PollClass};
@@ -20,33 +22,104 @@ use crate::transaction::{CONNECTION_CLOSED, Ended};
 /// Time of a transaction whose request is not decoded, at most.
 const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);
 
-/// A background request that has its turn.
+/// What was chosen for the line: a command to drives that waited among their others, or a background request.
+#[derive(Debug)]
+pub(super) enum Sending {
+    Command(Command),
+    Request(BackgroundRequest),
+}
+
+/// A background transaction that has its turn.
 #[derive(Debug)]
 pub(super) struct Begun {
-    pub(super) request: BackgroundRequest,
+    pub(super) sending: Sending,
     /// Whose time it takes; none where it goes as a command.
     pub(super) admission: Option<Admission>,
-    /// It is a command to drives of the bus, and waited among their others; the registers that it sets.
-    pub(super) ordered: Option<Touched>,
     /// Its transaction is on the line, or was.
     pub(super) sent: bool,
-    /// Its number among the commands, and its effect on each drive that it reaches.
-    pub(super) number: u64,
-    pub(super) effects: Vec<(DriveIndex, Effect)>,
 }
 
 impl Begun {
-    /// Its number among the commands to drives of the bus.
-    pub(super) fn number(&self) -> u64 {
-        self.number
+    /// The command to drives of the bus, where it is one.
+    pub(super) fn command(&self) -> Option<&Command> {
+        match &self.sending {
+            Sending::Command(command) => Some(command),
+            Sending::Request(_) => None,
+        }
     }
 
-    pub(super) fn turn(&self) -> Turn {
-        Turn {
-            drive: self.request.drive,
-            purpose: Purpose::Background,
-            pdu: self.request.pdu.clone(),
+    /// Its number among the commands to drives of the bus.
+    pub(super) fn number(&self) -> Option<u64> {
+        Some(self.command()?.intent.number)
+    }
+
+    fn passed_on(&self) -> Option<&PassedOn> {
+        match &self.sending {
+            Sending::Command(command) => command.as_passed_on(),
+            Sending::Request(request) => request.passed_on.as_ref(),
         }
+    }
+
+    fn origin(&self) -> &Origin {
+        match &self.sending {
+            Sending::Command(command) => command.ticket.origin(),
+            Sending::Request(request) => request.ticket.origin(),
+        }
+    }
+
+    fn drive(&self) -> DriveIndex {
+        match &self.sending {
+            Sending::Command(command) => command.intent.drive,
+            Sending::Request(request) => request.drive,
+        }
+    }
+
+    fn expires(&self) -> Instant {
+        match &self.sending {
+            Sending::Command(command) => command.intent.window.expires,
+            Sending::Request(request) => request.expires,
+        }
+    }
+
+    fn pace(&self) -> Pace {
+        match &self.sending {
+            Sending::Command(_) => Pace::Brisk,
+            Sending::Request(request) => request.pace,
+        }
+    }
+
+    fn pdu(&self) -> Option<&RequestPdu> {
+        match &self.sending {
+            Sending::Request(request) => Some(&request.pdu),
+            Sending::Command(command) => match &command.intent.order {
+                Order::Write(pdu) | Order::Read(pdu) => Some(pdu),
+                Order::Points(_) | Order::Parameter(_) => None,
+            },
+        }
+    }
+
+    pub(super) fn turn(&self) -> Option<Turn> {
+        Some(Turn {
+            drive: self.drive(),
+            purpose: Purpose::Background,
+            pdu: self.pdu()?.clone(),
+        })
+    }
+
+    /// Reports the outcome, with the frame of the reply for a tool.
+    fn answer(self, outcome: Outcome, frame: Vec<u8>, now: Instant) {
+        let (ticket, passed_on) = match self.sending {
+            Sending::Command(Command { ticket, work, .. }) => match work {
+                Work::PassedOn(passed_on) => (ticket, Some(passed_on)),
+                Work::Stop(_) | Work::Set(_) | Work::Read => (ticket, None),
+            },
+            Sending::Request(request) => (request.ticket, request.passed_on),
+        };
+        if let Some(passed_on) = passed_on {
+            // The tool may have gone.
+            let _ = passed_on.frame.send(frame);
+        }
+        ticket.answer(outcome, now);
     }
 }
 
@@ -83,13 +156,9 @@ impl Master {
         let Some(begun) = self.background.take_if(|begun| !begun.sent) else {
             return;
         };
-        match begun.ordered {
-            Some(touched) => {
-                let mut command = begun.request.into_command(touched);
-                (command.number, command.effects) = (begun.number, begun.effects);
-                self.bus.queue.lock().put_back(command, now);
-            }
-            None => self.bus.queue.background().put_back(begun.request, now),
+        match begun.sending {
+            Sending::Command(command) => self.bus.queue.lock().put_back(command, now),
+            Sending::Request(request) => self.bus.queue.background().put_back(request, now),
         }
     }
 
@@ -136,14 +205,11 @@ impl Master {
             return Err(blocked);
         };
         let begun = self.background.insert(Begun {
-            request,
+            sending: Sending::Request(request),
             admission: Some(admission),
-            ordered: None,
             sent: false,
-            number: 0,
-            effects: Vec::new(),
         });
-        Ok(begun.turn())
+        begun.turn().ok_or(blocked)
     }
 
     /// Duration of the transaction, as far as the profile gives it.
@@ -156,46 +222,39 @@ impl Master {
 
     /// Whether the background transaction that was chosen may still go.
     pub(super) fn background_is_due(&self, now: Instant) -> bool {
-        let Some(begun) = self.background.as_ref().filter(|begun| begun.request.expires > now) else {
+        let Some(begun) = self.background.as_ref().filter(|begun| begun.expires() > now) else {
             return false;
         };
-        let orders = begun.request.passed_on.as_ref().filter(|_| begun.ordered.is_some());
-        orders.is_none_or(|passed_on| {
-            let reach = passed_on.reach.iter();
-            let mut started = reach.filter(|drive| !passed_on.stops.contains(*drive));
-            let pending = self.bus.queue.lock();
-            // A stop that came in while the line went silent.
-            !started.any(|drive| pending.was_stopped(*drive))
-        }) && self.waits.starts.as_ref().is_none_or(|starts| {
-            let mut started = begun.effects.iter().filter(|(_, effect)| effect.run == Some(true));
-            started.all(|(drive, _)| starts.may_still_write(*drive, begun.number, now))
-        })
+        let Some(command) = begun.command() else { return true };
+        let facts = AtTurn::of(&self.drives, &self.bus.image.drives, now);
+        let mut pending = self.bus.queue.lock();
+        // A stop that came in while the line went silent.
+        let stopped = command
+            .reach()
+            .any(|drive| pending.was_stopped(drive) && !command.stops(drive));
+        !stopped && pending.gate.judge(Stage::Write, command, &facts, now) == Verdict::Go
     }
 
     /// The background transaction is sent. It is a command to every drive that receives it.
     pub(super) fn background_sent(&mut self, now: Instant) {
         let Some(begun) = &mut self.background else { return };
         begun.sent = true;
-        let orders = begun.request.passed_on.as_ref().filter(|_| begun.ordered.is_some());
-        let origin = begun.request.ticket.origin();
-        for index in orders.map_or(&[][..], |passed_on| &passed_on.reach) {
-            let renews = self.bus.renews(*index, origin);
-            if let Some(drive) = self.drives.get_mut(*index) {
+        let Some(command) = begun.command() else { return };
+        let (origin, pdu) = (command.ticket.origin(), begun.pdu());
+        for (index, effect) in command.intent.effects.iter() {
+            let renews = self.bus.renews(index, origin);
+            if let Some(drive) = self.drives.get_mut(index) {
                 drive.heard_order(renews, now);
             }
-        }
-        let Some(starts) = self.waits.starts.as_ref().filter(|_| orders.is_some()) else {
-            return;
-        };
-        for (drive, effect) in &begun.effects {
-            let Some(image) = self.bus.image.drives.get(*drive) else {
-                continue;
-            };
-            let start = (effect.run == Some(true)).then(|| Start {
-                number: begun.number,
-                client: begun.request.ticket.origin().client().clone(),
-            });
-            starts.written(*drive, &image.spec.profile, &begun.request.pdu, start.as_ref(), now);
+            if let Some(starts) = &self.waits.starts
+                && let Some((image, pdu)) = self.bus.image.drives.get(index).zip(pdu)
+            {
+                let start = effect.starts().then(|| Start {
+                    number: command.intent.number,
+                    client: origin.client().clone(),
+                });
+                starts.written(index, &image.spec.profile, pdu, start.as_ref(), now);
+            }
         }
     }
 
@@ -203,20 +262,20 @@ impl Master {
     pub(super) fn abandon_background(&mut self, unsent: Outcome, why: Interruption, now: Instant) {
         if let Some(begun) = self.background.take() {
             let outcome = if begun.sent { Outcome::Interrupted(why) } else { unsent };
-            begun.request.answer(outcome, now);
+            begun.answer(outcome, Vec::new(), now);
         }
     }
 
     /// Whether it is the turn of a background transaction that a client requested.
     pub(super) fn background_of_others(&self) -> bool {
         let begun = self.background.as_ref();
-        begun.is_some_and(|begun| !begun.request.is_of_gateway())
+        begun.is_some_and(|begun| begun.origin().kind != SourceKind::Schedule)
     }
 
     /// Whether the background transaction is the broadcast of the shutdown.
     pub(super) fn stops_the_line(&self) -> bool {
         let begun = self.background.as_ref();
-        begun.is_some_and(|begun| begun.request.ticket.origin().kind == SourceKind::Shutdown)
+        begun.is_some_and(|begun| begun.origin().kind == SourceKind::Shutdown)
     }
 
     /// A background transaction has ended: it is answered, whatever came of it.
@@ -233,34 +292,29 @@ impl Master {
         match begun.admission {
             Some(admission) => self
                 .schedule
-                .background_done(begun.request.pace, admission, answered, end.took),
+                .background_done(begun.pace(), admission, answered, end.took),
             None => {
                 self.schedule.command_done(Urgency::Command, end.took);
-                self.schedule.background_owes(begun.request.pace, end.took);
+                self.schedule.background_owes(begun.pace(), end.took);
             }
         }
         if answered {
             self.schedule.seen(index, now);
         }
         let frame = std::mem::take(&mut end.frame);
-        let outcome = match self.is_broadcast_of(&begun.request) && end.ended == Ended::Silent {
+        let outcome = match self.is_broadcast_of(&begun) && end.ended == Ended::Silent {
             true => Outcome::Acknowledged(Reply::Written),
             false => self.background_outcome(turn, end, now),
         };
-        if begun
-            .request
-            .passed_on
-            .as_ref()
-            .is_some_and(|passed_on| passed_on.may_write)
-        {
-            self.unchecked_write(&begun.request, &outcome, now);
+        if begun.passed_on().is_some_and(|passed_on| passed_on.may_write) {
+            self.unchecked_write(&begun, turn, &outcome, now);
         } else if turn.pdu.is_write() {
             self.note_background_write(turn, &outcome, now);
         }
         if let Outcome::Acknowledged(reply) = &outcome {
             self.note_background_read(turn, reply, now, news);
         }
-        begun.request.answer_with(outcome, frame, now);
+        begun.answer(outcome, frame, now);
     }
 
     /// Stores read values in the process image, too. A drive that was identified, or polled for changes, may have
@@ -291,11 +345,10 @@ impl Master {
     }
 
     /// A request that may have written anything: the command words of all drives that received it are unknown.
-    fn unchecked_write(&mut self, request: &BackgroundRequest, outcome: &Outcome, now: Instant) {
-        let reach = request.passed_on.as_ref().map_or(&[][..], |passed_on| &passed_on.reach);
-        let writes = written(&request.pdu);
-        for index in reach.iter().copied() {
-            let renews = self.bus.renews(index, request.ticket.origin());
+    fn unchecked_write(&mut self, begun: &Begun, turn: &Turn, outcome: &Outcome, now: Instant) {
+        let writes = written(&turn.pdu);
+        for index in begun.command().into_iter().flat_map(Command::reach) {
+            let renews = self.bus.renews(index, begun.origin());
             let Some(drive) = self.drives.get_mut(index) else {
                 continue;
             };
@@ -318,7 +371,7 @@ impl Master {
             .background
             .as_ref()
             .filter(|_| turn.purpose == Purpose::Background)?;
-        let passed_on = begun.request.passed_on.as_ref()?;
+        let passed_on = begun.passed_on()?;
         (turn.drive == NO_DRIVE).then_some(passed_on.address)
     }
 
@@ -327,9 +380,9 @@ impl Master {
         self.stranger(turn) == Some(0) && self.waits.sessions.is_empty()
     }
 
-    fn is_broadcast_of(&self, request: &BackgroundRequest) -> bool {
-        let address = request.passed_on.as_ref().map(|passed_on| passed_on.address);
-        address == Some(0) && request.drive == NO_DRIVE && self.waits.sessions.is_empty()
+    fn is_broadcast_of(&self, begun: &Begun) -> bool {
+        let address = begun.passed_on().map(|passed_on| passed_on.address);
+        address == Some(0) && begun.drive() == NO_DRIVE && self.waits.sessions.is_empty()
     }
 
     /// How long the first byte of the reply is waited for where that is not as with the gateway's own requests: after a broadcast

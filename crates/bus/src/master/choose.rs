@@ -2,13 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use super::passed_on::{drop_in_vain, may_go};
+use super::passed_on::{drop_unwanted, is_ready};
+use super::permission::{AtTurn, wanted};
 use super::{Before, Master, Purpose, Turn};
 use crate::codec::RequestPdu;
-use crate::command::{
-    Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Origin, Outcome, Refusal, StopEnd, Urgency,
-    still_keeps_limits,
-};
+use crate::command::{Chosen, Command, DEFAULT_EXPIRY, Interruption, Order, Outcome, Ready, StopEnd, Urgency, Work};
 use crate::command_run::{CommandRun, Step};
 use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::{DriveState, Wanted};
@@ -18,10 +16,6 @@ use crate::schedule::{Decision, Poll};
 const IN_A_ROW: u32 = 8;
 /// Decisions without a transaction before the rest waits for the next look: commands that end without one are answered.
 const MOST_DECISIONS: usize = 1000;
-
-/// How old a frequency range may be on which a command rests that has started. Whether it was too old for the command
-/// was decided when that was admitted.
-const RANGE_AGE: Duration = Duration::from_secs(60);
 
 /// The ranks, the highest first.
 const RANKS: [Urgency; 3] = [Urgency::Stop, Urgency::Command, Urgency::Read];
@@ -56,7 +50,7 @@ impl Turns {
 }
 
 /// A step of a started command that can go.
-struct Ready {
+struct NextStep {
     drive: DriveIndex,
     slot: Urgency,
     rank: Urgency,
@@ -67,7 +61,7 @@ struct Ready {
 #[derive(Default)]
 struct Commands {
     /// By rank.
-    ready: [Option<Ready>; 3],
+    ready: [Option<NextStep>; 3],
     queued: [Option<Chosen>; 3],
     /// When more of them may go.
     wake_at: Option<Instant>,
@@ -153,7 +147,7 @@ impl Master {
 
     /// The write of a parameter to a drive that said, in the transaction before, that its motor stands: nothing but a
     /// stop goes between the two.
-    fn checked_write(&mut self, now: Instant) -> Option<Ready> {
+    fn checked_write(&mut self, now: Instant) -> Option<NextStep> {
         let (slot, rank) = (Urgency::Command, Urgency::Command);
         let Master { drives, bus, waits, .. } = self;
         let is_checked = |drive: &mut DriveState| drive.run(slot).is_some_and(CommandRun::is_checked);
@@ -165,7 +159,7 @@ impl Master {
             Wanted::Step(Urgency::Command, step)
                 if step.pdu.is_write() && waits.sessions.before(drive, Some(slot), now).is_none() =>
             {
-                Some(Ready {
+                Some(NextStep {
                     drive,
                     slot,
                     rank,
@@ -184,20 +178,6 @@ impl Master {
                 drive.purge(image, now);
             }
         }
-        if self.bus.queue.is_guarded() {
-            self.end_what_was_taken(now);
-        }
-    }
-
-    /// Ends the started commands of a client when another one took the drive.
-    fn end_what_was_taken(&mut self, now: Instant) {
-        let pending = self.bus.queue.lock().take_taken();
-        for index in pending {
-            if let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) {
-                let refuses = |origin: &Origin| self.bus.queue.lock().hold_ends_run(index, origin, now);
-                drive.taken(refuses, image, now);
-            }
-        }
     }
 
     fn commands(&mut self, now: Instant) -> Commands {
@@ -207,17 +187,8 @@ impl Master {
             if !drive.has_runs() {
                 continue;
             }
-            let mut wanted = drive.wanted(image, &waits.n2_late, now);
-            while let Some(starts) = &mut waits.starts
-                && starts.forbids(index, drive, &wanted, now)
-            {
-                wanted = drive.wanted(image, &waits.n2_late, now);
-            }
-            let quiet = waits.quiet.filter(|(quiet, _)| *quiet == index);
-            match wanted {
-                Wanted::Step(slot, _) if quiet.is_some() && slot != Urgency::Stop => {
-                    quiet.into_iter().for_each(|(_, until)| commands.wait(until));
-                }
+            let want = |drive: &mut DriveState| drive.wanted(image, &waits.n2_late, now);
+            match wanted(bus, index, (drive, image), want, now) {
                 Wanted::Step(slot, step) => {
                     // What N2 needs said before is blocked by late replies as the step itself is.
                     let before = waits.sessions.before(index, Some(slot), now).map(RequestPdu::N2);
@@ -230,7 +201,7 @@ impl Master {
                     let rank = drive.run(slot).map_or(slot, |run| run.rank);
                     let place = commands.ready.get_mut(rank as usize);
                     if let Some(place @ None) = place {
-                        *place = Some(Ready {
+                        *place = Some(NextStep {
                             drive: index,
                             slot,
                             rank,
@@ -260,39 +231,26 @@ impl Master {
             waits,
             ..
         } = self;
-        drop_in_vain(&mut pending, &bus.image.drives, now);
+        drop_unwanted(&mut pending, now);
         let stands: PerDrive<bool> = drives
             .iter()
             .zip(&bus.image.drives)
             .map(|(drive, image)| drive.was_stopped() && drive.stands_by_stop(&image.reading(now, drive.fresh)))
             .collect();
         let redundant = |drive: DriveIndex| stands.get(drive).copied().unwrap_or(false);
+        let facts = AtTurn::of(drives, &bus.image.drives, now);
         for rank in RANKS {
-            let mut until: Option<Instant> = None;
-            let chosen = pending.next(
-                rank,
-                now,
-                |command| {
-                    let online = schedule.is_online(command.drive);
-                    may_go(command, online, waits, drives, now).unwrap_or_else(|at| {
-                        until = Some(until.map_or(at, |before| before.min(at)));
-                        false
-                    })
-                },
-                redundant,
-            );
+            let ready = |command: &Command| {
+                let online = schedule.is_online(command.intent.drive);
+                is_ready(command, online, waits, drives, now)
+            };
+            let choice = pending.next(rank, now, &facts, ready, redundant);
             if let Some(place) = commands.queued.get_mut(rank as usize) {
-                *place = chosen;
+                *place = choice.chosen;
             }
-            if let Some(until) = until {
+            if let Some(until) = choice.wake_at {
                 commands.wait(until);
             }
-        }
-        if let Some(starts) = &mut waits.starts
-            && starts.refuse(&mut pending, now)
-        {
-            // Others may go instead.
-            commands.wait(now);
         }
     }
 
@@ -306,7 +264,7 @@ impl Master {
         }
         let chosen = commands.queued.get(rank as usize).copied().flatten()?;
         let command = self.bus.queue.lock().take(chosen)?;
-        if command.passed_on.is_some() {
+        if command.as_passed_on().is_some() {
             self.turns.served(rank, lower_waits);
             return self.begin_passed_on(command, None, now).map(Ok);
         }
@@ -316,64 +274,35 @@ impl Master {
     }
 
     /// Begins a command that was taken from the queue. A stop goes to a drive that does not answer too: it is its probe.
-    fn begin(&mut self, command: Command, rank: Urgency, now: Instant) {
-        let online = self.schedule.is_online(command.drive) || command.urgency == Urgency::Stop;
-        let index = command.drive;
-        let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
+    fn begin(&mut self, mut command: Command, rank: Urgency, now: Instant) {
+        let index = command.intent.drive;
+        let online = self.schedule.is_online(index) || command.is_stop();
+        let known = self.drives.get_mut(index).zip(self.bus.image.drives.get(index));
+        let Some((drive, image)) = known.filter(|_| online) else {
             command.answer(&Outcome::Offline, now);
             return;
         };
-        if !online {
-            command.answer(&Outcome::Offline, now);
-            return;
-        }
-        if command.behind.as_ref().is_some_and(StopEnd::has_failed) {
+        if let Work::Set(set) = &command.work
+            && set.behind.as_ref().is_some_and(StopEnd::has_failed)
+        {
             command.answer(&Outcome::NotStopped, now);
             return;
         }
-        // It was admitted before the drive was held.
-        let is_restore = matches!(command.order, Order::Parameter(_));
-        if command.urgency == Urgency::Command
-            && !is_restore
-            && let Some(why) = image.hold.why()
-        {
-            command.answer(&Outcome::Refused(Refusal::NotAllowed(why.to_string())), now);
-            return;
-        }
-        let (lost, renews) = self.bus.judges_turn(&command, now);
-        if let Some(refusal) = lost {
-            command.answer(&Outcome::Refused(refusal), now);
-            return;
-        }
-        let reading = image.reading(now, RANGE_AGE);
-        let hold = |range: &FrequencyRange| range.holds(&reading, drive.written.range);
-        if command.urgency == Urgency::Command && !command.ranges.iter().all(hold) {
-            command.answer(&Outcome::Refused(range_changed()), now);
-            return;
-        }
-        if command.urgency == Urgency::Command
-            && let Err(refusal) = still_keeps_limits(&reading, &command.order, drive.written)
-        {
-            command.answer(&Outcome::Refused(refusal), now);
-            return;
-        }
-        let mut command = command;
-        if command.urgency == Urgency::Stop {
+        if command.is_stop() {
             // It waited for its turn: its time begins now.
-            command.expires = command.expires.max(now + DEFAULT_EXPIRY);
+            let window = &mut command.intent.window;
+            window.expires = window.expires.max(now + DEFAULT_EXPIRY);
         }
-        let start = self
-            .waits
-            .starts
-            .as_ref()
-            .and_then(|starts| starts.start_of(&command, index));
+        let starts = self.waits.starts.as_ref();
+        let start = starts.and_then(|starts| starts.start_of(&command.intent, command.ticket.origin(), index));
+        let renews = self.bus.renews_by(&command);
         let mut run = CommandRun::new(command, &image.spec.profile);
         (run.rank, run.renews, run.start) = (rank, renews, start);
         drive.begin(run);
     }
 
-    fn turn(&mut self, ready: Ready, now: Instant) -> Turn {
-        let Ready {
+    fn turn(&mut self, ready: NextStep, now: Instant) -> Turn {
+        let NextStep {
             drive,
             slot,
             rank,
@@ -431,11 +360,7 @@ impl Master {
             return self.background_is_due(now);
         }
         let Some(slot) = turn.slot() else { return true };
-        if let Some(starts) = self.waits.starts.as_ref().filter(|_| slot == Urgency::Command)
-            && let Some(drive) = self.drives.get_mut(turn.drive)
-            && starts.may_not_write(turn.drive, drive, turn.pdu(), now).is_some()
-        {
-            // It is refused when it is chosen again.
+        if !self.may_still_write(turn.drive, slot, now) {
             return false;
         }
         let run = self.drives.get_mut(turn.drive).and_then(|drive| drive.run(slot));
@@ -456,40 +381,22 @@ impl Master {
     }
 }
 
-fn range_changed() -> Refusal {
-    Refusal::NotKnown(
-        "the drive's frequency range was written, or changed, since the command was accepted; nothing was written; \
-         send it again"
-            .to_string(),
-    )
-}
-
-/// Whether a queued command can be started now.
-///
-/// # Errors
-/// When it can be, if it must wait.
-pub(super) fn may_begin(
-    drive: &mut DriveState,
-    command: &Command,
-    online: bool,
-    now: Instant,
-) -> Result<bool, Instant> {
+/// Whether the drive of a queued command is ready for it.
+pub(super) fn may_begin(drive: &mut DriveState, command: &Command, online: bool, now: Instant) -> Ready {
     // Behind a stop that has started nothing goes before it has ended.
-    if drive.is_busy(command.urgency) || (command.urgency == Urgency::Command && drive.is_busy(Urgency::Stop)) {
-        return Ok(false);
+    let urgency = command.urgency();
+    if drive.is_busy(urgency) || (urgency == Urgency::Command && drive.is_busy(Urgency::Stop)) {
+        return Ready::No;
     }
-    if command.urgency == Urgency::Stop {
-        return match drive.vain_stops.waits_until(now) {
-            Some(until) => Err(until),
-            None => Ok(true),
-        };
+    if urgency == Urgency::Stop {
+        return drive.vain_stops.waits_until(now).map_or(Ready::Now, Ready::At);
     }
     // A command to a drive that is away is answered at once.
-    if let Order::Read(pdu) | Order::Write(pdu) = &command.order
+    if let Order::Read(pdu) | Order::Write(pdu) = &command.intent.order
         && online
         && let Some(until) = drive.late.blocks(pdu, now)
     {
-        return Err(until);
+        return Ready::At(until);
     }
-    Ok(true)
+    Ready::Now
 }

@@ -16,13 +16,13 @@ pub(super) fn look_at_hold(
     index: DriveIndex,
     image: &Arc<DriveImage>,
     drive: &mut DriveState,
-    (guarded, writes): (bool, &Arc<WriteStats>),
+    (has_authority, writes): (bool, &Arc<WriteStats>),
     now: Instant,
 ) {
-    drive.guarded = guarded;
+    drive.has_authority = has_authority;
     let carried_out = std::mem::take(&mut drive.carried_out);
     let reading = image.reading(now, drive.fresh);
-    let remote = reading.model(ModelPoint::Remote).good().filter(|_| guarded);
+    let remote = reading.model(ModelPoint::Remote).good().filter(|_| has_authority);
     let local = remote.map(|remote| !remote.as_bool());
     if local == drive.local && carried_out.is_empty() {
         return;
@@ -30,13 +30,13 @@ pub(super) fn look_at_hold(
     let before = std::mem::replace(&mut drive.local, local);
     let mut queue = bus.queue.lock();
     for origin in &carried_out {
-        queue.hold_renewed(index, origin, now);
+        queue.gate.hold_renewed(index, origin, now);
     }
     if local != before {
         // An unknown control place does not count as local.
-        queue.set_local(index, local == Some(true));
+        queue.gate.set_local(index, local == Some(true));
     }
-    let stops = queue.rules().is_some_and(|rules| rules.stop_at_local);
+    let stops = queue.gate.rules().is_some_and(|rules| rules.stop_at_local);
     drop(queue);
     if stops && before == Some(false) && local == Some(true) {
         stop_at_local(bus, index, drive, &reading, writes);

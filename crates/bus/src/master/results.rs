@@ -251,7 +251,7 @@ impl Master {
             drive.went_offline(now);
         }
         self.waits.sessions.gone(index);
-        let gone = |c: &Command| c.drive == index && c.urgency != Urgency::Stop;
+        let gone = |c: &Command| c.intent.drive == index && !c.is_stop();
         self.bus.queue.lock().remove(now, &Outcome::Offline, gone);
         news.push(News::Offline(index));
     }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use crate::codec::RequestPdu;
-use crate::command::{BackgroundRequest, Command, Order, PassedOn, Urgency};
+use crate::command::{BackgroundRequest, Command, Order, PassedOn, Ready, Urgency};
 use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::DriveState;
 use crate::late_replies::LateReplies;
@@ -51,30 +51,19 @@ impl Waits {
     /// Until when a request has to wait, since it would reach a drive that a drill sends nothing.
     pub(super) fn quiet_until(&self, request: &BackgroundRequest) -> Option<Instant> {
         let (quiet, until) = self.quiet?;
-        let reach = request.passed_on.as_ref().map_or(&[][..], |passed_on| &passed_on.reach);
-        (request.drive == quiet || reach.contains(&quiet)).then_some(until)
+        (request.drive == quiet).then_some(until)
     }
 
-    /// Whether what is passed on to drives of the bus can go: nothing has started for any of them.
-    ///
-    /// # Errors
-    /// When it can, if it must wait.
-    pub(super) fn may_pass_on(
-        &mut self,
-        command: &Command,
-        drives: &mut PerDrive<DriveState>,
-        now: Instant,
-    ) -> Result<bool, Instant> {
+    /// Whether the drives that something passed on reaches are ready: nothing has started for any of them.
+    pub(super) fn may_pass_on(&mut self, command: &Command, drives: &mut PerDrive<DriveState>, now: Instant) -> Ready {
         let busy = |drive: &DriveState| drive.is_busy(Urgency::Stop) || drive.is_busy(Urgency::Command);
-        if command.reach().iter().filter_map(|drive| drives.get(*drive)).any(busy) {
-            return Ok(false);
+        if command.reach().filter_map(|drive| drives.get(drive)).any(busy) {
+            return Ready::No;
         }
-        let Order::Write(pdu) = &command.order else {
-            return Ok(true);
+        let Order::Write(pdu) = &command.intent.order else {
+            return Ready::Now;
         };
-        match self.blocks((command.drive, pdu), command.passed_on.as_ref(), drives, now) {
-            Some(until) => Err(until),
-            None => Ok(true),
-        }
+        let until = self.blocks((command.intent.drive, pdu), command.as_passed_on(), drives, now);
+        until.map_or(Ready::Now, Ready::At)
     }
 }

@@ -3,7 +3,7 @@
 use std::time::{Instant, SystemTime};
 
 use super::{RECENT, Report, goes_offline};
-use crate::command::{Origin, Refusal};
+use crate::command::Denied;
 use crate::confirm::Unconfirmed;
 use crate::drive::DriveIndex;
 use crate::event::{Event, EventKind, RefusedCommand};
@@ -44,15 +44,14 @@ impl Report {
     }
 
     /// A command was refused at its turn, as others are when they come.
-    pub(super) fn start_refused(
-        &self,
-        index: DriveIndex,
-        origin: &Origin,
-        what: &str,
-        refusal: &Refusal,
-        now: Instant,
-    ) {
-        let Some(drive) = self.image.drives.get(index) else {
+    pub(super) fn denied(&self, denied: &Denied, now: Instant) {
+        let Denied {
+            drive,
+            origin,
+            what,
+            refusal,
+        } = denied;
+        let Some(drive) = self.image.drives.get(*drive) else {
             return;
         };
         let refused = RefusedCommand {

@@ -16,8 +16,8 @@ use tokio::sync::Notify;
 
 pub use self::report::{DrillReport, DrillState, DrillStep, Kind, Proof, SavedDrills, StopProof};
 use self::run::{Ended, Run};
-use crate::command::Origin;
 use crate::drive::ModelPoint;
+use crate::order::Origin;
 use crate::plant::{DriveHandle, Plant};
 use crate::process_image::{Access, DriveSpec, Machine};
 

@@ -9,12 +9,13 @@ use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::broadcast::Receiver;
 
 use super::{ARMED, DrillOptions, DrillReport, DrillState, DrillStep, Kind, Proof};
-use crate::command::{AuditRecord, Authority, Order, Origin, Outcome, Refusal, SourceKind};
 use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, EventKind};
-use crate::plant::{DriveHandle, Placed, Plant};
-use crate::process_image::{Machine, Reading};
-use crate::stop_all::{OneStop, Standstill};
+use crate::order::{AuditRecord, Authority, Order, Origin, Outcome, Refusal, SourceKind};
+use crate::permit::DrillLock;
+use crate::plant::{DriveHandle, OrderRequest, Placed, Plant};
+use crate::process_image::{Machine, Reading, Standstill};
+use crate::stop_all::OneStop;
 
 /// Maximum time to write the start of a drill to disk; a motor must not start when nobody expects it any more.
 const KEEP: Duration = Duration::from_secs(5);
@@ -175,7 +176,7 @@ impl Run {
             steps: kinds.map(step).collect(),
         };
         Run {
-            own: who.clone().acting(format!("drill of {}", who.who)),
+            own: who.clone().as_drill(format!("drill of {}", who.who)),
             who: who.clone(),
             report,
             machine,
@@ -253,6 +254,7 @@ impl Run {
     pub(super) fn start(&mut self, plant: &Plant, keep: Option<u64>, now: Instant, time: SystemTime) {
         self.records = Some(plant.writes.audit().subscribe());
         self.stops = self.drive.stops();
+        self.lock(None);
         self.report.state = DrillState::Running;
         self.report.started_at = Some(text_of(time));
         match keep {
@@ -318,8 +320,10 @@ impl Run {
             .filter_map(|(point, value)| Some((profile.model_index(point)?, value)));
         let order = Order::Points(order.collect());
         self.report.text = format!("starting the motor at {} %", self.report.speed);
-        let drive = self.drive.clone().waiting(true);
-        let placed = drive.place(order, self.own.clone(), Authority::Write, START, now);
+        let request = OrderRequest::new(order, self.own.clone(), Authority::Write)
+            .within(START)
+            .waiting(true);
+        let placed = self.drive.place(request, now);
         self.go(Step::Starting(placed), now);
     }
 
@@ -335,7 +339,7 @@ impl Run {
 
     /// The drill ends so, once its last stop is there.
     fn end(&mut self, state: DrillState, why: String, now: Instant) {
-        self.drive.bus.queue.keep_quiet(self.drive.index, None);
+        self.lock(None);
         if let Some(step) = self.current().filter(|step| !step.state.is_over()) {
             step.state = state;
             step.seen.clone_from(&why);
@@ -344,6 +348,13 @@ impl Run {
         self.report.text = why;
         let stop = OneStop::place(&self.drive, self.machine.clone(), &self.own, now);
         self.go(Step::Ending(state, stop), now);
+    }
+
+    /// From now on no other order to the drive runs, and until then nothing but stops is sent to it.
+    fn lock(&self, quiet_until: Option<Instant>) {
+        let who = format!("drill `{}`", self.report.id);
+        let lock = DrillLock { who, quiet_until };
+        self.drive.bus.queue.set_drill(self.drive.index, Some(lock));
     }
 
     fn not_tried(&mut self) {
@@ -359,10 +370,7 @@ impl Run {
     }
 
     fn finish(&mut self, state: DrillState, text: String, time: SystemTime) {
-        self.drive.bus.queue.keep_quiet(self.drive.index, None);
-        if self.report.started_at.is_some() {
-            self.drive.image.hold.set(None);
-        }
+        self.drive.bus.queue.set_drill(self.drive.index, None);
         self.not_tried();
         self.report.state = state;
         self.report.text = text;
@@ -405,11 +413,6 @@ impl Run {
         match placed.answer() {
             None => self.step = Step::Starting(placed),
             Some(answer) if answer.outcome.is_ok() => {
-                let why = format!(
-                    "drill `{}` is running; only stops are accepted, and they end it",
-                    self.report.id
-                );
-                self.drive.image.hold.set(Some(why));
                 self.report.text = "waiting until the motor turns".to_string();
                 self.go(Step::SpeedingUp(None), now);
             }
@@ -472,8 +475,8 @@ impl Run {
             Kind::Order => {
                 let run = self.drive.image.spec.profile.model_index(ModelPoint::Run);
                 let order = Order::Points(run.map(|run| (run, Value::Bool(false))).into_iter().collect());
-                let drive = self.drive.clone().at_once();
-                let placed = drive.place(order, self.own.clone(), Authority::Write, self.options.limit, now);
+                let request = OrderRequest::new(order, self.own.clone(), Authority::Write);
+                let placed = self.drive.place(request.within(self.options.limit).at_once(), now);
                 self.report.text = "a stop command was sent".to_string();
                 Cause::Order(placed)
             }
@@ -483,7 +486,7 @@ impl Run {
             }
             Kind::Gateway => {
                 let until = now + self.options.limit;
-                self.drive.bus.queue.keep_quiet(self.drive.index, Some(until));
+                self.lock(Some(until));
                 self.report.text = format!(
                     "nothing is sent to the drive for {} s",
                     self.options.limit.as_secs_f64()
@@ -500,7 +503,6 @@ impl Run {
         stop.look(plant, now);
         self.stops = self.drive.stops();
         if stop.is_acknowledged() && stop.stands(plant, now) {
-            self.drive.image.hold.set(None);
             self.at += 1;
             return self.begin_step(now);
         }

@@ -15,8 +15,8 @@ use super::recorder::{Capture, Note, NoteBody, Recorder};
 use super::store::{self, Entry, ReadError, Store};
 use super::trigger::{Trigger, TriggerKind, is_refused_stop};
 use super::{Clock, History, RecorderOptions, Recording};
-use crate::command::{AuditRecord, WriteStats};
 use crate::event::{Event, EventKind, Events, RecordingMade};
+use crate::order::{AuditRecord, WriteStats};
 use crate::process_image::BusImage;
 
 /// Interval at which the tapes of the buses are taken.

@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use crate::codec::Table;
-use crate::command::AuditRecord;
 use crate::drive::{DriveIndex, ModelPoint, Profile, Value};
 use crate::event::EventKind;
+use crate::order::AuditRecord;
 use crate::process_image::{Reading, TriggerLimit};
 
 /// Errors on a line within [`BURST_IN`] that are a burst.
@@ -113,14 +113,14 @@ pub struct Trigger {
 pub(super) fn is_refused_stop(record: &AuditRecord, profile: &Profile) -> bool {
     const TAKEN: [&str; 7] = [
         "acknowledged",
-        crate::command::CONFIRMED,
+        crate::order::CONFIRMED,
         "replaced",
         "purged",
         "withdrawn",
         "shutting_down",
         "interrupted",
     ];
-    let stops = |change: &crate::command::Change| match (change.point.split_once(' '), change.new) {
+    let stops = |change: &crate::order::Change| match (change.point.split_once(' '), change.new) {
         (None, Value::Bool(false)) => change.point == ModelPoint::Run.name(),
         // A raw write: table and address.
         (Some((table, address)), Value::Integer(word)) => {

@@ -11,10 +11,10 @@ use std::time::Duration;
 use super::file::{Entry, Id, ParameterFile};
 use super::names::Names;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::Outcome;
 use crate::diagnosis::CountedByDrive;
 use crate::drive::Profile;
 use crate::drive::parameters::{Label, Numbering, RawValue};
+use crate::order::Outcome;
 
 /// Attempts of a request without a reply.
 const TRIES: u32 = 4;

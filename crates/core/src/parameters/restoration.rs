@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use super::journal::{Journal, Phase};
 use super::plan::ParameterWrite;
 use crate::codec::{Exception, Reply};
-use crate::command::{Outcome, ParameterOrder, Refusal};
 use crate::drive::parameters::RawValue;
+use crate::order::{Outcome, ParameterOrder, Refusal};
 
 /// A restore that cannot continue for that long ends.
 const MOST_WAIT: Duration = Duration::from_secs(3600);

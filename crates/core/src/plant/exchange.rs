@@ -10,12 +10,13 @@ use tokio::sync::oneshot;
 use super::BusHandle;
 use super::orders::changes;
 use crate::codec::{Protocol, RequestPdu, describe};
-use crate::command::{
-    Answer, BackgroundRequest, Effect, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Ticket, Touched, WriteStats,
-    written,
-};
 use crate::drive::DriveIndex;
+use crate::order::{
+    Answer, Arrival, BackgroundRequest, Command, Effect, Effects, Intent, NO_DRIVE, Order, Origin, Outcome, Pace,
+    PassedOn, Ticket, Touched, Window, WriteStats, written,
+};
 use crate::process_image::DriveImage;
+use crate::queue::Denied;
 
 /// Who on the line is asked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,8 +36,8 @@ pub struct Question {
     pub pdu: RequestPdu,
     /// Whether it may change anything: then it is counted and audited as a command.
     pub may_write: bool,
-    /// When it began to arrive.
-    pub asked: Instant,
+    /// When it came, and over which connection.
+    pub arrival: Arrival,
     /// Not sent after this.
     pub expires: Instant,
     /// Its origin.
@@ -50,7 +51,7 @@ impl Question {
             target: Target::Address(0),
             pdu,
             may_write: true,
-            asked,
+            arrival: Arrival::now(asked),
             expires: asked + within,
             origin,
         }
@@ -116,36 +117,59 @@ impl BusHandle {
             let run = changes.iter().rev().find_map(|change| change.run)?;
             Some((drive.spec.name.clone(), run))
         });
-        let runs: Vec<(String, bool)> = runs.collect();
-        let stops = heard().filter(|(_, drive)| is_stop(drive, &question.pdu));
-        let stops = stops.map(|(index, _)| index).collect();
-        let effects = heard().map(|(index, drive)| (index, Effect::of(&order, &drive.spec.profile)));
-        let effects = effects.filter(|_| may_write).collect();
+        let (ticket, answer) = Ticket::new(question.origin, &name, what, may_write, now, writes.clone());
+        let ticket = ticket.with_runs(runs.collect());
+        let (sender, frame) = oneshot::channel();
+        let passed_on = PassedOn {
+            address,
+            may_write,
+            first,
+            frame: sender,
+        };
+        if !may_write || reach.is_empty() {
+            let request = BackgroundRequest {
+                drive,
+                pdu: question.pdu,
+                pace: Pace::Brisk,
+                expires: question.expires,
+                ticket,
+                passed_on: Some(passed_on),
+            };
+            self.queue.submit_background(request, now);
+            return Exchange { answer, frame };
+        }
+        let effect = |(index, drive): (DriveIndex, &Arc<DriveImage>)| {
+            let effect = Effect {
+                stops: is_stop(drive, &question.pdu),
+                ..Effect::of(&order, &drive.spec.profile)
+            };
+            (index, effect)
+        };
         // A request that is not decoded may write anything. The registers are the same for every drive that receives
         // it.
         let touched = heard().next().map_or(Touched::Anything, |(_, drive)| {
             Touched::of(&order, &[], &drive.spec.profile)
         });
-        let (ticket, answer) = Ticket::new(question.origin, &name, what, may_write, now, writes.clone());
-        let ticket = ticket.with_runs(runs);
-        let (sender, frame) = oneshot::channel();
-        let request = BackgroundRequest {
-            drive,
-            pdu: question.pdu,
-            pace: Pace::Brisk,
+        let effects = Effects::on_all(heard().map(effect).collect(), touched);
+        let window = Window {
+            arrival: question.arrival,
             expires: question.expires,
-            ticket,
-            passed_on: Some(PassedOn {
-                address,
-                may_write,
-                reach,
-                stops,
-                effects,
-                first,
-                frame: sender,
-            }),
+            waits: false,
         };
-        self.queue.submit_passed_on(request, touched, question.asked, now);
+        let intent = Intent::new(drive, order.clone(), effects, window);
+        let facts = self.at_accept(Duration::ZERO, now);
+        let (origin, what) = (ticket.origin().clone(), ticket.what().to_string());
+        let refusal = self
+            .queue
+            .submit(Command::passed_on(intent, passed_on, ticket), &facts, now);
+        if let (Some(refusal), Some(drive)) = (refusal, reach.first().copied()) {
+            self.queue.lock().note_denied(Denied {
+                drive,
+                origin,
+                what,
+                refusal,
+            });
+        }
         Exchange { answer, frame }
     }
 }

@@ -3,29 +3,27 @@
 use std::time::{Instant, SystemTime};
 
 use super::{BusHandle, DriveHandle, Plant};
-use crate::command::{
-    self, Admitted, Asks, Authority, Command, Effect, HoldState, HoldView, KeptReservation, Origin, Refusal, Rules,
-    Told, Unheld, Urgency, Verb, What,
-};
 use crate::drive::DriveIndex;
 use crate::drive::why::{Cause, Explanation};
 use crate::event::{Event, EventKind, Events};
+use crate::order::{Asks, Authority, Command, Origin, Refusal};
+use crate::permit::{self, Claim, HoldState, HoldView, KeptReservation, Rules, Told, Unheld, Verb, What};
 
 impl BusHandle {
     /// Whether a command of that client renews the lease of a drive.
     pub fn renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
-        !self.queue.is_guarded() || self.queue.lock().hold_renews(drive, origin)
+        !self.queue.has_authority() || self.queue.lock().gate.hold_renews(drive, origin)
     }
 
     /// Publishes the changes of the holds of its drives.
     pub fn tell_holds(&self, events: &Events, now: Instant, time: SystemTime) {
-        if !self.queue.is_guarded() {
+        if !self.queue.has_authority() {
             return;
         }
         let mut queue = self.queue.lock();
-        let told = queue.take_told(now);
-        let unheld = queue.take_unheld();
-        let rules = queue.rules().cloned();
+        let told = queue.gate.take_told(now);
+        let unheld = queue.gate.take_unheld();
+        let rules = queue.gate.rules().cloned();
         drop(queue);
         let Some(rules) = rules else { return };
         let name_of = |drive: DriveIndex| self.image.drives.get(drive).map(|image| image.spec.name.as_str());
@@ -53,7 +51,7 @@ impl BusHandle {
 
     /// After a reload: ends the holds of machines that are on none of these buses, and reports that.
     pub fn end_holds(&self, after: &[&BusHandle], events: &Events, now: Instant, time: SystemTime) {
-        if !self.queue.is_guarded() {
+        if !self.queue.has_authority() {
             return;
         }
         for (index, drive) in self.image.drives.enumerate() {
@@ -64,21 +62,20 @@ impl BusHandle {
             };
             if !after.iter().any(is_there) {
                 let why = "a reload changed bus, address or profile of the drive";
-                self.queue.lock().hold_ends(index, why);
+                self.queue.lock().gate.hold_ends(index, why);
             }
         }
         self.tell_holds(events, now, time);
     }
 
-    /// Why a command that was accepted is not started at its turn, and whether it renews the lease of its drive.
-    pub fn judges_turn(&self, command: &Command, now: Instant) -> (Option<Refusal>, bool) {
-        if !self.queue.is_guarded() {
-            return (None, true);
+    /// Whether a command whose turn came renews the lease of its drive.
+    pub fn renews_by(&self, command: &Command) -> bool {
+        if !self.queue.has_authority() {
+            return true;
         }
-        let mut queue = self.queue.lock();
-        let mut origins = std::iter::once(&command.ticket).chain(command.joined.iter().map(|(ticket, _)| ticket));
-        let renews = origins.any(|ticket| queue.hold_renews(command.drive, ticket.origin()));
-        (queue.hold_at_turn(command, now), renews)
+        let queue = self.queue.lock();
+        let mut origins = command.origins();
+        origins.any(|origin| queue.gate.hold_renews(command.intent.drive, origin))
     }
 }
 
@@ -87,7 +84,7 @@ impl BusHandle {
         let queue = self.queue.lock();
         let drives = self.image.drives.enumerate();
         let kept = drives.filter_map(|(index, image)| {
-            let (until, who, rank, lease) = queue.reservation(index, now)?;
+            let (until, who, rank, lease) = queue.gate.reservation(index, now)?;
             let machine = self.image.spec.machine(&image.spec);
             let stopped = time.checked_sub(lease.saturating_sub(until.saturating_duration_since(now)))?;
             Some((until, KeptReservation::new(machine, (who, rank), stopped, lease)))
@@ -97,19 +94,9 @@ impl BusHandle {
 }
 
 impl DriveHandle {
-    /// Why a command of a client is not taken, where someone else holds the drive.
-    pub(super) fn hold_refuses(&self, admitted: &Admitted, origin: &Origin, now: Instant) -> Option<Refusal> {
-        if !self.bus.queue.is_guarded() || admitted.urgency == Urgency::Read {
-            return None;
-        }
-        let effect = Effect::of(&admitted.order, &self.image.spec.profile);
-        let asks = Asks::by(&admitted.order, admitted.urgency, effect);
-        self.bus.queue.lock().hold_refuses(self.index, origin, asks, now)
-    }
-
     /// Whether `[authority]` is on.
-    pub fn is_guarded(&self) -> bool {
-        self.bus.queue.is_guarded()
+    pub fn has_authority(&self) -> bool {
+        self.bus.queue.has_authority()
     }
 
     /// Applies a client's action to the hold and returns its published state. A refusal is audited, counted and
@@ -128,17 +115,17 @@ impl DriveHandle {
     }
 
     fn act(&self, verb: Verb, origin: &Origin, authority: Authority, now: Instant) -> Result<HoldView, Refusal> {
-        command::authority(&self.reading(now), authority)?;
+        permit::authority(&self.reading(now), authority)?;
         if let (Some(why), Verb::Take | Verb::Break) = (self.image.hold.why(), verb) {
             return Err(Refusal::NotAllowed(why.to_string()));
         }
         let mut queue = self.bus.queue.lock();
-        let acted = queue.hold_act(self.index, origin, verb, now).unwrap_or_else(|| {
+        let acted = queue.gate.hold_act(self.index, origin, verb, now).unwrap_or_else(|| {
             Err(Refusal::NotAllowed(
                 "drives cannot be held: [authority] is off; set its mode".to_string(),
             ))
         });
-        let view = queue.hold_view(self.index, None, now);
+        let view = queue.gate.hold_view(self.index, None, now);
         drop(queue);
         // What was started for another one may have to end.
         self.bus.queue.wake();
@@ -152,16 +139,16 @@ impl DriveHandle {
 
     /// The published state of the hold, and whether that client has it; none while `[authority]` is off.
     pub fn hold_view(&self, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
-        match self.bus.queue.is_guarded() {
-            true => self.bus.queue.lock().hold_view(self.index, origin, now),
+        match self.bus.queue.has_authority() {
+            true => self.bus.queue.lock().gate.hold_view(self.index, origin, now),
             false => None,
         }
     }
 
     /// The name of that client among the principals, and the ranks below its own; nothing where it is none.
     pub fn rank_of(&self, origin: &Origin) -> Option<(String, Vec<String>)> {
-        let rules = match self.bus.queue.is_guarded() {
-            true => self.bus.queue.lock().rules().cloned()?,
+        let rules = match self.bus.queue.has_authority() {
+            true => self.bus.queue.lock().gate.rules().cloned()?,
             false => return None,
         };
         let claim = rules.claim_of(origin)?;
@@ -172,12 +159,12 @@ impl DriveHandle {
     /// The heartbeat of a client that may command: the lease of the drive runs again, unless another client's silence
     /// counts, and so does its hold.
     pub fn heartbeat(&self, origin: &Origin, now: Instant) {
-        if !self.bus.queue.is_guarded() {
+        if !self.bus.queue.has_authority() {
             return self.image.renew_lease(now);
         }
         let mut queue = self.bus.queue.lock();
-        queue.hold_renewed(self.index, origin, now);
-        let renews = queue.hold_renews(self.index, origin);
+        queue.gate.hold_renewed(self.index, origin, now);
+        let renews = queue.gate.hold_renews(self.index, origin);
         drop(queue);
         if renews {
             self.image.renew_lease(now);
@@ -194,7 +181,7 @@ impl DriveHandle {
         let left = view.left_s.unwrap_or_default();
         let mut evidence = format!("{who} ({rank}) stopped it; reserved for another {left} s");
         let mut remedy = format!("wait, or have {who} release it; ranks from {rank} up may take it");
-        if let Some(repeater) = self.bus.queue.lock().repeater(self.index) {
+        if let Some(repeater) = self.bus.queue.lock().gate.repeater(self.index) {
             evidence += &format!("; {repeater} repeats its stop, which ended the hold of another client");
             remedy = format!(
                 "set cyclic = true for principal `{repeater}` if it writes its command word cyclically; else {remedy}"
@@ -211,8 +198,8 @@ impl DriveHandle {
 
     /// A client withdrew its request, and nothing is sent for it.
     pub fn said_stop(&self, origin: &Origin) {
-        if self.bus.queue.is_guarded() {
-            self.bus.queue.lock().hold_said_stop(self.index, origin);
+        if self.bus.queue.has_authority() {
+            self.bus.queue.lock().gate.hold_said_stop(self.index, origin);
         }
     }
 
@@ -221,13 +208,8 @@ impl DriveHandle {
     /// # Errors
     /// The refusal.
     pub fn may_begin_restore(&self, origin: &Origin, now: Instant) -> Result<(), Refusal> {
-        if !self.bus.queue.is_guarded() {
-            return Ok(());
-        }
-        let mut queue = self.bus.queue.lock();
-        queue
-            .hold_refuses(self.index, origin, Asks::Other, now)
-            .map_or(Ok(()), Err)
+        let queue = self.bus.queue.lock();
+        queue.gate.hold_lets(self.index, origin, Asks::Other, now)
     }
 }
 
@@ -235,7 +217,7 @@ impl Plant {
     /// The reservations that stand, with when they end: what is kept for the next start. `now` is `time` on the calendar.
     pub fn reservations(&self, now: Instant, time: SystemTime) -> Vec<(Instant, KeptReservation)> {
         let of_bus = |bus: &BusHandle| bus.reservations(now, time);
-        let guarded = self.buses.iter().filter(|bus| bus.queue.is_guarded());
+        let guarded = self.buses.iter().filter(|bus| bus.queue.has_authority());
         guarded.flat_map(of_bus).collect()
     }
 
@@ -246,10 +228,10 @@ impl Plant {
                 continue;
             };
             let mut queue = drive.bus.queue.lock();
-            let rules = queue.rules().cloned();
+            let rules = queue.gate.rules().cloned();
             let goes_on = rules.and_then(|rules| one.goes_on(&rules, now, time));
             if let Some((who, until)) = goes_on {
-                queue.reserve(drive.index, who, until);
+                queue.gate.reserve(drive.index, who, until);
             }
         }
     }
@@ -265,7 +247,7 @@ impl Plant {
 
 /// The event for a change of a hold.
 fn words(told: &Told, rules: &Rules) -> (EventKind, String) {
-    let named = |claim: &command::Claim| format!("{} ({})", claim.name, rules.rank(claim.rank));
+    let named = |claim: &Claim| format!("{} ({})", claim.name, rules.rank(claim.rank));
     let who = named(&told.who);
     match &told.what {
         What::Held => (EventKind::Held, format!("{who} holds the drive")),

@@ -1,28 +1,120 @@
-//! Placing commands in the queue of a bus, and refusing those that cannot be placed.
+//! Placing orders in the queue of a bus, and refusing those that cannot be placed.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use super::{BusHandle, DriveHandle, Manner, Placed};
+use super::{BusHandle, DriveHandle, Placed};
 use crate::codec::{RequestPdu, Table, describe};
-use crate::command::{
-    self, Admitted, Answer, Authority, BackgroundRequest, Change, Command, Effect, Order, Origin, Outcome, Pace, Parts,
-    Refusal, SlotWrite, StopEnd, Ticket, Urgency, WriteStats,
-};
 use crate::drive::parameters::RawValue;
 use crate::drive::{DriveIndex, ModelPoint, PointIndex, Value};
 use crate::event::RefusedCommand;
-use crate::process_image::Reading;
+use crate::order::{
+    Answer, Arrival, Authority, BackgroundRequest, Change, Command, DEFAULT_EXPIRY, Haste, Order, Origin, Outcome,
+    Pace, Parts, Refusal, SlotWrite, StopEnd, Ticket, Urgency, Window, Work, WriteStats, written,
+};
+use crate::permit::{Facts, Seen, admit};
+use crate::process_image::{BusImage, Reading};
 
-/// Who gives a command, what that client may do at all, until when it may be sent, when its head came, and now.
-struct Terms {
+/// An order as a way in gives it to a drive.
+#[derive(Debug, Clone)]
+pub struct OrderRequest {
+    order: Order,
+    /// What else was in it and is refused, where only its stop was understood: as text, and why.
+    rest: Option<(String, Refusal)>,
     origin: Origin,
     authority: Authority,
-    expires: Instant,
-    asked: Instant,
+    /// When it came; now where nothing else is said.
+    arrival: Option<Arrival>,
+    expiry: Duration,
+    slot: Option<SlotWrite>,
+    waits: bool,
+    at_once: bool,
+}
+
+impl OrderRequest {
+    /// The order of that client, with what the client may do at all. It is not sent later than 2 s from now.
+    pub fn new(order: Order, origin: Origin, authority: Authority) -> OrderRequest {
+        OrderRequest {
+            order,
+            rest: None,
+            origin,
+            authority,
+            arrival: None,
+            expiry: DEFAULT_EXPIRY,
+            slot: None,
+            waits: false,
+            at_once: false,
+        }
+    }
+
+    /// It is not sent later than that from now.
+    #[must_use]
+    pub fn within(self, expiry: Duration) -> OrderRequest {
+        OrderRequest { expiry, ..self }
+    }
+
+    /// It came so: no stop that came in since is undone by it.
+    #[must_use]
+    pub fn arrived(self, arrival: Arrival) -> OrderRequest {
+        OrderRequest {
+            arrival: Some(arrival),
+            ..self
+        }
+    }
+
+    /// Its order is the stop of a command that was understood; the rest, as text, is refused.
+    #[must_use]
+    pub fn without_rest(self, what: &str, refusal: Refusal) -> OrderRequest {
+        OrderRequest {
+            rest: Some((what.to_string(), refusal)),
+            ..self
+        }
+    }
+
+    /// It follows from that write to a slot: both are accepted, or neither is.
+    #[must_use]
+    pub fn by_slot(self, write: SlotWrite) -> OrderRequest {
+        OrderRequest {
+            slot: Some(write),
+            ..self
+        }
+    }
+
+    /// Whether a start that must wait does so, up to its expiry; else it is refused.
+    #[must_use]
+    pub fn waiting(self, waits: bool) -> OrderRequest {
+        OrderRequest { waits, ..self }
+    }
+
+    /// No guard delays its stop.
+    #[must_use]
+    pub fn at_once(self) -> OrderRequest {
+        OrderRequest { at_once: true, ..self }
+    }
+}
+
+/// One part of an order on its way into the queue.
+struct Part {
+    ticket: Ticket,
+    window: Window,
+    slot: Option<SlotWrite>,
+    at_once: bool,
+}
+
+/// What an order sees of the drives of a bus when it is accepted.
+struct AtAccept<'a> {
+    image: &'a BusImage,
     now: Instant,
+    stale_after: Duration,
+}
+
+impl Facts for AtAccept<'_> {
+    fn seen(&self, drive: DriveIndex) -> Option<Seen<'_>> {
+        let reading = self.image.drives.get(drive)?.reading(self.now, self.stale_after);
+        Some(Seen { reading, written: None })
+    }
 }
 
 /// The points a command sets, with their previous values.
@@ -45,7 +137,7 @@ pub(super) fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
             })
             .collect(),
         Order::Write(pdu) => {
-            let (table, items) = command::written(pdu).unwrap_or((Table::Holding, Vec::new()));
+            let (table, items) = written(pdu).unwrap_or((Table::Holding, Vec::new()));
             let runs = |address: u16, word: u16| reading.spec.profile.runs_by(table, address, word);
             let number = |word: u16| Value::Integer(i64::from(word));
             let change = |(address, word): (u16, u16)| Change {
@@ -95,6 +187,15 @@ pub fn turn_away(
 }
 
 impl BusHandle {
+    /// What an order sees of the drives when it is accepted; samples older than `stale_after` are stale.
+    pub(super) fn at_accept(&self, stale_after: Duration, now: Instant) -> impl Facts + '_ {
+        AtAccept {
+            image: &self.image,
+            now,
+            stale_after,
+        }
+    }
+
     /// Gives the drive of `reading`, at place `drive` on this bus, a command of the gateway itself: a point of the
     /// model and its value. No client is after it, so it renews no lease, and no newer reference of a client takes its
     /// place.
@@ -117,82 +218,47 @@ impl BusHandle {
         })?;
         let order = Order::Points(vec![(index, value)]);
         let changes = changes(reading, &order);
-        let mut admitted = command::admit(order, reading, Authority::Write)?;
+        let mut admitted = admit(order, reading, Authority::Write)?;
         admitted.reference_only = false;
         let what = format!("{}={value}", point.name());
         let (ticket, answer) = Ticket::new(origin, &spec.name, what, true, now, writes.clone());
-        let command = Command::new(drive, admitted, now + expiry, ticket.with_changes(changes));
-        let command = command.asked_of(&spec.profile, now);
-        self.queue.submit(command, now);
+        let window = Window {
+            arrival: Arrival::now(now),
+            expires: now + expiry,
+            waits: false,
+        };
+        let ticket = ticket.with_changes(changes);
+        let command = Command::new(drive, admitted, &spec.profile, window, ticket);
+        self.queue
+            .submit(command, &self.at_accept(reading.stale_after, now), now);
         Ok(answer)
     }
 }
 
 impl DriveHandle {
-    /// Gives a command to the drive, at `now`. When this returns it is in the queue of the bus, behind all that was
-    /// placed before, or answered: refused when it is not admitted, not sent when the bus is down or the drive offline.
+    /// Gives an order to the drive, at `now`: the one door for all ways in. When this returns it is in the queue of the bus, behind
+    /// all that was placed before, or answered: refused when it is not admitted, not sent when the bus is down or the drive
+    /// offline. Refused writes are audited and published as an event.
     ///
-    /// `authority` says what the client may do at all. The order is not sent later than `expiry` from now. Refused
-    /// writes are audited and published as an event. Of a command that stops and does more, the stop is carried out
-    /// whatever becomes of the rest; it is audited as two.
-    pub fn place(&self, order: Order, origin: Origin, authority: Authority, expiry: Duration, now: Instant) -> Placed {
-        self.place_asked(order, origin, authority, expiry, now, now)
-    }
-
-    /// The same of a command whose head came at `asked`: no stop that came in since is undone by it.
-    pub fn place_asked(
-        &self,
-        order: Order,
-        origin: Origin,
-        authority: Authority,
-        expiry: Duration,
-        asked: Instant,
-        now: Instant,
-    ) -> Placed {
+    /// Of an order that stops and does more, the stop is carried out whatever becomes of the rest; it is audited as two.
+    pub fn place(&self, request: OrderRequest, now: Instant) -> Placed {
         let reading = self.reading(now);
-        let terms = Terms {
-            origin,
-            authority,
-            expires: now + expiry,
-            asked,
-            now,
-        };
+        let OrderRequest { order, rest, .. } = request.clone();
+        let may_go = |stop: &Order| self.takes_stops() && admit(stop.clone(), &reading, request.authority).is_ok();
+        if let Some((what, refusal)) = rest {
+            return match may_go(&order) {
+                true => self.place_parts(order, (&what, Err(refusal)), request, &reading),
+                false => self.place_one(order, request, &reading),
+            };
+        }
         match Parts::of(order.clone(), &self.image.spec.profile) {
-            Parts::Two(stop, rest) if self.may_go(&stop, &reading, authority) => {
+            Parts::Two(stop, rest) if may_go(&stop) => {
                 let what = self.describe(&rest);
-                self.place_parts(stop, (&what, Ok(rest)), terms)
+                self.place_parts(stop, (&what, Ok(rest)), request, &reading)
             }
-            Parts::Two(..) => self.place_one(order, None, terms),
-            Parts::One(order) => self.place_one(order, None, terms),
+            Parts::Two(..) => self.place_one(order, request, &reading),
+            Parts::One(order) => self.place_one(order, request, &reading),
         }
-    }
-
-    /// As [`DriveHandle::place`] for a command whose stop was understood and whose rest, `what`, is refused.
-    pub fn place_stop(
-        &self,
-        stop: Order,
-        (what, refusal): (&str, Refusal),
-        origin: Origin,
-        authority: Authority,
-        expiry: Duration,
-        now: Instant,
-    ) -> Placed {
-        let terms = Terms {
-            origin,
-            authority,
-            expires: now + expiry,
-            asked: now,
-            now,
-        };
-        match self.may_go(&stop, &self.reading(now), authority) {
-            true => self.place_parts(stop, (what, Err(refusal)), terms),
-            false => self.place_one(stop, None, terms),
-        }
-    }
-
-    /// Whether a stop goes to the bus.
-    fn may_go(&self, stop: &Order, reading: &Reading<'_>, authority: Authority) -> bool {
-        self.takes_stops() && command::admit(stop.clone(), reading, authority).is_ok()
     }
 
     /// Whether the bus is open, or about to open its port: a stop waits for that.
@@ -200,102 +266,88 @@ impl DriveHandle {
         self.bus_up() || !self.bus.image.is_tried()
     }
 
-    /// The order that follows from a write to a slot; both are accepted, or neither is.
-    pub fn place_slot(
-        &self,
-        order: Order,
-        write: SlotWrite,
-        origin: Origin,
-        expiry: Duration,
-        (asked, now): (Instant, Instant),
-    ) -> Placed {
-        let terms = Terms {
-            origin,
-            authority: Authority::Write,
-            expires: now + expiry,
-            asked,
-            now,
-        };
-        self.place_one(order, Some(write), terms)
-    }
-
-    fn place_one(&self, order: Order, write_to: Option<SlotWrite>, terms: Terms) -> Placed {
-        let Terms {
-            origin, expires, now, ..
-        } = terms;
-        let reading = self.reading(now);
+    fn place_one(&self, order: Order, request: OrderRequest, reading: &Reading<'_>) -> Placed {
+        let now = reading.now;
         let write = !matches!(order, Order::Read(_));
         let what = self.describe(&order);
-        let (mut ticket, answer) = self.ticket(&what, changes(&reading, &order), origin, write, now);
+        let window = request.window(now);
+        let (mut ticket, answer) = self.ticket(&what, changes(reading, &order), request.origin, write, now);
         let placed = Placed::new(now, answer, ticket.confirmation());
-        match self.judge(order, ticket.origin(), &reading, terms.authority, expires) {
-            Err(outcome) => self.turn_away(ticket, &what, outcome, write, now),
-            Ok(admitted) => {
-                let command = Command::new(self.index, admitted, expires, ticket).of_slot(write_to);
-                let command = command.asked_of(&self.image.spec.profile, terms.asked);
-                self.bus.queue.submit(self.in_manner(command), now);
+        let part = Part {
+            ticket,
+            window,
+            slot: request.slot,
+            at_once: request.at_once,
+        };
+        match self.command(order, part, reading, request.authority) {
+            Err((ticket, outcome)) => self.turn_away(ticket, &what, outcome, write, now),
+            Ok(command) => {
+                let origin = command.ticket.origin().clone();
+                let facts = self.bus.at_accept(self.stale_after, now);
+                let refusal = self.bus.queue.submit(command, &facts, now);
+                self.tell_refused(&what, refusal, &origin, now);
             }
         }
         placed
     }
 
-    /// The stop of a command goes to the bus, and its rest after it unless it is refused.
-    fn place_parts(&self, stop: Order, (what, rest): (&str, Result<Order, Refusal>), terms: Terms) -> Placed {
-        let Terms {
-            origin,
-            authority,
-            expires,
-            asked,
-            now,
-        } = terms;
-        let reading = self.reading(now);
+    /// The stop of an order goes to the bus, and its rest after it unless it is refused.
+    fn place_parts(
+        &self,
+        stop: Order,
+        (what, rest): (&str, Result<Order, Refusal>),
+        request: OrderRequest,
+        reading: &Reading<'_>,
+    ) -> Placed {
+        let (now, window) = (reading.now, request.window(reading.now));
         let end = StopEnd::default();
-        let sets = changes(&reading, &stop);
-        let (ticket, answer) = self.ticket(&self.describe(&stop), sets, origin.clone(), true, now);
+        let sets = changes(reading, &stop);
+        let of_stop = self.describe(&stop);
+        let (ticket, answer) = self.ticket(&of_stop, sets, request.origin.clone(), true, now);
         let mut ticket = ticket.with_rest(end.clone());
         let placed = Placed::new(now, answer, ticket.confirmation());
         // The stop is the other part's, also where a block repeats it.
         let mut sets = rest
             .as_ref()
-            .map_or_else(|_| Vec::new(), |order| changes(&reading, order));
+            .map_or_else(|_| Vec::new(), |order| changes(reading, order));
         sets.iter_mut().for_each(|change| change.run = None);
-        let (mut rest_ticket, rest_answer) = self.ticket(what, sets, origin, true, now);
+        let (mut rest_ticket, rest_answer) = self.ticket(what, sets, request.origin.clone(), true, now);
         let placed = placed.with_rest(rest_answer, rest_ticket.confirmation());
-        let stop = match self.judge(stop, ticket.origin(), &reading, authority, expires) {
-            Ok(admitted) => {
-                let stop = Command::new(self.index, admitted, expires, ticket);
-                self.in_manner(stop.asked_of(&self.image.spec.profile, now))
-            }
-            Err(outcome) => {
-                self.turn_away(ticket, what, outcome, true, now);
+        let part = |ticket: Ticket| Part {
+            ticket,
+            window,
+            slot: None,
+            at_once: request.at_once,
+        };
+        let stop = match self.command(stop, part(ticket), reading, request.authority) {
+            Ok(stop) => stop,
+            Err((ticket, outcome)) => {
+                self.turn_away(ticket, &of_stop, outcome, true, now);
                 rest_ticket.answer(Outcome::NotStopped, now);
                 return placed;
             }
         };
-        let judged = match rest {
-            Ok(order) => self.judge(order, rest_ticket.origin(), &reading, authority, expires),
-            Err(refusal) => Err(Outcome::Refused(refusal)),
+        let facts = self.bus.at_accept(self.stale_after, now);
+        let rest = match rest {
+            Ok(order) => self.command(order, part(rest_ticket), reading, request.authority),
+            Err(refusal) => Err((rest_ticket, Outcome::Refused(refusal))),
         };
-        match judged {
-            Ok(admitted) => {
-                let rest = Command::new(self.index, admitted, expires, rest_ticket).behind(end);
-                let rest = rest.asked_of(&self.image.spec.profile, asked);
-                self.bus.queue.submit_parts(stop, rest, now);
+        match rest {
+            Ok(mut rest) => {
+                if let Work::Set(set) = &mut rest.work {
+                    set.behind = Some(end);
+                }
+                let [of_stop_refused, of_rest] = self.bus.queue.submit_parts(stop, rest, &facts, now);
+                self.tell_refused(&of_stop, of_stop_refused, &request.origin, now);
+                self.tell_refused(what, of_rest, &request.origin, now);
             }
-            Err(outcome) => {
-                self.bus.queue.submit(stop, now);
-                self.turn_away(rest_ticket, what, outcome, true, now);
+            Err((ticket, outcome)) => {
+                let refused = self.bus.queue.submit(stop, &facts, now);
+                self.tell_refused(&of_stop, refused, &request.origin, now);
+                self.turn_away(ticket, what, outcome, true, now);
             }
         }
         placed
-    }
-
-    fn in_manner(&self, command: Command) -> Command {
-        Command {
-            waits: self.manner == Manner::Waits,
-            is_urgent: self.manner == Manner::AtOnce,
-            ..command
-        }
     }
 
     fn ticket(
@@ -311,47 +363,42 @@ impl DriveHandle {
         (ticket.with_changes(sets), answer)
     }
 
-    /// Decides whether a command may be sent, or why not.
-    fn judge(
+    /// The command made of an order that configuration, profile and limits let through, or why there is none.
+    fn command(
         &self,
         order: Order,
-        origin: &Origin,
+        part: Part,
         reading: &Reading<'_>,
         authority: Authority,
-        expires: Instant,
-    ) -> Result<Admitted, Outcome> {
+    ) -> Result<Command, (Ticket, Outcome)> {
         let online = reading.snapshot.link.is_online();
-        let admitted = match command::admit(order, reading, authority) {
-            Err(Refusal::NotKnown(_)) if !self.bus_up() => return Err(Outcome::BusDown),
-            Err(Refusal::NotKnown(_)) if !online => return Err(Outcome::Offline),
-            admitted => admitted.map_err(Outcome::Refused)?,
+        let admitted = match admit(order, reading, authority) {
+            Err(Refusal::NotKnown(_)) if !self.bus_up() => return Err((part.ticket, Outcome::BusDown)),
+            Err(Refusal::NotKnown(_)) if !online => return Err((part.ticket, Outcome::Offline)),
+            Err(refusal) => return Err((part.ticket, Outcome::Refused(refusal))),
+            Ok(admitted) => admitted,
         };
-        if let Some(refusal) = self.hold_refuses(&admitted, origin, reading.now) {
-            return Err(Outcome::Refused(refusal));
-        }
         let is_stop = admitted.urgency == Urgency::Stop;
         if (!is_stop && !self.bus_up()) || !self.takes_stops() {
-            return Err(Outcome::BusDown);
+            return Err((part.ticket, Outcome::BusDown));
         }
         // A stop goes to a drive that does not answer too: it may be back.
         if !online && !is_stop {
-            return Err(Outcome::Offline);
+            return Err((part.ticket, Outcome::Offline));
         }
-        let held_back = || {
-            let effect = Effect::of(&admitted.order, &self.image.spec.profile);
-            let until = (self.manner == Manner::Waits).then_some(expires);
-            let queue = self.bus.queue.lock();
-            let held_back = queue.held_back(self.index, origin, effect);
-            held_back.or_else(|| queue.guarded(self.index, effect, until, reading.now))
-        };
-        // Judged once more when it is accepted.
-        match (admitted.urgency == Urgency::Command).then(held_back).flatten() {
-            Some(refusal) => Err(Outcome::Refused(refusal)),
-            None => Ok(admitted),
+        let profile = &self.image.spec.profile;
+        let mut command = Command::new(self.index, admitted, profile, part.window, part.ticket);
+        command.intent.slot = part.slot;
+        command.intent.named = self.named;
+        if let Work::Stop(stop) = &mut command.work
+            && part.at_once
+        {
+            stop.haste = Haste::AtOnce;
         }
+        Ok(command)
     }
 
-    /// Answers a command that is not sent. Reads that nothing answers are no commands, and no event.
+    /// Answers an order that is not sent. Reads that nothing answers are no commands, and no event.
     fn turn_away(&self, ticket: Ticket, what: &str, outcome: Outcome, write: bool, now: Instant) {
         if let Outcome::Refused(refusal) = &outcome
             && write
@@ -359,6 +406,13 @@ impl DriveHandle {
             self.publish_refusal(what, refusal, ticket.origin(), now);
         }
         ticket.answer(outcome, now);
+    }
+
+    /// Publishes the refusal of a command that the gate refused and answered.
+    fn tell_refused(&self, what: &str, refusal: Option<Refusal>, origin: &Origin, now: Instant) {
+        if let Some(refusal) = refusal {
+            self.publish_refusal(what, &refusal, origin, now);
+        }
     }
 
     /// Asks the drive for something at the lowest rank, at `now`; nothing is sent later than `expiry` from now. The
@@ -372,7 +426,7 @@ impl DriveHandle {
         now: Instant,
     ) -> Outcome {
         let reading = self.reading(now);
-        let order = match command::admit(Order::Read(pdu), &reading, Authority::ReadOnly) {
+        let order = match admit(Order::Read(pdu), &reading, Authority::ReadOnly) {
             Ok(admitted) => admitted.order,
             Err(refusal) => return Outcome::Refused(refusal),
         };
@@ -400,7 +454,7 @@ impl DriveHandle {
         answer.await.map_or(Outcome::ShuttingDown, |answer| answer.outcome)
     }
 
-    /// Refuses a command before it became a command; audited, counted and published like any other refusal.
+    /// Refuses an order before it became a command; audited, counted and published like any other refusal.
     pub fn refuse(&self, what: &str, refusal: Refusal, origin: Origin, now: Instant) -> Answer {
         self.publish_refusal(what, &refusal, &origin, now);
         let name = &self.image.spec.name;
@@ -433,6 +487,16 @@ impl DriveHandle {
             }
             Order::Parameter(order) => order.what(),
             Order::Write(pdu) | Order::Read(pdu) => describe::request_on(self.bus.image.spec.protocol, pdu),
+        }
+    }
+}
+
+impl OrderRequest {
+    fn window(&self, now: Instant) -> Window {
+        Window {
+            arrival: self.arrival.unwrap_or_else(|| Arrival::now(now)),
+            expires: now + self.expiry,
+            waits: self.waits,
         }
     }
 }

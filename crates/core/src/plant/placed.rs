@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use crate::command::{Answer, Outcome, joined};
+use crate::order::{Answer, Outcome, joined};
 
 /// What reads showed about an acknowledged command; empty for any other.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]

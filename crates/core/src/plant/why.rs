@@ -2,10 +2,9 @@
 
 use std::time::Duration;
 
-use crate::command::{AuditRecord, CONFIRMED, Origin, SourceKind, WriteStats};
 use crate::drive::why::{self, Cause, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
+use crate::order::{AuditRecord, CONFIRMED, Guarded, Origin, Reason, SourceKind, WriteStats};
 use crate::process_image::{Access, BusImage, Hold, Link, Reading};
-use crate::start_guard::{Guarded, Reason};
 
 /// Whether the drive of `reading`, on that bus, runs, and why not.
 pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {
@@ -88,7 +87,7 @@ fn fate(result: &str) -> Fate {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::command::{Holder, Refusal};
+    use crate::order::{Holder, Refusal};
 
     #[test]
     fn what_was_refused_did_not_expire() {

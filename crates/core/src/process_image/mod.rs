@@ -5,14 +5,16 @@
 
 mod contradiction;
 mod health;
-mod hold;
+mod restore_lock;
 mod snapshot;
+mod standstill;
 mod tape;
 mod trace;
 
 pub use health::{BusHealth, Histogram, HistogramSnapshot, Outcome, PollCycle};
-pub use hold::Hold;
+pub use restore_lock::Hold;
 pub use snapshot::{Cadence, Link, Reading, Snapshot, Unavailable};
+pub use standstill::Standstill;
 pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Taping, Verdict};
 pub use trace::{Direction, FrameRecord, Trace};
 

@@ -3,15 +3,18 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::*;
 use crate::codec::{RequestPdu, Table};
-use crate::command::{
-    BackgroundRequest, Effect, NO_DRIVE, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind, Ticket, Touched,
-};
 use crate::drive::DriveIndex;
+use crate::order::{
+    Arrival, Command, Effect, Effects, Intent, NO_DRIVE, Order, Origin, Outcome, PassedOn, Refusal, SourceKind, Ticket,
+    Touched, Window,
+};
+use crate::permit::{Gate, Stage, Verdict};
 use crate::process_image::{BusSpec, DriveImage, DriveSpec, Link};
-use crate::testkit::{bus_spec, controlled, image, nx, profile, read};
+use crate::testkit::{Unseen, bus_spec, controlled, image, nx, profile, read};
 
 const SECOND: Duration = Duration::from_secs(1);
 const RUN: Effect = Effect {
+    stops: false,
     run: Some(true),
     reverse: None,
     reference: false,
@@ -65,49 +68,47 @@ impl GuardedDrives {
     }
 
     fn refused(&self, drive: usize, seconds: f64) -> Option<&'static str> {
-        let refusal = self
-            .guards
-            .refuses(DriveIndex::new(drive), RUN, None, self.at(seconds))?;
-        Some(match refusal {
-            Refusal::Guarded(guarded) => guarded.reason.name(),
-            Refusal::Interlocked(_) => "interlock",
-            other => unreachable!("{other}"),
-        })
+        match reason(self.asked(Stage::Accept, &[drive], (0, None), seconds)) {
+            "go" | "wait" => None,
+            reason => Some(reason),
+        }
+    }
+
+    fn refusal(&self, drive: usize, seconds: f64) -> Option<Refusal> {
+        match self.asked(Stage::Accept, &[drive], (0, None), seconds) {
+            Verdict::Refuse(Outcome::Refused(refusal)) => Some(refusal),
+            _ => None,
+        }
+    }
+
+    /// A started command that starts the drive writes.
+    fn may_write(&self, drive: usize, number: u64, seconds: f64) -> bool {
+        self.asked(Stage::Write, &[drive], (number, None), seconds) == Verdict::Go
     }
 
     /// A command that starts these drives has its turn.
-    fn clear(&self, drives: &[usize], number: u64, seconds: f64) -> Clearance {
-        self.clear_waiting(drives, number, false, seconds)
+    fn clear(&self, drives: &[usize], number: u64, seconds: f64) -> Verdict {
+        self.asked(Stage::Turn, drives, (number, None), seconds)
     }
 
-    fn clear_waiting(&self, drives: &[usize], number: u64, waits: bool, seconds: f64) -> Clearance {
-        let now = self.at(seconds);
-        let origin = Origin::new(SourceKind::Mqtt, "c");
-        let (ticket, _) = Ticket::new(origin, "d", String::new(), true, now, Arc::default());
-        let request = BackgroundRequest {
-            drive: NO_DRIVE,
-            pdu: RequestPdu::write_register(2000, 1),
-            pace: Pace::Brisk,
-            expires: now + 2 * SECOND,
-            ticket,
-            passed_on: Some(PassedOn {
-                address: 0,
-                may_write: true,
-                reach: drives.iter().copied().map(DriveIndex::new).collect(),
-                stops: Vec::new(),
-                effects: drives.iter().map(|drive| (DriveIndex::new(*drive), RUN)).collect(),
-                first: false,
-                frame: tokio::sync::oneshot::channel().0,
-            }),
-        };
-        let mut command = request.into_command(Touched::Anything);
-        (command.number, command.waits) = (number, waits);
-        self.guards.clear(&command, now)
+    /// Likewise of one that waits for its start until then.
+    fn clear_waiting(&self, drives: &[usize], number: u64, until: f64, seconds: f64) -> Verdict {
+        self.asked(Stage::Turn, drives, (number, Some(until)), seconds)
+    }
+
+    fn asked(&self, stage: Stage, drives: &[usize], (number, waits): (u64, Option<f64>), seconds: f64) -> Verdict {
+        judged(
+            &self.guards,
+            stage,
+            drives,
+            (number, waits.map(|until| self.at(until))),
+            self.at(seconds),
+        )
     }
 
     /// Starts a drive and sees it run, then stops it and sees it stand a second later.
     fn start_and_stop(&self, drive: usize, number: u64, seconds: f64) {
-        assert_eq!(self.clear(&[drive], number, seconds), Clearance::Go, "at {seconds} s");
+        assert_eq!(self.clear(&[drive], number, seconds), Verdict::Go, "at {seconds} s");
         self.guards
             .start_written(DriveIndex::new(drive), number, &Arc::from("c"), self.at(seconds));
         self.read(drive, true, seconds + 0.1);
@@ -116,13 +117,44 @@ impl GuardedDrives {
     }
 }
 
-fn reason(clearance: Clearance) -> &'static str {
-    match clearance {
-        Clearance::Refused(Refusal::Guarded(guarded)) => guarded.reason.name(),
-        Clearance::Refused(Refusal::Interlocked(_)) => "interlock",
-        Clearance::Refused(other) => unreachable!("{other}"),
-        Clearance::Go => "go",
-        Clearance::Wait(_) => "wait",
+/// What the gate says of a command that starts these drives.
+fn judged(
+    guards: &Arc<BusGuards>,
+    stage: Stage,
+    drives: &[usize],
+    (number, waits): (u64, Option<Instant>),
+    now: Instant,
+) -> Verdict {
+    let mut gate = Gate::default();
+    gate.set_starts(Some(guards.clone()));
+    let origin = Origin::new(SourceKind::Mqtt, "c");
+    let (ticket, _) = Ticket::new(origin, "d", String::new(), true, now, Arc::default());
+    let window = Window {
+        arrival: Arrival::now(now),
+        expires: waits.unwrap_or(now + 2 * SECOND),
+        waits: waits.is_some(),
+    };
+    let effects = drives.iter().map(|drive| (DriveIndex::new(*drive), RUN)).collect();
+    let order = Order::Write(RequestPdu::write_register(2000, 1));
+    let intent = Intent::new(NO_DRIVE, order, Effects::on_all(effects, Touched::Anything), window);
+    let passed_on = PassedOn {
+        address: 0,
+        may_write: true,
+        first: false,
+        frame: tokio::sync::oneshot::channel().0,
+    };
+    let mut command = Command::passed_on(intent, passed_on, ticket);
+    command.intent.number = number;
+    gate.judge(stage, &command, &Unseen, now)
+}
+
+fn reason(verdict: Verdict) -> &'static str {
+    match verdict {
+        Verdict::Refuse(Outcome::Refused(Refusal::Guarded(guarded))) => guarded.reason.name(),
+        Verdict::Refuse(Outcome::Refused(Refusal::Interlocked(_))) => "interlock",
+        Verdict::Refuse(other) => unreachable!("{other}"),
+        Verdict::Go | Verdict::LookFirst => "go",
+        Verdict::Wait(_) => "wait",
     }
 }
 
@@ -142,7 +174,7 @@ fn the_window_of_an_hour_slides() {
     }
     assert_eq!(rig.refused(0, 1300.0), Some("starts_per_hour"));
     assert_eq!(rig.refused(1, 1300.0), None, "each drive for itself");
-    let Some(Refusal::Guarded(wait)) = rig.guards.refuses(DriveIndex::new(0), RUN, None, rig.at(1300.0)) else {
+    let Some(Refusal::Guarded(wait)) = rig.refusal(0, 1300.0) else {
         unreachable!()
     };
     assert_eq!(
@@ -172,13 +204,13 @@ fn the_window_of_an_hour_slides() {
 fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
     let rig = GuardedDrives::of(per_hour(1), Vec::new());
     rig.read(0, false, 0.0);
-    assert_eq!(rig.clear(&[0], 1, 1.0), Clearance::Go);
+    assert_eq!(rig.clear(&[0], 1, 1.0), Verdict::Go);
     rig.guards
         .start_written(DriveIndex::new(0), 1, &Arc::from("c"), rig.at(1.0));
     assert_eq!(rig.refused(0, 1.05), Some("starts_per_hour"), "not seen to run yet");
     rig.read(0, true, 1.1);
     assert_eq!(rig.refused(0, 1.2), None, "it runs");
-    assert_eq!(rig.clear(&[0], 2, 1.2), Clearance::Go);
+    assert_eq!(rig.clear(&[0], 2, 1.2), Verdict::Go);
     rig.guards
         .start_written(DriveIndex::new(0), 2, &Arc::from("c"), rig.at(1.2));
     rig.guards.stop_written(DriveIndex::new(0), rig.at(2.0));
@@ -197,8 +229,8 @@ fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
     rig.read(0, false, 3.0);
     assert_eq!(rig.refused(0, 3.1), Some("starts_per_hour"));
     // A run that was cleared while the motor ran does not start it when it has stopped since.
-    assert!(rig.guards.may_write(DriveIndex::new(0), 2, rig.at(3.1)).is_err());
-    assert!(rig.guards.may_write(DriveIndex::new(0), 1, rig.at(3.1)).is_ok());
+    assert!(!rig.may_write(0, 2, 3.1));
+    assert!(rig.may_write(0, 1, 3.1));
 }
 
 #[test]
@@ -231,7 +263,7 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     rig.start_and_stop(0, 1, 40.0);
     assert_eq!((rig.refused(0, 70.9), rig.refused(0, 71.0)), (Some("min_off"), None));
     // A start and a stop between two reads: it is to be seen to stand anew.
-    assert_eq!(rig.clear(&[0], 2, 71.0), Clearance::Go);
+    assert_eq!(rig.clear(&[0], 2, 71.0), Verdict::Go);
     rig.guards
         .start_written(DriveIndex::new(0), 2, &Arc::from("c"), rig.at(71.0));
     rig.read(0, false, 71.0);
@@ -252,22 +284,11 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     assert_eq!((rig.refused(0, 219.0), rig.refused(0, 220.0)), (Some("min_off"), None));
     // One that waits is taken in if it can go in time.
     rig.read(1, false, 200.0);
-    let until = |seconds| Some(rig.at(seconds));
-    assert!(
-        rig.guards
-            .refuses(DriveIndex::new(1), RUN, until(229.0), rig.at(220.0))
-            .is_some()
-    );
-    assert_eq!(
-        rig.guards.refuses(DriveIndex::new(1), RUN, until(231.0), rig.at(220.0)),
-        None
-    );
-    assert_eq!(
-        rig.clear_waiting(&[1], 9, true, 229.0),
-        Clearance::Wait(rig.at(230.0)),
-        "it goes at its time"
-    );
-    assert_eq!(rig.clear_waiting(&[1], 9, true, 230.0), Clearance::Go);
+    let accepted = |until: f64| reason(rig.asked(Stage::Accept, &[1], (0, Some(until)), 220.0));
+    assert_eq!((accepted(229.0), accepted(231.0)), ("min_off", "wait"));
+    let waits = rig.clear_waiting(&[1], 9, 231.0, 229.0);
+    assert_eq!(waits, Verdict::Wait(rig.at(230.0)), "it goes at its time");
+    assert_eq!(rig.clear_waiting(&[1], 9, 231.0, 230.0), Verdict::Go);
 }
 
 #[test]
@@ -279,20 +300,20 @@ fn drives_of_a_group_start_one_after_the_other() {
     let rig = GuardedDrives::of(guard, Vec::new());
     (0..3).for_each(|drive| rig.read(drive, false, 0.0));
     assert_eq!(reason(rig.clear(&[0, 1], 1, 1.0)), "stagger", "never two by one order");
-    assert_eq!(rig.clear(&[0], 2, 2.0), Clearance::Go);
+    assert_eq!(rig.clear(&[0], 2, 2.0), Verdict::Go);
     // Cleared and not written: it may be at any time.
     assert_eq!(reason(rig.clear(&[1], 3, 7.5)), "stagger");
     rig.guards
         .start_written(DriveIndex::new(0), 2, &Arc::from("c"), rig.at(8.0));
     assert_eq!(
         (reason(rig.clear(&[1], 3, 12.9)), rig.clear(&[1], 3, 13.0)),
-        ("stagger", Clearance::Go)
+        ("stagger", Verdict::Go)
     );
     // What was cleared and not written counts from when it was.
     rig.guards.settle(DriveIndex::new(1), 3);
     assert_eq!((rig.refused(0, 17.9), rig.refused(0, 18.0)), (Some("stagger"), None));
     // A drive without a guard is not held back, and its starts count for the others.
-    assert_eq!(rig.clear(&[2], 4, 18.0), Clearance::Go);
+    assert_eq!(rig.clear(&[2], 4, 18.0), Verdict::Go);
     rig.guards
         .start_written(DriveIndex::new(2), 4, &Arc::from("c"), rig.at(18.0));
     assert_eq!((rig.refused(0, 22.9), rig.refused(0, 23.0)), (Some("stagger"), None));
@@ -308,7 +329,7 @@ fn only_a_good_point_holds_an_interlock() {
     };
     let rig = GuardedDrives::of(Guard::default(), vec![interlock("d3", true)]);
     rig.read(0, false, 0.0);
-    let text = |seconds| match rig.guards.refuses(DriveIndex::new(0), RUN, None, rig.at(seconds)) {
+    let text = |seconds| match rig.refusal(0, seconds) {
         Some(refusal @ Refusal::Interlocked(_)) => refusal.to_string(),
         other => format!("{other:?}"),
     };
@@ -323,10 +344,10 @@ fn only_a_good_point_holds_an_interlock() {
     assert_eq!(rig.refused(0, 2.5), None);
     assert!(text(3.5).contains("is stale: read 1.5 s ago"), "{}", text(3.5));
     rig.read(2, true, 4.0);
-    assert_eq!(rig.clear(&[0], 1, 4.5), Clearance::Go);
+    assert_eq!(rig.clear(&[0], 1, 4.5), Verdict::Go);
     // It does not hold any more when the word is to be written.
-    assert!(rig.guards.may_write(DriveIndex::new(0), 1, rig.at(4.9)).is_ok());
-    assert!(rig.guards.may_write(DriveIndex::new(0), 1, rig.at(5.5)).is_err());
+    assert!(rig.may_write(0, 1, 4.9));
+    assert!(!rig.may_write(0, 1, 5.5));
     assert_eq!(
         rig.guards.unmet(DriveIndex::new(0), true, rig.at(5.5)),
         [],
@@ -352,7 +373,7 @@ fn a_start_waits_until_it_is_on_disk() {
     let (generation, saved) = rig.shared.to_write(rig.at(1.0), time).unwrap();
     assert_eq!(reason(rig.clear(&[0], 1, 1.1)), "wait");
     rig.shared.wrote(generation, Ok(()));
-    assert_eq!(rig.clear(&[0], 1, 1.2), Clearance::Go);
+    assert_eq!(rig.clear(&[0], 1, 1.2), Verdict::Go);
     assert_eq!(rig.shared.to_write(rig.at(1.2), time), None);
     // Killed before it wrote anything, the next run knows of it.
     let next = GuardedDrives::of(per_hour(1), Vec::new());
@@ -383,7 +404,7 @@ fn a_start_that_cannot_be_counted_is_refused_and_is_none() {
     let (generation, _) = rig.shared.to_write(rig.at(1.0), time).unwrap();
     rig.shared.wrote(generation, Err("starts.json: no space".to_string()));
     let refused = rig.clear(&[0], 1, 1.1);
-    let Clearance::Refused(refusal) = &refused else {
+    let Verdict::Refuse(refusal) = &refused else {
         unreachable!("{refused:?}")
     };
     assert!(refusal.to_string().contains("starts.json: no space"), "{refusal}");
@@ -397,7 +418,7 @@ fn a_start_that_cannot_be_counted_is_refused_and_is_none() {
     assert_eq!(reason(rig.clear(&[0], 3, 5.0)), "wait");
     let (generation, _) = rig.shared.to_write(rig.at(5.0), time).unwrap();
     rig.shared.wrote(generation, Ok(()));
-    assert_eq!(rig.clear(&[0], 3, 5.1), Clearance::Go);
+    assert_eq!(rig.clear(&[0], 3, 5.1), Verdict::Go);
 }
 
 #[test]
@@ -405,17 +426,19 @@ fn counters_belong_to_the_machine_over_a_reload() {
     let rig = GuardedDrives::of(per_hour(1), Vec::new());
     rig.read(0, false, 0.0);
     rig.start_and_stop(0, 1, 1.0);
+    let starts =
+        |guards: &Arc<BusGuards>, drive| reason(judged(guards, Stage::Accept, &[drive], (0, None), rig.at(10.0)));
     // Renamed, and at another place of the bus.
     let mut specs: Vec<DriveSpec> = rig.images.iter().map(|image| image.spec.clone()).collect();
     specs[0].name = "other".to_string();
     specs.reverse();
     let after = BusGuards::of(&rig.shared, &rig.bus, &specs).unwrap();
-    assert!(after.refuses(DriveIndex::new(2), RUN, None, rig.at(10.0)).is_some());
-    assert!(after.refuses(DriveIndex::new(1), RUN, None, rig.at(10.0)).is_none());
+    assert_eq!(starts(&after, 2), "starts_per_hour");
+    assert_eq!(starts(&after, 1), "go");
     // Another machine at its address has none.
     specs[2].profile = profile("vacon-cx");
     let after = BusGuards::of(&rig.shared, &rig.bus, &specs).unwrap();
-    assert!(after.refuses(DriveIndex::new(2), RUN, None, rig.at(10.0)).is_none());
+    assert_eq!(starts(&after, 2), "go");
     specs
         .iter_mut()
         .for_each(|spec| (spec.guard, spec.staggers) = (None, false));
@@ -434,7 +457,7 @@ fn min_run_delays_the_first_stop_of_the_client_that_started_the_motor() {
     let rig = GuardedDrives::of(guard, Vec::new());
     rig.read(0, false, 0.0);
     assert!(!rig.guards.is_ordinary_stop(DriveIndex::new(0), "c", None), "it stands");
-    assert_eq!(rig.clear(&[0], 1, 1.0), Clearance::Go);
+    assert_eq!(rig.clear(&[0], 1, 1.0), Verdict::Go);
     rig.guards
         .start_written(DriveIndex::new(0), 1, &Arc::from("c"), rig.at(1.0));
     let waits = |seconds| rig.guards.stop_waits(DriveIndex::new(0), rig.at(seconds));

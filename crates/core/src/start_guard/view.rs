@@ -1,15 +1,14 @@
-//! The guards of one bus: whether a command to its drives may start them. Pure: time is an argument.
+//! The guards of one bus: what they say of its drives. The rules that ask them are in `permit`. Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::ledger::{Guards, Kept, Ledger};
+use super::ledger::{Guards, Kept};
 use super::{Guard, Guarded, Interlock, Reason, Seen, Unmet, shown};
-use crate::command::{Command, Effect, Refusal};
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, Plan, Value};
-use crate::process_image::{BusSpec, DriveSpec, Link, Machine, Reading};
-use crate::stop_all::Standstill;
+use crate::order::{Effects, Refusal};
+use crate::process_image::{BusSpec, DriveSpec, Link, Machine, Reading, Standstill};
 
 /// Time until a start that waits for the disk is looked at again.
 const LOOK: Duration = Duration::from_millis(2);
@@ -40,8 +39,8 @@ pub enum Clearance {
     Go,
     /// Not before then.
     Wait(Instant),
-    /// No.
-    Refused(Refusal),
+    /// No: it cannot be counted.
+    Refused(Guarded),
 }
 
 impl BusGuards {
@@ -89,31 +88,70 @@ impl BusGuards {
         self.of_drive(drive).is_some()
     }
 
-    /// Why a command with that effect is not accepted; counted. One that may wait does so until `waits_until`.
-    pub fn refuses(
-        &self,
-        drive: DriveIndex,
-        effect: Effect,
-        waits_until: Option<Instant>,
-        now: Instant,
-    ) -> Option<Refusal> {
-        let of = self.of_drive(drive).filter(|_| effect.run == Some(true))?;
-        let mut ledger = self.shared.lock();
-        if !ledger.motor(&of.machine)?.is_started_by_run() {
-            return None;
-        }
-        let refused = self.interlocked(of, now).or_else(|| {
-            let wait = ledger.hindered(&of.machine, &of.guard, now)?;
-            Some(wait).filter(|wait| waits_until.is_none_or(|until| now + wait.retry_after > until))
-        })?;
-        ledger.count_refused(&of.machine, refused.reason);
-        Some(refusal(refused))
+    /// Those of the guarded drives whose motor an order with these effects starts, if it is written now.
+    pub fn started_by(&self, effects: &Effects) -> impl Iterator<Item = DriveIndex> {
+        let started = effects
+            .iter()
+            .filter(|(drive, effect)| effect.starts() && self.is_started_by_run(*drive));
+        started.map(|(drive, _)| drive)
+    }
+
+    /// Whether a run command, written now, starts the motor of that drive, and is to be judged: it does not run for certain.
+    pub fn is_started_by_run(&self, drive: DriveIndex) -> bool {
+        let Some(of) = self.of_drive(drive) else { return false };
+        let ledger = self.shared.lock();
+        ledger.motor(&of.machine).is_some_and(|motor| motor.is_started_by_run())
+    }
+
+    /// Whether the start of that order was cleared for the drive.
+    pub fn is_cleared(&self, drive: DriveIndex, number: u64) -> bool {
+        let Some(of) = self.of_drive(drive) else { return false };
+        let ledger = self.shared.lock();
+        ledger.motor(&of.machine).is_some_and(|motor| motor.is_cleared(number))
+    }
+
+    /// Why the guard of the drive lets its motor not start now, and when it may.
+    pub fn hindered(&self, drive: DriveIndex, now: Instant) -> Option<Guarded> {
+        let of = self.of_drive(drive)?;
+        self.shared.lock().hindered(&of.machine, &of.guard, now)
+    }
+
+    /// Why the interlocks of the drive let its motor not start now.
+    pub fn interlocked(&self, drive: DriveIndex, now: Instant) -> Option<Guarded> {
+        self.interlocked_of(self.of_drive(drive)?, now)
+    }
+
+    /// The motor ran when the order was judged, and has stopped since: a start that nothing cleared.
+    pub fn stopped_since(&self, drive: DriveIndex) -> Option<Guarded> {
+        let of = self.of_drive(drive)?;
+        Some(Guarded {
+            reason: Reason::MinOff,
+            why: "the motor was running when the command arrived, and has stopped since; send it again".to_string(),
+            retry_after: of.guard.min_off,
+        })
+    }
+
+    /// Why that drive is not started by one order together with the others that it starts.
+    pub fn too_close_together(&self, drive: DriveIndex, effects: &Effects) -> Option<Guarded> {
+        let of = self.of_drive(drive).filter(|of| !of.guard.stagger.is_zero())?;
+        let others = self.started_by(effects).filter_map(|other| self.of_drive(other));
+        let of_group = |other: &&Guarding| other.machine != of.machine && other.group == of.group;
+        others.into_iter().find(of_group)?;
+        Some(Guarded {
+            reason: Reason::Stagger,
+            why: format!(
+                "one command would start several drives whose starts must be {} apart (guard.stagger); start them one \
+                 by one",
+                shown(of.guard.stagger)
+            ),
+            retry_after: of.guard.stagger,
+        })
     }
 
     /// Why the motor may not be started now, as text; not counted.
     pub(crate) fn hindrance(&self, drive: DriveIndex, now: Instant) -> Option<Guarded> {
         let of = self.of_drive(drive)?;
-        let interlocked = self.interlocked(of, now);
+        let interlocked = self.interlocked_of(of, now);
         interlocked.or_else(|| {
             let ledger = self.shared.lock();
             // One that runs by its order, with a reference of zero, is not kept from a start.
@@ -143,7 +181,7 @@ impl BusGuards {
         wanted.filter_map(|interlock| interlock.unmet(&around, now)).collect()
     }
 
-    fn interlocked(&self, of: &Guarding, now: Instant) -> Option<Guarded> {
+    fn interlocked_of(&self, of: &Guarding, now: Instant) -> Option<Guarded> {
         let unmet = self.unmet_of(of, false, now);
         let unmet: Vec<String> = unmet.iter().map(Unmet::to_string).collect();
         (!unmet.is_empty()).then(|| Guarded {
@@ -153,83 +191,15 @@ impl BusGuards {
         })
     }
 
-    /// A command has its turn. Its start is counted once, when it may be sent.
-    pub fn clear(&self, command: &Command, now: Instant) -> Clearance {
-        let all = command.reach().iter();
-        let started = all.filter(|drive| command.effect(**drive).run == Some(true));
-        let started: Vec<&Guarding> = started.filter_map(|drive| self.of_drive(*drive)).collect();
-        if started.is_empty() {
-            return Clearance::Go;
-        }
+    /// An order has its turn and may go: its starts of these drives are counted once, and it goes when that is on disk. It is not
+    /// written later than `expires`.
+    pub fn clear(&self, started: &[DriveIndex], number: u64, expires: Instant, now: Instant) -> Clearance {
+        let started: Vec<&Guarding> = started.iter().filter_map(|drive| self.of_drive(*drive)).collect();
         let mut ledger = self.shared.lock();
-        let starts = |of: &&&Guarding| ledger.motor(&of.machine).is_some_and(|motor| motor.is_started_by_run());
-        let started: Vec<&Guarding> = started.iter().filter(starts).copied().collect();
-        match self.judge(&ledger, &started, command, now) {
-            Err((of, refused)) => {
-                ledger.count_refused(&of.machine, refused.reason);
-                Clearance::Refused(refusal(refused))
-            }
-            Ok(Some(until)) => Clearance::Wait(until),
-            Ok(None) => self.count(&mut ledger, &started, command, now),
-        }
-    }
-
-    /// Until when the start of these drives waits; none where it may go.
-    fn judge<'g>(
-        &self,
-        ledger: &Ledger,
-        started: &[&'g Guarding],
-        command: &Command,
-        now: Instant,
-    ) -> Result<Option<Instant>, (&'g Guarding, Guarded)> {
-        let mut waits: Option<Instant> = None;
-        for of in started {
-            if let Some(refused) = self.interlocked(of, now) {
-                return Err((of, refused));
-            }
-            let cleared = ledger
-                .motor(&of.machine)
-                .is_some_and(|motor| motor.is_cleared(command.number));
-            if cleared {
-                continue;
-            }
-            if let Some(wait) = ledger.hindered(&of.machine, &of.guard, now) {
-                let until = now + wait.retry_after;
-                if !command.waits || until > command.expires {
-                    return Err((of, wait));
-                }
-                waits = waits.max(Some(until));
-            }
-        }
-        if let Some(of) = started.iter().find(|of| self.is_together(of, started)) {
-            let why = format!(
-                "one command would start several drives whose starts must be {} apart (guard.stagger); start them one \
-                 by one",
-                shown(of.guard.stagger)
-            );
-            let refused = Guarded {
-                reason: Reason::Stagger,
-                why,
-                retry_after: of.guard.stagger,
-            };
-            return Err((of, refused));
-        }
-        Ok(waits)
-    }
-
-    /// Whether that drive is not to be started together with another of these.
-    fn is_together(&self, of: &Guarding, started: &[&Guarding]) -> bool {
-        let other = |other: &&Guarding| other.machine != of.machine && other.group == of.group;
-        !of.guard.stagger.is_zero() && started.iter().any(other)
-    }
-
-    /// Counts what is not counted yet, and looks whether that is on disk.
-    fn count(&self, ledger: &mut Ledger, started: &[&Guarding], command: &Command, now: Instant) -> Clearance {
-        let number = command.number;
         let mut changed = false;
-        for of in started {
+        for of in &started {
             if !ledger.motor(&of.machine).is_some_and(|motor| motor.is_cleared(number)) {
-                ledger.reserve(&of.machine, number, command.expires, now);
+                ledger.reserve(&of.machine, number, expires, now);
                 changed = true;
             }
         }
@@ -237,7 +207,7 @@ impl BusGuards {
             self.shared.tell_change();
         }
         let mut clearance = Clearance::Go;
-        for of in started {
+        for of in &started {
             let Some(reserved) = ledger.motor(&of.machine).and_then(|motor| motor.reserved) else {
                 continue;
             };
@@ -245,47 +215,24 @@ impl BusGuards {
                 Kept::Yes => {}
                 Kept::NotYet => clearance = Clearance::Wait(now + LOOK),
                 Kept::Failed(why) => {
-                    let refused = Guarded {
+                    started.iter().for_each(|of| ledger.withdraw(&of.machine));
+                    return Clearance::Refused(Guarded {
                         reason: Reason::StateFile,
                         why: format!("its start cannot be counted: {why}; check state_dir of [gateway] and the disk"),
                         retry_after: super::ledger::DISK,
-                    };
-                    ledger.count_refused(&of.machine, refused.reason);
-                    started.iter().for_each(|of| ledger.withdraw(&of.machine));
-                    return Clearance::Refused(refusal(refused));
+                    });
                 }
             }
         }
         clearance
     }
 
-    /// Whether the next write of a command that was cleared may go, if it starts the motor by now.
-    ///
-    /// # Errors
-    /// Why not: an interlock does not hold any more, or the motor, which ran when the order was judged, has stopped.
-    pub fn may_write(&self, drive: DriveIndex, number: u64, now: Instant) -> Result<(), Refusal> {
-        let Some(of) = self.of_drive(drive) else { return Ok(()) };
-        let ledger = self.shared.lock();
-        let Some(motor) = ledger.motor(&of.machine).filter(|motor| motor.is_started_by_run()) else {
-            return Ok(());
-        };
-        let stopped = || Guarded {
-            reason: Reason::MinOff,
-            why: "the motor was running when the command arrived, and has stopped since; send it again".to_string(),
-            retry_after: of.guard.min_off,
-        };
-        let refused = match motor.is_cleared(number) {
-            true => self.interlocked(of, now),
-            false => Some(stopped()),
-        };
-        refused.map_or(Ok(()), |refused| Err(refusal(refused)))
-    }
-
-    /// A started command was refused so.
+    /// A start of that drive was refused by its guard or an interlock.
     pub fn count_refused(&self, drive: DriveIndex, refusal: &Refusal) {
         let reason = match refusal {
             Refusal::Guarded(guarded) => guarded.reason,
-            _ => Reason::Interlock,
+            Refusal::Interlocked(_) => Reason::Interlock,
+            _ => return,
         };
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().count_refused(&of.machine, reason);
@@ -368,13 +315,6 @@ impl BusGuards {
     pub fn refused(&self, drive: DriveIndex) -> BTreeMap<Reason, u64> {
         let of = self.of_drive(drive);
         of.map_or_else(BTreeMap::new, |of| self.shared.lock().refused(&of.machine))
-    }
-}
-
-fn refusal(refused: Guarded) -> Refusal {
-    match refused.reason {
-        Reason::Interlock => Refusal::Interlocked(refused.why),
-        _ => Refusal::Guarded(Box::new(refused)),
     }
 }
 

@@ -7,7 +7,6 @@
 
 mod one_stop;
 mod scope;
-mod standstill;
 pub mod stop_of_line;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -18,13 +17,12 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::{Notify, oneshot};
 
 pub use self::scope::{NothingToStop, Scope};
-pub use self::standstill::Standstill;
 
 pub(crate) use self::one_stop::OneStop;
 use self::stop_of_line::stop_of_line;
-use crate::command::{Authority, Origin};
+use crate::order::Origin;
 use crate::plant::{BusHandle, DriveHandle, Exchange, Plant, Question};
-use crate::process_image::{Access, Machine};
+use crate::process_image::{Access, Machine, Standstill};
 
 /// Time after which a command is answered though not every drive stands, unless it says otherwise.
 pub const WAIT: Duration = Duration::from_secs(10);
@@ -253,9 +251,6 @@ pub fn not_standing<'d>(drives: impl IntoIterator<Item = &'d DriveHandle>, now: 
     let stands = |drive: &&DriveHandle| drive.reading(now).standstill(None) == Standstill::Stands;
     controlled.filter(|drive| !stands(drive)).count()
 }
-
-/// The authority for the stops: already checked when the stop all was accepted.
-const MAY_WRITE: Authority = Authority::Write;
 
 #[cfg(test)]
 mod tests;

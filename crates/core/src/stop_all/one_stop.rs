@@ -2,11 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use super::{MAY_WRITE, Standstill, Stopped, StoppedDrive};
-use crate::command::{Answer, DEFAULT_EXPIRY, Order, Origin, Outcome};
+use super::{Stopped, StoppedDrive};
 use crate::drive::{ModelPoint, Value};
-use crate::plant::{DriveHandle, Placed, Plant};
-use crate::process_image::Machine;
+use crate::order::{Answer, Authority, Order, Origin, Outcome};
+use crate::plant::{DriveHandle, OrderRequest, Placed, Plant};
+use crate::process_image::{Machine, Standstill};
 
 /// Wait before a stop that failed is placed again; twice as long each time.
 const AGAIN: Duration = Duration::from_millis(100);
@@ -61,8 +61,9 @@ impl OneStop {
         self.step = match profile.model_index(ModelPoint::Run) {
             Some(run) => {
                 let order = Order::Points(vec![(run, Value::Bool(false))]);
-                let drive = drive.clone().at_once();
-                Step::Placed(drive.place(order, self.origin.clone(), MAY_WRITE, DEFAULT_EXPIRY, now))
+                // Whether it may be stopped was checked when the stop all was accepted.
+                let request = OrderRequest::new(order, self.origin.clone(), Authority::Write).at_once();
+                Step::Placed(drive.place(request, now))
             }
             None => {
                 self.failed = Some(format!("its profile `{}` has no `run`", profile.name));

@@ -56,9 +56,8 @@ pub fn load(path: &Path) -> Result<Option<SavedDrills>, String> {
 }
 
 /// Looks at drills as long as the gateway runs, and keeps the file of them up to date.
-pub(super) fn watch(plant: SharedPlant, file: DrillsFile) -> tokio::task::JoinHandle<()> {
+pub(super) fn watch(plant: SharedPlant, drills: Arc<Drills>, file: DrillsFile) -> tokio::task::JoinHandle<()> {
     tokio::spawn(async move {
-        let drills = plant.load().drills.clone();
         let mut writer = Writer::default();
         loop {
             // Either is a reason to look.
@@ -130,8 +129,13 @@ fn begin_to_write(drills: &Drills, file: &DrillsFile) -> Option<Writing> {
 }
 
 /// The gateway ends, or the bus of that drill does: so does the drill, with its stop.
-pub(super) async fn end(plant: &SharedPlant, file: &DrillsFile, by: &str, of_bus: impl Fn(&str) -> bool) {
-    let drills = plant.load().drills.clone();
+pub(super) async fn end(
+    plant: &SharedPlant,
+    drills: &Drills,
+    file: &DrillsFile,
+    by: &str,
+    of_bus: impl Fn(&str) -> bool,
+) {
     let reports = drills.reports().into_iter();
     let mut running = reports.filter(|report| !report.state.is_over());
     let running = running.find(|report| of_bus(&report.bus));
@@ -152,7 +156,7 @@ pub(super) async fn end(plant: &SharedPlant, file: &DrillsFile, by: &str, of_bus
             "the stop with which a drill ends was not acknowledged in time ({by}); check the motor"
         );
     }
-    until_on_disk(&drills, file).await;
+    until_on_disk(drills, file).await;
 }
 
 /// Waits until the task that looks at drills has written the file.

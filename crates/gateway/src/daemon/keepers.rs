@@ -111,15 +111,22 @@ impl Daemon {
             let mut before = self.buses.iter().map(|(bus, _)| bus);
             before.any(|bus| bus.spec.name == name && !settings.buses.contains(bus))
         };
-        self.plant.load().drills.set_options(None);
-        drills::end(&self.plant, &self.drills, "a reload of its bus", changed).await;
+        self.north.drills.set_options(None);
+        drills::end(
+            &self.plant,
+            &self.north.drills,
+            &self.drills,
+            "a reload of its bus",
+            changed,
+        )
+        .await;
     }
 
     /// Drills as they are configured, kept where the gateway keeps its state.
     pub(super) fn apply_drills(&self, settings: &Settings) {
-        let drills = self.plant.load().drills.clone();
+        let drills = &self.north.drills;
         let kept = settings.keeps_history && settings.drill.is_some();
-        drills::keep_in(&self.drills, kept.then_some(settings.state_dir.as_path()), &drills);
+        drills::keep_in(&self.drills, kept.then_some(settings.state_dir.as_path()), drills);
         drills.set_options(settings.drill);
     }
 

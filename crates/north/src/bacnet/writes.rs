@@ -8,11 +8,10 @@ use drivegate_bacnet::{Address, Datum, Error, Job};
 use super::objects::Meaning;
 use super::view::View;
 use crate::command::{
-    self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite,
-    SourceKind,
+    self, Arrival, Authority, Commanded, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite, SourceKind,
 };
 use crate::drive::{PointIndex, Value};
-use crate::plant::{DriveHandle, Placed};
+use crate::plant::{DriveHandle, OrderRequest, Placed};
 use crate::process_image::Machine;
 
 /// The priority that belongs to minimum on and off times.
@@ -53,13 +52,14 @@ pub(super) fn begin(view: &View, job: &Job, now: Instant) -> Begun {
         return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
     };
     let origin = origin(&job.from, job.priority);
+    let arrival = Arrival::now(now).asked(job.asked);
     match (meaning, &job.value) {
         (Meaning::Point(index), Some(value)) => match value_of(value) {
             Some(value) => {
                 let order = Order::Points(vec![(index, value)]);
                 waits(
                     handle,
-                    handle.place_asked(order, origin, Authority::Write, DEFAULT_EXPIRY, job.asked, now),
+                    handle.place(OrderRequest::new(order, origin, Authority::Write).arrived(arrival), now),
                     None,
                 )
             }
@@ -74,7 +74,7 @@ pub(super) fn begin(view: &View, job: &Job, now: Instant) -> Begun {
             let order = Order::Points(vec![(index, Value::Bool(true))]);
             waits(
                 handle,
-                handle.place_asked(order, origin, Authority::Write, DEFAULT_EXPIRY, job.asked, now),
+                handle.place(OrderRequest::new(order, origin, Authority::Write).arrived(arrival), now),
                 None,
             )
         }
@@ -119,6 +119,7 @@ fn slot(
     now: Instant,
 ) -> Begun {
     let priority = job.priority.unwrap_or(16);
+    let arrival = Arrival::now(now).asked(job.asked);
     let value = job.value.as_ref().and_then(value_of);
     if let Some(value) = value
         && let Err(refusal) = possible(handle, index, value, now)
@@ -142,7 +143,12 @@ fn slot(
                 };
                 let order = Order::Points(vec![(run, Value::Bool(false))]);
                 let id = write.id;
-                let placed = handle.place_slot(order, write, origin, DEFAULT_EXPIRY, (job.asked, now));
+                let placed = handle.place(
+                    OrderRequest::new(order, origin, Authority::Write)
+                        .arrived(arrival)
+                        .by_slot(write),
+                    now,
+                );
                 return waits(handle, placed, Some(id));
             }
             Follows::Order(of, entry) => {
@@ -152,9 +158,14 @@ fn slot(
                 let order = Order::Points(vec![(point, entry.value)]);
                 let own = write.entry.is_some();
                 // What comes to govern was written long ago; its order is given now.
-                let asked = if own { job.asked } else { now };
+                let arrival = if own { arrival } else { Arrival::now(now) };
                 let as_planned = write.clone().in_favour_of(&entry);
-                let mut placed = handle.place_slot(order, as_planned, entry.origin, DEFAULT_EXPIRY, (asked, now));
+                let mut placed = handle.place(
+                    OrderRequest::new(order, entry.origin, Authority::Write)
+                        .arrived(arrival)
+                        .by_slot(as_planned),
+                    now,
+                );
                 let refused = matches!(placed.answer().map(|answer| answer.outcome), Some(Outcome::Refused(_)));
                 let next = handle.priorities(|all| all.successor(&write));
                 match next.filter(|_| refused && !own) {

@@ -10,11 +10,11 @@ use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value as Json;
 use serde_json::value::RawValue;
 
-use crate::command::{Answer, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, sets_twice, stop_of};
+use crate::command::{Answer, Arrival, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, sets_twice, stop_of};
 use crate::document::nearest;
 use crate::drive::model::Kind;
 use crate::drive::{PointIndex, Profile, Value};
-use crate::plant::{DriveHandle, Placed, Plant};
+use crate::plant::{DriveHandle, OrderRequest, Placed, Plant};
 
 /// Maximum size of a command, bytes.
 pub(crate) const MAX_PAYLOAD: usize = 64 * 1024;
@@ -135,12 +135,16 @@ impl Asked {
         (came, now): (Instant, Instant),
     ) -> Result<Placed, Answer> {
         let (write, expiry) = (Authority::Write, self.expiry);
+        let arrival = Arrival::now(now).asked(came);
         let Some(refusal) = self.refused else {
-            let drive = drive.clone().waiting(self.wait);
-            return Ok(drive.place_asked(Order::Points(self.points), origin, write, expiry, came, now));
+            let request = OrderRequest::new(Order::Points(self.points), origin, write).within(expiry);
+            return Ok(drive.place(request.waiting(self.wait).arrived(arrival), now));
         };
         match stop_of(&self.points, &drive.image.spec.profile) {
-            Some(stop) => Ok(drive.place_stop(Order::Points(stop), (what, refusal), origin, write, expiry, now)),
+            Some(stop) => {
+                let request = OrderRequest::new(Order::Points(stop), origin, write).within(expiry);
+                Ok(drive.place(request.without_rest(what, refusal).arrived(arrival), now))
+            }
             None => Err(drive.refuse(what, refusal, origin, now)),
         }
     }

@@ -14,7 +14,7 @@ use super::replies::{Replied, not_found};
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{self, Authority, Order, Origin};
 use crate::drive::{Point, PointIndex, PollClass, Profile, Quality, Raw, Sample, Source};
-use crate::plant::DriveHandle;
+use crate::plant::{DriveHandle, OrderRequest};
 use crate::process_image::{Link, Reading, Unavailable, public_points};
 
 /// Most points of one request; a profile has some hundred.
@@ -131,7 +131,10 @@ async fn forwarded(drive: &DriveHandle, point: &Point, raw: &Raw, origin: Origin
     };
     let now = Instant::now();
     let expiry = deadline.saturating_duration_since(now);
-    let mut placed = drive.place(Order::Read(pdu), origin, Authority::ReadOnly, expiry, now);
+    let mut placed = drive.place(
+        OrderRequest::new(Order::Read(pdu), origin, Authority::ReadOnly).within(expiry),
+        now,
+    );
     let outcome = placed.answered().await.outcome;
     let words: Option<Vec<u16>> = match &outcome {
         command::Outcome::Acknowledged(Reply::Registers(words)) => Some(words.clone()),

@@ -110,7 +110,7 @@ pub(super) async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<Str
     let plant = app.plant.load();
     let drive = plant.drive(&name).ok_or_else(|| no_drive(&plant, &name))?;
     let clock = api::Clock::new(Instant::now(), SystemTime::now());
-    let stops = plant.drills.stops(&drive, SystemTime::now());
+    let stops = app.north.drills.stops(&drive, SystemTime::now());
     Ok(Json(api::Drive::new(&drive, &app.north.history, clock).proven(stops)).into_response())
 }
 

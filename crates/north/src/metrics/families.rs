@@ -19,7 +19,7 @@ use crate::{NorthState, ServerKind};
 /// All series, those of a family one after the other.
 pub(super) fn collect(plant: &Plant, north: &NorthState, now: Instant) -> Families {
     let mut all = Families::default();
-    drives(plant, now, &mut all);
+    drives(plant, north, now, &mut all);
     runs(plant, north, &mut all);
     buses(&plant.buses, &mut all);
     writes(plant, &mut all);
@@ -33,7 +33,7 @@ pub(super) fn collect(plant: &Plant, north: &NorthState, now: Instant) -> Famili
     all
 }
 
-fn drives(plant: &Plant, now: Instant, all: &mut Families) {
+fn drives(plant: &Plant, north: &NorthState, now: Instant, all: &mut Families) {
     let up = all.gauge(
         "drivegate_drive_up",
         "Whether the drive replies: 1, else 0 (also before its first reply).",
@@ -99,12 +99,12 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
         "drivegate_drill_passed",
         "1 if the motor stopped in time in that drill.",
     );
-    let drills = plant.drills.options().is_some();
+    let drills = north.drills.options().is_some();
     for drive in plant.drives() {
         let image = &drive.image;
         let labels = labels_of(image);
         let reading = drive.reading(now);
-        let proofs = drills.then(|| plant.drills.proofs(&drive.machine()));
+        let proofs = drills.then(|| north.drills.proofs(&drive.machine()));
         for proof in proofs.into_iter().flatten() {
             let labels = labels.with("kind", proof.kind.name());
             all.add(drill_age, labels.clone(), proof.age(SystemTime::now()).as_secs_f64());
@@ -127,7 +127,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
             if let (HoldState::Held, Some(rank)) = (view.state, &view.rank) {
                 all.add(held, labels.with("rank", rank.to_string()), 1.0);
             }
-            let count = drive.bus.queue.lock().unheld(drive.index);
+            let count = drive.bus.queue.lock().gate.unheld(drive.index);
             all.add(unheld, labels.clone(), count);
         }
         all.add(up, labels.clone(), reading.snapshot.link.is_online());

@@ -11,8 +11,8 @@ use super::client::Client;
 use super::frame::Header;
 use crate::codec::n2::Object;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
-use crate::command::{Authority, DEFAULT_EXPIRY, Order, Outcome, Refusal};
-use crate::plant::{DriveHandle, Placed};
+use crate::command::{Arrival, Authority, Order, Outcome, Refusal};
+use crate::plant::{DriveHandle, OrderRequest, Placed};
 use crate::process_image::{Reading, Unavailable};
 
 /// A request that is forwarded to a drive.
@@ -127,9 +127,11 @@ impl ForwardedRequest {
             BusWork::Order(order) => forwarded.place(order, client, client.rights.authority(), asked, now),
             BusWork::Stop(stop, refusal) => {
                 let what = describe::request(&forwarded.request);
-                let (authority, rest) = (client.rights.authority(), (what.as_str(), refusal));
-                let drive = &forwarded.drive;
-                let placed = drive.place_stop(stop, rest, client.origin(), authority, DEFAULT_EXPIRY, now);
+                let request = OrderRequest::new(stop, client.origin(), client.rights.authority());
+                let request = request
+                    .without_rest(&what, refusal)
+                    .arrived(Arrival::now(now).asked(asked));
+                let placed = forwarded.drive.place(request, now);
                 Progress::Pending(PendingRequest::Forwarded(Some(forwarded), placed))
             }
             BusWork::Refused(refusal) => {
@@ -156,10 +158,8 @@ impl ForwardedRequest {
         asked: Instant,
         now: Instant,
     ) -> Progress {
-        let origin = client.origin();
-        let placed = self
-            .drive
-            .place_asked(order, origin, authority, DEFAULT_EXPIRY, asked, now);
+        let request = OrderRequest::new(order, client.origin(), authority);
+        let placed = self.drive.place(request.arrived(Arrival::now(now).asked(asked)), now);
         Progress::Pending(PendingRequest::Forwarded(Some(self), placed))
     }
 

@@ -256,7 +256,7 @@ impl TcpService<Options> for ModbusTcp {
                 }
                 None => {
                     *opened += 1;
-                    let view = PlantView::new(plant.clone(), buses);
+                    let view = PlantView::new(plant.clone(), state.stats.stop_all.clone(), buses);
                     Arc::new(Admission::new(*opened, policy, view, state.clone(), cancel.clone()))
                 }
             };

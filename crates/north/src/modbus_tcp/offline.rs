@@ -35,7 +35,7 @@ impl Offline {
     ) -> Offline {
         let (state, view) = (
             ServerState::new(options, stats, CancellationToken::new()),
-            PlantView::new(plant, None),
+            PlantView::new(plant, Arc::default(), None),
         );
         let client = Client::new(peer, None, authority);
         Offline::of(ClientSession::new(Arc::new(state), Arc::new(view), client))

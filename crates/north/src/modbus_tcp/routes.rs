@@ -5,7 +5,7 @@ use std::sync::Arc;
 use arc_swap::ArcSwap;
 
 use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
-use crate::stop_all::Scope;
+use crate::stop_all::{Scope, StopAll};
 
 /// Names of the visible buses; `None` for all.
 type VisibleBuses = Option<Vec<String>>;
@@ -14,16 +14,18 @@ type VisibleBuses = Option<Vec<String>>;
 #[derive(Debug)]
 pub(super) struct PlantView {
     plant: SharedPlant,
+    stop_all: Arc<StopAll>,
     buses: ArcSwap<VisibleBuses>,
     routes: ArcSwap<Routes>,
 }
 
 impl PlantView {
-    pub(super) fn new(plant: SharedPlant, buses: Option<Vec<String>>) -> PlantView {
+    pub(super) fn new(plant: SharedPlant, stop_all: Arc<StopAll>, buses: Option<Vec<String>>) -> PlantView {
         let buses = Arc::new(buses);
-        let routes = ArcSwap::from_pointee(Routes::new(plant.load_full(), buses.clone()));
+        let routes = ArcSwap::from_pointee(Routes::new(plant.load_full(), stop_all.clone(), buses.clone()));
         PlantView {
             plant,
+            stop_all,
             buses: ArcSwap::new(buses),
             routes,
         }
@@ -42,7 +44,11 @@ impl PlantView {
         if self.is_current(&routes) {
             return routes;
         }
-        let routes = Arc::new(Routes::new(self.plant.load_full(), self.buses.load_full()));
+        let routes = Arc::new(Routes::new(
+            self.plant.load_full(),
+            self.stop_all.clone(),
+            self.buses.load_full(),
+        ));
         self.routes.store(routes.clone());
         routes
     }
@@ -56,6 +62,7 @@ impl PlantView {
 #[derive(Debug)]
 pub(super) struct Routes {
     pub(super) plant: Arc<Plant>,
+    pub(super) stop_all: Arc<StopAll>,
     buses: Arc<VisibleBuses>,
     drives: Vec<DriveHandle>,
     /// Index in `drives`.
@@ -65,7 +72,7 @@ pub(super) struct Routes {
 }
 
 impl Routes {
-    fn new(plant: Arc<Plant>, buses: Arc<VisibleBuses>) -> Routes {
+    fn new(plant: Arc<Plant>, stop_all: Arc<StopAll>, buses: Arc<VisibleBuses>) -> Routes {
         let is_visible = |name: &String| buses.as_ref().as_ref().is_none_or(|buses| buses.contains(name));
         let drives: Vec<DriveHandle> = plant.drives().filter(|d| is_visible(&d.image.spec.bus)).collect();
         let mut units = vec![None; usize::from(u8::MAX) + 1];
@@ -77,6 +84,7 @@ impl Routes {
         let visible = plant.buses.iter().map(|b| is_visible(&b.image.spec.name)).collect();
         Routes {
             plant,
+            stop_all,
             buses,
             drives,
             units,

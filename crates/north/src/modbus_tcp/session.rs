@@ -321,7 +321,7 @@ impl ClientSession {
             return Err(Exception::VALUE);
         }
         let (plant, scope, origin) = (&self.routes.plant, self.routes.scope(), self.client.origin());
-        match plant.stop_all.order(plant, &scope, &origin, stop_all::WAIT, now) {
+        match self.routes.stop_all.order(plant, &scope, &origin, stop_all::WAIT, now) {
             Ok(order) => Ok(Decision::StopAll(request, order.acknowledged)),
             // Nothing here may be written.
             Err(_) => Err(Exception::FUNCTION),
@@ -366,7 +366,7 @@ impl ClientSession {
     fn common(&self, drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
         let reading = drive.reading(now);
         let bus = if drive.bus_up() { BusState::Up } else { BusState::Down };
-        let hold = drive.is_guarded().then(|| self.client.origin());
+        let hold = drive.has_authority().then(|| self.client.origin());
         let hold = hold.and_then(|origin| drive.hold_view(Some(&origin), now));
         DriveView::new(&reading, bus)
             .with_hold(hold)
@@ -412,7 +412,7 @@ impl ClientSession {
         now: Instant,
     ) -> Decision {
         let last = usize::from(start).saturating_add(values.len().saturating_sub(1));
-        if drive.is_guarded() && start <= HOLD && usize::from(HOLD) <= last {
+        if drive.has_authority() && start <= HOLD && usize::from(HOLD) <= last {
             return self.hold(drive, request, start, values, now);
         }
         let spec = &drive.image.spec;

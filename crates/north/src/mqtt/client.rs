@@ -135,7 +135,13 @@ impl PlainClient {
         let now = Instant::now();
         let mut left = stats.mqtt_left.lock().orders.take();
         let results = left.as_mut().map(|left| std::mem::take(&mut left.results));
-        let commands = Commands::new(topics.clone(), rules, stats.commands.mqtt.clone(), left);
+        let commands = Commands::new(
+            topics.clone(),
+            rules,
+            stats.commands.mqtt.clone(),
+            stats.stop_all.clone(),
+            left,
+        );
         let mut client = PlainClient {
             store: Store::open(events_buffer, MQTT_EVENTS, (stats, MqttKind::Event)),
             history: Store::open(history_buffer, MQTT_HISTORY, (stats, MqttKind::History)),

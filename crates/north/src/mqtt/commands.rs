@@ -17,7 +17,7 @@ use super::topics::{Target, Topics};
 use crate::command::{Answer, Authority, Origin, Proof, Refusal, SourceKind, Verb};
 use crate::command_json::{HoldReply, Id, Repetition, SharedMemory, excerpt, refuse_unknown, stop_all};
 use crate::plant::{Placed, Plant, Shown};
-use crate::stop_all::StopReport;
+use crate::stop_all::{StopAll, StopReport};
 
 /// Limits of the commands that wait for the bus. Only stops can be so many: the queues of the buses accept fewer other
 /// commands.
@@ -42,6 +42,7 @@ pub(super) struct Commands {
     confirming: PendingCommands,
     stopping: Vec<PendingStop>,
     memory: SharedMemory,
+    stop_all: Arc<StopAll>,
     rules: Rules,
 }
 
@@ -91,7 +92,13 @@ pub(super) enum Finished {
 impl Commands {
     /// `memory` outlives this client, so that a command is recognised after a reload; it continues with the commands that the
     /// client before has `left`.
-    pub(super) fn new(topics: Topics, rules: Rules, memory: SharedMemory, left: Option<OrdersLeft>) -> Commands {
+    pub(super) fn new(
+        topics: Topics,
+        rules: Rules,
+        memory: SharedMemory,
+        stop_all: Arc<StopAll>,
+        left: Option<OrdersLeft>,
+    ) -> Commands {
         if left.is_none() {
             memory.lock().abandon();
         }
@@ -103,6 +110,7 @@ impl Commands {
             confirming: left.confirming,
             stopping: left.stopping,
             memory,
+            stop_all,
             rules,
         }
     }
@@ -241,7 +249,7 @@ impl Commands {
             Ok(wanted) => wanted,
             Err(why) => return refuse(why),
         };
-        match plant.stop_all.order(plant, &scope, origin, wait, now) {
+        match self.stop_all.order(plant, &scope, origin, wait, now) {
             Ok(order) => {
                 let report = order.report;
                 self.stopping.push(PendingStop { reply, report });

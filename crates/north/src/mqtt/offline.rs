@@ -54,7 +54,13 @@ impl Offline {
         };
         Offline {
             plant,
-            commands: Commands::new(Topics::new(base, &gateway), rules, SharedMemory::default(), None),
+            commands: Commands::new(
+                Topics::new(base, &gateway),
+                rules,
+                SharedMemory::default(),
+                std::sync::Arc::default(),
+                None,
+            ),
             held: VecDeque::new(),
             results: Vec::new(),
             begun: (now, time),

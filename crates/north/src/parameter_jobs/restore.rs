@@ -17,7 +17,7 @@ use crate::parameters::{
     End, Journal, JournalFile, NO_IDENTIFICATION, NOT_KNOWN, Owner, ParameterFile, Phase, Plan, Prepared, Reading,
     Restoration, RestoreStage, Then, Vault, Wanted, Wishes, plan,
 };
-use crate::plant::{DriveHandle, Plant, SharedPlant};
+use crate::plant::{DriveHandle, OrderRequest, Plant, SharedPlant};
 use crate::process_image::Machine;
 
 /// A command of a restore waits no longer than that for its turn; then it is given again.
@@ -431,13 +431,8 @@ impl Run {
         }
         let (now, write) = (Instant::now(), order.write());
         let pause = pause_after(&drive, &order);
-        let mut placed = drive.place(
-            Order::Parameter(order),
-            self.origin.clone(),
-            Authority::Write,
-            EXPIRY,
-            now,
-        );
+        let request = OrderRequest::new(Order::Parameter(order), self.origin.clone(), Authority::Write);
+        let mut placed = drive.place(request.within(EXPIRY), now);
         let outcome = placed.answered().await.outcome;
         if outcome.is_ok() {
             note_written(&drive, &write, now);

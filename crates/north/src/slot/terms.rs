@@ -8,9 +8,11 @@ use std::time::{Duration, Instant};
 use super::request::{Meaning, Refused, ToolRequest};
 use super::{Slot, SlotAccess};
 use crate::codec::{LineFormat, Protocol, RequestPdu, describe};
-use crate::command::{self, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
+use crate::command::{self, Arrival, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
 use crate::drive::plan::WireTime;
-use crate::plant::{BusHandle, DriveHandle, Exchange, Placed, Plant, Question, SharedPlant, Target, turn_away};
+use crate::plant::{
+    BusHandle, DriveHandle, Exchange, OrderRequest, Placed, Plant, Question, SharedPlant, Target, turn_away,
+};
 use crate::process_image::Access;
 use crate::{NorthState, SlotOutcome};
 
@@ -213,15 +215,10 @@ impl Tool {
         }
         let cost = cost(drive, pdu);
         self.terms.paces.wrote(&self.terms.slot.bus, cost, now);
-        let order = Order::Write(pdu.clone());
-        Decision::Wait(Work::Command(drive.place_asked(
-            order,
-            self.origin.clone(),
-            Authority::Write,
-            EXPIRY,
-            asked,
-            now,
-        )))
+        let request =
+            OrderRequest::new(Order::Write(pdu.clone()), self.origin.clone(), Authority::Write).within(EXPIRY);
+        let placed = drive.place(request.arrived(Arrival::now(now).asked(asked)), now);
+        Decision::Wait(Work::Command(placed))
     }
 
     /// What only `access = "raw"` admits: broadcasts, functions that are not decoded, writes to addresses of no configured drive.
@@ -249,16 +246,12 @@ impl Tool {
         for drive in drives {
             // It has no reply: it was a broadcast.
             if let Some(stop) = stop_in(drive, pdu, now) {
-                drop(drive.place(stop, self.origin.clone(), Authority::Write, EXPIRY, now));
+                let request = OrderRequest::new(stop, self.origin.clone(), Authority::Write).within(EXPIRY);
+                drop(drive.place(request, now));
             }
         }
         for drive in drives {
             let whole = Order::Write(pdu.clone());
-            let only_stops = stop_in(drive, pdu, now).is_some_and(|stop| stop == whole);
-            // While its parameters are restored nothing else reaches it but what stops it.
-            if let Some(why) = drive.image.hold.why().filter(|_| !only_stops) {
-                return self.refuse(drive, pdu, Refusal::NotAllowed(why.to_string()), now);
-            }
             // Limits hold for each of them.
             if let Meaning::Write(_) = &request.meaning
                 && let Err(refusal) = command::admit(whole, &drive.reading(now), Authority::Write)
@@ -275,7 +268,7 @@ impl Tool {
             target,
             pdu: pdu.clone(),
             may_write,
-            asked: case.asked,
+            arrival: Arrival::now(case.now).asked(case.asked),
             expires: case.deadline,
             origin: self.origin.clone(),
         };

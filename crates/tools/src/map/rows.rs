@@ -76,7 +76,7 @@ pub(super) fn drive_rows(drive: &DriveHandle, access: Access) -> Vec<Row> {
         .into_iter()
         .flatten()
         // Without [authority] nothing is there.
-        .filter(|entry| entry.content != Content::Hold || drive.is_guarded())
+        .filter(|entry| entry.content != Content::Hold || drive.has_authority())
         .map(|entry| entry_row(profile, plan, entry, access));
     let mut raw: Vec<(&Point, &Raw)> = profile
         .points

@@ -6,9 +6,9 @@ use std::time::Instant;
 use tokio::sync::broadcast::error::TryRecvError;
 
 use super::{Cause, Run, Step, named};
-use crate::command::{AuditRecord, Origin, SourceKind};
 use crate::drill::Kind;
 use crate::drive::ModelPoint;
+use crate::order::{AuditRecord, Origin, SourceKind};
 use crate::plant::Plant;
 use crate::process_image::Reading;
 

@@ -6,8 +6,8 @@ use super::interruption::{LOCAL, is_local};
 use super::{Cause, READ, Run, Step};
 use crate::drill::{DrillState, Kind, Proof};
 use crate::plant::Placed;
-use crate::process_image::Reading;
-use crate::stop_all::{OneStop, Standstill};
+use crate::process_image::{Reading, Standstill};
+use crate::stop_all::OneStop;
 
 /// The observation of a test.
 enum Seen {

@@ -17,7 +17,7 @@ use crate::drill::{DrillRefusal, DrillReport, Kind};
 
 /// All that are known, the newest first.
 pub(in crate::http) async fn drills(State(app): State<Arc<AppState>>) -> Json<Vec<DrillReport>> {
-    Json(app.plant.load().drills.reports())
+    Json(app.north.drills.reports())
 }
 
 /// One of them.
@@ -25,7 +25,7 @@ pub(in crate::http) async fn drill(
     State(app): State<Arc<AppState>>,
     Path(id): Path<String>,
 ) -> Replied<Json<DrillReport>> {
-    let report = app.plant.load().drills.report(&id);
+    let report = app.north.drills.report(&id);
     report.map(Json).ok_or_else(|| why_not(&DrillRefusal::Unknown(id)))
 }
 
@@ -45,9 +45,9 @@ pub(in crate::http) async fn arm_drill(
     } else {
         &wish.kinds
     };
-    let plant = app.plant.load();
     let (now, time) = (Instant::now(), SystemTime::now());
-    let armed = plant
+    let armed = app
+        .north
         .drills
         .arm(&drive, (kinds, wish.speed), &operator.origin(), now, time);
     let report = armed.map_err(|refusal| why_not(&refusal))?;
@@ -62,7 +62,7 @@ pub(in crate::http) async fn start_drill(
 ) -> Replied<Json<DrillReport>> {
     let plant = app.plant.load();
     let (now, time) = (Instant::now(), SystemTime::now());
-    let started = plant.drills.start(&plant, &id, &operator.origin(), now, time);
+    let started = app.north.drills.start(&plant, &id, &operator.origin(), now, time);
     started.map(Json).map_err(|refusal| why_not(&refusal))
 }
 
@@ -72,8 +72,10 @@ pub(in crate::http) async fn end_drill(
     Path(id): Path<String>,
     Commander(operator): Commander,
 ) -> Replied<Json<DrillReport>> {
-    let drills = app.plant.load().drills.clone();
-    let ended = drills.abort(&id, &operator.origin(), Instant::now(), SystemTime::now());
+    let ended = app
+        .north
+        .drills
+        .abort(&id, &operator.origin(), Instant::now(), SystemTime::now());
     ended.map(Json).map_err(|refusal| why_not(&refusal))
 }
 

@@ -49,7 +49,7 @@ pub(in crate::http) async fn hold(
     let done = drive.hold(verb, &origin, Authority::Write, now);
     let status = match &done {
         Ok(_) => StatusCode::OK,
-        Err(refusal) if refusal.holder().is_none() && drive.is_guarded() => StatusCode::FORBIDDEN,
+        Err(refusal) if refusal.holder().is_none() && drive.has_authority() => StatusCode::FORBIDDEN,
         Err(_) => StatusCode::CONFLICT,
     };
     let view = drive.hold_view(Some(&origin), now);

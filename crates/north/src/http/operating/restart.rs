@@ -5,7 +5,7 @@ use std::future::poll_fn;
 use std::time::{Duration, Instant};
 
 use crate::codec::{Reply, RequestPdu};
-use crate::command::{Answer, DEFAULT_EXPIRY, Origin, Outcome, Refusal};
+use crate::command::{Answer, Arrival, DEFAULT_EXPIRY, Origin, Outcome, Refusal};
 use crate::drive::RESTART_COMMUNICATION;
 use crate::plant::{DriveHandle, Question, Shown, Target};
 use crate::process_image::Access;
@@ -37,7 +37,7 @@ pub(super) async fn communication(drive: &DriveHandle, origin: Origin, asked: In
             data: 0,
         },
         may_write: true,
-        asked,
+        arrival: Arrival::now(now).asked(asked),
         expires: now + DEFAULT_EXPIRY,
         origin,
     };

@@ -23,7 +23,8 @@ pub(in crate::http) async fn stop(
 ) -> Replied {
     let (scope, wait) = stop_all(&payload).map_err(|why| refused(StatusCode::UNPROCESSABLE_ENTITY, why))?;
     let plant = app.plant.load_full();
-    let order = plant
+    let order = app
+        .north
         .stop_all
         .order(&plant, &scope, &operator.origin(), wait, Instant::now());
     let order = order.map_err(|why| match (why.to_string(), why) {

@@ -64,7 +64,7 @@ impl DriveMetrics {
         if spec.profile.model_index(ModelPoint::FaultCode).is_some() {
             all.push((Source::FaultText, text("fault_text")));
         }
-        if drive.is_guarded() {
+        if drive.has_authority() {
             all.push((Source::HoldState, text("Hold/State")));
             all.push((Source::Holder, text("Hold/Holder")));
             all.push((Source::HoldRank, text("Hold/Rank")));

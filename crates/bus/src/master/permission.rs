@@ -1,0 +1,123 @@
+//! What the master tells the gate of its drives, and the question that it asks before each frame of a started command.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::Master;
+use crate::command::{Ask, Denied, Facts, LastWritten, Outcome, Seen, Stage, Urgency, Verdict};
+use crate::command_run::CommandRun;
+use crate::drive::{DriveIndex, PerDrive};
+use crate::drive_state::{DriveState, Wanted};
+use crate::plant::BusHandle;
+use crate::process_image::DriveImage;
+
+/// How old a frequency range may be on which a command rests whose turn came. Whether it was too old for the command
+/// was decided when that was accepted.
+const RANGE_AGE: Duration = Duration::from_secs(60);
+
+/// What is seen of the drives when the turn of a command comes.
+pub(super) struct AtTurn {
+    images: Vec<Arc<DriveImage>>,
+    written: PerDrive<LastWritten>,
+    now: Instant,
+}
+
+impl AtTurn {
+    pub(super) fn of(drives: &PerDrive<DriveState>, images: &PerDrive<Arc<DriveImage>>, now: Instant) -> AtTurn {
+        AtTurn {
+            images: images.iter().cloned().collect(),
+            written: drives.iter().map(|drive| drive.written).collect(),
+            now,
+        }
+    }
+}
+
+impl Facts for AtTurn {
+    fn seen(&self, drive: DriveIndex) -> Option<Seen<'_>> {
+        let reading = self.images.get(drive.place())?.reading(self.now, RANGE_AGE);
+        let written = self.written.get(drive).copied();
+        Some(Seen { reading, written })
+    }
+}
+
+/// Whether the next frame of a started command may go. The end of a pulse is always sent, and so is a stop.
+pub(super) fn may_write(
+    bus: &BusHandle,
+    index: DriveIndex,
+    image: &DriveImage,
+    (run, written): (&CommandRun, LastWritten),
+    now: Instant,
+) -> Verdict {
+    if run.urgency() != Urgency::Command || !run.may_write_on() {
+        return Verdict::Go;
+    }
+    let Some(origin) = run.origins().next() else {
+        return Verdict::Go;
+    };
+    let seen = Seen {
+        reading: image.reading(now, RANGE_AGE),
+        written: Some(written),
+    };
+    let ask = Ask {
+        stage: Stage::Write,
+        now,
+        drive: index,
+        intent: run.intent(),
+        origin,
+        seen: Some(&seen),
+    };
+    bus.queue.lock().gate.ask(&ask)
+}
+
+/// What the started commands of a drive need, once those that may not go on have ended.
+pub(super) fn wanted(
+    bus: &BusHandle,
+    index: DriveIndex,
+    (drive, image): (&mut DriveState, &DriveImage),
+    want: impl Fn(&mut DriveState) -> Wanted,
+    now: Instant,
+) -> Wanted {
+    loop {
+        let wanted = want(drive);
+        let Wanted::Step(slot @ Urgency::Command, _) = wanted else {
+            return wanted;
+        };
+        let written = drive.written;
+        let Some(run) = drive.run(slot) else { return wanted };
+        match may_write(bus, index, image, (run, written), now) {
+            Verdict::Go | Verdict::LookFirst => return wanted,
+            Verdict::Wait(until) => return Wanted::Wait(until),
+            Verdict::Refuse(outcome) => deny(bus, index, run, outcome),
+        }
+    }
+}
+
+/// A started command goes no further; its refusal is reported as if it had come at once.
+fn deny(bus: &BusHandle, drive: DriveIndex, run: &mut CommandRun, outcome: Outcome) {
+    if let (Outcome::Refused(refusal), Some(ticket)) = (&outcome, run.first_ticket()) {
+        let denied = Denied {
+            drive,
+            origin: ticket.origin().clone(),
+            what: ticket.what().to_string(),
+            refusal: refusal.clone(),
+        };
+        bus.queue.lock().note_denied(denied);
+    }
+    run.denied(outcome);
+}
+
+impl Master {
+    /// Whether the frame of a started command that was chosen earlier may still go.
+    pub(super) fn may_still_write(&mut self, index: DriveIndex, slot: Urgency, now: Instant) -> bool {
+        let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
+            return true;
+        };
+        let written = drive.written;
+        let Some(run) = drive.run(slot) else { return true };
+        // It is refused, or waits, when it is chosen again.
+        matches!(
+            may_write(&self.bus, index, image, (run, written), now),
+            Verdict::Go | Verdict::LookFirst
+        )
+    }
+}

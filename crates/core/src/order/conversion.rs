@@ -1,0 +1,53 @@
+//! What a point is once the register of another one is written. Pure.
+
+use crate::drive::model::Kind;
+use crate::drive::{Point, PointIndex, Source, Value};
+use crate::process_image::Reading;
+
+/// What a point is once the register of another one is written.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Becomes {
+    /// The two have nothing to do with each other.
+    Untouched,
+    /// The band by which it is converted is not known.
+    Unknown,
+    Known(Value),
+}
+
+/// What a point is once the register of another one is written: itself, or by the point that takes its commands, or by
+/// conversion.
+pub(crate) fn becomes(drive: &Reading<'_>, point: PointIndex, written: (PointIndex, Value)) -> Becomes {
+    let (index, value) = written;
+    if point == index {
+        return Becomes::Known(value);
+    }
+    let Some(entry) = drive.spec.profile.points.get(point) else {
+        return Becomes::Untouched;
+    };
+    if let Some(target) = entry.write_to {
+        return becomes(drive, target, written);
+    }
+    let Source::Derived(derived) = &entry.source else {
+        return Becomes::Untouched;
+    };
+    let Some((of, minimum, maximum)) = derived.band() else {
+        return Becomes::Untouched;
+    };
+    let of = match becomes(drive, of, written) {
+        Becomes::Known(of) => of,
+        other => return other,
+    };
+    let band = drive.band_for_commands(minimum, maximum);
+    match band.and_then(|band| derived.value([of], Some(band))) {
+        Some(value) => Becomes::Known(value),
+        None => Becomes::Unknown,
+    }
+}
+
+/// The value of a raw point as far as its register tells it: what is rounded to 0 has no sign.
+pub(crate) fn as_held(drive: &Reading<'_>, (index, value): (PointIndex, Value)) -> Value {
+    let raw = drive.spec.profile.points.get(index).and_then(Point::raw);
+    let held = raw.and_then(|raw| raw.decode(&raw.encode(value, 0).ok()?, Kind::Number));
+    held.filter(|held| held.as_f64() == 0.0)
+        .map_or(value, |_| Value::Number(0.0))
+}

@@ -1,0 +1,271 @@
+//! What a command does to the drives that it reaches, by their profiles: decided once, when it is accepted. Pure.
+
+use super::{Order, Touched, Urgency, written};
+use crate::codec::Table;
+use crate::drive::{DriveIndex, ModelPoint, PointIndex, Profile, Source};
+
+/// What a command requires of the hold of a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Asks {
+    /// It may start the motor: needs the hold, takes a free drive.
+    Run,
+    /// A reference or a direction needs the hold and takes a free drive likewise, but starts nothing.
+    Steer,
+    /// A fault reset, a parameter, any other raw write: passes if the drive is free, and takes no hold.
+    Other,
+    /// Takes the run command away: always passes.
+    Stop,
+    /// Nothing: a read, or a write of a restore that has started and is not to be left half done.
+    Nothing,
+}
+
+impl Asks {
+    /// What an order with that effect requires.
+    pub fn of(order: &Order, effect: Effect) -> Asks {
+        match order {
+            _ if effect.stops => Asks::Stop,
+            Order::Read(_) | Order::Parameter(_) => Asks::Nothing,
+            Order::Points(_) | Order::Write(_) if effect.may_run() => Asks::Run,
+            Order::Points(_) | Order::Write(_) if effect.steers() => Asks::Steer,
+            Order::Points(_) | Order::Write(_) => Asks::Other,
+        }
+    }
+
+    /// Whether it takes a free drive.
+    pub fn takes(self) -> bool {
+        matches!(self, Asks::Run | Asks::Steer)
+    }
+}
+
+/// What a command does to one drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Effect {
+    /// It takes the run command away, with the rights of a stop.
+    pub stops: bool,
+    /// The run command.
+    pub run: Option<bool>,
+    /// The direction.
+    pub reverse: Option<bool>,
+    /// A reference.
+    pub reference: bool,
+    /// A raw word at the place of the run command that is no stop.
+    pub word: bool,
+}
+
+impl Effect {
+    /// Unknown effect: it may start the motor, and set a reference.
+    pub const UNKNOWN: Effect = Effect {
+        stops: false,
+        run: Some(true),
+        reverse: None,
+        reference: true,
+        word: true,
+    };
+
+    /// The effect of a command of that rank on a drive of that profile.
+    pub fn of_command(order: &Order, urgency: Urgency, profile: &Profile) -> Effect {
+        Effect {
+            stops: urgency == Urgency::Stop,
+            ..Effect::of(order, profile)
+        }
+    }
+
+    /// Whether it starts a motor that stands.
+    pub fn starts(self) -> bool {
+        !self.stops && self.run == Some(true)
+    }
+
+    /// Whether it writes a run command, or a word at its place that is no stop.
+    pub fn may_run(self) -> bool {
+        self.run == Some(true) || self.word
+    }
+
+    /// Whether it sets a reference or a direction.
+    pub fn steers(self) -> bool {
+        self.reverse.is_some() || self.reference
+    }
+
+    /// The effect of an order on a drive of that profile, whatever its rank.
+    pub fn of(order: &Order, profile: &Profile) -> Effect {
+        match order {
+            Order::Points(values) => {
+                let mut effect = Effect::default();
+                for (index, value) in values {
+                    let is = |point: ModelPoint| {
+                        profile
+                            .model_index(point)
+                            .is_some_and(|own| behind(profile, own) == behind(profile, *index))
+                    };
+                    if is(ModelPoint::Run) {
+                        effect.run = Some(value.as_bool());
+                    }
+                    if is(ModelPoint::Reverse) {
+                        effect.reverse = Some(value.as_bool());
+                    }
+                    effect.reference |= is(ModelPoint::SpeedReference) || is(ModelPoint::FrequencyReference);
+                }
+                effect
+            }
+            Order::Write(pdu) => match written(pdu) {
+                Some((table, items)) => raw(profile, table, &items),
+                None => Effect::UNKNOWN,
+            },
+            Order::Read(_) | Order::Parameter(_) => Effect::default(),
+        }
+    }
+}
+
+/// The point whose register accepts the commands for a point.
+fn behind(profile: &Profile, index: PointIndex) -> PointIndex {
+    let mut at = index;
+    // A point rests on one with a register, over one that takes its commands.
+    for _ in 0..4 {
+        let Some(point) = profile.points.get(at) else { return at };
+        let next = match (&point.source, point.write_to) {
+            (_, Some(target)) => Some(target),
+            (Source::Derived(derived), None) => derived.band().map(|(of, ..)| of),
+            (Source::Raw(_), None) => None,
+        };
+        match next {
+            Some(next) => at = next,
+            None => return at,
+        }
+    }
+    at
+}
+
+fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
+    let register = |point: ModelPoint| {
+        let index = profile.model_index(point)?;
+        profile.points.get(behind(profile, index))?.raw()
+    };
+    let covered = |point: ModelPoint| {
+        register(point).is_some_and(|raw| items.iter().any(|(address, _)| raw.covers(table, *address)))
+    };
+    let runs = |wanted: bool| {
+        let mut items = items.iter();
+        items.any(|(address, word)| profile.runs_by(table, *address, *word) == Some(wanted))
+    };
+    // One that says both is a stop.
+    let run = match (runs(false), runs(true)) {
+        (true, _) => Some(false),
+        (false, true) => Some(true),
+        (false, false) => None,
+    };
+    let bit = |point: ModelPoint| {
+        let raw = register(point)?;
+        let (_, word) = items.iter().find(|(address, _)| raw.covers(table, *address))?;
+        raw.decode(&[*word], crate::drive::model::Kind::Bool)
+    };
+    let by_control = || {
+        let control = profile.control.as_ref().filter(|control| control.at.table == table)?;
+        let (_, word) = items.iter().find(|(address, _)| *address == control.at.address)?;
+        control.direction_of(*word)
+    };
+    let commands = |address: u16| {
+        let control = profile.control.as_ref().map(|control| control.at);
+        let mut places = profile.run_place().into_iter().chain(control);
+        places.any(|place| (place.table, place.address) == (table, address))
+    };
+    let no_stop = |(address, word): &(u16, u16)| commands(*address) && !profile.is_stop(table, *address, *word);
+    Effect {
+        stops: false,
+        run,
+        reverse: bit(ModelPoint::Reverse)
+            .map(|value| value.as_bool())
+            .or_else(by_control),
+        reference: covered(ModelPoint::SpeedReference) || covered(ModelPoint::FrequencyReference),
+        word: items.iter().any(no_stop),
+    }
+}
+
+/// What a command does to all drives that it reaches.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Effects {
+    on: Vec<(DriveIndex, Effect)>,
+    /// The registers that it sets, and on which it rests.
+    pub touches: Touched,
+}
+
+impl Effects {
+    /// Those of a command to one drive.
+    pub fn on_one(drive: DriveIndex, effect: Effect, touches: Touched) -> Effects {
+        Effects {
+            on: vec![(drive, effect)],
+            touches,
+        }
+    }
+
+    /// Those of a command to several drives.
+    pub fn on_all(on: Vec<(DriveIndex, Effect)>, touches: Touched) -> Effects {
+        Effects { on, touches }
+    }
+
+    /// The drives that it reaches.
+    pub fn drives(&self) -> impl Iterator<Item = DriveIndex> + '_ {
+        self.on.iter().map(|(drive, _)| *drive)
+    }
+
+    /// What it does to that drive; nothing to one that it does not reach.
+    pub fn on(&self, drive: DriveIndex) -> Effect {
+        let on = self.on.iter().find(|(of, _)| *of == drive);
+        on.map(|(_, effect)| *effect).unwrap_or_default()
+    }
+
+    /// Every drive that it reaches, with what it does there.
+    pub fn iter(&self) -> impl Iterator<Item = (DriveIndex, Effect)> + '_ {
+        self.on.iter().copied()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::codec::RequestPdu;
+    use crate::drive::Value;
+    use crate::drive::profile::{Form, Profiles};
+
+    #[test]
+    fn points_and_registers_say_the_same() {
+        let profiles = Profiles::built_in();
+        for profile in profiles.iter() {
+            let run = profile.model_point(ModelPoint::Run).and_then(|run| run.raw());
+            let Some((raw, Form::Bit { bit, invert })) = run.map(|raw| (raw, raw.form)) else {
+                continue;
+            };
+            let point = |point: ModelPoint| profile.model_index(point).unwrap();
+            for on in [false, true] {
+                let order = Order::Points(vec![(point(ModelPoint::Run), Value::Bool(on))]);
+                assert_eq!(Effect::of(&order, profile).run, Some(on), "{}", profile.name);
+                let value = u16::from(on != invert) << bit;
+                let pdu = match raw.table {
+                    Table::Coil => RequestPdu::WriteCoil {
+                        address: raw.address,
+                        on: on != invert,
+                    },
+                    _ => RequestPdu::write_register(raw.address, value),
+                };
+                assert_eq!(
+                    Effect::of(&Order::Write(pdu), profile).run,
+                    Some(on),
+                    "{}",
+                    profile.name
+                );
+            }
+            for reference in [ModelPoint::SpeedReference, ModelPoint::FrequencyReference] {
+                let Some(index) = profile.model_index(reference) else {
+                    continue;
+                };
+                let order = Order::Points(vec![(index, Value::Number(1.0))]);
+                let only = Effect {
+                    reference: true,
+                    ..Effect::default()
+                };
+                assert_eq!(Effect::of(&order, profile), only, "{}", profile.name);
+            }
+        }
+        let nx = profiles.get("vacon-nx").unwrap();
+        let other = Order::Write(RequestPdu::Other(vec![0x43, 1]));
+        assert_eq!(Effect::of(&other, nx), Effect::UNKNOWN);
+    }
+}

@@ -1,0 +1,399 @@
+//! What an order is: its content, what it does to each drive that it reaches, when it came and until when it may be sent,
+//! who gave it, and the ticket by which it gets exactly one result.
+//!
+//! A way in gives an [`Order`]; [`crate::permit::admit`] checks and converts it; the [`Command`] made of it waits in the
+//! [`crate::queue`] of its bus. The [`Ticket`] inside a command yields its result when it is used or dropped, so a
+//! command can neither get two results nor be forgotten.
+//!
+//! [`Outcome`] has the code, the text and the Modbus exception of every result; the texts of refusals are where the
+//! refusal is decided, in [`crate::permit`].
+
+mod arrival;
+mod audit;
+mod conversion;
+mod effect;
+mod frequency_range;
+mod guarded;
+mod origin;
+mod outcome;
+mod parameter;
+mod parts;
+mod passed_on;
+mod raw;
+mod slot_write;
+mod ticket;
+mod touched;
+
+pub use arrival::{Arrival, ConnectionId};
+pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
+pub use audit::{SENT, milliseconds, milliseconds_or_null};
+pub(crate) use conversion::{Becomes, as_held, becomes};
+pub use effect::{Asks, Effect, Effects};
+pub(crate) use frequency_range::rests_on;
+pub use frequency_range::{FrequencyRange, is_range_end};
+pub use guarded::{Guarded, Reason};
+pub use origin::{Acting, Authority, Origin, Proof, SourceKind};
+pub use outcome::{Answer, Holder, Interruption, Outcome, Refusal};
+pub use parameter::ParameterOrder;
+pub use parts::{Parts, StopEnd, joined, stop_of};
+pub use passed_on::{BackgroundRequest, NO_DRIVE, Pace, PassedOn};
+pub use raw::written;
+pub use slot_write::{Commanded, Entry, SlotWrite};
+pub use ticket::{Receipt, Ticket, WriteStats};
+pub use touched::Touched;
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use crate::codec::RequestPdu;
+use crate::drive::{DriveIndex, PointIndex, Profile, Value};
+
+/// Default time after which a command is no longer sent.
+pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);
+
+/// Commands and forwarded reads that may wait on one bus, in addition to two stops per drive.
+pub const CAPACITY: usize = 64;
+
+/// The result code of an acknowledged command whose effect a read showed.
+pub const CONFIRMED: &str = "confirmed";
+
+/// A command's content.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Order {
+    /// Points set as one command: index in the profile, value in engineering units.
+    Points(Vec<(PointIndex, Value)>),
+    /// A raw write, passed on as it is (except bits of a control word).
+    Write(RequestPdu),
+    /// A raw read outside the plan.
+    Read(RequestPdu),
+    /// One parameter set by a restore, while the motor is stopped.
+    Parameter(ParameterOrder),
+}
+
+/// Rank of a command on the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Urgency {
+    /// Takes a run command away.
+    Stop,
+    /// Any other command.
+    Command,
+    /// Forwarded read.
+    Read,
+}
+
+/// A command that was checked and converted, and may wait for its turn.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Admitted {
+    /// The order, derived points replaced by the points they rest on.
+    pub order: Order,
+    /// Its rank.
+    pub urgency: Urgency,
+    /// It sets references only.
+    pub reference_only: bool,
+    /// Frequency ranges on which it rests.
+    pub ranges: Vec<FrequencyRange>,
+}
+
+/// Whether `min_run` of its drive may delay a stop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Haste {
+    /// Never: the stop of a person, of the gateway itself, a second one.
+    AtOnce,
+    /// Where it is the first stop of the client that started the motor.
+    Usual,
+    /// It waits until the motor has run for that time.
+    Delayed,
+}
+
+/// A command that takes the run command away.
+#[derive(Debug)]
+pub struct Stop {
+    /// Whether it may be delayed.
+    pub haste: Haste,
+    /// Those who wait for the same stop, and until when.
+    pub joined: Vec<(Ticket, Instant)>,
+    /// Another bus accepted it before a reload: what follows for holds and priorities was noted there.
+    pub is_inherited: bool,
+    /// Another bus had started it before a reload.
+    pub was_begun: bool,
+}
+
+impl Stop {
+    fn new() -> Stop {
+        Stop {
+            haste: Haste::Usual,
+            joined: Vec::new(),
+            is_inherited: false,
+            was_begun: false,
+        }
+    }
+}
+
+/// A command that sets something and is no stop.
+#[derive(Debug, Default)]
+pub struct Set {
+    /// It sets references only: a newer one of the same points replaces it.
+    pub reference_only: bool,
+    /// It is the rest of a command whose stop goes first, and is not sent if that fails.
+    pub behind: Option<StopEnd>,
+}
+
+/// What a command is among the commands of its bus.
+#[derive(Debug)]
+pub enum Work {
+    /// It takes the run command away.
+    Stop(Stop),
+    /// It sets anything else.
+    Set(Set),
+    /// It reads outside the plan.
+    Read,
+    /// A tool's write, or a broadcast, which goes to all drives that hear it.
+    PassedOn(PassedOn),
+}
+
+/// When a command came, and until when it may be sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Window {
+    /// When its first byte came.
+    pub arrival: Arrival,
+    /// Not sent after this.
+    pub expires: Instant,
+    /// A start that must wait does so until then; else it is refused.
+    pub waits: bool,
+}
+
+/// What the rules ask about: which command it is, what it does where, and when it came.
+#[derive(Debug, Clone)]
+pub struct Intent {
+    /// Names the command: no other one of the process has the same number.
+    pub number: u64,
+    /// Index of the drive on its bus.
+    pub drive: DriveIndex,
+    /// Its content.
+    pub order: Order,
+    /// What it does to each drive that it reaches.
+    pub effects: Effects,
+    /// Frequency ranges on which its values rest.
+    pub ranges: Vec<FrequencyRange>,
+    /// When it came, and until when it may be sent.
+    pub window: Window,
+    /// The write to a BACnet slot from which it follows.
+    pub slot: Option<SlotWrite>,
+    /// What the name of the drive means since the order came.
+    pub named: Named,
+}
+
+/// What the name, unit or object by which an order named its drive means by now.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Named {
+    /// The machine that it meant when the first byte of the order came.
+    #[default]
+    This,
+    /// Another machine, or none: a reload changed that since.
+    Formerly,
+}
+
+/// A command on its way to the bus.
+#[derive(Debug)]
+pub struct Command {
+    /// What it does, where, and when it came.
+    pub intent: Intent,
+    /// What it is among the commands of its bus.
+    pub work: Work,
+    /// Its ticket.
+    pub ticket: Ticket,
+    /// Younger commands that went before it.
+    pub(crate) overtaken: usize,
+}
+
+/// A number that no other command of the process has: what is kept of one never fits another.
+fn next_number() -> u64 {
+    static LAST: AtomicU64 = AtomicU64::new(0);
+    LAST.fetch_add(1, Ordering::Relaxed) + 1
+}
+
+impl Intent {
+    /// Of a new command.
+    pub fn new(drive: DriveIndex, order: Order, effects: Effects, window: Window) -> Intent {
+        Intent {
+            number: next_number(),
+            drive,
+            order,
+            effects,
+            ranges: Vec::new(),
+            window,
+            slot: None,
+            named: Named::This,
+        }
+    }
+
+    /// Until when a start of it waits that must wait; none where it does not wait.
+    pub fn waits_until(&self) -> Option<Instant> {
+        self.window.waits.then_some(self.window.expires)
+    }
+}
+
+impl Command {
+    /// A command to the drive of that profile at that place of its bus.
+    pub fn new(drive: DriveIndex, admitted: Admitted, profile: &Profile, window: Window, ticket: Ticket) -> Command {
+        let Admitted {
+            order,
+            urgency,
+            reference_only,
+            ranges,
+        } = admitted;
+        let effect = Effect::of_command(&order, urgency, profile);
+        let effects = Effects::on_one(drive, effect, Touched::of(&order, &ranges, profile));
+        let work = match urgency {
+            Urgency::Stop => Work::Stop(Stop::new()),
+            Urgency::Read => Work::Read,
+            Urgency::Command => Work::Set(Set {
+                reference_only,
+                behind: None,
+            }),
+        };
+        Command {
+            intent: Intent {
+                ranges,
+                ..Intent::new(drive, order, effects, window)
+            },
+            work,
+            ticket,
+            overtaken: 0,
+        }
+    }
+
+    /// A tool's write, or a broadcast, which has its place among the commands of all drives that it reaches.
+    pub fn passed_on(intent: Intent, passed_on: PassedOn, ticket: Ticket) -> Command {
+        Command {
+            intent,
+            work: Work::PassedOn(passed_on),
+            ticket,
+            overtaken: 0,
+        }
+    }
+
+    /// A stop that a bus had started, for the bus that takes its place.
+    pub fn begun_stop(intent: Intent, was_begun: bool, ticket: Ticket, joined: Vec<(Ticket, Instant)>) -> Command {
+        Command {
+            intent,
+            work: Work::Stop(Stop {
+                haste: Haste::AtOnce,
+                joined,
+                is_inherited: true,
+                was_begun,
+            }),
+            ticket,
+            overtaken: 0,
+        }
+    }
+
+    /// Its rank on the bus. What is passed on has that of a command, whatever it does.
+    pub fn urgency(&self) -> Urgency {
+        match self.work {
+            Work::Stop(_) => Urgency::Stop,
+            Work::Set(_) | Work::PassedOn(_) => Urgency::Command,
+            Work::Read => Urgency::Read,
+        }
+    }
+
+    /// The drives that it reaches.
+    pub fn reach(&self) -> impl Iterator<Item = DriveIndex> + '_ {
+        self.intent.effects.drives()
+    }
+
+    /// Whether it reaches that drive.
+    pub fn reaches(&self, drive: DriveIndex) -> bool {
+        self.reach().any(|reached| reached == drive)
+    }
+
+    /// What it does to that drive.
+    pub fn effect(&self, drive: DriveIndex) -> Effect {
+        self.intent.effects.on(drive)
+    }
+
+    /// Whether it takes the run command of that drive away.
+    pub fn stops(&self, drive: DriveIndex) -> bool {
+        self.effect(drive).stops
+    }
+
+    /// Whether it is a stop that takes place before everything else to its drive.
+    pub fn is_stop(&self) -> bool {
+        matches!(self.work, Work::Stop(_))
+    }
+
+    /// Whether another bus accepted it before a reload: what follows from that was noted there.
+    pub(crate) fn is_inherited(&self) -> bool {
+        matches!(&self.work, Work::Stop(stop) if stop.is_inherited)
+    }
+
+    /// Whether it sets something and is no stop.
+    pub(crate) fn is_command(&self) -> bool {
+        self.urgency() == Urgency::Command
+    }
+
+    /// Whether it sets references only.
+    pub(crate) fn is_reference_only(&self) -> bool {
+        matches!(&self.work, Work::Set(set) if set.reference_only)
+    }
+
+    /// What is passed on for a tool, where it is that.
+    pub fn as_passed_on(&self) -> Option<&PassedOn> {
+        match &self.work {
+            Work::PassedOn(passed_on) => Some(passed_on),
+            Work::Stop(_) | Work::Set(_) | Work::Read => None,
+        }
+    }
+
+    /// Whether it is a stop that `min_run` delays.
+    pub fn is_delayed_stop(&self) -> bool {
+        matches!(&self.work, Work::Stop(stop) if stop.haste == Haste::Delayed)
+    }
+
+    /// Whether it may go while the gateway ends: a stop, and the broadcast that stops a whole line.
+    pub(crate) fn ends_the_gateway(&self) -> bool {
+        let is_shutdown = self.ticket.origin().kind == SourceKind::Shutdown;
+        self.is_stop() || (is_shutdown && self.as_passed_on().is_some())
+    }
+
+    /// Those who gave it: the client whose order it is, then those that joined.
+    pub fn origins(&self) -> impl Iterator<Item = &Origin> {
+        let joined = match &self.work {
+            Work::Stop(stop) => stop.joined.as_slice(),
+            Work::Set(_) | Work::Read | Work::PassedOn(_) => &[],
+        };
+        let joined = joined.iter().map(|(ticket, _)| ticket);
+        std::iter::once(&self.ticket).chain(joined).map(Ticket::origin)
+    }
+
+    /// Until when a client waits for it; none for the gateway's own.
+    pub(crate) fn client_waits_until(&self) -> Option<Instant> {
+        let joined = match &self.work {
+            Work::Stop(stop) => stop.joined.as_slice(),
+            Work::Set(_) | Work::Read | Work::PassedOn(_) => &[],
+        };
+        let joined = joined.iter().map(|(ticket, expires)| (ticket, *expires));
+        let tickets = std::iter::once((&self.ticket, self.intent.window.expires)).chain(joined);
+        let of_clients = tickets.filter(|(ticket, _)| ticket.origin().kind.is_client());
+        of_clients.map(|(_, expires)| expires).max()
+    }
+
+    /// Reports the outcome to its client and all that joined.
+    pub fn answer(self, outcome: &Outcome, now: Instant) {
+        let (was_begun, joined) = match self.work {
+            Work::Stop(stop) => (stop.was_begun, stop.joined),
+            Work::Set(_) | Work::Read | Work::PassedOn(_) => (false, Vec::new()),
+        };
+        let outcome = &match outcome {
+            Outcome::Expired if was_begun => Outcome::Interrupted(Interruption::Expired),
+            Outcome::BusDown if was_begun => Outcome::Interrupted(Interruption::BusDown),
+            Outcome::ShuttingDown if was_begun => Outcome::Interrupted(Interruption::ShuttingDown),
+            Outcome::Offline if was_begun => Outcome::Interrupted(Interruption::Offline),
+            Outcome::Replaced if was_begun => Outcome::Interrupted(Interruption::Stop),
+            outcome => outcome.clone(),
+        };
+        let joined = joined.into_iter().map(|(ticket, _)| ticket);
+        let tickets = [self.ticket].into_iter().chain(joined);
+        tickets.for_each(|ticket| ticket.answer(outcome.clone(), now));
+    }
+}

@@ -1,0 +1,229 @@
+//! Who commands.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+
+/// Where a command comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum SourceKind {
+    /// Modbus TCP client.
+    ModbusTcp,
+    /// MQTT topic.
+    Mqtt,
+    /// Command of a Sparkplug host.
+    Sparkplug,
+    /// HTTP: the status page, or a program.
+    Http,
+    /// Lease that expired.
+    Supervision,
+    /// The gateway stops.
+    Shutdown,
+    /// `drivegate write` through the socket of the gateway.
+    LocalSocket,
+    /// `drivegate write`, without a gateway.
+    CommandLine,
+    /// The other master of a line on which the gateway only listens.
+    OtherMaster,
+    /// The gateway's own periodic reads.
+    Schedule,
+    /// A tool at a slot of the bus.
+    Slot,
+    /// BACnet client.
+    Bacnet,
+    /// Interlock that does not hold.
+    Interlock,
+}
+
+impl SourceKind {
+    /// All kinds.
+    pub const ALL: [SourceKind; 13] = [
+        SourceKind::ModbusTcp,
+        SourceKind::Mqtt,
+        SourceKind::Sparkplug,
+        SourceKind::Http,
+        SourceKind::Supervision,
+        SourceKind::Shutdown,
+        SourceKind::LocalSocket,
+        SourceKind::CommandLine,
+        SourceKind::OtherMaster,
+        SourceKind::Schedule,
+        SourceKind::Slot,
+        SourceKind::Bacnet,
+        SourceKind::Interlock,
+    ];
+
+    /// The label of metrics and audit lines.
+    pub fn name(self) -> &'static str {
+        match self {
+            SourceKind::ModbusTcp => "modbus_tcp",
+            SourceKind::Mqtt => "mqtt",
+            SourceKind::Sparkplug => "sparkplug",
+            SourceKind::Http => "http",
+            SourceKind::Supervision => "supervision",
+            SourceKind::Shutdown => "shutdown",
+            SourceKind::LocalSocket => "local_socket",
+            SourceKind::CommandLine => "command_line",
+            SourceKind::OtherMaster => "other_master",
+            SourceKind::Schedule => "schedule",
+            SourceKind::Slot => "slot",
+            SourceKind::Bacnet => "bacnet",
+            SourceKind::Interlock => "interlock",
+        }
+    }
+
+    /// Whether `min_run` may delay a stop that comes this way: those of people are never delayed.
+    pub fn stops_may_be_delayed(self) -> bool {
+        matches!(
+            self,
+            SourceKind::ModbusTcp | SourceKind::Mqtt | SourceKind::Sparkplug | SourceKind::Bacnet | SourceKind::Slot
+        )
+    }
+
+    /// Whether a client commands; the gateway itself is none.
+    pub fn is_client(self) -> bool {
+        !matches!(
+            self,
+            SourceKind::Supervision | SourceKind::Shutdown | SourceKind::Schedule | SourceKind::Interlock
+        )
+    }
+}
+
+/// The authority of a client; the drive may allow less.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Authority {
+    /// Read and write.
+    Write,
+    /// Read; every write is refused.
+    ReadOnly,
+}
+
+/// What a client's connection proves about it.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum Proof {
+    /// Nothing.
+    #[default]
+    Nothing,
+    /// The address of a Modbus TCP client, or of a tool at a TCP slot.
+    Address(IpAddr),
+    /// The name in its certificate, and its address.
+    Certificate(Arc<str>, IpAddr),
+    /// A user of HTTP.
+    User(Arc<str>),
+    /// A user id at the local socket.
+    Uid(u32),
+    /// WHO in the MQTT topic `as/WHO`, which the broker's access rules secure.
+    Topic(Arc<str>),
+    /// A Sparkplug host.
+    Sparkplug,
+    /// The address of a BACnet client, and the priority of its write.
+    Bacnet(IpAddr, u8),
+    /// A program at the pseudo-terminal of that path.
+    Pty(Arc<str>),
+}
+
+/// In which part a client acts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Acting {
+    /// As itself.
+    #[default]
+    Usual,
+    /// Its stop is a new one, also where the client repeats its word all the time.
+    Insisting,
+    /// The drill that it armed gives the order.
+    Drill,
+}
+
+/// Who commands: for the audit, and as a client among others.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Origin {
+    /// Kind of the source.
+    pub kind: SourceKind,
+    /// Address, topic or certificate name, as the audit shows it.
+    pub who: String,
+    client: Arc<str>,
+    login: Option<Arc<str>>,
+    proof: Proof,
+    acting: Acting,
+}
+
+impl Origin {
+    /// Who acts when a lease expires.
+    pub const LEASE: &str = "supervision";
+    /// The client name for the stop of a drive that was switched to local control with its run command set.
+    pub const LOCAL: &str = "local control place";
+
+    /// One that is a client by itself.
+    pub fn new(kind: SourceKind, who: impl Into<String>) -> Origin {
+        let who = who.into();
+        let client = format!("{} {who}", kind.name()).into();
+        Origin::of(client, kind, who)
+    }
+
+    /// One that is `client` in all that is shared among clients: turns and places in the queue, records of the audit. A
+    /// client gains nothing there by more connections or topics, as long as they all name the same `client`.
+    pub fn of(client: Arc<str>, kind: SourceKind, who: impl Into<String>) -> Origin {
+        let who = who.into();
+        Origin {
+            kind,
+            who,
+            client,
+            login: None,
+            proof: Proof::Nothing,
+            acting: Acting::Usual,
+        }
+    }
+
+    /// The same, of whom its connection proves that.
+    pub fn proven(mut self, proof: Proof) -> Origin {
+        self.proof = proof;
+        self
+    }
+
+    /// The drill that this client armed, which appears under that name in audit and events.
+    pub(crate) fn as_drill(mut self, who: String) -> Origin {
+        (self.who, self.acting) = (who, Acting::Drill);
+        self
+    }
+
+    /// This client, whose stop is a new one even if it repeats its word all the time.
+    pub(crate) fn insisting(mut self) -> Origin {
+        self.acting = Acting::Insisting;
+        self
+    }
+
+    /// Whether a stop is never taken for a repetition.
+    pub(crate) fn insists(&self) -> bool {
+        self.acting == Acting::Insisting
+    }
+
+    /// Whether a drill gives the order.
+    pub(crate) fn is_drill(&self) -> bool {
+        self.acting == Acting::Drill
+    }
+
+    /// The proof from its connection.
+    pub fn proof(&self) -> &Proof {
+        &self.proof
+    }
+
+    /// The same with a login, which may renew the lease of the drive until another client commands it.
+    pub fn with_login(mut self, login: Arc<str>) -> Origin {
+        self.login = Some(login);
+        self
+    }
+
+    /// The login, if the client has one.
+    pub fn login(&self) -> Option<&Arc<str>> {
+        self.login.as_ref()
+    }
+
+    /// Whether it is the lease of a drive, and no other stop of the gateway's own.
+    pub fn is_lease(&self) -> bool {
+        self.kind == SourceKind::Supervision && self.who == Origin::LEASE
+    }
+
+    /// The client, whatever connection or topic it uses.
+    pub fn client(&self) -> &Arc<str> {
+        &self.client
+    }
+}

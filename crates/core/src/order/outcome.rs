@@ -1,0 +1,371 @@
+//! How a command ends: code, text and Modbus exception of every result.
+
+use std::fmt;
+use std::time::Duration;
+
+use super::audit::Reach;
+use super::{CAPACITY, Guarded};
+use crate::codec::{Exception, Reply};
+
+/// What interrupted a started command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Interruption {
+    /// A stop arrived.
+    Stop,
+    /// Its time expired.
+    Expired,
+    /// The port was lost.
+    BusDown,
+    /// The drive no longer replies.
+    Offline,
+    /// The gateway stops, or its bus restarts.
+    ShuttingDown,
+    /// Another client took the drive.
+    Taken,
+}
+
+/// How a command ended.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Outcome {
+    /// The drive acknowledged it (a read: its reply).
+    Acknowledged(Reply),
+    /// The drive refused it.
+    Exception(Exception),
+    /// The reply leaves the outcome open: 05, or a gateway's 0A or 0B.
+    Unknown(Exception),
+    /// Refused before it reached the bus.
+    Refused(Refusal),
+    /// The drive did not reply.
+    TimedOut,
+    /// The drive's reply was invalid: wrong check code or length.
+    Garbled,
+    /// It expired before its turn; not sent.
+    Expired,
+    /// A newer reference took its place; not sent.
+    Replaced,
+    /// A stop removed it; not sent.
+    Purged,
+    /// A supervision action withdrawn because a client returned; not sent.
+    Withdrawn,
+    /// The drive acknowledged it and shows another value.
+    NotTaken(String),
+    /// It was started and was interrupted: whether the drive took it, or a part of it, is not known.
+    Interrupted(Interruption),
+    /// The rest of a command whose stop failed; not sent.
+    NotStopped,
+    /// Of a command that stops and does more, the drive acknowledged the stop; the result of the rest.
+    StopOnly(Box<Outcome>),
+    /// The stop of such a command failed, in that way, and the rest was not sent.
+    StopFailed(Box<Outcome>),
+    /// The port is not open.
+    BusDown,
+    /// The drive is offline.
+    Offline,
+    /// 64 commands wait already.
+    QueueFull,
+    /// The gateway stops.
+    ShuttingDown,
+}
+
+impl Outcome {
+    /// The code in results, audit lines and metrics.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Outcome::Acknowledged(_) => "acknowledged",
+            Outcome::Exception(_) => "refused_by_drive",
+            Outcome::Unknown(_) => "unknown",
+            Outcome::Refused(refusal) => refusal.code(),
+            Outcome::TimedOut => "timeout",
+            Outcome::Garbled => "garbled",
+            Outcome::Expired => "expired",
+            Outcome::Replaced => "replaced",
+            Outcome::Purged => "purged",
+            Outcome::Withdrawn => "withdrawn",
+            Outcome::NotTaken(_) => "not_taken",
+            Outcome::Interrupted(_) => "interrupted",
+            Outcome::NotStopped => "not_stopped",
+            Outcome::StopOnly(_) => "stop_only",
+            Outcome::StopFailed(stop) => stop.code(),
+            Outcome::BusDown => "bus_down",
+            Outcome::Offline => "offline",
+            Outcome::QueueFull => "queue_full",
+            Outcome::ShuttingDown => "shutting_down",
+        }
+    }
+
+    /// How far the command got.
+    pub(super) fn reach(&self) -> Reach {
+        match self {
+            Outcome::Acknowledged(_)
+            | Outcome::Exception(_)
+            | Outcome::Unknown(_)
+            | Outcome::TimedOut
+            | Outcome::Garbled
+            | Outcome::NotTaken(_)
+            | Outcome::Interrupted(_)
+            | Outcome::StopOnly(_) => Reach::Sent,
+            Outcome::StopFailed(stop) => stop.reach(),
+            Outcome::Expired
+            | Outcome::Replaced
+            | Outcome::Purged
+            | Outcome::Withdrawn
+            | Outcome::NotStopped
+            | Outcome::ShuttingDown => Reach::Queued,
+            Outcome::Refused(_) | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull => Reach::Refused,
+        }
+    }
+
+    /// The outcome of a write refused with that exception.
+    pub fn of_exception(code: Exception) -> Outcome {
+        match code.leaves_open() {
+            true => Outcome::Unknown(code),
+            false => Outcome::Exception(code),
+        }
+    }
+
+    /// Whether the drive took it.
+    pub fn is_ok(&self) -> bool {
+        matches!(self, Outcome::Acknowledged(_))
+    }
+
+    /// The exception for a Modbus TCP client (`docs/modbus-tcp.md`); `None` for success.
+    pub fn exception(&self) -> Option<Exception> {
+        match self {
+            Outcome::Acknowledged(_) => None,
+            Outcome::Exception(code) | Outcome::Unknown(code) if code.0 <= 0x0B => Some(*code),
+            Outcome::Exception(_) | Outcome::Unknown(_) | Outcome::Garbled | Outcome::NotTaken(_) => {
+                Some(Exception::DEVICE_FAILURE)
+            }
+            Outcome::Refused(refusal) => Some(refusal.exception()),
+            Outcome::QueueFull => Some(Exception::BUSY),
+            Outcome::BusDown | Outcome::ShuttingDown => Some(Exception::GATEWAY_PATH),
+            Outcome::TimedOut | Outcome::Offline | Outcome::Expired | Outcome::NotStopped => {
+                Some(Exception::GATEWAY_TARGET)
+            }
+            // The client must know what was not done; never success, which would mean both parts.
+            Outcome::StopOnly(part) | Outcome::StopFailed(part) => {
+                Some(part.exception().unwrap_or(Exception::DEVICE_FAILURE))
+            }
+            Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn => Some(Exception::BUSY),
+            Outcome::Interrupted(Interruption::BusDown | Interruption::ShuttingDown) => Some(Exception::GATEWAY_PATH),
+            Outcome::Interrupted(_) => Some(Exception::GATEWAY_TARGET),
+        }
+    }
+}
+
+impl fmt::Display for Outcome {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Outcome::Acknowledged(_) => f.write_str("the drive acknowledged it"),
+            Outcome::Exception(code) => write!(f, "the drive refused it with {code}"),
+            Outcome::Unknown(code) => {
+                write!(
+                    f,
+                    "the drive replied {code}; whether it executed the command is unknown"
+                )
+            }
+            Outcome::Refused(refusal) => refusal.fmt(f),
+            Outcome::TimedOut => f.write_str("the drive did not reply; whether it executed the command is unknown"),
+            Outcome::Garbled => {
+                f.write_str("the drive's reply was garbled; whether it executed the command is unknown")
+            }
+            Outcome::Expired => f.write_str("it expired before its turn came; it was not sent"),
+            Outcome::Replaced => f.write_str("a newer command replaced it; it was not sent"),
+            Outcome::Purged => f.write_str("a stop arrived after it was requested; it was not sent"),
+            Outcome::Withdrawn => f.write_str("a client commands the drive again; it was not sent"),
+            Outcome::NotTaken(shown) => write!(f, "the drive acknowledged it, but {shown}"),
+            Outcome::Interrupted(why) => {
+                let why = match why {
+                    Interruption::Stop => "a stop arrived",
+                    Interruption::Expired => "it expired",
+                    Interruption::BusDown => "the bus went down",
+                    Interruption::Offline => "the drive went offline",
+                    Interruption::ShuttingDown => "the gateway is shutting down",
+                    Interruption::Taken => "another client took the drive",
+                };
+                write!(
+                    f,
+                    "it was started, then {why}; whether the drive executed it is unknown"
+                )
+            }
+            Outcome::NotStopped => f.write_str("the stop of the same command failed; it was not sent"),
+            Outcome::StopOnly(rest) => {
+                let rest = rest
+                    .to_string()
+                    .replace("nothing was written", "nothing else was written");
+                write!(
+                    f,
+                    "the drive acknowledged the stop; the rest was not carried out: {rest}"
+                )
+            }
+            Outcome::StopFailed(stop) => write!(f, "{stop}; the rest of the command was not sent"),
+            Outcome::BusDown => f.write_str("the bus is down; it was not sent"),
+            Outcome::Offline => f.write_str("the drive is offline; it was not sent"),
+            Outcome::QueueFull => write!(f, "{CAPACITY} commands are already waiting; it was not sent, try again"),
+            Outcome::ShuttingDown => f.write_str("the gateway is shutting down; it was not sent"),
+        }
+    }
+}
+
+/// Why a command was refused before it reached the bus.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Refusal {
+    /// Writing is off for that client or drive.
+    #[error("{0}")]
+    NotAllowed(String),
+    /// The point or address cannot be written, or does not exist.
+    #[error("{0}")]
+    NotWritable(String),
+    /// It depends on a value that was not read from the drive yet; for a silent drive, its absence is the reason
+    /// instead.
+    #[error("{0}")]
+    NotKnown(String),
+    /// The value is outside the type, the profile or the limits, or the command contradicts itself.
+    #[error("{0}")]
+    BadValue(String),
+    /// Someone else has a right to the drive that goes before that of the client.
+    #[error("{0}")]
+    HeldByOther(Box<Holder>),
+    /// The motor may not be started yet.
+    #[error("{0}; it was not sent")]
+    Guarded(Box<Guarded>),
+    /// An interlock is not satisfied.
+    #[error("{0}; it was not sent")]
+    Interlocked(String),
+    /// A client refused after a stop repeats run, or renews a hold it does not have.
+    #[error("{0}")]
+    NeedsTake(Box<Holder>),
+    /// There is no drive of that name.
+    #[error("{0}")]
+    UnknownDrive(String),
+    /// The drive reports that its motor runs: no parameter is written.
+    #[error("{0}")]
+    MotorRuns(String),
+    /// The drive has neither the value that a restore found nor the one to be written.
+    #[error("{0}")]
+    OtherValue(String),
+}
+
+/// The client that blocks a drive for others.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Holder {
+    /// Who.
+    pub who: String,
+    /// By which right.
+    pub rank: String,
+    /// What is held, and how that ends.
+    pub keeps: String,
+    /// Seconds until it ends by itself, if it does.
+    pub left_s: Option<u64>,
+}
+
+impl fmt::Display for Holder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Holder { who, rank, keeps, .. } = self;
+        write!(f, "{who} ({rank}) {keeps}; it was not sent")
+    }
+}
+
+impl Refusal {
+    pub(super) const UNKNOWN_DRIVE: &str = "unknown_drive";
+
+    /// The code in results.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => "not_allowed",
+            Refusal::NotWritable(_) | Refusal::NotKnown(_) => "not_writable",
+            Refusal::BadValue(_) => "bad_value",
+            Refusal::HeldByOther(_) => "held_by_other",
+            Refusal::Guarded(_) => "guarded",
+            Refusal::Interlocked(_) => "interlocked",
+            Refusal::NeedsTake(_) => "needs_take",
+            Refusal::UnknownDrive(_) => Refusal::UNKNOWN_DRIVE,
+        }
+    }
+
+    /// The client that blocks the drive, if any.
+    pub fn holder(&self) -> Option<&Holder> {
+        match self {
+            Refusal::HeldByOther(holder) | Refusal::NeedsTake(holder) => Some(holder),
+            _ => None,
+        }
+    }
+
+    /// The Modbus exception.
+    pub fn exception(&self) -> Exception {
+        match self {
+            Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => Exception::FUNCTION,
+            Refusal::NotWritable(_) | Refusal::NotKnown(_) => Exception::ADDRESS,
+            Refusal::BadValue(_) => Exception::VALUE,
+            Refusal::HeldByOther(_) | Refusal::NeedsTake(_) | Refusal::Guarded(_) | Refusal::Interlocked(_) => {
+                Exception::BUSY
+            }
+            Refusal::UnknownDrive(_) => Exception::GATEWAY_PATH,
+        }
+    }
+}
+
+/// The one result of a command.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Answer {
+    /// How it ended.
+    pub outcome: Outcome,
+    /// From acceptance to result.
+    pub latency: Duration,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_page_has_every_result() {
+        let page = include_str!("../../../../docs/commands.md");
+        let refusals = [
+            Refusal::NotAllowed,
+            Refusal::NotWritable,
+            Refusal::BadValue,
+            Refusal::UnknownDrive,
+        ];
+        let mut outcomes: Vec<Outcome> = refusals.iter().map(|r| Outcome::Refused(r(String::new()))).collect();
+        let held = [Refusal::HeldByOther(Box::default()), Refusal::NeedsTake(Box::default())];
+        outcomes.extend(held.map(Outcome::Refused));
+        outcomes.extend([
+            Outcome::Refused(Refusal::Interlocked(String::new())),
+            Outcome::Acknowledged(Reply::Written),
+            Outcome::TimedOut,
+            Outcome::Garbled,
+            Outcome::Expired,
+            Outcome::Replaced,
+            Outcome::Purged,
+            Outcome::Withdrawn,
+            Outcome::NotTaken(String::new()),
+            Outcome::Interrupted(Interruption::Stop),
+            Outcome::NotStopped,
+            Outcome::BusDown,
+            Outcome::Offline,
+            Outcome::QueueFull,
+            Outcome::ShuttingDown,
+        ]);
+        for outcome in outcomes {
+            let exception = outcome
+                .exception()
+                .map_or("none".to_string(), |e| format!("{:02X}", e.0));
+            let row = format!("| `{}` | {exception} |", outcome.code());
+            assert!(page.contains(&row), "docs/commands.md lacks {row}");
+        }
+        assert!(page.contains("| `guarded` | 06 | 409 |"));
+        for with_code in [Outcome::Exception, Outcome::Unknown] {
+            assert!(page.contains(&format!("| `{}` |", with_code(Exception::BUSY).code())));
+        }
+        assert!(page.contains(&format!(
+            "| `{}` |",
+            Outcome::StopOnly(Box::new(Outcome::Purged)).code()
+        )));
+        assert_eq!(
+            Outcome::Exception(Exception(0x33)).exception(),
+            Some(Exception::DEVICE_FAILURE)
+        );
+        assert_eq!(Outcome::Exception(Exception::BUSY).exception(), Some(Exception::BUSY));
+    }
+}

@@ -1,0 +1,84 @@
+//! What is passed on to the line as it is: for a tool, as a broadcast, or for work of the gateway that has time.
+
+use std::time::Instant;
+
+use tokio::sync::oneshot;
+
+use super::{Outcome, SourceKind, Ticket};
+use crate::codec::RequestPdu;
+use crate::drive::DriveIndex;
+
+/// How much of a busy line background transactions take, as shares of the wire time of process data; where the line
+/// rests they may have all of the rest. All of both kinds together take no more than a fifth of a busy line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Pace {
+    /// 18 %: someone waits for the reply.
+    Brisk,
+    /// 1.5 %: unnoticeable.
+    Slow,
+}
+
+impl Pace {
+    /// All, in the order in which they have their turn.
+    pub const ALL: [Pace; 2] = [Pace::Brisk, Pace::Slow];
+
+    /// The share of a busy line.
+    pub const fn share(self) -> f64 {
+        match self {
+            Pace::Brisk => 0.18,
+            Pace::Slow => 0.015,
+        }
+    }
+}
+
+/// The index of no drive: that of a request to an address of the line at which none is configured.
+pub const NO_DRIVE: DriveIndex = DriveIndex::new(usize::MAX);
+
+/// A request passed on for a tool, which gets the drive's reply, or a broadcast.
+#[derive(Debug)]
+pub struct PassedOn {
+    /// The address on the line; 0 is the broadcast, except on N2.
+    pub address: u8,
+    /// It may change any value of every drive that receives it.
+    pub may_write: bool,
+    /// It stops all drives that receive it, and precedes all waiting commands.
+    pub first: bool,
+    /// Receives the reply frame, as the drive sent it.
+    pub frame: oneshot::Sender<Vec<u8>>,
+}
+
+/// A request of the lowest rank: one transaction with one drive, which is no command to it.
+#[derive(Debug)]
+pub struct BackgroundRequest {
+    /// Index of the drive on its bus, or [`NO_DRIVE`].
+    pub drive: DriveIndex,
+    /// The request.
+    pub pdu: RequestPdu,
+    /// How much of a busy line it may take.
+    pub pace: Pace,
+    /// Not sent after this.
+    pub expires: Instant,
+    /// Its ticket.
+    pub ticket: Ticket,
+    /// Who gets the frame of the reply, for a tool; none for a request of the gateway itself.
+    pub passed_on: Option<PassedOn>,
+}
+
+impl BackgroundRequest {
+    /// Whether the gateway reads something by itself, from time to time: it is left of no command and of no fault.
+    pub fn is_of_gateway(&self) -> bool {
+        self.ticket.origin().kind == SourceKind::Schedule
+    }
+
+    /// Whether the tool that sent it has disconnected, or has sent another request.
+    pub fn is_unwanted(&self) -> bool {
+        self.passed_on
+            .as_ref()
+            .is_some_and(|passed_on| passed_on.frame.is_closed())
+    }
+
+    /// Reports the outcome to the requester.
+    pub fn answer(self, outcome: Outcome, now: Instant) {
+        self.ticket.answer(outcome, now);
+    }
+}

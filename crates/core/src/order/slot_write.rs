@@ -1,0 +1,118 @@
+//! A write to a slot of a BACnet priority array, and the entry that it leaves there. Pure.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Instant;
+
+use super::Origin;
+use crate::drive::{ModelPoint, Value};
+
+/// A point that is commanded by priorities.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Commanded {
+    /// The run command.
+    Run,
+    /// The direction.
+    Reverse,
+    /// The speed reference.
+    SpeedReference,
+    /// The frequency reference.
+    FrequencyReference,
+}
+
+impl Commanded {
+    /// All.
+    pub const ALL: [Commanded; 4] = [
+        Commanded::Run,
+        Commanded::Reverse,
+        Commanded::SpeedReference,
+        Commanded::FrequencyReference,
+    ];
+
+    /// The point.
+    pub fn point(self) -> ModelPoint {
+        match self {
+            Commanded::Run => ModelPoint::Run,
+            Commanded::Reverse => ModelPoint::Reverse,
+            Commanded::SpeedReference => ModelPoint::SpeedReference,
+            Commanded::FrequencyReference => ModelPoint::FrequencyReference,
+        }
+    }
+
+    /// Points that count as one to the drive: both references do.
+    pub(crate) fn together(self) -> &'static [Commanded] {
+        match self {
+            Commanded::Run => &[Commanded::Run],
+            Commanded::Reverse => &[Commanded::Reverse],
+            Commanded::SpeedReference | Commanded::FrequencyReference => {
+                &[Commanded::SpeedReference, Commanded::FrequencyReference]
+            }
+        }
+    }
+}
+
+/// The entry in a slot.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Entry {
+    /// The value, in the unit of the point.
+    pub value: Value,
+    /// Who wrote it.
+    pub origin: Origin,
+    /// When.
+    pub at: Instant,
+    pub(crate) number: u64,
+}
+
+impl Entry {
+    /// An entry written by that client.
+    pub fn new(value: Value, origin: Origin, at: Instant) -> Entry {
+        Entry {
+            value,
+            origin,
+            at,
+            number: number(),
+        }
+    }
+}
+
+/// A number that was not given before: later writes have greater ones.
+fn number() -> u64 {
+    static LAST: AtomicU64 = AtomicU64::new(1);
+    LAST.fetch_add(1, Ordering::Relaxed)
+}
+
+/// A write to a slot; the order that follows from it carries it, so that both are accepted at once.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SlotWrite {
+    /// Names it.
+    pub id: u64,
+    /// Whose array.
+    pub what: Commanded,
+    /// 1..=16.
+    pub priority: u8,
+    /// The new entry; none releases the slot.
+    pub entry: Option<Entry>,
+    /// Slots released with it: their owners' commands were refused when they were to govern.
+    pub also: Vec<(Commanded, u8)>,
+    /// The entry that is planned to govern as a result.
+    pub(crate) heir: Option<u64>,
+}
+
+impl SlotWrite {
+    /// A write that was not made yet.
+    pub fn new(what: Commanded, priority: u8, entry: Option<Entry>) -> SlotWrite {
+        SlotWrite {
+            id: number(),
+            what,
+            priority,
+            entry,
+            also: Vec::new(),
+            heir: None,
+        }
+    }
+
+    /// The same, planned with that entry governing as a result.
+    pub fn in_favour_of(mut self, entry: &Entry) -> SlotWrite {
+        self.heir = Some(entry.number);
+        self
+    }
+}

@@ -1,0 +1,70 @@
+//! Which registers of a drive a command sets, and on which it rests: whether two commands may change places. Pure.
+
+use super::{FrequencyRange, Order, written};
+use crate::codec::Table;
+use crate::drive::{PointIndex, Profile, Raw};
+
+/// A register or coil of a drive.
+type Item = (Table, u16);
+
+/// The registers of a command.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum Touched {
+    /// Which ones is not known.
+    #[default]
+    Anything,
+    /// These.
+    These {
+        /// It sets them.
+        sets: Vec<Item>,
+        /// By them its values were converted or limited.
+        rests_on: Vec<Item>,
+    },
+}
+
+impl Touched {
+    /// The registers of a command to a drive of that profile, which rests on these frequency ranges.
+    pub fn of(order: &Order, ranges: &[FrequencyRange], profile: &Profile) -> Touched {
+        let raw = |index: PointIndex| profile.points.get(index).and_then(|point| point.raw());
+        let items = |raw: &Raw| {
+            let table = raw.table;
+            raw.addresses()
+                .map(move |address| (table, address))
+                .collect::<Vec<Item>>()
+        };
+        let sets: Option<Vec<Item>> = match order {
+            // A point without a register of its own is refused before it sets anything.
+            Order::Points(values) => {
+                let raws = values.iter().filter_map(|(index, _)| raw(*index));
+                Some(raws.flat_map(items).collect())
+            }
+            Order::Write(pdu) => written(pdu).map(|(table, items)| {
+                let item = |(address, _)| (table, address);
+                items.into_iter().map(item).collect()
+            }),
+            Order::Read(_) => Some(Vec::new()),
+            Order::Parameter(_) => None,
+        };
+        let ends = ranges.iter().flat_map(FrequencyRange::ends).filter_map(raw);
+        sets.map_or(Touched::Anything, |sets| Touched::These {
+            sets,
+            rests_on: ends.flat_map(items).collect(),
+        })
+    }
+
+    /// Whether it is the same which of the two goes first.
+    pub(crate) fn commutes(&self, other: &Touched) -> bool {
+        let (
+            Touched::These { sets, rests_on },
+            Touched::These {
+                sets: other_sets,
+                rests_on: other_rests_on,
+            },
+        ) = (self, other)
+        else {
+            return false;
+        };
+        let apart = |left: &[Item], right: &[Item]| left.iter().all(|item| !right.contains(item));
+        apart(sets, other_sets) && apart(sets, other_rests_on) && apart(rests_on, other_sets)
+    }
+}

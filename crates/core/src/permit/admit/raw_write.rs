@@ -1,0 +1,150 @@
+//! Which raw writes are let through: addresses first, then the control word, then values. Pure.
+
+use super::{checked, related_limits};
+use crate::codec::n2::Object;
+use crate::codec::{Protocol, RequestPdu, Table};
+use crate::drive::control::ControlItem;
+use crate::drive::model::Kind;
+use crate::order::{FrequencyRange, Refusal, rests_on, written};
+use crate::process_image::Reading;
+
+/// The frequency ranges on which a raw write rests.
+pub(super) fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<Vec<FrequencyRange>, Refusal> {
+    let profile = &drive.spec.profile;
+    let Some((table, items)) = written(pdu) else {
+        return Err(Refusal::NotAllowed(format!(
+            "function {} cannot be passed on to this drive",
+            pdu.function()
+        )));
+    };
+    let Some((first, _)) = items.first() else {
+        return Err(Refusal::BadValue(
+            "the write names no register; nothing was written".to_string(),
+        ));
+    };
+    let range = profile.range(table, *first).filter(|r| r.write > 0).ok_or_else(|| {
+        Refusal::NotWritable(format!(
+            "{table} {first} of `{}` is read-only or unknown",
+            drive.spec.name
+        ))
+    })?;
+    if let Some((beyond, _)) = items.iter().find(|(address, _)| !range.addresses.contains(address)) {
+        return Err(Refusal::NotWritable(format!(
+            "{table} {beyond} of `{}` is read-only or unknown",
+            drive.spec.name
+        )));
+    }
+    raw_rule(drive, table, &items)?;
+    control_words(drive, table, &items)?;
+    if profile.protocols.contains(&Protocol::N2) {
+        one_object(table, *first, items.len())?;
+    }
+    if items.len() > usize::from(range.write) {
+        let (count, most) = (items.len(), range.write);
+        return Err(Refusal::BadValue(format!(
+            "{count} items in one write, but the drive accepts at most {most}; nothing was written"
+        )));
+    }
+    raw_values(drive, table, &items)
+}
+
+/// The registers beyond those of writable points that the drive's configuration does not admit.
+fn raw_rule(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
+    let spec = drive.spec;
+    let addresses = items.iter().map(|(address, _)| *address);
+    match spec.raw_writes.refused(&spec.profile, table, addresses) {
+        None => Ok(()),
+        Some(address) => Err(Refusal::NotWritable(format!(
+            "{table} {address} of `{}` belongs to no writable point; add [{address}, {address}] to `raw_writes` of the \
+             drive to write it raw",
+            spec.name
+        ))),
+    }
+}
+
+/// A control word that is neither a stop nor clearly a run command is not passed on: its effect is unknown.
+fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
+    let Some(control) = &drive.spec.profile.control else {
+        return Ok(());
+    };
+    let refused = |(address, word): &&(u16, u16)| {
+        !control.admits(
+            ControlItem {
+                table,
+                address: *address,
+            },
+            *word,
+        )
+    };
+    match items.iter().find(refused) {
+        None => Ok(()),
+        Some((address, word)) => Err(Refusal::BadValue(format!(
+            "{word:#06x} at {table} {address} of `{}` neither stops nor runs the drive according to its profile; \
+             nothing was written",
+            drive.spec.name
+        ))),
+    }
+}
+
+/// On N2 a write goes to one object and sets all of it: an address at which none begins is no address, another length
+/// no value.
+fn one_object(table: Table, first: u16, count: usize) -> Result<(), Refusal> {
+    let object = Object::at(table, first)
+        .ok_or_else(|| Refusal::NotWritable(format!("no object starts at {table} {first}; nothing was written")))?;
+    let items = object.items();
+    if count != usize::from(items) {
+        return Err(Refusal::BadValue(format!(
+            "{object} must be written with exactly {items} items; nothing was written"
+        )));
+    }
+    Ok(())
+}
+
+/// The points that a raw write of `items` sets: each whole, and within its limits; and the frequency ranges on which that
+/// rests.
+fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<Vec<FrequencyRange>, Refusal> {
+    let mut ranges = Vec::new();
+    for (index, point) in drive.spec.profile.points.enumerate() {
+        let Some(raw) = point.raw().filter(|raw| raw.table == table) else {
+            continue;
+        };
+        let words: Vec<u16> = raw
+            .addresses()
+            .filter_map(|address| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word))
+            .collect();
+        if words.is_empty() || point.kind() == Kind::Bool {
+            continue;
+        }
+        if words.len() < usize::from(raw.form.items()) {
+            return Err(Refusal::BadValue(format!(
+                "`{}` takes {} registers; write them together; nothing was written",
+                point.name,
+                raw.form.items()
+            )));
+        }
+        match raw.decode(&words, Kind::Number) {
+            Some(value) => {
+                let value = checked(drive, index, point, value)?;
+                related_limits(drive, index, index, value)?;
+                ranges.extend(rests_on(drive, index, (index, value)));
+            }
+            None => {
+                return Err(Refusal::BadValue(format!(
+                    "`{}`: not a number; nothing was written",
+                    point.name
+                )));
+            }
+        }
+    }
+    Ok(ranges)
+}
+
+/// Whether a raw write takes the run command away and does nothing else. One of several items is judged as any other
+/// command: its stop was taken out of it before ([`crate::order::Parts`]).
+pub(super) fn stops(drive: &Reading<'_>, pdu: &RequestPdu) -> bool {
+    let profile = &drive.spec.profile;
+    written(pdu).is_some_and(|(table, items)| match items.as_slice() {
+        [(address, value)] => profile.is_stop(table, *address, *value),
+        _ => false,
+    })
+}

@@ -1,0 +1,309 @@
+//! What is known of the drives of a bus that decides about orders: stops, who holds them, priorities, drills, starts. Pure:
+//! time is an argument.
+//!
+//! The gate is part of the queue of the bus, so that orders and what they change here have one order of acceptance.
+
+mod holds;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use self::holds::HoldNews;
+pub use self::holds::Unheld;
+use super::holder::{Claim, Holding, Rules};
+use super::judge::{self, Ask, Facts, Stage, Verdict};
+use super::priorities::Priorities;
+use crate::drive::DriveIndex;
+use crate::order::{Arrival, Command, Intent, Origin, Outcome, Refusal, Urgency};
+use crate::start_guard::{BusGuards, Clearance};
+
+/// A drill under way at a drive: no other order to it runs.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DrillLock {
+    /// The drill, as text.
+    pub who: String,
+    /// Nothing but stops is sent until then, so that the drive's own supervision of the fieldbus acts.
+    pub quiet_until: Option<Instant>,
+}
+
+/// The last stop that a drive was given.
+#[derive(Debug, Clone)]
+pub(super) struct LastStop {
+    /// When it was accepted.
+    pub(super) at: Instant,
+    /// When it came, and over which connection.
+    pub(super) arrival: Arrival,
+    by: Origin,
+}
+
+/// What is known of one drive.
+#[derive(Debug, Default)]
+pub(super) struct DriveGate {
+    /// Stops accepted so far.
+    stops: u64,
+    pub(super) last_stop: Option<LastStop>,
+    /// The login of the last client command; none if there was none, or its client has no login.
+    commander: Option<Arc<str>>,
+    pub(super) priorities: Priorities,
+    pub(super) holding: Holding,
+    pub(super) drill: Option<DrillLock>,
+    /// Commands that were carried out, or would have been refused, though another client held the drive.
+    unheld: u64,
+}
+
+/// What is known of the drives of a bus.
+#[derive(Debug, Default)]
+pub struct Gate {
+    /// `[authority]`, where it is on.
+    pub(super) rules: Option<Arc<Rules>>,
+    drives: BTreeMap<DriveIndex, DriveGate>,
+    /// The start guards.
+    pub(super) starts: Option<Arc<BusGuards>>,
+    /// Commands whose start was cleared and that are not over, with the drives that they start.
+    cleared: Vec<(u64, Vec<DriveIndex>)>,
+    hold_news: HoldNews,
+}
+
+/// What a bus hands over of a drive to the bus that takes its place.
+#[derive(Debug)]
+pub(crate) struct Inheritance {
+    stops: u64,
+    last_stop: Option<LastStop>,
+    commander: Option<Arc<str>>,
+    priorities: Priorities,
+    holding: Holding,
+}
+
+impl Gate {
+    /// The drive's part, which begins when it is asked for first.
+    pub(super) fn drive(&mut self, drive: DriveIndex) -> &mut DriveGate {
+        self.drives.entry(drive).or_default()
+    }
+
+    /// Judges a command as far as every drive is concerned that it reaches. A refusal is noted where it counts.
+    pub fn judge(&mut self, stage: Stage, command: &Command, facts: &dyn Facts, now: Instant) -> Verdict {
+        let (intent, origin) = (&command.intent, command.ticket.origin());
+        let drives: Vec<DriveIndex> = command.reach().collect();
+        let mut verdict = Verdict::Go;
+        for drive in drives {
+            let seen = facts.seen(drive);
+            let ask = Ask {
+                stage,
+                now,
+                drive,
+                intent,
+                origin,
+                seen: seen.as_ref(),
+            };
+            match (self.ask(&ask), &verdict) {
+                (refused @ Verdict::Refuse(_), _) => return refused,
+                (Verdict::Wait(until), Verdict::Wait(before)) => verdict = Verdict::Wait(until.max(*before)),
+                (Verdict::Go, _) => {}
+                (wait, _) => verdict = wait,
+            }
+        }
+        if stage == Stage::Turn && verdict == Verdict::Go {
+            verdict = self.clear(intent, now);
+        }
+        if stage == Stage::Turn && verdict == Verdict::Go {
+            self.hold_turn_came(command, now);
+        }
+        verdict
+    }
+
+    /// Judges one question. A refusal is noted where it counts.
+    pub fn ask(&mut self, ask: &Ask<'_>) -> Verdict {
+        let nothing_known = DriveGate::default();
+        let drive = self.drives.get(&ask.drive).unwrap_or(&nothing_known);
+        let verdict = judge::judge(ask, drive, self);
+        if let Verdict::Refuse(Outcome::Refused(refusal)) = &verdict {
+            if ask.stage == Stage::Accept {
+                self.note_refused_run(ask);
+            }
+            if let Some(starts) = &self.starts {
+                starts.count_refused(ask.drive, refusal);
+            }
+        }
+        verdict
+    }
+
+    /// Counts the starts that a command causes whose turn came, and looks whether they are on disk.
+    fn clear(&mut self, intent: &Intent, now: Instant) -> Verdict {
+        let Some(starts) = self.starts.clone() else {
+            return Verdict::Go;
+        };
+        let started: Vec<DriveIndex> = starts.started_by(&intent.effects).collect();
+        if started.is_empty() {
+            return Verdict::Go;
+        }
+        let clearance = starts.clear(&started, intent.number, intent.window.expires, now);
+        if !self.cleared.iter().any(|(number, _)| *number == intent.number) {
+            self.cleared.push((intent.number, started));
+        }
+        match clearance {
+            Clearance::Go => Verdict::Go,
+            Clearance::Wait(until) => Verdict::Wait(until),
+            Clearance::Refused(guarded) => {
+                let refusal = Refusal::Guarded(Box::new(guarded));
+                starts.count_refused(intent.drive, &refusal);
+                Verdict::refuse(refusal)
+            }
+        }
+    }
+
+    /// Starts that were cleared for commands that have ended count as made, whatever they wrote.
+    pub fn settle(&mut self, is_alive: impl Fn(u64) -> bool) {
+        let Some(starts) = &self.starts else { return };
+        self.cleared.retain(|(number, drives)| {
+            let alive = is_alive(*number);
+            if !alive {
+                drives.iter().for_each(|drive| starts.settle(*drive, *number));
+            }
+            alive
+        });
+    }
+
+    /// Whether a start was cleared for a command that is not over.
+    pub fn has_cleared(&self) -> bool {
+        !self.cleared.is_empty()
+    }
+
+    /// A command was accepted: who gave it, what it withdraws, whose hold it takes or ends.
+    pub(crate) fn accepted(&mut self, command: &Command, now: Instant) {
+        if command.urgency() == Urgency::Read {
+            return;
+        }
+        self.hold_accepted(command, now);
+        let origin = command.ticket.origin();
+        for (drive, effect) in command.intent.effects.iter() {
+            let of_drive = self.drive(drive);
+            if !command.is_inherited() {
+                let slot = command.intent.slot.as_ref();
+                of_drive.priorities.accepted(origin, effect, slot, now);
+            }
+            if origin.kind.is_client() {
+                of_drive.commander = origin.login().cloned();
+            }
+        }
+    }
+
+    /// A stop was accepted.
+    pub(crate) fn stop_accepted(&mut self, drive: DriveIndex, arrival: Arrival, by: Origin, now: Instant) {
+        let of_drive = self.drive(drive);
+        of_drive.stops += 1;
+        let at = of_drive.last_stop.as_ref().map_or(now, |last| now.max(last.at));
+        of_drive.last_stop = Some(LastStop { at, arrival, by });
+    }
+
+    /// Whether a stop of that drive was accepted after a command's first byte came.
+    pub(crate) fn is_behind_a_stop(&self, intent: &Intent) -> bool {
+        let stopped = |(drive, effect): (DriveIndex, crate::order::Effect)| {
+            let last = self.drives.get(&drive).and_then(|drive| drive.last_stop.as_ref());
+            !effect.stops && last.is_some_and(|last| last.is_after(&intent.window.arrival))
+        };
+        intent.effects.iter().any(stopped)
+    }
+
+    /// Whether a stop waits until its motor has run for `min_run`.
+    pub(crate) fn may_be_delayed(&self, stop: &Command) -> bool {
+        let (drive, origin) = (stop.intent.drive, stop.ticket.origin());
+        let last = self.drives.get(&drive).and_then(|drive| drive.last_stop.as_ref());
+        let last = last.map(|last| last.at);
+        let starts = self.starts.as_ref().filter(|_| origin.kind.stops_may_be_delayed());
+        starts.is_some_and(|starts| starts.is_ordinary_stop(drive, origin.client(), last))
+    }
+
+    /// Until when an ordinary stop of that drive waits.
+    pub fn stop_waits(&self, drive: DriveIndex, now: Instant) -> Option<Instant> {
+        self.starts.as_ref()?.stop_waits(drive, now)
+    }
+
+    /// Stops of that drive that were accepted so far, also by the bus before a reload.
+    pub fn stops(&self, drive: DriveIndex) -> u64 {
+        self.drives.get(&drive).map_or(0, |drive| drive.stops)
+    }
+
+    /// Who gave the last stop of that drive that was accepted.
+    pub(crate) fn last_stop_by(&self, drive: DriveIndex) -> Option<&Origin> {
+        Some(&self.drives.get(&drive)?.last_stop.as_ref()?.by)
+    }
+
+    /// The login that commanded a drive last, unless another client did since.
+    pub fn commander(&self, drive: DriveIndex) -> Option<&Arc<str>> {
+        self.drives.get(&drive)?.commander.as_ref()
+    }
+
+    /// The priority arrays of a drive.
+    pub fn priorities(&mut self, drive: DriveIndex) -> &mut Priorities {
+        &mut self.drive(drive).priorities
+    }
+
+    /// A drill begins, goes silent, or ends at that drive.
+    pub(crate) fn set_drill(&mut self, drive: DriveIndex, lock: Option<DrillLock>) {
+        self.drive(drive).drill = lock;
+    }
+
+    /// The drive to which a drill sends nothing but stops, and until when.
+    pub(crate) fn quiet(&self, now: Instant) -> Option<(DriveIndex, Instant)> {
+        self.drives.iter().find_map(|(drive, of_drive)| {
+            let until = of_drive.drill.as_ref()?.quiet_until.filter(|until| now < *until)?;
+            Some((*drive, until))
+        })
+    }
+
+    /// The start guards, if any drive of the bus has some.
+    pub fn starts(&self) -> Option<&Arc<BusGuards>> {
+        self.starts.as_ref()
+    }
+
+    /// From now on starts are guarded so.
+    pub(crate) fn set_starts(&mut self, starts: Option<Arc<BusGuards>>) {
+        self.starts = starts;
+    }
+
+    /// What the bus that takes the place of this one is to know of a drive.
+    pub(crate) fn inheritance(&mut self, drive: DriveIndex) -> Inheritance {
+        let of_drive = self.drive(drive);
+        Inheritance {
+            stops: of_drive.stops,
+            last_stop: of_drive.last_stop.clone(),
+            commander: of_drive.commander.clone(),
+            priorities: of_drive.priorities.clone(),
+            holding: of_drive.holding.clone(),
+        }
+    }
+
+    /// Takes over what the bus before a reload knew of a machine.
+    pub(crate) fn inherit(&mut self, drive: DriveIndex, from: Inheritance) {
+        let Inheritance {
+            stops,
+            last_stop,
+            commander,
+            priorities,
+            mut holding,
+        } = from;
+        // The next reading says it again.
+        holding.set_local(false, &mut Vec::new());
+        let of_drive = self.drive(drive);
+        (of_drive.stops, of_drive.last_stop, of_drive.commander) = (stops, last_stop, commander);
+        (of_drive.priorities, of_drive.holding) = (priorities, holding);
+    }
+
+    /// The stops of a drive that is new count from that number on.
+    pub(crate) fn count_stops_from(&mut self, drive: DriveIndex, number: u64) {
+        self.drive(drive).stops = number;
+    }
+
+    fn claim(&self, origin: &Origin) -> Option<Claim> {
+        self.rules.as_ref()?.claim_of(origin)
+    }
+}
+
+impl LastStop {
+    /// Whether the stop was accepted after the first byte of another order came. Over one connection the orders have their
+    /// own order: what follows a stop there is newer than it.
+    pub(super) fn is_after(&self, order: &Arrival) -> bool {
+        order.asked < self.at && order.connection != self.arrival.connection
+    }
+}

@@ -1,0 +1,292 @@
+//! Who holds the drives of the bus, where `[authority]` is on: what accepted and refused orders change about it.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::{DriveGate, Gate};
+use crate::drive::DriveIndex;
+use crate::order::{Asks, Command, Holder, Origin, Refusal};
+use crate::permit::holder::{Claim, Denial, HoldView, Holding, Mode, Rules, Told, Verb};
+use crate::permit::judge::Ask;
+
+/// Most changes of holds waiting to be published, which happens several times a second; beyond that the oldest is
+/// dropped.
+const MOST_TOLD: usize = 256;
+/// A command of a client that does not hold its drive is logged once in this time.
+const UNHELD_LOGGED: Duration = Duration::from_secs(60);
+
+/// Changes of holds that are to be published, and commands to be logged.
+#[derive(Debug, Default)]
+pub(super) struct HoldNews {
+    told: Vec<(DriveIndex, Told)>,
+    unheld: Vec<(DriveIndex, Unheld)>,
+    /// When a command of a client that did not hold its drive was last logged.
+    logged: BTreeMap<Arc<str>, Instant>,
+}
+
+/// A command that advisory mode carried out.
+#[derive(Debug, Clone)]
+pub struct Unheld {
+    /// Who gave it.
+    pub client: Arc<str>,
+    /// Why exclusive mode would have refused it.
+    pub why: String,
+}
+
+impl HoldNews {
+    fn tell(&mut self, drive: DriveIndex, told: Vec<Told>) {
+        self.told.extend(told.into_iter().map(|told| (drive, told)));
+        let beyond = self.told.len().saturating_sub(MOST_TOLD);
+        self.told.drain(..beyond);
+    }
+
+    /// Notes a command that exclusive mode would have refused, for the log: once a client and minute.
+    fn note_unheld(&mut self, drive: DriveIndex, client: Arc<str>, denial: &Denial, rules: &Rules, now: Instant) {
+        self.logged.retain(|_, at| now < *at + UNHELD_LOGGED);
+        if self.logged.contains_key(&client) || self.unheld.len() >= MOST_TOLD {
+            return;
+        }
+        self.logged.insert(client.clone(), now);
+        let why = match denial.refusal(rules).holder() {
+            Some(Holder { who, rank, keeps, .. }) => format!("{who} ({rank}) {keeps}"),
+            None => "it is not a principal of [authority]".to_string(),
+        };
+        self.unheld.push((drive, Unheld { client, why }));
+    }
+}
+
+impl Gate {
+    /// Calls `change` with the rules and the holding of a drive, and the list of its changes; none while `[authority]`
+    /// is off.
+    fn with_hold<T>(
+        &mut self,
+        drive: DriveIndex,
+        change: impl FnOnce(&mut Holding, &Rules, &mut Vec<Told>) -> T,
+    ) -> Option<T> {
+        let rules = self.rules.clone()?;
+        let mut told = Vec::new();
+        let changed = change(&mut self.drive(drive).holding, &rules, &mut told);
+        self.hold_news.tell(drive, told);
+        Some(changed)
+    }
+
+    /// Applies new rules; none: `[authority]` is off, and all holds end.
+    pub(crate) fn set_rules(&mut self, rules: Option<Arc<Rules>>) {
+        if self.rules == rules {
+            return;
+        }
+        let drives: Vec<DriveIndex> = self.drives.keys().copied().collect();
+        if rules.is_some() {
+            self.rules = rules;
+            for drive in drives {
+                self.with_hold(drive, |holding, rules, told| holding.keep_known(rules, told));
+            }
+            return;
+        }
+        for drive in drives {
+            self.hold_ends(drive, "a reload turned [authority] off");
+            self.drive(drive).holding = Holding::default();
+        }
+        self.rules = None;
+    }
+
+    /// The hold of a drive ends, for that reason.
+    pub(crate) fn hold_ends(&mut self, drive: DriveIndex, why: &str) {
+        self.with_hold(drive, |holding, _, told| holding.end(why, told));
+    }
+
+    /// A run command that is refused after a stop is remembered: its client does not start the motor by going on with it.
+    pub(super) fn note_refused_run(&mut self, ask: &Ask<'_>) {
+        let Some(rules) = self.rules.clone().filter(|_| ask.origin.kind.is_client()) else {
+            return;
+        };
+        let who = rules.claim_of(ask.origin);
+        let holding = &mut self.drive(ask.drive).holding;
+        if let Err(denial) = holding.judge(who.as_ref(), ask.asks(), &rules, ask.now) {
+            holding.refused(who.as_ref(), ask.asks(), &denial, &rules, ask.now);
+        }
+    }
+
+    /// Whether a client may begin something that asks so much of a drive, where no order is judged yet.
+    ///
+    /// # Errors
+    /// The refusal.
+    pub(crate) fn hold_lets(
+        &self,
+        drive: DriveIndex,
+        origin: &Origin,
+        asks: Asks,
+        now: Instant,
+    ) -> Result<(), Refusal> {
+        let nothing_known = DriveGate::default();
+        let drive = self.drives.get(&drive).unwrap_or(&nothing_known);
+        self.judge_hold(drive, origin, asks, now).map_or(Ok(()), Err)
+    }
+
+    /// Why an order of that client is refused, in exclusive mode, where the hold of the drive keeps it.
+    pub(in crate::permit) fn judge_hold(
+        &self,
+        drive: &DriveGate,
+        origin: &Origin,
+        asks: Asks,
+        now: Instant,
+    ) -> Option<Refusal> {
+        let rules = self.rules.as_ref().filter(|rules| rules.mode == Mode::Exclusive)?;
+        if !origin.kind.is_client() {
+            return None;
+        }
+        let denial = drive
+            .holding
+            .judge(rules.claim_of(origin).as_ref(), asks, rules, now)
+            .err()?;
+        Some(denial.refusal(rules))
+    }
+
+    /// An accepted command has its turn and passes: it takes the hold again if that has ended since.
+    pub(super) fn hold_turn_came(&mut self, command: &Command, now: Instant) {
+        let origin = command.ticket.origin();
+        let Some(who) = self.claim(origin).filter(|_| origin.kind.is_client()) else {
+            return;
+        };
+        for (drive, effect) in command.intent.effects.iter() {
+            let asks = Asks::of(&command.intent.order, effect);
+            self.with_hold(drive, |holding, rules, told| {
+                holding.turn_came(&who, asks, rules, now, told);
+            });
+        }
+    }
+
+    /// A command is accepted.
+    pub(super) fn hold_accepted(&mut self, command: &Command, now: Instant) {
+        // Of a stop that another bus accepted, it was noted there.
+        let Some(rules) = self.rules.clone().filter(|_| !command.is_inherited()) else {
+            return;
+        };
+        let origin = command.ticket.origin();
+        let who = rules.claim_of(origin);
+        for (drive, effect) in command.intent.effects.iter() {
+            let asks = Asks::of(&command.intent.order, effect);
+            if !origin.kind.is_client() {
+                if asks == Asks::Stop {
+                    let supervision = origin.is_lease();
+                    self.with_hold(drive, |holding, rules, told| {
+                        holding.stopped_by_gateway(supervision, rules, now, told);
+                    });
+                }
+                continue;
+            }
+            let unheld = self.with_hold(drive, |holding, rules, told| {
+                let unheld = holding.judge(who.as_ref(), asks, rules, now).err();
+                holding.accepted(who.as_ref(), asks, rules, now, told);
+                unheld
+            });
+            if let Some(denial) = unheld.flatten() {
+                self.drive(drive).unheld += 1;
+                let client = who
+                    .as_ref()
+                    .map_or_else(|| origin.client().clone(), |who| who.name.clone());
+                self.hold_news.note_unheld(drive, client, &denial, &rules, now);
+            }
+        }
+    }
+
+    /// A client was received from: its heartbeat came, or its order was carried out.
+    pub fn hold_renewed(&mut self, drive: DriveIndex, origin: &Origin, now: Instant) {
+        let Some(who) = self.claim(origin) else { return };
+        self.with_hold(drive, |holding, rules, _| holding.renew(&who, rules, now));
+    }
+
+    /// Whether supervision follows that client: it holds the drive, or was the last holder, or there was none.
+    pub fn hold_renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
+        let known = self.rules.as_ref().and_then(|_| self.drives.get(&drive));
+        known.is_none_or(|drive| drive.holding.is_whose_silence_counts(self.claim(origin).as_ref()))
+    }
+
+    /// Applies a client's action to a hold. Orders of other clients that wait or have started are refused when they go on.
+    ///
+    /// # Errors
+    /// Why it may not; none while `[authority]` is off.
+    pub(crate) fn hold_act(
+        &mut self,
+        drive: DriveIndex,
+        origin: &Origin,
+        verb: Verb,
+        now: Instant,
+    ) -> Option<Result<(), Refusal>> {
+        let rules = self.rules.clone()?;
+        let who = rules.claim_of(origin);
+        let acted = self.with_hold(drive, |holding, rules, told| {
+            holding.act(who.as_ref(), verb, rules, now, told)
+        })?;
+        Some(acted.map_err(|denial: Denial| denial.refusal(&rules)))
+    }
+
+    /// The client stopped, though nothing is sent for it.
+    pub(crate) fn hold_said_stop(&mut self, drive: DriveIndex, origin: &Origin) {
+        let Some(who) = self.claim(origin) else { return };
+        self.with_hold(drive, |holding, _, _| holding.said_stop(&who));
+    }
+
+    /// Whether the local control place of a drive has it now.
+    pub fn set_local(&mut self, drive: DriveIndex, local: bool) {
+        self.with_hold(drive, |holding, _, told| holding.set_local(local, told));
+    }
+
+    /// Ends what has expired, and returns the changes since the last call.
+    pub fn take_told(&mut self, now: Instant) -> Vec<(DriveIndex, Told)> {
+        let drives: Vec<DriveIndex> = self.drives.keys().copied().collect();
+        for drive in drives {
+            self.with_hold(drive, |holding, rules, told| holding.settle(rules, now, told));
+        }
+        std::mem::take(&mut self.hold_news.told)
+    }
+
+    /// Commands of clients that did not hold their drive, to be logged.
+    pub fn take_unheld(&mut self) -> Vec<(DriveIndex, Unheld)> {
+        std::mem::take(&mut self.hold_news.unheld)
+    }
+
+    /// Whether that client writes its command word all the time, so that its repeated stop is no new one.
+    pub(crate) fn is_cyclic(&self, origin: &Origin) -> bool {
+        self.claim(origin).is_some_and(|who| who.cyclic)
+    }
+
+    /// The published state of a hold, and whether that client has it.
+    pub fn hold_view(&self, drive: DriveIndex, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
+        let rules = self.rules.as_ref()?;
+        let free = Holding::default();
+        let holding = self.drives.get(&drive).map_or(&free, |drive| &drive.holding);
+        let who = origin.and_then(|origin| rules.claim_of(origin));
+        let own = who.is_some_and(|who| holding.is_held_by(&who, now));
+        Some((holding.view(rules, now), own))
+    }
+
+    /// The client whose repeated stops end the holds of others.
+    pub(crate) fn repeater(&self, drive: DriveIndex) -> Option<Arc<str>> {
+        self.drives.get(&drive)?.holding.repeater().cloned()
+    }
+
+    /// Commands that were carried out in advisory mode though another client held the drive.
+    pub fn unheld(&self, drive: DriveIndex) -> u64 {
+        self.drives.get(&drive).map_or(0, |drive| drive.unheld)
+    }
+
+    /// The rules, where `[authority]` is on.
+    pub fn rules(&self) -> Option<&Arc<Rules>> {
+        self.rules.as_ref()
+    }
+
+    /// The reservation of a drive: until when, for whom by name and rank, and for how long such a one lasts.
+    pub(crate) fn reservation(&self, drive: DriveIndex, now: Instant) -> Option<(Instant, String, String, Duration)> {
+        let rules = self.rules.as_ref()?;
+        let (who, until) = self.drives.get(&drive)?.holding.reservation()?;
+        let rank = rules.rank(who.rank).to_string();
+        (until > now).then(|| (until, who.name.to_string(), rank, rules.lease))
+    }
+
+    /// A stop before the start of the process reserved the drive.
+    pub fn reserve(&mut self, drive: DriveIndex, who: Claim, until: Instant) {
+        self.with_hold(drive, |holding, _, _| holding.reserve(who, until));
+    }
+}

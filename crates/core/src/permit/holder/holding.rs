@@ -1,0 +1,509 @@
+//! The hold of one drive: holder, remaining time, and reservations after a stop. Pure: time is an argument.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::denial::seconds;
+use super::{Claim, Denial, Mode, Rules};
+use crate::order::Asks;
+
+/// Leases without a run command after which a client refused after a stop is forgotten.
+const FORGOTTEN_AFTER: u32 = 10;
+/// The name of the gateway's own stop after a client went silent.
+const SUPERVISION: &str = "supervision";
+/// Most clients whose last command word is remembered.
+const MOST_STOOD: usize = 256;
+
+/// An action on the hold of a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verb {
+    /// Takes a free drive, or renews.
+    Take,
+    /// Renews its hold.
+    Renew,
+    /// Gives it back; of one who does not hold it without effect.
+    Release,
+    /// Takes it from a lower rank.
+    Break,
+}
+
+impl Verb {
+    /// All.
+    pub const ALL: [Verb; 4] = [Verb::Take, Verb::Renew, Verb::Release, Verb::Break];
+
+    /// The word for it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Verb::Take => "take",
+            Verb::Renew => "renew",
+            Verb::Release => "release",
+            Verb::Break => "break",
+        }
+    }
+
+    /// The verb of that word.
+    pub fn of(name: &str) -> Option<Verb> {
+        Verb::ALL.into_iter().find(|verb| verb.name() == name)
+    }
+}
+
+/// Who has a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum HoldState {
+    /// No holder.
+    Free,
+    /// A client.
+    Held,
+    /// A stop reserved it.
+    Reserved,
+    /// Its local control place.
+    Local,
+}
+
+impl HoldState {
+    /// The word for it.
+    pub fn name(self) -> &'static str {
+        match self {
+            HoldState::Free => "free",
+            HoldState::Held => "held",
+            HoldState::Reserved => "reserved",
+            HoldState::Local => "local",
+        }
+    }
+}
+
+/// The published state of a hold.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct HoldView {
+    /// Who has it.
+    pub state: HoldState,
+    /// The holder, or who stopped it.
+    pub holder: Option<Arc<str>>,
+    /// The name of its rank.
+    pub rank: Option<Arc<str>>,
+    /// Seconds left, rounded up; 0 if free, none for local control.
+    pub left_s: Option<u64>,
+}
+
+/// A change of a hold, for an event.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Told {
+    /// The holder.
+    pub who: Claim,
+    /// The change.
+    pub what: What,
+}
+
+/// A change of a hold.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum What {
+    /// It began.
+    Held,
+    /// It ended, for that reason.
+    Released(String),
+    /// Another one broke it.
+    Broken(Claim),
+}
+
+#[derive(Debug, Clone, Default)]
+enum State {
+    #[default]
+    Free,
+    Held(Claim, Instant),
+    Reserved(Claim, Instant),
+}
+
+/// A client whose run command was refused after a stop.
+#[derive(Debug, Clone)]
+struct Waiting {
+    who: Claim,
+    /// Whose stop it was.
+    stopper: Claim,
+    /// When it last tried.
+    tried: Instant,
+}
+
+/// The hold of one drive.
+#[derive(Debug, Clone, Default)]
+pub struct Holding {
+    state: State,
+    local: bool,
+    /// The last holder: its silence is the one that counts.
+    last: Option<Claim>,
+    /// No more of them than principals.
+    waiting: Vec<Waiting>,
+    /// The clients whose last command word was a stop.
+    stood: Vec<Arc<str>>,
+    /// One that is not cyclic and ended the hold of another by a stop that repeated its last one.
+    repeater: Option<Arc<str>>,
+}
+
+impl Holding {
+    /// Ends what has expired.
+    pub fn settle(&mut self, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+        match &self.state {
+            State::Held(_, until) if *until <= now => self.ends("its lease ended", told),
+            State::Reserved(_, until) if *until <= now => self.state = State::Free,
+            _ => {}
+        }
+        let time = rules.lease * FORGOTTEN_AFTER;
+        self.waiting
+            .retain(|waiting| now.saturating_duration_since(waiting.tried) < time);
+    }
+
+    /// A hold ends; a reservation stays.
+    fn ends(&mut self, why: &str, told: &mut Vec<Told>) {
+        if let State::Held(who, _) = &self.state {
+            told.push(Told {
+                who: who.clone(),
+                what: What::Released(why.to_string()),
+            });
+            self.state = State::Free;
+        }
+    }
+
+    fn held(&self, now: Instant) -> Option<(&Claim, Duration)> {
+        match &self.state {
+            State::Held(by, until) if *until > now => Some((by, *until - now)),
+            _ => None,
+        }
+    }
+
+    fn reserved(&self, now: Instant) -> Option<(&Claim, Duration)> {
+        match &self.state {
+            State::Reserved(by, until) if *until > now => Some((by, *until - now)),
+            _ => None,
+        }
+    }
+
+    /// Whether a command of that client passes. Being a principal grants nothing; it was admitted before.
+    ///
+    /// # Errors
+    /// Why it does not; in advisory mode, why it would not.
+    pub fn judge(&self, who: Option<&Claim>, asks: Asks, rules: &Rules, now: Instant) -> Result<(), Denial> {
+        match (asks, who) {
+            (Asks::Nothing, _) | (Asks::Stop, None) => return Ok(()),
+            (_, None) => return Err(Denial::Nobody),
+            (Asks::Stop, Some(who)) => {
+                return match self.held(now) {
+                    Some((by, left)) if !by.is(who) && self.repeats(who) => Err(Denial::Repeats(by.clone(), left)),
+                    _ => Ok(()),
+                };
+            }
+            (Asks::Run | Asks::Steer | Asks::Other, Some(_)) => {}
+        }
+        let Some(who) = who else { return Ok(()) };
+        if self.local {
+            return Err(Denial::Local);
+        }
+        if let Some((by, left)) = self.held(now).filter(|(by, _)| !by.is(who)) {
+            let breaks = who.breaks && by.is_below(who) && asks.takes();
+            return if breaks {
+                Ok(())
+            } else {
+                Err(Denial::Held(by.clone(), left))
+            };
+        }
+        if let Some((by, left)) = self.reserved(now).filter(|(by, _)| who.is_below(by)) {
+            return Err(Denial::Reserved(by.clone(), left));
+        }
+        let waits = self.waiting.iter().find(|waiting| waiting.who.is(who));
+        let is_due = |waiting: &&Waiting| now.saturating_duration_since(waiting.tried) < rules.lease * FORGOTTEN_AFTER;
+        match waits.filter(is_due).filter(|_| asks == Asks::Run) {
+            Some(waiting) if self.held(now).is_none() => Err(Denial::NeedsTake(waiting.stopper.clone())),
+            _ => Ok(()),
+        }
+    }
+
+    /// A command was refused; a run command after a stop is remembered.
+    pub fn refused(&mut self, who: Option<&Claim>, asks: Asks, denial: &Denial, rules: &Rules, now: Instant) {
+        self.note_word(who, asks);
+        let Some(who) = who.filter(|_| asks == Asks::Run && rules.mode == Mode::Exclusive) else {
+            return;
+        };
+        let (Denial::Reserved(stopper, _) | Denial::NeedsTake(stopper)) = denial else {
+            return;
+        };
+        match self.waiting.iter_mut().find(|waiting| waiting.who.is(who)) {
+            Some(waiting) => waiting.tried = now,
+            None => self.waiting.push(Waiting {
+                who: who.clone(),
+                stopper: stopper.clone(),
+                tried: now,
+            }),
+        }
+    }
+
+    /// A command was accepted.
+    pub fn accepted(&mut self, who: Option<&Claim>, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+        self.settle(rules, now, told);
+        let repeats = asks == Asks::Stop && who.is_some_and(|who| self.repeats(who));
+        let ends = |who: &&Claim| asks == Asks::Stop && self.held(now).is_some_and(|(by, _)| !by.is(who));
+        if let Some(who) = who.filter(|who| self.stood.contains(&who.name)).filter(ends) {
+            self.repeater = Some(who.name.clone());
+        }
+        self.note_word(who, asks);
+        match (asks, who) {
+            (Asks::Nothing, _) => {}
+            (Asks::Stop, _) if repeats => {}
+            (Asks::Stop, None) => self.ends("someone stopped the drive", told),
+            (Asks::Stop, Some(who)) => self.stopped(who, rules, now, told),
+            (Asks::Run | Asks::Steer, Some(who)) => self.taken(who, rules, now, told),
+            (Asks::Other, Some(who)) => self.renew(who, rules, now),
+            (Asks::Run | Asks::Steer | Asks::Other, None) => {}
+        }
+    }
+
+    fn stopped(&mut self, who: &Claim, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+        self.said_stop(who);
+        match &self.state {
+            State::Held(by, _) if by.is(who) => return self.renew(who, rules, now),
+            State::Reserved(by, _) if who.is_below(by) => return,
+            State::Held(..) => self.ends(&format!("{} stopped the drive", who.name), told),
+            State::Free | State::Reserved(..) => {}
+        }
+        self.state = State::Reserved(who.clone(), now + rules.lease);
+    }
+
+    /// Supervision stops the drive with the rank of the client that went silent. Any other stop of the gateway's own
+    /// reserves nothing.
+    pub fn stopped_by_gateway(&mut self, supervision: bool, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+        self.settle(rules, now, told);
+        self.ends("the gateway stopped the drive", told);
+        let Some(silent) = self.last.as_ref().filter(|_| supervision) else {
+            return;
+        };
+        let stopper = Claim {
+            name: SUPERVISION.into(),
+            rank: silent.rank,
+            cyclic: false,
+            breaks: false,
+        };
+        if !matches!(&self.state, State::Reserved(by, _) if stopper.is_below(by)) {
+            self.state = State::Reserved(stopper, now + rules.lease);
+        }
+    }
+
+    /// The client stopped, or gave its run back: it does not continue a run that was refused.
+    pub fn said_stop(&mut self, who: &Claim) {
+        self.waiting.retain(|waiting| !waiting.who.is(who));
+    }
+
+    fn taken(&mut self, who: &Claim, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+        if self.local {
+            return;
+        }
+        let held = What::Held;
+        match &self.state {
+            State::Held(by, _) if by.is(who) => {}
+            State::Held(by, _) if rules.mode == Mode::Exclusive => told.push(Told {
+                who: by.clone(),
+                what: What::Broken(who.clone()),
+            }),
+            State::Held(..) => {
+                self.ends(&format!("{} commanded the drive", who.name), told);
+                told.push(Told {
+                    who: who.clone(),
+                    what: held,
+                });
+            }
+            State::Free | State::Reserved(..) => told.push(Told {
+                who: who.clone(),
+                what: held,
+            }),
+        }
+        self.said_stop(who);
+        self.last = Some(who.clone());
+        self.state = State::Held(who.clone(), now + rules.lease);
+    }
+
+    /// An accepted command has its turn and passes: it takes the hold again if that has ended since.
+    pub(crate) fn turn_came(&mut self, who: &Claim, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+        self.settle(rules, now, told);
+        if asks.takes() && rules.mode == Mode::Exclusive && !self.is_held_by(who, now) {
+            self.taken(who, rules, now, told);
+        }
+    }
+
+    /// A command of that client was executed, or its heartbeat arrived: renews its hold. A lease is never shortened.
+    pub fn renew(&mut self, who: &Claim, rules: &Rules, now: Instant) {
+        if let State::Held(by, until) = &mut self.state
+            && by.is(who)
+            && *until > now
+        {
+            *until = (*until).max(now + rules.lease);
+        }
+    }
+
+    /// Applies a client's action to the hold.
+    ///
+    /// # Errors
+    /// Why it may not.
+    pub fn act(
+        &mut self,
+        who: Option<&Claim>,
+        verb: Verb,
+        rules: &Rules,
+        now: Instant,
+        told: &mut Vec<Told>,
+    ) -> Result<(), Denial> {
+        self.settle(rules, now, told);
+        let who = who.ok_or(Denial::Nobody)?;
+        if verb == Verb::Release {
+            self.release(who, told);
+            return Ok(());
+        }
+        if self.local {
+            return Err(Denial::Local);
+        }
+        match &self.state {
+            State::Held(by, _) if by.is(who) => self.renew(who, rules, now),
+            State::Held(by, _) if verb == Verb::Break && by.is_below(who) => self.taken(who, rules, now, told),
+            State::Held(by, until) => return Err(Denial::Held(by.clone(), *until - now)),
+            State::Reserved(by, until) if who.is_below(by) => return Err(Denial::Reserved(by.clone(), *until - now)),
+            State::Free | State::Reserved(..) if verb == Verb::Renew => return Err(Denial::NotHeld),
+            State::Free | State::Reserved(..) => self.taken(who, rules, now, told),
+        }
+        self.said_stop(who);
+        Ok(())
+    }
+
+    fn release(&mut self, who: &Claim, told: &mut Vec<Told>) {
+        match &self.state {
+            State::Held(by, _) if by.is(who) => self.ends("its holder released it", told),
+            State::Reserved(by, _) if by.is(who) => self.state = State::Free,
+            _ => {}
+        }
+        self.waiting.retain(|waiting| !waiting.stopper.is(who));
+    }
+
+    /// Sets whether the drive is under local control. That ends a hold, but not a reservation.
+    pub fn set_local(&mut self, local: bool, told: &mut Vec<Told>) {
+        if local && !self.local {
+            self.ends("the drive was switched to its local control place", told);
+        }
+        self.local = local;
+    }
+
+    /// Whether it is under local control, as last reported.
+    pub fn is_local(&self) -> bool {
+        self.local
+    }
+
+    /// After a reload: principals that are gone hold nothing, those that changed have their new rank.
+    pub(crate) fn keep_known(&mut self, rules: &Rules, told: &mut Vec<Told>) {
+        if let State::Held(by, _) = &self.state
+            && !rules.knows(by)
+        {
+            self.ends("a reload removed it from [authority]", told);
+        }
+        let rank_of = |claim: &mut Claim| {
+            if let Some(known) = rules.principals.iter().find(|p| p.name == claim.name) {
+                (claim.rank, claim.cyclic) = (known.rank, known.cyclic);
+            }
+            claim.rank = claim.rank.min(rules.ranks.len().saturating_sub(1));
+        };
+        match &mut self.state {
+            State::Held(by, _) | State::Reserved(by, _) => rank_of(by),
+            State::Free => {}
+        }
+        self.last = self.last.take().filter(|last| rules.knows(last));
+        self.last.iter_mut().for_each(rank_of);
+        self.waiting.retain(|waiting| rules.knows(&waiting.who));
+        let is_known = |name: &Arc<str>| rules.principals.iter().any(|p| p.name == *name);
+        self.stood.retain(is_known);
+        self.repeater = None;
+    }
+
+    /// Ends the hold, for that reason.
+    pub fn end(&mut self, why: &str, told: &mut Vec<Told>) {
+        self.ends(why, told);
+    }
+
+    /// Whether the silence of that client is the one that counts: it is the holder, or was the last one.
+    pub(crate) fn is_whose_silence_counts(&self, who: Option<&Claim>) -> bool {
+        match &self.last {
+            None => true,
+            Some(last) => who.is_some_and(|who| who.is(last)),
+        }
+    }
+
+    /// The holder, unless its hold was seen to end.
+    pub fn holder(&self) -> Option<&Arc<str>> {
+        match &self.state {
+            State::Held(by, _) => Some(&by.name),
+            State::Free | State::Reserved(..) => None,
+        }
+    }
+
+    /// The client whose repeated stops end the holds of others: it should be cyclic.
+    pub(crate) fn repeater(&self) -> Option<&Arc<str>> {
+        self.repeater.as_ref()
+    }
+
+    /// The present reservation: for whom, and until when.
+    pub(crate) fn reservation(&self) -> Option<(&Claim, Instant)> {
+        match &self.state {
+            State::Reserved(by, until) => Some((by, *until)),
+            State::Free | State::Held(..) => None,
+        }
+    }
+
+    /// A stop before the start of the process reserved the drive.
+    pub fn reserve(&mut self, who: Claim, until: Instant) {
+        if let State::Free = self.state {
+            self.state = State::Reserved(who, until);
+        }
+    }
+
+    /// Whether that client holds the drive.
+    pub(crate) fn is_held_by(&self, who: &Claim, now: Instant) -> bool {
+        self.held(now).is_some_and(|(by, _)| by.is(who))
+    }
+
+    /// Its published state.
+    pub fn view(&self, rules: &Rules, now: Instant) -> HoldView {
+        let of = |state: HoldState, (by, left): (&Claim, Duration)| HoldView {
+            state,
+            holder: Some(by.name.clone()),
+            rank: Some(rules.rank(by.rank)),
+            left_s: Some(seconds(left)),
+        };
+        if self.local {
+            return HoldView {
+                state: HoldState::Local,
+                holder: Some("local".into()),
+                rank: Some("local".into()),
+                left_s: None,
+            };
+        }
+        let held = self.held(now).map(|held| of(HoldState::Held, held));
+        let reserved = || self.reserved(now).map(|reserved| of(HoldState::Reserved, reserved));
+        held.or_else(reserved).unwrap_or(HoldView {
+            state: HoldState::Free,
+            holder: None,
+            rank: None,
+            left_s: Some(0),
+        })
+    }
+
+    /// Whether that cyclic client's last word was a stop, too.
+    fn repeats(&self, who: &Claim) -> bool {
+        who.cyclic && self.stood.contains(&who.name)
+    }
+
+    fn note_word(&mut self, who: Option<&Claim>, asks: Asks) {
+        let Some(who) = who else { return };
+        match asks {
+            Asks::Stop if !self.stood.contains(&who.name) => {
+                // Beside the principals there may be any number of users of the machine.
+                if self.stood.len() >= MOST_STOOD {
+                    self.stood.remove(0);
+                }
+                self.stood.push(who.name.clone());
+            }
+            Asks::Run => self.stood.retain(|name| *name != who.name),
+            Asks::Stop | Asks::Steer | Asks::Other | Asks::Nothing => {}
+        }
+    }
+}

@@ -1,0 +1,191 @@
+//! Who a client is, and what rank it has. Pure.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ipnet::IpNet;
+
+use crate::order::{Origin, Proof};
+
+/// How commands of non-holders are treated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Mode {
+    /// They are counted, reported and executed.
+    Advisory,
+    /// They are refused, except stops.
+    Exclusive,
+}
+
+/// A client by the name that it has for all north sides.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Principal {
+    /// Its name.
+    pub name: Arc<str>,
+    /// Place of its rank; 0 is the highest.
+    pub rank: usize,
+    /// It writes its command word all the time: one that repeats its last stop is no new stop.
+    pub cyclic: bool,
+    /// Its addresses over Modbus TCP and TCP slots.
+    pub modbus_tcp: Vec<IpNet>,
+    /// The name in its certificate.
+    pub certificate: Option<String>,
+    /// Its user over HTTP.
+    pub http_user: Option<String>,
+    /// Its level of the MQTT topics `as/WHO`.
+    pub mqtt: Option<String>,
+    /// Whether it is the Sparkplug host.
+    pub sparkplug: bool,
+    /// Its addresses over BACnet.
+    pub bacnet: Vec<IpNet>,
+    /// Its user id at the local socket.
+    pub socket: Option<u32>,
+}
+
+impl Principal {
+    /// One that no connection proves to be it.
+    pub fn new(name: impl Into<Arc<str>>, rank: usize) -> Principal {
+        Principal {
+            name: name.into(),
+            rank,
+            cyclic: false,
+            modbus_tcp: Vec::new(),
+            certificate: None,
+            http_user: None,
+            mqtt: None,
+            sparkplug: false,
+            bacnet: Vec::new(),
+            socket: None,
+        }
+    }
+}
+
+/// Who a client is when it commands.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Claim {
+    /// Its name: two claims of one name are one principal.
+    pub name: Arc<str>,
+    /// Place of its rank; 0 is the highest.
+    pub rank: usize,
+    /// See [`Principal::cyclic`].
+    pub cyclic: bool,
+    /// Its commands break the hold of a lower rank by themselves: in BACnet the priority is the act.
+    pub breaks: bool,
+}
+
+impl Claim {
+    /// Whether it is the same principal.
+    pub fn is(&self, other: &Claim) -> bool {
+        self.name == other.name
+    }
+
+    /// Whether it ranks below another.
+    pub fn is_below(&self, other: &Claim) -> bool {
+        self.rank > other.rank
+    }
+}
+
+/// `[authority]` of the configuration, if on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Rules {
+    /// How commands of non-holders are treated.
+    pub mode: Mode,
+    /// Names of the ranks, the highest first; never empty.
+    pub ranks: Vec<Arc<str>>,
+    /// How long a hold lasts without renewal, and a reservation.
+    pub lease: Duration,
+    /// Whether a stop is written when a drive with its run command set is switched to local control.
+    pub stop_at_local: bool,
+    /// Those who are known by name.
+    pub principals: Vec<Principal>,
+}
+
+impl Rules {
+    /// The principal that sent a command; none if unknown.
+    pub(crate) fn claim_of(&self, origin: &Origin) -> Option<Claim> {
+        let claim = self.claim(origin.proof())?;
+        Some(Claim {
+            cyclic: claim.cyclic && !origin.insists(),
+            ..claim
+        })
+    }
+
+    /// The principal of a client; none if unknown.
+    pub fn claim(&self, proof: &Proof) -> Option<Claim> {
+        let named = |is: &dyn Fn(&Principal) -> bool| self.principals.iter().find(|p| is(p)).map(claim_of);
+        let matches = |field: &Option<String>, name: &str| field.as_deref() == Some(name);
+        match proof {
+            Proof::Nothing => None,
+            Proof::Certificate(name, address) => {
+                named(&|p| matches(&p.certificate, name)).or_else(|| self.at(*address, |p| &p.modbus_tcp))
+            }
+            Proof::Address(address) => self.at(*address, |p| &p.modbus_tcp),
+            Proof::User(user) => named(&|p| matches(&p.http_user, user)),
+            Proof::Topic(who) => named(&|p| matches(&p.mqtt, who)),
+            Proof::Sparkplug => named(&|p| p.sparkplug),
+            Proof::Uid(uid) => named(&|p| p.socket == Some(*uid)).or_else(|| Some(first(format!("socket:{uid}")))),
+            Proof::Pty(path) => Some(first(format!("slot:{path}"))),
+            Proof::Bacnet(address, priority) => {
+                let claim = self.at(*address, |p| &p.bacnet)?;
+                let rank = claim.rank.max(self.rank_of_priority(*priority));
+                Some(Claim {
+                    rank,
+                    breaks: true,
+                    ..claim
+                })
+            }
+        }
+    }
+
+    /// The principal with the longest prefix at an address.
+    fn at(&self, address: IpAddr, networks: impl Fn(&Principal) -> &Vec<IpNet>) -> Option<Claim> {
+        let address = address.to_canonical();
+        let longest = |p: &Principal| {
+            let of = networks(p).iter().filter(|network| network.contains(&address));
+            of.map(IpNet::prefix_len).max()
+        };
+        let known = self.principals.iter().filter_map(|p| Some((longest(p)?, p)));
+        known.max_by_key(|(length, _)| *length).map(|(_, p)| claim_of(p))
+    }
+
+    /// The rank that a priority of BACnet counts as, at most.
+    fn rank_of_priority(&self, priority: u8) -> usize {
+        let rank = match priority {
+            0..=2 => 0,
+            3..=8 => 1,
+            9..=14 => 2,
+            _ => 3,
+        };
+        rank.min(self.ranks.len().saturating_sub(1))
+    }
+
+    /// The name of a rank.
+    pub fn rank(&self, rank: usize) -> Arc<str> {
+        self.ranks.get(rank).cloned().unwrap_or_else(|| "?".into())
+    }
+
+    /// Whether that principal is still known.
+    pub fn knows(&self, claim: &Claim) -> bool {
+        // Names of principals have no colon.
+        claim.name.contains(':') || self.principals.iter().any(|p| p.name == claim.name)
+    }
+}
+
+fn claim_of(principal: &Principal) -> Claim {
+    Claim {
+        name: principal.name.clone(),
+        rank: principal.rank,
+        cyclic: principal.cyclic,
+        breaks: false,
+    }
+}
+
+/// Anyone who may open a socket or a pseudo-terminal without being named: the mode of the file is the authority.
+fn first(name: String) -> Claim {
+    Claim {
+        name: name.into(),
+        rank: 0,
+        cyclic: false,
+        breaks: false,
+    }
+}

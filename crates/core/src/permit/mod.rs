@@ -1,0 +1,31 @@
+//! When an order may move a motor: one gate, asked at every moment that counts, about the world as it is then.
+//!
+//! An order passes three moments ([`Stage`]): it is accepted into the queue of its bus, its turn comes on the line, and each of its
+//! frames is about to go. Between two of them the world changes: another client, a stop, a reload, a pause of the process, a drive
+//! that restarts, a person at the panel. So there is one list of rules (`judge`), each in a file of its own below `rules`, and one
+//! state that they look at ([`Gate`]). Who asks does not know the rules, and a rule does not know who asks. Before an order is
+//! judged it is checked and converted by profile and limits ([`admit`]).
+//!
+//! - `admit`: what the profile, the configuration and the limits let through. `reference_limits`: the present reference
+//!   under a changed frequency range.
+//! - `holder`: principals and who holds a drive. `priorities`: the slots of BACnet. The starts of motors are counted in
+//!   [`crate::start_guard`].
+//! - `gate`: what is known of the drives of a bus that decides about orders.
+//! - `judge`: the list. `rules`: the rules.
+
+mod admit;
+mod gate;
+mod holder;
+mod judge;
+mod priorities;
+mod reference_limits;
+mod rules;
+
+pub use admit::{admit, authority, converted, may_restore, sets_twice};
+pub use gate::{DrillLock, Gate, Unheld};
+pub use holder::{
+    Claim, Denial, HoldState, HoldView, Holding, KeptReservation, Mode, Principal, Rules, Told, Verb, What,
+};
+pub use judge::{Ask, Facts, Seen, Stage, Verdict};
+pub use priorities::{Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled};
+pub use reference_limits::{LastWritten, is_reference, limits_passed};

@@ -1,0 +1,28 @@
+//! Whether a drill is under way at the drive: no other order runs meanwhile, and a stop ends it. While it keeps the line silent
+//! nothing at all is sent to the drive but stops.
+
+use crate::order::{Holder, Refusal};
+use crate::permit::gate::{DriveGate, Gate};
+use crate::permit::judge::{Ask, Rule, Stage, Verdict};
+
+pub(in crate::permit) const RULE: Rule = Rule {
+    stages: &[Stage::Accept, Stage::Turn, Stage::Write],
+    binds_stops: false,
+    judge,
+};
+
+fn judge(ask: &Ask<'_>, drive: &DriveGate, _: &Gate) -> Verdict {
+    let Some(drill) = &drive.drill else { return Verdict::Go };
+    if ask.changes() && !ask.origin.is_drill() {
+        return Verdict::refuse(Refusal::HeldByOther(Box::new(Holder {
+            who: drill.who.clone(),
+            rank: "drill".to_string(),
+            keeps: "is under way; a stop ends it".to_string(),
+            left_s: None,
+        })));
+    }
+    match drill.quiet_until {
+        Some(until) if ask.now < until => Verdict::Wait(until),
+        _ => Verdict::Go,
+    }
+}

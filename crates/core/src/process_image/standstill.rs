@@ -1,0 +1,88 @@
+//! Whether a motor stands, as far as reads show it. Pure.
+
+use std::time::Instant;
+
+use super::{Reading, Unavailable};
+use crate::drive::{ModelPoint, PollClass, Value};
+
+/// Causes (`blocks` of a point in the profile) by which a motor may turn whatever the drive does with it.
+const FED_OTHERWISE: [&str; 2] = ["bypass", "fire_mode"];
+
+/// Output frequency in Hz up to which a motor that does not run stands.
+const STANDS: f64 = 0.5;
+
+/// The state of a motor in readings.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Standstill {
+    /// It stands.
+    Stands,
+    /// It turns, with the evidence.
+    Turns(String),
+    /// Neither is known; why.
+    Unknown(String),
+}
+
+impl Reading<'_> {
+    /// Whether the motor stands, by good samples that were read after `since`: at zero speed, or without output frequency, and
+    /// not running.
+    pub fn standstill(&self, since: Option<Instant>) -> Standstill {
+        if let Some(why) = self.may_turn() {
+            return Standstill::Unknown(why);
+        }
+        let is_after = |at: Option<Instant>| since.is_none_or(|since| at.is_some_and(|at| at > since));
+        let known = |point| {
+            let sample = self.model(point);
+            sample.good().filter(|_| is_after(sample.at))
+        };
+        let running = known(ModelPoint::Running).map(Value::as_bool);
+        let at_zero = known(ModelPoint::ZeroSpeed).map(Value::as_bool);
+        let frequency = known(ModelPoint::OutputFrequency).map(|hertz| hertz.as_f64().abs());
+        match (running, at_zero, frequency) {
+            (Some(true), _, Some(hertz)) => Standstill::Turns(format!("`running` at {hertz:.1} Hz")),
+            (Some(true), _, None) => Standstill::Turns("`running`".to_string()),
+            (_, Some(true), _) => Standstill::Stands,
+            (_, _, Some(hertz)) if hertz > STANDS => Standstill::Turns(format!("`output_frequency` {hertz:.1} Hz")),
+            (Some(false), _, Some(_)) => Standstill::Stands,
+            _ if !self.tells_standstill() => Standstill::Unknown(
+                "standstill cannot be verified: the drive has neither `zero_speed` nor a frequency".to_string(),
+            ),
+            _ => Standstill::Unknown("it has not been read since".to_string()),
+        }
+    }
+
+    /// Whether the polls of the drive can show that the motor stands.
+    fn tells_standstill(&self) -> bool {
+        let reads = |point| {
+            let point = self.spec.profile.model_point(point);
+            point.is_some_and(|point| point.class != PollClass::Never)
+        };
+        reads(ModelPoint::ZeroSpeed) || (reads(ModelPoint::Running) && reads(ModelPoint::OutputFrequency))
+    }
+
+    /// Why a motor may turn though the drive stands: the point that says so, or does not say otherwise yet. One that the drive
+    /// refuses, or that is not polled, says nothing.
+    pub fn may_turn(&self) -> Option<String> {
+        let points = self.spec.profile.points.enumerate();
+        let reasons = points.filter_map(|(index, point)| {
+            let blocks = point.blocks.as_ref()?;
+            if !FED_OTHERWISE.contains(&blocks.cause.as_str()) {
+                return None;
+            }
+            match self.sample(index).good() {
+                Some(value) if value.as_bool() == blocks.when => {
+                    let state = if value.as_bool() { "on" } else { "off" };
+                    Some(format!("`{}` is {state}: {}", point.name, blocks.remedy))
+                }
+                Some(_) => None,
+                None => {
+                    let raw = point.raw()?;
+                    let is_awaited = self.words(raw.table, raw.address, raw.form.items()) == Err(Unavailable::Stale);
+                    is_awaited.then(|| format!("`{}` is unknown", point.name))
+                }
+            }
+        });
+        let reasons: Vec<String> = reasons.collect();
+        let motor = "the motor may turn although the drive is stopped";
+        (!reasons.is_empty()).then(|| format!("{motor}, {}", reasons.join(", ")))
+    }
+}

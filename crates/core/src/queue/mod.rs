@@ -1,0 +1,435 @@
+//! The command queue of a bus: bounded, ordered, with replacing, purging and expiry. Whether a command may go is asked of the
+//! gate ([`crate::permit`]), which is part of the queue.
+
+mod background;
+mod handover;
+mod passed_on;
+mod shared;
+mod stops;
+
+pub use background::{BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background};
+pub use shared::CommandQueue;
+pub use stops::{NotStopped, Stopping};
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::time::Instant;
+
+use crate::drive::DriveIndex;
+use crate::order::{CAPACITY, Command, Order, Origin, Outcome, Refusal, Urgency};
+use crate::permit::{Facts, Gate, Stage, Verdict};
+
+/// Most clients and drives whose turns are remembered.
+const SERVED_KEPT: usize = 4 * CAPACITY;
+/// Most refusals at a turn that wait to be reported, which happens before the next transaction; the oldest is dropped.
+const MOST_DENIED: usize = 256;
+
+/// The waiting commands: pure, time is an argument.
+///
+/// To one drive they go in the order in which they were accepted, from whatever client; only a stop goes ahead. What is
+/// passed on to several drives has its place among the commands of each of them. Between drives the clients take turns,
+/// and within a client its drives.
+#[derive(Debug, Default)]
+pub struct Pending {
+    waiting: VecDeque<Command>,
+    /// What decides whether they may go.
+    pub gate: Gate,
+    /// Set once the queue is closed: the outcome that every command gets.
+    closed: Option<Outcome>,
+    /// The gateway is about to stop: only stops get in.
+    stops_only: bool,
+    /// Clients and their drives in the order in which they were served, the last one last.
+    served: VecDeque<(String, DriveIndex)>,
+    /// Drives for which a stop arrived since the bus last checked, each once.
+    stopped: Vec<DriveIndex>,
+    /// The bus ends and another one takes its place: stops wait for that one.
+    ending: bool,
+    /// The queues that took over the stops of drives, and their places there.
+    heirs: BTreeMap<DriveIndex, (Arc<CommandQueue>, DriveIndex)>,
+    /// The stops that the gateway wants before it ends, until the bus takes note of it.
+    stopping: Option<Stopping>,
+    /// Commands that were refused at their turn, to be reported.
+    denied: VecDeque<Denied>,
+}
+
+/// The command that has its turn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Chosen {
+    /// Rank with which it competes for the line: a redundant stop has that of a command.
+    pub rank: Urgency,
+    number: u64,
+}
+
+/// An accepted command that was refused later, to be reported as one that was refused at once.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Denied {
+    /// The drive, or one of those that it was to reach.
+    pub drive: DriveIndex,
+    /// Who gave it.
+    pub origin: Origin,
+    /// What it was.
+    pub what: String,
+    /// Why.
+    pub refusal: Refusal,
+}
+
+/// What the bus says of a command that has not started.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ready {
+    /// Its drive is ready for it.
+    Now,
+    /// Its drive is busy with another one.
+    No,
+    /// Not before then.
+    At(Instant),
+}
+
+/// The commands that may go, and when to look again.
+#[derive(Debug, Default)]
+pub struct Choice {
+    /// The next one.
+    pub chosen: Option<Chosen>,
+    /// When another one may go.
+    pub wake_at: Option<Instant>,
+}
+
+impl Choice {
+    fn wait(&mut self, until: Instant) {
+        self.wake_at = Some(self.wake_at.map_or(until, |at| at.min(until)));
+    }
+}
+
+impl Pending {
+    /// Takes a command in. A stop removes the queued run and reference commands of its drive, or joins the stop that
+    /// waits; a newer reference takes the place of an older one. Stops always find room. When 64 other commands and
+    /// reads wait, a command takes the place of the youngest of a client that has more waiting than its own client would
+    /// have, or of a drive that its client has more waiting for.
+    ///
+    /// Returns the refusal where the gate refused it; it is answered then.
+    pub fn push(&mut self, mut command: Command, facts: &dyn Facts, now: Instant) -> Option<Refusal> {
+        let is_stop = command.is_stop();
+        if is_stop && let Some((queue, place)) = self.heirs.get(&command.intent.drive) {
+            let (queue, place) = (queue.clone(), *place);
+            command.move_to(place);
+            return queue.submit(command, facts, now);
+        }
+        let waits = self.ending && is_stop;
+        if let Some(outcome) = self.closed.clone().filter(|_| !waits) {
+            command.answer(&outcome, now);
+            return None;
+        }
+        if self.stops_only && !command.ends_the_gateway() {
+            command.answer(&Outcome::ShuttingDown, now);
+            return None;
+        }
+        self.delay(&mut command);
+        if let Verdict::Refuse(outcome) = self.gate.judge(Stage::Accept, &command, facts, now) {
+            command.answer(&outcome, now);
+            return match outcome {
+                Outcome::Refused(refusal) => Some(refusal),
+                _ => None,
+            };
+        }
+        match is_stop {
+            true => self.take_stop(command, now),
+            false => self.take_other(command, now),
+        }
+        None
+    }
+
+    /// Takes in a command that is no stop.
+    fn take_other(&mut self, command: Command, now: Instant) {
+        if let Some(index) = self.replaced_by(&command)
+            && let Some(older) = self.waiting.remove(index)
+        {
+            older.answer(&Outcome::Replaced, now);
+            self.gate.accepted(&command, now);
+            self.waiting.insert(index, command);
+            return;
+        }
+        let others = self.waiting.iter().filter(|c| !c.is_stop()).count();
+        if others >= CAPACITY {
+            match self.victim(&command).and_then(|index| self.waiting.remove(index)) {
+                Some(victim) => victim.answer(&Outcome::QueueFull, now),
+                None => {
+                    command.answer(&Outcome::QueueFull, now);
+                    return;
+                }
+            }
+        }
+        self.gate.accepted(&command, now);
+        self.waiting.push_back(command);
+    }
+
+    /// The numbers of the commands that wait.
+    pub fn numbers(&self) -> impl Iterator<Item = u64> + '_ {
+        self.waiting.iter().map(|c| c.intent.number)
+    }
+
+    /// The commands that were refused at their turn since the last call.
+    pub fn take_denied(&mut self) -> VecDeque<Denied> {
+        std::mem::take(&mut self.denied)
+    }
+
+    /// The queued reference that a newer one replaces: the last of the same points, unless a later command conflicts
+    /// with it.
+    fn replaced_by(&self, command: &Command) -> Option<usize> {
+        let to_drive = |c: &Command| c.urgency() != Urgency::Read && c.reaches(command.intent.drive);
+        let same = |c: &Command| c.is_reference_only() && same_points(&c.intent.order, &command.intent.order);
+        let touches = &command.intent.effects.touches;
+        let ends = |c: &Command| same(c) || !c.intent.effects.touches.commutes(touches);
+        let last = || self.waiting.iter().rposition(|c| to_drive(c) && ends(c));
+        let index = command.is_reference_only().then(last)??;
+        self.waiting.get(index).is_some_and(same).then_some(index)
+    }
+
+    /// The command displaced in a full queue: the newest of the client with the most entries, or else, within its own
+    /// client, of the drive with the most; neither may have fewer than the new command's client or drive would have.
+    fn victim(&self, command: &Command) -> Option<usize> {
+        let (client, drive) = (command.ticket.client(), command.intent.drive);
+        let of_client = |c: &Command| (c.ticket.client() == client).then_some(c.intent.drive);
+        self.youngest_of_most(|c| Some(c.ticket.client()), client)
+            .or_else(|| self.youngest_of_most(of_client, drive))
+    }
+
+    /// The youngest of those with the most of one kind, if they are more than the `own` ones would be with one more.
+    fn youngest_of_most<'p, K: PartialEq>(&'p self, kind: impl Fn(&'p Command) -> Option<K>, own: K) -> Option<usize> {
+        let others = || self.waiting.iter().enumerate().filter(|(_, c)| !c.is_stop());
+        let held = |wanted: &K| others().filter(|(_, c)| kind(c).as_ref() == Some(wanted)).count();
+        let counted = others().filter_map(|(index, c)| Some((held(&kind(c)?), index)));
+        let (most, index) = counted.max()?;
+        (most > held(&own) + 1).then_some(index)
+    }
+
+    /// The next command of that rank at `now`; expired and refused ones are removed. `ready` says whether the drive of a
+    /// command is ready for it: while the oldest for a drive cannot go, later ones for that drive wait. `redundant` decides
+    /// whether a stop has no effect on its drive, which gives it the rank of a command.
+    pub fn next(
+        &mut self,
+        rank: Urgency,
+        now: Instant,
+        facts: &dyn Facts,
+        mut ready: impl FnMut(&Command) -> Ready,
+        redundant: impl Fn(DriveIndex) -> bool,
+    ) -> Choice {
+        self.expire(now);
+        let mut choice = Choice::default();
+        let mut passed_over: Vec<u64> = Vec::new();
+        while let Some(number) = self.best(rank, &passed_over, &mut ready, &redundant, &mut choice) {
+            match self.judge_turn(number, facts, now) {
+                Verdict::Go => {
+                    choice.chosen = Some(Chosen { rank, number });
+                    break;
+                }
+                Verdict::Wait(until) => {
+                    choice.wait(until);
+                    passed_over.push(number);
+                }
+                Verdict::LookFirst => passed_over.push(number),
+                // Others may go in its place.
+                Verdict::Refuse(_) => choice.wait(now),
+            }
+        }
+        choice
+    }
+
+    /// The command that goes first of that rank as far as order and fairness say, those `passed_over` apart.
+    fn best(
+        &self,
+        rank: Urgency,
+        passed_over: &[u64],
+        ready: &mut impl FnMut(&Command) -> Ready,
+        redundant: &impl Fn(DriveIndex) -> bool,
+        choice: &mut Choice,
+    ) -> Option<u64> {
+        let mut is_ready = |command: &Command| match ready(command) {
+            Ready::Now => !passed_over.contains(&command.intent.number),
+            Ready::No => false,
+            Ready::At(until) => {
+                choice.wait(until);
+                false
+            }
+        };
+        let pressed = self.pressed();
+        let passed_on = match pressed.is_empty() || rank != Urgency::Command {
+            true => Vec::new(),
+            false => self.passed_on(&mut is_ready),
+        };
+        // Drives whose later commands wait: behind an older one, or behind a stop.
+        let mut behind: Vec<DriveIndex> = self.drives_of(Urgency::Stop);
+        let mut stopped: Vec<DriveIndex> = Vec::new();
+        let mut best = None;
+        for (index, command) in self.waiting.iter().enumerate() {
+            let (drive, urgency) = (command.intent.drive, command.urgency());
+            if urgency == Urgency::Stop {
+                // Of the stops of a drive the oldest goes first, anyone who else its client commands.
+                if stopped.contains(&drive) {
+                    continue;
+                }
+                stopped.push(drive);
+            }
+            let is_passed_on = command.as_passed_on().is_some();
+            let own = match urgency {
+                Urgency::Command if !is_passed_on && behind.contains(&drive) => continue,
+                Urgency::Stop if redundant(drive) && !self.may_start(drive) => Urgency::Command,
+                urgency => urgency,
+            };
+            if urgency == Urgency::Command {
+                behind.extend(command.reach());
+            }
+            let number = command.intent.number;
+            let goes = || pressed.contains(&number) && passed_on.contains(&number);
+            if own != rank || (is_passed_on && !goes()) || !is_ready(command) {
+                continue;
+            }
+            let (client, of_client) = self.served(command);
+            // `None`, never served, comes before any place. What was overtaken often enough comes before all.
+            let key = (command.overtaken < CAPACITY, client, of_client, index);
+            if best.is_none_or(|(best, _)| key < best) {
+                best = Some((key, number));
+            }
+        }
+        best.map(|(_, number)| number)
+    }
+
+    /// Judges a waiting command whose turn came. One that is refused is answered, and reported.
+    fn judge_turn(&mut self, number: u64, facts: &dyn Facts, now: Instant) -> Verdict {
+        let Some(index) = self.waiting.iter().position(|c| c.intent.number == number) else {
+            return Verdict::Go;
+        };
+        let Some(command) = self.waiting.get(index) else {
+            return Verdict::Go;
+        };
+        if command.is_delayed_stop()
+            && let Some(until) = self.gate.stop_waits(command.intent.drive, now)
+        {
+            return Verdict::Wait(until);
+        }
+        let verdict = self.gate.judge(Stage::Turn, command, facts, now);
+        if let Verdict::Refuse(outcome) = &verdict
+            && let Some(command) = self.waiting.remove(index)
+        {
+            self.deny(command, outcome, now);
+        }
+        verdict
+    }
+
+    /// Keeps the refusal of an accepted command to be reported.
+    pub fn note_denied(&mut self, denied: Denied) {
+        if self.denied.len() >= MOST_DENIED {
+            self.denied.pop_front();
+        }
+        self.denied.push_back(denied);
+    }
+
+    /// Answers an accepted command that is refused, and keeps the refusal to be reported.
+    fn deny(&mut self, command: Command, outcome: &Outcome, now: Instant) {
+        if let Outcome::Refused(refusal) = outcome {
+            self.note_denied(Denied {
+                drive: command.reach().next().unwrap_or(command.intent.drive),
+                origin: command.ticket.origin().clone(),
+                what: command.ticket.what().to_string(),
+                refusal: refusal.clone(),
+            });
+        }
+        command.answer(outcome, now);
+    }
+
+    /// Takes the command that was chosen, unless it was removed since.
+    pub fn take(&mut self, chosen: Chosen) -> Option<Command> {
+        let index = self.waiting.iter().position(|c| c.intent.number == chosen.number)?;
+        let command = self.waiting.remove(index)?;
+        for older in self.waiting.iter_mut().take(index) {
+            if older.urgency() >= command.urgency() {
+                older.overtaken += 1;
+            }
+        }
+        let of = (command.ticket.client().to_string(), command.intent.drive);
+        self.served.retain(|served| *served != of);
+        // Only clients that wait are counted: there are never more of them than waiting commands.
+        if self.served.len() >= SERVED_KEPT {
+            self.served.pop_front();
+        }
+        self.served.push_back(of);
+        Some(command)
+    }
+
+    /// When the client of that command was served last, and when its drive for it: places in order.
+    fn served(&self, command: &Command) -> (Option<usize>, Option<usize>) {
+        let client = command.ticket.client();
+        let last = self.served.iter().rposition(|(of, _)| of == client);
+        let of_drive = self
+            .served
+            .iter()
+            .position(|(of, drive)| of == client && *drive == command.intent.drive);
+        (last, of_drive)
+    }
+
+    fn drives_of(&self, urgency: Urgency) -> Vec<DriveIndex> {
+        let of_rank = self.waiting.iter().filter(|c| c.urgency() == urgency);
+        of_rank.map(|c| c.intent.drive).collect()
+    }
+
+    /// Whether a command waits that may start the drive.
+    fn may_start(&self, drive: DriveIndex) -> bool {
+        let starts = |c: &Command| c.reaches(drive) && c.is_command() && !c.is_reference_only() && !c.stops(drive);
+        self.waiting.iter().any(starts)
+    }
+
+    /// The latest expiry of a client's waiting command or stop for that drive; none if none waits.
+    pub fn client_waits_until(&self, drive: DriveIndex) -> Option<Instant> {
+        let commands = self
+            .waiting
+            .iter()
+            .filter(|c| c.reaches(drive) && c.urgency() != Urgency::Read);
+        commands.filter_map(Command::client_waits_until).max()
+    }
+
+    /// Ends expired commands. An accepted stop is sent, however long it waits.
+    fn expire(&mut self, now: Instant) {
+        self.remove(now, &Outcome::Expired, |c| {
+            c.intent.window.expires <= now && !c.is_stop()
+        });
+    }
+
+    /// Ends and removes the commands that `which` selects.
+    pub fn remove(&mut self, now: Instant, outcome: &Outcome, which: impl Fn(&Command) -> bool) {
+        let mut index = 0;
+        while let Some(command) = self.waiting.get(index) {
+            if which(command) {
+                if let Some(command) = self.waiting.remove(index) {
+                    command.answer(outcome, now);
+                }
+            } else {
+                index += 1;
+            }
+        }
+    }
+
+    /// Commands that wait.
+    pub fn len(&self) -> usize {
+        self.waiting.len()
+    }
+
+    /// Commands that wait to write, forwarded reads left out.
+    pub fn writes(&self) -> usize {
+        self.waiting.iter().filter(|c| c.urgency() < Urgency::Read).count()
+    }
+
+    /// Whether none waits.
+    pub fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+}
+
+fn same_points(older: &Order, newer: &Order) -> bool {
+    match (older, newer) {
+        (Order::Points(a), Order::Points(b)) => {
+            a.len() == b.len() && a.iter().zip(b).all(|((left, _), (right, _))| left == right)
+        }
+        _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,197 @@
+//! The command queue of a bus, shared by the servers and the bus: behind a lock, with the descriptor that wakes the
+//! bus.
+
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use rustix::event::{EventfdFlags, eventfd};
+use tokio::sync::oneshot;
+
+use super::{Background, NotStopped, Pending, Stopping};
+use crate::drive::DriveIndex;
+use crate::order::{BackgroundRequest, Command, Outcome, Refusal};
+use crate::permit::{DrillLock, Facts, Rules};
+use crate::start_guard::BusGuards;
+
+/// The queue between the north sides and one bus.
+#[derive(Debug)]
+pub struct CommandQueue {
+    pending: Mutex<Pending>,
+    background: Mutex<Background>,
+    /// Whether `[authority]` is on.
+    has_authority: AtomicBool,
+    /// Whether a drive is to be sent nothing for a time.
+    has_quiet: AtomicBool,
+    wake: OwnedFd,
+    guards: Option<Arc<BusGuards>>,
+}
+
+impl CommandQueue {
+    /// An empty queue.
+    ///
+    /// # Errors
+    /// When the system gives no event descriptor.
+    pub fn new() -> io::Result<CommandQueue> {
+        let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
+        Ok(CommandQueue {
+            pending: Mutex::default(),
+            background: Mutex::default(),
+            has_authority: AtomicBool::new(false),
+            has_quiet: AtomicBool::new(false),
+            wake,
+            guards: None,
+        })
+    }
+
+    /// The same with the start guards of its drives.
+    #[must_use]
+    pub fn guarded(mut self, guards: Option<Arc<BusGuards>>) -> CommandQueue {
+        self.lock().gate.set_starts(guards.clone());
+        self.guards = guards;
+        self
+    }
+
+    /// The start guards of its drives, if any.
+    pub fn guards(&self) -> Option<&Arc<BusGuards>> {
+        self.guards.as_ref()
+    }
+
+    /// Takes a command in and wakes the bus. Returns the refusal where the gate refused it; it is answered then.
+    pub fn submit(&self, command: Command, facts: &dyn Facts, now: Instant) -> Option<Refusal> {
+        let refusal = self.lock().push(command, facts, now);
+        self.wake();
+        refusal
+    }
+
+    /// Takes the stop of a command and its rest in, with nothing between them, and wakes the bus. Returns the refusals of both.
+    pub(crate) fn submit_parts(
+        &self,
+        stop: Command,
+        rest: Command,
+        facts: &dyn Facts,
+        now: Instant,
+    ) -> [Option<Refusal>; 2] {
+        let mut pending = self.lock();
+        let is_behind = pending.gate.is_behind_a_stop(&rest.intent);
+        let of_stop = pending.push(stop, facts, now);
+        let of_rest = match is_behind {
+            true => {
+                rest.answer(&Outcome::Purged, now);
+                None
+            }
+            false => pending.push(rest, facts, now),
+        };
+        drop(pending);
+        self.wake();
+        [of_stop, of_rest]
+    }
+
+    /// Takes a background request in and wakes the bus.
+    pub fn submit_background(&self, request: BackgroundRequest, now: Instant) {
+        self.background().push(request, now);
+        self.wake();
+    }
+
+    /// The waiting background requests, for the bus.
+    pub fn background(&self) -> MutexGuard<'_, Background> {
+        self.background.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The waiting commands, for the bus.
+    pub fn lock(&self) -> MutexGuard<'_, Pending> {
+        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Ends everything that waits, and everything submitted from now on, with `outcome`.
+    pub fn close(&self, outcome: Outcome, now: Instant) {
+        self.background().close(&outcome, now);
+        let mut pending = self.lock();
+        // That the port is gone does not matter to stops that another bus sends.
+        let keeps_stops = pending.ending && outcome == Outcome::BusDown;
+        pending.remove(now, &outcome, |c| !keeps_stops || !c.is_stop());
+        pending.ending = keeps_stops;
+        pending.closed = Some(outcome);
+    }
+
+    /// The gateway is shutting down: from now on only stops are accepted. Waiting commands end, except stops. The bus
+    /// stops its drives until `deadline`, and reports those that were not stopped.
+    pub fn begin_shutdown(&self, deadline: Instant, now: Instant) -> oneshot::Receiver<Vec<NotStopped>> {
+        let (report, missing) = oneshot::channel();
+        self.background().close(&Outcome::ShuttingDown, now);
+        let mut pending = self.lock();
+        pending.remove(now, &Outcome::ShuttingDown, |c| !c.is_stop());
+        pending.waiting.iter_mut().for_each(Command::hurry);
+        pending.stops_only = true;
+        pending.stopping = Some(Stopping { deadline, report });
+        drop(pending);
+        self.wake();
+        missing
+    }
+
+    /// Takes commands again.
+    pub fn open(&self) {
+        let mut pending = self.lock();
+        if pending.ending {
+            return;
+        }
+        pending.closed = None;
+        if !pending.stops_only {
+            self.background().open();
+        }
+    }
+
+    /// Wakes the bus from its wait.
+    pub fn wake(&self) {
+        // A full counter means that the bus is being woken already.
+        let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
+    }
+
+    /// Readable when the bus is to look at the queue.
+    pub fn wake_fd(&self) -> BorrowedFd<'_> {
+        self.wake.as_fd()
+    }
+
+    /// Clears the wake-up.
+    pub fn clear_wake(&self) {
+        let mut count = [0u8; 8];
+        // Nothing to read: the bus was not woken.
+        let _ = rustix::io::read(&self.wake, &mut count);
+    }
+
+    /// From now on these rules hold for the drives of the bus; none: `[authority]` is off.
+    pub fn set_authority(&self, rules: Option<Arc<Rules>>) {
+        let mut pending = self.lock();
+        self.has_authority.store(rules.is_some(), Ordering::Release);
+        pending.gate.set_rules(rules);
+    }
+
+    /// Whether `[authority]` is on.
+    pub fn has_authority(&self) -> bool {
+        self.has_authority.load(Ordering::Acquire)
+    }
+
+    /// A drill begins at that drive, goes silent, or ends.
+    pub fn set_drill(&self, drive: DriveIndex, lock: Option<DrillLock>) {
+        let mut pending = self.lock();
+        let is_quiet = lock.as_ref().is_some_and(|lock| lock.quiet_until.is_some());
+        self.has_quiet.store(is_quiet, Ordering::Release);
+        pending.gate.set_drill(drive, lock);
+        drop(pending);
+        self.wake();
+    }
+
+    /// The drive to which a drill sends nothing but stops, and until when.
+    pub fn quiet(&self, now: Instant) -> Option<(DriveIndex, Instant)> {
+        if !self.has_quiet.load(Ordering::Acquire) {
+            return None;
+        }
+        let pending = self.lock();
+        let quiet = pending.gate.quiet(now);
+        // Under the lock, so that one that begins now is not lost.
+        self.has_quiet.store(quiet.is_some(), Ordering::Release);
+        quiet
+    }
+}

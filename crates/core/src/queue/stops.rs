@@ -1,0 +1,154 @@
+//! Stops in the queue of a bus: ahead of everything, one that does nothing else and one that does for each drive, and what they
+//! end. Pure: time is an argument.
+
+use std::time::Instant;
+
+use tokio::sync::oneshot;
+
+use super::Pending;
+use crate::drive::DriveIndex;
+use crate::order::{Command, Haste, Order, Origin, Outcome, Work};
+
+/// The wish of the gateway, which is about to end, that a bus stops its drives.
+#[derive(Debug)]
+pub struct Stopping {
+    pub(super) deadline: Instant,
+    pub(super) report: oneshot::Sender<Vec<NotStopped>>,
+}
+
+/// A drive that did not get, or did not acknowledge, the stop that the gateway wanted before it ends.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NotStopped {
+    /// Its name.
+    pub drive: String,
+    /// The result of the stop, in words.
+    pub why: String,
+}
+
+impl std::fmt::Display for NotStopped {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "`{}` {}", self.drive, self.why)
+    }
+}
+
+impl Stopping {
+    /// When the gateway ends all the same.
+    pub fn deadline(&self) -> Instant {
+        self.deadline
+    }
+
+    /// The bus has finished; `missing` are the drives that were not stopped.
+    pub fn report(self, missing: Vec<NotStopped>) {
+        // The gateway may have given up waiting.
+        let _ = self.report.send(missing);
+    }
+}
+
+impl Pending {
+    /// A stop that `min_run` delays, or that repeats such a one for a cyclic client, waits: that is no second stop.
+    pub(super) fn delay(&self, command: &mut Command) {
+        let is_usual = matches!(&command.work, Work::Stop(stop) if stop.haste == Haste::Usual);
+        let delays = is_usual && (self.gate.may_be_delayed(command) || self.repeats(command));
+        if let Work::Stop(stop) = &mut command.work
+            && delays
+        {
+            stop.haste = Haste::Delayed;
+        }
+    }
+
+    /// Whether a cyclic client gives its waiting delayed stop again.
+    fn repeats(&self, stop: &Command) -> bool {
+        let origin = stop.ticket.origin();
+        let alike = |c: &Command| c.intent.drive == stop.intent.drive && c.intent.order == stop.intent.order;
+        let own = |c: &Command| c.ticket.origin().client() == origin.client();
+        let waits = |c: &Command| c.is_delayed_stop() && alike(c) && own(c);
+        self.waiting.iter().any(waits) && self.gate.is_cyclic(origin)
+    }
+
+    /// Until when the stop that waits for that drive does so by `min_run`.
+    pub fn stop_waits(&self, drive: DriveIndex, now: Instant) -> Option<Instant> {
+        let delayed = |c: &Command| c.is_delayed_stop() && c.intent.drive == drive;
+        self.waiting
+            .iter()
+            .any(delayed)
+            .then(|| self.gate.stop_waits(drive, now))?
+    }
+
+    /// Takes a stop in.
+    pub(super) fn take_stop(&mut self, stop: Command, now: Instant) {
+        let (drive, arrival) = (stop.intent.drive, stop.intent.window.arrival);
+        self.gate
+            .stop_accepted(drive, arrival, stop.ticket.origin().clone(), now);
+        self.push_stop(stop, now);
+    }
+
+    /// Of each drive one stop waits that does nothing else, and one that does. Later ones join theirs if they ask for
+    /// the same, and are answered with it; of two that also do different things, the newer one is sent.
+    pub(super) fn push_stop(&mut self, stop: Command, now: Instant) {
+        let drive = stop.intent.drive;
+        self.gate.accepted(&stop, now);
+        self.remove(now, &Outcome::Purged, |c| {
+            c.reaches(drive) && c.is_command() && !c.stops(drive)
+        });
+        if !self.stopped.contains(&drive) {
+            self.stopped.push(drive);
+        }
+        // A second stop waits for nothing, nor does the first one any more.
+        if !stop.is_delayed_stop() {
+            let of_drive = self.waiting.iter_mut().filter(|c| c.intent.drive == drive);
+            of_drive.for_each(Command::hurry);
+        }
+        let bare = stop.is_bare_stop();
+        let alike = |c: &Command| c.intent.drive == drive && c.is_stop() && c.is_bare_stop() == bare;
+        let waiting = self.waiting.iter_mut().find(|c| alike(c));
+        match waiting.map(|waiting| (waiting.intent.order == stop.intent.order, &mut waiting.work)) {
+            Some((true, Work::Stop(waiting))) => {
+                waiting.joined.push((stop.ticket, stop.intent.window.expires));
+                if let Work::Stop(stop) = stop.work {
+                    waiting.joined.extend(stop.joined);
+                }
+                return;
+            }
+            Some(_) => self.remove(now, &Outcome::Replaced, alike),
+            None => {}
+        }
+        self.waiting.push_back(stop);
+    }
+
+    /// Drives for which a stop arrived since the last call: their started commands end, whatever the result of the
+    /// stop.
+    pub fn take_stopped(&mut self) -> Vec<DriveIndex> {
+        std::mem::take(&mut self.stopped)
+    }
+
+    /// Withdraws a supervision action that has not started: a client commands the drive again.
+    pub fn withdraw_supervision(&mut self, drive: DriveIndex, now: Instant) {
+        self.remove(now, &Outcome::Withdrawn, |c| {
+            c.intent.drive == drive && c.origins().all(Origin::is_lease)
+        });
+    }
+
+    /// The stops that the gateway wants before it ends, once.
+    pub fn take_stopping(&mut self) -> Option<Stopping> {
+        self.stopping.take()
+    }
+}
+
+impl Command {
+    /// A stop that does nothing but take the run command away.
+    pub(super) fn is_bare_stop(&self) -> bool {
+        match &self.intent.order {
+            Order::Points(values) => values.len() == 1,
+            Order::Write(_) | Order::Read(_) | Order::Parameter(_) => false,
+        }
+    }
+
+    /// A stop is no longer delayed.
+    pub(super) fn hurry(&mut self) {
+        if let Work::Stop(stop) = &mut self.work
+            && stop.haste == Haste::Delayed
+        {
+            stop.haste = Haste::AtOnce;
+        }
+    }
+}

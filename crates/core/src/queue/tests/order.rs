@@ -1,0 +1,227 @@
+//! One order for each drive: what is passed on to several of them among the others, and what was asked for before a stop.
+
+use super::*;
+use crate::codec::{Reply, RequestPdu};
+use crate::drive::{DriveIndex, PointIndex};
+use crate::order::{Effect, Effects, Intent, NO_DRIVE, PassedOn};
+
+const START: u16 = 1;
+const STOP: u16 = 0;
+
+impl Clients {
+    /// A broadcast that a tool passes on to drives 1 and 2.
+    fn broadcast(&mut self, value: u16) -> Receiver<Answer> {
+        let origin = Origin::new(SourceKind::Slot, "tool");
+        let (ticket, receiver) = Ticket::new(origin, "all", String::new(), true, self.now, self.stats.clone());
+        let (frame, wanted) = tokio::sync::oneshot::channel();
+        std::mem::forget(wanted);
+        let effect = Effect {
+            stops: value == STOP,
+            run: Some(value == START),
+            ..Effect::default()
+        };
+        let effects = [1, 2].map(|drive| (DriveIndex::new(drive), effect)).to_vec();
+        let window = Window {
+            arrival: Arrival::now(self.now),
+            expires: self.now + EXPIRY,
+            waits: false,
+        };
+        let order = Order::Write(RequestPdu::write_register(2000, value));
+        let effects = Effects::on_all(effects, Touched::Anything);
+        let intent = Intent::new(NO_DRIVE, order, effects, window);
+        let passed_on = PassedOn {
+            address: 0,
+            may_write: true,
+            first: false,
+            frame,
+        };
+        self.pending
+            .push(Command::passed_on(intent, passed_on, ticket), &Unseen, self.now);
+        receiver
+    }
+
+    fn run_asked(&mut self, drive: usize, asked: Instant) -> Receiver<Answer> {
+        let (ticket, receiver) = ticket(&self.stats, self.now);
+        let admitted = Admitted {
+            order: points(&[1]),
+            urgency: Urgency::Command,
+            reference_only: false,
+            ranges: Vec::new(),
+        };
+        let mut command = command(drive, admitted, self.now, ticket);
+        command.intent.window.arrival.asked = asked;
+        self.pending.push(command, &Unseen, self.now);
+        receiver
+    }
+
+    fn passes_on(&mut self) -> bool {
+        self.pending
+            .next_passed_on(self.now, &Unseen, |_| Ready::Now)
+            .chosen
+            .is_some()
+    }
+}
+
+fn reference(percent: f64) -> Order {
+    Order::Points(vec![(PointIndex::new(7), Value::Number(percent))])
+}
+
+#[test]
+fn a_newer_reference_keeps_behind_an_order_that_sets_the_same() {
+    let mut rig = Clients::new();
+    let give = |rig: &mut Clients, order: Order, only: bool| {
+        rig.give((SourceKind::Mqtt, "t"), 1, Urgency::Command, order, only)
+    };
+    let mut first = give(&mut rig, reference(10.0), true);
+    let both = Order::Points(vec![
+        (PointIndex::new(1), Value::Bool(true)),
+        (PointIndex::new(7), Value::Number(20.0)),
+    ]);
+    let _both = give(&mut rig, both.clone(), false);
+    let mut second = give(&mut rig, reference(30.0), true);
+    assert_eq!((outcome(&mut first), outcome(&mut second)), (None, None));
+    // Behind that order the newest takes the place of the one before.
+    let _third = give(&mut rig, reference(40.0), true);
+    assert_eq!(outcome(&mut second), Some(Outcome::Replaced));
+    // What does not touch it changes nothing.
+    let _other = give(&mut rig, points(&[8]), false);
+    let _fourth = give(&mut rig, reference(50.0), true);
+    let sent: Vec<Order> = std::iter::from_fn(|| rig.take()).map(|c| c.intent.order).collect();
+    assert_eq!(sent, [reference(10.0), both, reference(50.0), points(&[8])]);
+}
+
+#[test]
+fn a_newer_reference_keeps_behind_what_it_rests_on() {
+    let range = |sets: &[usize], rests_on: &[usize]| {
+        let items = |points: &[usize]| points.iter().map(|point| (Table::Holding, *point as u16)).collect();
+        Touched::These {
+            sets: items(sets),
+            rests_on: items(rests_on),
+        }
+    };
+    let reference = range(&[7], &[9]);
+    assert!(reference.commutes(&range(&[1], &[])) && reference.commutes(&range(&[1], &[9])));
+    for other in [range(&[7], &[]), range(&[9], &[]), range(&[1], &[7]), Touched::Anything] {
+        assert!(!reference.commutes(&other) && !other.commutes(&reference), "{other:?}");
+    }
+}
+
+#[test]
+fn a_stop_drops_a_broadcast_that_reaches_its_drive_but_for_one_that_stops_it() {
+    let mut rig = Clients::new();
+    let (mut start, mut stops) = (rig.broadcast(START), rig.broadcast(STOP));
+    let _stop = rig.push(2, Urgency::Stop, &[1], false);
+    assert_eq!(outcome(&mut start), Some(Outcome::Purged));
+    assert_eq!(outcome(&mut stops), None);
+    // Held up at the tool meanwhile.
+    let asked = rig.now;
+    rig.now += Duration::from_millis(5);
+    let _stop = rig.push(1, Urgency::Stop, &[1], false);
+    let later = std::mem::replace(&mut rig.now, asked);
+    let mut held = rig.broadcast(START);
+    assert_eq!(outcome(&mut held), Some(Outcome::Purged));
+    rig.now = later;
+    assert_eq!(outcome(&mut rig.broadcast(START)), None);
+}
+
+#[test]
+fn a_broadcast_has_its_place_among_the_orders_of_each_drive() {
+    let mut rig = Clients::new();
+    let _before = rig.push_from("a", 1, &[1]);
+    let _broadcast = rig.broadcast(START);
+    assert!(!rig.passes_on(), "an older order waits for drive 1");
+    let _behind = rig.push_from("a", 2, &[2]);
+    let _beside = rig.push_from("a", 3, &[3]);
+    let order: Vec<usize> = std::iter::from_fn(|| rig.take())
+        .map(|c| c.intent.drive.place())
+        .collect();
+    let place = |drive| order.iter().position(|d| *d == drive);
+    assert!(
+        place(1) < place(NO_DRIVE.place()) && place(NO_DRIVE.place()) < place(2),
+        "{order:?}"
+    );
+    assert_eq!(order.len(), 4);
+    // Where nothing waits behind it, it waits for time that is left over.
+    let _broadcast = rig.broadcast(STOP);
+    assert_eq!(rig.pop(), None);
+    assert!(rig.passes_on());
+}
+
+#[test]
+fn a_broadcast_that_was_not_sent_is_not_put_back_behind_a_stop() {
+    let mut rig = Clients::new();
+    let mut broadcast = rig.broadcast(START);
+    let chosen = rig
+        .pending
+        .next_passed_on(rig.now, &Unseen, |_| Ready::Now)
+        .chosen
+        .unwrap();
+    let taken = rig.pending.take(chosen).unwrap();
+    rig.pending.put_back(taken, rig.now);
+    assert_eq!(outcome(&mut broadcast), None);
+    let chosen = rig
+        .pending
+        .next_passed_on(rig.now, &Unseen, |_| Ready::Now)
+        .chosen
+        .unwrap();
+    let taken = rig.pending.take(chosen).unwrap();
+    let _stop = rig.push(1, Urgency::Stop, &[1], false);
+    rig.pending.put_back(taken, rig.now);
+    assert_eq!(outcome(&mut broadcast), Some(Outcome::Purged));
+}
+
+#[test]
+fn what_was_asked_for_before_a_stop_does_not_go_behind_it() {
+    let mut rig = Clients::new();
+    let asked = rig.now;
+    rig.now += Duration::from_millis(50);
+    let _stop = rig.push(1, Urgency::Stop, &[1], false);
+    assert_eq!(rig.pop(), Some((1, Urgency::Stop)));
+    rig.now += Duration::from_millis(50);
+    assert_eq!(outcome(&mut rig.run_asked(1, asked)), Some(Outcome::Purged));
+    assert_eq!(outcome(&mut rig.run_asked(2, asked)), None, "another drive");
+    let now = rig.now;
+    assert_eq!(outcome(&mut rig.run_asked(1, now)), None, "asked for since");
+}
+
+#[test]
+fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
+    let stats: Arc<WriteStats> = Arc::default();
+    let now = Instant::now();
+    let give = |queue: &CommandQueue, drive: usize, urgency: Urgency| {
+        let (ticket, receiver) = ticket(&stats, now);
+        let admitted = Admitted {
+            order: points(&[1]),
+            urgency,
+            reference_only: false,
+            ranges: Vec::new(),
+        };
+        queue.submit(command(drive, admitted, now, ticket), &Unseen, now);
+        receiver
+    };
+    let (old, new) = (CommandQueue::new().unwrap(), Arc::new(CommandQueue::new().unwrap()));
+    let mut waits = give(&old, 3, Urgency::Stop);
+    let mut run = give(&old, 2, Urgency::Command);
+    old.begin_handover(now);
+    assert_eq!(outcome(&mut run), Some(Outcome::ShuttingDown));
+    let (mut late, mut gone) = (give(&old, 2, Urgency::Stop), give(&old, 4, Urgency::Stop));
+    // The port may go, and come, in its last moments.
+    old.close(Outcome::BusDown, now);
+    old.open();
+    old.hand_over(DriveIndex::new(3), &new, DriveIndex::new(0), now);
+    old.hand_over(DriveIndex::new(2), &new, DriveIndex::new(1), now);
+    let mut last = give(&old, 2, Urgency::Stop);
+    let mut refused = give(&old, 2, Urgency::Command);
+    assert!(outcome(&mut refused).is_some());
+    old.close(Outcome::ShuttingDown, now);
+    assert_eq!(outcome(&mut gone), Some(Outcome::ShuttingDown), "nobody takes it over");
+    let mut sent = Vec::new();
+    while let Some(stop) = crate::testkit::take_next(&new, now) {
+        sent.push(stop.intent.drive);
+        stop.answer(&Outcome::Acknowledged(Reply::Written), now);
+    }
+    assert_eq!(sent, [0, 1]);
+    for answer in [&mut waits, &mut late, &mut last] {
+        assert!(outcome(answer).is_some_and(|outcome| outcome.is_ok()));
+    }
+}

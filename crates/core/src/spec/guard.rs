@@ -1,0 +1,32 @@
+//! How often and how soon a motor may be started, and under which conditions.
+
+use std::time::Duration;
+
+/// Most starts an hour that can be configured.
+pub const MOST_STARTS: u32 = 120;
+
+/// `guard` of a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Guard {
+    /// Starts within any hour.
+    pub starts_per_hour: Option<u32>,
+    /// Time that the motor stands before it is started again.
+    pub min_off: Duration,
+    /// Time that the motor runs before an ordinary stop.
+    pub min_run: Duration,
+    /// Time between two starts of drives of the same group.
+    pub stagger: Duration,
+}
+
+/// A condition for starting a motor.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Interlock {
+    /// The drive that shows it.
+    pub drive: String,
+    /// A point of it that is true or false.
+    pub point: String,
+    /// Its required value.
+    pub is: bool,
+    /// Whether the running motor is stopped where it does not hold.
+    pub trip: bool,
+}

@@ -1,0 +1,219 @@
+//! Drives and buses as configured: what they are, and what may be done with them. Pure.
+
+mod guard;
+
+pub use guard::{Guard, Interlock, MOST_STARTS};
+
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::codec::{LineFormat, Protocol};
+use crate::drive::{PointIndex, Profile, RawWrites};
+
+/// Whether a drive may be commanded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Access {
+    /// Every write is refused.
+    #[default]
+    Monitor,
+    /// Writes are passed on.
+    Control,
+    /// Another master owns the line (`mode = "listen"` of the bus): nothing is ever sent.
+    Listen,
+}
+
+/// The permitted access to a drive's parameters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ParamsAccess {
+    #[default]
+    Read,
+    /// They are restored, too.
+    Write,
+}
+
+/// The action when a drive's lease expires.
+#[derive(Debug, Clone, PartialEq)]
+pub enum LeaseAction {
+    /// Stop the drive.
+    Stop,
+    /// Only raise the event.
+    Hold,
+    /// Set the speed reference, percent.
+    SpeedReference(f64),
+}
+
+/// Lease of a drive, renewed by commands that reach the wire and by accepted heartbeats.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Supervision {
+    /// Time without renewal after which the lease expires.
+    pub timeout: Duration,
+    /// The action then.
+    pub action: LeaseAction,
+    /// A drive that runs when the gateway starts gets its lease started: the clock only, nothing is written.
+    pub adopt: bool,
+}
+
+/// The action for a drive at shutdown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum OnShutdown {
+    /// Nothing is written.
+    #[default]
+    Hold,
+    /// The stop is written and its acknowledgement awaited.
+    Stop,
+}
+
+/// A drive as configured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DriveSpec {
+    /// Name, unique in the gateway.
+    pub name: String,
+    /// Name of its bus.
+    pub bus: String,
+    /// Address on the bus, 1..=247.
+    pub address: u8,
+    /// Modbus TCP unit id, 1..=254.
+    pub unit: u8,
+    /// Its family.
+    pub profile: Arc<Profile>,
+    /// Group of drives that are stopped together, and started one after the other.
+    pub group: Option<String>,
+    /// How often and how soon it may be started.
+    pub guard: Option<Guard>,
+    /// The interlocks of its starts.
+    pub interlocks: Vec<Interlock>,
+    /// A drive of its group starts at a distance from the others, so that its own starts count.
+    pub staggers: bool,
+    /// Whether it may be commanded.
+    pub access: Access,
+    /// Limits of commands in engineering units, by point name.
+    pub limits: BTreeMap<String, RangeInclusive<f64>>,
+    /// Lease, if there is one.
+    pub supervision: Option<Supervision>,
+    /// The action at shutdown.
+    pub on_shutdown: OnShutdown,
+    /// Time the drive takes to begin its answer, for the prediction.
+    pub turnaround: Duration,
+    /// Minimum and maximum frequency, Hz, where the drive's own parameters cannot be read.
+    pub frequency_range: Option<RangeInclusive<f64>>,
+    /// Values, in addition to faults, that trigger a recording.
+    pub triggers: Vec<PointTrigger>,
+    /// The permitted raw writes in addition to writable points.
+    pub raw_writes: RawWrites,
+    /// The permitted access to its parameters.
+    pub params: ParamsAccess,
+}
+
+/// A value that makes a recording when it holds for a time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PointTrigger {
+    /// Index of the point in the profile.
+    pub point: PointIndex,
+    pub limit: TriggerLimit,
+    /// For how long without interruption.
+    pub hold: Duration,
+}
+
+/// The side of a limit that triggers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum TriggerLimit {
+    /// Values above it.
+    Above(f64),
+    /// Values below it.
+    Below(f64),
+}
+
+/// A bus as configured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BusSpec {
+    /// Name, unique in the gateway.
+    pub name: String,
+    /// Path of the serial port, or `tcp://host:port` or `rfc2217://host:port`.
+    pub port: String,
+    pub protocol: Protocol,
+    /// Baud rate and character format.
+    pub format: LineFormat,
+    /// Cadence aimed at for process data.
+    pub cycle: Duration,
+    /// Cadence aimed at for the slow class.
+    pub slow_cycle: Duration,
+}
+
+/// Which machine a drive is, as far as the configuration says: what a lease, a hold or a journal of it belongs to. The name of
+/// a drive, and that of its bus, may come to mean another one.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Machine {
+    /// The port of its bus.
+    pub port: String,
+    /// Its address there.
+    pub address: u8,
+    /// The name of its profile.
+    pub profile: String,
+}
+
+impl std::fmt::Display for Machine {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Machine { port, address, profile } = self;
+        write!(f, "address {address} on {port}, profile `{profile}`")
+    }
+}
+
+impl BusSpec {
+    /// The machine that a drive of this bus is.
+    pub fn machine(&self, drive: &DriveSpec) -> Machine {
+        Machine {
+            port: self.port.clone(),
+            address: drive.address,
+            profile: drive.profile.name.clone(),
+        }
+    }
+}
+
+impl DriveSpec {
+    /// A drive with only place and profile configured: monitored, its unit is its address.
+    pub fn new(name: &str, bus: &str, address: u8, profile: Arc<Profile>) -> DriveSpec {
+        DriveSpec {
+            name: name.to_string(),
+            bus: bus.to_string(),
+            address,
+            unit: address,
+            turnaround: profile.turnaround,
+            profile,
+            group: None,
+            guard: None,
+            interlocks: Vec::new(),
+            staggers: false,
+            access: Access::Monitor,
+            limits: BTreeMap::new(),
+            supervision: None,
+            on_shutdown: OnShutdown::Hold,
+            frequency_range: None,
+            triggers: Vec::new(),
+            raw_writes: RawWrites::Points,
+            params: ParamsAccess::Read,
+        }
+    }
+
+    /// Whether its starts count: for itself or for others.
+    pub fn is_guarded(&self) -> bool {
+        self.guard.is_some() || self.staggers || !self.interlocks.is_empty()
+    }
+
+    /// The drives with which it shares `stagger`, as text: those of its group, else those of its bus.
+    pub fn starts_with(&self) -> Arc<str> {
+        match &self.group {
+            Some(group) => format!("group `{group}`").into(),
+            None => format!("bus `{}`", self.bus).into(),
+        }
+    }
+
+    /// Limits of a command to that point: the configured ones, else the profile's.
+    pub fn limits_of(&self, point: PointIndex) -> Option<RangeInclusive<f64>> {
+        let point = self.profile.points.get(point)?;
+        self.limits.get(&point.name).cloned().or_else(|| point.range.clone())
+    }
+}
