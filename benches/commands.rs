@@ -10,8 +10,9 @@ use std::error::Error;
 use std::process::ExitCode;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, SourceKind};
+use drivegate::command::{Authority, Order, Origin, SourceKind};
 use drivegate::drive::Value;
+use drivegate::plant::OrderRequest;
 use drivegate::process_image::Direction;
 
 use common::gateway::{Bus, Gateway, line, settings};
@@ -58,7 +59,7 @@ fn measure() -> Result<(), Box<dyn Error>> {
             let order = Order::Points(vec![(point, Value::Number(f64::from(value) / 100.0))]);
             while frames.try_recv().is_ok() {}
             let queued = SystemTime::now();
-            let mut placed = drive.place(order, origin, Authority::Write, DEFAULT_EXPIRY, Instant::now());
+            let mut placed = drive.place(OrderRequest::new(order, origin, Authority::Write), Instant::now());
             if !placed.answered().await.outcome.is_ok() {
                 failed += 1;
                 continue;

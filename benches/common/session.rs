@@ -73,8 +73,6 @@ pub fn plant(name: &str, drives: u16) -> Result<Plant, Box<dyn Error>> {
         buses: vec![bus],
         events: Default::default(),
         writes: Default::default(),
-        stop_all: Arc::default(),
-        drills: Arc::default(),
     })
 }
 

@@ -156,8 +156,6 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
         }],
         events: Default::default(),
         writes: Default::default(),
-        stop_all: Arc::default(),
-        drills: Arc::default(),
     };
     let poll = move || {
         for (drive, value) in drives.iter().cycle().zip((0..=u16::MAX).cycle()) {

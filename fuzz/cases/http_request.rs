@@ -15,8 +15,6 @@ static SERVER: LazyLock<Offline> = LazyLock::new(|| {
         buses: Vec::new(),
         events: Default::default(),
         writes: Default::default(),
-        stop_all: Default::default(),
-        drills: Default::default(),
     };
     Offline::new(Arc::new(ArcSwap::from_pointee(plant))).expect("a server")
 });

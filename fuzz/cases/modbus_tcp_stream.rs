@@ -11,7 +11,7 @@ use std::time::{Duration, Instant, SystemTime};
 use arc_swap::ArcSwap;
 use drivegate::process_image::{BusImage, DriveImage, Link};
 use drivegate::codec::{Exception, Reply, RequestPdu, Table};
-use drivegate::command::{Authority, Command, CommandQueue, Order, Outcome, Urgency};
+use drivegate::command::{Ready, Authority, Command, CommandQueue, Order, Outcome, Urgency};
 use drivegate::config::Settings;
 use drivegate::north::modbus_tcp::{Offline, Options, Uncached};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
@@ -64,8 +64,6 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         buses: buses.collect(),
         events: Default::default(),
         writes: Default::default(),
-        stop_all: Default::default(),
-        drills: Default::default(),
     }))
 });
 
@@ -81,7 +79,7 @@ fn answer(command: Command, how: u8) {
         1 => Outcome::Exception(Exception(how >> 3)),
         2 => Outcome::Acknowledged(Reply::Registers(vec![7; usize::from(how >> 3)])),
         3 => Outcome::BusDown,
-        _ => Outcome::Acknowledged(match &command.order {
+        _ => Outcome::Acknowledged(match &command.intent.order {
             Order::Read(RequestPdu::Read { table, count, .. }) if table.is_bits() => {
                 Reply::Bits(vec![true; usize::from(*count)])
             }
@@ -98,7 +96,7 @@ fn next_command(plant: &SharedPlant) -> Option<Command> {
     plant.buses.iter().find_map(|bus| {
         let mut pending = bus.queue.lock();
         let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
-        let chosen = ranks.into_iter().find_map(|rank| pending.next(rank, now, |_| true, |_| false))?;
+        let chosen = ranks.into_iter().find_map(|rank| pending.next(rank, now, &(), |_| Ready::Now, |_| false).chosen)?;
         pending.take(chosen)
     })
 }

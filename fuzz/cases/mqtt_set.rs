@@ -7,7 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::{Reply, Table};
-use drivegate::command::{CommandQueue, Order, Outcome, Urgency};
+use drivegate::command::{Ready, CommandQueue, Order, Outcome, Urgency};
 use drivegate::config::Settings;
 use drivegate::north::mqtt::{Incoming, Offline};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
@@ -52,8 +52,6 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         buses: buses.collect(),
         events: Default::default(),
         writes: Default::default(),
-        stop_all: Default::default(),
-        drills: Default::default(),
     }))
 });
 
@@ -85,12 +83,12 @@ pub(crate) fn run(data: &[u8]) {
     loop {
         let mut pending = bus.queue.lock();
         let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
-        let chosen = ranks.into_iter().find_map(|rank| pending.next(rank, now, |_| true, |_| false));
+        let chosen = ranks.into_iter().find_map(|rank| pending.next(rank, now, &(), |_| Ready::Now, |_| false).chosen);
         let Some(command) = chosen.and_then(|chosen| pending.take(chosen)) else { break };
         drop(pending);
         queued += 1;
-        assert!(!retain && command.drive == 0, "only p1 is commanded, and never by a retained message");
-        let Order::Points(points) = &command.order else { panic!("points only") };
+        assert!(!retain && command.intent.drive == 0, "only p1 is commanded, and never by a retained message");
+        let Order::Points(points) = &command.intent.order else { panic!("points only") };
         let profile = &bus.image.drives[0].spec.profile;
         for (index, value) in points {
             let point = profile.points.get(*index).unwrap();

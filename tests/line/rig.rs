@@ -11,7 +11,7 @@ use drivegate::drive::profile::Profile;
 use drivegate::drive::{ModelPoint, State, Value};
 use drivegate::event::Events;
 use drivegate::line::LineOptions;
-use drivegate::plant::{DriveHandle, Plant};
+use drivegate::plant::{DriveHandle, OrderRequest, Plant};
 use drivegate::process_image::{BusSpec, DriveImage, DriveSpec};
 use drivegate::sim::endpoint::EndpointOptions;
 use drivegate::sim::half_duplex::LineRules;
@@ -161,10 +161,7 @@ impl Rig {
         let origin = Origin::new(SourceKind::Mqtt, "test");
         handle
             .place(
-                Order::Points(values),
-                origin,
-                Authority::Write,
-                PATIENCE,
+                OrderRequest::new(Order::Points(values), origin, Authority::Write).within(PATIENCE),
                 Instant::now(),
             )
             .answered()

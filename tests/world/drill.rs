@@ -5,9 +5,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_world::codec::Protocol;
-use drivegate_world::command::{Authority, DEFAULT_EXPIRY, Origin, Outcome, SourceKind};
+use drivegate_world::command::{Authority, Origin, Outcome, SourceKind};
 use drivegate_world::drill::{DrillOptions, DrillReport, DrillState, Drills, Kind, LOOK, SavedDrills};
 use drivegate_world::drive::ModelPoint;
+use drivegate_world::plant::OrderRequest;
 use drivegate_world::process_image::{LeaseAction, Supervision};
 use drivegate_world::sim::faults::FaultPlan;
 use drivegate_world::sim::nx::Command;
@@ -57,16 +58,18 @@ fn who() -> Origin {
 
 struct Play {
     rig: Rig,
+    drills: Arc<Drills>,
     began: Instant,
 }
 
 impl Play {
     fn of(works: &Line, seed: u64) -> Play {
         let mut rig = Rig::new(works, Parts::of(0, works, seed));
-        rig.plant.drills.set_options(Some(OPTIONS));
+        let drills = Arc::<Drills>::default();
+        drills.set_options(Some(OPTIONS));
         rig.until("all are read", PATIENCE, Rig::is_whole);
         let began = rig.now;
-        Play { rig, began }
+        Play { rig, drills, began }
     }
 
     fn time(&self) -> SystemTime {
@@ -74,7 +77,7 @@ impl Play {
     }
 
     fn begin(&mut self, kinds: &[Kind], speed: f64) -> String {
-        let drills = self.rig.plant.drills.clone();
+        let drills = self.drills.clone();
         let drive = self.rig.drive(1);
         let armed = drills.arm(&drive, (kinds, Some(speed)), &who(), self.rig.now, self.time());
         let id = armed.unwrap().id;
@@ -88,7 +91,7 @@ impl Play {
     /// Runs a drill to its end; `meanwhile` is called at each look with what is said of it.
     fn drill(&mut self, kinds: &[Kind], mut meanwhile: impl FnMut(&mut Rig, &DrillReport)) -> DrillReport {
         let id = self.begin(kinds, 10.0);
-        let drills = self.rig.plant.drills.clone();
+        let drills = self.drills.clone();
         let until = self.rig.now + Duration::from_secs(300);
         loop {
             assert!(self.rig.now < until, "it does not end: {:?}", drills.report(&id));
@@ -241,7 +244,7 @@ fn what_does_not_stop_is_named() {
                 let bob = Origin::new(SourceKind::Mqtt, "bob");
                 let mut placed = rig
                     .drive(1)
-                    .place(order, bob, Authority::Write, DEFAULT_EXPIRY, rig.now);
+                    .place(OrderRequest::new(order, bob, Authority::Write), rig.now);
                 rig.bus.command_came(rig.now);
                 let refused = matches!(placed.answer().map(|answer| answer.outcome), Some(Outcome::Refused(_)));
                 assert_eq!(refused, points[0].0 != "run", "only stops pass");
@@ -343,7 +346,7 @@ impl Trouble {
                 let bob = Origin::new(SourceKind::Mqtt, "bob");
                 drop(
                     rig.drive(1)
-                        .place(order, bob, Authority::Write, DEFAULT_EXPIRY, rig.now),
+                        .place(OrderRequest::new(order, bob, Authority::Write), rig.now),
                 );
                 rig.bus.command_came(rig.now);
             }
@@ -443,7 +446,7 @@ fn a_thousand_drills_and_a_noisy_line() {
 #[test]
 fn one_at_a_time_by_who_armed_it_and_within_a_minute() {
     let mut play = Play::of(&works("vacon-nx", Protocol::ModbusRtu), 17);
-    let drills = play.rig.plant.drills.clone();
+    let drills = play.drills.clone();
     let (now, time) = (play.rig.now, play.time());
     let drive = play.rig.drive(1);
     let arm = |kinds: &[Kind], speed| drills.arm(&drive, (kinds, speed), &who(), now, time);
@@ -518,7 +521,7 @@ fn a_kill_at_any_moment_leaves_no_motor_running() {
             ..works("vacon-nx", Protocol::ModbusRtu)
         };
         let mut play = Play::of(&works, u64::from(kill));
-        play.rig.plant.drills.keep(true);
+        play.drills.keep(true);
         let mut disk = Disk {
             on_disk: None,
             writing: None,
@@ -527,8 +530,8 @@ fn a_kill_at_any_moment_leaves_no_motor_running() {
         let id = play.begin(&[Kind::Order, Kind::Gateway], 10.0);
         for look in 0..=kill * 10 {
             play.rig.run(LOOK);
-            disk.look(&play.rig.plant.drills, play.rig.now);
-            play.rig.plant.drills.look(&play.rig.plant, play.rig.now, play.time());
+            disk.look(&play.drills, play.rig.now);
+            play.drills.look(&play.rig.plant, play.rig.now, play.time());
             play.rig.bus.command_came(play.rig.now);
             assert!(
                 !turns(&mut play.rig) || disk.knows(&id),
@@ -538,20 +541,19 @@ fn a_kill_at_any_moment_leaves_no_motor_running() {
         let turned = turns(&mut play.rig);
         // What the process that was killed knew is gone, but for its file.
         let drive = play.rig.drive(1);
-        drive.bus.queue.keep_quiet(drive.index, None);
-        drive.image.hold.set(None);
-        play.rig.plant.drills = Arc::default();
-        play.rig.plant.drills.set_options(Some(OPTIONS));
+        drive.bus.queue.set_drill(drive.index, None);
+        play.drills = Arc::default();
+        play.drills.set_options(Some(OPTIONS));
         if let Some(saved) = disk.on_disk {
-            play.rig.plant.drills.restore(saved);
+            play.drills.restore(saved);
         }
         for _ in 0..500 {
             play.rig.run(LOOK);
-            play.rig.plant.drills.look(&play.rig.plant, play.rig.now, play.time());
+            play.drills.look(&play.rig.plant, play.rig.now, play.time());
             play.rig.bus.command_came(play.rig.now);
         }
         play.healed();
-        let report = play.rig.plant.drills.report(&id);
+        let report = play.drills.report(&id);
         assert!(
             report.as_ref().is_none_or(|report| report.state.is_over()),
             "{report:#?}"

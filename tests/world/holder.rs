@@ -10,7 +10,7 @@ use drivegate_world::command::{
     Authority, DEFAULT_EXPIRY, HoldState, Mode, Order, Origin, Outcome, Principal, Proof, Refusal, Rules, SourceKind,
     Verb, written,
 };
-use drivegate_world::plant::Placed;
+use drivegate_world::plant::{OrderRequest, Placed};
 use drivegate_world::process_image::DriveSpec;
 use drivegate_world::sim::faults::FaultPlan;
 use drivegate_world::sim::random::Random;
@@ -128,7 +128,10 @@ impl Play {
 
     fn holder(&self, drive: usize) -> (HoldState, String) {
         let queue = self.rig.bus.handle.queue.lock();
-        let (view, _) = queue.hold_view(DriveIndex::new(drive), None, self.rig.now).unwrap();
+        let (view, _) = queue
+            .gate
+            .hold_view(DriveIndex::new(drive), None, self.rig.now)
+            .unwrap();
         (
             view.state,
             view.holder.map(|holder| holder.to_string()).unwrap_or_default(),
@@ -192,7 +195,7 @@ impl Play {
     fn place(&mut self, client: usize, drive: usize, points: &[(&str, f64)]) -> Placed {
         let order: Order = self.rig.points(drive as u8 + 1, points);
         let handle = self.rig.drive(drive as u8 + 1);
-        let placed = handle.place(order, origin(client), Authority::Write, DEFAULT_EXPIRY, self.rig.now);
+        let placed = handle.place(OrderRequest::new(order, origin(client), Authority::Write), self.rig.now);
         self.rig.bus.command_came(self.rig.now);
         placed
     }
@@ -311,7 +314,7 @@ fn stops_take(authority: bool, seed: u64) -> Duration {
         let order = rig.points(1, points);
         let placed = rig
             .drive(1)
-            .place(order, origin(client), Authority::Write, DEFAULT_EXPIRY, rig.now);
+            .place(OrderRequest::new(order, origin(client), Authority::Write), rig.now);
         rig.bus.command_came(rig.now);
         placed
     };

@@ -9,12 +9,12 @@ use drivegate_world::bus::listener::ListenCore;
 use drivegate_world::bus::{BusOptions, Mode};
 use drivegate_world::codec::n2::Session;
 use drivegate_world::codec::{Decoded, Exception, LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
-use drivegate_world::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate_world::command::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
 use drivegate_world::diagnosis::Cause;
 use drivegate_world::drive::{ModelPoint, Quality, Value};
 use drivegate_world::event::{EventKind, Events};
 use drivegate_world::line::LineOptions;
-use drivegate_world::plant::{BusHandle, Plant};
+use drivegate_world::plant::{BusHandle, OrderRequest, Plant};
 use drivegate_world::process_image::{Access, BusImage, DriveImage, DriveSpec, Outcome as Counted};
 use drivegate_world::sim::SimTime;
 use drivegate_world::sim::faults::FaultPlan;
@@ -537,8 +537,6 @@ fn whatever_clients_try_nothing_goes_out_for_an_hour() {
         buses: vec![scene.handle.clone()],
         events: scene.events.clone(),
         writes: scene.writes.clone(),
-        stop_all: Arc::default(),
-        drills: Arc::default(),
     };
     let profile = scene.handle.image.drives[0].spec.profile.clone();
     let index = |point: ModelPoint| profile.model_index(point).unwrap();
@@ -571,7 +569,7 @@ fn whatever_clients_try_nothing_goes_out_for_an_hour() {
         let origin = Origin::new(kinds[tried % kinds.len()], "a client");
         let drive = plant.drives().nth(tried % 3).unwrap();
         let now = scene.instant();
-        let mut placed = drive.place(order, origin, Authority::Write, DEFAULT_EXPIRY, now);
+        let mut placed = drive.place(OrderRequest::new(order, origin, Authority::Write), now);
         let answer = placed.answer().expect("at once");
         let exception = if is_read {
             Exception::ADDRESS

@@ -3,9 +3,10 @@
 use std::time::Duration;
 
 use drivegate_world::codec::{Exception, Protocol, RequestPdu};
-use drivegate_world::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Refusal, SourceKind};
+use drivegate_world::command::{Authority, Order, Origin, Outcome, Refusal, SourceKind};
 use drivegate_world::drive::{ModelPoint, Quality, State, Value};
 use drivegate_world::event::EventKind;
+use drivegate_world::plant::OrderRequest;
 use drivegate_world::process_image::{Access, LeaseAction, Supervision};
 use drivegate_world::sim::faults::{Fault, FaultPlan};
 use drivegate_world::sim::nx::NxOptions;
@@ -502,20 +503,14 @@ fn a_stop_is_taken_while_the_bus_ends_and_before_its_port_is_open_again() {
     let ends = rig.bus.handle.clone();
     ends.queue.begin_handover(rig.now);
     let mut while_it_ends = before.place(
-        order.clone(),
-        Origin::new(SourceKind::Mqtt, "test"),
-        Authority::Write,
-        DEFAULT_EXPIRY,
+        OrderRequest::new(order.clone(), Origin::new(SourceKind::Mqtt, "test"), Authority::Write),
         rig.now,
     );
     assert_eq!(while_it_ends.answer(), None);
     rig.restart_now();
     // Whoever still has the drive as it was.
     let mut behind = before.place(
-        order,
-        Origin::new(SourceKind::Mqtt, "test"),
-        Authority::Write,
-        DEFAULT_EXPIRY,
+        OrderRequest::new(order, Origin::new(SourceKind::Mqtt, "test"), Authority::Write),
         rig.now,
     );
     assert!(rig.answered(&mut while_it_ends).is_ok() && rig.answered(&mut behind).is_ok());

@@ -12,7 +12,7 @@ use drivegate_world::parameters::{
     End, Journal, NO_IDENTIFICATION, Names, Next, Owner, ParameterFile, Phase, Plan, Reading, Restoration, Then,
     Wanted, Wishes, differences, plan,
 };
-use drivegate_world::plant::Placed;
+use drivegate_world::plant::{OrderRequest, Placed};
 use drivegate_world::process_image::ParamsAccess;
 use drivegate_world::sim::faults::FaultPlan;
 use drivegate_world::sim::nx::Command;
@@ -361,10 +361,10 @@ impl RestoreWorld {
     fn set(&mut self, order: ParameterOrder) -> Result<Outcome, Cut> {
         let origin = Origin::new(SourceKind::LocalSocket, "test");
         let (order, expiry) = (Order::Parameter(order), Duration::from_secs(30));
-        let mut placed = self
-            .rig
-            .drive(DRIVE)
-            .place(order, origin, Authority::Write, expiry, self.rig.now);
+        let mut placed = self.rig.drive(DRIVE).place(
+            OrderRequest::new(order, origin, Authority::Write).within(expiry),
+            self.rig.now,
+        );
         self.rig.bus.command_came(self.rig.now);
         let until = self.rig.now + Duration::from_secs(120);
         loop {

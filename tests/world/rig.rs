@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate_world::codec::{Protocol, Reply, RequestPdu, Table};
-use drivegate_world::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate_world::command::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
 use drivegate_world::drive::{ModelPoint, PollClass, Sample, State, Value};
 use drivegate_world::event::Events;
-use drivegate_world::plant::{DriveHandle, Placed, Plant, SharedPlant};
+use drivegate_world::plant::{DriveHandle, OrderRequest, Placed, Plant, SharedPlant};
 use drivegate_world::process_image::{OnShutdown, Outcome as Counted};
 use drivegate_world::sim::SimTime;
 use drivegate_world::sim::faults::FaultPlan;
@@ -100,8 +100,6 @@ impl Rig {
             buses: vec![bus.handle.clone()],
             events,
             writes,
-            stop_all: Arc::default(),
-            drills: Arc::default(),
         };
         Rig { bus, now, plant }
     }
@@ -147,7 +145,7 @@ impl Rig {
         let origin = Origin::new(SourceKind::Mqtt, client);
         let placed = self
             .drive(address)
-            .place(order, origin, Authority::Write, DEFAULT_EXPIRY, self.now);
+            .place(OrderRequest::new(order, origin, Authority::Write), self.now);
         self.bus.command_came(self.now);
         placed
     }
@@ -177,8 +175,6 @@ impl Rig {
             buses: self.plant.buses.clone(),
             events: self.plant.events.clone(),
             writes: self.plant.writes.clone(),
-            stop_all: Arc::default(),
-            drills: Arc::default(),
         }))
     }
 

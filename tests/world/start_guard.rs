@@ -11,7 +11,7 @@ use drivegate_world::command::{
     Authority, Mode, Order, Origin, Outcome, Principal, Proof, Refusal, Rules, SourceKind, written,
 };
 use drivegate_world::drive::{ModelPoint, State, Value};
-use drivegate_world::plant::Placed;
+use drivegate_world::plant::{OrderRequest, Placed};
 use drivegate_world::process_image::DriveSpec;
 use drivegate_world::sim::faults::FaultPlan;
 use drivegate_world::sim::random::Random;
@@ -263,8 +263,13 @@ impl Play {
         };
         let kind = [SourceKind::Mqtt, SourceKind::ModbusTcp, SourceKind::Http][self.dice.within(0..=2) as usize];
         let (waits, expiry) = (self.dice.chance(0.3), SECOND * self.dice.within(1..=8) as u32);
-        let drive = self.rig.drive(address).waiting(waits);
-        let placed = drive.place(order, Origin::new(kind, "c"), Authority::Write, expiry, self.rig.now);
+        let drive = self.rig.drive(address);
+        let placed = drive.place(
+            OrderRequest::new(order, Origin::new(kind, "c"), Authority::Write)
+                .within(expiry)
+                .waiting(waits),
+            self.rig.now,
+        );
         self.rig.bus.command_came(self.rig.now);
         match stop {
             true => self.stops.push((placed, self.rig.now)),
@@ -451,9 +456,10 @@ fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
             first.as_mut().and_then(|placed| placed.answer())
         );
         let origin = Origin::new(kind, who);
-        let mut second = rig
-            .drive(1)
-            .place(stop.clone(), origin, Authority::Write, SECOND, rig.now);
+        let mut second = rig.drive(1).place(
+            OrderRequest::new(stop.clone(), origin, Authority::Write).within(SECOND),
+            rig.now,
+        );
         rig.bus.command_came(rig.now);
         assert!(rig.answered(&mut second).is_ok(), "{who}");
         if let Some(first) = &mut first {
@@ -507,7 +513,10 @@ fn repeated_stops_of_a_cyclic_client_wait_for_min_run() {
         let give = |rig: &mut Rig, points: &[(&str, f64)], proof: Proof| {
             let order = rig.points(1, points);
             let origin = Origin::new(SourceKind::Mqtt, "plc").proven(proof);
-            let placed = rig.drive(1).place(order, origin, Authority::Write, SECOND, rig.now);
+            let placed = rig.drive(1).place(
+                OrderRequest::new(order, origin, Authority::Write).within(SECOND),
+                rig.now,
+            );
             rig.bus.command_came(rig.now);
             placed
         };

@@ -8,7 +8,7 @@ use drivegate_world::command::{Origin, SourceKind};
 use drivegate_world::process_image::Access;
 use drivegate_world::sim::faults::FaultPlan;
 use drivegate_world::sim::statistics::Recorded;
-use drivegate_world::stop_all::{LOOK, Scope, StopReport, Stopped, StoppedDrive};
+use drivegate_world::stop_all::{LOOK, Scope, StopAll, StopReport, Stopped, StoppedDrive};
 
 use super::bus::Parts;
 use super::rig::{PATIENCE, Rig, line};
@@ -37,7 +37,7 @@ fn turns(rig: &mut Rig, address: u8) -> bool {
 /// Gives the order, lets time pass until its answer, and checks what that says against the drives themselves.
 fn stop_all(rig: &mut Rig, meanwhile: Meanwhile) -> StopReport {
     let origin = Origin::new(SourceKind::Http, "alice");
-    let orders = rig.plant.stop_all.clone();
+    let orders = StopAll::default();
     let wait = Duration::from_secs(20);
     let mut order = orders
         .order(&rig.plant, &Scope::Gateway, &origin, wait, rig.now)
@@ -154,7 +154,7 @@ fn forty_four_drives_are_stopped_as_fast_as_the_line_can() {
         }
         let before = rig.requests().len();
         let ordered = rig.now;
-        let orders = rig.plant.stop_all.clone();
+        let orders = StopAll::default();
         let (origin, wait) = (Origin::new(SourceKind::Http, "alice"), Duration::from_secs(30));
         let mut order = orders
             .order(&rig.plant, &Scope::Gateway, &origin, wait, rig.now)

@@ -263,7 +263,5 @@ fn plant_of(buses: &[WorldBus], events: &Events, writes: &Arc<WriteStats>) -> Pl
         buses: buses.iter().map(|bus| bus.handle.clone()).collect(),
         events: events.clone(),
         writes: writes.clone(),
-        stop_all: Arc::default(),
-        drills: Arc::default(),
     }
 }

@@ -1,12 +1,12 @@
 //! Commands without a client, and what became of them.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use drivegate_core::command::{
-    Answer, Audit, Command, CommandQueue, Facts, Origin, Pending, Ready, Seen, SourceKind, Ticket, Urgency, WriteStats,
+    Answer, Arrival, Audit, Command, CommandQueue, Origin, Pending, Ready, SourceKind, Ticket, Urgency, Window,
+    WriteStats,
 };
-use drivegate_model::drive::DriveIndex;
 use serde_json::Value;
 use tokio::sync::oneshot::Receiver;
 
@@ -19,29 +19,28 @@ pub fn audited(audit: &Audit) -> Vec<Value> {
         .collect()
 }
 
-/// Drives of which nothing is seen: no rule refuses an order for what it would see.
-#[derive(Debug)]
-pub struct Unseen;
-
-impl Facts for Unseen {
-    fn seen(&self, _: DriveIndex) -> Option<Seen<'_>> {
-        None
-    }
-}
-
 /// Takes the next command of that rank or a higher one, where every drive is free and no stop is redundant.
 pub fn next_command(pending: &mut Pending, lowest: Urgency, now: Instant) -> Option<Command> {
     let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
     let chosen = ranks
         .into_iter()
         .filter(|rank| *rank <= lowest)
-        .find_map(|rank| pending.next(rank, now, &Unseen, |_| Ready::Now, |_| false).chosen)?;
+        .find_map(|rank| pending.next(rank, now, &(), |_| Ready::Now, |_| false).chosen)?;
     pending.take(chosen)
 }
 
 /// Takes the next command of a queue, whatever its rank.
 pub fn take_next(queue: &CommandQueue, now: Instant) -> Option<Command> {
     next_command(&mut queue.lock(), Urgency::Read, now)
+}
+
+/// When a command came that comes at `now`, over a connection of its own, and may be sent for that long.
+pub fn window(now: Instant, expiry: Duration) -> Window {
+    Window {
+        arrival: Arrival::now(now),
+        expires: now + expiry,
+        waits: false,
+    }
 }
 
 /// The ticket of a command of an MQTT client to drive `d`, and where its answer arrives.

@@ -3,9 +3,10 @@
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind};
+use drivegate::command::{Authority, Order, Origin, Outcome, SourceKind};
 use drivegate::drive::Value;
 use drivegate::north::http::{Options, Scope, Token, Tokens, User, Users};
+use drivegate::plant::OrderRequest;
 use drivegate::process_image::{Access, LeaseAction, Supervision};
 use drivegate_testkit::{image, monitored};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -461,7 +462,7 @@ async fn only_who_commanded_last_renews_the_lease() {
     let run = drive.image.spec.profile.point_index("run").unwrap();
     let order = Order::Points(vec![(run, Value::Bool(false))]);
     let origin = Origin::new(SourceKind::ModbusTcp, "192.0.2.1:1");
-    let mut placed = drive.place(order, origin, Authority::Write, DEFAULT_EXPIRY, Instant::now());
+    let mut placed = drive.place(OrderRequest::new(order, origin, Authority::Write), Instant::now());
     timeout(PATIENCE, placed.answered()).await.unwrap();
     assert_eq!(renew(&bob).await, (409, false));
     assert_eq!(rig.command(BASIC, STOP).await.status, 200);

@@ -37,7 +37,7 @@ impl OfflineClient {
     /// The drive takes the next order, which this gives.
     fn serve(&self) -> Order {
         let command = self.pop().unwrap();
-        let (order, outcome) = (command.order.clone(), acknowledge(&command));
+        let (order, outcome) = (command.intent.order.clone(), acknowledge(&command));
         command.ticket.answer(outcome, self.now);
         order
     }
@@ -58,7 +58,7 @@ fn orders_are_queued_when_the_call_returns_and_end_by_the_time_that_is_told() {
     assert_eq!(session.plant.load().buses[0].queue.lock().len(), 2);
     let first = session.pop().unwrap();
     assert_eq!(first.ticket.client(), "modbus_tcp 10.0.0.9");
-    assert_eq!(first.expires, session.now + Duration::from_secs(2));
+    assert_eq!(first.intent.window.expires, session.now + Duration::from_secs(2));
     let outcome = acknowledge(&first);
     first.ticket.answer(outcome, session.now);
     assert_eq!(session.receive(&[]), frame(1, 1, &words(6, &[0x8101, 1000])));
@@ -78,9 +78,9 @@ fn the_next_piece_of_a_read_is_queued_when_the_last_one_is_finished() {
     session.now += Duration::from_secs(1);
     assert!(session.receive(&[]).is_empty());
     let second = session.pop().unwrap();
-    assert_eq!(second.order, piece(8));
+    assert_eq!(second.intent.order, piece(8));
     assert_eq!(
-        second.expires,
+        second.intent.window.expires,
         session.now + Duration::from_secs(2),
         "each has its own time"
     );
@@ -108,7 +108,7 @@ fn clients_of_one_server_share_the_command_word() {
     assert!(other.receive(&reset, session.now).is_empty());
     let second = session.pop().unwrap();
     assert_eq!(second.ticket.client(), "modbus_tcp 10.0.0.10");
-    let Order::Points(second) = second.order else {
+    let Order::Points(second) = second.intent.order else {
         panic!("a command")
     };
     assert_eq!(second.len(), 2);

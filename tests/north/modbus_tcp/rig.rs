@@ -109,7 +109,7 @@ impl FakeBus {
                     };
                     seen.lock()
                         .unwrap()
-                        .push((command.drive.place(), command.order.clone()));
+                        .push((command.intent.drive.place(), command.intent.order.clone()));
                     match (script.lock().unwrap())(&command) {
                         Some(outcome) => command.answer(&outcome, Instant::now()),
                         None => kept.push(command),
@@ -153,7 +153,7 @@ impl Drop for FakeBus {
 
 /// A drive whose register n holds n.
 pub(crate) fn acknowledge(command: &Command) -> Outcome {
-    Outcome::Acknowledged(match &command.order {
+    Outcome::Acknowledged(match &command.intent.order {
         Order::Read(RequestPdu::Read { table, start, count }) if table.is_bits() => {
             Reply::Bits((*start..start + count).map(|n| n % 3 == 0).collect())
         }

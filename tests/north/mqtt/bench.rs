@@ -469,13 +469,16 @@ async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
         plant.load().report_refusals(now);
         for bus in &plant.load().buses {
             while let Some(command) = take_next(&bus.queue, now) {
-                let drive = &bus.image.drives[command.drive.place()];
+                let drive = &bus.image.drives[command.intent.drive.place()];
                 let name = |index: PointIndex| drive.spec.profile.points.get(index).unwrap().name.clone();
-                if let Order::Points(points) = &command.order {
+                if let Order::Points(points) = &command.intent.order {
                     let points = points.iter().map(|(index, value)| (name(*index), *value)).collect();
                     // It may have come after `now`.
-                    let life = command.expires.saturating_duration_since(Instant::now());
-                    orders.lock().unwrap().push((command.drive.place(), points, life));
+                    let life = command.intent.window.expires.saturating_duration_since(Instant::now());
+                    orders
+                        .lock()
+                        .unwrap()
+                        .push((command.intent.drive.place(), points, life));
                 }
                 command.answer(&Outcome::Acknowledged(Reply::Written), now);
             }

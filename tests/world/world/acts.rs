@@ -2,6 +2,7 @@
 
 use super::*;
 use drivegate_world::drive::PointIndex;
+use drivegate_world::plant::OrderRequest;
 
 /// How much longer a client waits whose order was answered at once.
 const TURNED_AWAY: Duration = Duration::from_millis(40);
@@ -254,7 +255,10 @@ impl World {
         let name = self.buses[bus].handle.image.drives[drive].spec.name.clone();
         let handle = self.plant.load().drive(&name).unwrap();
         let origin = Origin::new(SourceKind::CommandLine, format!("client {client}"));
-        let mut placed = handle.place(order, origin, Authority::Write, expiry, self.now);
+        let mut placed = handle.place(
+            OrderRequest::new(order, origin, Authority::Write).within(expiry),
+            self.now,
+        );
         self.replaced();
         if let Some(answer) = placed.answer() {
             self.answered(id, answer.outcome.code(), Some(&answer.outcome));

@@ -1,3 +1,4 @@
+use drivegate_testkit::window;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -55,14 +56,19 @@ impl ObedientDrive {
         let origin = Origin::new(SourceKind::Mqtt, "t");
         let stats = Arc::new(WriteStats::default());
         let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, stats);
-        let expires = self.now + Duration::from_secs(1);
         let admitted = Admitted {
             order: Order::Points(values),
             urgency,
             reference_only: false,
             ranges: Vec::new(),
         };
-        let command = Command::new(DriveIndex::new(0), admitted, expires, ticket);
+        let command = Command::new(
+            DriveIndex::new(0),
+            admitted,
+            &self.profile,
+            window(self.now, Duration::from_secs(1)),
+            ticket,
+        );
         (CommandRun::new(command, &self.profile), receiver)
     }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::SystemTime;
 
-use drivegate_testkit::{bus, bus_spec, controlled, image};
+use drivegate_testkit::{bus, bus_spec, controlled, image, window};
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
@@ -239,8 +239,9 @@ impl Rig {
         let admitted = admit(order, &image.reading(self.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, who);
         let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
-        let command = Command::new(DriveIndex::new(drive), admitted, self.now + DEFAULT_EXPIRY, ticket);
-        self.bus.queue.submit(command, self.now);
+        let window = window(self.now, DEFAULT_EXPIRY);
+        let command = Command::new(DriveIndex::new(drive), admitted, &image.spec.profile, window, ticket);
+        self.bus.queue.submit(command, &(), self.now);
         answer
     }
 

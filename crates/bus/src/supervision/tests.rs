@@ -1,4 +1,4 @@
-use drivegate_testkit::{audited, bus_spec, controlled, next_command, nx, online};
+use drivegate_testkit::{audited, bus_spec, controlled, next_command, nx, online, window};
 use std::sync::Arc;
 use std::time::SystemTime;
 
@@ -182,8 +182,9 @@ impl SupervisedDrive {
         let admitted = admit(Order::Points(vec![(index, value)]), &reading, Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "client");
         let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
-        let command = Command::new(DriveIndex::new(0), admitted, self.now + DEFAULT_EXPIRY, ticket);
-        self.bus.queue.submit(command, self.now);
+        let window = window(self.now, DEFAULT_EXPIRY);
+        let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
+        self.bus.queue.submit(command, &(), self.now);
         answer
     }
 
@@ -227,7 +228,7 @@ fn the_action_is_written_once_and_again_until_it_is_acknowledged() {
             Outcome::QueueFull,
         ] {
             let command = rig.after(1_000, true).expect("the action");
-            assert_eq!(command.urgency, urgency);
+            assert_eq!(command.urgency(), urgency);
             assert!(rig.after(10, true).is_none(), "not while its answer is waited for");
             command.answer(&failed, rig.now);
             assert!(rig.after(10, true).is_none(), "a pause first");
@@ -312,7 +313,7 @@ fn every_family_is_written_its_action() {
             rig.reload(spec);
             rig.heartbeat();
             let command = rig.after(6_000, true).expect("the action");
-            assert_eq!(command.urgency == Urgency::Stop, stop, "{}", profile.name);
+            assert_eq!(command.urgency() == Urgency::Stop, stop, "{}", profile.name);
             let sets = writes(profile, command, rig.now);
             let wanted: &[(&str, Value)] = if stop {
                 &[("run", Value::Bool(false))]
@@ -404,7 +405,7 @@ fn an_action_that_is_due_outlives_the_bus() {
     command.answer(&Outcome::TimedOut, rig.now);
     rig.reload(rig.spec());
     let command = rig.after(10, true).expect("the stop is due still");
-    assert_eq!(command.urgency, Urgency::Stop);
+    assert_eq!(command.urgency(), Urgency::Stop);
     // The bus ends while the stop is on its way.
     drop(command);
     rig.reload(rig.spec());
@@ -524,7 +525,7 @@ fn a_drive_that_runs_without_a_lease_is_told_once_and_adopted_where_that_is_want
     assert!(rig.after(100, true).is_none(), "the clock only");
     assert!(rig.after(4_900, true).is_none());
     assert_eq!(rig.news, [News::RunsUnsupervised(DriveIndex::new(0), Adopted::Yes)]);
-    assert_eq!(rig.after(100, true).expect("the stop").urgency, Urgency::Stop);
+    assert_eq!(rig.after(100, true).expect("the stop").urgency(), Urgency::Stop);
     // Whoever commands it before it is seen to run has his lease.
     let mut rig = SupervisedDrive::new(LeaseAction::Stop);
     rig.heartbeat();

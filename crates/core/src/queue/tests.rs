@@ -7,7 +7,7 @@ use super::*;
 use crate::codec::Table;
 use crate::drive::{DriveIndex, PointIndex, Value};
 use crate::order::{Admitted, Answer, Arrival, SourceKind, Ticket, Touched, Window, WriteStats};
-use crate::testkit::{Unseen, next_command, nx, ticket};
+use crate::testkit::{next_command, nx, ticket};
 
 mod order;
 mod slots;
@@ -83,7 +83,7 @@ impl Clients {
         };
         let mut command = command(drive, admitted, self.now, ticket);
         command.intent.effects.touches = touched(&command.intent.order);
-        self.pending.push(command, &Unseen, self.now);
+        self.pending.push(command, &(), self.now);
         receiver
     }
 
@@ -203,7 +203,7 @@ fn later_commands_wait_behind_the_oldest_of_their_drive_that_cannot_begin() {
     let chosen = rig.pending.next(
         Urgency::Command,
         rig.now,
-        &Unseen,
+        &(),
         |command: &Command| {
             asked.push(command.intent.order.clone());
             match command.intent.drive == DriveIndex::new(1) {
@@ -225,7 +225,7 @@ fn what_was_chosen_and_is_gone_is_not_taken() {
     let mut run = rig.push(1, Urgency::Command, &[1], false);
     let chosen = rig
         .pending
-        .next(Urgency::Command, rig.now, &Unseen, |_| Ready::Now, |_| false);
+        .next(Urgency::Command, rig.now, &(), |_| Ready::Now, |_| false);
     let _stop = rig.push(1, Urgency::Stop, &[1], false);
     assert_eq!(outcome(&mut run), Some(Outcome::Purged));
     assert!(rig.pending.take(chosen.chosen.unwrap()).is_none());
@@ -382,17 +382,17 @@ fn a_closed_queue_answers_at_once() {
         ranges: Vec::new(),
     };
     let command = |urgency, ticket| self::command(0, admitted(urgency), rig.now, ticket);
-    queue.submit(command(Urgency::Command, ticket_a), &Unseen, rig.now);
+    queue.submit(command(Urgency::Command, ticket_a), &(), rig.now);
     queue.close(Outcome::BusDown, rig.now);
     assert_eq!(outcome(&mut a), Some(Outcome::BusDown));
     for urgency in [Urgency::Command, Urgency::Stop] {
         let (ticket_b, mut b) = ticket(&rig.stats, rig.now);
-        queue.submit(command(urgency, ticket_b), &Unseen, rig.now);
+        queue.submit(command(urgency, ticket_b), &(), rig.now);
         assert_eq!(outcome(&mut b), Some(Outcome::BusDown));
     }
     queue.open();
     let (ticket_c, mut c) = ticket(&rig.stats, rig.now);
-    queue.submit(command(Urgency::Command, ticket_c), &Unseen, rig.now);
+    queue.submit(command(Urgency::Command, ticket_c), &(), rig.now);
     assert_eq!(outcome(&mut c), None);
     rig.now += Duration::from_secs(1);
 }
@@ -450,7 +450,7 @@ fn the_login_that_commanded_last_is_kept_until_another_client_commands() {
             ranges: Vec::new(),
         };
         let command = command(1, admitted, rig.now, ticket);
-        rig.pending.push(command, &Unseen, rig.now);
+        rig.pending.push(command, &(), rig.now);
     };
     use SourceKind::{Http, ModbusTcp, Shutdown, Supervision};
     use Urgency::{Read, Stop};

@@ -10,7 +10,7 @@ use crate::order::{
 };
 use crate::permit::{Gate, Stage, Verdict};
 use crate::process_image::{BusSpec, DriveImage, DriveSpec, Link};
-use crate::testkit::{Unseen, bus_spec, controlled, image, nx, profile, read};
+use crate::testkit::{bus_spec, controlled, image, nx, profile, read};
 
 const SECOND: Duration = Duration::from_secs(1);
 const RUN: Effect = Effect {
@@ -145,7 +145,7 @@ fn judged(
     };
     let mut command = Command::passed_on(intent, passed_on, ticket);
     command.intent.number = number;
-    gate.judge(stage, &command, &Unseen, now)
+    gate.judge(stage, &command, &(), now)
 }
 
 fn reason(verdict: Verdict) -> &'static str {

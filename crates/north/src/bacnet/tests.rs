@@ -10,7 +10,7 @@ use super::*;
 use crate::codec::{Reply, Table};
 use crate::command::{Authority, Commanded, Follows, Order, Origin, Outcome, Refusal, Settled, SlotWrite, SourceKind};
 use crate::drive::{ModelPoint, PointIndex, Value};
-use crate::plant::{DriveHandle, Plant};
+use crate::plant::{DriveHandle, OrderRequest, Plant};
 use crate::process_image::{DriveSpec, Link};
 
 mod objects;
@@ -136,8 +136,8 @@ impl ControlledDrive {
     fn carry_out(&self, outcome: Outcome) -> String {
         let drive = self.drive();
         let command = take_next(&drive.bus.queue, self.now).expect("an order");
-        let Order::Points(values) = &command.order else {
-            panic!("{:?}", command.order)
+        let Order::Points(values) = &command.intent.order else {
+            panic!("{:?}", command.intent.order)
         };
         let name = |index: PointIndex| drive.image.spec.profile.points.get(index).unwrap().name.clone();
         let values: Vec<String> = values
@@ -168,7 +168,10 @@ impl ControlledDrive {
         let index = drive.image.spec.profile.model_index(point).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "cloud");
         let order = Order::Points(vec![(index, value)]);
-        let mut placed = drive.place(order, origin, Authority::Write, Duration::from_secs(2), self.now);
+        let mut placed = drive.place(
+            OrderRequest::new(order, origin, Authority::Write).within(Duration::from_secs(2)),
+            self.now,
+        );
         match placed.answer().map(|answer| answer.outcome) {
             Some(Outcome::Refused(refusal)) => Some(refusal),
             _ => None,

@@ -151,7 +151,7 @@ mod tests {
             }
             let bus = &plant.load().buses[0];
             let last = next_command(&mut bus.queue.lock(), Urgency::Read, now).unwrap();
-            assert_eq!(last.order, Order::Points(vec![(run, Value::Bool(false))]));
+            assert_eq!(last.intent.order, Order::Points(vec![(run, Value::Bool(false))]));
             assert!(bus.queue.lock().is_empty(), "the run was removed");
             let taken = now + Duration::from_millis(12);
             let receipt = last.ticket.acknowledge(Outcome::Acknowledged(Reply::Written), taken);

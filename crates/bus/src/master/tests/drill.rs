@@ -3,21 +3,22 @@
 use super::*;
 use crate::event::EventKind;
 use crate::plant::Plant;
-use drivegate_core::drill::{DrillOptions, DrillReport, DrillState, Kind};
+use drivegate_core::drill::{DrillOptions, DrillReport, DrillState, Drills, Kind};
 
 const LIMIT: Duration = Duration::from_secs(2);
 
-fn plant(rig: &Rig) -> Plant {
+fn plant(rig: &Rig) -> (Plant, Drills) {
     let plant = Plant {
         writes: rig.stats.clone(),
         ..Plant::new("g", Duration::from_secs(1), vec![rig.bus.clone()])
     };
-    plant.drills.set_options(Some(DrillOptions {
+    let drills = Drills::default();
+    drills.set_options(Some(DrillOptions {
         max_speed: 20.0,
         limit: LIMIT,
         every: Duration::from_secs(3600),
     }));
-    plant
+    (plant, drills)
 }
 
 /// Drills the first of two drives; `meanwhile` is called with what is said of it.
@@ -27,8 +28,7 @@ fn drill(kind: Kind, mut meanwhile: impl FnMut(&mut Rig, &DrillReport)) -> (Rig,
     rig.drives[0].holding.extend([(2101, 1 << 13), (2102, 1000)]);
     rig.run(Duration::from_secs(2));
     rig.bus.image.update_health(|health| health.up = true);
-    let plant = plant(&rig);
-    let drills = plant.drills.clone();
+    let (plant, drills) = plant(&rig);
     let (alice, time) = (Origin::new(SourceKind::Http, "alice"), SystemTime::now());
     let drive = plant.drives().next().unwrap();
     let armed = drills.arm(&drive, (&[kind], Some(10.0)), &alice, rig.now, time);
@@ -115,21 +115,19 @@ fn a_silent_client_stops_a_motor_by_its_lease_only() {
 }
 
 /// A plant with drills that a file keeps, and a drill of its first drive that was started.
-fn started() -> (Rig, Plant, String) {
+fn started() -> (Rig, (Plant, Drills), String) {
     let mut rig = Rig::new(2);
     rig.drives[0].holding.extend([(2101, 1 << 13), (2102, 1000)]);
     rig.run(Duration::from_secs(2));
     rig.bus.image.update_health(|health| health.up = true);
-    let plant = plant(&rig);
-    plant.drills.keep(true);
+    let (plant, drills) = plant(&rig);
+    drills.keep(true);
     let (alice, time) = (Origin::new(SourceKind::Http, "alice"), time(0));
     let drive = plant.drives().next().unwrap();
-    let armed = plant
-        .drills
-        .arm(&drive, (&[Kind::Order], Some(10.0)), &alice, rig.now, time);
+    let armed = drills.arm(&drive, (&[Kind::Order], Some(10.0)), &alice, rig.now, time);
     let id = armed.unwrap().id;
-    plant.drills.start(&plant, &id, &alice, rig.now, time).unwrap();
-    (rig, plant, id)
+    drills.start(&plant, &id, &alice, rig.now, time).unwrap();
+    (rig, (plant, drills), id)
 }
 
 fn time(seconds: u64) -> SystemTime {
@@ -137,12 +135,12 @@ fn time(seconds: u64) -> SystemTime {
 }
 
 /// Looks for that long; whether a drill is under way at its end.
-fn look(rig: &mut Rig, plant: &Plant, at: SystemTime, span: Duration) -> bool {
+fn look(rig: &mut Rig, (plant, drills): &(Plant, Drills), at: SystemTime, span: Duration) -> bool {
     let until = rig.now + span;
     let mut goes_on = true;
     while rig.now < until {
         rig.step();
-        goes_on = plant.drills.look(plant, rig.now, at);
+        goes_on = drills.look(plant, rig.now, at);
     }
     goes_on
 }
@@ -150,7 +148,7 @@ fn look(rig: &mut Rig, plant: &Plant, at: SystemTime, span: Duration) -> bool {
 #[test]
 fn a_motor_starts_once_the_start_is_on_disk() {
     let (mut rig, plant, id) = started();
-    let drills = plant.drills.clone();
+    let drills = &plant.1;
     assert!(look(&mut rig, &plant, time(1), Duration::from_secs(2)));
     assert!(!rig.runs(0), "its start is not on disk");
     let (generation, saved) = drills.to_keep().unwrap();
@@ -168,9 +166,9 @@ fn a_motor_starts_once_the_start_is_on_disk() {
 #[test]
 fn a_start_that_cannot_be_recorded_starts_nothing() {
     let (mut rig, plant, id) = started();
-    plant.drills.not_kept("no space left", time(1));
+    plant.1.not_kept("no space left", time(1));
     assert!(!look(&mut rig, &plant, time(1), Duration::from_secs(1)));
-    let report = plant.drills.report(&id).unwrap();
+    let report = plant.1.report(&id).unwrap();
     assert_eq!(report.state, DrillState::Aborted);
     assert!(
         says(&report, "could not be recorded on disk (no space left)"),
@@ -179,10 +177,10 @@ fn a_start_that_cannot_be_recorded_starts_nothing() {
     let (mut rig, plant, id) = started();
     assert!(!look(&mut rig, &plant, time(1), Duration::from_secs(6)));
     // A disk that answers after that starts nothing any more.
-    plant.drills.kept(u64::MAX, rig.now);
+    plant.1.kept(u64::MAX, rig.now);
     look(&mut rig, &plant, time(1), Duration::from_secs(1));
     assert!(!rig.runs(0));
-    let report = plant.drills.report(&id).unwrap();
+    let report = plant.1.report(&id).unwrap();
     assert!(says(&report, "not recorded on disk within 5 s"), "{report:#?}");
 }
 
@@ -190,22 +188,22 @@ fn a_start_that_cannot_be_recorded_starts_nothing() {
 fn the_motor_of_a_drill_that_was_cut_off_is_stopped_at_the_next_start() {
     for (age, stops) in [(30, true), (4_000, false)] {
         let (mut rig, plant, id) = started();
-        let (generation, saved) = plant.drills.to_keep().unwrap();
-        plant.drills.kept(generation, rig.now);
+        let (generation, saved) = plant.1.to_keep().unwrap();
+        plant.1.kept(generation, rig.now);
         look(&mut rig, &plant, time(1), Duration::from_secs(1));
         assert!(rig.runs(0));
         // The process that comes up after the one that was killed.
         let plant = self::plant(&rig);
-        plant.drills.restore(saved);
-        let mut events = plant.events.subscribe();
+        plant.1.restore(saved);
+        let mut events = plant.0.events.subscribe();
         // Its client is still there, so that no lease stops the motor.
         let (alice, until) = (Origin::new(SourceKind::Http, "alice"), rig.now + Duration::from_secs(2));
         while rig.now < until {
-            plant.drives().next().unwrap().heartbeat(&alice, rig.now);
+            plant.0.drives().next().unwrap().heartbeat(&alice, rig.now);
             look(&mut rig, &plant, time(age), Duration::from_millis(100));
         }
         assert_eq!(!rig.runs(0), stops, "{age} s");
-        let report = plant.drills.report(&id).unwrap();
+        let report = plant.1.report(&id).unwrap();
         assert_eq!(report.state, DrillState::Aborted, "{report:#?}");
         assert!(says(&report, "killed or lost power"), "{report:#?}");
         assert_eq!(report.last_stop.as_deref(), stops.then_some("acknowledged"));
@@ -213,7 +211,7 @@ fn the_motor_of_a_drill_that_was_cut_off_is_stopped_at_the_next_start() {
         assert!(event.is_some_and(|event| event.text.contains("killed or lost power")));
         assert!(
             !plant
-                .drills
+                .1
                 .to_keep()
                 .unwrap()
                 .1

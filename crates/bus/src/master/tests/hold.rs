@@ -3,7 +3,7 @@
 use super::*;
 use crate::command::{Mode, Principal, Proof, Refusal, Rules, Verb};
 use crate::drive::DriveIndex;
-use crate::plant::{DriveHandle, Plant};
+use crate::plant::{DriveHandle, OrderRequest, Plant};
 use std::time::Duration as Time;
 
 /// The NX says by that bit that the fieldbus controls it.
@@ -50,7 +50,7 @@ fn place(rig: &Rig, plant: &Plant, name: &str, point: ModelPoint, value: Value) 
     let drive = drive(plant, 0);
     let index = drive.image.spec.profile.model_index(point).unwrap();
     let order = Order::Points(vec![(index, value)]);
-    drive.place(order, who(name), Authority::Write, DEFAULT_EXPIRY, rig.now)
+    drive.place(OrderRequest::new(order, who(name), Authority::Write), rig.now)
 }
 
 fn code(placed: &mut crate::plant::Placed) -> &'static str {
@@ -108,9 +108,9 @@ fn advisory_sends_all_and_counts() {
         rig.run(Time::from_millis(200));
         assert_eq!(code(&mut reference), "acknowledged", "{name}");
     }
-    assert_eq!(rig.bus.queue.lock().unheld(DriveIndex::new(0)), 2);
+    assert_eq!(rig.bus.queue.lock().gate.unheld(DriveIndex::new(0)), 2);
     let clients = |rig: &Rig| {
-        let unheld = rig.bus.queue.lock().take_unheld();
+        let unheld = rig.bus.queue.lock().gate.take_unheld();
         let clients = unheld.iter().map(|(_, unheld)| unheld.client.to_string());
         clients.collect::<Vec<_>>()
     };
@@ -163,7 +163,7 @@ fn what_has_begun_goes_no_further_when_a_hold_is_broken() {
         (index(ModelPoint::Run), Value::Bool(true)),
         (index(ModelPoint::SpeedReference), Value::Number(30.0)),
     ]);
-    let mut both = handle.place(order, who("plc"), Authority::Write, DEFAULT_EXPIRY, rig.now);
+    let mut both = handle.place(OrderRequest::new(order, who("plc"), Authority::Write), rig.now);
     let from = rig.wire.len();
     while writes(&rig, from) == 0 {
         rig.step();
@@ -179,7 +179,7 @@ fn the_turn_is_judged_again() {
     let (mut rig, plant) = guarded(1, Mode::Exclusive);
     let mut waits = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
     // Before its turn a reload removes the client, and another one takes the drive.
-    let rules = rig.bus.queue.lock().rules().cloned().unwrap();
+    let rules = rig.bus.queue.lock().gate.rules().cloned().unwrap();
     let mut fewer = Rules::clone(&rules);
     fewer.principals.retain(|principal| &*principal.name != "plc");
     rig.bus.queue.set_authority(Some(Arc::new(fewer)));
@@ -269,7 +269,7 @@ fn nothing_starts_when_local_control_ends() {
     // Found so at a start of the gateway: nothing is written.
     let mut rig = Rig::new(1);
     rig.drives[0].holding.insert(2000, 1);
-    let rules = plant.buses[0].queue.lock().rules().cloned();
+    let rules = plant.buses[0].queue.lock().gate.rules().cloned();
     rig.bus.queue.set_authority(rules);
     let from = rig.wire.len();
     rig.run(Time::from_millis(300));

@@ -117,8 +117,9 @@ fn a_read_renews_nothing_and_holds_nothing() {
     .unwrap();
     let origin = Origin::new(SourceKind::ModbusTcp, "10.0.0.1:1");
     let (ticket, _answer) = Ticket::new(origin, "d", String::new(), false, rig.now, rig.stats.clone());
-    let command = Command::new(DriveIndex::new(0), admitted, rig.now + DEFAULT_EXPIRY, ticket);
-    rig.bus.queue.submit(command, rig.now);
+    let window = window(rig.now, DEFAULT_EXPIRY);
+    let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
+    rig.bus.queue.submit(command, &(), rig.now);
     rig.look(50, true);
     rig.begin();
     rig.send();

@@ -47,7 +47,7 @@ fn where_the_drive_refuses_to_tell_its_run_command_stands_for_it() {
             rig.shows(ModelPoint::Run, Value::Bool(run));
         }
         let action = rig.later(100);
-        assert_eq!(action.map(|a| a.urgency), acts.then_some(Urgency::Stop), "{run:?}");
+        assert_eq!(action.map(|a| a.urgency()), acts.then_some(Urgency::Stop), "{run:?}");
         let unknown = rig
             .news
             .iter()

@@ -36,7 +36,7 @@ impl Clients {
             frame,
         };
         self.pending
-            .push(Command::passed_on(intent, passed_on, ticket), &Unseen, self.now);
+            .push(Command::passed_on(intent, passed_on, ticket), &(), self.now);
         receiver
     }
 
@@ -50,13 +50,13 @@ impl Clients {
         };
         let mut command = command(drive, admitted, self.now, ticket);
         command.intent.window.arrival.asked = asked;
-        self.pending.push(command, &Unseen, self.now);
+        self.pending.push(command, &(), self.now);
         receiver
     }
 
     fn passes_on(&mut self) -> bool {
         self.pending
-            .next_passed_on(self.now, &Unseen, |_| Ready::Now)
+            .next_passed_on(self.now, &(), |_| Ready::Now)
             .chosen
             .is_some()
     }
@@ -151,19 +151,11 @@ fn a_broadcast_has_its_place_among_the_orders_of_each_drive() {
 fn a_broadcast_that_was_not_sent_is_not_put_back_behind_a_stop() {
     let mut rig = Clients::new();
     let mut broadcast = rig.broadcast(START);
-    let chosen = rig
-        .pending
-        .next_passed_on(rig.now, &Unseen, |_| Ready::Now)
-        .chosen
-        .unwrap();
+    let chosen = rig.pending.next_passed_on(rig.now, &(), |_| Ready::Now).chosen.unwrap();
     let taken = rig.pending.take(chosen).unwrap();
     rig.pending.put_back(taken, rig.now);
     assert_eq!(outcome(&mut broadcast), None);
-    let chosen = rig
-        .pending
-        .next_passed_on(rig.now, &Unseen, |_| Ready::Now)
-        .chosen
-        .unwrap();
+    let chosen = rig.pending.next_passed_on(rig.now, &(), |_| Ready::Now).chosen.unwrap();
     let taken = rig.pending.take(chosen).unwrap();
     let _stop = rig.push(1, Urgency::Stop, &[1], false);
     rig.pending.put_back(taken, rig.now);
@@ -196,7 +188,7 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
             reference_only: false,
             ranges: Vec::new(),
         };
-        queue.submit(command(drive, admitted, now, ticket), &Unseen, now);
+        queue.submit(command(drive, admitted, now, ticket), &(), now);
         receiver
     };
     let (old, new) = (CommandQueue::new().unwrap(), Arc::new(CommandQueue::new().unwrap()));

@@ -54,16 +54,16 @@ fn a_start_is_judged_when_it_is_accepted_and_a_stop_passes() {
     let now = rig.now;
     stand(&mut rig.pending, 1, 3, false, now);
     let (start, mut answer) = order(SourceKind::Mqtt, 1, true, now);
-    rig.pending.push(start, &Unseen, now);
+    rig.pending.push(start, &(), now);
     let refused = outcome(&mut answer).unwrap();
     assert_eq!(refused.code(), "held_by_other");
     assert!(refused.to_string().contains("10.0.0.5"), "{refused}");
     let (elsewhere, mut answer) = order(SourceKind::Mqtt, 2, true, now);
-    rig.pending.push(elsewhere, &Unseen, now);
+    rig.pending.push(elsewhere, &(), now);
     assert_eq!(outcome(&mut answer), None, "another drive");
     for kind in [SourceKind::Mqtt, SourceKind::Supervision] {
         let (stop, mut answer) = order(kind, 1, false, now);
-        rig.pending.push(stop, &Unseen, now);
+        rig.pending.push(stop, &(), now);
         assert_eq!(outcome(&mut answer), None);
     }
     assert_eq!(
@@ -99,11 +99,11 @@ fn what_a_tool_sends_to_all_is_refused_for_one_and_its_stop_withdraws() {
         (Command::passed_on(intent, passed_on, ticket), answer)
     };
     let (start, mut answer) = broadcast(true);
-    rig.pending.push(start, &Unseen, now);
+    rig.pending.push(start, &(), now);
     assert_eq!(outcome(&mut answer).unwrap().code(), "held_by_other");
     assert_eq!(stands(&mut rig.pending, 2), [8]);
     let (stop, mut answer) = broadcast(false);
-    rig.pending.push(stop, &Unseen, now);
+    rig.pending.push(stop, &(), now);
     assert_eq!(outcome(&mut answer), None);
     assert_eq!(
         (stands(&mut rig.pending, 1), stands(&mut rig.pending, 2)),
@@ -122,7 +122,7 @@ fn a_stop_that_another_bus_takes_over_withdraws_there() {
     old.hand_over(DriveIndex::new(3), &new, DriveIndex::new(0), now);
     assert_eq!(stands(&mut new.lock(), 0), [8]);
     let (stop, mut answer) = order(SourceKind::Mqtt, 3, false, now);
-    old.submit(stop, &Unseen, now);
+    old.submit(stop, &(), now);
     assert_eq!(outcome(&mut answer), None);
     assert_eq!(stands(&mut new.lock(), 0), Vec::<u8>::new());
 }

@@ -27,7 +27,7 @@ impl Clients {
             .next(
                 rank,
                 self.now,
-                &Unseen,
+                &(),
                 |_| Ready::Now,
                 |drive| redundant.contains(&drive.place()),
             )

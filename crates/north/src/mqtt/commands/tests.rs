@@ -14,6 +14,7 @@ struct SetTopics {
     plant: Plant,
     commands: Commands,
     memory: SharedMemory,
+    stop_all: Arc<StopAll>,
     now: Instant,
     events: tokio::sync::broadcast::Receiver<Arc<crate::event::Event>>,
 }
@@ -22,11 +23,12 @@ impl SetTopics {
     fn new() -> SetTopics {
         let plant = fixture::plant(&["p1"]);
         fixture::read(&plant, "p1", 1, 0, Instant::now());
-        let memory = SharedMemory::default();
+        let (memory, stop_all) = (SharedMemory::default(), Arc::<StopAll>::default());
         SetTopics {
             events: plant.events.subscribe(),
-            commands: commands(&memory),
+            commands: commands(&memory, &stop_all),
             memory,
+            stop_all,
             now: Instant::now(),
             plant,
         }
@@ -34,14 +36,20 @@ impl SetTopics {
 
     /// A reload starts the client anew.
     fn reload_client(&mut self) {
-        self.commands = commands(&self.memory);
+        self.commands = commands(&self.memory, &self.stop_all);
     }
 
     /// A reload starts the client anew, which goes on with what the one before has left.
     fn succeed_client(&mut self) {
         let after = |left| {
             let topics = Topics::new("drivegate", "hall");
-            Commands::new(topics, rules(false), self.memory.clone(), Some(left))
+            Commands::new(
+                topics,
+                rules(false),
+                self.memory.clone(),
+                self.stop_all.clone(),
+                Some(left),
+            )
         };
         let before = std::mem::replace(&mut self.commands, after(OrdersLeft::default()));
         self.commands = after(before.leave(Vec::new()));
@@ -80,7 +88,7 @@ impl SetTopics {
         let pop = |bus: &crate::plant::BusHandle| next_command(&mut bus.queue.lock(), Urgency::Read, self.now);
         let command = self.plant.buses.iter().find_map(pop)?;
         let outcome = Outcome::Acknowledged(BusReply::Written);
-        Some((command.order, command.ticket.acknowledge(outcome, self.now)))
+        Some((command.intent.order, command.ticket.acknowledge(outcome, self.now)))
     }
 
     /// The result of the next command, which the drive acknowledges but never shows.
@@ -90,8 +98,14 @@ impl SetTopics {
     }
 }
 
-fn commands(memory: &SharedMemory) -> Commands {
-    Commands::new(Topics::new("drivegate", "hall"), rules(false), memory.clone(), None)
+fn commands(memory: &SharedMemory, stop_all: &Arc<StopAll>) -> Commands {
+    Commands::new(
+        Topics::new("drivegate", "hall"),
+        rules(false),
+        memory.clone(),
+        stop_all.clone(),
+        None,
+    )
 }
 
 fn rules(require_id: bool) -> Rules {

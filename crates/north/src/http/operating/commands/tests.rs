@@ -5,6 +5,7 @@ use drivegate_testkit::next_command;
 use super::*;
 use crate::http::operating::state::IN_PROGRESS;
 use crate::mqtt::fixture;
+use crate::plant::OrderRequest;
 
 fn operator(user: &str, login: &str) -> Operator {
     Operator {
@@ -152,10 +153,12 @@ fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
         crate::drive::Value::Bool(false),
     )];
     let _placed = drive.place(
-        crate::command::Order::Points(points),
-        origin,
-        crate::command::Authority::Write,
-        Duration::from_secs(1),
+        OrderRequest::new(
+            crate::command::Order::Points(points),
+            origin,
+            crate::command::Authority::Write,
+        )
+        .within(Duration::from_secs(1)),
         rig.now,
     );
     assert_eq!(drive.commander(), None, "another client");

@@ -106,7 +106,7 @@ fn a_command_is_one_order() {
         (bench.index("run"), Value::Bool(true)),
         (bench.index("speed_reference"), Value::Number(33.3)),
     ];
-    assert_eq!(command.order, Order::Points(expected));
+    assert_eq!(command.intent.order, Order::Points(expected));
     assert_eq!(command.ticket.origin().kind, SourceKind::Sparkplug);
     assert_eq!(command.ticket.origin().who, "spBv1.0/plant/DCMD/hall/p1");
     assert!(!bench.orders.is_idle());
@@ -267,7 +267,7 @@ fn an_empty_name_counts_for_nothing_and_a_contradiction_is_refused() {
             "{name} {alias}"
         );
         let expected = vec![(bench.index("speed_reference"), Value::Number(40.0))];
-        assert_eq!(bench.pop().unwrap().order, Order::Points(expected));
+        assert_eq!(bench.pop().unwrap().intent.order, Order::Points(expected));
     }
     for wrong in [run, 9999] {
         let finished = bench
