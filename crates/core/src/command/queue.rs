@@ -127,12 +127,10 @@ impl Pending {
             && let Some(older) = self.waiting.remove(index)
         {
             older.answer(&Outcome::Replaced, now);
-            self.note_accepted(&command, now);
-            self.waiting.insert(index, command);
+            self.accept(command, Some(index), now);
             return;
         }
-        let others = self.waiting.iter().filter(|c| c.urgency != Urgency::Stop).count();
-        if others >= CAPACITY {
+        if self.is_full() {
             match self.victim(&command).and_then(|index| self.waiting.remove(index)) {
                 Some(victim) => victim.answer(&Outcome::QueueFull, now),
                 None => {
@@ -141,8 +139,19 @@ impl Pending {
                 }
             }
         }
+        self.accept(command, None, now);
+    }
+
+    /// A command waits from now on: at the place of the one that it replaces, or behind all others.
+    fn accept(&mut self, command: Command, place: Option<usize>, now: Instant) {
         self.note_accepted(&command, now);
-        self.waiting.push_back(command);
+        self.waiting.insert(place.unwrap_or(self.waiting.len()), command);
+    }
+
+    /// Whether a command must make room for another one. Stops need none.
+    fn is_full(&self) -> bool {
+        let others = self.waiting.iter().filter(|c| c.urgency != Urgency::Stop);
+        others.count() >= CAPACITY
     }
 
     /// Who blocks a command that starts the motor or sets a reference.
@@ -296,9 +305,7 @@ impl Pending {
                 Urgency::Stop if redundant(drive) && !self.may_start(drive) => Urgency::Command,
                 urgency => urgency,
             };
-            if command.urgency == Urgency::Command {
-                behind.extend(command.reach());
-            }
+            keep_order(command, &mut behind);
             let goes = || pressed.contains(&command.number) && passed_on.contains(&command.number);
             if own != rank || (command.passed_on.is_some() && !goes()) || !may(command) {
                 continue;
@@ -408,6 +415,13 @@ impl Command {
         let tickets = std::iter::once((&self.ticket, self.expires)).chain(joined);
         let of_clients = tickets.filter(|(ticket, _)| ticket.origin().kind.is_client());
         of_clients.map(|(_, expires)| expires).max()
+    }
+}
+
+/// Later commands to the drives that a command reaches wait behind it.
+fn keep_order(command: &Command, behind: &mut Vec<DriveIndex>) {
+    if command.urgency == Urgency::Command {
+        behind.extend(command.reach());
     }
 }
 

@@ -98,9 +98,7 @@ impl Pending {
     pub(super) fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.drive;
         self.note_accepted(&stop, now);
-        self.remove(now, &Outcome::Purged, |c| {
-            c.reaches(drive) && c.urgency == Urgency::Command && !c.stops(drive)
-        });
+        self.remove(now, &Outcome::Purged, |c| is_purged(c, drive));
         if !self.stopped.contains(&drive) {
             self.stopped.push(drive);
         }
@@ -153,6 +151,11 @@ impl Pending {
     pub fn take_stopping(&mut self) -> Option<Stopping> {
         self.stopping.take()
     }
+}
+
+/// Whether a stop to the drive drops what waits: every command that reaches the drive and does not stop it too.
+fn is_purged(command: &Command, drive: DriveIndex) -> bool {
+    command.reaches(drive) && command.urgency == Urgency::Command && !command.stops(drive)
 }
 
 impl Command {
