@@ -62,8 +62,12 @@ def write_tree(tree):
 def anchored(tree, mutants):
     """The edits, each as the name of its fault, itself and the function that it changes; and what is wrong with others."""
     found, edits, wrong = index(tree), [], []
+    names = [mutant["name"] for mutant in mutants]
+    wrong += [f"{name}: two faults have this name" for name in sorted({name for name in names if names.count(name) > 1})]
     for mutant in mutants:
-        for edit in mutant["edit"]:
+        if unknown := (set(mutant) - {"unseen"}) ^ {"name", "promise", "edit"}:
+            wrong.append(f"{mutant['name']}: missing or unknown: {', '.join(sorted(unknown))}")
+        for edit in mutant.get("edit", []):
             name, forms = edit.get("fn", ""), [form for form in FORMS if form in edit]
             here = matching(found, name, edit.get("crate"))
             why = None
@@ -124,7 +128,7 @@ def changed(tree, edits, function):
         begun_by, ended_by = ("async ", "().await") if " async " in f" {text[slice(*function.signature)]}" else ("", "()")
         result = function.result or "()"
         arrow, typed = ("", "") if "impl " in result else (f" -> {result}", f": {result}")
-        first += f"#[allow(clippy::redundant_closure_call)]\nlet result{typed} = ({begun_by}||{arrow} {{"
+        first += f"let result{typed} = ({begun_by}||{arrow} {{"
         yield end, f"\n}}){ended_by};\n{results}result\n"
     yield begin, f"\n{first}"
 
