@@ -313,21 +313,6 @@ fn links_lead_somewhere() {
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
-/// The edits of the faults that the world must find fit the code as it stands.
-#[test]
-fn every_fault_of_the_world_fits_the_core() {
-    let faults: toml::Table = read(&root().join("tests/world/mutants.toml")).parse().unwrap();
-    for fault in faults["mutant"].as_array().unwrap() {
-        let (name, promise) = (fault["name"].as_str().unwrap(), fault["promise"].as_str().unwrap());
-        assert!(!promise.is_empty(), "{name}");
-        for edit in fault["edit"].as_array().unwrap() {
-            let (file, old) = (edit["file"].as_str().unwrap(), edit["old"].as_str().unwrap());
-            let places = read(&root().join(file)).matches(old).count();
-            assert_eq!(places, 1, "`{name}` is to replace one place of {file}: {old}");
-        }
-    }
-}
-
 /// The lines of all examples for a shell, a command that goes over several lines as one.
 fn examples() -> Vec<(PathBuf, String)> {
     let mut examples = Vec::new();

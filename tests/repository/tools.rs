@@ -4,7 +4,7 @@ use std::fs;
 use std::process::{Command, Stdio};
 
 use crate::support::process::until;
-use crate::support::tools::{root, run_well};
+use crate::support::tools::{python, root, run, run_well};
 
 fn needs(arguments: &[&str]) -> String {
     let script = root().join("deploy/package/tools.sh");
@@ -74,4 +74,64 @@ fn temporary_files_of_the_tests_go_with_their_run() {
     assert_eq!(left(), 1);
     assert!(with("true").status().unwrap().success());
     assert_eq!(left(), 0);
+}
+
+/// The functions that the faults of the world change are found, each once.
+#[test]
+fn every_fault_of_the_world_fits_the_core() {
+    let script = root().join("tests/world/mutants.py");
+    run_well(&python(), &[script.to_str().unwrap(), "--check"]);
+    let finder = root().join("tests/world/rust_functions.py");
+    run_well(&python(), &["-m", "doctest", finder.to_str().unwrap()]);
+}
+
+#[test]
+fn a_fault_that_fits_no_function_is_named_with_what_may_be_meant() {
+    let folder = tempfile::tempdir().unwrap();
+    let faults = folder.path().join("mutants.toml");
+    let edits = [
+        (
+            "gone",
+            "fn = 'Pending::pusch'\nreturns = '()'",
+            "0 functions have this name",
+        ),
+        (
+            "elsewhere",
+            "fn = 'Waiting::push_stop'\nreturns = '()'",
+            "core::command::queue::stops::Pending::push_stop in",
+        ),
+        (
+            "twice",
+            "fn = 'not_held'\nreturns = 'Ok(())'",
+            "2 functions have this name",
+        ),
+        (
+            "renamed",
+            "fn = 'Pending::push'\ngiven.commando = 'command'",
+            "no parameter commando",
+        ),
+        (
+            "both",
+            "fn = 'Pending::push'\nbefore = ''\nreturns = '()'",
+            "one of given, before, returns, result",
+        ),
+        (
+            "quoted",
+            "fn = 'Pending::push'\nold = ''\nreturns = '()'",
+            "unknown: old",
+        ),
+    ];
+    let text = |(name, edit, _): &(&str, &str, &str)| {
+        format!("[[mutant]]\nname = '{name}'\npromise = 'one'\n[[mutant.edit]]\n{edit}\n")
+    };
+    fs::write(&faults, edits.iter().map(text).collect::<String>()).unwrap();
+    let script = root().join("tests/world/mutants.py");
+    let check = ["--check", "--faults", faults.to_str().unwrap()];
+    let output = run(&python(), &[&[script.to_str().unwrap()], &check[..]].concat());
+    assert!(!output.status.success());
+    let said = String::from_utf8(output.stderr).unwrap();
+    for (name, _, why) in edits {
+        let line = said.lines().find(|line| line.starts_with(&format!("{name}: ")));
+        assert!(line.is_some_and(|line| line.contains(why)), "{name}: {said}");
+    }
 }

@@ -1,6 +1,7 @@
 #!/usr/bin/env python3
 """Shows that the seeded world finds faults: puts those of mutants.toml into a copy of the tree and runs the fixed seeds,
-then, where none of them found it, the other scenarios in virtual time.
+then, where none of them found it, the other scenarios in virtual time. With --check it builds nothing and says only which
+of them name no function, or more than one.
 
 All faults are built into one program, each behind a switch (the variable MUTANT names the one that is on), so that there
 is one build for all of them, in target/mutants. With none switched on the same program must pass all seeds. Prints one
@@ -9,6 +10,7 @@ row of a table for each fault; ends with 1 if one survived that the world should
 
 import argparse
 import concurrent.futures
+import difflib
 import json
 import os
 import pathlib
@@ -18,8 +20,12 @@ import subprocess
 import sys
 import tomllib
 
+from rust_functions import index, matching
+
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 COPY = ROOT / "target/mutants"
+# What a fault does to a function; each edit has one of them, see mutants.toml.
+FORMS = ("given", "before", "returns", "result")
 # Below `[workspace.package]`, and of the own packages in the lock file.
 VERSION = re.compile(rb'((?:\[workspace\.package\]|name = "drivegate[a-z-]*")\nversion = "[0-9.]+)')
 # Where the switch stands; every other crate that has faults takes it from there.
@@ -33,17 +39,18 @@ pub fn mutant(name: &str) -> bool {
 """
 
 
-def copy_tree():
-    """The files under version control as they are now; unchanged ones keep their time, so that the build is short."""
+def listed_tree():
+    """The files under version control as they are now."""
     listed = subprocess.run(["git", "ls-files", "-z", "--cached"], cwd=ROOT, check=True, capture_output=True, text=True)
     files = {name for name in listed.stdout.split("\0") if name and (ROOT / name).is_file()}
-    for old in [path for path in COPY.rglob("*") if path.is_file()]:
-        if str(old.relative_to(COPY)) not in files:
-            old.unlink()
     return {name: (ROOT / name).read_bytes() for name in files}
 
 
 def write_tree(tree):
+    """Copies it; unchanged files keep their time, so that the build is short."""
+    for old in [path for path in COPY.rglob("*") if path.is_file()]:
+        if str(old.relative_to(COPY)) not in tree:
+            old.unlink()
     for name, content in tree.items():
         path = COPY / name
         if not path.is_file() or path.read_bytes() != content:
@@ -52,38 +59,94 @@ def write_tree(tree):
             shutil.copymode(ROOT / name, path)
 
 
-def switched(mutant, old, new):
-    """The text that is `new` while the fault is switched on, else `old`."""
-    on = f'crate::mutant("{mutant["name"]}")'
-    if re.search(r"\bON\b", new):
-        return re.sub(r"\bON\b", on, new)
-    text = f"if {on} {{ {new} }} else {{ {old} }}"
-    return text if old.rstrip()[-1] in ";}" else f"({text})"
-
-
-def put_in(tree, mutants):
-    edits = {}
+def anchored(tree, mutants):
+    """The edits, each as the name of its fault, itself and the function that it changes; and what is wrong with others."""
+    found, edits, wrong = index(tree), [], []
+    names = [mutant["name"] for mutant in mutants]
+    wrong += [f"{name}: two faults have this name" for name in sorted({name for name in names if names.count(name) > 1})]
     for mutant in mutants:
-        for edit in mutant["edit"]:
-            text = tree.get(edit["file"], b"").decode()
-            if text.count(edit["old"]) != 1:
-                sys.exit(f'{mutant["name"]}: stands {text.count(edit["old"])} times in {edit["file"]}: {edit["old"]}')
-            begin = text.index(edit["old"])
-            place = (begin, begin + len(edit["old"]), switched(mutant, edit["old"], edit["new"]), mutant["name"])
-            edits.setdefault(edit["file"], []).append(place)
-    for name, places in edits.items():
-        text, places = tree[name].decode(), sorted(places)
-        for (_, end, _, one), (begin, _, _, other) in zip(places, places[1:]):
-            if begin < end:
-                sys.exit(f"{one} and {other} change the same text in {name}")
-        for begin, end, new, _ in reversed(places):
-            text = text[:begin] + new + text[end:]
-        tree[name] = text.encode()
+        if unknown := (set(mutant) - {"unseen"}) ^ {"name", "promise", "edit"}:
+            wrong.append(f"{mutant['name']}: missing or unknown: {', '.join(sorted(unknown))}")
+        for edit in mutant.get("edit", []):
+            name, forms = edit.get("fn", ""), [form for form in FORMS if form in edit]
+            here = matching(found, name, edit.get("crate"))
+            why = None
+            if unknown := set(edit) - {"fn", "crate", *FORMS}:
+                why = f"unknown: {', '.join(sorted(unknown))}"
+            elif len(forms) != 1:
+                why = f"one of {', '.join(FORMS)} is needed"
+            elif len(here) != 1:
+                why = f"{len(here)} functions have this name; {candidates(found, name, here)}"
+            elif strange := [of for of in edit.get("given", {}) if not parameter(tree, here[0], of)]:
+                why = f"it has no parameter {', '.join(strange)}"
+            if why:
+                wrong.append(f"{mutant['name']}: `{name}`: {why}")
+            else:
+                edits.append((mutant["name"], edit, here[0]))
+    return edits, wrong
+
+
+def candidates(found, name, here):
+    """The functions that may be meant."""
+    last = name.split("::")[-1]
+    others = here or [function for function in found if function.path[-1] == last]
+    if not others:
+        close = difflib.get_close_matches(last, {function.path[-1] for function in found}, 3)
+        others = [function for function in found if function.path[-1] in close]
+    return "candidates: " + (", ".join(f"{function} in {function.file}" for function in others[:8]) or "none")
+
+
+def parameter(tree, function, name):
+    """How the function declares it: `name: ` or `mut name: `."""
+    signature = tree[function.file].decode()[slice(*function.signature)]
+    return re.search(rf"[(,]\s*((?:mut\s+)?{re.escape(name)})\s*:", signature)
+
+
+def begun(tree, name, edit, function):
+    """What comes first in the body."""
+    on = f'crate::mutant("{name}")'
+    if "given" in edit:
+        lets = [(parameter(tree, function, of).group(1), of, new) for of, new in edit["given"].items()]
+        return "".join(f"let {declared} = if {on} {{ {new} }} else {{ {of} }};\n" for declared, of, new in lets)
+    if "before" in edit:
+        return f"if {on} {{ {edit['before']} }}\n"
+    return f"if {on} {{ return {edit['returns']}; }}\n"
+
+
+def changed(tree, edits, function):
+    """What the edits of one function insert into its file, and where: all of them go together, each with its own switch."""
+    text = tree[function.file].decode()
+    begin, end = function.body[0] + 1, function.body[1] - 1
+    first = "".join(begun(tree, name, edit, function) for name, edit in edits if "result" not in edit)
+    results = "".join(
+        f'let result = if crate::mutant("{name}") {{ {edit["result"]} }} else {{ result }};\n'
+        for name, edit in edits
+        if "result" in edit
+    )
+    if results:
+        # The body may return early: a closure keeps that in it.
+        begun_by, ended_by = ("async ", "().await") if " async " in f" {text[slice(*function.signature)]}" else ("", "()")
+        result = function.result or "()"
+        arrow, typed = ("", "") if "impl " in result else (f" -> {result}", f": {result}")
+        first += f"let result{typed} = ({begun_by}||{arrow} {{"
+        yield end, f"\n}}){ended_by};\n{results}result\n"
+    yield begin, f"\n{first}"
+
+
+def put_in(tree, edits):
+    functions, inserted = {}, {}
+    for name, edit, function in edits:
+        functions.setdefault(function, []).append((name, edit))
+    for function, of in functions.items():
+        inserted.setdefault(function.file, []).extend(changed(tree, of, function))
+    for file, places in inserted.items():
+        text = tree[file].decode()
+        for at, new in sorted(places, reverse=True):
+            text = text[:at] + new + text[at:]
+        tree[file] = text.encode()
     tree[LOWEST] += SWITCH.encode()
-    crates = {"/".join(name.split("/")[:2]) for name in edits}
-    for crate in crates:
-        if crate != "crates/proto":
-            tree[f"{crate}/src/lib.rs"] += b"\npub(crate) use drivegate_proto::mutant;\n"
+    for crate in {function.path[0] for function in functions} - {"proto"}:
+        tree[f"crates/{crate}/src/lib.rs"] += b"\npub(crate) use drivegate_proto::mutant;\n"
     # A version of its own: cargo, which shares the built dependencies, must not take one tree's program for the other's.
     for name in ("Cargo.toml", "Cargo.lock"):
         tree[name] = VERSION.sub(rb'\1-mutants', tree[name])
@@ -132,13 +195,20 @@ def main():
     options.add_argument("only", nargs="*", help="names of faults; all without any")
     options.add_argument("--seeds", type=int, default=400, help="seeds tried on each (400)")
     options.add_argument("--time", type=int, default=600, help="seconds for one fault (600)")
+    options.add_argument("--check", action="store_true", help="only find the functions that they change; builds nothing")
+    options.add_argument("--faults", type=pathlib.Path, default=ROOT / "tests/world/mutants.toml", help="another mutants.toml")
     options.add_argument("--jobs", type=int, default=os.cpu_count(), help="faults run side by side")
     options = options.parse_args()
-    mutants = tomllib.loads((ROOT / "tests/world/mutants.toml").read_text())["mutant"]
+    mutants = tomllib.loads(options.faults.read_text())["mutant"]
     if unknown := set(options.only) - {mutant["name"] for mutant in mutants}:
         sys.exit(f"no such fault: {', '.join(sorted(unknown))}")
-    tree = copy_tree()
-    put_in(tree, mutants)
+    tree = listed_tree()
+    edits, wrong = anchored(tree, mutants)
+    if wrong:
+        sys.exit("\n".join(wrong))
+    if options.check:
+        return print(f"{len(mutants)} faults with {len(edits)} edits: each names one function")
+    put_in(tree, edits)
     write_tree(tree)
     program = build()
     chosen = [mutant for mutant in mutants if not options.only or mutant["name"] in options.only]

@@ -122,7 +122,7 @@ fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> 
         Effect::Stops => {
             let stopped = model(ModelPoint::Running).map(|running| !running.as_bool());
             // Not the speed: in percent of a band from a minimum frequency, 0 % is a motor that turns.
-            let stands = model(ModelPoint::OutputFrequency).map(|v| v.as_f64() == 0.0);
+            let stands = model(ModelPoint::OutputFrequency).map(is_standstill);
             stopped.into_iter().chain(stands).reduce(|a, b| a || b)
         }
         Effect::ReadBack(index, value) => {
@@ -135,6 +135,10 @@ fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> 
             })
         }
     }
+}
+
+fn is_standstill(output_frequency: Value) -> bool {
+    output_frequency.as_f64() == 0.0
 }
 
 /// How fast the motor turns, whatever the direction: its output frequency, which falls to zero, as a percentage of a band

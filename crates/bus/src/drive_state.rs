@@ -182,8 +182,7 @@ impl DriveState {
             return;
         };
         if run.in_doubt() {
-            // A bit of another command must not bring back what an unanswered stop took away.
-            self.words.forget();
+            self.forget_words();
         }
         if run.is_heard() && run.reached_the_wire() {
             self.supervision.renew(now);
@@ -275,6 +274,11 @@ impl DriveState {
                 run.finish(&outcome, now);
             }
         }
+    }
+
+    /// A bit of another command must not bring back what an unanswered stop took away.
+    fn forget_words(&mut self) {
+        self.words.forget();
     }
 
     /// The drive no longer replies. A stop is retried; other started commands have failed.

@@ -189,7 +189,7 @@ impl LineState {
         // A reply cannot be whole before its own time on the wire has ended.
         let least = self.format.chars(self.protocol.least_reply_chars(&request.pdu));
         let earliest = sent + least.mul_f64(ALMOST);
-        let doubtful = sending.could_be_doubled || !is_unlike_its_reply(&request.pdu);
+        let doubtful = is_doubtful(&request, sending);
         let timeout = sending.response_timeout;
         let mut transaction = Transaction::new(
             self.protocol,
@@ -239,13 +239,18 @@ impl LineState {
     /// Bytes were received at `now`. Returns the transaction if they complete it.
     pub fn heard(&mut self, bytes: &[u8], now: Instant) -> Option<Exchanged> {
         if !bytes.is_empty() {
-            self.quiet_since = now.max(self.quiet_since);
+            self.begin_silence(now);
         }
         let underway = self.underway.as_mut()?;
         match underway.transaction.on_bytes(now, bytes) {
             Step::Wait(_) => None,
             Step::Done(ended) => self.over(ended, now),
         }
+    }
+
+    /// Something was on the line, a reply or garbage: the silence before the next request begins anew.
+    fn begin_silence(&mut self, now: Instant) {
+        self.quiet_since = now.max(self.quiet_since);
     }
 
     /// Time went by.
@@ -334,6 +339,11 @@ impl LineState {
         };
         self.learned.early_weight = (self.learned.early_weight + weight).min(MOST_WEIGHT);
     }
+}
+
+/// Whether a duplicate of an earlier reply, or an echo of the request, could pass for the reply.
+fn is_doubtful(request: &Request, sending: Sending) -> bool {
+    sending.could_be_doubled || !is_unlike_its_reply(&request.pdu)
 }
 
 #[cfg(test)]

@@ -142,8 +142,7 @@ impl N2LateReplies {
     }
 
     fn alike(&self, wanted: Form, now: Instant) -> impl Iterator<Item = &Late> {
-        let alike = move |late: &&Late| late.until > now && late.form.is_like(wanted);
-        self.0.iter().filter(alike)
+        self.0.iter().filter(move |late| late.could_pass_for(wanted, now))
     }
 
     /// The meaning of the complete frame at the start of `bytes`, received at `now` in the transaction of `pdu` with
@@ -238,6 +237,11 @@ fn has_form(form: Form, answer: &Answer) -> bool {
 impl Late {
     fn is_of(&self, address: u8, pdu: &RequestPdu) -> bool {
         self.address == address && self.pdu == *pdu
+    }
+
+    /// Whether it may still come and be taken for a reply of that form.
+    fn could_pass_for(&self, wanted: Form, now: Instant) -> bool {
+        self.until > now && self.form.is_like(wanted)
     }
 
     fn could_be(&self, answer: &Answer) -> bool {

@@ -182,7 +182,7 @@ impl Supervision {
             // The action of the lease before, which a client that is back has suspended for good.
             State::Held(_) if self.answer.is_some() => Demand::Withdraw,
             State::Held(since) => {
-                if now.saturating_duration_since(since) >= spec.timeout && !held {
+                if has_run_out(since, spec.timeout, now) && !held {
                     self.runs_out(since, reading, words, now, news, drive);
                 }
                 match self.lease.0 {
@@ -285,13 +285,16 @@ impl Supervision {
         match answer.try_recv() {
             Err(TryRecvError::Empty) => return,
             Ok(answer) if answer.outcome.is_ok() => self.lease = Lease(State::Ended),
-            Ok(answer) => {
-                self.next_try = Some(now + AGAIN);
-                self.failure = Some(answer.outcome).filter(has_failed);
-            }
+            Ok(answer) => self.not_acknowledged(answer.outcome, now),
             Err(TryRecvError::Closed) => self.next_try = Some(now + AGAIN),
         }
         self.answer = None;
+    }
+
+    /// The action is written again.
+    fn not_acknowledged(&mut self, outcome: Outcome, now: Instant) {
+        self.next_try = Some(now + AGAIN);
+        self.failure = Some(outcome).filter(has_failed);
     }
 
     /// Reports a failed action, and one that succeeded after that.
@@ -404,6 +407,11 @@ pub(super) fn written_run(reading: &Reading<'_>, words: &KnownWords) -> Option<b
     let place = profile.run_place()?;
     let word = words.get(place.table, place.address)?;
     Some(profile.runs_by(place.table, place.address, word).unwrap_or(false))
+}
+
+/// Whether a lease that was renewed last at `since` ends.
+fn has_run_out(since: Instant, timeout: Duration, now: Instant) -> bool {
+    now.saturating_duration_since(since) >= timeout
 }
 
 /// Whether this outcome is a failed action: not if another command replaced it, or the bus restarts.

@@ -115,11 +115,10 @@ impl Master {
             return Some(Ok(self.turn(ready, now)));
         }
         let rank = self.turns.rank(|rank| commands.waits(rank));
-        if self.shutdown.is_some() {
+        if self.polls_cease() {
             if !self.stops_the_line() {
                 self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
             }
-            // Polls cease: the line belongs to the stops.
             return match rank {
                 Some(rank) => self.command(rank, &mut commands, now),
                 // The broadcast that stops the whole line goes before the stops that wait for it.
@@ -289,9 +288,7 @@ impl Master {
             return;
         }
         if command.is_stop() {
-            // It waited for its turn: its time begins now.
-            let window = &mut command.intent.window;
-            window.expires = window.expires.max(now + DEFAULT_EXPIRY);
+            begin_time(&mut command, now);
         }
         let starts = self.waits.starts.as_ref();
         let start = starts.and_then(|starts| starts.start_of(&command.intent, command.ticket.origin(), index));
@@ -363,29 +360,46 @@ impl Master {
         if !self.may_still_write(turn.drive, slot, now) {
             return false;
         }
-        let run = self.drives.get_mut(turn.drive).and_then(|drive| drive.run(slot));
-        let Some(run) = run.filter(|run| !run.is_late(now)) else {
+        let Some(run) = self.run_in_time(turn.drive, slot, now) else {
             return false;
         };
-        if run.is_of_supervision() && run.is_owed() {
-            // A client that came back while the line went silent suspends it.
-            let beats = self
-                .bus
-                .image
-                .drives
-                .get(turn.drive)
-                .is_some_and(|image| image.has_heartbeat());
-            return !beats && self.bus.queue.lock().client_waits_until(turn.drive).is_none();
-        }
-        true
+        let is_action = run.is_of_supervision() && run.is_owed();
+        !(is_action && self.client_is_back(turn.drive))
     }
+
+    /// The command under way, unless it expired while the line went silent.
+    fn run_in_time(&mut self, drive: DriveIndex, slot: Urgency, now: Instant) -> Option<&mut CommandRun> {
+        let run = self.drives.get_mut(drive).and_then(|drive| drive.run(slot));
+        run.filter(|run| !run.is_late(now))
+    }
+
+    /// Whether a client came back while the line went silent, which suspends the action of its lease.
+    fn client_is_back(&self, drive: DriveIndex) -> bool {
+        let image = self.bus.image.drives.get(drive);
+        image.is_some_and(|image| image.has_heartbeat()) || self.bus.queue.lock().client_waits_until(drive).is_some()
+    }
+
+    /// Whether the gateway stops: the line belongs to the stops then.
+    fn polls_cease(&self) -> bool {
+        self.shutdown.is_some()
+    }
+}
+
+/// The time of a stop begins when the stop does, however long it waited for its turn.
+fn begin_time(stop: &mut Command, now: Instant) {
+    let window = &mut stop.intent.window;
+    window.expires = window.expires.max(now + DEFAULT_EXPIRY);
+}
+
+/// Behind a stop that has started nothing goes before the stop has ended.
+fn waits_for_stop(drive: &DriveState, command: &Command) -> bool {
+    command.urgency() == Urgency::Command && drive.is_busy(Urgency::Stop)
 }
 
 /// Whether the drive of a queued command is ready for it.
 pub(super) fn may_begin(drive: &mut DriveState, command: &Command, online: bool, now: Instant) -> Ready {
-    // Behind a stop that has started nothing goes before it has ended.
     let urgency = command.urgency();
-    if drive.is_busy(urgency) || (urgency == Urgency::Command && drive.is_busy(Urgency::Stop)) {
+    if drive.is_busy(urgency) || waits_for_stop(drive, command) {
         return Ready::No;
     }
     if urgency == Urgency::Stop {

@@ -65,8 +65,7 @@ impl Master {
             // Nobody answers it.
             return;
         }
-        // The drive's own reply, unless a late one of an earlier transaction may have been that.
-        let came_mangled = end.mangled && !self.late_before;
+        let came_mangled = self.came_mangled(end);
         if !self.waits.sessions.is_empty() {
             self.note_late_on_n2(turn, end, came_mangled, now);
         }
@@ -106,6 +105,11 @@ impl Master {
             }
             Ended::Silent | Ended::Corrupt(_) => {}
         }
+    }
+
+    /// Whether it was mangled that came: the drive's own reply, unless a late one of an earlier transaction may have been that.
+    fn came_mangled(&self, end: &TurnEnd) -> bool {
+        end.mangled && !self.late_before
     }
 
     /// The same on an N2 line. What waited for a late reply that will not come is due again.

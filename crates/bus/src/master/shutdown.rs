@@ -12,7 +12,7 @@ use crate::command::{Answer, NotStopped, Origin, Outcome, SourceKind, Stopping, 
 use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::drive_state::FRESH;
 use crate::plant::{BusHandle, Exchange, Question};
-use crate::process_image::{Access, OnShutdown};
+use crate::process_image::{Access, DriveImage, OnShutdown};
 use crate::stop_of_line::stop_of_line;
 
 /// How long the stops wait for a broadcast that goes before them: a transaction that is on the line, the broadcast, and
@@ -53,6 +53,13 @@ enum State {
     Refused(String),
 }
 
+impl State {
+    /// A stop that was not acknowledged is ordered again.
+    fn due_again(now: Instant) -> State {
+        State::Due(now + AGAIN)
+    }
+}
+
 impl Stop {
     /// Looks at the answer; `now` is when it is ordered again where it failed.
     fn look(&mut self, now: Instant) {
@@ -68,9 +75,9 @@ impl Stop {
             }) => State::Refused(outcome.to_string()),
             Ok(answer) => {
                 self.last = Some(answer.outcome.to_string());
-                State::Due(now + AGAIN)
+                State::due_again(now)
             }
-            Err(TryRecvError::Closed) => State::Due(now + AGAIN),
+            Err(TryRecvError::Closed) => State::due_again(now),
         };
         self.in_vain |= matches!(self.state, State::Due(_));
     }
@@ -83,8 +90,7 @@ impl Stop {
 impl Shutdown {
     fn new(stopping: Stopping, bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Shutdown {
         let drives = bus.image.drives.enumerate();
-        let wanted = drives
-            .filter(|(_, image)| image.spec.on_shutdown == OnShutdown::Stop && image.spec.access == Access::Control);
+        let wanted = drives.filter(|(_, image)| is_to_stop(image));
         let stop = |(drive, _)| Stop {
             drive,
             state: State::Due(now),
@@ -168,6 +174,11 @@ impl Master {
             }
         }
     }
+}
+
+/// Whether the drive is to be stopped with the gateway.
+fn is_to_stop(image: &DriveImage) -> bool {
+    image.spec.on_shutdown == OnShutdown::Stop && image.spec.access == Access::Control
 }
 
 /// The broadcast that stops all drives of the bus, where all of them are to be stopped and one of them answers.

@@ -174,7 +174,7 @@ impl Schedule {
                     let slow = drive.items.iter().filter(|i| i.is_slow() && !drive.waits_for_fast());
                     let slow = slow.map(|i| drive.due(i));
                     let asked = drive.items.iter().filter_map(|i| i.asked);
-                    slow.chain(asked).filter(|due| *due > now).min()
+                    slow.chain(asked).filter(|due| is_ahead(*due, now)).min()
                 }
             };
             next = due.map_or(next, |due| next.min(due));
@@ -190,4 +190,9 @@ impl Schedule {
             self.slow_started = Some(now);
         }
     }
+}
+
+/// What is due already waits for its turn, not for a time.
+fn is_ahead(due: Instant, now: Instant) -> bool {
+    due > now
 }

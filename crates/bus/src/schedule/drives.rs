@@ -267,7 +267,7 @@ impl DriveSchedule {
             // What is on the line then, and what goes before it, is within the longest pause too.
             Presence::Away(now + (took * 4).clamp(first, longest.mul_f64(0.9)), first)
         } else {
-            let doubled = (pause * 2).min(longest);
+            let doubled = doubled(pause);
             let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);
             Presence::Away(now + doubled.max(affordable), doubled)
         };
@@ -366,4 +366,9 @@ impl DriveSchedule {
         }
         self.items = joined;
     }
+}
+
+/// The pause after this one between probes of a drive that stays away.
+fn doubled(pause: Duration) -> Duration {
+    (pause * 2).min(PROBE_PAUSE.1)
 }

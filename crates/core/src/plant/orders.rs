@@ -244,21 +244,25 @@ impl DriveHandle {
     pub fn place(&self, request: OrderRequest, now: Instant) -> Placed {
         let reading = self.reading(now);
         let OrderRequest { order, rest, .. } = request.clone();
-        let may_go = |stop: &Order| self.takes_stops() && admit(stop.clone(), &reading, request.authority).is_ok();
         if let Some((what, refusal)) = rest {
-            return match may_go(&order) {
+            return match self.may_go(&order, &reading, request.authority) {
                 true => self.place_parts(order, (&what, Err(refusal)), request, &reading),
                 false => self.place_one(order, request, &reading),
             };
         }
         match Parts::of(order.clone(), &self.image.spec.profile) {
-            Parts::Two(stop, rest) if may_go(&stop) => {
+            Parts::Two(stop, rest) if self.may_go(&stop, &reading, request.authority) => {
                 let what = self.describe(&rest);
                 self.place_parts(stop, (&what, Ok(rest)), request, &reading)
             }
             Parts::Two(..) => self.place_one(order, request, &reading),
             Parts::One(order) => self.place_one(order, request, &reading),
         }
+    }
+
+    /// Whether a stop goes to the bus.
+    fn may_go(&self, stop: &Order, reading: &Reading<'_>, authority: Authority) -> bool {
+        self.takes_stops() && admit(stop.clone(), reading, authority).is_ok()
     }
 
     /// Whether the bus is open, or about to open its port: a stop waits for that.

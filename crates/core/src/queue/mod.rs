@@ -143,12 +143,10 @@ impl Pending {
             && let Some(older) = self.waiting.remove(index)
         {
             older.answer(&Outcome::Replaced, now);
-            self.gate.accepted(&command, now);
-            self.waiting.insert(index, command);
+            self.accept(command, Some(index), now);
             return;
         }
-        let others = self.waiting.iter().filter(|c| !c.is_stop()).count();
-        if others >= CAPACITY {
+        if self.is_full() {
             match self.victim(&command).and_then(|index| self.waiting.remove(index)) {
                 Some(victim) => victim.answer(&Outcome::QueueFull, now),
                 None => {
@@ -157,8 +155,18 @@ impl Pending {
                 }
             }
         }
+        self.accept(command, None, now);
+    }
+
+    /// A command waits from now on: at the place of the one that it replaces, or behind all others.
+    fn accept(&mut self, command: Command, place: Option<usize>, now: Instant) {
         self.gate.accepted(&command, now);
-        self.waiting.push_back(command);
+        self.waiting.insert(place.unwrap_or(self.waiting.len()), command);
+    }
+
+    /// Whether a command must make room for another one. Stops need none.
+    fn is_full(&self) -> bool {
+        self.waiting.iter().filter(|c| !c.is_stop()).count() >= CAPACITY
     }
 
     /// The numbers of the commands that wait.
@@ -274,9 +282,7 @@ impl Pending {
                 Urgency::Stop if redundant(drive) && !self.may_start(drive) => Urgency::Command,
                 urgency => urgency,
             };
-            if urgency == Urgency::Command {
-                behind.extend(command.reach());
-            }
+            keep_order(command, &mut behind);
             let number = command.intent.number;
             let goes = || pressed.contains(&number) && passed_on.contains(&number);
             if own != rank || (is_passed_on && !goes()) || !is_ready(command) {
@@ -419,6 +425,13 @@ impl Pending {
     /// Whether none waits.
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()
+    }
+}
+
+/// Later commands to the drives that a command reaches wait behind it.
+fn keep_order(command: &Command, behind: &mut Vec<DriveIndex>) {
+    if command.is_command() {
+        behind.extend(command.reach());
     }
 }
 

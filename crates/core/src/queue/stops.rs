@@ -87,9 +87,7 @@ impl Pending {
     pub(super) fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.intent.drive;
         self.gate.accepted(&stop, now);
-        self.remove(now, &Outcome::Purged, |c| {
-            c.reaches(drive) && c.is_command() && !c.stops(drive)
-        });
+        self.remove(now, &Outcome::Purged, |c| is_purged(c, drive));
         if !self.stopped.contains(&drive) {
             self.stopped.push(drive);
         }
@@ -132,6 +130,11 @@ impl Pending {
     pub fn take_stopping(&mut self) -> Option<Stopping> {
         self.stopping.take()
     }
+}
+
+/// Whether a stop to the drive drops what waits: every command that reaches the drive and does not stop it too.
+fn is_purged(command: &Command, drive: DriveIndex) -> bool {
+    command.reaches(drive) && command.is_command() && !command.stops(drive)
 }
 
 impl Command {

@@ -55,6 +55,13 @@ struct Group {
     reserved: usize,
 }
 
+impl Group {
+    /// One of its drives starts: the next one waits.
+    fn started(&mut self, now: Instant) {
+        self.last = self.last.max(Some(now));
+    }
+}
+
 /// Whether starts are kept.
 #[derive(Debug, Default)]
 enum Disk {
@@ -287,7 +294,7 @@ impl Ledger {
             if was_reserved && entry.motor.reserved.is_none() {
                 group.reserved = group.reserved.saturating_sub(1);
             }
-            group.last = group.last.max(Some(now));
+            group.started(now);
             self.generation += 1;
         }
     }
