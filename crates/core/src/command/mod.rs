@@ -44,6 +44,7 @@ pub use standing::{LastWritten, is_reference, limits_passed, still_keeps_limits}
 pub use ticket::{Receipt, Ticket, WriteStats};
 pub use touched::Touched;
 
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use crate::codec::RequestPdu;
@@ -54,6 +55,13 @@ pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);
 
 /// The result code of an acknowledged command whose effect a read showed.
 pub const CONFIRMED: &str = "confirmed";
+
+/// A number that nothing in this process had before; later ones are greater. Clearances of starts outlive the queue of a
+/// bus, and go by the number of their command.
+fn number() -> u64 {
+    static LAST: AtomicU64 = AtomicU64::new(1);
+    LAST.fetch_add(1, Ordering::Relaxed)
+}
 
 /// A command's content.
 #[derive(Debug, Clone, PartialEq)]
@@ -102,7 +110,7 @@ pub struct Command {
     pub behind: Option<StopEnd>,
     /// Younger commands that went before it.
     pub overtaken: usize,
-    /// Its number in the queue.
+    /// Its number; no other command of the process has it.
     pub number: u64,
     /// When its request began to arrive: a command requested before a stop arrived is not sent after it.
     pub asked: Option<Instant>,

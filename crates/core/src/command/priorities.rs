@@ -8,10 +8,9 @@
 mod effect;
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
-use super::{Origin, Outcome, SourceKind};
+use super::{Origin, Outcome, SourceKind, number};
 use crate::drive::{ModelPoint, Value};
 
 pub use effect::Effect;
@@ -87,12 +86,6 @@ impl Entry {
             number: number(),
         }
     }
-}
-
-/// A number that was not given before: later writes have greater ones.
-fn number() -> u64 {
-    static LAST: AtomicU64 = AtomicU64::new(1);
-    LAST.fetch_add(1, Ordering::Relaxed)
 }
 
 /// A write to a slot; the order that follows from it carries it, so that both are accepted at once.

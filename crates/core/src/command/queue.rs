@@ -15,7 +15,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use self::holds::Holds;
-use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal, Urgency};
+use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal, Urgency, number};
 use crate::drive::DriveIndex;
 use crate::start_guard::BusGuards;
 
@@ -40,8 +40,6 @@ pub struct Pending {
     served: VecDeque<(String, DriveIndex)>,
     /// Drives for which a stop arrived since the bus last checked, each once.
     stopped: Vec<DriveIndex>,
-    /// Commands taken in so far.
-    numbered: u64,
     /// Stops taken in so far, by drive.
     stops: BTreeMap<DriveIndex, u64>,
     /// When the last of them arrived.
@@ -80,8 +78,7 @@ impl Pending {
     /// reads wait, a command takes the place of the youngest of a client that has more waiting than its own client would
     /// have, or of a drive that its client has more waiting for.
     pub fn push(&mut self, mut command: Command, now: Instant) {
-        self.numbered += 1;
-        command.number = self.numbered;
+        command.number = number();
         if command.urgency == Urgency::Stop
             && let Some((queue, place)) = self.heirs.get(&command.drive)
         {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use super::{CommandQueue, Pending};
-use crate::command::{Command, Outcome, Urgency};
+use crate::command::{Command, Outcome, Urgency, number};
 use crate::drive::DriveIndex;
 
 impl Pending {
@@ -30,8 +30,7 @@ impl Pending {
 
     /// A stop that was given to the bus before; it was counted there.
     fn inherit(&mut self, mut stop: Command, now: Instant) {
-        self.numbered += 1;
-        stop.number = self.numbered;
+        stop.number = number();
         // Its consequences were noted there, too.
         (stop.effects, stop.slot) = (Vec::new(), None);
         match &self.closed {
