@@ -226,6 +226,12 @@ impl Pending {
             .with(drive, |holding, rules, _| holding.renew(&who, rules, now));
     }
 
+    /// The drive acknowledged a stop of that client.
+    pub fn hold_stop_acknowledged(&mut self, drive: DriveIndex, origin: &Origin) {
+        let Some(who) = self.holds.claim(origin) else { return };
+        self.holds.with(drive, |holding, _, _| holding.stop_acknowledged(&who));
+    }
+
     /// Whether supervision follows that client: it holds the drive, or was the last holder, or there was none.
     pub(crate) fn hold_renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
         let Some(holding) = self.holds.rules.as_ref().and_then(|_| self.holds.drives.get(&drive)) else {
