@@ -5,7 +5,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::ledger::{Guards, Kept, Ledger};
-use super::{Guard, Guarded, Interlock, Reason, Seen, Unmet, shown};
+use super::motor::Motor;
+use super::passage::ByRun;
+use super::{Guard, Guarded, Interlock, Reason, Seen, Unable, Unmet, shown};
 use crate::command::{Command, Effect, Refusal};
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, Plan, Value};
 use crate::process_image::{BusSpec, DriveSpec, Link, Machine, Reading};
@@ -45,25 +47,21 @@ pub enum Clearance {
 }
 
 impl BusGuards {
-    /// Those of a bus; none where nothing of it is guarded.
+    /// Those of a bus; none where nothing of it is guarded. They take effect with [`BusGuards::begin`].
     pub fn of<'d>(
         shared: &Arc<Guards>,
         bus: &BusSpec,
         drives: impl IntoIterator<Item = &'d DriveSpec>,
     ) -> Option<Arc<BusGuards>> {
-        let mut ledger = shared.lock();
         let drives = drives.into_iter().map(|drive| {
             if !drive.is_guarded() {
                 return None;
             }
-            let machine = bus.machine(drive);
-            let group = drive.starts_with();
-            ledger.register(&machine, &group);
             let profile = &drive.profile;
             let running = profile.model_index(ModelPoint::Running);
             Some(Guarding {
-                machine,
-                group,
+                machine: bus.machine(drive),
+                group: drive.starts_with(),
                 guard: drive.guard.unwrap_or_default(),
                 interlocks: drive.interlocks.clone(),
                 tells_running: running.is_some_and(|index| Plan::of(profile).shows(profile, index)),
@@ -71,13 +69,21 @@ impl BusGuards {
         });
         let drives: PerDrive<Option<Guarding>> = drives.collect();
         let any = drives.iter().any(Option::is_some);
-        drop(ledger);
         any.then(|| {
             Arc::new(BusGuards {
                 shared: shared.clone(),
                 drives,
             })
         })
+    }
+
+    /// The bus is about to begin: from now on the starts of its drives count so. Until then, and after a reload that is
+    /// refused, the drives of the bus before it are guarded as they were.
+    pub fn begin(&self) {
+        let mut ledger = self.shared.lock();
+        for of in self.drives.iter().flatten() {
+            ledger.register(&of.machine, &of.group);
+        }
     }
 
     fn of_drive(&self, drive: DriveIndex) -> Option<&Guarding> {
@@ -99,11 +105,15 @@ impl BusGuards {
     ) -> Option<Refusal> {
         let of = self.of_drive(drive).filter(|_| effect.run == Some(true))?;
         let mut ledger = self.shared.lock();
-        if !ledger.motor(&of.machine)?.is_started_by_run() {
+        let motor = ledger.motor(&of.machine)?;
+        let by_run = motor.by_run();
+        if by_run == ByRun::Runs {
             return None;
         }
+        // The order before this one starts it, if it does.
+        let is_first = by_run != ByRun::Repeats && motor.reserved.is_none();
         let refused = self.interlocked(of, now).or_else(|| {
-            let wait = ledger.hindered(&of.machine, &of.guard, now)?;
+            let wait = ledger.hindered(&of.machine, &of.guard, now).filter(|_| is_first)?;
             Some(wait).filter(|wait| waits_until.is_none_or(|until| now + wait.retry_after > until))
         })?;
         ledger.count_refused(&of.machine, refused.reason);
@@ -117,15 +127,20 @@ impl BusGuards {
         interlocked.or_else(|| {
             let ledger = self.shared.lock();
             // One that runs by its order, with a reference of zero, is not kept from a start.
-            let starts = ledger.motor(&of.machine).is_none_or(|motor| motor.is_started_by_run());
+            let by_run = ledger.motor(&of.machine).map(Motor::by_run);
+            let starts = !matches!(by_run, Some(ByRun::Runs | ByRun::Repeats));
             starts.then(|| ledger.hindered(&of.machine, &of.guard, now)).flatten()
         })
     }
 
-    /// The interlocks that do not hold, or of them those that stop the motor.
-    pub fn unmet(&self, drive: DriveIndex, trips_only: bool, now: Instant) -> Vec<Unmet> {
-        let of = self.of_drive(drive);
-        of.map_or_else(Vec::new, |of| self.unmet_of(of, trips_only, now))
+    /// The interlocks that do not hold and stop the running motor of that drive.
+    pub fn tripped(&self, drive: DriveIndex, now: Instant) -> Vec<Unmet> {
+        let Some(of) = self.of_drive(drive) else {
+            return Vec::new();
+        };
+        let around = self.shared.around();
+        let trips = of.interlocks.iter().filter(|interlock| interlock.trip);
+        trips.filter_map(|interlock| interlock.trips(&around, now)).collect()
     }
 
     /// Whether an interlock of that drive stops its motor.
@@ -134,18 +149,16 @@ impl BusGuards {
         of.is_some_and(|of| of.interlocks.iter().any(|interlock| interlock.trip))
     }
 
-    fn unmet_of(&self, of: &Guarding, trips_only: bool, now: Instant) -> Vec<Unmet> {
+    fn interlocked(&self, of: &Guarding, now: Instant) -> Option<Guarded> {
         if of.interlocks.is_empty() {
-            return Vec::new();
+            return None;
         }
         let around = self.shared.around();
-        let wanted = of.interlocks.iter().filter(|interlock| interlock.trip || !trips_only);
-        wanted.filter_map(|interlock| interlock.unmet(&around, now)).collect()
-    }
-
-    fn interlocked(&self, of: &Guarding, now: Instant) -> Option<Guarded> {
-        let unmet = self.unmet_of(of, false, now);
-        let unmet: Vec<String> = unmet.iter().map(Unmet::to_string).collect();
+        let unmet = of
+            .interlocks
+            .iter()
+            .filter_map(|interlock| interlock.unmet(&around, now));
+        let unmet: Vec<String> = unmet.map(|unmet| unmet.to_string()).collect();
         (!unmet.is_empty()).then(|| Guarded {
             reason: Reason::Interlock,
             why: format!("an interlock is not satisfied: {}", unmet.join(", ")),
@@ -162,8 +175,9 @@ impl BusGuards {
             return Clearance::Go;
         }
         let mut ledger = self.shared.lock();
-        let starts = |of: &&&Guarding| ledger.motor(&of.machine).is_some_and(|motor| motor.is_started_by_run());
-        let started: Vec<&Guarding> = started.iter().filter(starts).copied().collect();
+        let by_run = |of: &Guarding| ledger.motor(&of.machine).map_or(ByRun::Runs, Motor::by_run);
+        let started = started.into_iter().map(|of| (of, by_run(of)));
+        let started: Vec<(&Guarding, ByRun)> = started.filter(|(_, by_run)| *by_run != ByRun::Runs).collect();
         match self.judge(&ledger, &started, command, now) {
             Err((of, refused)) => {
                 ledger.count_refused(&of.machine, refused.reason);
@@ -178,19 +192,19 @@ impl BusGuards {
     fn judge<'g>(
         &self,
         ledger: &Ledger,
-        started: &[&'g Guarding],
+        started: &[(&'g Guarding, ByRun)],
         command: &Command,
         now: Instant,
     ) -> Result<Option<Instant>, (&'g Guarding, Guarded)> {
         let mut waits: Option<Instant> = None;
-        for of in started {
+        for (of, by_run) in started {
             if let Some(refused) = self.interlocked(of, now) {
                 return Err((of, refused));
             }
             let cleared = ledger
                 .motor(&of.machine)
                 .is_some_and(|motor| motor.is_cleared(command.number));
-            if cleared {
+            if cleared || *by_run == ByRun::Repeats {
                 continue;
             }
             if let Some(wait) = ledger.hindered(&of.machine, &of.guard, now) {
@@ -201,7 +215,7 @@ impl BusGuards {
                 waits = waits.max(Some(until));
             }
         }
-        if let Some(of) = started.iter().find(|of| self.is_together(of, started)) {
+        if let Some((of, _)) = started.iter().find(|(of, _)| is_together(of, started)) {
             let why = format!(
                 "one command would start several drives whose starts must be {} apart (guard.stagger); start them one \
                  by one",
@@ -217,18 +231,13 @@ impl BusGuards {
         Ok(waits)
     }
 
-    /// Whether that drive is not to be started together with another of these.
-    fn is_together(&self, of: &Guarding, started: &[&Guarding]) -> bool {
-        let other = |other: &&Guarding| other.machine != of.machine && other.group == of.group;
-        !of.guard.stagger.is_zero() && started.iter().any(other)
-    }
-
     /// Counts what is not counted yet, and looks whether that is on disk.
-    fn count(&self, ledger: &mut Ledger, started: &[&Guarding], command: &Command, now: Instant) -> Clearance {
+    fn count(&self, ledger: &mut Ledger, started: &[(&Guarding, ByRun)], command: &Command, now: Instant) -> Clearance {
         let number = command.number;
         let mut changed = false;
-        for of in started {
-            if !ledger.motor(&of.machine).is_some_and(|motor| motor.is_cleared(number)) {
+        for (of, by_run) in started {
+            let cleared = ledger.motor(&of.machine).is_some_and(|motor| motor.is_cleared(number));
+            if *by_run == ByRun::Starts && !cleared {
                 ledger.reserve(&of.machine, number, command.expires, now);
                 changed = true;
             }
@@ -237,7 +246,7 @@ impl BusGuards {
             self.shared.tell_change();
         }
         let mut clearance = Clearance::Go;
-        for of in started {
+        for (of, _) in started {
             let Some(reserved) = ledger.motor(&of.machine).and_then(|motor| motor.reserved) else {
                 continue;
             };
@@ -251,7 +260,7 @@ impl BusGuards {
                         retry_after: super::ledger::DISK,
                     };
                     ledger.count_refused(&of.machine, refused.reason);
-                    started.iter().for_each(|of| ledger.withdraw(&of.machine));
+                    started.iter().for_each(|(of, _)| ledger.withdraw(&of.machine));
                     return Clearance::Refused(refusal(refused));
                 }
             }
@@ -259,24 +268,27 @@ impl BusGuards {
         clearance
     }
 
-    /// Whether the next write of a command that was cleared may go, if it starts the motor by now.
+    /// Whether the next write of a command may go, if the motor does not run for certain by now.
     ///
     /// # Errors
-    /// Why not: an interlock does not hold any more, or the motor, which ran when the order was judged, has stopped.
+    /// Why not: an interlock does not hold any more, or the command would make a start that was not judged and counted,
+    /// since the motor has stopped, or the drive become able to start, after its turn came.
     pub fn may_write(&self, drive: DriveIndex, number: u64, now: Instant) -> Result<(), Refusal> {
         let Some(of) = self.of_drive(drive) else { return Ok(()) };
         let ledger = self.shared.lock();
-        let Some(motor) = ledger.motor(&of.machine).filter(|motor| motor.is_started_by_run()) else {
+        let Some(motor) = ledger.motor(&of.machine) else {
             return Ok(());
         };
-        let stopped = || Guarded {
-            reason: Reason::MinOff,
-            why: "the motor was running when the command arrived, and has stopped since; send it again".to_string(),
-            retry_after: of.guard.min_off,
-        };
-        let refused = match motor.is_cleared(number) {
-            true => self.interlocked(of, now),
-            false => Some(stopped()),
+        let refused = match motor.by_run() {
+            ByRun::Runs => None,
+            ByRun::Starts if !motor.is_cleared(number) => Some(Guarded {
+                reason: Reason::MinOff,
+                why: "the motor was running, or the drive could not start, when the command arrived, and that has changed since; \
+                      send it again"
+                    .to_string(),
+                retry_after: of.guard.min_off,
+            }),
+            ByRun::Repeats | ByRun::Vain | ByRun::Starts => self.interlocked(of, now),
         };
         refused.map_or(Ok(()), |refused| Err(refusal(refused)))
     }
@@ -371,6 +383,14 @@ impl BusGuards {
     }
 }
 
+/// Whether that drive is not to be started together with another of these.
+fn is_together(of: &Guarding, started: &[(&Guarding, ByRun)]) -> bool {
+    let other = |(other, by_run): &(&Guarding, ByRun)| {
+        *by_run != ByRun::Repeats && other.machine != of.machine && other.group == of.group
+    };
+    !of.guard.stagger.is_zero() && started.iter().any(other)
+}
+
 fn refusal(refused: Guarded) -> Refusal {
     match refused.reason {
         Reason::Interlock => Refusal::Interlocked(refused.why),
@@ -386,10 +406,18 @@ fn seen(reading: &Reading<'_>) -> Option<Seen> {
     let runs = running && !reading.is_set(ModelPoint::Fault);
     let commanded = reading.model(ModelPoint::Run);
     let turns = || matches!(reading.standstill(None), Standstill::Turns(_));
+    let told = |point: ModelPoint, as_told: bool| {
+        let sample = reading.model(point);
+        let is_told = sample.good().is_some_and(|value| value.as_bool() == as_told);
+        sample.at.filter(|_| is_told)
+    };
+    let fault = told(ModelPoint::Fault, true).map(|at| (Unable::Fault, at));
+    let not_ready = || told(ModelPoint::Ready, false).map(|at| (Unable::NotReady, at));
     Some(Seen {
         running: runs,
         commanded: commanded.good().map(Value::as_bool).zip(commanded.at),
         stands: !running && !turns(),
+        unable: fault.or_else(not_ready).filter(|_| !runs),
         at: sample.at?,
     })
 }
