@@ -149,7 +149,7 @@ impl WorldBus {
             mode: Default::default(),
         };
         let guards = Arc::new(Guards::default());
-        let handle = handle(index, line, &profile, format, &guards);
+        let handle = handle(index, line, &profile, format, (&guards, now));
         let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();
         let predicted = predict(&handle.image.spec, parts.silence, &specs);
         let (round, slow_round) = (predicted.fast_cycle, predicted.slow_cycle);
@@ -205,11 +205,13 @@ impl WorldBus {
     /// The bus as a reload starts it anew, with the same drives on the same line.
     pub fn restart(&mut self, index: usize, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
         self.handle.queue.begin_handover(now);
+        let leaving: Vec<_> = self.handle.image.drives.iter().cloned().collect();
+        self.guards.expect(&leaving, now);
         let before = self.core.ended(now);
         let format = self.handle.image.spec.format;
         let stopped = std::mem::replace(
             &mut self.handle,
-            handle(index, &self.line, &self.profile, format, &self.guards),
+            handle(index, &self.line, &self.profile, format, (&self.guards, now)),
         );
         self.handle.take_over(std::slice::from_ref(&stopped), now);
         stopped
@@ -229,7 +231,7 @@ impl WorldBus {
         self.wire.cut();
         self.guards = Arc::new(guards);
         let format = self.handle.image.spec.format;
-        self.handle = handle(self.index, &self.line, &self.profile, format, &self.guards);
+        self.handle = handle(self.index, &self.line, &self.profile, format, (&self.guards, now));
         let (bus, options, before) = (self.handle.clone(), &self.options, Handover::default());
         self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
         if self.open {
@@ -451,7 +453,7 @@ pub fn handle(
     line: &Line,
     profile: &Arc<Profile>,
     format: LineFormat,
-    guards: &Arc<Guards>,
+    (guards, now): (&Arc<Guards>, Instant),
 ) -> BusHandle {
     let name = format!("line{index}");
     let spec = BusSpec {
@@ -477,7 +479,9 @@ pub fn handle(
     };
     let drives: Vec<Arc<DriveImage>> = (1..=line.drives).map(drive).collect();
     let guarded = BusGuards::of(guards, &spec, drives.iter().map(|drive| &drive.spec));
-    guards.watch(drives.iter().cloned(), Duration::from_secs(1));
+    guarded.iter().for_each(|guarded| guarded.begin());
+    let watched = drives.iter().map(|drive| (spec.machine(&drive.spec), drive.clone()));
+    guards.watch(watched, Duration::from_secs(1), now);
     BusHandle {
         image: Arc::new(BusImage::new(spec, drives)),
         queue: Arc::new(CommandQueue::new().unwrap().guarded(guarded)),

@@ -42,9 +42,9 @@ pub(super) struct DriveState {
     pub(super) written: LastWritten,
     /// A start (true) or a stop was acknowledged, and the guards have not taken note of it.
     pub(super) acknowledged: Option<bool>,
-    /// Whether `[authority]` is on: then the senders of executed commands are kept.
+    /// Whether `[authority]` is on: then the senders of executed commands are kept, and whether these were stops.
     pub(super) has_authority: bool,
-    pub(super) carried_out: Vec<Origin>,
+    pub(super) carried_out: Vec<(Origin, bool)>,
     /// Whether its local control place has it; none while that is not known.
     pub(super) local: Option<bool>,
 }
@@ -188,7 +188,9 @@ impl DriveState {
             self.supervision.renew(now);
         }
         if self.has_authority && outcome.is_ok() {
-            self.carried_out.extend(run.origins().cloned());
+            let is_stop = urgency == Urgency::Stop;
+            self.carried_out
+                .extend(run.origins().map(|origin| (origin.clone(), is_stop)));
         }
         if urgency == Urgency::Stop && run.has_begun() {
             // Stops without end must not make each other news.

@@ -221,7 +221,7 @@ impl Master {
                 sessions,
                 n2_late: N2LateReplies::default(),
                 strangers: BTreeMap::new(),
-                starts: StartGate::of(&bus, now),
+                starts: StartGate::of(&bus),
                 quiet: None,
             },
             last_answered: None,

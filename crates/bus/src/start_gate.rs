@@ -20,14 +20,11 @@ use crate::start_guard::BusGuards;
 
 /// First and longest pause before a motor that an interlock stopped and that runs on is stopped again.
 const AGAIN: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
-/// After the start of the bus so long a point that was not read yet stops no motor.
-const FIRST_READ: Duration = Duration::from_secs(10);
 
 /// The guards of the bus, and the stops of their interlocks.
 #[derive(Debug)]
 pub(super) struct StartGate {
     guards: Arc<BusGuards>,
-    began: Instant,
     /// News to report.
     told: Vec<News>,
     trips: PerDrive<Trip>,
@@ -52,12 +49,11 @@ struct Trip {
 }
 
 impl StartGate {
-    pub(super) fn of(bus: &BusHandle, now: Instant) -> Option<StartGate> {
+    pub(super) fn of(bus: &BusHandle) -> Option<StartGate> {
         let guards = bus.queue.guards()?.clone();
         let trips = bus.image.drives.iter().map(|_| Trip::default()).collect();
         Some(StartGate {
             guards,
-            began: now,
             told: Vec::new(),
             trips,
         })
@@ -120,10 +116,7 @@ impl StartGate {
             return;
         };
         trip.note_answer(now);
-        let mut unmet = self.guards.unmet(index, true, now);
-        if now < self.began + FIRST_READ {
-            unmet.retain(|unmet| unmet.was_read());
-        }
+        let unmet = self.guards.tripped(index, now);
         if unmet.is_empty() || !may_run(reading, words) {
             (trip.next, trip.pause, trip.is_told) = (None, AGAIN.0, false);
             return;

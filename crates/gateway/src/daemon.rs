@@ -213,14 +213,15 @@ impl Daemon {
     /// before, without a recorder.
     pub async fn reload(&mut self, settings: Settings) -> Result<Vec<String>, StartError> {
         let settings = file_limit::fit(settings);
-        self.apply_guards(&settings).await;
-        // Everything that can fail comes before anything that runs is stopped for good.
+        // Everything that can fail comes before anything that runs is stopped for good, or counts otherwise.
         let prepared = self.prepare_buses(&settings)?;
         let servers = self.prepare_servers(&settings).await?;
         if let Err(error) = self.apply_recorder(&settings).await {
             self.abort_servers(servers).await;
             return Err(error);
         }
+        // Before the first start is counted.
+        self.apply_guards(&settings).await;
         self.apply_params(&settings);
         self.hold_unfinished(&settings).await;
         self.commit_servers(servers).await;
@@ -255,6 +256,8 @@ impl Daemon {
         let mut learned: BTreeMap<String, Learned> = BTreeMap::new();
         self.watch(&kept);
         let stopped: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
+        let leaving = stopped.iter().flat_map(|bus| bus.image.drives.iter().cloned());
+        self.guards.expect(&leaving.collect::<Vec<_>>(), Instant::now());
         for (before, left) in at_once(removed, BusTask::make_room).await {
             learned.extend(left.learned.map(|learned| (before.spec.port.clone(), learned)));
             leases.left(&before, left.leases);
@@ -264,6 +267,11 @@ impl Daemon {
         let known = [stopped.clone(), parted].concat();
         for (bus, task) in prepared {
             task.handle().take_over(&known, Instant::now());
+            task.handle()
+                .queue
+                .guards()
+                .into_iter()
+                .for_each(|guards| guards.begin());
             let handover = Handover {
                 leases: leases.of(&bus, Instant::now()),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
@@ -332,10 +340,13 @@ impl Daemon {
             events: self.events.clone(),
             writes: self.writes.clone(),
         }));
-        let images = buses
-            .iter()
-            .flat_map(|(_, task)| task.handle().image.drives.iter().cloned());
-        self.guards.watch(images, settings.stale_after);
+        let of_bus = |image: &Arc<BusImage>| {
+            let drives = image.drives.iter();
+            let named = drives.map(|drive| (image.spec.machine(&drive.spec), drive.clone()));
+            named.collect::<Vec<_>>()
+        };
+        let drives = buses.iter().flat_map(|(_, task)| of_bus(&task.handle().image));
+        self.guards.watch(drives, settings.stale_after, Instant::now());
         if let Some(recorder) = &self.recorder {
             let images = buses.iter().map(|(_, task)| task.handle().image.clone());
             recorder.adopt(images.collect(), settings.stale_after);

@@ -29,8 +29,11 @@ pub(super) fn look_at_hold(
     }
     let before = std::mem::replace(&mut drive.local, local);
     let mut queue = bus.queue.lock();
-    for origin in &carried_out {
+    for (origin, is_stop) in &carried_out {
         queue.gate.hold_renewed(index, origin, now);
+        if *is_stop {
+            queue.gate.hold_stop_acknowledged(index, origin);
+        }
     }
     if local != before {
         // An unknown control place does not count as local.

@@ -129,6 +129,20 @@ fn outcome(receiver: &mut Receiver<Answer>) -> Option<Outcome> {
 }
 
 #[test]
+fn no_number_of_a_command_is_used_twice_in_the_process() {
+    let mut numbers = std::collections::BTreeSet::new();
+    for _ in 0..3 {
+        // The queue of a bus that a reload starts anew.
+        let mut clients = Clients::new();
+        for drive in 0..2 {
+            clients.give((SourceKind::Mqtt, "a"), drive, Urgency::Command, points(&[1]), false);
+        }
+        numbers.extend(clients.pending.waiting.iter().map(|command| command.intent.number));
+    }
+    assert_eq!(numbers.len(), 6);
+}
+
+#[test]
 fn stop_first_and_it_purges_its_drive() {
     let mut rig = Clients::new();
     let mut read = rig.push(1, Urgency::Read, &[], false);

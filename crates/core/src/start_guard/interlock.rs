@@ -4,8 +4,8 @@ use std::fmt;
 use std::time::Instant;
 
 use super::Interlock;
-use super::ledger::Around;
-use crate::drive::{Quality, Value};
+use super::around::{Around, Watched};
+use crate::drive::{PointIndex, Quality, Value};
 
 /// An interlock that does not hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -15,61 +15,82 @@ pub struct Unmet {
     is: bool,
     /// The actual state of the point.
     but: String,
-    was_read: bool,
-}
-
-impl Unmet {
-    /// Whether the point was read since the gateway started.
-    pub fn was_read(&self) -> bool {
-        self.was_read
-    }
 }
 
 impl fmt::Display for Unmet {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Unmet {
-            drive, point, is, but, ..
-        } = self;
+        let Unmet { drive, point, is, but } = self;
         write!(f, "`{point}` of {drive} must be {is}, but {but}")
     }
 }
 
 impl Interlock {
-    /// Returns it if not satisfied. Only a good sample satisfies it.
+    /// Returns it if a start is not to be made. Only a good sample satisfies it.
     pub(super) fn unmet(&self, around: &Around, now: Instant) -> Option<Unmet> {
-        let (but, was_read) = self.differs(around, now)?;
-        Some(Unmet {
-            was_read,
-            drive: self.drive.clone(),
-            point: self.point.clone(),
-            is: self.is,
-            but,
+        self.of(around, |watched, index| self.differs(watched, index, around, now))
+    }
+
+    /// Returns it if a running motor is to be stopped. A drive whose bus was started anew counts as it counted before until it was
+    /// read.
+    pub(super) fn trips(&self, around: &Around, now: Instant) -> Option<Unmet> {
+        self.of(around, |watched, index| {
+            self.differed(watched, index, around, (now, now))
         })
     }
 
-    /// The actual state of the point if the interlock is not satisfied, and whether the point was ever read.
-    fn differs(&self, around: &Around, now: Instant) -> Option<(String, bool)> {
-        let Some(image) = around.images.get(&self.drive) else {
-            return Some(("there is no such drive".to_string(), true));
+    fn of(&self, around: &Around, differs: impl Fn(&Watched, PointIndex) -> Option<String>) -> Option<Unmet> {
+        let but = match around.drive(&self.drive) {
+            None => Some("there is no such drive".to_string()),
+            Some(watched) => match watched.image.spec.profile.point_index(&self.point) {
+                None => Some("the drive has no such point".to_string()),
+                Some(index) => differs(watched, index),
+            },
         };
-        let Some(index) = image.spec.profile.point_index(&self.point) else {
-            return Some(("the drive has no such point".to_string(), true));
+        Some(Unmet {
+            drive: self.drive.clone(),
+            point: self.point.clone(),
+            is: self.is,
+            but: but?,
+        })
+    }
+
+    /// The state of the point at `at` if the interlock was not satisfied then.
+    fn differed(
+        &self,
+        watched: &Watched,
+        index: PointIndex,
+        around: &Around,
+        (at, now): (Instant, Instant),
+    ) -> Option<String> {
+        let Some(anew) = watched.anew(now) else {
+            return self.differs(watched, index, around, at);
         };
-        let reading = image.reading(now, around.stale_after);
+        let read = watched.image.reading(at, around.stale_after).sample(index).at;
+        // What the bus that ends reads last grows old while the next one starts.
+        if !watched.is_leaving() && read.is_some_and(|read| read > anew.since) {
+            return self.differs(watched, index, around, at);
+        }
+        // One that was not there before stops no motor until it was read.
+        let before = anew.before.as_ref()?;
+        self.differed(before, index, around, (anew.since, now))
+    }
+
+    /// The state of the point if it does not satisfy the interlock.
+    fn differs(&self, watched: &Watched, index: PointIndex, around: &Around, now: Instant) -> Option<String> {
+        let reading = watched.image.reading(now, around.stale_after);
         let sample = reading.sample(index);
         let age = || {
             sample
                 .at
                 .map_or(0.0, |at| now.saturating_duration_since(at).as_secs_f64())
         };
-        let but = match sample.good().map(Value::as_bool) {
+        Some(match sample.good().map(Value::as_bool) {
             Some(is) if is == self.is => return None,
             Some(is) => format!("is {is}"),
             None if !reading.snapshot.link.is_online() => "is unknown: the drive is offline".to_string(),
             None if sample.at.is_none() => "was never read".to_string(),
             None if sample.quality == Quality::Stale => format!("is stale: read {:.1} s ago", age()),
             None => "is unknown: its value is bad".to_string(),
-        };
-        Some((but, sample.at.is_some()))
+        })
     }
 }

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 
+use super::around::Around;
 use super::file::Saved;
 use super::motor::{HOUR, Motor, Reserved};
 use super::{Guard, Guarded, Reason, shown};
@@ -22,17 +23,9 @@ pub struct Guards {
     around: ArcSwap<Around>,
 }
 
-/// The images that interlocks check.
-#[derive(Debug, Default)]
-pub(super) struct Around {
-    pub(super) images: BTreeMap<String, Arc<DriveImage>>,
-    pub(super) stale_after: Duration,
-}
-
 #[derive(Debug, Default)]
 pub(super) struct Ledger {
     motors: BTreeMap<Machine, Entry>,
-    groups: BTreeMap<Arc<str>, Group>,
     /// Counts changes that belong on disk.
     generation: u64,
     disk: Disk,
@@ -45,21 +38,6 @@ pub(super) struct Entry {
     group: Arc<str>,
     /// Starts that were refused, by reason.
     refused: BTreeMap<Reason, u64>,
-}
-
-/// Drives that are started one after the other.
-#[derive(Debug, Default)]
-struct Group {
-    last: Option<Instant>,
-    /// Starts that are decided and not written.
-    reserved: usize,
-}
-
-impl Group {
-    /// One of its drives starts: the next one waits.
-    fn started(&mut self, now: Instant) {
-        self.last = self.last.max(Some(now));
-    }
 }
 
 /// Whether starts are kept.
@@ -95,12 +73,20 @@ impl Guards {
     }
 
     /// From now on interlocks look at these drives.
-    pub fn watch(&self, drives: impl IntoIterator<Item = Arc<DriveImage>>, stale_after: Duration) {
-        let named = |image: Arc<DriveImage>| (image.spec.name.clone(), image);
-        self.around.store(Arc::new(Around {
-            images: drives.into_iter().map(named).collect(),
-            stale_after,
-        }));
+    pub fn watch(
+        &self,
+        drives: impl IntoIterator<Item = (Machine, Arc<DriveImage>)>,
+        stale_after: Duration,
+        now: Instant,
+    ) {
+        let next = self.around.load().follow(drives, stale_after, now);
+        self.around.store(Arc::new(next));
+    }
+
+    /// The buses of these drives are about to be started anew.
+    pub fn expect(&self, drives: &[Arc<DriveImage>], now: Instant) {
+        let next = self.around.load().expecting(drives, now);
+        self.around.store(Arc::new(next));
     }
 
     /// Something changed that belongs on disk.
@@ -154,34 +140,22 @@ impl Guards {
 }
 
 impl Ledger {
-    /// A drive is configured; its starts count in that group.
+    /// From now on the starts of a drive count, in that group.
     pub(super) fn register(&mut self, machine: &Machine, group: &Arc<str>) {
-        let entry = self.motors.entry(machine.clone()).or_insert_with(|| Entry {
-            motor: Motor::default(),
-            group: group.clone(),
-            refused: BTreeMap::new(),
-        });
-        if entry.group != *group && entry.motor.reserved.is_some() {
-            entry.motor.settle();
-            let before = self.groups.entry(entry.group.clone()).or_default();
-            before.reserved = before.reserved.saturating_sub(1);
-        }
-        entry.group = group.clone();
-        let last = entry.motor.starts().max();
-        let group = self.groups.entry(group.clone()).or_default();
-        group.last = group.last.max(last);
+        self.entry(machine.clone()).group = group.clone();
     }
 
-    fn remember(&mut self, machine: Machine, starts: impl Iterator<Item = Instant>, now: Instant) {
-        let entry = self.motors.entry(machine).or_insert_with(|| Entry {
+    fn entry(&mut self, machine: Machine) -> &mut Entry {
+        self.motors.entry(machine).or_insert_with(|| Entry {
             motor: Motor::default(),
             group: Arc::from(""),
             refused: BTreeMap::new(),
-        });
-        entry.motor.remember(starts.map(|at| at.min(now)));
-        let last = entry.motor.starts().max();
-        let group = self.groups.entry(entry.group.clone()).or_default();
-        group.last = group.last.max(last);
+        })
+    }
+
+    fn remember(&mut self, machine: Machine, starts: impl Iterator<Item = Instant>, now: Instant) {
+        let starts = starts.map(|at| at.min(now));
+        self.entry(machine).motor.remember(starts);
     }
 
     pub(super) fn motor(&self, machine: &Machine) -> Option<&Motor> {
@@ -206,12 +180,17 @@ impl Ledger {
     }
 
     fn too_close(&self, name: &Arc<str>, guard: &Guard, now: Instant) -> Option<Guarded> {
-        let group = self.groups.get(name).filter(|_| !guard.stagger.is_zero())?;
-        let last = group.last.filter(|_| group.reserved == 0);
-        let retry_after = match (group.reserved, last) {
+        if guard.stagger.is_zero() {
+            return None;
+        }
+        let members = || self.motors.values().filter(|entry| entry.group == *name);
+        let retry_after = match members().any(|entry| entry.motor.reserved.is_some()) {
             // It may be written at any time.
-            (1.., _) => guard.stagger,
-            (0, last) => (last? + guard.stagger).saturating_duration_since(now),
+            true => guard.stagger,
+            false => {
+                let last = members().filter_map(|entry| entry.motor.starts().max()).max()?;
+                (last + guard.stagger).saturating_duration_since(now)
+            }
         };
         (!retry_after.is_zero()).then(|| Guarded {
             reason: Reason::Stagger,
@@ -229,40 +208,29 @@ impl Ledger {
         self.settle(machine, None);
         self.generation += 1;
         let generation = self.generation;
-        let Some(entry) = self.motors.get_mut(machine) else {
-            return;
-        };
-        entry.motor.reserve(Reserved {
-            number,
-            at: now,
-            until,
-            generation,
+        self.with(machine, |motor| {
+            motor.reserve(Reserved {
+                number,
+                at: now,
+                until,
+                generation,
+            });
         });
-        self.groups.entry(entry.group.clone()).or_default().reserved += 1;
     }
 
     /// Counts decided starts that will not be written as made; with a number, only that command's.
     pub(super) fn settle(&mut self, machine: &Machine, number: Option<u64>) {
-        let Some(entry) = self.motors.get_mut(machine) else {
-            return;
-        };
-        let of = |reserved: &Reserved| number.is_none_or(|number| reserved.number == number);
-        let Some(reserved) = entry.motor.reserved.filter(of) else {
-            return;
-        };
-        entry.motor.settle();
-        let group = self.groups.entry(entry.group.clone()).or_default();
-        group.reserved = group.reserved.saturating_sub(1);
-        group.last = group.last.max(Some(reserved.at));
+        let of = |reserved: Reserved| number.is_none_or(|number| reserved.number == number);
+        self.with(machine, |motor| {
+            if motor.reserved.is_some_and(of) {
+                motor.settle();
+            }
+        });
     }
 
     /// A start that could not be counted on disk is not made, and does not count.
     pub(super) fn withdraw(&mut self, machine: &Machine) {
-        if let Some(entry) = self.motors.get_mut(machine)
-            && entry.motor.reserved.take().is_some()
-        {
-            let group = self.groups.entry(entry.group.clone()).or_default();
-            group.reserved = group.reserved.saturating_sub(1);
+        if self.with(machine, |motor| motor.reserved.take()).flatten().is_some() {
             self.generation += 1;
         }
     }
@@ -283,34 +251,18 @@ impl Ledger {
         }
     }
 
-    /// A word that starts a motor is sent.
+    /// A word of a command that would start a standing motor is sent.
     pub(super) fn start_written(&mut self, machine: &Machine, number: u64, client: &Arc<str>, now: Instant) {
-        let Some(entry) = self.motors.get_mut(machine) else {
-            return;
-        };
-        let was_reserved = entry.motor.reserved.is_some();
-        if entry.motor.start_written(number, client, now) {
-            let group = self.groups.entry(entry.group.clone()).or_default();
-            if was_reserved && entry.motor.reserved.is_none() {
-                group.reserved = group.reserved.saturating_sub(1);
-            }
-            group.started(now);
+        if self.with(machine, |motor| motor.start_written(number, client, now)) == Some(true) {
             self.generation += 1;
         }
     }
 
     /// A motor was read. Whether that changed what belongs on disk.
     pub(super) fn seen(&mut self, machine: &Machine, seen: super::Seen) -> bool {
-        let Some(entry) = self.motors.get_mut(machine) else {
-            return false;
-        };
-        let started = entry.motor.seen(seen);
-        if started {
-            let group = self.groups.entry(entry.group.clone()).or_default();
-            group.last = group.last.max(Some(seen.at));
-            self.generation += 1;
-        }
-        started
+        let changed = self.with(machine, |motor| motor.seen(seen)) == Some(true);
+        self.generation += u64::from(changed);
+        changed
     }
 
     /// A start was refused.

@@ -1,20 +1,23 @@
 //! Start guards: how often, how soon and how close together motors may be started, and under which conditions.
 //!
-//! A start is the passage of a motor from standing to running, by whomever. One [`Guards`] for the whole gateway counts
+//! A start is one passage of a motor from standing to running, by whomever. One [`Guards`] for the whole gateway counts
 //! them, since drives of several buses can belong to one group; every bus has its view of it, [`BusGuards`]. Whether an
 //! order may start a motor is asked by the rules of [`crate::permit`]. A start that is cleared ([`BusGuards::clear`])
 //! counts from that moment, and is not written before it is on disk ([`keep`]). Stops are not checked here, except those
 //! that `min_run` delays.
 //!
-//! - `motor`: what is known of one motor, and the rules. `ledger`: all motors, groups, and what is to be written.
-//! - `interlock`: whether the points hold that a start needs. `view`: what the guards say.
+//! - `motor`: what is known of one motor. `passage`: its last start by an order. `ledger`: all motors, and what is to be written.
+//! - `interlock`: whether the points hold that a start needs. `around`: the drives that have these points. `view`: what the
+//!   guards of one bus say.
 //! - `file`: the form of the file. `keeper`: the thread that writes it; the only place here with I/O and a clock.
 
+mod around;
 mod file;
 mod interlock;
 mod keeper;
 mod ledger;
 mod motor;
+mod passage;
 mod view;
 
 use std::time::Duration;
@@ -23,7 +26,9 @@ pub use self::file::Saved;
 pub use self::interlock::Unmet;
 pub use self::keeper::keep;
 pub use self::ledger::Guards;
+pub use self::passage::ByRun;
 pub use self::motor::Seen;
+pub use self::passage::Unable;
 pub use self::view::{BusGuards, Clearance};
 pub use crate::order::{Guarded, Reason};
 pub use crate::spec::{Guard, Interlock, MOST_STARTS};

@@ -1,17 +1,17 @@
 //! The state of one motor, and when it may be started. Pure: time is an argument.
+//!
+//! A start is one passage of the motor from standing to running. The start of an order counts from before its word is
+//! written, once, however often the order is repeated until the motor was seen to stand again.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::{Guard, Guarded, MOST_STARTS, Reason, shown};
+use super::passage::{Besides, ByRun, Passage, Progress, SETTLES, Shown};
+use super::{Guard, Guarded, MOST_STARTS, Reason, Unable, shown};
 
 /// The window of `starts_per_hour`.
 pub(super) const HOUR: Duration = Duration::from_secs(3600);
-/// A motor that is seen to start so soon after a command that starts it was started by that.
-const STARTS_WITHIN: Duration = Duration::from_secs(30);
-/// For so long after the word that starts it a motor may still read as standing.
-const SETTLES: Duration = Duration::from_secs(1);
 /// For so long after its start a motor counts as running though it was not read since.
 const UNREAD: Duration = Duration::from_secs(2);
 
@@ -24,6 +24,8 @@ pub struct Seen {
     pub commanded: Option<(bool, Instant)>,
     /// It stands.
     pub stands: bool,
+    /// Why it does not run and cannot start, and when that was read.
+    pub unable: Option<(Unable, Instant)>,
     /// When it was read.
     pub at: Instant,
 }
@@ -31,7 +33,7 @@ pub struct Seen {
 /// A start that is decided and not written yet.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Reserved {
-    /// The command, by its number in the queue.
+    /// The number of the command.
     pub(super) number: u64,
     pub(super) at: Instant,
     /// It is not written later.
@@ -54,16 +56,16 @@ pub(super) struct Motor {
     /// The last starts, oldest first.
     starts: VecDeque<Instant>,
     pub(super) reserved: Option<Reserved>,
-    /// The command whose start was the last one that was written, and when; a motor that is seen to start soon after it was
-    /// started by it.
-    written: Option<(u64, Instant)>,
-    is_awaited: bool,
+    /// The last start by an order.
+    passage: Option<Passage>,
     /// Whether it runs, and when that was read; none while it is not known.
     running: Option<(bool, Instant)>,
     /// The same when it was known last.
     ran: Option<bool>,
     /// Its run command as the drive had it last, and when that was read.
     commanded: Option<(bool, Instant)>,
+    /// By the last reading it does not run, and cannot start.
+    unable: bool,
     stands_since: Option<Instant>,
     stop_written: Option<Instant>,
     started: Option<Started>,
@@ -82,11 +84,31 @@ impl Motor {
         self.starts.iter().copied().chain(reserved)
     }
 
-    /// Whether a command to run, written now, starts it: it does not run for certain. One that slows down after a stop
-    /// may stand by the time the order reaches it.
-    pub(super) fn is_started_by_run(&self) -> bool {
+    /// What a run command is, written now.
+    pub(super) fn by_run(&self) -> ByRun {
+        if self.runs_for_certain() {
+            return ByRun::Runs;
+        }
+        let passage = self.passage.as_ref();
+        passage.map_or(ByRun::Starts, |passage| passage.by_run(self.besides()))
+    }
+
+    fn besides(&self) -> Besides {
+        Besides {
+            stop: self.stop_written,
+            commanded: self.commanded,
+        }
+    }
+
+    /// When the word of the last start by an order was written.
+    fn written(&self) -> Option<Instant> {
+        self.passage.as_ref().map(|passage| passage.written)
+    }
+
+    /// Whether it runs, and goes on. One that slows down after a stop may stand by the time that an order reaches it.
+    fn runs_for_certain(&self) -> bool {
         let since_stop = |at: Instant| self.stop_written.is_none_or(|stop| at > stop);
-        let written = self.written.map(|(_, written)| written);
+        let written = self.written();
         let stopped_last = self
             .stop_written
             .is_some_and(|stop| written.is_none_or(|start| stop > start));
@@ -95,13 +117,13 @@ impl Motor {
         let is_off = |(on, at): (bool, Instant)| !on && written.is_none_or(|start| at > start);
         let slows_down = (stopped_last && !told_on) || self.commanded.is_some_and(is_off);
         let runs = |(running, at): (bool, Instant)| running && since_stop(at) && !slows_down;
-        !self.running.is_some_and(runs)
+        self.running.is_some_and(runs)
     }
 
     /// Whether the start of that command is decided, or written.
     pub(super) fn is_cleared(&self, number: u64) -> bool {
         let reserved = self.reserved.is_some_and(|reserved| reserved.number == number);
-        reserved || self.written.is_some_and(|(of, _)| of == number)
+        reserved || self.passage.as_ref().is_some_and(|passage| passage.number == number)
     }
 
     /// Why it may not be started now, apart from its group.
@@ -155,6 +177,12 @@ impl Motor {
         self.starts.push_back(at);
     }
 
+    fn discount(&mut self, at: Instant) {
+        if let Some(place) = self.starts.iter().rposition(|start| *start == at) {
+            self.starts.remove(place);
+        }
+    }
+
     /// A start is decided.
     pub(super) fn reserve(&mut self, reserved: Reserved) {
         self.settle();
@@ -168,21 +196,36 @@ impl Motor {
         }
     }
 
-    /// A word of a command that starts the motor is sent. Whether it made a start.
+    /// A word of a command that would start a standing motor is sent. Whether it makes a start.
     pub(super) fn start_written(&mut self, number: u64, client: &Arc<str>, now: Instant) -> bool {
-        if self.reserved.is_some_and(|reserved| reserved.number == number) {
-            self.reserved = None;
-            self.count(now);
-        } else if self.written.is_some_and(|(of, _)| of == number) {
+        let is_next = self.reserved.take_if(|reserved| reserved.number == number).is_some();
+        match &mut self.passage {
+            _ if is_next => {}
             // One more word of the same start, or the same word once more.
-            if let Some(last) = self.starts.back_mut() {
-                *last = now;
+            Some(passage) if passage.number == number && passage.progress != Progress::Vain => {
+                let counted = passage.counted;
+                self.discount(counted);
             }
-        } else {
-            return false;
+            // A repetition.
+            Some(passage) => {
+                passage.last = now;
+                return false;
+            }
+            None => return false,
         }
-        self.written = Some((number, now));
-        self.is_awaited = true;
+        self.count(now);
+        let same = self.passage.take().filter(|_| !is_next);
+        self.passage = Some(Passage {
+            number,
+            client: client.clone(),
+            progress: Progress::Awaited,
+            written: now,
+            last: now,
+            counted: now,
+            unable: same.as_ref().map_or(self.unable, |same| same.unable),
+            away: false,
+            stood: same.map_or(self.stands_since, |same| same.stood),
+        });
         // It is to be seen to stand again, also where it was never seen to run.
         self.stands_since = None;
         self.started = Some(Started {
@@ -195,6 +238,7 @@ impl Motor {
     /// The drive acknowledged a start; of one that does not say whether it runs that is all that shows it.
     pub(super) fn start_acknowledged(&mut self, now: Instant) {
         (self.running, self.ran, self.stands_since) = (Some((true, now)), Some(true), None);
+        self.progresses(Progress::Ran);
     }
 
     /// A stop is sent.
@@ -206,18 +250,22 @@ impl Motor {
     pub(super) fn stop_acknowledged(&mut self, now: Instant) {
         (self.running, self.ran, self.started) = (Some((false, now)), Some(false), None);
         self.stands_since.get_or_insert(now);
+        self.progresses(Progress::Over);
     }
 
-    /// It was read. Returns whether a start was seen that was not commanded here.
+    fn progresses(&mut self, to: Progress) {
+        if let Some(passage) = &mut self.passage {
+            passage.progress = to;
+        }
+    }
+
+    /// It was read. Returns whether that changed which starts count, or from when.
     pub(super) fn seen(&mut self, seen: Seen) -> bool {
         let Seen {
-            running,
-            commanded,
-            stands,
-            at,
+            running, stands, at, ..
         } = seen;
-        let written = self.written.map(|(_, written)| written);
-        self.commanded = commanded.or(self.commanded);
+        self.commanded = seen.commanded.or(self.commanded);
+        let written = self.written();
         if [written, self.stop_written]
             .into_iter()
             .flatten()
@@ -228,37 +276,75 @@ impl Motor {
         }
         let came = running && self.ran == Some(false);
         (self.running, self.ran) = (Some((running, at)), Some(running));
+        self.unable = seen.unable.is_some();
         if running {
             self.stands_since = None;
-        } else {
-            if stands && written.is_none_or(|written| at >= written + SETTLES) {
-                self.stands_since.get_or_insert(at);
+            return self.is_seen_running(came, at);
+        }
+        if stands && written.is_none_or(|written| at >= written + SETTLES) {
+            self.stands_since.get_or_insert(at);
+        }
+        if self.started.as_ref().is_some_and(|started| at > started.at + UNREAD) {
+            self.started = None;
+        }
+        self.is_seen_not_running(&seen)
+    }
+
+    fn is_seen_running(&mut self, came: bool, at: Instant) -> bool {
+        let besides = self.besides();
+        let Some(passage) = &mut self.passage else {
+            return came && self.counts_seen(None, at);
+        };
+        match passage.is_seen_running(came, besides, at) {
+            Shown::Nothing => false,
+            Shown::Started => {
+                let by = Some(passage.client.clone());
+                self.started.get_or_insert(Started { at, by });
+                false
             }
-            if self.started.as_ref().is_some_and(|started| at > started.at + UNREAD) {
-                self.started = None;
+            Shown::StartedLate => {
+                let counted = std::mem::replace(&mut passage.counted, at);
+                let by = Some(passage.client.clone());
+                self.discount(counted);
+                self.counts_seen(by, at)
             }
+            Shown::Another(by) => self.counts_seen(by, at),
         }
-        if !came {
-            return false;
-        }
-        let awaited = std::mem::take(&mut self.is_awaited);
-        let ordered = |(_, written): (u64, Instant)| at.saturating_duration_since(written) <= STARTS_WITHIN;
-        if awaited && self.written.is_some_and(ordered) {
-            return false;
-        }
+    }
+
+    fn counts_seen(&mut self, by: Option<Arc<str>>, at: Instant) -> bool {
         self.count(at);
-        self.started = Some(Started { at, by: None });
+        self.started = Some(Started { at, by });
+        true
+    }
+
+    /// The motor does not run. Whether a start does not count any more.
+    fn is_seen_not_running(&mut self, seen: &Seen) -> bool {
+        let besides = self.besides();
+        let Some(passage) = self.passage.as_mut() else {
+            return false;
+        };
+        if !passage.is_seen_not_running(seen, besides) {
+            return false;
+        }
+        let (counted, stood) = (passage.counted, passage.stood);
+        self.discount(counted);
+        self.stands_since = stood.or(self.stands_since);
+        self.started = None;
         true
     }
 
     /// It cannot be read: its state meanwhile is unknown.
     pub(super) fn unseen(&mut self) {
-        self.running = None;
+        (self.running, self.unable) = (None, false);
     }
 
     /// The drive is away: it may run and stand again unseen.
     pub(super) fn away(&mut self) {
-        (self.running, self.stands_since) = (None, None);
+        (self.running, self.unable, self.stands_since) = (None, false, None);
+        if let Some(passage) = &mut self.passage {
+            passage.away = true;
+        }
     }
 
     /// Nothing shows whether it runs; it is taken to stand from now on.
@@ -300,3 +386,6 @@ impl Motor {
         self.starts().all(|at| at + HOUR <= now)
     }
 }
+
+#[cfg(test)]
+mod tests;

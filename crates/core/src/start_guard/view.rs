@@ -5,7 +5,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::ledger::{Guards, Kept};
-use super::{Guard, Guarded, Interlock, Reason, Seen, Unmet, shown};
+use super::motor::Motor;
+use super::passage::ByRun;
+use super::{Guard, Guarded, Interlock, Reason, Seen, Unable, Unmet, shown};
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, Plan, Value};
 use crate::order::{Effects, Refusal};
 use crate::process_image::{BusSpec, DriveSpec, Link, Machine, Reading, Standstill};
@@ -44,25 +46,21 @@ pub enum Clearance {
 }
 
 impl BusGuards {
-    /// Those of a bus; none where nothing of it is guarded.
+    /// Those of a bus; none where nothing of it is guarded. They take effect with [`BusGuards::begin`].
     pub fn of<'d>(
         shared: &Arc<Guards>,
         bus: &BusSpec,
         drives: impl IntoIterator<Item = &'d DriveSpec>,
     ) -> Option<Arc<BusGuards>> {
-        let mut ledger = shared.lock();
         let drives = drives.into_iter().map(|drive| {
             if !drive.is_guarded() {
                 return None;
             }
-            let machine = bus.machine(drive);
-            let group = drive.starts_with();
-            ledger.register(&machine, &group);
             let profile = &drive.profile;
             let running = profile.model_index(ModelPoint::Running);
             Some(Guarding {
-                machine,
-                group,
+                machine: bus.machine(drive),
+                group: drive.starts_with(),
                 guard: drive.guard.unwrap_or_default(),
                 interlocks: drive.interlocks.clone(),
                 tells_running: running.is_some_and(|index| Plan::of(profile).shows(profile, index)),
@@ -70,13 +68,21 @@ impl BusGuards {
         });
         let drives: PerDrive<Option<Guarding>> = drives.collect();
         let any = drives.iter().any(Option::is_some);
-        drop(ledger);
         any.then(|| {
             Arc::new(BusGuards {
                 shared: shared.clone(),
                 drives,
             })
         })
+    }
+
+    /// The bus is about to begin: from now on the starts of its drives count so. Until then, and after a reload that is
+    /// refused, the drives of the bus before it are guarded as they were.
+    pub fn begin(&self) {
+        let mut ledger = self.shared.lock();
+        for of in self.drives.iter().flatten() {
+            ledger.register(&of.machine, &of.group);
+        }
     }
 
     fn of_drive(&self, drive: DriveIndex) -> Option<&Guarding> {
@@ -88,19 +94,27 @@ impl BusGuards {
         self.of_drive(drive).is_some()
     }
 
-    /// Those of the guarded drives whose motor an order with these effects starts, if it is written now.
+    /// Those of the guarded drives that an order with these effects does not leave running as they run.
     pub fn started_by(&self, effects: &Effects) -> impl Iterator<Item = DriveIndex> {
         let started = effects
             .iter()
-            .filter(|(drive, effect)| effect.starts() && self.is_started_by_run(*drive));
+            .filter(|(drive, effect)| effect.starts() && self.by_run(*drive) != ByRun::Runs);
         started.map(|(drive, _)| drive)
     }
 
-    /// Whether a run command, written now, starts the motor of that drive, and is to be judged: it does not run for certain.
-    pub fn is_started_by_run(&self, drive: DriveIndex) -> bool {
+    /// What a run command, written now, does to the motor of that drive; one without guards is not looked after.
+    pub fn by_run(&self, drive: DriveIndex) -> ByRun {
+        let Some(of) = self.of_drive(drive) else {
+            return ByRun::Runs;
+        };
+        self.shared.lock().motor(&of.machine).map_or(ByRun::Runs, Motor::by_run)
+    }
+
+    /// Whether the start of an order was cleared for the drive and is not written: that one starts it, if it does.
+    pub fn has_cleared(&self, drive: DriveIndex) -> bool {
         let Some(of) = self.of_drive(drive) else { return false };
         let ledger = self.shared.lock();
-        ledger.motor(&of.machine).is_some_and(|motor| motor.is_started_by_run())
+        ledger.motor(&of.machine).is_some_and(|motor| motor.reserved.is_some())
     }
 
     /// Whether the start of that order was cleared for the drive.
@@ -121,12 +135,14 @@ impl BusGuards {
         self.interlocked_of(self.of_drive(drive)?, now)
     }
 
-    /// The motor ran when the order was judged, and has stopped since: a start that nothing cleared.
-    pub fn stopped_since(&self, drive: DriveIndex) -> Option<Guarded> {
+    /// The motor ran, or could not start, when the order was judged, and that has changed since: a start that nothing cleared.
+    pub fn changed_since(&self, drive: DriveIndex) -> Option<Guarded> {
         let of = self.of_drive(drive)?;
         Some(Guarded {
             reason: Reason::MinOff,
-            why: "the motor was running when the command arrived, and has stopped since; send it again".to_string(),
+            why: "the motor was running, or the drive could not start, when the command arrived, and that has changed since; \
+                  send it again"
+                .to_string(),
             retry_after: of.guard.min_off,
         })
     }
@@ -134,9 +150,9 @@ impl BusGuards {
     /// Why that drive is not started by one order together with the others that it starts.
     pub fn too_close_together(&self, drive: DriveIndex, effects: &Effects) -> Option<Guarded> {
         let of = self.of_drive(drive).filter(|of| !of.guard.stagger.is_zero())?;
-        let others = self.started_by(effects).filter_map(|other| self.of_drive(other));
-        let of_group = |other: &&Guarding| other.machine != of.machine && other.group == of.group;
-        others.into_iter().find(of_group)?;
+        let others = self.started_by(effects).filter(|other| self.by_run(*other) != ByRun::Repeats);
+        let mut others = others.filter_map(|other| self.of_drive(other));
+        others.find(|other| other.machine != of.machine && other.group == of.group)?;
         Some(Guarded {
             reason: Reason::Stagger,
             why: format!(
@@ -155,15 +171,20 @@ impl BusGuards {
         interlocked.or_else(|| {
             let ledger = self.shared.lock();
             // One that runs by its order, with a reference of zero, is not kept from a start.
-            let starts = ledger.motor(&of.machine).is_none_or(|motor| motor.is_started_by_run());
+            let by_run = ledger.motor(&of.machine).map(Motor::by_run);
+            let starts = !matches!(by_run, Some(ByRun::Runs | ByRun::Repeats));
             starts.then(|| ledger.hindered(&of.machine, &of.guard, now)).flatten()
         })
     }
 
-    /// The interlocks that do not hold, or of them those that stop the motor.
-    pub fn unmet(&self, drive: DriveIndex, trips_only: bool, now: Instant) -> Vec<Unmet> {
-        let of = self.of_drive(drive);
-        of.map_or_else(Vec::new, |of| self.unmet_of(of, trips_only, now))
+    /// The interlocks that do not hold and stop the running motor of that drive.
+    pub fn tripped(&self, drive: DriveIndex, now: Instant) -> Vec<Unmet> {
+        let Some(of) = self.of_drive(drive) else {
+            return Vec::new();
+        };
+        let around = self.shared.around();
+        let trips = of.interlocks.iter().filter(|interlock| interlock.trip);
+        trips.filter_map(|interlock| interlock.trips(&around, now)).collect()
     }
 
     /// Whether an interlock of that drive stops its motor.
@@ -172,18 +193,16 @@ impl BusGuards {
         of.is_some_and(|of| of.interlocks.iter().any(|interlock| interlock.trip))
     }
 
-    fn unmet_of(&self, of: &Guarding, trips_only: bool, now: Instant) -> Vec<Unmet> {
+    fn interlocked_of(&self, of: &Guarding, now: Instant) -> Option<Guarded> {
         if of.interlocks.is_empty() {
-            return Vec::new();
+            return None;
         }
         let around = self.shared.around();
-        let wanted = of.interlocks.iter().filter(|interlock| interlock.trip || !trips_only);
-        wanted.filter_map(|interlock| interlock.unmet(&around, now)).collect()
-    }
-
-    fn interlocked_of(&self, of: &Guarding, now: Instant) -> Option<Guarded> {
-        let unmet = self.unmet_of(of, false, now);
-        let unmet: Vec<String> = unmet.iter().map(Unmet::to_string).collect();
+        let unmet = of
+            .interlocks
+            .iter()
+            .filter_map(|interlock| interlock.unmet(&around, now));
+        let unmet: Vec<String> = unmet.map(|unmet| unmet.to_string()).collect();
         (!unmet.is_empty()).then(|| Guarded {
             reason: Reason::Interlock,
             why: format!("an interlock is not satisfied: {}", unmet.join(", ")),
@@ -198,7 +217,8 @@ impl BusGuards {
         let mut ledger = self.shared.lock();
         let mut changed = false;
         for of in &started {
-            if !ledger.motor(&of.machine).is_some_and(|motor| motor.is_cleared(number)) {
+            let Some(motor) = ledger.motor(&of.machine) else { continue };
+            if motor.by_run() == ByRun::Starts && !motor.is_cleared(number) {
                 ledger.reserve(&of.machine, number, expires, now);
                 changed = true;
             }
@@ -326,10 +346,18 @@ fn seen(reading: &Reading<'_>) -> Option<Seen> {
     let runs = running && !reading.is_set(ModelPoint::Fault);
     let commanded = reading.model(ModelPoint::Run);
     let turns = || matches!(reading.standstill(None), Standstill::Turns(_));
+    let told = |point: ModelPoint, as_told: bool| {
+        let sample = reading.model(point);
+        let is_told = sample.good().is_some_and(|value| value.as_bool() == as_told);
+        sample.at.filter(|_| is_told)
+    };
+    let fault = told(ModelPoint::Fault, true).map(|at| (Unable::Fault, at));
+    let not_ready = || told(ModelPoint::Ready, false).map(|at| (Unable::NotReady, at));
     Some(Seen {
         running: runs,
         commanded: commanded.good().map(Value::as_bool).zip(commanded.at),
         stands: !running && !turns(),
+        unable: fault.or_else(not_ready).filter(|_| !runs),
         at: sample.at?,
     })
 }

@@ -197,6 +197,12 @@ impl Gate {
         self.with_hold(drive, |holding, rules, _| holding.renew(&who, rules, now));
     }
 
+    /// The drive acknowledged a stop of that client.
+    pub fn hold_stop_acknowledged(&mut self, drive: DriveIndex, origin: &Origin) {
+        let Some(who) = self.claim(origin) else { return };
+        self.with_hold(drive, |holding, _, _| holding.stop_acknowledged(&who));
+    }
+
     /// Whether supervision follows that client: it holds the drive, or was the last holder, or there was none.
     pub fn hold_renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
         let known = self.rules.as_ref().and_then(|_| self.drives.get(&drive));

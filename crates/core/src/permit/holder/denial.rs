@@ -18,7 +18,7 @@ pub enum Denial {
     NeedsTake(Claim),
     /// The drive's own local control place has it.
     Local,
-    /// It repeats its last stop while another one holds the drive.
+    /// It repeats an acknowledged stop of its own while another one holds the drive, or, with no time left, started the motor.
     Repeats(Claim, Duration),
     /// It renews a hold it does not have.
     NotHeld,
@@ -53,7 +53,12 @@ impl Denial {
                 Refusal::HeldByOther(holder(by, *left, keeps))
             }
             Denial::Repeats(by, left) => {
-                let keeps = "holds the drive, and this only repeats an earlier stop".to_string();
+                let has = if left.is_zero() {
+                    "started the motor"
+                } else {
+                    "holds the drive"
+                };
+                let keeps = format!("{has}, and this only repeats an earlier stop");
                 Refusal::HeldByOther(holder(by, *left, keeps))
             }
             Denial::NeedsTake(by) => {

@@ -123,6 +123,14 @@ struct Waiting {
     tried: Instant,
 }
 
+/// A client whose last command word was a stop.
+#[derive(Debug, Clone)]
+struct Stood {
+    name: Arc<str>,
+    /// The drive acknowledged it.
+    acknowledged: bool,
+}
+
 /// The hold of one drive.
 #[derive(Debug, Clone, Default)]
 pub struct Holding {
@@ -133,7 +141,9 @@ pub struct Holding {
     /// No more of them than principals.
     waiting: Vec<Waiting>,
     /// The clients whose last command word was a stop.
-    stood: Vec<Arc<str>>,
+    stood: Vec<Stood>,
+    /// Whose run command was accepted last.
+    starter: Option<Claim>,
     /// One that is not cyclic and ended the hold of another by a stop that repeated its last one.
     repeater: Option<Arc<str>>,
 }
@@ -184,12 +194,7 @@ impl Holding {
         match (asks, who) {
             (Asks::Nothing, _) | (Asks::Stop, None) => return Ok(()),
             (_, None) => return Err(Denial::Nobody),
-            (Asks::Stop, Some(who)) => {
-                return match self.held(now) {
-                    Some((by, left)) if !by.is(who) && self.repeats(who) => Err(Denial::Repeats(by.clone(), left)),
-                    _ => Ok(()),
-                };
-            }
+            (Asks::Stop, Some(who)) => return self.repeats_in_vain(who, now).map_or(Ok(()), Err),
             (Asks::Run | Asks::Steer | Asks::Other, Some(_)) => {}
         }
         let Some(who) = who else { return Ok(()) };
@@ -198,21 +203,32 @@ impl Holding {
         }
         if let Some((by, left)) = self.held(now).filter(|(by, _)| !by.is(who)) {
             let breaks = who.breaks && by.is_below(who) && asks.takes();
-            return if breaks {
-                Ok(())
-            } else {
-                Err(Denial::Held(by.clone(), left))
-            };
+            if !breaks {
+                return Err(Denial::Held(by.clone(), left));
+            }
         }
         if let Some((by, left)) = self.reserved(now).filter(|(by, _)| who.is_below(by)) {
             return Err(Denial::Reserved(by.clone(), left));
         }
         let waits = self.waiting.iter().find(|waiting| waiting.who.is(who));
         let is_due = |waiting: &&Waiting| now.saturating_duration_since(waiting.tried) < rules.lease * FORGOTTEN_AFTER;
+        // Also where it holds the drive by a reference.
         match waits.filter(is_due).filter(|_| asks == Asks::Run) {
-            Some(waiting) if self.held(now).is_none() => Err(Denial::NeedsTake(waiting.stopper.clone())),
-            _ => Ok(()),
+            Some(waiting) => Err(Denial::NeedsTake(waiting.stopper.clone())),
+            None => Ok(()),
         }
+    }
+
+    /// Why the stop of a cyclic client is not sent: it repeats one that the drive acknowledged, and another client holds the drive,
+    /// or started the motor last.
+    fn repeats_in_vain(&self, who: &Claim, now: Instant) -> Option<Denial> {
+        let is_acknowledged = |stood: &Stood| stood.acknowledged && stood.name == who.name;
+        if !who.cyclic || !self.stood.iter().any(is_acknowledged) {
+            return None;
+        }
+        let starter = self.starter.as_ref().map(|starter| (starter, Duration::ZERO));
+        let mut others = self.held(now).into_iter().chain(starter).filter(|(by, _)| !by.is(who));
+        others.next().map(|(by, left)| Denial::Repeats(by.clone(), left))
     }
 
     /// A command was refused; a run command after a stop is remembered.
@@ -238,11 +254,15 @@ impl Holding {
     pub fn accepted(&mut self, who: Option<&Claim>, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
         self.settle(rules, now, told);
         let repeats = asks == Asks::Stop && who.is_some_and(|who| self.repeats(who));
-        let ends = |who: &&Claim| asks == Asks::Stop && self.held(now).is_some_and(|(by, _)| !by.is(who));
-        if let Some(who) = who.filter(|who| self.stood.contains(&who.name)).filter(ends) {
+        let is_other = |by: &Claim| who.is_some_and(|who| !by.is(who));
+        let ends = asks == Asks::Stop && !repeats && self.held(now).is_some_and(|(by, _)| is_other(by));
+        if let Some(who) = who.filter(|who| ends && self.has_stood(who)) {
             self.repeater = Some(who.name.clone());
         }
         self.note_word(who, asks);
+        if asks == Asks::Run {
+            self.starter = Some(who.cloned().unwrap_or_else(Claim::nobody));
+        }
         match (asks, who) {
             (Asks::Nothing, _) => {}
             (Asks::Stop, _) if repeats => {}
@@ -312,7 +332,6 @@ impl Holding {
                 what: held,
             }),
         }
-        self.said_stop(who);
         self.last = Some(who.clone());
         self.state = State::Held(who.clone(), now + rules.lease);
     }
@@ -364,7 +383,9 @@ impl Holding {
             State::Free | State::Reserved(..) if verb == Verb::Renew => return Err(Denial::NotHeld),
             State::Free | State::Reserved(..) => self.taken(who, rules, now, told),
         }
-        self.said_stop(who);
+        if verb != Verb::Renew {
+            self.said_stop(who);
+        }
         Ok(())
     }
 
@@ -410,7 +431,7 @@ impl Holding {
         self.last = self.last.take().filter(|last| rules.knows(last));
         self.last.iter_mut().for_each(rank_of);
         self.waiting.retain(|waiting| rules.knows(&waiting.who));
-        let is_known = |name: &Arc<str>| rules.principals.iter().any(|p| p.name == *name);
+        let is_known = |stood: &Stood| rules.principals.iter().any(|p| p.name == stood.name);
         self.stood.retain(is_known);
         self.repeater = None;
     }
@@ -487,22 +508,36 @@ impl Holding {
         })
     }
 
+    /// The drive acknowledged a stop of that client.
+    pub(crate) fn stop_acknowledged(&mut self, who: &Claim) {
+        for stood in self.stood.iter_mut().filter(|stood| stood.name == who.name) {
+            stood.acknowledged = true;
+        }
+    }
+
+    fn has_stood(&self, who: &Claim) -> bool {
+        self.stood.iter().any(|stood| stood.name == who.name)
+    }
+
     /// Whether that cyclic client's last word was a stop, too.
     fn repeats(&self, who: &Claim) -> bool {
-        who.cyclic && self.stood.contains(&who.name)
+        who.cyclic && self.has_stood(who)
     }
 
     fn note_word(&mut self, who: Option<&Claim>, asks: Asks) {
         let Some(who) = who else { return };
         match asks {
-            Asks::Stop if !self.stood.contains(&who.name) => {
+            Asks::Stop if !self.has_stood(who) => {
                 // Beside the principals there may be any number of users of the machine.
                 if self.stood.len() >= MOST_STOOD {
                     self.stood.remove(0);
                 }
-                self.stood.push(who.name.clone());
+                self.stood.push(Stood {
+                    name: who.name.clone(),
+                    acknowledged: false,
+                });
             }
-            Asks::Run => self.stood.retain(|name| *name != who.name),
+            Asks::Run => self.stood.retain(|stood| stood.name != who.name),
             Asks::Stop | Asks::Steer | Asks::Other | Asks::Nothing => {}
         }
     }

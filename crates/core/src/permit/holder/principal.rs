@@ -74,6 +74,16 @@ pub struct Claim {
 }
 
 impl Claim {
+    /// A client that is no principal.
+    pub(super) fn nobody() -> Claim {
+        Claim {
+            name: "nobody".into(),
+            rank: usize::MAX,
+            cyclic: false,
+            breaks: false,
+        }
+    }
+
     /// Whether it is the same principal.
     pub fn is(&self, other: &Claim) -> bool {
         self.name == other.name

@@ -76,6 +76,12 @@ impl Drive {
         acted.map_or_else(|denial| denial.refusal(&self.rules).code(), |()| "ok")
     }
 
+    /// The drive acknowledged the last stop of that client.
+    fn acknowledged(&mut self, name: &str) {
+        let who = self.who(name).unwrap();
+        self.holding.stop_acknowledged(&who);
+    }
+
     fn wait(&mut self, seconds: u64) {
         self.now += Duration::from_secs(seconds);
     }
@@ -304,6 +310,21 @@ fn a_run_that_goes_on_behind_a_stop_needs_a_take() {
     assert_eq!(drive.order("plc", Asks::Run), "needs_take");
     drive.wait(300);
     assert_eq!(drive.order("plc", Asks::Run), "ok");
+    // Nothing else: not a reference that takes the drive, nor the hold renewed, a reset, or a stop of somebody else.
+    for asks in [Asks::Steer, Asks::Other] {
+        let mut drive = stopped();
+        drive.wait(31);
+        for _ in 0..3 {
+            assert_eq!(drive.order("plc", asks), "ok");
+            assert_eq!(drive.order("plc", Asks::Run), "needs_take", "{asks:?}");
+        }
+        drive.act("plc", Verb::Renew);
+        assert_eq!(drive.order("plc", Asks::Run), "needs_take", "{asks:?}");
+        drive.order("nobody", Asks::Stop);
+        assert_eq!(drive.order("plc", Asks::Run), "needs_take", "{asks:?}");
+        drive.act("plc", Verb::Take);
+        assert_eq!(drive.order("plc", Asks::Run), "ok");
+    }
     // A reference was no run.
     let mut drive = Drive::new();
     drive.order("op", Asks::Stop);
@@ -317,6 +338,7 @@ fn a_cyclic_client_stops_once() {
     let mut drive = Drive::new();
     drive.order("cycle", Asks::Run);
     assert_eq!(drive.order("cycle", Asks::Stop), "ok");
+    drive.acknowledged("cycle");
     assert_eq!(drive.state(), "held cycle 30");
     drive.wait(20);
     assert_eq!(drive.order("cycle", Asks::Stop), "ok");
@@ -342,11 +364,121 @@ fn a_cyclic_client_stops_once() {
     let mut drive = Drive::new();
     let cycle = drive.who("cycle").unwrap();
     drive.order("cycle", Asks::Stop);
+    drive.acknowledged("cycle");
     drive.act("op", Verb::Break);
     let insists = Claim { cyclic: false, ..cycle };
     assert_eq!(
         drive.holding.judge(Some(&insists), Asks::Stop, &drive.rules, drive.now),
         Ok(())
+    );
+}
+
+/// Each row: what happened after the cyclic client said stop, whether the drive acknowledged that, and the repetition of it.
+#[test]
+fn a_repeated_stop_is_not_sent_while_the_motor_was_started_by_another() {
+    type Then = fn(&mut Drive);
+    let op_starts = |drive: &mut Drive| drive.wait(31);
+    let rows: [(&str, bool, Then, &str); 9] = [
+        ("nobody started it since", true, |_| {}, "ok"),
+        (
+            "held by another",
+            true,
+            |drive| _ = drive.act("op", Verb::Take),
+            "held_by_other",
+        ),
+        (
+            "held and started by another",
+            true,
+            |drive| _ = drive.order("op", Asks::Run),
+            "held_by_other",
+        ),
+        (
+            "started by another, whose hold has lapsed",
+            true,
+            |drive| {
+                drive.order("op", Asks::Run);
+                drive.wait(31);
+            },
+            "held_by_other",
+        ),
+        (
+            "started by another, who gave it back",
+            true,
+            |drive| {
+                drive.order("op", Asks::Run);
+                drive.act("op", Verb::Release);
+            },
+            "held_by_other",
+        ),
+        (
+            "started by another, and its own stop was never acknowledged",
+            false,
+            |drive| {
+                drive.order("op", Asks::Run);
+                drive.wait(31);
+            },
+            "ok",
+        ),
+        (
+            "its own word was another one since",
+            true,
+            |drive| {
+                drive.order("op", Asks::Run);
+                drive.wait(31);
+                drive.order("cycle", Asks::Run);
+            },
+            "ok",
+        ),
+        (
+            "its own run was refused since",
+            true,
+            |drive| {
+                drive.order("op", Asks::Run);
+                assert_eq!(drive.order("cycle", Asks::Run), "held_by_other");
+            },
+            "ok",
+        ),
+        (
+            "a reference is no other word",
+            true,
+            |drive| {
+                drive.order("op", Asks::Run);
+                drive.wait(31);
+                assert_eq!(drive.order("cycle", Asks::Steer), "ok");
+            },
+            "held_by_other",
+        ),
+    ];
+    for (about, is_acknowledged, then, expected) in rows {
+        let mut drive = Drive::new();
+        assert_eq!(drive.order("cycle", Asks::Stop), "ok");
+        if is_acknowledged {
+            drive.acknowledged("cycle");
+        }
+        op_starts(&mut drive);
+        then(&mut drive);
+        let before = drive.state();
+        assert_eq!(drive.order("cycle", Asks::Stop), expected, "{about}");
+        if about.starts_with("started by another") {
+            assert_eq!(drive.state(), before, "{about}: it neither ends a hold nor reserves");
+        }
+    }
+    // Nothing is left of a hold: the refusal names who started the motor.
+    let mut drive = Drive::new();
+    drive.order("cycle", Asks::Stop);
+    drive.acknowledged("cycle");
+    drive.wait(31);
+    drive.order("op", Asks::Run);
+    drive.wait(31);
+    let cycle = drive.who("cycle");
+    let denial = drive.holding.judge(cycle.as_ref(), Asks::Stop, &drive.rules, drive.now);
+    let refusal = denial.unwrap_err().refusal(&drive.rules);
+    assert_eq!(refusal.holder().unwrap().left_s, Some(0));
+    assert!(
+        refusal
+            .to_string()
+            .starts_with("op (operator) started the motor, and this only repeats an earlier stop"),
+        "{refusal}"
     );
 }
 
@@ -492,6 +624,18 @@ fn in_bacnet_the_priority_is_the_act() {
     assert_eq!(holding.judge(high.as_ref(), Asks::Run, &drive.rules, drive.now), Ok(()));
     holding.accepted(high.as_ref(), Asks::Run, &drive.rules, drive.now, &mut drive.told);
     assert_eq!(drive.told(), ["plc held", "plc broken by op"]);
+    // One that goes on behind a stop is judged like any run: it breaks no hold.
+    let mut holding = Holding::default();
+    let site = drive.who("site");
+    holding.accepted(site.as_ref(), Asks::Stop, &drive.rules, drive.now, &mut drive.told);
+    let denial = holding
+        .judge(high.as_ref(), Asks::Run, &drive.rules, drive.now)
+        .unwrap_err();
+    holding.refused(high.as_ref(), Asks::Run, &denial, &drive.rules, drive.now);
+    let later = drive.now + LEASE;
+    holding.accepted(plc.as_ref(), Asks::Run, &drive.rules, later, &mut drive.told);
+    let again = holding.judge(high.as_ref(), Asks::Run, &drive.rules, later);
+    assert!(matches!(again, Err(Denial::NeedsTake(_))), "{again:?}");
 }
 
 #[test]

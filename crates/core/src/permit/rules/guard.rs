@@ -3,7 +3,7 @@
 use crate::order::Refusal;
 use crate::permit::gate::{DriveGate, Gate};
 use crate::permit::judge::{Ask, Rule, Stage, Verdict};
-use crate::start_guard::BusGuards;
+use crate::start_guard::{BusGuards, ByRun};
 
 pub(in crate::permit) const RULE: Rule = Rule {
     stages: &[Stage::Accept, Stage::Turn, Stage::Write],
@@ -12,15 +12,19 @@ pub(in crate::permit) const RULE: Rule = Rule {
 };
 
 fn judge(ask: &Ask<'_>, _: &DriveGate, gate: &Gate) -> Verdict {
-    let Some(starts) = &gate.starts else { return Verdict::Go };
-    if !ask.effect().starts() || !starts.is_started_by_run(ask.drive) {
+    let Some(starts) = gate.starts.as_ref().filter(|_| ask.effect().starts()) else {
         return Verdict::Go;
-    }
-    match ask.stage {
-        Stage::Accept | Stage::Turn => may_begin(ask, starts),
-        // Its start was counted when its turn came, or it did not start the motor then.
-        Stage::Write if starts.is_cleared(ask.drive, ask.intent.number) => Verdict::Go,
-        Stage::Write => refuse(starts.stopped_since(ask.drive)),
+    };
+    match (ask.stage, starts.by_run(ask.drive)) {
+        // A run command that stands is no new start until the motor was seen to stand again.
+        (_, ByRun::Runs | ByRun::Repeats) => Verdict::Go,
+        // The order before this one starts the motor, if it does.
+        (Stage::Accept, _) if starts.has_cleared(ask.drive) => Verdict::Go,
+        (Stage::Accept | Stage::Turn, _) => may_begin(ask, starts),
+        (Stage::Write, ByRun::Starts) if !starts.is_cleared(ask.drive, ask.intent.number) => {
+            refuse(starts.changed_since(ask.drive))
+        }
+        (Stage::Write, ByRun::Starts | ByRun::Vain) => Verdict::Go,
     }
 }
 

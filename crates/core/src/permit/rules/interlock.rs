@@ -5,6 +5,7 @@ use crate::order::Refusal;
 use crate::permit::gate::{DriveGate, Gate};
 use crate::permit::judge::{Ask, Rule, Stage, Verdict};
 use crate::process_image::Reading;
+use crate::start_guard::ByRun;
 
 /// Output frequency in Hz below which a motor with its run command stands, or sleeps.
 const TURNS: f64 = 0.5;
@@ -18,7 +19,7 @@ pub(in crate::permit) const RULE: Rule = Rule {
 fn judge(ask: &Ask<'_>, _: &DriveGate, gate: &Gate) -> Verdict {
     let Some(starts) = &gate.starts else { return Verdict::Go };
     let effect = ask.effect();
-    let begins = effect.starts() && starts.is_started_by_run(ask.drive);
+    let begins = effect.starts() && starts.by_run(ask.drive) != ByRun::Runs;
     let wakes = || effect.reference && ask.seen.is_some_and(|seen| waits_for_a_reference(&seen.reading));
     if !begins && !wakes() {
         return Verdict::Go;

@@ -1,0 +1,111 @@
+//! The drives that interlocks look at, over reloads too. Pure: time is an argument.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use crate::process_image::{DriveImage, Machine};
+
+/// For so long a drive whose bus was started anew, and that was not read since, counts as it counted before.
+const FIRST_READ: Duration = Duration::from_secs(10);
+
+/// The drives of all buses, by name.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Around {
+    drives: BTreeMap<String, Watched>,
+    pub(super) stale_after: Duration,
+}
+
+/// One of them.
+#[derive(Debug, Clone)]
+pub(super) struct Watched {
+    machine: Machine,
+    pub(super) image: Arc<DriveImage>,
+    anew: Option<Anew>,
+}
+
+/// The last beginning of its bus.
+#[derive(Debug, Clone)]
+pub(super) struct Anew {
+    /// When the bus before it had ended.
+    pub(super) since: Instant,
+    /// The same machine until then; none if it was not there.
+    pub(super) before: Option<Arc<Watched>>,
+}
+
+impl Around {
+    /// The same with these drives.
+    pub(super) fn follow(
+        &self,
+        drives: impl IntoIterator<Item = (Machine, Arc<DriveImage>)>,
+        stale_after: Duration,
+        now: Instant,
+    ) -> Around {
+        let watched = |(machine, image): (Machine, Arc<DriveImage>)| {
+            let before = self.drives.values().find(|before| before.machine == machine);
+            let anew = match before {
+                Some(before) if Arc::ptr_eq(&before.image, &image) => before.anew.clone(),
+                Some(before) => Some(before.expected().cloned().unwrap_or_else(|| before.left(now))),
+                None => Some(Anew {
+                    since: now,
+                    before: None,
+                }),
+            };
+            (image.spec.name.clone(), Watched { machine, image, anew })
+        };
+        Around {
+            drives: drives.into_iter().map(watched).collect(),
+            stale_after,
+        }
+    }
+
+    /// The same while the buses of these drives are started anew.
+    pub(super) fn expecting(&self, drives: &[Arc<DriveImage>], now: Instant) -> Around {
+        let mut next = self.clone();
+        let is_meant = |watched: &&mut Watched| drives.iter().any(|image| Arc::ptr_eq(image, &watched.image));
+        for watched in next.drives.values_mut().filter(is_meant) {
+            watched.anew = Some(watched.left(now));
+        }
+        next
+    }
+
+    pub(super) fn drive(&self, name: &str) -> Option<&Watched> {
+        self.drives.get(name)
+    }
+}
+
+impl Watched {
+    /// What it leaves to the bus that takes the place of its own.
+    fn left(&self, now: Instant) -> Anew {
+        let anew = self.anew.clone().filter(|anew| anew.is_recent(now));
+        let before = Watched { anew, ..self.clone() };
+        Anew {
+            since: now,
+            before: Some(Arc::new(before)),
+        }
+    }
+
+    /// The end of its bus, where another one is to take its place.
+    fn expected(&self) -> Option<&Anew> {
+        let is_same = |before: &Arc<Watched>| Arc::ptr_eq(&before.image, &self.image);
+        self.anew
+            .as_ref()
+            .filter(|anew| anew.before.as_ref().is_some_and(is_same))
+    }
+
+    /// Whether another bus is to take the place of its own.
+    pub(super) fn is_leaving(&self) -> bool {
+        self.expected().is_some()
+    }
+
+    /// The last beginning of its bus, while a first reading may still be awaited.
+    pub(super) fn anew(&self, now: Instant) -> Option<&Anew> {
+        self.anew.as_ref().filter(|anew| anew.is_recent(now))
+    }
+}
+
+impl Anew {
+    fn is_recent(&self, now: Instant) -> bool {
+        now < self.since + FIRST_READ
+    }
+}

@@ -1,0 +1,164 @@
+//! One start by an order: the passage of the motor from standing to running, and what further run commands are
+//! meanwhile. Pure: time is an argument.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::Seen;
+
+/// A motor that is seen to start later than that after its word started then, and not when the word was written.
+const STARTS_WITHIN: Duration = Duration::from_secs(30);
+/// For so long after a word that starts it a motor may still read as standing.
+pub(super) const SETTLES: Duration = Duration::from_secs(1);
+
+/// Why a drive cannot start its motor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unable {
+    /// It has a fault.
+    Fault,
+    /// It says that it is not ready. The words of a start make some families ready.
+    NotReady,
+}
+
+/// What a run command to the motor is, written now.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ByRun {
+    /// Nothing new: the motor runs for certain.
+    Runs,
+    /// The repetition of a start that is under way, and counts already.
+    Repeats,
+    /// The repetition of a run command that the drive could not follow: it does not count as long as that is so.
+    Vain,
+    /// A start.
+    Starts,
+}
+
+/// How far a start has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Progress {
+    /// Nothing shows it yet.
+    Awaited,
+    /// The motor turns, and does not count as running yet.
+    Turns,
+    /// It was seen to run.
+    Ran,
+    /// It has ended: the motor stands again, or the drive did not take the command.
+    Over,
+    /// The drive could not start, and did not.
+    Vain,
+}
+
+/// A start by an order, from its last word on.
+#[derive(Debug, Clone)]
+pub(super) struct Passage {
+    /// The number of its command.
+    pub(super) number: u64,
+    pub(super) client: Arc<str>,
+    pub(super) progress: Progress,
+    /// When its word was written.
+    pub(super) written: Instant,
+    /// When a run command was written last, its own or a repetition.
+    pub(super) last: Instant,
+    /// Its date among the starts that count.
+    pub(super) counted: Instant,
+    /// The drive could not start before the word, nor in any reading since.
+    pub(super) unable: bool,
+    /// The drive was away since.
+    pub(super) away: bool,
+    /// Since when the motor had stood before.
+    pub(super) stood: Option<Instant>,
+}
+
+/// What a reading of the running motor says of the starts that count.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Shown {
+    /// Nothing new.
+    Nothing,
+    /// The awaited start was made.
+    Started,
+    /// The same, so late that it counts from now on.
+    StartedLate,
+    /// A start that does not count yet, and whose it is.
+    Another(Option<Arc<str>>),
+}
+
+/// What was written and read besides: the last stop, and the run command as the drive had it last.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Besides {
+    pub(super) stop: Option<Instant>,
+    pub(super) commanded: Option<(bool, Instant)>,
+}
+
+impl Passage {
+    fn is_stopped(&self, besides: Besides) -> bool {
+        besides.stop.is_some_and(|stop| stop > self.last)
+    }
+
+    /// What a run command to a motor is that does not run for certain.
+    pub(super) fn by_run(&self, besides: Besides) -> ByRun {
+        // It was taken away since, at the drive itself or from elsewhere.
+        let is_off = besides.commanded.is_some_and(|(on, at)| !on && at > self.last);
+        match self.progress {
+            _ if self.is_stopped(besides) || self.away => ByRun::Starts,
+            Progress::Vain => ByRun::Vain,
+            Progress::Awaited => ByRun::Repeats,
+            Progress::Turns | Progress::Ran if !is_off => ByRun::Repeats,
+            Progress::Turns | Progress::Ran | Progress::Over => ByRun::Starts,
+        }
+    }
+
+    /// The motor is seen to run; it `came` to run if it did not in the reading before.
+    pub(super) fn is_seen_running(&mut self, came: bool, besides: Besides, at: Instant) -> Shown {
+        if self.progress == Progress::Over {
+            return if came { Shown::Another(None) } else { Shown::Nothing };
+        }
+        let before = std::mem::replace(&mut self.progress, Progress::Ran);
+        match before {
+            Progress::Vain => return Shown::Another(Some(self.client.clone())),
+            Progress::Awaited | Progress::Turns if came => {}
+            _ => return Shown::Nothing,
+        }
+        let may_be_of_others = self.away || self.is_stopped(besides);
+        if may_be_of_others && at > self.last + STARTS_WITHIN {
+            return Shown::Another(None);
+        }
+        // Its run command stood all the while.
+        match at > self.counted + STARTS_WITHIN {
+            true => Shown::StartedLate,
+            false => Shown::Started,
+        }
+    }
+
+    /// The motor does not run. Whether this start was in vain from the reading on.
+    pub(super) fn is_seen_not_running(&mut self, seen: &Seen, besides: Besides) -> bool {
+        let before = self.progress;
+        self.unable &= seen.unable.is_some();
+        let has_fault = seen.unable.is_some_and(|(why, _)| why == Unable::Fault);
+        self.progress = match before {
+            Progress::Ran | Progress::Over => Progress::Over,
+            Progress::Turns if seen.stands || has_fault => Progress::Over,
+            Progress::Turns => Progress::Turns,
+            Progress::Vain if seen.unable.is_some() => Progress::Vain,
+            Progress::Vain => Progress::Over,
+            Progress::Awaited => self.awaited(seen, besides),
+        };
+        before != Progress::Vain && self.progress == Progress::Vain
+    }
+
+    fn awaited(&self, seen: &Seen, besides: Besides) -> Progress {
+        let is_on = besides.commanded.is_some_and(|(on, at)| on && at > self.written);
+        let shown = |is_shown: bool| if is_shown { Progress::Vain } else { Progress::Awaited };
+        match seen.unable {
+            Some((Unable::Fault, at)) if self.unable => shown(at > self.written),
+            Some((Unable::NotReady, at)) if self.unable && seen.stands => shown(at >= self.written + SETTLES),
+            // It may have started, and have tripped at once.
+            Some((Unable::Fault, at)) if at > self.written => Progress::Over,
+            _ if !seen.stands => Progress::Turns,
+            _ if self.is_stopped(besides) => Progress::Over,
+            // At a reference of zero, asleep, or held back by a terminal.
+            _ if is_on => Progress::Awaited,
+            _ if seen.at >= self.last + SETTLES => Progress::Over,
+            _ => Progress::Awaited,
+        }
+    }
+}
