@@ -2,6 +2,7 @@
 //! from what is known of the family, not from the profile. The words here are by hand, too.
 
 mod cases;
+mod other_stops;
 mod words;
 
 use std::io::{Read, Write};
@@ -11,7 +12,7 @@ use std::time::Duration;
 use cases::{Case, Order, cases};
 
 use crate::support::process::{PATIENCE, Running, api, free_port, until};
-use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, curl};
 use crate::support::tools::{python, root};
 
 /// Each profile with the module of its drive.
@@ -27,17 +28,22 @@ struct Rig {
     site: Site,
     /// The tool slot, by which addresses are reached that are the common model's over Modbus TCP.
     slot: u16,
+    /// One that also passes broadcasts on.
+    raw_slot: u16,
     drive: Running,
     _gateway: Running,
 }
 
 impl Rig {
     fn new(case: &Case, unprepared: bool) -> Rig {
-        let (port, slot) = (free_port(), free_port());
-        let bus = LINE1.replace("port = \"line1\"", &format!("port = \"tcp://127.0.0.1:{port}\""));
+        let (port, slot, raw_slot) = (free_port(), free_port(), free_port());
+        let bus = LINE1
+            .replace("port = \"line1\"", &format!("port = \"tcp://127.0.0.1:{port}\""))
+            .replace("name = \"test\"", "name = \"test\"\nsocket = \"own.sock\"");
         let drive = format!(
             "cycle = \"50ms\"\nslow_cycle = \"200ms\"\n[[bus.drive]]\nname = \"drive\"\naddress = 1\nprofile = \"{}\"\n\
-             access = \"control\"\n[[bus.slot]]\nlisten = \"127.0.0.1:{slot}\"\naccess = \"write\"\n",
+             access = \"control\"\n[[bus.slot]]\nlisten = \"127.0.0.1:{slot}\"\naccess = \"write\"\n\
+             [[bus.slot]]\nlisten = \"127.0.0.1:{raw_slot}\"\naccess = \"raw\"\n",
             case.profile
         );
         let site = Site::of(&[&bus, &drive, MODBUS_TCP, HTTP]);
@@ -51,6 +57,7 @@ impl Rig {
         Rig {
             site,
             slot,
+            raw_slot,
             drive,
             _gateway: gateway,
         }
@@ -82,22 +89,32 @@ impl Rig {
     fn exchange(&self, order: &Order) -> Answer {
         let pdu = order.pdu();
         let hidden = !matches!(order, Order::Model(..)) && pdu[1] >= 0x80;
-        let (port, frame, head) = match hidden {
-            true => (self.slot, rtu(&pdu), 1),
-            false => {
-                let head = [0, 1, 0, 0, 0, pdu.len() as u8 + 1, 1];
-                (self.site.modbus, [&head[..], &pdu].concat(), 7)
-            }
-        };
-        let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        stream.write_all(&frame).unwrap();
-        let mut reply = vec![0; head + 2];
-        stream.read_exact(&mut reply).unwrap();
-        match reply[head] & 0x80 {
-            0 => Answer::Done,
-            _ => Answer::Exception(reply[head + 1]),
+        match hidden {
+            true => self.by_slot(1, &pdu),
+            false => self.by_modbus_tcp(&pdu),
         }
+    }
+
+    fn by_modbus_tcp(&self, pdu: &[u8]) -> Answer {
+        let head = [0, 1, 0, 0, 0, pdu.len() as u8 + 1, 1];
+        answer(self.site.modbus, &[&head[..], pdu].concat(), 7)
+    }
+
+    fn by_slot(&self, address: u8, pdu: &[u8]) -> Answer {
+        answer(self.slot, &rtu(address, pdu), 1)
+    }
+
+    /// A command of named values by the local socket: its status and result.
+    fn command(&self, values: &str) -> (u16, serde_json::Value) {
+        let socket = self.site.path("own.sock");
+        let url = "http://gateway/api/v1/drives/drive/commands";
+        curl(&["--unix-socket", &socket, "-d", values, url])
+    }
+
+    /// How often the motor has started to turn.
+    fn starts(&self) -> usize {
+        let output = self.drive.output();
+        output.matches("motor forward").count() + output.matches("motor reverse").count()
     }
 
     fn state(&self) -> String {
@@ -108,9 +125,22 @@ impl Rig {
     }
 }
 
-/// The frame of a request to address 1.
-fn rtu(pdu: &[u8]) -> Vec<u8> {
-    let mut frame = [&[1], pdu].concat();
+/// Sends a request on a connection of its own; `head` bytes go before the function of the reply.
+fn answer(port: u16, frame: &[u8], head: usize) -> Answer {
+    let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.write_all(frame).unwrap();
+    let mut reply = vec![0; head + 2];
+    stream.read_exact(&mut reply).unwrap();
+    match reply[head] & 0x80 {
+        0 => Answer::Done,
+        _ => Answer::Exception(reply[head + 1]),
+    }
+}
+
+/// The frame of a request.
+fn rtu(address: u8, pdu: &[u8]) -> Vec<u8> {
+    let mut frame = [&[address], pdu].concat();
     let shift = |crc: u16| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 };
     let crc = frame.iter().fold(0xFFFF, |crc, byte| {
         (0..8).fold(crc ^ u16::from(*byte), |crc, _| shift(crc))

@@ -106,8 +106,10 @@ enum Event {
 /// A command, as the points that it sets.
 type Sets = &'static [(ModelPoint, bool)];
 
+const STOP: Sets = &[(ModelPoint::Run, false)];
+
 const COMMANDS: [Sets; 10] = [
-    &[(ModelPoint::Run, false)],
+    STOP,
     &[(ModelPoint::Run, false), (ModelPoint::Reverse, false)],
     &[(ModelPoint::Run, true)],
     &[(ModelPoint::Run, true), (ModelPoint::Reverse, true)],
@@ -134,12 +136,14 @@ pub fn prove(profile: &Profile) -> Result<Proof, Box<Counterexample>> {
 
 fn explore(profile: &Profile, control: &Control) -> Result<Proof, Box<Counterexample>> {
     let mut proof = Proof::default();
-    for start in Start::ALL {
+    for start in Start::all(control) {
         for known in [true, false] {
-            for sets in COMMANDS {
-                let Some(case) = Case::new(profile, control, start, known, sets) else {
-                    continue;
-                };
+            let commands = COMMANDS
+                .iter()
+                .map(|sets| Case::new(profile, control, start, known, sets));
+            let words = control.also_stop.iter();
+            let words = words.map(|stop| Case::of_word(profile, control, start, known, stop));
+            for case in commands.chain(words).flatten() {
                 let frames = case.run(Event::None)?;
                 proof.add(frames.len());
                 for number in different(&frames) {
@@ -210,7 +214,7 @@ struct Case<'p> {
     /// The gateway knows the control word.
     known: bool,
     sets: Sets,
-    values: Vec<(PointIndex, Value)>,
+    order: Order,
 }
 
 /// The progress of a case.
@@ -239,8 +243,31 @@ impl<'p> Case<'p> {
             start,
             known,
             sets,
-            values: values?,
+            order: Order::Points(values?),
         })
+    }
+
+    /// A run command with these bits, written raw: a stop.
+    fn of_word(
+        profile: &'p Profile,
+        control: &'p Control,
+        start: Start,
+        known: bool,
+        stop: &Setting,
+    ) -> Option<Case<'p>> {
+        let reverse = start == Start::Running { reverse: true };
+        let running = Drive::new(profile, control, Start::Running { reverse })?;
+        let word = stop.applied(running.word(control.at));
+        let pdu = profile.functions.write_register(control.at.address, word);
+        let case = Case::new(profile, control, start, known, STOP)?;
+        Some(Case {
+            order: Order::Write(pdu),
+            ..case
+        })
+    }
+
+    fn is_raw(&self) -> bool {
+        matches!(self.order, Order::Write(_))
     }
 
     fn says(&self, point: ModelPoint) -> Option<bool> {
@@ -251,11 +278,11 @@ impl<'p> Case<'p> {
         self.says(ModelPoint::Run) == Some(false)
     }
 
-    fn begin(&self, values: Vec<(PointIndex, Value)>, urgency: Urgency, now: Instant, expires: Instant) -> CommandRun {
+    fn begin(&self, order: Order, urgency: Urgency, now: Instant, expires: Instant) -> CommandRun {
         let origin = Origin::new(SourceKind::LocalSocket, "proof");
         let (ticket, _) = Ticket::new(origin, "", String::new(), false, now, Arc::new(WriteStats::default()));
         let admitted = Admitted {
-            order: Order::Points(values),
+            order,
             urgency,
             reference_only: false,
             ranges: Vec::new(),
@@ -293,7 +320,7 @@ impl<'p> Case<'p> {
             Urgency::Command
         };
         let expires = now + LONGEST;
-        let mut run = self.begin(self.values.clone(), urgency, now, expires);
+        let mut run = self.begin(self.order.clone(), urgency, now, expires);
         let mut stopped = false;
         let mut late = Duration::ZERO;
         let outcome = loop {
@@ -330,7 +357,8 @@ impl<'p> Case<'p> {
             return Ok(());
         };
         let expires = progress.now + LONGEST;
-        let mut stop = self.begin(vec![(run, Value::Bool(false))], Urgency::Stop, progress.now, expires);
+        let stop = Order::Points(vec![(run, Value::Bool(false))]);
+        let mut stop = self.begin(stop, Urgency::Stop, progress.now, expires);
         progress.frames.push("(a stop comes in)".to_string());
         for _ in 0..MOST_FRAMES {
             if self.step(&mut stop, progress, None, Duration::ZERO, true)?.is_some() {
@@ -449,7 +477,8 @@ impl<'p> Case<'p> {
         };
         for (address, word) in items {
             let place = ControlItem { table, address };
-            if place == self.control.at && !is_coil(place) && !self.keeps_always(word) {
+            let own = place == self.control.at && !is_coil(place) && !self.is_raw();
+            if own && !self.keeps_always(word) {
                 return Err(self.wrong("a word lacks a bit of `always`", progress));
             }
             if self.says_both(place, word) {
@@ -517,7 +546,8 @@ impl<'p> Case<'p> {
 
     /// Checks that an undisturbed command has its effect.
     fn judge_effect(&self, outcome: &Outcome, progress: &Progress<'p>) -> Result<(), Box<Counterexample>> {
-        let stands = matches!(self.start, Start::PoweredUp | Start::Stopped | Start::Prepared);
+        use Start::{PoweredUp, Prepared, Stopped, StoppedOtherwise};
+        let stands = matches!(self.start, PoweredUp | Stopped | Prepared | StoppedOtherwise(_));
         let starts = self.says(ModelPoint::Run) == Some(true);
         let direction = self.says(ModelPoint::Reverse);
         if starts && stands {
@@ -542,10 +572,14 @@ impl<'p> Case<'p> {
             false => "; the gateway does not know its control word",
         };
         let sets = self.sets.iter().map(|(point, on)| format!("{} = {on}", point.name()));
+        let command = match &self.order {
+            Order::Write(pdu) => in_words(pdu),
+            _ => sets.collect::<Vec<_>>().join(", "),
+        };
         Box::new(Counterexample {
             what: what.to_string(),
             state: format!("{}{known}", self.start.in_words()),
-            command: sets.collect::<Vec<_>>().join(", "),
+            command,
             frames: progress.frames.clone(),
         })
     }

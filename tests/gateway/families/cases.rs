@@ -57,6 +57,14 @@ pub(super) struct Case {
 }
 
 impl Case {
+    /// The register of the reference, where it is one.
+    pub(super) fn reference_register(&self) -> Option<u16> {
+        match self.reference.as_slice() {
+            [Raw(Word(address, _) | Single(address, _))] => Some(*address),
+            _ => None,
+        }
+    }
+
     /// Whether the family is started by a sequence of words that the drive confirms.
     pub(super) fn has_sequence(&self) -> bool {
         ["abb", "cia402", "siemens"].contains(&self.peer)
@@ -65,22 +73,22 @@ impl Case {
 
 /// Profile, peer, what it shows, reset, refused words. A raw 7 is neither a stop nor a run command of INVT.
 const CASES: &str = "\
-abb-acs550         | abb        | frequency          | 0=0x47E,0x4FE,0x47E         | 0=0x7F,0x477,0x47D,0x57E
-abb-acs580         | abb        |                    | 0=0x47E,0x4FE,0x47E         | 0=0x1,0x477
-danfoss-fc         | danfoss    | frequency          | 49999=0x43C,0x4BC,0x43C     | 49999=0x7C,0x3C,0x41C,0x53C
-siemens-v20        | siemens    | frequency          | 99=0x47E,0x4FE,0x47E        | 99=0x7F,0x7E,0x57E,0x47D
+abb-acs550         | abb        | frequency          | 0=0x47E,0x4FE,0x47E         | 0=0x7F,0x57E,0x67F
+abb-acs580         | abb        |                    | 0=0x47E,0x4FE,0x47E         | 0=0x7,0x77
+danfoss-fc         | danfoss    | frequency          | 49999=0x43C,0x4BC,0x43C     | 49999=0x7C,0x3C,0x41C,0x53C,0x74
+siemens-v20        | siemens    | frequency          | 99=0x47E,0x4FE,0x47E        | 99=0x7F,0x7E,0x57E,0x7D
 siemens-g120       | siemens    |                    | 99=0x47E,0x4FE,0x47E        | 99=0x77,0x67E
-schneider-altivar  | cia402     | frequency          | 8501=0,0x80,0               | 8501=0x1F,0x8F,0xA
+schneider-altivar  | cia402     | frequency          | 8501=0,0x80,0               | 8501=0x1F,0x8F,0xE
 yaskawa-v1000      | yaskawa    | frequency reversed | 1=0,8,0                     | 1=3,4,5,0x10
 delta-ms300        | delta      | frequency reversed | 0x2002=2                    | 0x2000=0,2,3 0x2002=1,4
-invt-goodrive      | invt       | frequency reversed |                             | 0x2000=0,3,4,7,8
+invt-goodrive      | invt       | frequency reversed |                             | 0x2000=0,3,4,7,8,14
 mitsubishi-d700    | mitsubishi | frequency reversed |                             | 8=6,1,8
-invertek-optidrive | invertek   | frequency          | 0=0,4,0                     | 0=9,3 1=0xFF06
-weg-cfw            | weg        | frequency          | 682=0x16,0x96,0x16          | 682=0x7,0x1E,0x15,0x6
+invertek-optidrive | invertek   | frequency          | 0=0,4,0                     | 0=0x11,0x21 1=0xFF06
+weg-cfw            | weg        | frequency          | 682=0x16,0x96,0x16          | 682=0x7,0x1E,0x5,0x6
 fuji-frenic        | fuji       | frequency reversed | 0x0706=0,0x8000,0           | 0x0706=3,4,0x2000
 hitachi-wj200      | hitachi    | frequency reversed | 0=off 3=on 3=off            |
-toshiba-vf-s15     | toshiba    | frequency reversed | 0xFA00=0xC000,0xE000,0xC000 | 0xFA00=0,0x4400,0xD400,0xCC00
-ls-g100            | ls         | frequency reversed |                             | 5=0,6,8,16
+toshiba-vf-s15     | toshiba    | frequency reversed | 0xFA00=0xC000,0xE000,0xC000 | 0xFA00=0,0x4400,0x5400,0x4C00
+ls-g100            | ls         | frequency reversed |                             | 5=0,6,8,32
 teco-f510          | teco       | frequency reversed | 0x2501=0,8,0                | 0x2501=5,4,0x11
 vacon-10           | vacon10    | frequency reversed | 2000=4                      |";
 

@@ -22,9 +22,10 @@ fn any(word: u16, mask: u16) -> bool {
     word & mask != 0
 }
 
-/// Off without bit 0 (1 and 2 are OFF2 and OFF3), inhibited without bit 3; bits 8 and 9 jog while bit 0 is off.
+/// Off without bit 0, 1 or 2 (OFF1 to OFF3), inhibited without bit 3; bits 8 and 9 jog while bit 0 is off.
 fn off_words(word: u16) -> Does {
     match word {
+        _ if !is(word, 0x0006) => Stops,
         _ if !is(word, 0x0001) && any(word, 0x0300) => Other,
         _ if !is(word, 0x000F) => Stops,
         _ if is(word, 0x047F) && !any(word, 0x0300) => Runs,
@@ -103,10 +104,11 @@ fn invt(word: u16) -> Does {
     }
 }
 
+/// Bit 3 coasts, bit 1 is the fast stop; bit 0 counts last.
 fn invertek(word: u16) -> Does {
     match word {
-        _ if any(word, 0x0008) || !is(word, 0x0001) => Stops,
-        _ if any(word, 0xFFF2) => Other,
+        _ if any(word, 0x000A) || !is(word, 0x0001) => Stops,
+        _ if any(word, 0xFFF0) => Other,
         _ => Runs,
     }
 }
@@ -131,6 +133,7 @@ fn toshiba(word: u16) -> Does {
 
 fn ls(word: u16) -> Does {
     match word & 7 {
+        _ if any(word, 0x0010) => Stops,
         1 => Stops,
         2 | 4 if !any(word, 0xFFF8) => Runs,
         _ => Other,

@@ -164,7 +164,8 @@ class Drive:
         return pdu[:5]
 
     def exchange(self, frame):
-        if frame[0] != 1:
+        # 0 is a broadcast, which nobody answers.
+        if frame[0] not in (0, 1):
             return b""
         with self.lock:
             self.show()
@@ -172,6 +173,8 @@ class Drive:
                 pdu = self.answer(frame[1:-2])
             except Refused as refused:
                 pdu = bytes([frame[1] | 0x80, refused.code])
+        if frame[0] == 0:
+            return b""
         reply = bytes([1]) + pdu
         return reply + crc(reply)
 

@@ -21,8 +21,11 @@ class Drive(drive.Drive):
         before, self.word = self.word, value
         if value & 0x0004 and not before & 0x0004:
             self.reset()
+        # Coast goes before the fast stop, and that before a run command.
         if value & 0x0008:
             self.coast()
+        elif value & 0x0002:
+            self.stop()
         elif value & 0x0001:
             self.start(-1 if drive.signed(self.holding[1]) < 0 else 1)
         else:

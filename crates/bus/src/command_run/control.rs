@@ -330,7 +330,7 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
         return Made::Nothing;
     };
     let at = control.at;
-    let own = words.get(at.table, at.address);
+    let own = words.get(at.table, at.address).map(|own| control.standing(own));
     if asks_first(word, control, own, known) {
         return Made::Send(read_of(at));
     }
@@ -364,7 +364,7 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
         Word::Stop(reverse) => {
             let stop = control.stop_word(base);
             let turned = reverse.map_or(stop, |reverse| control.with_direction(stop, reverse));
-            sent(if control.is_stop(at, turned) { turned } else { stop })
+            sent(if control.is_own_stop(at, turned) { turned } else { stop })
         }
         Word::Direction(reverse) => match &control.run {
             // Kept for the next start where no bit of the drive says it; the word that stands is sent once more.

@@ -23,6 +23,8 @@ pub(super) enum Start {
     /// A fault came while it ran: the run command stands.
     FaultedRunning,
     FaultedStopped,
+    /// Stopped by another of its own means: that one of the words of the profile.
+    StoppedOtherwise(usize),
     /// Commanded at its panel; the gateway's word is a stop.
     Local,
     /// The same, and the gateway's word is a run command.
@@ -30,17 +32,22 @@ pub(super) enum Start {
 }
 
 impl Start {
-    pub(super) const ALL: [Start; 9] = [
-        Start::PoweredUp,
-        Start::Stopped,
-        Start::Prepared,
-        Start::Running { reverse: false },
-        Start::Running { reverse: true },
-        Start::FaultedRunning,
-        Start::FaultedStopped,
-        Start::Local,
-        Start::LocalRunning,
-    ];
+    /// Every state of a drive with that profile.
+    pub(super) fn all(control: &Control) -> Vec<Start> {
+        let mut all = vec![
+            Start::PoweredUp,
+            Start::Stopped,
+            Start::Prepared,
+            Start::Running { reverse: false },
+            Start::Running { reverse: true },
+            Start::FaultedRunning,
+            Start::FaultedStopped,
+            Start::Local,
+            Start::LocalRunning,
+        ];
+        all.extend((0..control.also_stop.len()).map(Start::StoppedOtherwise));
+        all
+    }
 
     pub(super) fn in_words(self) -> &'static str {
         match self {
@@ -51,6 +58,7 @@ impl Start {
             Start::Running { reverse: true } => "running in reverse",
             Start::FaultedRunning => "faulted, the run command still set",
             Start::FaultedStopped => "faulted and stopped",
+            Start::StoppedOtherwise(_) => "stopped by a word of `also_stop`",
             Start::Local => "commanded at its panel, stopped",
             Start::LocalRunning => "commanded at its panel, the run command still set",
         }
@@ -104,6 +112,12 @@ impl<'p> Drive<'p> {
                 drive.prepared = steps;
                 drive.put_run(reverse);
                 drive.running = Some(reverse);
+            }
+            Start::StoppedOtherwise(number) => {
+                drive.prepared = steps;
+                drive.put_run(reverse);
+                let stop = control.also_stop.get(number)?;
+                drive.put(control.at, stop.applied(drive.word(control.at)));
             }
         }
         drive.fault = matches!(start, Start::FaultedRunning | Start::FaultedStopped);

@@ -1,5 +1,7 @@
 //! How a family is commanded: the control word, which words run, stop and reset, and what comes before. Pure.
 
+mod contradictions;
+
 use crate::drive::PointIndex;
 use std::time::Duration;
 
@@ -19,6 +21,8 @@ pub struct Control {
     pub run: Run,
     /// How it is stopped, and how a stop is recognised.
     pub stop: Setting,
+    /// Further words of the control register by which the drive stops by another of its own means: the gateway sends none of them.
+    pub also_stop: Vec<Setting>,
     /// How it is reversed, unless that is part of `run`.
     pub reverse: Option<Setting>,
     /// How a fault is reset.
@@ -203,7 +207,17 @@ impl Control {
 
     /// Whether that word, written there, stops the motor.
     pub fn is_stop(&self, place: ControlItem, word: u16) -> bool {
+        self.is_own_stop(place, word) || self.is_also_stop(place, word)
+    }
+
+    /// Whether it stops as the gateway itself stops.
+    pub fn is_own_stop(&self, place: ControlItem, word: u16) -> bool {
         self.stop.place.unwrap_or(self.at) == place && self.stop.holds(word)
+    }
+
+    /// Whether it stops by another of the drive's own means.
+    fn is_also_stop(&self, place: ControlItem, word: u16) -> bool {
+        place == self.at && self.also_stop.iter().any(|stop| stop.holds(word))
     }
 
     /// Whether that word, written there, starts it or lets it run.
@@ -240,11 +254,44 @@ impl Control {
 
     /// The bits of the direction count for nothing in a sequence, nor does what resets.
     fn holds_run(&self, setting: &Setting, word: u16) -> bool {
-        let free = match (&self.run, &self.reverse) {
+        (word ^ setting.value) & setting.mask & !self.free() == 0
+    }
+
+    /// The bits of the words of a sequence that say the direction, as commanded.
+    pub(super) fn free(&self) -> u16 {
+        match (&self.run, &self.reverse) {
             (Run::Steps(_), Some(reverse)) if reverse.place.is_none() => reverse.mask,
             _ => 0,
+        }
+    }
+
+    /// The states of the control word in which a run command stands: those of [`Control::runs`] without the words that stop by
+    /// other means.
+    pub(super) fn run_states(&self) -> Vec<Setting> {
+        let (free, always) = (self.free(), self.always);
+        let differ = |stop: &Setting| (stop.value & always.clear) | (!stop.value & stop.mask & always.set);
+        let others = self.also_stop.iter().fold(0, |bits, stop| bits | differ(stop));
+        let state = |run: Setting| {
+            let others = match run.place {
+                None => others & !run.mask,
+                Some(_) => 0,
+            };
+            Setting {
+                mask: run.mask & !free | others,
+                value: run.value & !free | always.set & others,
+                ..run
+            }
         };
-        (word ^ setting.value) & setting.mask & !free == 0
+        self.runs().into_iter().map(state).collect()
+    }
+
+    /// The word from which the next one is made where the drive has `own`: behind one that stops by other means the word of a stop,
+    /// so that nothing that is written later runs.
+    pub fn standing(&self, own: u16) -> u16 {
+        match self.is_also_stop(self.at, own) {
+            true => self.stop_word(own),
+            false => own,
+        }
     }
 
     /// The word without a reset that stands in it: its bits as they are between two resets.
@@ -272,60 +319,6 @@ impl Control {
             Run::Pair { forward, .. } if forward.holds(word) => Some(false),
             _ => None,
         }
-    }
-
-    /// Contradictions: the key, the fault and the remedy.
-    pub fn contradictions(&self) -> Vec<(&'static str, String, &'static str)> {
-        let always = self.always;
-        let mut found = Vec::new();
-        let mut refuse = |key: &'static str, setting: &Setting| {
-            let own = setting.place.is_none_or(|place| place == self.at);
-            if own && (setting.value & always.clear != 0 || setting.mask & !setting.value & always.set != 0) {
-                let what = format!("{:#06x} in {:#06x} contradicts `always`", setting.value, setting.mask);
-                found.push((key, what, "leave these bits out of one of them"));
-            }
-        };
-        self.runs().iter().for_each(|run| refuse("run", run));
-        if let Run::Steps(steps) = &self.run {
-            let before = steps.len().saturating_sub(1);
-            steps.iter().take(before).for_each(|step| refuse("run", &step.write));
-        }
-        refuse("stop", &self.stop);
-        self.reverse.iter().for_each(|reverse| refuse("reverse", reverse));
-        let reset = self.fault_reset.map(|reset| reset.setting);
-        reset.iter().for_each(|reset| refuse("fault_reset", reset));
-        if self.runs().iter().any(|run| run.agrees(&self.stop)) {
-            found.push((
-                "stop",
-                "a word can be a run command and a stop at once".to_string(),
-                "write bits that the run command sets differently",
-            ));
-        }
-        match &self.run {
-            Run::Pair { .. } if self.reverse.is_some() => found.push((
-                "reverse",
-                "`run` already sets the direction".to_string(),
-                "leave `reverse` out",
-            )),
-            Run::Pair { forward, reverse } if forward.agrees(reverse) => found.push((
-                "run",
-                "a word can run forward and in reverse at once".to_string(),
-                "write bits that distinguish the two",
-            )),
-            _ => {}
-        }
-        if self.reverse.is_some_and(|reverse| {
-            self.runs().iter().any(|run| {
-                run.place == reverse.place && run.mask & reverse.mask != 0 && !matches!(self.run, Run::Steps(_))
-            })
-        }) {
-            found.push((
-                "reverse",
-                "the direction shares bits with the run command".to_string(),
-                "write only the bits of the direction, or `run` as a pair",
-            ));
-        }
-        found
     }
 
     /// Where `run` is written.

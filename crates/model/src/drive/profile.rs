@@ -489,6 +489,7 @@ impl Profile {
             always: Always::default(),
             run: Run::One(within(run)),
             stop: within(setting(ModelPoint::Run, false)?),
+            also_stop: Vec::new(),
             reverse: setting(ModelPoint::Reverse, true).map(within),
             fault_reset: reset.map(|setting| Reset {
                 setting,

@@ -25,6 +25,7 @@ pub(super) fn told(control: &Control, known: &Known<'_>, place: ControlItem, wor
         (Run::Steps(steps), Some(step)) if step + 1 == steps.len() => Does::Runs { reverse: reverse() },
         (Run::Steps(_), Some(step)) => Does::Prepares(step + 1),
         _ if here(&control.stop) && holds(&control.stop) => Does::Stops,
+        _ if control.is_stop(place, word) => Does::Coasts,
         // A word without its constant bits is no command.
         _ if own && !control.always.holds(word) => Does::Nothing,
         (Run::One(run), _) if holds(run) && concerns_run(control, place) => Does::Runs { reverse: reverse() },

@@ -284,10 +284,11 @@ fn mitsubishi(_: &Known<'_>, word: u16) -> Told {
     told(pair(word >> 1 & 3), false, word)
 }
 
-/// Bit 3 coasts, bit 1 is the second ramp.
+/// Bit 3 coasts, bit 1 stops by the second ramp; both go before bit 0.
 fn invertek(known: &Known<'_>, word: u16) -> Told {
     let does = match word {
         _ if is(word, 0x0008) => Does::Coasts,
+        _ if is(word, 0x0002) => Does::Stops,
         _ if is(word, 0x0001) => runs(false),
         _ => Does::Stops,
     };

@@ -31,6 +31,10 @@ pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, 
         }
     }
     lines.push(("stop", setting(&control.stop)));
+    if !control.also_stop.is_empty() {
+        let stops: Vec<String> = control.also_stop.iter().map(setting).collect();
+        lines.push(("stops, too", stops.join("; ")));
+    }
     lines.extend(control.reverse.as_ref().map(|reverse| ("reverse", setting(reverse))));
     if let Some(reset) = &control.fault_reset {
         let hold = format_duration(reset.hold);

@@ -20,7 +20,7 @@ fn reset_of(control: &mut Control) -> Option<(Setting, &mut Setting)> {
     (reset.setting.place == run.place).then_some((run, &mut reset.setting))
 }
 
-const FAULTS: [(&str, Fault); 14] = [
+const FAULTS: [(&str, Fault); 16] = [
     ("a stop with its bits the other way", |control| {
         control.stop.value ^= control.stop.mask;
         Some(())
@@ -33,6 +33,27 @@ const FAULTS: [(&str, Fault); 14] = [
         let runs = control.runs().iter().fold(0, |bits, run| bits | run.mask & run.value);
         let free = (0..16).map(|bit| 1u16 << bit).find(|bit| runs & bit == 0)?;
         (control.stop.mask, control.stop.value) = (free, 0);
+        Some(())
+    }),
+    ("another stop that is the run command", |control| {
+        let run = *run_of(control)?;
+        control.also_stop.push(run);
+        Some(())
+    }),
+    ("another stop of one bit that no run command has", |control| {
+        let always = control.always;
+        let taken = control
+            .runs()
+            .iter()
+            .fold(always.set | always.clear, |bits, run| bits | run.mask);
+        let free = (0..16).map(|bit| 1u16 << bit).find(|bit| taken & bit == 0)?;
+        let stop = Setting {
+            place: None,
+            mask: free,
+            value: free,
+            once: false,
+        };
+        control.also_stop.push(stop);
         Some(())
     }),
     ("a reset that runs, too", |control| {

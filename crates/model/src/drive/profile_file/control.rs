@@ -17,6 +17,7 @@ use crate::document::{Finding, Reader};
 const STEP_TIMEOUT: Duration = Duration::from_secs(2);
 const LONGEST: Duration = Duration::from_secs(60);
 const MOST_STEPS: usize = 8;
+const MOST_STOPS: usize = 16;
 /// The helper that holds the control word.
 const CONTROL_WORD: &str = "control_word";
 
@@ -49,6 +50,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Around<'_>) -> Option<Control> 
         setting
     };
     let (stop, reverse) = (of("stop"), of("reverse"));
+    let also_stop = read_stops(&table, around);
     let fault_reset = read_reset(&table, around);
     let restarts_on_reset = table.or("restarts_on_reset", false);
     for key in ["run", "stop"].into_iter().filter(|key| !table.has(key)) {
@@ -61,6 +63,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Around<'_>) -> Option<Control> 
         always,
         run: run?,
         stop: stop?,
+        also_stop: also_stop?,
         reverse,
         fault_reset,
         restarts_on_reset,
@@ -270,6 +273,26 @@ fn read_steps(form: &Reader<'_>, around: &Around<'_>) -> Option<Vec<Step>> {
     steps.into_iter().collect()
 }
 
+/// `also_stop`: none where a form is wrong, which is reported.
+fn read_stops(table: &Reader<'_>, around: &Around<'_>) -> Option<Vec<Setting>> {
+    let forms = table.tables("also_stop");
+    if forms.len() > MOST_STOPS {
+        table.problem(
+            "also_stop",
+            format!("{} forms", forms.len()),
+            format!("write {MOST_STOPS} at most"),
+        );
+        return None;
+    }
+    let read = |form: &Reader<'_>| {
+        let setting = read_setting(form, around);
+        form.finish();
+        setting
+    };
+    let stops: Vec<Option<Setting>> = forms.iter().map(read).collect();
+    stops.into_iter().collect()
+}
+
 fn read_step(table: &Reader<'_>, around: &Around<'_>) -> Option<Step> {
     let (write, mask) = (table.required::<u16>("write"), table.or("mask", u16::MAX));
     let place = read_place(table, around);
@@ -392,24 +415,19 @@ pub(super) fn made_points(control: &Control, points: &PerPoint<Point>, before: u
             first + helpers.len() - 1
         }))
     };
-    // The direction stands in the words of a sequence as commanded.
-    let free = match (&control.run, control.reverse) {
-        (Run::Steps(_), Some(reverse)) if reverse.place.is_none() => reverse.mask,
-        _ => 0,
-    };
-    let mut state = |setting: &Setting, free: u16| Mask {
+    let mut state = |setting: &Setting| Mask {
         point: index_of(setting.place.unwrap_or(control.at)),
-        mask: u64::from(setting.mask & !free),
-        is: u64::from(setting.value & !free),
+        mask: u64::from(setting.mask),
+        is: u64::from(setting.value),
     };
     let reset = control.fault_reset.map(|reset| reset.setting);
     let reversed = match &control.run {
         Run::Pair { reverse, .. } => Some(*reverse),
         Run::One(_) | Run::Steps(_) => control.reverse,
     };
-    let of_run = control.runs().iter().map(|run| state(run, free)).collect();
-    let of_reverse = reversed.iter().map(|reverse| state(reverse, 0)).collect();
-    let of_reset = reset.iter().map(|reset| state(reset, 0)).collect();
+    let of_run = control.run_states().iter().map(&mut state).collect();
+    let of_reverse = reversed.iter().map(&mut state).collect();
+    let of_reset = reset.iter().map(&mut state).collect();
     let made: [(ModelPoint, Vec<Mask>); 3] = [
         (ModelPoint::Run, of_run),
         (ModelPoint::Reverse, of_reverse),

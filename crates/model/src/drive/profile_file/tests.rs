@@ -8,6 +8,7 @@ use super::*;
 use crate::drive::Value;
 use crate::drive::model::Kind;
 
+mod stops;
 mod values;
 
 /// The beginning of a valid profile.
@@ -402,7 +403,7 @@ fn the_page_names_every_key() {
     });
     known.retain(|key| !key.contains("texts.") && !key.contains(".always.") && !key.contains(".until."));
     // The forms of all commands have their keys in one table.
-    const FORMS: [&str; 4] = ["run", "stop", "reverse", "fault_reset"];
+    const FORMS: [&str; 5] = ["run", "stop", "also_stop[]", "reverse", "fault_reset"];
     let form = |key: String| {
         let of = FORMS.iter().find_map(|of| key.strip_prefix(&format!("control.{of}.")));
         of.map_or(key.clone(), |key| {
