@@ -38,6 +38,7 @@ mod gateway {
     mod slow_log;
     mod start_guard;
     mod stop_all;
+    mod stops_in_blocks;
     mod trace;
     mod trying;
     mod user_profiles;

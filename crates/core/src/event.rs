@@ -317,6 +317,7 @@ pub struct RefusedCommand<'r> {
     pub client: &'r Arc<str>,
     /// Code of the reason.
     pub reason: &'static str,
+    /// The bus and the drive; both empty if it is for none in particular.
     pub bus: &'r str,
     pub drive: &'r str,
     /// For people.
@@ -400,15 +401,14 @@ impl Events {
             "interlocked" => EventKind::Interlock,
             _ => EventKind::RefusedCommand,
         };
+        let drive = Some(refused.drive).filter(|drive| !drive.is_empty());
         let event = Event {
             bus: refused.bus.to_string(),
-            drive: Some(refused.drive.to_string()),
+            drive: drive.map(str::to_string),
             ..Event::new(kind, SystemTime::now(), refused.text)
         };
         let mut store = self.store();
-        let passed = store
-            .limit
-            .admit(refused.client, refused.reason, Some(refused.drive), event, now);
+        let passed = store.limit.admit(refused.client, refused.reason, drive, event, now);
         passed
             .into_iter()
             .for_each(|passed| self.publish_counted(&mut store, passed));

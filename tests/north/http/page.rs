@@ -78,6 +78,12 @@ async fn drives_are_operated_from_the_page() {
     browse("operating.js", Vec::new()).await;
 }
 
+/// A key that is held answers nothing, and a question ends when what it rests on changes.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn questions_are_answered_about_what_they_asked() {
+    browse("questions.js", Vec::new()).await;
+}
+
 /// The time that an update takes grows with the number of drives and no faster.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_thousand_drives_stay_smooth() {

@@ -293,7 +293,7 @@ impl Taker {
     }
 
     fn command(&mut self, record: &AuditRecord, clock: Clock) {
-        let Some((bus, drive)) = self.recorder.drive(&record.drive) else {
+        let Some((bus, _)) = self.recorder.drive(&record.drive) else {
             return;
         };
         let at = clock.instant_at(record.time).min(clock.now);
@@ -306,7 +306,7 @@ impl Taker {
         };
         self.recorder
             .note(&bus.spec.name, Some(&record.drive), &Note { at, body });
-        if is_refused_stop(record, &drive.spec.profile) {
+        if is_refused_stop(record) {
             let text = format!(
                 "a stop from {} {} failed: {}",
                 record.source, record.client, record.text

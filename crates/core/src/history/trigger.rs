@@ -5,8 +5,7 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
-use crate::codec::Table;
-use crate::drive::{DriveIndex, ModelPoint, Profile, Value};
+use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::event::EventKind;
 use crate::order::AuditRecord;
 use crate::process_image::{Reading, TriggerLimit};
@@ -109,8 +108,9 @@ pub struct Trigger {
     pub text: String,
 }
 
-/// Whether a record is a stop that the drive did not acknowledge, and that nothing newer took the place of.
-pub(super) fn is_refused_stop(record: &AuditRecord, profile: &Profile) -> bool {
+/// Whether a record is a stop that the drive did not acknowledge, and that nothing newer took the place of. The refused rest of a
+/// write whose stop was carried out is none, though the write repeats the stop.
+pub(super) fn is_refused_stop(record: &AuditRecord) -> bool {
     const TAKEN: [&str; 7] = [
         "acknowledged",
         crate::order::CONFIRMED,
@@ -120,21 +120,7 @@ pub(super) fn is_refused_stop(record: &AuditRecord, profile: &Profile) -> bool {
         "shutting_down",
         "interrupted",
     ];
-    let stops = |change: &crate::order::Change| match (change.point.split_once(' '), change.new) {
-        (None, Value::Bool(false)) => change.point == ModelPoint::Run.name(),
-        // A raw write: table and address.
-        (Some((table, address)), Value::Integer(word)) => {
-            let table = Table::from_name(table);
-            let address = address.parse::<u16>().ok();
-            let word = u16::try_from(word).ok();
-            match (table, address, word) {
-                (Some(table), Some(address), Some(word)) => profile.is_stop(table, address, word),
-                _ => false,
-            }
-        }
-        _ => false,
-    };
-    !TAKEN.contains(&record.result) && record.points.iter().any(stops)
+    !TAKEN.contains(&record.result) && record.run() == Some(false)
 }
 
 /// The last values of a drive whose changes trigger recordings.

@@ -85,8 +85,21 @@ fn read_one(reader: &Reader<'_>, ranks: &[String]) -> Option<Principal> {
         socket: uid.flatten(),
         ..Principal::new(name.clone().unwrap_or_default(), place.unwrap_or_default())
     };
+    if principal.cyclic && !repeats(&principal) {
+        reader.problem(
+            PRINCIPAL.cyclic.name,
+            "a stop over HTTP or the local socket is always a new stop".to_string(),
+            "delete this key, or name a client that writes cyclically: modbus_tcp, certificate, mqtt, sparkplug or bacnet",
+        );
+    }
     reader.finish();
     (name.is_some() && place.is_some() && uid.is_none_or(|uid| uid.is_some())).then_some(principal)
+}
+
+/// Whether it has a way in by which a client may repeat its stop.
+fn repeats(principal: &Principal) -> bool {
+    let by_address = !principal.modbus_tcp.is_empty() || !principal.bacnet.is_empty();
+    by_address || principal.certificate.is_some() || principal.mqtt.is_some() || principal.sparkplug
 }
 
 /// The id of a user of this machine.

@@ -155,7 +155,8 @@ impl Asked {
 /// # Errors
 /// The refusal; nothing of the command may be executed.
 pub(crate) fn order(payload: &[u8], profile: &Profile) -> Result<Asked, Refusal> {
-    points_of(object(payload)?, profile)
+    let (fields, refused) = object(payload)?;
+    points_of(fields, refused, profile)
 }
 
 /// Refuses a payload that is too long.
@@ -171,12 +172,13 @@ pub(crate) fn check_size(size: usize) -> Result<(), Refusal> {
     }
 }
 
-fn points_of(fields: Fields, profile: &Profile) -> Result<Asked, Refusal> {
+/// `refused` says what is wrong with the whole, a stop apart.
+fn points_of(fields: Fields, refused: Option<Refusal>, profile: &Profile) -> Result<Asked, Refusal> {
     let mut expiry = DEFAULT_EXPIRY;
     let mut points = Vec::new();
     let mut wait = false;
     let twice = |name: String| sets_twice(excerpt(name.as_bytes()).trim_matches('`'));
-    let mut refused = fields.twice.map(twice);
+    let mut refused = refused.or(fields.twice.map(twice));
     for (name, value) in fields.all {
         let understood = match name.as_str() {
             "id" if is_id(&value) => Ok(()),
@@ -281,17 +283,50 @@ fn brief(value: &Json) -> String {
     }
 }
 
-fn object(payload: &[u8]) -> Result<Fields, Refusal> {
+/// The fields of an object. If some of its values are none in JSON (`NaN`, `1e999`), they are null, and the refusal says so.
+fn object(payload: &[u8]) -> Result<(Fields, Option<Refusal>), Refusal> {
     let shape = "send a JSON object such as {\"run\": true, \"speed_reference\": 50}";
-    let value: Json = serde_json::from_slice(payload)
-        .map_err(|e| Refusal::BadValue(format!("{} is not JSON: {e}; {shape}", excerpt(payload))))?;
+    let value: Json = match serde_json::from_slice(payload) {
+        Ok(value) => value,
+        Err(e) => {
+            let refusal = Refusal::BadValue(format!("{} is not JSON: {e}; {shape}", excerpt(payload)));
+            let readable = with_nulls(payload).and_then(|text| serde_json::from_str(&text).ok());
+            return readable.map(|fields| (fields, Some(refusal.clone()))).ok_or(refusal);
+        }
+    };
     if !value.is_object() {
         return Err(Refusal::BadValue(format!(
             "{} is not a JSON object; {shape}",
             excerpt(payload)
         )));
     }
-    serde_json::from_slice(payload).map_err(|e| Refusal::BadValue(e.to_string()))
+    let fields = serde_json::from_slice(payload).map_err(|e| Refusal::BadValue(e.to_string()))?;
+    Ok((fields, None))
+}
+
+/// The text with null for each bare word and number that JSON does not know.
+fn with_nulls(payload: &[u8]) -> Option<String> {
+    let text = std::str::from_utf8(payload).ok()?;
+    let (mut sound, mut word) = (String::with_capacity(text.len()), String::new());
+    let (mut quoted, mut escaped) = (false, false);
+    for c in text.chars().chain(std::iter::once(' ')) {
+        if !quoted && (c.is_alphanumeric() || "+-._".contains(c)) {
+            word.push(c);
+            continue;
+        }
+        if !word.is_empty() {
+            let is_sound = serde_json::from_str::<Json>(&word).is_ok();
+            sound.push_str(if is_sound { &word } else { "null" });
+            word.clear();
+        }
+        sound.push(c);
+        (quoted, escaped) = match c {
+            '"' if !escaped => (!quoted, false),
+            '\\' => (quoted, quoted && !escaped),
+            _ => (quoted, false),
+        };
+    }
+    Some(sound)
 }
 
 /// The fields of an object, and the first name that is repeated: that is an error, since it is ambiguous.

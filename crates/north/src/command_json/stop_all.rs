@@ -1,11 +1,18 @@
 //! The body of a stop of all drives.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
 use super::excerpt;
-use crate::stop_all::{LONGEST_WAIT, Scope, WAIT};
+use crate::command::{Origin, Outcome, Refusal};
+use crate::event::RefusedCommand;
+use crate::plant::{Plant, turn_away};
+use crate::stop_all::{LONGEST_WAIT, NothingToStop, Scope, WAIT};
+
+/// What a stop of several drives is called in audit and events, and the drives that it is for.
+const STOP_ALL: &str = "stop all";
+const DRIVES: &str = "all drives";
 
 /// Which drives are to be stopped.
 #[derive(Debug, Default, Serialize, Deserialize, utoipa::ToSchema)]
@@ -20,12 +27,12 @@ pub struct StopBody {
 ///
 /// # Errors
 /// It is not clear which.
-pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), String> {
+pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), Refusal> {
     let unclear = |why: String| {
         let shown = excerpt(payload);
-        format!(
+        Refusal::BadValue(format!(
             "{shown} does not say which drives to stop ({why}), so no stop was sent; write {{}}, {{\"bus\": \"NAME\"}} or {{\"group\": \"NAME\"}}"
-        )
+        ))
     };
     let body = match payload.trim_ascii() {
         [] => StopBody::default(),
@@ -40,12 +47,37 @@ pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), String> {
         (Some(bus), None) => Scope::Bus(bus),
         (None, Some(group)) => Scope::Group(group),
         (Some(_), Some(_)) => {
-            return Err("both `bus` and `group` are given, so no stop was sent; write one of them".to_string());
+            let why = "both `bus` and `group` are given, so no stop was sent; write one of them";
+            return Err(Refusal::BadValue(why.to_string()));
         }
     };
     // A wait that is none is no reason not to stop.
     let wait = body.wait_s.filter(|wait| *wait >= 0.0).unwrap_or(WAIT.as_secs_f64());
     Ok((scope, Duration::from_secs_f64(wait.min(LONGEST_WAIT.as_secs_f64()))))
+}
+
+/// Refuses a stop of several drives: audited, counted and published as an event. The words for the client.
+pub(crate) fn refuse_stop_all(plant: &Plant, refusal: Refusal, origin: &Origin, now: Instant) -> String {
+    let why = refusal.to_string();
+    let refused = RefusedCommand {
+        client: origin.client(),
+        reason: refusal.code(),
+        bus: "",
+        drive: "",
+        text: format!("refused {STOP_ALL} from {} {}: {why}", origin.kind.name(), origin.who),
+    };
+    plant.events.publish_refusal(refused, now);
+    let outcome = Outcome::Refused(refusal);
+    turn_away(&plant.writes, DRIVES, STOP_ALL, outcome, origin.clone(), now);
+    why
+}
+
+/// Why nothing is stopped, as a refusal.
+pub(crate) fn nothing_to_stop(why: &NothingToStop) -> Refusal {
+    match why {
+        NothingToStop::NotControlled => Refusal::NotAllowed(why.to_string()),
+        NothingToStop::Unknown { .. } => Refusal::BadValue(why.to_string()),
+    }
 }
 
 #[cfg(test)]

@@ -15,7 +15,8 @@ use super::{ServerState, Uncached};
 use crate::ModbusTcpStats;
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Authority, Order, Outcome, Verb};
+use crate::command::{self, Authority, Order, Outcome, Verb};
+use crate::command_json::{nothing_to_stop, refuse_stop_all};
 use crate::drive::{Profile, State};
 use crate::log_throttle::LogThrottle;
 use crate::plant::{BusHandle, DriveHandle};
@@ -151,7 +152,8 @@ impl ClientSession {
                 }
                 Progress::Stopped(header, request, all) => {
                     match all {
-                        true => self.put(header, &request, &Reply::Written, out),
+                        true if stops_all_only(&request) => self.put(header, &request, &Reply::Written, out),
+                        true => self.put_exception(header, request.function(), Exception::ADDRESS, out),
                         false => self.put_exception(header, request.function(), Exception::DEVICE_FAILURE, out),
                     }
                     return None;
@@ -300,23 +302,18 @@ impl ClientSession {
         Ok(Decision::Reply(request, reply))
     }
 
-    /// A write to unit 255: 1 at the register that stops all drives that the listener serves.
+    /// A write to unit 255: 1 at the register that stops all drives that the listener serves. They are stopped whatever else the
+    /// write covers.
     fn stop_all(&self, frame: &Frame<'_>, now: Instant) -> Result<Decision, Exception> {
         if self.client.rights.authority() != Authority::Write {
             return Err(Exception::FUNCTION);
         }
         let request = RequestPdu::decode(frame.pdu)?;
-        let value = match &request {
-            RequestPdu::WriteRegister {
-                address: STOP_ALL,
-                value,
-            } => *value,
-            RequestPdu::WriteRegisters {
-                start: STOP_ALL,
-                values,
-            } if values.len() == 1 => values.first().copied().unwrap_or_default(),
-            _ => return Err(Exception::FUNCTION),
-        };
+        let written = command::written(&request).filter(|(table, _)| *table == Table::Holding);
+        let mut items = written.map(|(_, items)| items).unwrap_or_default().into_iter();
+        let (_, value) = items
+            .find(|(address, _)| *address == STOP_ALL)
+            .ok_or(Exception::FUNCTION)?;
         if value != 1 {
             return Err(Exception::VALUE);
         }
@@ -324,7 +321,10 @@ impl ClientSession {
         match self.routes.stop_all.order(plant, &scope, &origin, stop_all::WAIT, now) {
             Ok(order) => Ok(Decision::StopAll(request, order.acknowledged)),
             // Nothing here may be written.
-            Err(_) => Err(Exception::FUNCTION),
+            Err(why) => {
+                refuse_stop_all(plant, nothing_to_stop(&why), &origin, now);
+                Err(Exception::FUNCTION)
+            }
         }
     }
 
@@ -376,13 +376,8 @@ impl ClientSession {
             })
     }
 
-    /// A write to the register of the hold, also in one write with the heartbeat.
-    fn hold(&self, drive: &DriveHandle, request: RequestPdu, start: u16, values: &[u16], now: Instant) -> Decision {
-        let value = match (start, values) {
-            (HOLD, [value]) => *value,
-            (HEARTBEAT, [_, value]) => *value,
-            _ => return Exception::ADDRESS.into(),
-        };
+    /// A write of `value` to the register of the hold, also in one write with the heartbeat.
+    fn hold(&self, drive: &DriveHandle, request: RequestPdu, start: u16, value: u16, now: Instant) -> Decision {
         let verb = match value {
             0 => Verb::Release,
             1 => Verb::Take,
@@ -411,9 +406,12 @@ impl ClientSession {
         values: &[u16],
         now: Instant,
     ) -> Decision {
-        let last = usize::from(start).saturating_add(values.len().saturating_sub(1));
-        if drive.has_authority() && start <= HOLD && usize::from(HOLD) <= last {
-            return self.hold(drive, request, start, values, now);
+        // In any other write the register of the hold is refused as one that is not there, behind the stop that the write may contain.
+        match (start, values) {
+            (HOLD, [value]) | (HEARTBEAT, [_, value]) if drive.has_authority() => {
+                return self.hold(drive, request, start, *value, now);
+            }
+            _ => {}
         }
         let spec = &drive.image.spec;
         let fault = drive.reading(now).state() == Some(State::Fault);
@@ -451,6 +449,11 @@ impl ClientSession {
 
 fn forwarded(header: Header, drive: &DriveHandle, request: RequestPdu, work: BusWork) -> Decision {
     Decision::Drive(Box::new((ForwardedRequest::new(header, drive, request), work)))
+}
+
+/// Whether a write that stops all drives names no other register.
+fn stops_all_only(request: &RequestPdu) -> bool {
+    command::written(request).is_some_and(|(_, items)| items.len() == 1)
 }
 
 /// Whether the family has the table that a function code accesses. No family supports 22 and 23.

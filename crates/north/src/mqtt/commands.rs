@@ -14,8 +14,10 @@ use super::outbox::Message;
 use super::reply::{Reply, ResponseTopics};
 use super::request::{self, Incoming};
 use super::topics::{Target, Topics};
-use crate::command::{Answer, Authority, Origin, Proof, Refusal, SourceKind, Verb};
-use crate::command_json::{HoldReply, Id, Repetition, SharedMemory, excerpt, refuse_unknown, stop_all};
+use crate::command::{Answer, Authority, Origin, Outcome, Proof, Refusal, SourceKind, Verb};
+use crate::command_json::{
+    HoldReply, Id, Repetition, SharedMemory, excerpt, nothing_to_stop, refuse_stop_all, refuse_unknown, stop_all,
+};
 use crate::plant::{Placed, Plant, Shown};
 use crate::stop_all::{StopAll, StopReport};
 
@@ -144,12 +146,11 @@ impl Commands {
         time: SystemTime,
     ) -> Option<Message> {
         let (target, who) = self.topics.parse(&incoming.topic)?;
-        if incoming.retain && incoming.payload.is_empty() {
-            return None; // a retained message was cleared
-        }
         let origin = self.origin(&incoming, who);
         let (name, point) = match target {
             Target::StopAll => return self.stop_all(&incoming, &origin, plant, now),
+            // A retained message was cleared. An empty one is a stop of all drives, but no other command.
+            _ if incoming.retain && incoming.payload.is_empty() => return None,
             Target::Hold(drive) => return self.hold(&incoming, drive, origin, plant, now),
             Target::Set(drive, point) => (drive, point),
         };
@@ -210,9 +211,13 @@ impl Commands {
         let result = self.topics.drive(name, "result");
         let reply = Reply::to(incoming, result, name, &self.rules.responses);
         let what = || format!("hold={}", excerpt(&incoming.payload));
+        // Strings and numbers can always be serialized.
+        let json = |reply: HoldReply<'_>| serde_json::to_vec(&reply).unwrap_or_default();
         let Some(drive) = plant.drive(name) else {
-            refuse_unknown(plant, name, &what(), origin, now);
-            return None;
+            return match refuse_unknown(plant, name, &what(), origin, now).outcome {
+                Outcome::Refused(refusal) => Some(reply.with(json(HoldReply::new(name, Err(refusal), None)))),
+                _ => None,
+            };
         };
         let text = std::str::from_utf8(&incoming.payload).unwrap_or_default().trim();
         let done = match Verb::of(text) {
@@ -233,21 +238,20 @@ impl Commands {
             }
         };
         let seen = drive.hold_view(None, now).map(|(view, _)| view);
-        // Strings and numbers can always be serialized.
-        let json = serde_json::to_vec(&HoldReply::new(name, done, seen)).unwrap_or_default();
-        Some(reply.with(json))
+        Some(reply.with(json(HoldReply::new(name, done, seen))))
     }
 
     /// Takes a stop of all drives. Returns the answer where no stop is sent.
     fn stop_all(&mut self, incoming: &Incoming, origin: &Origin, plant: &Plant, now: Instant) -> Option<Message> {
         let reply = Reply::to(incoming, self.topics.result(), "", &self.rules.responses);
-        let refuse = |why: String| Some(reply.with(refused_stop(&why)));
+        let refuse = |refusal| Some(reply.with(refused_stop(&refuse_stop_all(plant, refusal, origin, now))));
         if incoming.retain {
-            return refuse("the message was retained, so no stop was sent; publish it without retain".to_string());
+            let why = "the message was retained, so no stop was sent; publish it without retain";
+            return refuse(Refusal::NotAllowed(why.to_string()));
         }
         let (scope, wait) = match stop_all(&incoming.payload) {
             Ok(wanted) => wanted,
-            Err(why) => return refuse(why),
+            Err(refusal) => return refuse(refusal),
         };
         match self.stop_all.order(plant, &scope, origin, wait, now) {
             Ok(order) => {
@@ -255,7 +259,7 @@ impl Commands {
                 self.stopping.push(PendingStop { reply, report });
                 None
             }
-            Err(why) => refuse(why.to_string()),
+            Err(why) => refuse(nothing_to_stop(&why)),
         }
     }
 

@@ -269,8 +269,24 @@ mod tests {
             assert_eq!(asked.points, [(run, Value::Bool(false))], "{payload}");
             assert!(asked.refused.unwrap().to_string().contains(text), "{payload}");
         }
+        for (payload, text) in [
+            (r#"{"run": false, "speed_reference": NaN}"#, "is not JSON"),
+            (r#"{"speed_reference": 1e999, "run": false}"#, "is not JSON"),
+            (r#"{"a\"NaN": -Infinity, "run":false}"#, "is not JSON"),
+            (r#"{"frequency_reference":nan,"run":0,"id":7}"#, "is not JSON"),
+            (r#"{"run": false, "speed_reference": [1, {"x": None}]}"#, "is not JSON"),
+        ] {
+            let asked = set(payload).order.expect(payload);
+            assert_eq!(asked.points, [(run, Value::Bool(false))], "{payload}");
+            assert!(asked.refused.unwrap().to_string().contains(text), "{payload}");
+        }
         for ambiguous in [
             r#"{"run": false, "run": true}"#,
+            r#"{"run": False, "speed_reference": NaN}"#,
+            r#"{"run": "NaN, \"run\": false", "x": NaN}"#,
+            r#"{"run": false, "run": NaN, "run": true}"#,
+            r#"[{"run": false}, NaN]"#,
+            r#"{run: false}"#,
             r#"{"run": false"#,
             r#"{"run": "false"}"#,
         ] {

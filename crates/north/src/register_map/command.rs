@@ -1,6 +1,6 @@
 //! Writes to the command block.
 
-use super::{COMMAND_WORD, FREQUENCY_REFERENCE, HEARTBEAT, NO_I16, NO_U16, REVERSE, RUN, SPEED_REFERENCE};
+use super::{COMMAND_WORD, FREQUENCY_REFERENCE, HEARTBEAT, HOLD, NO_I16, NO_U16, REVERSE, RUN, SPEED_REFERENCE};
 use crate::command::Refusal;
 use crate::drive::{ModelPoint, PointIndex, Profile, Value};
 
@@ -82,8 +82,12 @@ fn understood(profile: &Profile, start: u16, values: &[u16], before: CommandCont
     let writes: Vec<(u32, u16)> = (u32::from(start)..).zip(values.iter().copied()).collect();
     let outside = |a: &u32| !(u32::from(COMMAND_WORD)..=u32::from(HEARTBEAT)).contains(a);
     if let Some((address, _)) = writes.iter().find(|(a, _)| outside(a)) {
+        let hint = match *address == u32::from(HOLD) {
+            true => "; a hold (0x8104) is written alone or with 0x8103",
+            false => "",
+        };
         return Err(Refusal::NotWritable(format!(
-            "register 0x{address:04X} is not writable; commands are written to 0x8100 to 0x8103"
+            "register 0x{address:04X} is not writable; commands are written to 0x8100 to 0x8103{hint}"
         )));
     }
     let mut write = CommandWrite::default();

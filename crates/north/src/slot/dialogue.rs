@@ -260,17 +260,23 @@ impl Dialogue {
         if self.framing.has_begun() {
             return self.tool.count(SlotOutcome::Abandoned);
         }
-        self.tool.count(match outcome {
-            Outcome::Acknowledged(_) => SlotOutcome::Answered,
-            Outcome::Refused(_) => SlotOutcome::Refused,
-            _ => SlotOutcome::Exception,
-        });
+        self.tool.count(counted(outcome));
         self.output.extend(answer);
     }
 }
 
+fn counted(outcome: &Outcome) -> SlotOutcome {
+    match outcome {
+        Outcome::Acknowledged(_) => SlotOutcome::Answered,
+        Outcome::Refused(_) => SlotOutcome::Refused,
+        Outcome::StopOnly(part) | Outcome::StopFailed(part) => counted(part),
+        _ => SlotOutcome::Exception,
+    }
+}
+
 /// The frame of an answer whose bytes were not kept: to a command that may have taken several transactions. An
-/// acknowledgement is the same anyone who makes it.
+/// acknowledgement is the same anyone who makes it. Of a write whose stop alone was carried out the tool learns that the rest
+/// was not; silence tells that nobody knows.
 fn frame_of(protocol: Protocol, pending: &Pending, outcome: &Outcome) -> Option<Vec<u8>> {
     let request = &pending.request;
     match outcome {
@@ -286,6 +292,11 @@ fn frame_of(protocol: Protocol, pending: &Pending, outcome: &Outcome) -> Option<
         }
         Outcome::Exception(code) | Outcome::Unknown(code) => Some(request.refusal(protocol, Refused::Exception(*code))),
         Outcome::Refused(refusal) => Some(request.refusal(protocol, Refused::Exception(refusal.exception()))),
+        Outcome::StopOnly(rest) => match **rest {
+            Outcome::TimedOut | Outcome::Garbled | Outcome::Interrupted(_) => None,
+            _ => Some(request.refusal(protocol, Refused::Exception(outcome.exception()?))),
+        },
+        Outcome::StopFailed(stop) => frame_of(protocol, pending, stop),
         _ => None,
     }
 }

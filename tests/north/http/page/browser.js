@@ -8,7 +8,8 @@ const { spawn } = require("node:child_process");
 const PATIENCE_MS = Number(process.env.PATIENCE_MS ?? 120000);
 const FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
   "--disable-component-update", "--disable-sync", "--hide-scrollbars", "--force-color-profile=srgb", "--remote-debugging-pipe"];
-const KEYS = { Tab: 9, Enter: 13, Home: 36, End: 35, ArrowLeft: 37, ArrowRight: 39 };
+const KEYS = { Tab: 9, Enter: 13, Escape: 27, " ": 32, Home: 36, End: 35, ArrowLeft: 37, ArrowRight: 39 };
+const TYPES = { Enter: "\r", " ": " " };
 
 class Browser {
   constructor() {
@@ -141,10 +142,18 @@ class Page {
     }
   }
 
+  /// The key goes down, or its repetition while it is held.
+  async keyDown(key, autoRepeat = false) {
+    await this.send("Input.dispatchKeyEvent", { type: "keyDown", key, code: key, windowsVirtualKeyCode: KEYS[key], text: TYPES[key], autoRepeat });
+  }
+
+  async keyUp(key) {
+    await this.send("Input.dispatchKeyEvent", { type: "keyUp", key, code: key, windowsVirtualKeyCode: KEYS[key] });
+  }
+
   async press(key) {
-    const code = { key, code: key, windowsVirtualKeyCode: KEYS[key], ...(key === "Enter" ? { text: "\r" } : {}) };
-    await this.send("Input.dispatchKeyEvent", { type: "keyDown", ...code });
-    await this.send("Input.dispatchKeyEvent", { type: "keyUp", ...code });
+    await this.keyDown(key);
+    await this.keyUp(key);
   }
 
   async type(text) {

@@ -28,8 +28,8 @@ const ended = (count) => new Date(Date.now() - count * 1000).toISOString();
 class FakeGateway {
   constructor() {
     Object.assign(this, { drives: [], buses: [bus("line1")], events: [], recordings: {}, audit: [], trends: {}, diagnosis: null, asked: [] });
-    // Of a gateway that takes commands: who is logged in, what can be commanded, what was, and the answer to it.
-    Object.assign(this, { operating: false, session: null, about: null, commands: [], obey: () => [200, { result: "confirmed", confirmed_ms: 20 }] });
+    // Of a gateway that takes commands: who is logged in, what can be commanded, what was, and the answer to it, which may have to wait.
+    Object.assign(this, { operating: false, session: null, about: null, commands: [], obey: () => [200, { result: "confirmed", confirmed_ms: 20 }], wait: null });
     this.server = http.createServer((request, response) => this.answer(request, response));
   }
 
@@ -58,6 +58,7 @@ class FakeGateway {
   async post(url, request, response) {
     let body = "";
     for await (const part of request) body += part;
+    await this.wait;
     const [status, json] = this.posted(url.pathname, body && JSON.parse(body), request.headers["x-csrf-token"]);
     response.writeHead(status, { "content-type": "application/json" });
     response.end(status === 204 ? undefined : JSON.stringify(json));

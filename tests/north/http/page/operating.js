@@ -2,45 +2,12 @@
 // Operating from the page: what becomes of a stop, what is understood of a reference, in which direction a motor starts. Drives a
 // real browser against a gateway that says what the test wants.
 const assert = require("node:assert");
-const { Browser } = require("./browser.js");
-const { FakeGateway, drive, point } = require("./fake_gateway.js");
+const { STOP, click, logIn, opened, plant, run, shown } = require("./operated.js");
+const { point } = require("./fake_gateway.js");
 
 const AXE = require("node:fs").readFileSync(require.resolve("axe-core"), "utf8");
-const STOP = "button[aria-label='Stop pump-1']";
 
-const click = (selector) => document.querySelector(selector).click();
-const shown = (selector) => document.querySelector(selector)?.checkVisibility() && document.querySelector(selector).innerText;
 const inBanner = (wanted) => document.getElementById("stops").innerText.includes(wanted);
-
-const REFERENCE = { name: "speed_reference", kind: "number", unit: "%", minimum: 0, maximum: 80 };
-
-function plant(gateway, more = {}) {
-  const points = { actual_speed: point(0, { unit: "%" }), speed_reference: point(62.5, { unit: "%" }), reversed: point(false), reverse: point(false) };
-  gateway.drives = [drive("pump-1", { access: "control", points, ...more })];
-  gateway.about = { drive: "pump-1", points: [{ name: "run", kind: "bool" }, { name: "reverse", kind: "bool" }, REFERENCE], lease_ms: null, commanded_last: false };
-  Object.assign(gateway, { operating: true, commands: [], silent: false, obey: () => [200, { result: "confirmed", confirmed_ms: 20 }] });
-}
-
-async function logIn(gateway, page) {
-  if (gateway.session) return page.until(shown, ".login-known");
-  await page.until(() => document.querySelector("#login .login-open")?.checkVisibility());
-  await page.eval(click, ".login-open");
-  await page.until(() => document.activeElement.name === "user");
-  await page.type("alice");
-  await page.eval(() => document.querySelector("#login-fold input[name=password]").focus());
-  await page.type("correct horse");
-  await page.press("Enter");
-  await page.until(shown, ".login-known");
-}
-
-async function opened(gateway, page, address = "#/", more = {}) {
-  plant(gateway, more);
-  await page.open("about:blank");
-  await page.open(`${gateway.url}${address}`);
-  await page.until(() => document.querySelector(".login-known"));
-  await logIn(gateway, page);
-  await page.until(shown, STOP);
-}
 
 async function accessible(page, state) {
   const violations = await page.violations(AXE);
@@ -206,28 +173,5 @@ async function theStickyStopNamesItsDrive(gateway, page) {
   assert.equal(await page.eval(() => document.querySelector(".view > .operate .operate-name").innerText), "pump-1");
 }
 
-async function main() {
-  const gateway = new FakeGateway();
-  gateway.url = await gateway.start();
-  const browser = new Browser();
-  const page = await browser.page();
-  for (const step of [aStopThatIsRefusedCannotBeMissed, aStopWithoutAnAnswerIsSentAgain, aGatewayThatIsAwayIsTold, aGatewayThatWasStartedAnewIsNoticed, anotherTabLoggedIn, referencesAreUnderstoodAsTyped,
-    startsTellTheirDirection, theStickyStopNamesItsDrive]) {
-    if (process.argv[2] && step.name !== process.argv[2]) continue;
-    try {
-      await step(gateway, page);
-    } catch (error) {
-      throw new Error(`${step.name}: ${error.stack}`);
-    }
-    // Requests that are refused or cut off are what the step is about.
-    const problems = page.problems.filter((problem) => !/net::ERR_|cannot read the gateway|status of (401|403|502|503)/.test(problem));
-    assert.deepEqual(problems, [], step.name);
-  }
-  await browser.close();
-  await gateway.stop();
-}
-
-main().catch((error) => {
-  console.error(error);
-  process.exit(1);
-});
+run([aStopThatIsRefusedCannotBeMissed, aStopWithoutAnAnswerIsSentAgain, aGatewayThatIsAwayIsTold, aGatewayThatWasStartedAnewIsNoticed, anotherTabLoggedIn, referencesAreUnderstoodAsTyped,
+    startsTellTheirDirection, theStickyStopNamesItsDrive]);

@@ -12,7 +12,8 @@ use super::super::app_state::AppState;
 use super::super::body::Payload;
 use super::super::replies::{Replied, not_found, refused};
 use super::asker::Commander;
-use crate::command_json::stop_all;
+use crate::command::Refusal;
+use crate::command_json::{nothing_to_stop, refuse_stop_all, stop_all};
 use crate::stop_all::NothingToStop;
 
 /// 200 if every drive stands, 504 if one is not proven to.
@@ -21,13 +22,12 @@ pub(in crate::http) async fn stop(
     Commander(operator): Commander,
     Payload(payload): Payload,
 ) -> Replied {
-    let (scope, wait) = stop_all(&payload).map_err(|why| refused(StatusCode::UNPROCESSABLE_ENTITY, why))?;
-    let plant = app.plant.load_full();
-    let order = app
-        .north
-        .stop_all
-        .order(&plant, &scope, &operator.origin(), wait, Instant::now());
-    let order = order.map_err(|why| match (why.to_string(), why) {
+    let (plant, origin, now) = (app.plant.load_full(), operator.origin(), Instant::now());
+    let refuse = |refusal: Refusal| refuse_stop_all(&plant, refusal, &origin, now);
+    let (scope, wait) =
+        stop_all(&payload).map_err(|refusal| refused(StatusCode::UNPROCESSABLE_ENTITY, refuse(refusal)))?;
+    let order = app.north.stop_all.order(&plant, &scope, &origin, wait, now);
+    let order = order.map_err(|why| match (refuse(nothing_to_stop(&why)), why) {
         (text, NothingToStop::NotControlled) => refused(StatusCode::FORBIDDEN, text),
         (text, NothingToStop::Unknown { known, .. }) => not_found(text, known),
     })?;

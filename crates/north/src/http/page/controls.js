@@ -1,6 +1,7 @@
 // The controls of one drive: stop, start and direction, reference, reset.
 
 import { directionWord, hide, make, text } from "./common.js";
+import { asked, closed } from "./questions.js";
 import { numberOf, plain, t, unitOf } from "./texts.js";
 
 const isGood = (point) => point !== undefined && point.quality === "good" && point.value !== null;
@@ -95,15 +96,25 @@ function reading(typed, point) {
 
 // ---- Start and direction
 
+// Why the motor stands by a stop: the evidence says whose.
+const STOPS = ["stopped_by_order", "supervision", "stopped_by_gateway", "stopped_by_interlock"];
+
+/// What the question rests on. The reference is not part of that: it is shown as it is, and the answer does not set it.
+function restsOn({ json, about }) {
+  const { bus, address, profile, access, state, online, starts, held, hold, holder, holder_rank: rank } = json;
+  const stop = json.why.find(({ cause }) => STOPS.includes(cause));
+  return JSON.stringify([bus, address, profile, access, state, online, starts, held, hold, holder, rank, stop?.cause, stop?.evidence, orderedReverse(json), hasReverse(about)]);
+}
+
 // One question for both: what is about to happen is read before it is done.
-function buildQuestion(panel, name, { command, known }) {
+function buildQuestion(panel, name, { command, tell, known }) {
   panel.asked = make("span");
   panel.choice = make("span", "operate-directions");
   panel.choice.setAttribute("role", "radiogroup");
   panel.choice.setAttribute("aria-label", t("Direction of {drive}", { drive: name }));
   panel.directions = [false, true].map((isReverse) => {
     const radio = Object.assign(make("input"), { type: "radio", name: `direction of ${name}`, value: String(isReverse) });
-    radio.addEventListener("change", () => panel.ask());
+    radio.addEventListener("change", () => ask(panel, name, known(name)));
     panel.choice.append(make("label", "", radio, ` ${directionWord(isReverse)}`));
     return radio;
   });
@@ -121,23 +132,29 @@ function buildQuestion(panel, name, { command, known }) {
   panel.open = (kind) => {
     const { json } = known(name);
     panel.asking = kind;
+    panel.restsOn = restsOn(known(name));
     panel.takesOver = kind === "start" && mayTakeOver(known(name));
     panel.directions[orderedReverse(json) ? 1 : 0].checked = true;
-    // Whatever becomes of the drive meanwhile: what was asked is what is done.
     panel.target = !orderedReverse(json);
-    panel.ask();
+    ask(panel, name, known(name));
     for (const each of [panel.start, panel.turn]) hide(each, true);
     hide(panel.question, false);
+    asked(panel.asks);
     panel.really.focus();
   };
-  panel.close = () => {
+  panel.close = (why = "") => {
+    if (!panel.asking) return;
     const from = panel.asking === "turn" ? panel.turn : panel.start;
+    const hadFocus = panel.question.contains(document.activeElement);
     panel.asking = null;
+    closed(panel.asks);
     hide(panel.question, true);
     panel.show(known(name));
-    from.focus();
+    if (why) tell(name, t("{what}: nothing was sent, {why}", { what: panel.order[1], why }), false);
+    // What somebody presses next, meant for the question, meets no control.
+    if (hadFocus) (why || from.hidden ? panel.place : from).focus();
   };
-  panel.ask = () => ask(panel, name, known(name));
+  panel.asks = { element: panel.question, end: panel.close };
 }
 
 /// Writes the question; the reference may change while it is asked.
@@ -174,6 +191,7 @@ export function build(panel, name, actions) {
   panel.result.setAttribute("role", "status");
   panel.holder = make("span", "operate-holder");
   panel.lease = make("span", "operate-lease");
+  panel.place.tabIndex = -1;
   panel.place.setAttribute("role", "group");
   panel.place.setAttribute("aria-label", t("Commands of {drive}", { drive: name }));
   panel.place.classList.add("operate");
@@ -193,7 +211,8 @@ function show(panel, name, drive) {
   }
   hide(panel.reset, json.state !== "fault");
   text(panel.holder, holdWords(drive));
-  if (panel.asking) return panel.ask();
+  if (panel.asking && panel.restsOn !== restsOn(drive)) return panel.close(t("{drive} has changed", { drive: name }));
+  if (panel.asking) return ask(panel, name, drive);
   const runs = json.state === "running";
   hide(panel.start, runs);
   text(panel.start, mayTakeOver(drive) ? t("Take over and start …") : t("Start …"));

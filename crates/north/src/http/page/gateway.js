@@ -20,10 +20,14 @@ let lastGoodTime = null;
 let lost = null;
 // Requests without an answer since the last one that had one.
 let tries = 0;
-const listeners = [];
+const returning = [];
+const losing = [];
 
 /// Calls it when the gateway answers again after a request without an answer: it may be another one by then.
-export const onReturn = (listener) => listeners.push(listener);
+export const onReturn = (listener) => returning.push(listener);
+
+/// Calls it when nothing was heard of the gateway for a while, and the page is greyed.
+export const onLost = (listener) => losing.push(listener);
 
 /// JSON at `path`, below `api/v1/`. Throws `Refused` where the gateway answers that it has none.
 export async function load(path, limit = FETCH_MS) {
@@ -40,7 +44,7 @@ export function answered() {
   const returns = tries > 0;
   tries = 0;
   show(false);
-  if (returns) for (const listener of listeners) listener();
+  if (returns) for (const listener of returning) listener();
 }
 
 /// The gateway did not answer.
@@ -70,6 +74,7 @@ function show(isLost) {
   hide($("banner"), !lost);
   text($("banner-text"), lost ? `${since} ${t("The data below is out of date.")}` : "");
   showTries();
+  if (lost) for (const listener of losing) listener();
 }
 
 // Beside what is announced: it changes with every try.

@@ -35,7 +35,7 @@ pub(in crate::http) const ASSETS: &[Asset] = assets! {
     "text/css; charset=utf-8": "operate.css", "style.css", "views.css";
     "text/javascript; charset=utf-8":
         "common.js", "controls.js", "de.js", "drive.js", "events.js", "gateway.js", "lines.js", "operate.js", "overview.js",
-        "page.js", "plot.js", "recording.js", "session.js", "stop_all.js", "stops.js", "strips.js", "texts.js",
+        "page.js", "plot.js", "questions.js", "recording.js", "session.js", "stop_all.js", "stops.js", "strips.js", "texts.js",
         "trend.js";
 };
 

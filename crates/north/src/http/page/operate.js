@@ -10,8 +10,9 @@
 
 import { clock, text } from "./common.js";
 import { build } from "./controls.js";
+import { stopPressed } from "./questions.js";
 import { check, isLoggedIn, onSession, post } from "./session.js";
-import "./stop_all.js";
+import { onStopAll } from "./stop_all.js";
 import { notStopped, stopped } from "./stops.js";
 import { t, wordsOf } from "./texts.js";
 
@@ -116,11 +117,19 @@ async function tryStop(name) {
   }
 }
 
+function giveUp(drive) {
+  for (const abort of drive.pending) abort.abort();
+}
+
+// A start that takes the drive first is not sent behind a stop of all drives.
+onStopAll(() => drives.forEach(giveUp));
+
 // A stop waits for nothing, and what waits for an answer gives up its connection to it. While the gateway cannot be
 // reached it is sent again: a stop twice is a stop.
 async function stop(name) {
   const drive = known(name);
-  for (const abort of drive.pending) abort.abort();
+  giveUp(drive);
+  stopPressed();
   if (drive.stopping) return;
   drive.stopping = true;
   tell(name, t("{what}: sent …", { what: t("Stop") }), null);
@@ -195,8 +204,9 @@ onSession(() => {
 
 // ---- Leases
 
-function active() {
-  lastActive = performance.now();
+// Something that lies on a key is nobody.
+function active({ repeat }) {
+  if (!repeat) lastActive = performance.now();
 }
 
 const idle = () => performance.now() - lastActive;

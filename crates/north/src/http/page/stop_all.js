@@ -1,6 +1,7 @@
 // Stop all: a button in the header, asked back once, and what became of each drive.
 
 import { $, className, clock, hide, make, text } from "./common.js";
+import { asked, closed, stopPressed } from "./questions.js";
 import { check, isLoggedIn, onSession, post } from "./session.js";
 import { notStopped, stopped } from "./stops.js";
 import { t } from "./texts.js";
@@ -14,7 +15,12 @@ const PAUSE_MS = 1000;
 const open = make("button", "operate-stop", t("Stop all"));
 const bar = { words: make("p"), yes: make("button", "operate-stop", t("Stop all now")), no: make("button", "operate-button", t("Cancel")) };
 bar.element = make("div", "not-stopped", bar.words, make("div", "", bar.yes, " ", bar.no));
+const question = { element: bar.element, end: close, asksForStop: true };
+const listeners = [];
 let sending = false;
+
+/// Calls it when all drives are about to be stopped.
+export const onStopAll = (listener) => listeners.push(listener);
 
 function say(words, name = "not-stopped") {
   className(bar.element, name);
@@ -26,15 +32,18 @@ function say(words, name = "not-stopped") {
 
 function ask() {
   if (sending) return;
+  stopPressed();
   say(t("Stop every drive that this gateway may command?"));
   hide(bar.yes, false);
   text(bar.no, t("Cancel"));
   $("stops").prepend(bar.element);
+  asked(question);
   bar.yes.focus();
 }
 
 function close() {
-  if (sending) return;
+  if (sending || !bar.element.isConnected) return;
+  closed(question);
   bar.element.remove();
   open.focus({ preventScroll: true });
 }
@@ -67,6 +76,9 @@ async function sendOnce() {
 
 async function send() {
   sending = true;
+  closed(question);
+  stopPressed();
+  for (const listener of listeners) listener();
   say(t("{what}: sent …", { what: t("Stop all") }));
   const begun = performance.now();
   let ended = null;

@@ -15,7 +15,7 @@ use super::session::Session;
 use super::wire::{self, Metric, MetricValue, Payload};
 use crate::command::{Answer, CONFIRMED, DEFAULT_EXPIRY, Proof, Refusal, SourceKind};
 use crate::command_json::{Asked, SharedMemory, Taken, excerpt, refuse_unknown, resolve};
-use crate::drive::Profile;
+use crate::drive::{ModelPoint, Profile};
 use crate::plant::{Placed, Plant};
 
 /// Commands whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit
@@ -217,11 +217,6 @@ impl Request {
         }
         let payload = Payload::decoded(&incoming.payload)
             .map_err(|why| Refusal::BadValue(format!("the payload is not Sparkplug B: {why}")))?;
-        let count = payload.metrics.len();
-        if count > METRICS {
-            let why = format!("the command has {count} metrics, at most {METRICS} are allowed");
-            return Err(Refusal::BadValue(why));
-        }
         let placed = |mut metric: Metric| {
             // Some hosts send the field empty in addition to an alias.
             metric.name = metric.name.filter(|name| !name.is_empty());
@@ -235,7 +230,8 @@ impl Request {
     }
 
     fn metrics(&self) -> Vec<usize> {
-        self.metrics.iter().filter_map(|(_, place)| *place).collect()
+        let metrics = self.metrics.iter().take(METRICS);
+        metrics.filter_map(|(_, place)| *place).collect()
     }
 
     /// For the audit, if it is refused before it becomes a command.
@@ -293,7 +289,17 @@ impl Request {
             resolve(profile, &name, &value)
         };
         let (mut points, mut refused) = (Vec::new(), None);
-        for metric in &self.metrics {
+        let count = self.metrics.len();
+        if count > METRICS {
+            let why = format!("the command has {count} metrics, at most {METRICS} are allowed");
+            refused = Some(Refusal::BadValue(why));
+        }
+        // Of too many only the stop is looked for.
+        let run = profile.model_point(ModelPoint::Run).map(|point| point.name.as_str());
+        let is_run = |(metric, place): &&(Metric, Option<usize>)| {
+            place.and_then(name).as_deref().or(metric.name.as_deref()) == run && run.is_some()
+        };
+        for metric in self.metrics.iter().filter(|metric| count <= METRICS || is_run(metric)) {
             match point(metric) {
                 Ok(point) => points.push(point),
                 Err(refusal) => refused = refused.or(Some(refusal)),

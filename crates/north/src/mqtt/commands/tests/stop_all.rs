@@ -65,14 +65,9 @@ fn a_drive_that_is_not_proven_to_stand_is_named() {
 }
 
 #[test]
-fn what_is_retained_or_not_understood_stops_nothing_and_says_so() {
+fn what_is_not_understood_stops_nothing_and_says_so() {
     let mut bench = SetTopics::new();
-    let retained = Incoming {
-        retain: true,
-        ..stop("{}")
-    };
     for (message, says) in [
-        (retained, "retained"),
         (stop("{\"drive\": \"p1\"}"), "no stop was sent"),
         (stop("{\"bus\": \"line9\"}"), "known: line1"),
         (stop("{\"group\": \"fans\"}"), "there is no group `fans`"),
@@ -84,10 +79,68 @@ fn what_is_retained_or_not_understood_stops_nothing_and_says_so() {
             "{refused}"
         );
     }
-    let cleared = Incoming {
-        retain: true,
-        ..stop("")
-    };
-    assert_eq!(bench.take(cleared), None);
     assert_eq!(bench.queued(), 0);
+}
+
+/// What a retained message asks for is refused with event, result and audit. An empty one clears a topic, which is no command
+/// but where an empty message is one.
+#[test]
+fn retained_messages_are_refused_and_told() {
+    for (topic, payload, drive) in [
+        ("set/stop", "", "all drives"),
+        ("set/stop", "{}", "all drives"),
+        ("set/stop", "{\"bus\": \"line1\"}", "all drives"),
+        ("set/stop", "{", "all drives"),
+        ("as/cloud/stop", "", "all drives"),
+        ("as/cloud/stop", "{}", "all drives"),
+        ("drive/p1/set", "{\"run\": false}", "p1"),
+        ("drive/p1/set", "{\"run\": true}", "p1"),
+        ("drive/p1/set/run", "false", "p1"),
+        ("drive/p1/as/cloud/set", "{\"run\": false}", "p1"),
+        ("drive/p1/as/cloud/set/run", "false", "p1"),
+        ("drive/p1/hold", "take", "p1"),
+        ("drive/p1/as/cloud/hold", "take", "p1"),
+        ("drive/p9/set", "{\"run\": false}", "p9"),
+        ("drive/p9/as/cloud/hold", "take", "p9"),
+        ("drive/p1/set", "", ""),
+        ("drive/p1/set/run", "", ""),
+        ("drive/p1/as/cloud/set/run", "", ""),
+        ("drive/p1/hold", "", ""),
+        ("drive/p1/as/cloud/hold", "", ""),
+    ] {
+        let mut bench = SetTopics::new();
+        let message = Incoming {
+            topic: format!("drivegate/hall/{topic}"),
+            payload: payload.into(),
+            retain: true,
+            ..Incoming::default()
+        };
+        let result = bench.take(message).as_ref().map(json);
+        assert_eq!(
+            (bench.queued(), bench.commands.is_idle()),
+            (0, true),
+            "{topic} {payload}"
+        );
+        let audit = drivegate_testkit::audited(bench.plant.writes.audit());
+        if drive.is_empty() {
+            assert!(result.is_none() && audit.is_empty(), "{topic} was cleared");
+            continue;
+        }
+        let result = result.unwrap_or_else(|| panic!("a result of {topic} {payload}"));
+        assert_eq!(result["ok"], false, "{result}");
+        let records: Vec<_> = audit
+            .iter()
+            .map(|record| (&record["drive"], &record["result"]))
+            .collect();
+        let is_known = drive != "p9";
+        let code = if is_known { "not_allowed" } else { "unknown_drive" };
+        assert_eq!(records, [(&drive.into(), &code.into())], "{topic} {payload}");
+        let event = bench.events.try_recv().ok();
+        assert_eq!(event.is_some(), is_known, "{topic} {payload}");
+        if let Some(event) = event {
+            let of = event.drive.as_deref().unwrap_or("all drives");
+            assert_eq!((event.kind, of), (crate::event::EventKind::RefusedCommand, drive));
+            assert!(event.text.contains("retained"), "{}", event.text);
+        }
+    }
 }

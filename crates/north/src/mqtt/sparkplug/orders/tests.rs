@@ -234,6 +234,54 @@ fn a_repeated_command_is_refused_and_a_stop_never() {
 }
 
 #[test]
+fn a_stop_among_too_many_metrics_or_bad_ones_is_one() {
+    let unknown = |count: u64| {
+        (0..count).map(|alias| Metric {
+            alias: Some(5000 + alias),
+            value: Some(MetricValue::Double(1.0)),
+            ..Metric::default()
+        })
+    };
+    let bad = || named("speed_reference", MetricValue::Double(f64::NAN));
+    for (before, after, text) in [
+        (0, 64, "65 metrics, at most 64"),
+        (64, 0, "66 metrics, at most 64"),
+        (40, 40, "81 metrics, at most 64"),
+        (1, 1, "alias 5000"),
+    ] {
+        let mut bench = bench();
+        let place = bench.session.metric(0, Some("run"), None).unwrap();
+        let by_alias = Metric {
+            alias: bench.session.alias(0, place),
+            value: Some(MetricValue::Boolean(false)),
+            ..Metric::default()
+        };
+        for (time, run) in [(1, named("run", MetricValue::Boolean(false))), (2, by_alias)] {
+            let metrics = unknown(before).chain([run, bad()]).chain(unknown(after.max(1) - 1));
+            assert_eq!(
+                bench.take(&message(time, metrics.collect()), "p1"),
+                None,
+                "{before} {after}"
+            );
+            let mut queue = bench.plant.buses[0].queue.lock();
+            let stop = next_command(&mut queue, Urgency::Stop, bench.now).unwrap();
+            drop(queue);
+            let stopped = Order::Points(vec![(bench.index("run"), Value::Bool(false))]);
+            assert_eq!(stop.order, stopped);
+            drop(
+                stop.ticket
+                    .acknowledge(Outcome::Acknowledged(Reply::Written), bench.now),
+            );
+            let finished = bench.finish();
+            assert_eq!(finished.code, "stop_only");
+            let told = finished.error.contains(text) || before + after < 64;
+            assert!(told && finished.metrics.len() <= METRICS, "{finished:?}");
+            assert!(bench.pop().is_none());
+        }
+    }
+}
+
+#[test]
 fn a_start_that_came_before_a_stop_and_is_taken_behind_it_is_not_executed() {
     let mut bench = bench();
     let run = |value| vec![named("run", MetricValue::Boolean(value))];
