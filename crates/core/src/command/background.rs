@@ -108,7 +108,7 @@ impl BackgroundRequest {
             behind: None,
             overtaken: 0,
             number: 0,
-            asked: None,
+            arrival: None,
             touched,
             passed_on: self.passed_on,
             was_begun: false,

@@ -48,6 +48,8 @@ use std::time::{Duration, Instant};
 
 use crate::codec::RequestPdu;
 use crate::drive::{DriveIndex, PointIndex, Profile, Value};
+use crate::order::Arrival;
+use crate::permit::rules::age::Does;
 
 /// Default time after which a command is no longer sent.
 pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);
@@ -104,8 +106,8 @@ pub struct Command {
     pub overtaken: usize,
     /// Its number in the queue.
     pub number: u64,
-    /// When its request began to arrive: a command requested before a stop arrived is not sent after it.
-    pub asked: Option<Instant>,
+    /// How its request came; none for a stop that was taken over from another bus.
+    pub arrival: Option<Arrival>,
     /// The registers that it sets, and on which it rests.
     pub touched: Touched,
     /// What a write of a tool has besides that which may write anything, to one drive or to all that hear it.
@@ -139,7 +141,7 @@ impl Command {
             behind: None,
             overtaken: 0,
             number: 0,
-            asked: None,
+            arrival: None,
             touched: Touched::Anything,
             passed_on: None,
             was_begun: false,
@@ -151,12 +153,22 @@ impl Command {
         }
     }
 
-    /// The same to a drive of that profile, requested at `asked`.
-    pub(crate) fn asked_of(mut self, profile: &Profile, asked: Instant) -> Command {
+    /// The same to a drive of that profile, whose request came so.
+    pub(crate) fn asked_of(mut self, profile: &Profile, arrival: Arrival) -> Command {
         self.effects = vec![(self.drive, Effect::of(&self.order, profile))];
         self.touched = Touched::of(&self.order, &self.ranges, profile);
-        self.asked = Some(asked);
+        self.arrival = Some(arrival);
         self
+    }
+
+    /// What it does to that drive, as far as its age matters.
+    pub fn does(&self, drive: DriveIndex) -> Does {
+        match (self.urgency, Asks::of(self, drive)) {
+            (_, Asks::Stop) => Does::Stop,
+            (Urgency::Read, _) => Does::Read,
+            (_, Asks::Run) => Does::Start,
+            (_, Asks::Steer | Asks::Other | Asks::Nothing) => Does::Other,
+        }
     }
 
     /// The drives that it reaches.

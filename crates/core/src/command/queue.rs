@@ -1,5 +1,6 @@
 //! The command queue of a bus: bounded, ordered, with replacing, purging and expiry.
 
+mod age;
 mod handover;
 mod holds;
 mod passed_on;
@@ -17,6 +18,7 @@ use std::time::Instant;
 use self::holds::Holds;
 use super::{Command, Effect, Holder, Order, Origin, Outcome, Priorities, Refusal, Urgency};
 use crate::drive::DriveIndex;
+use crate::order::{LastStops, Stall};
 use crate::start_guard::BusGuards;
 
 /// Commands and forwarded reads that may wait on one bus, in addition to two stops per drive.
@@ -44,8 +46,12 @@ pub struct Pending {
     numbered: u64,
     /// Stops taken in so far, by drive.
     stops: BTreeMap<DriveIndex, u64>,
-    /// When the last of them arrived.
-    stopped_at: BTreeMap<DriveIndex, Instant>,
+    /// The last ones, by drive.
+    last_stops: BTreeMap<DriveIndex, LastStops>,
+    /// The last pause of the bus.
+    paused: Option<Stall>,
+    /// Drives whose leases are renewed by orders that a pause kept from them, each once.
+    renewed: Vec<DriveIndex>,
     /// Who gave the last of them.
     stopped_by: BTreeMap<DriveIndex, Origin>,
     /// A drive to which nothing but stops is sent until then.
@@ -105,7 +111,7 @@ impl Pending {
             return;
         }
         if command.urgency == Urgency::Stop {
-            self.note_stop(command.drive, command.ticket.origin().clone(), now);
+            self.note_stops(&command, now);
             self.push_stop(command, now);
             return;
         }
@@ -119,10 +125,11 @@ impl Pending {
             command.answer(&Outcome::Replaced, now);
             return;
         }
-        if self.is_behind_its_stop(&command) {
-            command.answer(&Outcome::Purged, now);
+        if let Some(outcome) = self.age(&command, now).refused() {
+            self.end_unwanted(command, &outcome, now);
             return;
         }
+        self.note_stops(&command, now);
         if let Some(index) = self.replaced_by(&command)
             && let Some(older) = self.waiting.remove(index)
         {
@@ -273,6 +280,7 @@ impl Pending {
         redundant: impl Fn(DriveIndex) -> bool,
     ) -> Option<Chosen> {
         self.expire(now);
+        let mut may = |command: &Command| self.waits_for_reads(command, now).is_none() && may(command);
         let pressed = self.pressed();
         let passed_on = match pressed.is_empty() || rank != Urgency::Command {
             true => Vec::new(),
@@ -362,13 +370,6 @@ impl Pending {
             .iter()
             .filter(|c| c.reaches(drive) && c.urgency != Urgency::Read);
         commands.filter_map(Command::client_waits_until).max()
-    }
-
-    /// Ends expired commands. An accepted stop is sent, however long it waits.
-    fn expire(&mut self, now: Instant) {
-        self.remove(now, &Outcome::Expired, |c| {
-            c.expires <= now && c.urgency != Urgency::Stop
-        });
     }
 
     /// Ends and removes the commands that `which` selects.

@@ -15,6 +15,7 @@ use crate::command::{
     written,
 };
 use crate::drive::DriveIndex;
+use crate::order::Arrival;
 use crate::process_image::DriveImage;
 
 /// Who on the line is asked.
@@ -35,8 +36,8 @@ pub struct Question {
     pub pdu: RequestPdu,
     /// Whether it may change anything: then it is counted and audited as a command.
     pub may_write: bool,
-    /// When it began to arrive.
-    pub asked: Instant,
+    /// How it came.
+    pub arrival: Arrival,
     /// Not sent after this.
     pub expires: Instant,
     /// Its origin.
@@ -44,14 +45,14 @@ pub struct Question {
 }
 
 impl Question {
-    /// A broadcast by the gateway itself or a client; it gets no reply.
-    pub fn broadcast(pdu: RequestPdu, origin: Origin, asked: Instant, within: Duration) -> Question {
+    /// A broadcast by the gateway itself at `now`, for itself or a client; it gets no reply.
+    pub fn broadcast(pdu: RequestPdu, origin: Origin, now: Instant, within: Duration) -> Question {
         Question {
             target: Target::Address(0),
             pdu,
             may_write: true,
-            asked,
-            expires: asked + within,
+            arrival: Arrival::now(now),
+            expires: now + within,
             origin,
         }
     }
@@ -145,7 +146,7 @@ impl BusHandle {
                 frame: sender,
             }),
         };
-        self.queue.submit_passed_on(request, touched, question.asked, now);
+        self.queue.submit_passed_on(request, touched, question.arrival, now);
         Exchange { answer, frame }
     }
 }

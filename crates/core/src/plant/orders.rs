@@ -14,14 +14,15 @@ use crate::command::{
 use crate::drive::parameters::RawValue;
 use crate::drive::{DriveIndex, ModelPoint, PointIndex, Value};
 use crate::event::RefusedCommand;
+use crate::order::Arrival;
 use crate::process_image::Reading;
 
-/// Who gives a command, what that client may do at all, until when it may be sent, when its head came, and now.
+/// Who gives a command, what that client may do at all, until when it may be sent, how it came, and now.
 struct Terms {
     origin: Origin,
     authority: Authority,
     expires: Instant,
-    asked: Instant,
+    arrival: Arrival,
     now: Instant,
 }
 
@@ -122,7 +123,7 @@ impl BusHandle {
         let what = format!("{}={value}", point.name());
         let (ticket, answer) = Ticket::new(origin, &spec.name, what, true, now, writes.clone());
         let command = Command::new(drive, admitted, now + expiry, ticket.with_changes(changes));
-        let command = command.asked_of(&spec.profile, now);
+        let command = command.asked_of(&spec.profile, Arrival::now(now));
         self.queue.submit(command, now);
         Ok(answer)
     }
@@ -132,29 +133,29 @@ impl DriveHandle {
     /// Gives a command to the drive, at `now`. When this returns it is in the queue of the bus, behind all that was
     /// placed before, or answered: refused when it is not admitted, not sent when the bus is down or the drive offline.
     ///
-    /// `authority` says what the client may do at all. The order is not sent later than `expiry` from now. Refused
+    /// `authority` says what the client may do at all. The order is not sent later than `expiry` after it came. Refused
     /// writes are audited and published as an event. Of a command that stops and does more, the stop is carried out
     /// whatever becomes of the rest; it is audited as two.
     pub fn place(&self, order: Order, origin: Origin, authority: Authority, expiry: Duration, now: Instant) -> Placed {
-        self.place_asked(order, origin, authority, expiry, now, now)
+        self.place_asked(order, origin, authority, expiry, Arrival::now(now), now)
     }
 
-    /// The same of a command whose head came at `asked`: no stop that came in since is undone by it.
+    /// The same of a command that came so: no stop that came in since is undone by it.
     pub fn place_asked(
         &self,
         order: Order,
         origin: Origin,
         authority: Authority,
         expiry: Duration,
-        asked: Instant,
+        arrival: Arrival,
         now: Instant,
     ) -> Placed {
         let reading = self.reading(now);
         let terms = Terms {
             origin,
             authority,
-            expires: now + expiry,
-            asked,
+            expires: arrival.asked + expiry,
+            arrival,
             now,
         };
         match Parts::of(order.clone(), &self.image.spec.profile) {
@@ -175,13 +176,13 @@ impl DriveHandle {
         origin: Origin,
         authority: Authority,
         expiry: Duration,
-        now: Instant,
+        (arrival, now): (Arrival, Instant),
     ) -> Placed {
         let terms = Terms {
             origin,
             authority,
-            expires: now + expiry,
-            asked: now,
+            expires: arrival.asked + expiry,
+            arrival,
             now,
         };
         match self.may_go(&stop, &self.reading(now), authority) {
@@ -207,13 +208,13 @@ impl DriveHandle {
         write: SlotWrite,
         origin: Origin,
         expiry: Duration,
-        (asked, now): (Instant, Instant),
+        (arrival, now): (Arrival, Instant),
     ) -> Placed {
         let terms = Terms {
             origin,
             authority: Authority::Write,
-            expires: now + expiry,
-            asked,
+            expires: arrival.asked + expiry,
+            arrival,
             now,
         };
         self.place_one(order, Some(write), terms)
@@ -232,7 +233,7 @@ impl DriveHandle {
             Err(outcome) => self.turn_away(ticket, &what, outcome, write, now),
             Ok(admitted) => {
                 let command = Command::new(self.index, admitted, expires, ticket).of_slot(write_to);
-                let command = command.asked_of(&self.image.spec.profile, terms.asked);
+                let command = command.asked_of(&self.image.spec.profile, terms.arrival);
                 self.bus.queue.submit(self.in_manner(command), now);
             }
         }
@@ -245,7 +246,7 @@ impl DriveHandle {
             origin,
             authority,
             expires,
-            asked,
+            arrival,
             now,
         } = terms;
         let reading = self.reading(now);
@@ -264,7 +265,7 @@ impl DriveHandle {
         let stop = match self.judge(stop, ticket.origin(), &reading, authority, expires) {
             Ok(admitted) => {
                 let stop = Command::new(self.index, admitted, expires, ticket);
-                self.in_manner(stop.asked_of(&self.image.spec.profile, now))
+                self.in_manner(stop.asked_of(&self.image.spec.profile, arrival.clone()))
             }
             Err(outcome) => {
                 self.turn_away(ticket, what, outcome, true, now);
@@ -279,7 +280,7 @@ impl DriveHandle {
         match judged {
             Ok(admitted) => {
                 let rest = Command::new(self.index, admitted, expires, rest_ticket).behind(end);
-                let rest = rest.asked_of(&self.image.spec.profile, asked);
+                let rest = rest.asked_of(&self.image.spec.profile, arrival);
                 self.bus.queue.submit_parts(stop, rest, now);
             }
             Err(outcome) => {

@@ -1,7 +1,7 @@
 //! Turns a client's write into a command, or a waiting slot (`docs/bacnet.md`, Commands).
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use drivegate_bacnet::{Address, Datum, Error, Job};
 
@@ -12,6 +12,7 @@ use crate::command::{
     SourceKind,
 };
 use crate::drive::{PointIndex, Value};
+use crate::order::Arrival;
 use crate::plant::{DriveHandle, Placed};
 use crate::process_image::Machine;
 
@@ -47,19 +48,20 @@ pub(super) fn origin(from: &Address, priority: Option<u8>) -> Origin {
     Origin::of(Arc::from(client), SourceKind::Bacnet, from.to_string()).proven(proof)
 }
 
-/// Takes up a write.
-pub(super) fn begin(view: &View, job: &Job, now: Instant) -> Begun {
+/// Takes up a write whose request came so.
+pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> Begun {
     let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
         return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
     };
     let origin = origin(&job.from, job.priority);
+    let expiry = expiry(job);
     match (meaning, &job.value) {
         (Meaning::Point(index), Some(value)) => match value_of(value) {
             Some(value) => {
                 let order = Order::Points(vec![(index, value)]);
                 waits(
                     handle,
-                    handle.place_asked(order, origin, Authority::Write, DEFAULT_EXPIRY, job.asked, now),
+                    handle.place_asked(order, origin, Authority::Write, expiry, arrival, now),
                     None,
                 )
             }
@@ -74,14 +76,19 @@ pub(super) fn begin(view: &View, job: &Job, now: Instant) -> Begun {
             let order = Order::Points(vec![(index, Value::Bool(true))]);
             waits(
                 handle,
-                handle.place_asked(order, origin, Authority::Write, DEFAULT_EXPIRY, job.asked, now),
+                handle.place_asked(order, origin, Authority::Write, expiry, arrival, now),
                 None,
             )
         }
         (Meaning::Reset(_), _) => Begun::Answered(Ok(())),
-        (Meaning::Slot(what, index), _) => slot(handle, (what, index), job, origin, now),
+        (Meaning::Slot(what, index), _) => slot(handle, (what, index), job, origin, (arrival, now)),
         _ => Begun::Answered(Err(Error::WRITE_ACCESS_DENIED)),
     }
+}
+
+/// For how long from its request a write may be sent: one that waited for another of the same request has its own time.
+fn expiry(job: &Job) -> Duration {
+    DEFAULT_EXPIRY + job.since.saturating_duration_since(job.asked)
 }
 
 fn waits(handle: &DriveHandle, placed: Placed, slot: Option<u64>) -> Begun {
@@ -116,7 +123,7 @@ fn slot(
     (what, index): (Commanded, PointIndex),
     job: &Job,
     origin: Origin,
-    now: Instant,
+    (arrival, now): (Arrival, Instant),
 ) -> Begun {
     let priority = job.priority.unwrap_or(16);
     let value = job.value.as_ref().and_then(value_of);
@@ -142,7 +149,7 @@ fn slot(
                 };
                 let order = Order::Points(vec![(run, Value::Bool(false))]);
                 let id = write.id;
-                let placed = handle.place_slot(order, write, origin, DEFAULT_EXPIRY, (job.asked, now));
+                let placed = handle.place_slot(order, write, origin, expiry(job), (arrival, now));
                 return waits(handle, placed, Some(id));
             }
             Follows::Order(of, entry) => {
@@ -152,9 +159,13 @@ fn slot(
                 let order = Order::Points(vec![(point, entry.value)]);
                 let own = write.entry.is_some();
                 // What comes to govern was written long ago; its order is given now.
-                let asked = if own { job.asked } else { now };
+                let mut came = arrival.clone();
+                let mut expires = expiry(job);
+                if !own {
+                    (came.asked, expires) = (now, DEFAULT_EXPIRY);
+                }
                 let as_planned = write.clone().in_favour_of(&entry);
-                let mut placed = handle.place_slot(order, as_planned, entry.origin, DEFAULT_EXPIRY, (asked, now));
+                let mut placed = handle.place_slot(order, as_planned, entry.origin, expires, (came, now));
                 let refused = matches!(placed.answer().map(|answer| answer.outcome), Some(Outcome::Refused(_)));
                 let next = handle.priorities(|all| all.successor(&write));
                 match next.filter(|_| refused && !own) {

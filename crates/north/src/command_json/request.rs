@@ -14,6 +14,7 @@ use crate::command::{Answer, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Re
 use crate::document::nearest;
 use crate::drive::model::Kind;
 use crate::drive::{PointIndex, Profile, Value};
+use crate::order::Arrival;
 use crate::plant::{DriveHandle, Placed, Plant};
 
 /// Maximum size of a command, bytes.
@@ -123,7 +124,7 @@ impl Asked {
         self.refused.is_none() && !(self.stops(profile) && whole())
     }
 
-    /// Gives it to the drive at `now`: as a whole, or its stop alone if the rest, `what`, is refused. It came at `came`.
+    /// Gives it to the drive at `now`: as a whole, or its stop alone if the rest, `what`, is refused. It came so.
     ///
     /// # Errors
     /// The answer if all of it is refused.
@@ -132,15 +133,18 @@ impl Asked {
         drive: &DriveHandle,
         what: &str,
         origin: Origin,
-        (came, now): (Instant, Instant),
+        (arrival, now): (Arrival, Instant),
     ) -> Result<Placed, Answer> {
         let (write, expiry) = (Authority::Write, self.expiry);
         let Some(refusal) = self.refused else {
             let drive = drive.clone().waiting(self.wait);
-            return Ok(drive.place_asked(Order::Points(self.points), origin, write, expiry, came, now));
+            return Ok(drive.place_asked(Order::Points(self.points), origin, write, expiry, arrival, now));
         };
         match stop_of(&self.points, &drive.image.spec.profile) {
-            Some(stop) => Ok(drive.place_stop(Order::Points(stop), (what, refusal), origin, write, expiry, now)),
+            Some(stop) => {
+                let (stop, rest) = (Order::Points(stop), (what, refusal));
+                Ok(drive.place_stop(stop, rest, origin, write, expiry, (arrival, now)))
+            }
             None => Err(drive.refuse(what, refusal, origin, now)),
         }
     }

@@ -12,6 +12,7 @@ use super::frame::Header;
 use crate::codec::n2::Object;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
 use crate::command::{Authority, DEFAULT_EXPIRY, Order, Outcome, Refusal};
+use crate::order::Arrival;
 use crate::plant::{DriveHandle, Placed};
 use crate::process_image::{Reading, Unavailable};
 
@@ -121,15 +122,15 @@ impl ForwardedRequest {
     }
 
     /// Queues its command, or the first one of several, before this returns.
-    pub(super) fn send(self, work: BusWork, client: &Client, asked: Instant, now: Instant) -> Progress {
+    pub(super) fn send(self, work: BusWork, client: &Client, arrival: Arrival, now: Instant) -> Progress {
         let mut forwarded = Box::new(self);
         match work {
-            BusWork::Order(order) => forwarded.place(order, client, client.rights.authority(), asked, now),
+            BusWork::Order(order) => forwarded.place(order, client, client.rights.authority(), arrival, now),
             BusWork::Stop(stop, refusal) => {
                 let what = describe::request(&forwarded.request);
                 let (authority, rest) = (client.rights.authority(), (what.as_str(), refusal));
                 let drive = &forwarded.drive;
-                let placed = drive.place_stop(stop, rest, client.origin(), authority, DEFAULT_EXPIRY, now);
+                let placed = drive.place_stop(stop, rest, client.origin(), authority, DEFAULT_EXPIRY, (arrival, now));
                 Progress::Pending(PendingRequest::Forwarded(Some(forwarded), placed))
             }
             BusWork::Refused(refusal) => {
@@ -153,13 +154,13 @@ impl ForwardedRequest {
         order: Order,
         client: &Client,
         authority: Authority,
-        asked: Instant,
+        arrival: Arrival,
         now: Instant,
     ) -> Progress {
         let origin = client.origin();
         let placed = self
             .drive
-            .place_asked(order, origin, authority, DEFAULT_EXPIRY, asked, now);
+            .place_asked(order, origin, authority, DEFAULT_EXPIRY, arrival, now);
         Progress::Pending(PendingRequest::Forwarded(Some(self), placed))
     }
 
@@ -173,7 +174,8 @@ impl ForwardedRequest {
                 ReadPart::Known(known) => read.words.extend(known),
                 ReadPart::Object { pdu, skip, take } => {
                     read.asked = (skip, take);
-                    return self.place(Order::Read(pdu), client, Authority::ReadOnly, now, now);
+                    let arrival = Arrival::now(now);
+                    return self.place(Order::Read(pdu), client, Authority::ReadOnly, arrival, now);
                 }
             }
         }

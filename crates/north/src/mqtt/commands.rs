@@ -16,6 +16,7 @@ use super::request::{self, Incoming};
 use super::topics::{Target, Topics};
 use crate::command::{Answer, Authority, Origin, Proof, Refusal, SourceKind, Verb};
 use crate::command_json::{HoldReply, Id, Repetition, SharedMemory, excerpt, refuse_unknown, stop_all};
+use crate::order::Arrival;
 use crate::plant::{Placed, Plant, Shown};
 use crate::stop_all::StopReport;
 
@@ -179,7 +180,8 @@ impl Commands {
                 None => number = self.memory.lock().remember(&taken, print, stops, now),
             }
         }
-        let placed = match asked.place(&drive, &what, origin, (incoming.asked.unwrap_or(now), now)) {
+        let arrival = incoming.arrival.clone().unwrap_or_else(|| Arrival::now(now));
+        let placed = match asked.place(&drive, &what, origin, (arrival, now)) {
             Ok(placed) => placed,
             Err(answer) => return refused(&answer, id),
         };

@@ -10,6 +10,7 @@ use super::{Slot, SlotAccess};
 use crate::codec::{LineFormat, Protocol, RequestPdu, describe};
 use crate::command::{self, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
 use crate::drive::plan::WireTime;
+use crate::order::Arrival;
 use crate::plant::{BusHandle, DriveHandle, Exchange, Placed, Plant, Question, SharedPlant, Target, turn_away};
 use crate::process_image::Access;
 use crate::{NorthState, SlotOutcome};
@@ -160,13 +161,13 @@ impl Tool {
             .collect()
     }
 
-    /// What becomes of a request whose first byte came at `asked`, and whose drives had been given so many `stops` when it was
+    /// What becomes of a request that came so, and whose drives had been given so many `stops` when it was
     /// whole: behind a stop that came in since it is not sent. What is given to the bus is in its queue when this returns, and
     /// is not sent after `deadline`.
     pub(super) fn decide(
         &self,
         request: &ToolRequest,
-        (asked, stops): (Instant, u64),
+        (mut arrival, stops): (Arrival, u64),
         deadline: Instant,
         now: Instant,
     ) -> Decision {
@@ -180,12 +181,14 @@ impl Tool {
         let broadcast = request.is_broadcast(self.protocol());
         // A stop that came in while it was held may have come at the same time by the clock.
         let stopped = drives.iter().map(DriveHandle::stops).sum::<u64>() != stops;
-        let before = asked.checked_sub(Duration::from_nanos(1)).filter(|_| stopped);
-        let asked = before.unwrap_or(asked);
+        if stopped {
+            let before = arrival.asked.checked_sub(Duration::from_nanos(1));
+            arrival.asked = before.unwrap_or(arrival.asked);
+        }
         let case = Case {
             plant: &plant,
             bus,
-            asked,
+            arrival,
             deadline,
             now,
         };
@@ -196,7 +199,7 @@ impl Tool {
                 Decision::Wait(self.exchange(&case, target, pdu, false))
             }
             Meaning::Write(pdu) if !broadcast && drives.len() == 1 => match drives.first() {
-                Some(drive) => self.write(drive, pdu, asked, now),
+                Some(drive) => self.write(drive, pdu, case.arrival, now),
                 None => Decision::Silent,
             },
             Meaning::Read(pdu) | Meaning::Write(pdu) | Meaning::Unchecked(pdu) => {
@@ -206,7 +209,7 @@ impl Tool {
     }
 
     /// A write to a configured drive: the same checks as those of a Modbus TCP client.
-    fn write(&self, drive: &DriveHandle, pdu: &RequestPdu, asked: Instant, now: Instant) -> Decision {
+    fn write(&self, drive: &DriveHandle, pdu: &RequestPdu, arrival: Arrival, now: Instant) -> Decision {
         if !self.writes() {
             let text = format!("the slot of bus `{}` has access = \"read\"", self.terms.slot.bus);
             return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
@@ -219,7 +222,7 @@ impl Tool {
             self.origin.clone(),
             Authority::Write,
             EXPIRY,
-            asked,
+            arrival,
             now,
         )))
     }
@@ -249,7 +252,8 @@ impl Tool {
         for drive in drives {
             // It has no reply: it was a broadcast.
             if let Some(stop) = stop_in(drive, pdu, now) {
-                drop(drive.place(stop, self.origin.clone(), Authority::Write, EXPIRY, now));
+                let (origin, arrival) = (self.origin.clone(), case.arrival.clone());
+                drop(drive.place_asked(stop, origin, Authority::Write, EXPIRY, arrival, now));
             }
         }
         for drive in drives {
@@ -275,7 +279,7 @@ impl Tool {
             target,
             pdu: pdu.clone(),
             may_write,
-            asked: case.asked,
+            arrival: case.arrival.clone(),
             expires: case.deadline,
             origin: self.origin.clone(),
         };
@@ -313,7 +317,7 @@ impl Tool {
 struct Case<'c> {
     plant: &'c Plant,
     bus: &'c BusHandle,
-    asked: Instant,
+    arrival: Arrival,
     deadline: Instant,
     now: Instant,
 }

@@ -56,11 +56,12 @@ impl CommandQueue {
     /// that are still given to this one.
     pub(crate) fn hand_over(&self, drive: DriveIndex, heir: &Arc<CommandQueue>, place: DriveIndex, now: Instant) {
         let mut pending = self.lock();
-        let stopped_at = pending.stopped_at.get(&drive).copied();
+        let last_stops = pending.last_stops.get(&drive).cloned();
         let mut of_heir = heir.lock();
-        if let Some(at) = stopped_at {
-            of_heir.stopped_at.insert(place, at);
+        if let Some(stops) = last_stops {
+            of_heir.last_stops.insert(place, stops);
         }
+        of_heir.paused = of_heir.paused.or(pending.paused);
         let (stops, others): (VecDeque<Command>, _) = std::mem::take(&mut pending.waiting)
             .into_iter()
             .partition(|c| c.drive == drive && c.urgency == Urgency::Stop);

@@ -313,6 +313,14 @@ impl Pending {
         std::mem::take(&mut self.holds.unheld_told)
     }
 
+    /// Whether a stop of that client is none, since it writes its command word all the time and its last one was a stop.
+    pub(super) fn repeats_its_word(&self, drive: DriveIndex, origin: &Origin) -> bool {
+        let Some(holding) = self.holds.drives.get(&drive) else {
+            return false;
+        };
+        self.holds.claim(origin).is_some_and(|who| holding.repeats(&who))
+    }
+
     /// Whether that client writes its command word all the time, so that its repeated stop is no new one.
     pub(super) fn is_cyclic(&self, origin: &Origin) -> bool {
         self.holds.claim(origin).is_some_and(|who| who.cyclic)

@@ -5,6 +5,7 @@ use std::time::Instant;
 use super::{Chosen, CommandQueue, Pending};
 use crate::command::{BackgroundRequest, Command, Outcome, PassedOn, Touched, Urgency};
 use crate::drive::DriveIndex;
+use crate::order::Arrival;
 
 impl Pending {
     /// The passed-on requests that may be sent, in order: nothing older waits for any drive that they reach. A stop
@@ -46,6 +47,7 @@ impl Pending {
     pub fn next_passed_on(&mut self, now: Instant, mut may: impl FnMut(&Command) -> bool) -> Option<Chosen> {
         self.expire(now);
         let rank = Urgency::Command;
+        let mut may = |command: &Command| self.waits_for_reads(command, now).is_none() && may(command);
         let number = self.passed_on(&mut may).first().copied();
         number.map(|number| Chosen { rank, number })
     }
@@ -87,12 +89,18 @@ impl Pending {
 }
 
 impl CommandQueue {
-    /// Takes in what is passed on for a tool, asked for at `asked`, and wakes the bus: a command to drives of the bus
-    /// has its place among their other commands, anything else waits with the background requests.
-    pub(crate) fn submit_passed_on(&self, request: BackgroundRequest, touched: Touched, asked: Instant, now: Instant) {
+    /// Takes in what is passed on for a tool, and wakes the bus: a command to drives of the bus has its place among
+    /// their other commands, anything else waits with the background requests.
+    pub(crate) fn submit_passed_on(
+        &self,
+        request: BackgroundRequest,
+        touched: Touched,
+        arrival: Arrival,
+        now: Instant,
+    ) {
         if request.passed_on.as_ref().is_some_and(PassedOn::is_order) {
             let mut command = request.into_command(touched);
-            command.asked = Some(asked);
+            command.arrival = Some(arrival);
             self.submit(command, now);
         } else {
             self.submit_background(request, now);

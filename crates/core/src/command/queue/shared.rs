@@ -66,17 +66,10 @@ impl CommandQueue {
     }
 
     /// Takes the stop of a command and its rest in, with nothing between them, and wakes the bus.
-    pub(crate) fn submit_parts(&self, stop: Command, mut rest: Command, now: Instant) {
+    pub(crate) fn submit_parts(&self, stop: Command, rest: Command, now: Instant) {
         let mut pending = self.lock();
-        let outdated = pending.is_behind_its_stop(&rest);
         pending.push(stop, now);
-        if outdated {
-            rest.answer(&Outcome::Purged, now);
-        } else {
-            // Its own stop is none that came in since.
-            rest.asked = None;
-            pending.push(rest, now);
-        }
+        pending.push(rest, now);
         drop(pending);
         self.wake();
     }

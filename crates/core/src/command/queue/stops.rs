@@ -8,6 +8,7 @@ use tokio::sync::oneshot;
 use super::Pending;
 use crate::command::{Command, Order, Origin, Outcome, SourceKind, Urgency};
 use crate::drive::DriveIndex;
+use crate::order::{Connection, LastStops};
 
 /// The wish of the gateway, which is about to end, that a bus stops its drives.
 #[derive(Debug)]
@@ -52,7 +53,7 @@ impl Pending {
             origin.kind,
             SourceKind::ModbusTcp | SourceKind::Mqtt | SourceKind::Sparkplug | SourceKind::Bacnet | SourceKind::Slot
         );
-        let last = self.stopped_at.get(&stop.drive).copied();
+        let last = self.last_stops.get(&stop.drive).and_then(LastStops::at);
         let delayed = delayed && stop.urgency == Urgency::Stop && !stop.is_urgent;
         let guards = self.guards.as_ref().filter(|_| delayed);
         guards.is_some_and(|guards| guards.is_ordinary_stop(stop.drive, origin.client(), last)) || self.repeats(stop)
@@ -77,20 +78,20 @@ impl Pending {
             .then(|| guards.stop_waits(drive, now))?
     }
 
-    pub(super) fn note_stop(&mut self, drive: DriveIndex, by: Origin, now: Instant) {
-        self.stopped_by.insert(drive, by);
-        *self.stops.entry(drive).or_default() += 1;
-        let at = self.stopped_at.entry(drive).or_insert(now);
-        *at = now.max(*at);
-    }
-
-    /// Whether a stop arrived after a command's request began to arrive.
-    pub(super) fn is_behind_its_stop(&self, command: &Command) -> bool {
-        let stopped = |drive: &DriveIndex| {
-            let at = self.stopped_at.get(drive).zip(command.asked);
-            at.is_some_and(|(stopped, asked)| asked < *stopped) && !command.stops(*drive)
-        };
-        command.urgency == Urgency::Command && command.reach().iter().any(stopped)
+    /// Keeps which drives a command stops, for the orders that were given before.
+    pub(super) fn note_stops(&mut self, command: &Command, now: Instant) {
+        let origin = command.ticket.origin();
+        if command.urgency == Urgency::Stop {
+            self.stopped_by.insert(command.drive, origin.clone());
+            *self.stops.entry(command.drive).or_default() += 1;
+        }
+        let arrival = command.arrival.as_ref();
+        let connection = arrival.map_or_else(|| Connection::opened(now), |arrival| arrival.connection.clone());
+        for drive in command.reach().iter().filter(|drive| command.stops(**drive)) {
+            if !self.repeats_its_word(*drive, origin) {
+                self.last_stops.entry(*drive).or_default().note(&connection, now);
+            }
+        }
     }
 
     /// Of each drive one stop waits that does nothing else, and one that does. Later ones join theirs if they ask for

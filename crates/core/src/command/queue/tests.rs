@@ -9,6 +9,7 @@ use crate::codec::Table;
 use crate::drive::{DriveIndex, PointIndex, Value};
 use crate::testkit::{next_command, ticket};
 
+mod age;
 mod order;
 mod slots;
 mod stops;

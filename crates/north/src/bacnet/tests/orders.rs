@@ -1,4 +1,5 @@
 use super::*;
+use crate::order::Arrival;
 
 const NULL: Option<Datum> = None;
 
@@ -191,7 +192,7 @@ fn a_stop_between_plan_and_acceptance_keeps_the_next_slot_from_starting() {
     let run = drive.image.spec.profile.model_index(ModelPoint::Run).unwrap();
     let order = Order::Points(vec![(run, entry.value)]);
     let null = null.in_favour_of(&entry);
-    let mut placed = drive.place_slot(order, null, entry.origin, Duration::from_secs(2), (rig.now, rig.now));
+    let mut placed = drive.place_slot(order, null, entry.origin, Duration::from_secs(2), (Arrival::now(rig.now), rig.now));
     let outcome = placed.answer().expect("refused at once").outcome;
     assert_eq!(outcome, Outcome::Replaced);
     assert_eq!(writes::error(&outcome), Err(Error::SERVICE_REQUEST_DENIED));

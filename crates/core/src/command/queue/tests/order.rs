@@ -4,6 +4,7 @@ use super::*;
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{BackgroundRequest, NO_DRIVE, Pace, PassedOn};
 use crate::drive::{DriveIndex, PointIndex};
+use crate::order::Arrival;
 
 const START: u16 = 1;
 const STOP: u16 = 0;
@@ -36,7 +37,7 @@ impl Clients {
             }),
         };
         let mut command = request.into_command(Touched::Anything);
-        command.asked = Some(self.now);
+        command.arrival = Some(Arrival::now(self.now));
         self.pending.push(command, self.now);
         receiver
     }
@@ -50,7 +51,7 @@ impl Clients {
             ranges: Vec::new(),
         };
         let mut command = Command::new(DriveIndex::new(drive), admitted, self.now + EXPIRY, ticket);
-        command.asked = Some(asked);
+        command.arrival = Some(Arrival::now(asked));
         self.pending.push(command, self.now);
         receiver
     }

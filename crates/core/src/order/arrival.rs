@@ -1,0 +1,78 @@
+//! When an order came, and over which connection. Pure.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use super::Stall;
+
+/// A way in: a TCP connection, a UDP socket, a pseudo-terminal, a connection to a broker. Clones are the same one.
+#[derive(Debug, Clone)]
+pub struct Connection(Arc<Way>);
+
+#[derive(Debug)]
+struct Way {
+    opened: Instant,
+    gone: AtomicBool,
+}
+
+impl Connection {
+    /// One that was opened then.
+    pub fn opened(at: Instant) -> Connection {
+        Connection(Arc::new(Way {
+            opened: at,
+            gone: AtomicBool::new(false),
+        }))
+    }
+
+    /// When it was opened.
+    pub fn opened_at(&self) -> Instant {
+        self.0.opened
+    }
+
+    /// Its client has closed or reset it.
+    pub fn hang_up(&self) {
+        self.0.gone.store(true, Ordering::Release);
+    }
+
+    /// Whether its client has closed or reset it.
+    pub fn is_gone(&self) -> bool {
+        self.0.gone.load(Ordering::Acquire)
+    }
+}
+
+impl PartialEq for Connection {
+    fn eq(&self, other: &Connection) -> bool {
+        Arc::ptr_eq(&self.0, &other.0)
+    }
+}
+
+/// How an order came.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Arrival {
+    /// The date of its first byte: no later than that really came.
+    pub asked: Instant,
+    /// Over which connection it came. In what order several connections were written to is not known.
+    pub connection: Connection,
+    /// The stall of the reading thread during which its first byte may have come.
+    pub stall: Option<Stall>,
+    /// The last pause of the reading thread, as long as orders of before may still come over connections of before.
+    pub pause: Option<Stall>,
+}
+
+impl Arrival {
+    /// An order that came at `now` over a connection of its own: one of the gateway itself.
+    pub fn now(now: Instant) -> Arrival {
+        Arrival::over(Connection::opened(now), now)
+    }
+
+    /// An order that came at `asked` over that connection, while its reader ran.
+    pub fn over(connection: Connection, asked: Instant) -> Arrival {
+        Arrival {
+            asked,
+            connection,
+            stall: None,
+            pause: None,
+        }
+    }
+}

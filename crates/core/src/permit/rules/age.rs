@@ -1,0 +1,290 @@
+//! Whether an order is still wanted: its age, what stopped its machine since, and whether its client is still there.
+//!
+//! What lay in a buffer while the reading thread stood still is as old as the stall, and came in no known order. Pure:
+//! time is an argument.
+
+use std::time::Instant;
+
+use crate::command::Outcome;
+use crate::order::{Arrival, LastStops, Stall};
+
+/// What an order does to a machine, as far as its age matters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Does {
+    /// It takes the run command away.
+    Stop,
+    /// It can make a standing motor turn.
+    Start,
+    /// Anything else, such as setting a reference.
+    Other,
+    /// It only reads.
+    Read,
+}
+
+/// What is looked at.
+#[derive(Debug, Clone, Copy)]
+pub struct Ask<'a> {
+    /// How it came.
+    pub arrival: &'a Arrival,
+    /// What it does.
+    pub does: Does,
+    /// It is not sent later.
+    pub expires: Instant,
+    /// The last stops of its machine.
+    pub stops: Option<&'a LastStops>,
+    /// The last pause of the thread that sends it.
+    pub waited: Option<Stall>,
+}
+
+/// The verdict.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// It goes.
+    Go,
+    /// It waits until then, and is asked about again.
+    Wait(Instant),
+    /// It is too old, or its client has gone.
+    Expired,
+    /// A stop came since, or may have.
+    Purged,
+}
+
+impl Verdict {
+    /// Its result, if it is refused.
+    pub fn refused(self) -> Option<Outcome> {
+        match self {
+            Verdict::Go | Verdict::Wait(_) => None,
+            Verdict::Expired => Some(Outcome::Expired),
+            Verdict::Purged => Some(Outcome::Purged),
+        }
+    }
+
+    /// Of an order to several machines: what keeps it from one of them keeps it from all.
+    #[must_use]
+    pub fn and(self, other: Verdict) -> Verdict {
+        match (self, other) {
+            (Verdict::Purged | Verdict::Expired, _) | (Verdict::Wait(_), Verdict::Go) => self,
+            (Verdict::Wait(one), Verdict::Wait(two)) => Verdict::Wait(one.max(two)),
+            _ => other,
+        }
+    }
+}
+
+/// Judges an order at `now`.
+pub fn age(ask: Ask<'_>, now: Instant) -> Verdict {
+    let Ask { arrival, does, .. } = ask;
+    if does == Does::Stop {
+        return Verdict::Go;
+    }
+    if ask.expires <= now {
+        return Verdict::Expired;
+    }
+    // One that waited while the bus stood still is of before, too.
+    let waited = ask.waited.filter(|pause| arrival.asked < pause.ended);
+    if arrival.connection.is_gone() && (arrival.stall.is_some() || waited.is_some()) {
+        return Verdict::Expired;
+    }
+    let stopped = ask.stops.and_then(|stops| stops.of_others(&arrival.connection));
+    if does != Does::Read && stopped.is_some_and(|stopped| arrival.asked < stopped) {
+        return Verdict::Purged;
+    }
+    if does != Does::Start {
+        return Verdict::Go;
+    }
+    let of_before = |pause: Stall| arrival.connection.opened_at() < pause.ended && now < pause.over();
+    if arrival.pause.is_some_and(of_before) || waited.is_some_and(of_before) {
+        return Verdict::Expired;
+    }
+    // A stop that came during the same stall may be read after it.
+    match arrival.stall.map(|stall| stall.read_by()) {
+        Some(until) if now < until => Verdict::Wait(until),
+        _ => Verdict::Go,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+    use crate::order::Connection;
+
+    /// A time, in milliseconds after the process was started.
+    fn at(start: Instant, ms: u64) -> Instant {
+        start + Duration::from_millis(ms)
+    }
+
+    /// Asked and expires; the stall that it came in; the last pause of its reader, and of the bus; when the connection
+    /// was opened, and whether it is gone; a stop by its own connection, and by another one; now.
+    #[derive(Clone, Copy)]
+    struct Case {
+        asked: u64,
+        expires: u64,
+        stall: Option<(u64, u64)>,
+        pause: Option<(u64, u64)>,
+        waited: Option<(u64, u64)>,
+        opened: u64,
+        gone: bool,
+        own_stop: Option<u64>,
+        other_stop: Option<u64>,
+        now: u64,
+    }
+
+    /// A healthy order, judged 100 ms after it came.
+    const PLAIN: Case = Case {
+        asked: 20_000,
+        expires: 22_000,
+        stall: None,
+        pause: None,
+        waited: None,
+        opened: 0,
+        gone: false,
+        own_stop: None,
+        other_stop: None,
+        now: 20_100,
+    };
+
+    /// The same, read after a stall of 200 ms.
+    const HICCUP: Case = Case {
+        stall: Some((20_000, 20_200)),
+        now: 20_201,
+        ..PLAIN
+    };
+
+    /// The same, read after a pause of 1.5 s.
+    const PAUSED: Case = Case {
+        stall: Some((20_000, 21_500)),
+        pause: Some((20_000, 21_500)),
+        now: 21_501,
+        ..PLAIN
+    };
+
+    /// The verdict on a stop, a start, a reference, and a read.
+    fn verdicts(case: Case) -> String {
+        let start = Instant::now();
+        let stall = |(began, ended): (u64, u64)| Stall {
+            began: at(start, began),
+            ended: at(start, ended),
+        };
+        let connection = Connection::opened(at(start, case.opened));
+        if case.gone {
+            connection.hang_up();
+        }
+        let mut stops = LastStops::default();
+        let other = Connection::opened(start);
+        let mut both = [(case.own_stop, &connection), (case.other_stop, &other)];
+        both.sort_by_key(|(at, _)| *at);
+        for (stopped, by) in both {
+            stopped.into_iter().for_each(|ms| stops.note(by, at(start, ms)));
+        }
+        let arrival = Arrival {
+            asked: at(start, case.asked),
+            connection: connection.clone(),
+            stall: case.stall.map(stall),
+            pause: case.pause.map(stall),
+        };
+        let all = [Does::Stop, Does::Start, Does::Other, Does::Read].map(|does| {
+            let ask = Ask {
+                arrival: &arrival,
+                does,
+                expires: at(start, case.expires),
+                stops: Some(&stops),
+                waited: case.waited.map(stall),
+            };
+            match age(ask, at(start, case.now)) {
+                Verdict::Go => "go".to_string(),
+                Verdict::Wait(until) => format!("wait {}", until.duration_since(start).as_millis()),
+                Verdict::Expired => "expired".to_string(),
+                Verdict::Purged => "purged".to_string(),
+            }
+        });
+        all.join(", ")
+    }
+
+    #[test]
+    fn what_becomes_of_a_stop_a_start_a_reference_and_a_read() {
+        let table = [
+            ("a healthy one", PLAIN, "go, go, go, go"),
+            ("the last moment", Case { now: 21_999, ..PLAIN }, "go, go, go, go"),
+            ("late", Case { now: 22_000, ..PLAIN }, "go, expired, expired, expired"),
+            ("a client that closed after it", Case { gone: true, ..PLAIN }, "go, go, go, go"),
+            ("a stop by another one before", Case { other_stop: Some(20_000), ..PLAIN }, "go, go, go, go"),
+            ("a stop by another one since", Case { other_stop: Some(20_001), ..PLAIN }, "go, purged, purged, go"),
+            ("one of its own, read before it", Case { own_stop: Some(20_050), ..PLAIN }, "go, go, go, go"),
+            (
+                "one of its own, and one of another since",
+                Case { own_stop: Some(20_050), other_stop: Some(20_010), ..PLAIN },
+                "go, purged, purged, go",
+            ),
+            (
+                "the other's was before",
+                Case { own_stop: Some(20_050), other_stop: Some(19_000), ..PLAIN },
+                "go, go, go, go",
+            ),
+            ("during a hiccup", HICCUP, "go, wait 20450, go, go"),
+            ("when that is read", Case { now: 20_450, ..HICCUP }, "go, go, go, go"),
+            ("a stop read before it", Case { other_stop: Some(20_201), ..HICCUP }, "go, purged, purged, go"),
+            ("a stop read after it", Case { other_stop: Some(20_300), now: 20_301, ..HICCUP }, "go, purged, purged, go"),
+            ("a stop of long before", Case { other_stop: Some(19_900), ..HICCUP }, "go, wait 20450, go, go"),
+            ("its own order counts", Case { own_stop: Some(20_201), ..HICCUP }, "go, wait 20450, go, go"),
+            ("its client has gone", Case { gone: true, ..HICCUP }, "go, expired, expired, expired"),
+            ("after a pause", PAUSED, "go, expired, go, go"),
+            ("its client has gone in the pause", Case { gone: true, ..PAUSED }, "go, expired, expired, expired"),
+            ("a pause of three seconds", Case { stall: Some((20_000, 23_000)), pause: Some((20_000, 23_000)), now: 23_001, ..PLAIN }, "go, expired, expired, expired"),
+            (
+                "sent later over an old connection",
+                Case { asked: 23_000, expires: 25_000, stall: None, now: 23_001, ..PAUSED },
+                "go, expired, go, go",
+            ),
+            (
+                "as long again and a second after the pause",
+                Case { asked: 24_000, expires: 26_000, stall: None, now: 24_000, ..PAUSED },
+                "go, go, go, go",
+            ),
+            (
+                "over a new connection",
+                Case { asked: 21_600, expires: 23_600, stall: None, opened: 21_550, now: 21_600, ..PAUSED },
+                "go, go, go, go",
+            ),
+            (
+                "a new connection of which the process read late",
+                Case { opened: 21_500, ..PAUSED },
+                "go, wait 21750, go, go",
+            ),
+            (
+                "it waited for its turn while the bus paused",
+                Case { waited: Some((20_050, 21_100)), now: 21_100, ..PLAIN },
+                "go, expired, go, go",
+            ),
+            (
+                "and its client has gone",
+                Case { waited: Some((20_050, 21_100)), now: 21_100, gone: true, ..PLAIN },
+                "go, expired, expired, expired",
+            ),
+            (
+                "the bus paused before it came",
+                Case { waited: Some((18_000, 19_999)), ..PLAIN },
+                "go, go, go, go",
+            ),
+        ];
+        for (what, case, expected) in table {
+            assert_eq!(verdicts(case), expected, "{what}");
+        }
+    }
+
+    #[test]
+    fn what_keeps_it_from_one_machine_keeps_it_from_all() {
+        let now = Instant::now();
+        let (soon, later) = (Verdict::Wait(now), Verdict::Wait(now + Duration::from_secs(1)));
+        for (one, other, both) in [
+            (Verdict::Go, Verdict::Go, Verdict::Go),
+            (Verdict::Go, soon, soon),
+            (later, soon, later),
+            (soon, Verdict::Purged, Verdict::Purged),
+            (Verdict::Expired, Verdict::Go, Verdict::Expired),
+        ] {
+            assert_eq!(one.and(other), both);
+            assert_eq!(other.and(one), both);
+        }
+    }
+}
