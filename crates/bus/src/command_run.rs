@@ -24,6 +24,8 @@ use super::start_gate::Start;
 use crate::codec::{Exception, Reply, Table};
 use crate::command::{Command, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Touched, Urgency};
 use crate::drive::{DriveIndex, Profile};
+use crate::order::Arrival;
+use crate::permit::rules::age::Does;
 
 /// Most stops to a drive that are sent before the end of a started pulse.
 const MOST_STOPS: u32 = 8;
@@ -129,12 +131,15 @@ pub struct CommandRun {
     pub(super) start: Option<Start>,
     /// Supervision follows the client that sent it.
     pub renews: bool,
+    /// How it came, and what it does.
+    came: Option<(Arrival, Does)>,
 }
 
 impl CommandRun {
     /// Arranges the steps in a safe order: a stop first, references before run, a reset before a new run edge. A
     /// command that cannot be sent as a whole is refused; a stop is sent as far as possible.
     pub fn new(command: Command, profile: &Profile) -> CommandRun {
+        let does = command.does(command.drive);
         let Command {
             order,
             urgency,
@@ -144,6 +149,7 @@ impl CommandRun {
             joined,
             was_begun,
             behind,
+            arrival,
             ..
         } = command;
         let effects = confirm::effects(profile, &order);
@@ -213,6 +219,7 @@ impl CommandRun {
             stop,
             start: None,
             renews: true,
+            came: arrival.map(|arrival| (arrival, does)),
         }
     }
 
@@ -240,7 +247,7 @@ impl CommandRun {
             behind: None,
             overtaken: 0,
             number: 0,
-            asked: None,
+            arrival: None,
             touched: Touched::Anything,
             passed_on: None,
             was_begun,
@@ -266,6 +273,17 @@ impl CommandRun {
     /// When its time expires.
     pub fn expires(&self) -> Instant {
         self.expires
+    }
+
+    /// How it came, and what it does; none for what was taken over.
+    pub fn came(&self) -> Option<&(Arrival, Does)> {
+        self.came.as_ref()
+    }
+
+    /// The thread stood still for long, the machine being suspended for `slept` of it. What has begun is not continued.
+    pub fn interrupted(&mut self, slept: Duration, now: Instant) {
+        let expires = self.expires.checked_sub(slept).unwrap_or(now);
+        self.expires = if self.reached_the_wire() { expires.min(now) } else { expires };
     }
 
     /// Whether a client sent it, not the gateway itself.

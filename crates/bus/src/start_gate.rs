@@ -16,13 +16,15 @@ use crate::command::{
     Answer, Command, DEFAULT_EXPIRY, Origin, Outcome, Pending, Refusal, SourceKind, Urgency, WriteStats, written,
 };
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, Profile, Value};
+use crate::order::Stall;
 use crate::plant::{BusHandle, turn_away};
 use crate::process_image::{DriveImage, Reading};
 use crate::start_guard::{BusGuards, Clearance};
 
 /// First and longest pause before a motor that an interlock stopped and that runs on is stopped again.
 const AGAIN: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
-/// After the start of the bus so long a point that was not read yet stops no motor.
+/// After the start of the bus, and after a time in which it stood still, so long a point that was not read since stops no
+/// motor.
 const FIRST_READ: Duration = Duration::from_secs(10);
 
 /// The guards of the bus, and their starts in progress.
@@ -30,6 +32,8 @@ const FIRST_READ: Duration = Duration::from_secs(10);
 pub(super) struct StartGate {
     guards: Arc<BusGuards>,
     began: Instant,
+    /// Until when the thread last stood still.
+    stood: Option<Instant>,
     /// Commands that were cleared and are not over, with the drives that they start.
     cleared: Vec<(u64, Vec<DriveIndex>)>,
     /// Commands that wait and are to be refused.
@@ -64,6 +68,7 @@ impl StartGate {
         Some(StartGate {
             guards,
             began: now,
+            stood: None,
             cleared: Vec::new(),
             refused: Vec::new(),
             told: Vec::new(),
@@ -110,6 +115,11 @@ impl StartGate {
                 Ok(false)
             }
         }
+    }
+
+    /// The thread stood still.
+    pub(super) fn stood(&mut self, stall: Stall) {
+        self.stood = Some(stall.ended);
     }
 
     /// Ends the refused commands. Returns whether there were any.
@@ -238,6 +248,10 @@ impl StartGate {
         let mut unmet = self.guards.unmet(index, true, now);
         if now < self.began + FIRST_READ {
             unmet.retain(|unmet| unmet.was_read());
+        }
+        if let Some(until) = self.stood.filter(|until| now < *until + FIRST_READ) {
+            // A first reading since decides.
+            unmet.retain(|unmet| unmet.met_last().is_none_or(|at| at > until));
         }
         if unmet.is_empty() || !may_run(reading, words) {
             (trip.next, trip.pause, trip.is_told) = (None, AGAIN.0, false);

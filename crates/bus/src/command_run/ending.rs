@@ -51,6 +51,11 @@ impl CommandRun {
         self.actions.is_empty().then(|| self.success())
     }
 
+    /// It is too old to be sent, or to be continued.
+    pub fn expire(&mut self) {
+        self.cut_off(self.unless_begun(Outcome::Expired, Interruption::Expired));
+    }
+
     /// Another client took the drive: the command ends, but the motor is left as it is. Returns the outcome if that
     /// ends it at once.
     pub fn taken(&mut self, refusal: Refusal) -> Option<Outcome> {

@@ -12,6 +12,8 @@ use crate::command::{
 use crate::command_run::{CommandRun, Step};
 use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::{DriveState, Wanted};
+use crate::permit::rules::age::Verdict;
+use crate::plant::BusHandle;
 use crate::schedule::{Decision, Poll};
 
 /// Transactions of one rank in a row, while a lower one waits, before that has its turn.
@@ -208,6 +210,9 @@ impl Master {
                 continue;
             }
             let mut wanted = drive.wanted(image, &waits.n2_late, now);
+            if ends_by_age(bus, index, drive, &wanted, now) {
+                wanted = drive.wanted(image, &waits.n2_late, now);
+            }
             while let Some(starts) = &mut waits.starts
                 && starts.forbids(index, drive, &wanted, now)
             {
@@ -287,6 +292,9 @@ impl Master {
             if let Some(until) = until {
                 commands.wait(until);
             }
+        }
+        if let Some(at) = pending.reads_end(now) {
+            commands.wait(at);
         }
         if let Some(starts) = &mut waits.starts
             && starts.refuse(&mut pending, now)
@@ -454,6 +462,27 @@ impl Master {
         }
         true
     }
+}
+
+/// Ends a started command that is about to write and no longer wanted. Whether it was that.
+fn ends_by_age(bus: &BusHandle, index: DriveIndex, drive: &mut DriveState, wanted: &Wanted, now: Instant) -> bool {
+    let Wanted::Step(Urgency::Command, step) = wanted else {
+        return false;
+    };
+    let run = drive.run(Urgency::Command);
+    let Some(run) = run.filter(|run| step.pdu.is_write() && run.may_write_on()) else {
+        return false;
+    };
+    let Some((arrival, does)) = run.came() else {
+        return false;
+    };
+    let what = (*does, run.expires());
+    let verdict = bus.queue.lock().age_at_write(index, arrival, what, now);
+    let ends = verdict == Verdict::Expired;
+    if ends {
+        run.expire();
+    }
+    ends
 }
 
 fn range_changed() -> Refusal {

@@ -79,6 +79,7 @@ impl Master {
         if let Some(starts) = &mut waits.starts {
             starts.refuse(pending, now);
         }
+        blocked = blocked.into_iter().chain(pending.reads_end(now)).min();
         (chosen, blocked)
     }
 
