@@ -11,6 +11,7 @@ use super::master::{Handover, Master, Purpose, Remains, Turn, TurnEnd};
 use super::news::News;
 use super::report::Report;
 use super::tap::Tap;
+use crate::order::Stalls;
 use super::transaction::Ended;
 use crate::codec::{Exception, Reply, Request};
 use crate::command::{Outcome, Urgency, WriteStats};
@@ -90,6 +91,10 @@ pub struct BusCore {
     writes: Arc<WriteStats>,
     /// Empty; kept for its memory.
     news: Vec<News>,
+    /// Those of its thread; none before that runs.
+    stalls: Option<Stalls>,
+    /// There was one since the request on the line was sent.
+    stood: bool,
 }
 
 impl BusCore {
@@ -121,6 +126,33 @@ impl BusCore {
             connection: Connection::default(),
             tap: None,
             news: Vec::new(),
+            stalls: None,
+            stood: false,
+        }
+    }
+
+    /// Its thread runs at `now`; `boot` is the time since the machine was started, suspensions included. Whether it stood
+    /// still since it ran last: then what came meanwhile is to be read before anything else.
+    pub fn ran(&mut self, now: Instant, boot: Duration) -> bool {
+        let stalls = self.stalls.get_or_insert_with(|| Stalls::new(now, boot));
+        let before = stalls.ran();
+        let Some(stood) = stalls.observe(now, boot) else {
+            if self.report.is_deaf(now) {
+                self.master.prolong(now.saturating_duration_since(before));
+            }
+            return false;
+        };
+        self.stood = true;
+        self.master.stood(stood, now);
+        self.report.stood(stood.stall);
+        true
+    }
+
+    /// Its thread runs on: since it ran last it did something else, such as to open the port.
+    pub fn runs_on(&mut self, now: Instant, boot: Duration) {
+        match &mut self.stalls {
+            Some(stalls) => stalls.go_on(now, boot),
+            None => self.stalls = Some(Stalls::new(now, boot)),
         }
     }
 
@@ -257,6 +289,8 @@ impl BusCore {
                 TurnEnd {
                     ended: refused,
                     began: now,
+                    at: now,
+                    stood: false,
                     took: Duration::ZERO,
                     mangled: false,
                     frame: Vec::new(),
@@ -317,6 +351,7 @@ impl BusCore {
         let late = self.master.take_late();
         self.line.send(request, frame, sending, late, now);
         self.connection.asked = true;
+        self.stood = false;
         self.asked = Some(turn);
         self.line.frame()
     }
@@ -360,10 +395,14 @@ impl BusCore {
             Purpose::Background => exchanged.transaction.reply_frame().to_vec(),
             Purpose::Poll(_) | Purpose::Session(..) | Purpose::Command { .. } => Vec::new(),
         };
-        let Exchanged { ended, began, took, .. } = exchanged;
+        let Exchanged {
+            ended, began, at, took, ..
+        } = exchanged;
         let end = TurnEnd {
             ended,
             began,
+            at,
+            stood: self.stood,
             took,
             mangled,
             frame,

@@ -15,6 +15,7 @@ use crate::codec::LineFormat;
 use crate::command::{Outcome, WriteStats};
 use crate::event::Events;
 use crate::line::{self, Arrival, Line, LineOptions, Lost, Names, OpenError, Receiver, Woken};
+use crate::order::Stalls;
 use crate::plant::BusHandle;
 
 /// First and longest pause between two tries to open the port.
@@ -321,9 +322,15 @@ impl Worker {
     fn serve_as_master(&self, core: &mut BusCore, line: &Line) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
         let mut break_off = None;
+        core.runs_on(Instant::now(), line::since_boot());
         // The transaction on the line is ended first: anyone who comes after would talk into its reply.
         while !self.stopping() || core.asked().is_some() {
             let now = Instant::now();
+            if core.ran(now, line::since_boot()) {
+                // What came meanwhile is a reply, whatever time it is now.
+                let count = line.receive(&mut buffer)?;
+                core.heard(buffer.get(..count).unwrap_or_default(), now);
+            }
             if self.stop.load(Ordering::Relaxed) && now >= *break_off.get_or_insert(now + LAST_EXCHANGE) {
                 return Ok(());
             }
@@ -332,10 +339,11 @@ impl Worker {
                 Action::Send => {
                     // A thread that was held up may not have seen the last bytes.
                     let count = line.receive(&mut buffer)?;
-                    if count == 0 {
-                        line.send(core.sending(Instant::now()))?;
-                    } else {
-                        core.heard(buffer.get(..count).unwrap_or_default(), Instant::now());
+                    let now = Instant::now();
+                    if count > 0 {
+                        core.heard(buffer.get(..count).unwrap_or_default(), now);
+                    } else if !core.ran(now, line::since_boot()) {
+                        line.send(core.sending(now))?;
                     }
                     continue;
                 }
@@ -365,8 +373,10 @@ impl Worker {
 
     /// Serves without a connection until something is to be sent, or the bus is to stop.
     fn wait_to_ask(&self, core: &mut BusCore) {
+        core.runs_on(Instant::now(), line::since_boot());
         while !self.stopping() {
             let now = Instant::now();
+            core.ran(now, line::since_boot());
             match core.poll(now) {
                 Action::Send => return,
                 Action::Wait { until, commands, .. } => {
@@ -385,19 +395,27 @@ impl Worker {
 
     fn only_listen(&self, core: &mut ListenCore, line: &Receiver) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
+        let mut stalls = Stalls::new(Instant::now(), line::since_boot());
+        // Since when what is read next may have been there.
+        let mut since = None;
         while !self.stopping() {
             let now = Instant::now();
+            let stood = stalls.observe(now, line::since_boot());
+            since = since.or(stood.map(|stood| stood.stall.began));
             let until = core.on_time(now).min(now + BEAT);
             match line.wait(until, Some(self.handle.queue.wake_fd()))? {
                 Woken::Readable => {
                     let count = line.receive(&mut buffer)?;
-                    core.on_bytes(buffer.get(..count).unwrap_or_default(), Instant::now());
+                    let now = Instant::now();
+                    let stood = stalls.observe(now, line::since_boot());
+                    let came = since.take().or(stood.map(|stood| stood.stall.began));
+                    core.on_bytes(buffer.get(..count).unwrap_or_default(), came.unwrap_or(now));
                 }
                 Woken::Command => {
                     self.handle.queue.clear_wake();
                     core.refuse_all(Instant::now());
                 }
-                Woken::Time => {}
+                Woken::Time => since = None,
             }
         }
         Ok(())

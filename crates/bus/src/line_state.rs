@@ -57,8 +57,10 @@ pub struct Exchanged {
     pub began: Instant,
     /// When the drive knew that the request was over.
     pub sent: Instant,
-    /// When the last bytes arrived; the end of the request if none did.
+    /// When the last bytes arrived, as far as they can be the drive's; the end of the request if none did.
     pub heard_at: Instant,
+    /// When it ended. However late that was noticed: no later than a reply can have left the drive.
+    pub at: Instant,
     /// Time on the wire of the received bytes.
     pub reply_time: Duration,
     /// How long the line was in use, including the silence after it.
@@ -288,15 +290,18 @@ impl LineState {
         self.weigh(&ended, early, doubtful || late, &transaction);
         let wire = WireTime::of(self.protocol, &self.format, &transaction.request().pdu);
         let reply_time = wire.reply.min(self.format.chars(transaction.seen().len()));
+        let at = now.min(transaction.deadline());
+        let heard_at = self.quiet_since.min(transaction.deadline());
         Some(Exchanged {
             transaction,
             ended,
             began,
             sent,
-            heard_at: self.quiet_since,
+            heard_at,
+            at,
             reply_time,
             // A reply that came faster than the wire could carry it frees the line no sooner.
-            took: now.max(self.quiet_since).saturating_duration_since(began) + self.silence,
+            took: at.max(heard_at).saturating_duration_since(began) + self.silence,
             beats,
         })
     }

@@ -9,6 +9,7 @@ mod background;
 mod choose;
 mod hold;
 mod passed_on;
+mod pauses;
 mod permission;
 mod remains;
 mod results;
@@ -126,6 +127,10 @@ pub struct TurnEnd {
     pub ended: Ended,
     /// When its request was given to the line.
     pub began: Instant,
+    /// When it ended: no later than a reply can have left the drive.
+    pub at: Instant,
+    /// The thread stood still meanwhile: that nothing came may be its own doing.
+    pub stood: bool,
     /// How long the line was taken.
     pub took: Duration,
     /// The invalid bytes were the drive's own reply, damaged.
@@ -473,7 +478,12 @@ pub(super) fn supervise(
     if let Some(at) = image.take_heartbeat() {
         drive.supervision.renew(at);
     }
-    let queued = bus.queue.lock().client_waits_until(index);
+    let mut queue = bus.queue.lock();
+    let (renewed, queued) = (queue.take_renewed(index), queue.client_waits_until(index));
+    drop(queue);
+    if renewed {
+        drive.supervision.renew(now);
+    }
     let orders = Orders {
         held_until: queued.max(drive.client_holds_until()),
     };

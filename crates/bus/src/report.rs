@@ -20,6 +20,7 @@ use crate::codec::{Exception, Reply, Request, Table};
 use crate::command::WriteStats;
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, PointIndex, PollClass, Value};
 use crate::event::{EventKind, Events};
+use crate::order::Stall;
 use crate::process_image::{
     Access, BusImage, DriveImage, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Verdict,
 };
@@ -181,6 +182,18 @@ impl Report {
                 snapshot.fast_at = Some(at);
             }
         });
+    }
+
+    /// Whether a thread that reads orders stands still.
+    pub(super) fn is_deaf(&self, now: Instant) -> bool {
+        self.events.pauses().is_deaf(now)
+    }
+
+    /// The thread of the bus stood still.
+    pub(super) fn stood(&self, stall: Stall) {
+        if stall.is_pause() {
+            self.events.publish_pause(stall, SystemTime::now());
+        }
     }
 
     pub(super) fn bus_up(&mut self, now: Instant) {

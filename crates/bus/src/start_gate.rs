@@ -14,17 +14,22 @@ use super::supervision::written_run;
 use crate::codec::RequestPdu;
 use crate::command::{Answer, DEFAULT_EXPIRY, Intent, Origin, Outcome, SourceKind, WriteStats, written};
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, Profile, Value};
+use crate::order::Stall;
 use crate::plant::{BusHandle, turn_away};
 use crate::process_image::{DriveImage, Reading};
 use crate::start_guard::BusGuards;
 
 /// First and longest pause before a motor that an interlock stopped and that runs on is stopped again.
 const AGAIN: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
+/// After a time in which the thread stood still, so long a point that was not read since stops no motor.
+const FIRST_READ: Duration = Duration::from_secs(10);
 
 /// The guards of the bus, and the stops of their interlocks.
 #[derive(Debug)]
 pub(super) struct StartGate {
     guards: Arc<BusGuards>,
+    /// Until when the thread last stood still.
+    stood: Option<Instant>,
     /// News to report.
     told: Vec<News>,
     trips: PerDrive<Trip>,
@@ -54,6 +59,7 @@ impl StartGate {
         let trips = bus.image.drives.iter().map(|_| Trip::default()).collect();
         Some(StartGate {
             guards,
+            stood: None,
             told: Vec::new(),
             trips,
         })
@@ -66,6 +72,11 @@ impl StartGate {
             number: intent.number,
             client: origin.client().clone(),
         })
+    }
+
+    /// The thread stood still.
+    pub(super) fn stood(&mut self, stall: Stall) {
+        self.stood = Some(stall.ended);
     }
 
     /// A write is sent, of a command that starts the motor or of another one.
@@ -116,7 +127,9 @@ impl StartGate {
             return;
         };
         trip.note_answer(now);
-        let unmet = self.guards.tripped(index, now);
+        // A first reading since decides.
+        let stood = self.stood.filter(|until| now < *until + FIRST_READ);
+        let unmet = self.guards.tripped(index, stood, now);
         if unmet.is_empty() || !may_run(reading, words) {
             (trip.next, trip.pause, trip.is_told) = (None, AGAIN.0, false);
             return;

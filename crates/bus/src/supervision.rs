@@ -29,7 +29,11 @@ const MOST_REASONS: usize = 8;
 
 /// The lease of a drive, as handed over to the next bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Lease(State);
+pub struct Lease {
+    state: State,
+    /// By how much it was prolonged since it was renewed last.
+    prolonged: Duration,
+}
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 enum State {
@@ -46,24 +50,36 @@ enum State {
     Ended,
 }
 
+impl From<State> for Lease {
+    fn from(state: State) -> Lease {
+        Lease {
+            state,
+            prolonged: Duration::ZERO,
+        }
+    }
+}
+
 impl Lease {
     /// One that runs since then.
     pub fn held(since: Instant) -> Lease {
-        Lease(State::Held(since))
+        State::Held(since).into()
     }
 
     /// The same when its time stood for so long.
     #[must_use]
     pub fn after(self, stood: Duration) -> Lease {
-        match self.0 {
-            State::Held(since) => Lease(State::Held(since + stood)),
+        match self.state {
+            State::Held(since) => Lease {
+                state: State::Held(since + stood),
+                ..self
+            },
             _ => self,
         }
     }
 
     /// What ends with it if no drive continues it, as text; none for one that has ended or never started.
     pub fn ends(self) -> Option<&'static str> {
-        match self.0 {
+        match self.state {
             State::Unheard | State::RunsUnheard | State::Ended => None,
             State::Held(_) => Some("nothing stops it any more if its client goes silent"),
             State::RanOut => Some("its action, which the drive has not acknowledged, is no longer written"),
@@ -123,21 +139,30 @@ impl Supervision {
 
     /// Whether the lease expired, and its action is not acknowledged.
     pub(super) fn owes_action(&self) -> bool {
-        self.lease.0 == State::RanOut
+        self.lease.state == State::RanOut
     }
 
     /// Whether the drive runs and no client has commanded it since the gateway started.
     pub(super) fn runs_unheard(&self) -> bool {
-        self.lease.0 == State::RunsUnheard
+        self.lease.state == State::RunsUnheard
     }
 
     /// Renews the lease: a client's command was sent or ended, or its heartbeat arrived.
     pub(super) fn renew(&mut self, now: Instant) {
-        self.lease = Lease(match self.lease.0 {
-            State::Held(since) => State::Held(since.max(now)),
-            _ => State::Held(now),
+        self.lease = Lease::held(match self.lease.state {
+            State::Held(since) => since.max(now),
+            _ => now,
         });
         self.begin_anew();
+    }
+
+    /// The gateway itself heard nobody for that time: the lease lasts longer by it, by one timeout in all since it was renewed.
+    pub(super) fn prolong(&mut self, time: Duration, timeout: Duration) {
+        if let State::Held(since) = &mut self.lease.state {
+            let time = time.min(timeout.saturating_sub(self.lease.prolonged));
+            *since += time;
+            self.lease.prolonged += time;
+        }
     }
 
     /// Another action, or another lease.
@@ -161,10 +186,10 @@ impl Supervision {
             return Demand::None;
         };
         let held = orders.held_until.is_some_and(|until| until > now);
-        match self.lease.0 {
+        match self.lease.state {
             State::Unheard => {
                 if !held && reading.is_set(ModelPoint::Running) {
-                    self.lease = Lease(State::RunsUnheard);
+                    self.lease = State::RunsUnheard.into();
                     news.push(News::RunsUnsupervised(
                         drive,
                         if spec.adopt { Adopted::Yes } else { Adopted::No },
@@ -185,7 +210,7 @@ impl Supervision {
                 if has_run_out(since, spec.timeout, now) && !held {
                     self.runs_out(since, reading, words, now, news, drive);
                 }
-                match self.lease.0 {
+                match self.lease.state {
                     State::RanOut => self.act(reading, now),
                     _ => Demand::None,
                 }
@@ -193,7 +218,7 @@ impl Supervision {
             State::RanOut => {
                 self.note_answer(now);
                 self.tell_failure(news, drive);
-                match self.lease.0 {
+                match self.lease.state {
                     // Suspended: anyone who is back decides, if the order reaches the wire.
                     State::RanOut if held && self.answer.is_some() => Demand::Withdraw,
                     State::RanOut if !held => self.act(reading, now),
@@ -229,11 +254,11 @@ impl Supervision {
                 reading.spec.supervision.as_ref().map(|s| &s.action),
                 Some(LeaseAction::Hold)
             );
-            self.lease = Lease(if holds { State::Ended } else { State::RanOut });
+            self.lease = if holds { State::Ended } else { State::RanOut }.into();
             self.begin_anew();
             news.push(News::LeaseRanOut(drive));
         } else if read_since {
-            self.lease = Lease(State::Ended);
+            self.lease = State::Ended.into();
         }
     }
 
@@ -284,7 +309,7 @@ impl Supervision {
         let Some(answer) = &mut self.answer else { return };
         match answer.try_recv() {
             Err(TryRecvError::Empty) => return,
-            Ok(answer) if answer.outcome.is_ok() => self.lease = Lease(State::Ended),
+            Ok(answer) if answer.outcome.is_ok() => self.lease = State::Ended.into(),
             Ok(answer) => self.not_acknowledged(answer.outcome, now),
             Err(TryRecvError::Closed) => self.next_try = Some(now + AGAIN),
         }
@@ -309,7 +334,7 @@ impl Supervision {
             let why = is_new.then_some(why);
             news.push(News::ActionFailed { drive, why });
         }
-        if self.lease.0 == State::Ended && self.failures > 0 {
+        if self.lease.state == State::Ended && self.failures > 0 {
             news.push(News::ActionTaken {
                 drive,
                 failures: std::mem::take(&mut self.failures),
@@ -348,7 +373,7 @@ impl Supervision {
 
     /// Withdraws the action, unless it was sent: then it still gets its result.
     pub(super) fn withdrawn(&mut self, now: Instant) {
-        match self.lease.0 {
+        match self.lease.state {
             State::RanOut => {
                 self.note_answer(now);
                 if self.answer.is_none() {
@@ -361,7 +386,7 @@ impl Supervision {
 
     /// Records results before a bus ends: an acknowledged action is not due again.
     pub(super) fn settle(&mut self, now: Instant) {
-        if self.lease.0 == State::RanOut {
+        if self.lease.state == State::RanOut {
             self.note_answer(now);
         }
     }

@@ -12,6 +12,8 @@ use std::time::{Instant, SystemTime};
 use serde::{Deserialize, Serialize};
 use tokio::sync::broadcast;
 
+use crate::order::{Pauses, Stall};
+
 pub use fair_ring::{FairRing, in_order};
 pub use log::{Before, LineError, Search, from_line};
 pub use refusals::RefusalLimit;
@@ -93,10 +95,12 @@ pub enum EventKind {
     HoldBroken,
     /// A drill has ended.
     Drill,
+    /// The process, or a thread of it, stood still for longer than a second.
+    Paused,
 }
 
 impl EventKind {
-    pub const ALL: [EventKind; 31] = [
+    pub const ALL: [EventKind; 32] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -128,6 +132,7 @@ impl EventKind {
         EventKind::Released,
         EventKind::HoldBroken,
         EventKind::Drill,
+        EventKind::Paused,
     ];
 
     /// Whether someone should look: the log has it as a warning.
@@ -146,6 +151,7 @@ impl EventKind {
             | EventKind::Diagnosis
             | EventKind::RestoreUnfinished
             | EventKind::Interlock
+            | EventKind::Paused
             | EventKind::ReloadRefused => true,
             EventKind::Online
             | EventKind::FaultEnd
@@ -201,6 +207,7 @@ impl EventKind {
             EventKind::Released => "released",
             EventKind::HoldBroken => "hold_broken",
             EventKind::Drill => "drill",
+            EventKind::Paused => "paused",
         }
     }
 }
@@ -329,6 +336,7 @@ pub struct RefusedCommand<'r> {
 pub struct Events {
     sender: broadcast::Sender<Arc<Event>>,
     store: Arc<Mutex<Store>>,
+    pauses: Pauses,
 }
 
 /// The latest events. Those of drives and buses are stored separately from refused commands, and no drive or kind
@@ -366,6 +374,7 @@ impl Events {
                 refused: FairRing::new(REFUSALS_KEPT),
                 limit: RefusalLimit::default(),
             })),
+            pauses: Pauses::default(),
         }
     }
 
@@ -391,6 +400,24 @@ impl Events {
         store.keep(&event);
         // Nobody listening is no error.
         let _ = self.sender.send(Arc::new(event));
+    }
+
+    /// The pauses of the process.
+    pub fn pauses(&self) -> &Pauses {
+        &self.pauses
+    }
+
+    /// A thread had this pause, which has ended at `time` on the calendar. It is published once, whichever threads had it.
+    pub fn publish_pause(&self, pause: Stall, time: SystemTime) {
+        if !self.pauses.note(pause) {
+            return;
+        }
+        let (seconds, over) = (pause.length().as_secs_f64(), (pause.over() - pause.ended).as_secs_f64());
+        let text = format!(
+            "the gateway stood still for {seconds:.1} s: its process was stopped, its machine suspended or too busy; \
+             orders from before are refused as `expired`, and for {over:.1} s only new connections start motors"
+        );
+        self.publish(Event::new(EventKind::Paused, time, text));
     }
 
     /// Publishes a refused command: the first of a kind at once, then one event a second per client, covering all of

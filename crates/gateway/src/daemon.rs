@@ -29,6 +29,7 @@ use crate::event::{Event, EventKind, Events};
 use crate::files::Keeper;
 use crate::history::RecorderTask;
 use crate::north::local::Control;
+use crate::north::reading::Watch;
 use crate::north::{NorthState, ServerError, bacnet, http, local, modbus_tcp, mqtt, slot};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
@@ -87,6 +88,8 @@ pub struct Daemon {
     starts: Option<Keeper>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
+    /// Watches the threads that serve, and tells of their pauses.
+    watcher: tokio::task::JoinHandle<()>,
     stopper: tokio::task::JoinHandle<()>,
     driller: tokio::task::JoinHandle<()>,
     drills: drills::DrillsFile,
@@ -129,6 +132,7 @@ impl Daemon {
             settings: settings.clone(),
             buses: Vec::new(),
             parted: Parted::default(),
+            watcher: tokio::spawn(Watch::of_this_thread().run(events.clone())),
             events,
             writes,
             north: north.clone(),
@@ -404,6 +408,7 @@ impl Daemon {
         })
         .await;
         self.reporter.abort();
+        self.watcher.abort();
         self.stopper.abort();
         self.reserver.abort();
         if let Some(reader) = &self.reader {

@@ -16,6 +16,14 @@ const REAL_TIME: u8 = 10;
 /// The same on the scale of `nice`, where real time is not allowed.
 const NICE: i32 = -10;
 
+/// Time since the machine was started, also that for which it was suspended: then the clock of [`Instant`] stands.
+pub fn since_boot() -> Duration {
+    let time = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
+    // Never negative.
+    let (seconds, nanoseconds) = (u64::try_from(time.tv_sec), u32::try_from(time.tv_nsec));
+    Duration::new(seconds.unwrap_or_default(), nanoseconds.unwrap_or_default())
+}
+
 /// Asks the kernel to wake this thread at the time it named: by default it may be 50 microseconds late, to save power.
 /// And to let it go before all ordinary ones that want the processor, since a thread of a line needs little time, but
 /// needs it at once: in real time, which the kernel allows to root, with CAP_SYS_NICE and within RLIMIT_RTPRIO; else by

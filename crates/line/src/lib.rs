@@ -21,7 +21,7 @@ use drivegate_proto as codec;
 
 pub use arrival::Arrival;
 use clock::WakeUps;
-pub use clock::{poll_until, sharpen_timers, wait_until};
+pub use clock::{poll_until, sharpen_timers, since_boot, wait_until};
 pub use names::Names;
 pub use options::{Level, LineOptions, MOST_RTS_DELAY, Rs485, Spin};
 pub use pty::Pty;

@@ -18,6 +18,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::{NorthState, ServerError, ServerKind};
+use crate::reading::Dated;
 
 use self::accept::{AcceptLoop, ListeningSocket, stop_listening};
 pub(crate) use self::state::ListenerState;
@@ -34,7 +35,7 @@ pub(crate) trait ConnectionHandler: Send + Sync + 'static {
     /// Serves a connection until it ends.
     fn serve(
         self: Arc<Self>,
-        stream: TcpStream,
+        stream: Dated<TcpStream>,
         peer: SocketAddr,
         permit: Self::Permit,
     ) -> impl Future<Output = ()> + Send;

@@ -207,7 +207,7 @@ fn runtime() -> Result<tokio::runtime::Runtime, String> {
 
 /// Runs `command` on a runtime of its own.
 fn block_on(command: impl Future<Output = Outcome>) -> Outcome {
-    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build();
+    let runtime = north::reading::watched_runtime();
     runtime.map_err(cannot_start)?.block_on(command)
 }
 

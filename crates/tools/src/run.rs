@@ -20,6 +20,7 @@ use super::{EXIT_CONFIG, VERSION, report};
 use crate::config::{Loaded, Settings};
 use crate::daemon::Daemon;
 use crate::north::local::Control;
+use crate::north::reading::watched_runtime;
 
 /// Runs the gateway until SIGTERM or Ctrl-C; SIGHUP reloads the configuration
 #[derive(Debug, clap::Args)]
@@ -53,7 +54,7 @@ fn run_from(path: &Path) -> io::Result<ExitCode> {
         .warnings
         .iter()
         .for_each(|problem| tracing::warn!(target: "drivegate::cli::run", "{problem}"));
-    let runtime = Builder::new_multi_thread().enable_all().build()?;
+    let runtime = watched_runtime()?;
     let mut signals = Signals::within(&runtime)?;
     // What these ones came too late for.
     while let Some(signal) = early.next().now_or_never() {

@@ -42,6 +42,8 @@ pub struct Job {
     pub priority: Option<u8>,
     /// When its request came.
     pub asked: Instant,
+    /// When its turn came: with the request, or when the write before it in that was answered.
+    pub since: Instant,
 }
 
 #[derive(Debug)]
@@ -267,6 +269,7 @@ impl Server {
                         value,
                         priority,
                         asked,
+                        since: now,
                     });
                     return;
                 }

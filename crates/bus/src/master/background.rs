@@ -302,6 +302,7 @@ impl Master {
             self.schedule.seen(index, now);
         }
         let frame = std::mem::take(&mut end.frame);
+        let at = end.at;
         let outcome = match self.is_broadcast_of(&begun) && end.ended == Ended::Silent {
             true => Outcome::Acknowledged(Reply::Written),
             false => self.background_outcome(turn, end, now),
@@ -312,14 +313,20 @@ impl Master {
             self.note_background_write(turn, &outcome, now);
         }
         if let Outcome::Acknowledged(reply) = &outcome {
-            self.note_background_read(turn, reply, now, news);
+            self.note_background_read(turn, reply, (at, now), news);
         }
         begun.answer(outcome, frame, now);
     }
 
     /// Stores read values in the process image, too. A drive that was identified, or polled for changes, may have
     /// restarted or reported changes to the tool: it is read again.
-    fn note_background_read(&mut self, turn: &Turn, reply: &Reply, now: Instant, news: &mut Vec<News>) {
+    fn note_background_read(
+        &mut self,
+        turn: &Turn,
+        reply: &Reply,
+        (at, now): (Instant, Instant),
+        news: &mut Vec<News>,
+    ) {
         match (&turn.pdu, reply) {
             (RequestPdu::Read { table, start, count }, reply) => {
                 let read = PlannedRead {
@@ -330,7 +337,7 @@ impl Master {
                     wide: 0,
                 };
                 if let Some(words) = reply.words() {
-                    self.learn(turn.drive, read, words, now, news);
+                    self.learn(turn.drive, read, words, at, news);
                 }
             }
             (_, Reply::Identified(_)) => {

@@ -177,7 +177,7 @@ impl Master {
             Before::Command(slot, rank) => {
                 self.schedule.command_done(*rank, end.took);
                 if failed {
-                    self.step_failed(drive, *slot, &unheard(step), &end.ended, end.took, now);
+                    self.step_failed(drive, *slot, &unheard(step), &end.ended, (end.took, end.stood), now);
                 }
             }
         }
@@ -210,9 +210,11 @@ impl Master {
                 Polled::Ok
             }
             Ended::Reply(reply) => {
-                self.read(poll.drive, poll.read, reply, end.began, now, news);
+                self.read(poll.drive, poll.read, reply, (end.began, end.at), now, news);
                 Polled::Ok
             }
+            // Its reply may have been lost by that: it does not count as away before it is asked again.
+            Ended::Silent if end.stood => Polled::Garbled,
             Ended::Silent => Polled::Failed,
             Ended::Corrupt(_) => Polled::Garbled,
         };
@@ -260,13 +262,13 @@ impl Master {
         news.push(News::Offline(index));
     }
 
-    /// The drive answered a read that was sent at `sent`.
+    /// The drive answered a read that was sent at `sent`, at the latest at `came`.
     fn read(
         &mut self,
         index: DriveIndex,
         read: PlannedRead,
         reply: Reply,
-        sent: Instant,
+        (sent, came): (Instant, Instant),
         now: Instant,
         news: &mut Vec<News>,
     ) {
@@ -275,8 +277,8 @@ impl Master {
             return;
         };
         let address = self.bus.image.drives.get(index).map(|image| image.spec.address);
-        let asked = address.and_then(|address| self.waits.n2_late.asked_by(address, &pdu, now));
-        let at = asked.unwrap_or_else(|| drive.late.asked_by(&pdu, now));
+        let asked = address.and_then(|address| self.waits.n2_late.asked_by(address, &pdu, came));
+        let at = asked.unwrap_or_else(|| drive.late.asked_by(&pdu, came));
         drive.late.answered(&pdu, sent, now);
         if let Some(words) = reply.into_words() {
             self.learn(index, read, words, at, news);
@@ -338,7 +340,8 @@ impl Master {
         let reply = match end.ended {
             // The drive ignored it: it is sent again once the drive is identified.
             Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => {
-                self.step_failed(index, slot, &unheard(Session::Identify), &Ended::Silent, end.took, now);
+                let how = (end.took, end.stood);
+                self.step_failed(index, slot, &unheard(Session::Identify), &Ended::Silent, how, now);
                 return;
             }
             Ended::Reply(reply) if !leaves_open(&reply, step) => reply,
@@ -346,7 +349,7 @@ impl Master {
                 if matches!(&ended, Ended::Reply(reply) if !says_no_answer(reply)) {
                     self.schedule.seen(index, now);
                 }
-                self.step_failed(index, slot, step, &ended, end.took, now);
+                self.step_failed(index, slot, step, &ended, (end.took, end.stood), now);
                 self.read_back(index, step, now);
                 return;
             }
@@ -385,7 +388,7 @@ impl Master {
         slot: Urgency,
         step: &Step,
         ended: &Ended,
-        took: Duration,
+        (took, stood): (Duration, bool),
         now: Instant,
     ) {
         let online = self.schedule.is_online(index);
@@ -413,7 +416,8 @@ impl Master {
         let retries = match *ended {
             // The request may never have reached the drive, which is no sign of it.
             Ended::Corrupt(CONNECTION_CLOSED) => self.retries.max(1),
-            _ if online => self.retries,
+            // As is the reply that was lost while the thread stood still.
+            _ if online => self.retries.max(u32::from(stood)),
             _ => 0,
         };
         let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));

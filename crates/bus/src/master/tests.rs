@@ -194,6 +194,8 @@ impl Rig {
                 let end = TurnEnd {
                     ended,
                     began,
+                    at: self.now,
+                    stood: false,
                     took,
                     mangled,
                     frame: Vec::new(),
@@ -459,6 +461,8 @@ fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
         let end = TurnEnd {
             ended,
             began: rig.now,
+            at: rig.now + COST,
+            stood: false,
             took: COST,
             mangled: false,
             frame: Vec::new(),

@@ -1,44 +1,78 @@
 //! When an order came, and over which connection. Pure.
 
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// A connection of a client, unique in the life of the process.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct ConnectionId(u64);
+use super::Stall;
 
-impl ConnectionId {
-    /// A connection that no other order came over.
-    pub fn next() -> ConnectionId {
-        static LAST: AtomicU64 = AtomicU64::new(0);
-        ConnectionId(LAST.fetch_add(1, Ordering::Relaxed))
+/// A way in: a TCP connection, a UDP socket, a pseudo-terminal, a connection to a broker. Clones are the same one.
+#[derive(Debug, Clone)]
+pub struct Connection(Arc<Way>);
+
+#[derive(Debug)]
+struct Way {
+    opened: Instant,
+    gone: AtomicBool,
+}
+
+impl Connection {
+    /// One that was opened then.
+    pub fn opened(at: Instant) -> Connection {
+        Connection(Arc::new(Way {
+            opened: at,
+            gone: AtomicBool::new(false),
+        }))
+    }
+
+    /// When it was opened.
+    pub fn opened_at(&self) -> Instant {
+        self.0.opened
+    }
+
+    /// Its client has closed or reset it.
+    pub fn hang_up(&self) {
+        self.0.gone.store(true, Ordering::Release);
+    }
+
+    /// Whether its client has closed or reset it.
+    pub fn is_gone(&self) -> bool {
+        self.0.gone.load(Ordering::Acquire)
     }
 }
 
-/// When an order came, and over which connection.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+impl PartialEq for Connection {
+    fn eq(&self, other: &Connection) -> bool {
+        Arc::ptr_eq(&self.0, &other.0)
+    }
+}
+
+/// How an order came.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Arrival {
-    /// The date of its first byte: no later than the moment at which it came.
+    /// The date of its first byte: no later than that really came.
     pub asked: Instant,
-    /// Over which connection.
-    pub connection: ConnectionId,
-    /// When that connection was opened.
-    pub connected: Instant,
+    /// Over which connection it came. In what order several connections were written to is not known.
+    pub connection: Connection,
+    /// The stall of the reading thread during which its first byte may have come.
+    pub stall: Option<Stall>,
+    /// The last pause of the reading thread, as long as orders of before may still come over connections of before.
+    pub pause: Option<Stall>,
 }
 
 impl Arrival {
-    /// An order of the gateway itself, or one whose first byte came just now over a connection of its own.
+    /// An order that came at `now` over a connection of its own: one of the gateway itself.
     pub fn now(now: Instant) -> Arrival {
-        Arrival {
-            asked: now,
-            connection: ConnectionId::next(),
-            connected: now,
-        }
+        Arrival::over(Connection::opened(now), now)
     }
 
-    /// The same order, whose first byte came at `asked`.
-    #[must_use]
-    pub fn asked(self, asked: Instant) -> Arrival {
-        Arrival { asked, ..self }
+    /// An order that came at `asked` over that connection, while its reader ran.
+    pub fn over(connection: Connection, asked: Instant) -> Arrival {
+        Arrival {
+            asked,
+            connection,
+            stall: None,
+            pause: None,
+        }
     }
 }

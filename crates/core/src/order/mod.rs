@@ -14,17 +14,20 @@ mod conversion;
 mod effect;
 mod frequency_range;
 mod guarded;
+mod last_stops;
 mod origin;
 mod outcome;
 mod parameter;
 mod parts;
 mod passed_on;
+mod pauses;
 mod raw;
 mod slot_write;
+mod stalls;
 mod ticket;
 mod touched;
 
-pub use arrival::{Arrival, ConnectionId};
+pub use arrival::{Arrival, Connection};
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
 pub use audit::{SENT, milliseconds, milliseconds_or_null};
 pub(crate) use conversion::{Becomes, as_held, becomes};
@@ -32,13 +35,16 @@ pub use effect::{Asks, Effect, Effects};
 pub(crate) use frequency_range::rests_on;
 pub use frequency_range::{FrequencyRange, is_range_end};
 pub use guarded::{Guarded, Reason};
+pub use last_stops::LastStops;
 pub use origin::{Acting, Authority, Origin, Proof, SourceKind};
 pub use outcome::{Answer, Holder, Interruption, Outcome, Refusal};
 pub use parameter::ParameterOrder;
 pub use parts::{Parts, StopEnd, joined, stop_of};
 pub use passed_on::{BackgroundRequest, NO_DRIVE, Pace, PassedOn};
+pub use pauses::{Heartbeat, Pauses};
 pub use raw::written;
 pub use slot_write::{Commanded, Entry, SlotWrite};
+pub use stalls::{Dated, READ_WITHIN, Stall, Stalls, Stood, TICK, UNNOTICED};
 pub use ticket::{Receipt, Ticket, WriteStats};
 pub use touched::Touched;
 
@@ -152,7 +158,7 @@ pub enum Work {
 }
 
 /// When a command came, and until when it may be sent.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Window {
     /// When its first byte came.
     pub arrival: Arrival,

@@ -15,7 +15,7 @@ use super::holder::{Claim, Holding, Rules};
 use super::judge::{self, Ask, Facts, Stage, Verdict};
 use super::priorities::Priorities;
 use crate::drive::DriveIndex;
-use crate::order::{Arrival, Command, Intent, Origin, Outcome, Refusal, Urgency};
+use crate::order::{Command, Intent, LastStops, Origin, Outcome, Refusal, Stall, Urgency};
 use crate::start_guard::{BusGuards, Clearance};
 
 /// A drill under way at a drive: no other order to it runs.
@@ -27,22 +27,15 @@ pub struct DrillLock {
     pub quiet_until: Option<Instant>,
 }
 
-/// The last stop that a drive was given.
-#[derive(Debug, Clone)]
-pub(super) struct LastStop {
-    /// When it was accepted.
-    pub(super) at: Instant,
-    /// When it came, and over which connection.
-    pub(super) arrival: Arrival,
-    by: Origin,
-}
-
 /// What is known of one drive.
 #[derive(Debug, Default)]
 pub(super) struct DriveGate {
     /// Stops accepted so far.
     stops: u64,
-    pub(super) last_stop: Option<LastStop>,
+    /// The last ones, as far as they decide on orders that were given before.
+    pub(super) last_stops: LastStops,
+    /// Who gave the last one.
+    stopped_by: Option<Origin>,
     /// The login of the last client command; none if there was none, or its client has no login.
     commander: Option<Arc<str>>,
     pub(super) priorities: Priorities,
@@ -58,6 +51,8 @@ pub struct Gate {
     /// `[authority]`, where it is on.
     pub(super) rules: Option<Arc<Rules>>,
     drives: BTreeMap<DriveIndex, DriveGate>,
+    /// The last pause of the bus.
+    pub(super) paused: Option<Stall>,
     /// The start guards.
     pub(super) starts: Option<Arc<BusGuards>>,
     /// Commands whose start was cleared and that are not over, with the drives that they start.
@@ -69,7 +64,8 @@ pub struct Gate {
 #[derive(Debug)]
 pub(crate) struct Inheritance {
     stops: u64,
-    last_stop: Option<LastStop>,
+    last_stops: LastStops,
+    stopped_by: Option<Origin>,
     commander: Option<Arc<str>>,
     priorities: Priorities,
     holding: Holding,
@@ -174,6 +170,10 @@ impl Gate {
         if command.urgency() == Urgency::Read {
             return;
         }
+        // Before the hold takes note of its word, which may repeat the last one.
+        if !command.is_inherited() {
+            self.note_stops(command, now);
+        }
         self.hold_accepted(command, now);
         let origin = command.ticket.origin();
         for (drive, effect) in command.intent.effects.iter() {
@@ -188,28 +188,34 @@ impl Gate {
         }
     }
 
-    /// A stop was accepted.
-    pub(crate) fn stop_accepted(&mut self, drive: DriveIndex, arrival: Arrival, by: Origin, now: Instant) {
-        let of_drive = self.drive(drive);
-        of_drive.stops += 1;
-        let at = of_drive.last_stop.as_ref().map_or(now, |last| now.max(last.at));
-        of_drive.last_stop = Some(LastStop { at, arrival, by });
+    /// Keeps which drives a command stops, for the orders that were given before.
+    fn note_stops(&mut self, command: &Command, now: Instant) {
+        let (origin, connection) = (command.ticket.origin(), &command.intent.window.arrival.connection);
+        for (drive, _) in command.intent.effects.iter().filter(|(_, effect)| effect.stops) {
+            if command.is_stop() {
+                let of_drive = self.drive(drive);
+                (of_drive.stops, of_drive.stopped_by) = (of_drive.stops + 1, Some(origin.clone()));
+            }
+            if !self.repeats_its_word(drive, origin) {
+                self.drive(drive).last_stops.note(connection, now);
+            }
+        }
     }
 
-    /// Whether a stop of that drive was accepted after a command's first byte came.
-    pub(crate) fn is_behind_a_stop(&self, intent: &Intent) -> bool {
-        let stopped = |(drive, effect): (DriveIndex, crate::order::Effect)| {
-            let last = self.drives.get(&drive).and_then(|drive| drive.last_stop.as_ref());
-            !effect.stops && last.is_some_and(|last| last.is_after(&intent.window.arrival))
-        };
-        intent.effects.iter().any(stopped)
+    /// The last pause of the bus.
+    pub(crate) fn paused(&self) -> Option<Stall> {
+        self.paused
+    }
+
+    /// The bus stood still.
+    pub fn note_pause(&mut self, pause: Stall) {
+        self.paused = Some(pause);
     }
 
     /// Whether a stop waits until its motor has run for `min_run`.
     pub(crate) fn may_be_delayed(&self, stop: &Command) -> bool {
         let (drive, origin) = (stop.intent.drive, stop.ticket.origin());
-        let last = self.drives.get(&drive).and_then(|drive| drive.last_stop.as_ref());
-        let last = last.map(|last| last.at);
+        let last = self.drives.get(&drive).and_then(|drive| drive.last_stops.at());
         let starts = self.starts.as_ref().filter(|_| origin.kind.stops_may_be_delayed());
         starts.is_some_and(|starts| starts.is_ordinary_stop(drive, origin.client(), last))
     }
@@ -226,7 +232,7 @@ impl Gate {
 
     /// Who gave the last stop of that drive that was accepted.
     pub(crate) fn last_stop_by(&self, drive: DriveIndex) -> Option<&Origin> {
-        Some(&self.drives.get(&drive)?.last_stop.as_ref()?.by)
+        self.drives.get(&drive)?.stopped_by.as_ref()
     }
 
     /// The login that commanded a drive last, unless another client did since.
@@ -267,7 +273,8 @@ impl Gate {
         let of_drive = self.drive(drive);
         Inheritance {
             stops: of_drive.stops,
-            last_stop: of_drive.last_stop.clone(),
+            last_stops: of_drive.last_stops.clone(),
+            stopped_by: of_drive.stopped_by.clone(),
             commander: of_drive.commander.clone(),
             priorities: of_drive.priorities.clone(),
             holding: of_drive.holding.clone(),
@@ -278,7 +285,8 @@ impl Gate {
     pub(crate) fn inherit(&mut self, drive: DriveIndex, from: Inheritance) {
         let Inheritance {
             stops,
-            last_stop,
+            last_stops,
+            stopped_by,
             commander,
             priorities,
             mut holding,
@@ -286,7 +294,8 @@ impl Gate {
         // The next reading says it again.
         holding.set_local(false, &mut Vec::new());
         let of_drive = self.drive(drive);
-        (of_drive.stops, of_drive.last_stop, of_drive.commander) = (stops, last_stop, commander);
+        (of_drive.stops, of_drive.last_stops, of_drive.stopped_by) = (stops, last_stops, stopped_by);
+        of_drive.commander = commander;
         (of_drive.priorities, of_drive.holding) = (priorities, holding);
     }
 
@@ -297,13 +306,5 @@ impl Gate {
 
     fn claim(&self, origin: &Origin) -> Option<Claim> {
         self.rules.as_ref()?.claim_of(origin)
-    }
-}
-
-impl LastStop {
-    /// Whether the stop was accepted after the first byte of another order came. Over one connection the orders have their
-    /// own order: what follows a stop there is newer than it.
-    pub(super) fn is_after(&self, order: &Arrival) -> bool {
-        order.asked < self.at && order.connection != self.arrival.connection
     }
 }

@@ -36,7 +36,7 @@ pub struct Question {
     pub pdu: RequestPdu,
     /// Whether it may change anything: then it is counted and audited as a command.
     pub may_write: bool,
-    /// When it came, and over which connection.
+    /// How it came.
     pub arrival: Arrival,
     /// Not sent after this.
     pub expires: Instant,
@@ -45,14 +45,14 @@ pub struct Question {
 }
 
 impl Question {
-    /// A broadcast by the gateway itself or a client; it gets no reply.
-    pub fn broadcast(pdu: RequestPdu, origin: Origin, asked: Instant, within: Duration) -> Question {
+    /// A broadcast by the gateway itself at `now`, for itself or a client; it gets no reply.
+    pub fn broadcast(pdu: RequestPdu, origin: Origin, now: Instant, within: Duration) -> Question {
         Question {
             target: Target::Address(0),
             pdu,
             may_write: true,
-            arrival: Arrival::now(asked),
-            expires: asked + within,
+            arrival: Arrival::now(now),
+            expires: now + within,
             origin,
         }
     }

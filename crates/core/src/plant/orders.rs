@@ -34,7 +34,7 @@ pub struct OrderRequest {
 }
 
 impl OrderRequest {
-    /// The order of that client, with what the client may do at all. It is not sent later than 2 s from now.
+    /// The order of that client, with what the client may do at all. It is not sent later than 2 s after it came.
     pub fn new(order: Order, origin: Origin, authority: Authority) -> OrderRequest {
         OrderRequest {
             order,
@@ -49,7 +49,7 @@ impl OrderRequest {
         }
     }
 
-    /// It is not sent later than that from now.
+    /// It is not sent later than that after it came.
     #[must_use]
     pub fn within(self, expiry: Duration) -> OrderRequest {
         OrderRequest { expiry, ..self }
@@ -319,7 +319,7 @@ impl DriveHandle {
         let placed = placed.with_rest(rest_answer, rest_ticket.confirmation());
         let part = |ticket: Ticket| Part {
             ticket,
-            window,
+            window: window.clone(),
             slot: None,
             at_once: request.at_once,
         };
@@ -497,9 +497,10 @@ impl DriveHandle {
 
 impl OrderRequest {
     fn window(&self, now: Instant) -> Window {
+        let arrival = self.arrival.clone().unwrap_or_else(|| Arrival::now(now));
         Window {
-            arrival: self.arrival.unwrap_or_else(|| Arrival::now(now)),
-            expires: now + self.expiry,
+            expires: arrival.asked + self.expiry,
+            arrival,
             waits: self.waits,
         }
     }

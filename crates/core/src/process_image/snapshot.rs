@@ -189,6 +189,15 @@ impl Snapshot {
         fast
     }
 
+    /// The machine was suspended for that time, in which its clock stood: all is older by it.
+    pub fn slept(&mut self, time: Duration) {
+        let earlier = |at: &mut Option<Instant>| *at = at.map(|at| at.checked_sub(time).unwrap_or(at));
+        earlier(&mut self.fast_at);
+        for cell in self.spans.iter_mut().flat_map(|span| &mut Arc::make_mut(span).cells) {
+            earlier(&mut cell.at);
+        }
+    }
+
     /// The drive refused these addresses.
     pub fn refuse(&mut self, table: Table, start: u16, count: u16, exception: Exception) {
         self.each(table, start, usize::from(count), |cell, _| {

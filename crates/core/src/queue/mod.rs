@@ -1,6 +1,7 @@
 //! The command queue of a bus: bounded, ordered, with replacing, purging and expiry. Whether a command may go is asked of the
 //! gate ([`crate::permit`]), which is part of the queue.
 
+mod age;
 mod background;
 mod handover;
 mod passed_on;
@@ -50,6 +51,8 @@ pub struct Pending {
     stopping: Option<Stopping>,
     /// Commands that were refused at their turn, to be reported.
     denied: VecDeque<Denied>,
+    /// Drives whose leases are renewed by orders that a pause kept from them, each once.
+    renewed: Vec<DriveIndex>,
 }
 
 /// The command that has its turn.
@@ -124,14 +127,14 @@ impl Pending {
         }
         self.delay(&mut command);
         if let Verdict::Refuse(outcome) = self.gate.judge(Stage::Accept, &command, facts, now) {
-            command.answer(&outcome, now);
+            self.end_unwanted(command, &outcome, now);
             return match outcome {
                 Outcome::Refused(refusal) => Some(refusal),
                 _ => None,
             };
         }
         match is_stop {
-            true => self.take_stop(command, now),
+            true => self.push_stop(command, now),
             false => self.take_other(command, now),
         }
         None
@@ -338,7 +341,7 @@ impl Pending {
                 refusal: refusal.clone(),
             });
         }
-        command.answer(outcome, now);
+        self.end_unwanted(command, outcome, now);
     }
 
     /// Takes the command that was chosen, unless it was removed since.
@@ -389,13 +392,6 @@ impl Pending {
             .iter()
             .filter(|c| c.reaches(drive) && c.urgency() != Urgency::Read);
         commands.filter_map(Command::client_waits_until).max()
-    }
-
-    /// Ends expired commands. An accepted stop is sent, however long it waits.
-    fn expire(&mut self, now: Instant) {
-        self.remove(now, &Outcome::Expired, |c| {
-            c.intent.window.expires <= now && !c.is_stop()
-        });
     }
 
     /// Ends and removes the commands that `which` selects.

@@ -75,15 +75,8 @@ impl CommandQueue {
         now: Instant,
     ) -> [Option<Refusal>; 2] {
         let mut pending = self.lock();
-        let is_behind = pending.gate.is_behind_a_stop(&rest.intent);
         let of_stop = pending.push(stop, facts, now);
-        let of_rest = match is_behind {
-            true => {
-                rest.answer(&Outcome::Purged, now);
-                None
-            }
-            false => pending.push(rest, facts, now),
-        };
+        let of_rest = pending.push(rest, facts, now);
         drop(pending);
         self.wake();
         [of_stop, of_rest]

@@ -74,14 +74,6 @@ impl Pending {
             .then(|| self.gate.stop_waits(drive, now))?
     }
 
-    /// Takes a stop in.
-    pub(super) fn take_stop(&mut self, stop: Command, now: Instant) {
-        let (drive, arrival) = (stop.intent.drive, stop.intent.window.arrival);
-        self.gate
-            .stop_accepted(drive, arrival, stop.ticket.origin().clone(), now);
-        self.push_stop(stop, now);
-    }
-
     /// Of each drive one stop waits that does nothing else, and one that does. Later ones join theirs if they ask for
     /// the same, and are answered with it; of two that also do different things, the newer one is sent.
     pub(super) fn push_stop(&mut self, stop: Command, now: Instant) {

@@ -9,6 +9,7 @@ use crate::drive::{DriveIndex, PointIndex, Value};
 use crate::order::{Admitted, Answer, Arrival, SourceKind, Ticket, Touched, Window, WriteStats};
 use crate::testkit::{next_command, nx, ticket};
 
+mod age;
 mod order;
 mod slots;
 mod stops;

@@ -32,10 +32,28 @@ impl Interlock {
 
     /// Returns it if a running motor is to be stopped. A drive whose bus was started anew counts as it counted before until it was
     /// read.
-    pub(super) fn trips(&self, around: &Around, now: Instant) -> Option<Unmet> {
+    /// After `stood`, until when the bus last stood still, a value that met it and is only too old waits for a first reading.
+    pub(super) fn trips(&self, around: &Around, stood: Option<Instant>, now: Instant) -> Option<Unmet> {
         self.of(around, |watched, index| {
-            self.differed(watched, index, around, (now, now))
+            let is_only_old = stood.is_some_and(|until| self.met_before(watched, index, around, (until, now)));
+            match is_only_old {
+                true => None,
+                false => self.differed(watched, index, around, (now, now)),
+            }
         })
+    }
+
+    /// Whether the last value was read before `until`, met the interlock, and is only too old now.
+    fn met_before(
+        &self,
+        watched: &Watched,
+        index: PointIndex,
+        around: &Around,
+        (until, now): (Instant, Instant),
+    ) -> bool {
+        let sample = watched.image.reading(now, around.stale_after).sample(index);
+        let met = sample.value.is_some_and(|value| value.as_bool() == self.is);
+        met && sample.quality == Quality::Stale && sample.at.is_some_and(|at| at <= until)
     }
 
     fn of(&self, around: &Around, differs: impl Fn(&Watched, PointIndex) -> Option<String>) -> Option<Unmet> {

@@ -361,7 +361,7 @@ fn only_a_good_point_holds_an_interlock() {
     assert!(rig.may_write(0, 1, 4.9));
     assert!(!rig.may_write(0, 1, 5.5));
     assert_eq!(
-        rig.guards.tripped(DriveIndex::new(0), rig.at(5.5)),
+        rig.guards.tripped(DriveIndex::new(0), None, rig.at(5.5)),
         [],
         "it stops no motor"
     );

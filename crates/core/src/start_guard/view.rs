@@ -177,14 +177,14 @@ impl BusGuards {
         })
     }
 
-    /// The interlocks that do not hold and stop the running motor of that drive.
-    pub fn tripped(&self, drive: DriveIndex, now: Instant) -> Vec<Unmet> {
+    /// The interlocks that do not hold and stop the running motor of that drive; `stood`: until when its bus last stood still.
+    pub fn tripped(&self, drive: DriveIndex, stood: Option<Instant>, now: Instant) -> Vec<Unmet> {
         let Some(of) = self.of_drive(drive) else {
             return Vec::new();
         };
         let around = self.shared.around();
         let trips = of.interlocks.iter().filter(|interlock| interlock.trip);
-        trips.filter_map(|interlock| interlock.trips(&around, now)).collect()
+        trips.filter_map(|interlock| interlock.trips(&around, stood, now)).collect()
     }
 
     /// Whether an interlock of that drive stops its motor.

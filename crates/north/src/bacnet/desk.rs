@@ -1,7 +1,7 @@
 //! Connects the protocol with the drives: waiting writes, slots that await a reading, leases, drives that come back. No
 //! sockets, no clock: `task` and `offline` provide both.
 
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
 use std::net::SocketAddrV4;
 use std::sync::Arc;
 use std::time::Instant;
@@ -12,9 +12,12 @@ use super::Options;
 use super::view::View;
 use super::writes::{self, Begun, Waiting};
 use crate::command::{Outcome, Settled};
+use crate::order::{Arrival, Connection};
 use crate::plant::{Plant, SharedPlant};
 use crate::process_image::{LeaseAction, Machine};
 
+/// Most batches of datagrams whose dates are kept until their writes are taken up.
+const MOST_KEPT: usize = 64;
 /// The name of the vendor without an identifier of one's own.
 const VENDOR: &str = "drivegate";
 
@@ -53,6 +56,10 @@ pub(super) struct Desk {
     leases: HashMap<u32, u64>,
     /// Devices with a slot that awaits the next reading.
     uncertain: BTreeSet<u32>,
+    /// When datagrams were taken up that came otherwise than just then, and how they came.
+    arrivals: VecDeque<(Instant, Arrival)>,
+    /// Over which the datagrams of [`Desk::receive`] come.
+    connection: Connection,
 }
 
 fn server_of((address, prefix): At, view: &View, now: Instant) -> Server {
@@ -77,6 +84,8 @@ impl Desk {
             present: HashSet::new(),
             leases: HashMap::new(),
             uncertain: BTreeSet::new(),
+            arrivals: VecDeque::new(),
+            connection: Connection::opened(now),
         }
     }
 
@@ -113,6 +122,22 @@ impl Desk {
         self.server.receive(from, datagram, &self.view, now);
     }
 
+    /// The datagrams that are taken up at `now` came so.
+    pub(super) fn came(&mut self, arrival: Arrival, now: Instant) {
+        if self.arrivals.len() >= MOST_KEPT {
+            self.arrivals.pop_front();
+        }
+        self.arrivals.push_back((now, arrival));
+    }
+
+    fn arrival(&self, taken_up: Instant) -> Arrival {
+        let known = self.arrivals.iter().rev().find(|(at, _)| *at == taken_up);
+        known.map_or_else(
+            || Arrival::over(self.connection.clone(), taken_up),
+            |(_, arrival)| arrival.clone(),
+        )
+    }
+
     /// Values of that device may have changed.
     pub(super) fn changed(&mut self, device: u32, now: Instant) {
         self.view.look(now);
@@ -123,7 +148,8 @@ impl Desk {
     pub(super) fn next_order(&mut self, now: Instant) -> Option<(u64, Waiting)> {
         self.view.look(now);
         while let Some(job) = self.server.take_job() {
-            match writes::begin(&self.view, &job, now) {
+            let arrival = self.arrival(job.asked);
+            match writes::begin(&self.view, &job, arrival, now) {
                 Begun::Answered(result) => self.server.written(job.token, result, &self.view, now),
                 Begun::Waits(waiting) => return Some((job.token, *waiting)),
             }

@@ -27,6 +27,7 @@ use crate::drive::ModelPoint;
 use crate::event::{Event, EventKind};
 use crate::plant::SharedPlant;
 use crate::process_image::Snapshot;
+use crate::reading::{Reader, is_readable};
 use crate::stats::BacnetFigures;
 
 /// How often time is looked at.
@@ -54,6 +55,8 @@ type Ending = Pin<Box<dyn Future<Output = Ended> + Send>>;
 pub(super) struct Task {
     options: Arc<Options>,
     sockets: Sockets,
+    /// Of the sockets: for this host, and for all.
+    readers: [Reader; 2],
     stats: Arc<NorthState>,
     busy: Arc<AtomicBool>,
     desk: Desk,
@@ -84,6 +87,7 @@ impl Task {
         Task {
             options,
             sockets,
+            readers: [Reader::here(), Reader::here()],
             stats,
             busy,
             desk,
@@ -149,14 +153,20 @@ impl Task {
     /// Processes received datagrams.
     fn take(&mut self, buffer: &mut [u8], broadcast: bool) {
         let now = Instant::now();
-        for _ in 0..BATCH {
-            let socket = match (broadcast, &self.sockets.broadcast) {
-                (true, Some(socket)) => socket,
-                _ => &self.sockets.unicast,
+        let [unicast, of_all] = &self.readers;
+        for place in 0..BATCH {
+            let (socket, reader) = match (broadcast, &self.sockets.broadcast) {
+                (true, Some(socket)) => (socket, of_all),
+                _ => (&self.sockets.unicast, unicast),
             };
             let Ok((length, SocketAddr::V4(from))) = socket.try_recv_from(buffer) else {
+                reader.nothing(Instant::now(), || is_readable(socket));
                 return;
             };
+            if place == 0 {
+                reader.came(now, false, || false);
+                self.desk.came(reader.last(), now);
+            }
             if let Some(datagram) = buffer.get(..length) {
                 self.desk.receive(from, datagram, now);
             }
@@ -323,6 +333,7 @@ impl Task {
                 self.options = Arc::from(options);
                 if let Some(sockets) = sockets {
                     self.sockets = sockets;
+                    self.readers = [Reader::here(), Reader::here()];
                 }
                 self.see();
                 let now = Instant::now();

@@ -10,6 +10,7 @@ use super::*;
 use crate::codec::{Reply, Table};
 use crate::command::{Authority, Commanded, Follows, Order, Origin, Outcome, Refusal, Settled, SlotWrite, SourceKind};
 use crate::drive::{ModelPoint, PointIndex, Value};
+use crate::order::Arrival;
 use crate::plant::{DriveHandle, OrderRequest, Plant};
 use crate::process_image::{DriveSpec, Link};
 
@@ -98,8 +99,9 @@ impl ControlledDrive {
             value,
             priority: Some(priority),
             asked: self.now,
+            since: self.now,
         };
-        writes::begin(&self.view, &job, self.now)
+        writes::begin(&self.view, &job, Arrival::now(self.now), self.now)
     }
 
     /// What is refused, or done, at once.

@@ -1,16 +1,17 @@
 //! Turns a client's write into a command, or a waiting slot (`docs/bacnet.md`, Commands).
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use drivegate_bacnet::{Address, Datum, Error, Job};
 
 use super::objects::Meaning;
 use super::view::View;
 use crate::command::{
-    self, Arrival, Authority, Commanded, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite, SourceKind,
+    self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite, SourceKind,
 };
 use crate::drive::{PointIndex, Value};
+use crate::order::Arrival;
 use crate::plant::{DriveHandle, OrderRequest, Placed};
 use crate::process_image::Machine;
 
@@ -46,20 +47,20 @@ pub(super) fn origin(from: &Address, priority: Option<u8>) -> Origin {
     Origin::of(Arc::from(client), SourceKind::Bacnet, from.to_string()).proven(proof)
 }
 
-/// Takes up a write.
-pub(super) fn begin(view: &View, job: &Job, now: Instant) -> Begun {
+/// Takes up a write whose request came so.
+pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> Begun {
     let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
         return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
     };
     let origin = origin(&job.from, job.priority);
-    let arrival = Arrival::now(now).asked(job.asked);
+    let expiry = expiry(job);
     match (meaning, &job.value) {
         (Meaning::Point(index), Some(value)) => match value_of(value) {
             Some(value) => {
                 let order = Order::Points(vec![(index, value)]);
                 waits(
                     handle,
-                    handle.place(OrderRequest::new(order, origin, Authority::Write).arrived(arrival), now),
+                    handle.place(OrderRequest::new(order, origin, Authority::Write).within(expiry).arrived(arrival), now),
                     None,
                 )
             }
@@ -74,14 +75,19 @@ pub(super) fn begin(view: &View, job: &Job, now: Instant) -> Begun {
             let order = Order::Points(vec![(index, Value::Bool(true))]);
             waits(
                 handle,
-                handle.place(OrderRequest::new(order, origin, Authority::Write).arrived(arrival), now),
+                handle.place(OrderRequest::new(order, origin, Authority::Write).within(expiry).arrived(arrival), now),
                 None,
             )
         }
         (Meaning::Reset(_), _) => Begun::Answered(Ok(())),
-        (Meaning::Slot(what, index), _) => slot(handle, (what, index), job, origin, now),
+        (Meaning::Slot(what, index), _) => slot(handle, (what, index), job, origin, (arrival, now)),
         _ => Begun::Answered(Err(Error::WRITE_ACCESS_DENIED)),
     }
+}
+
+/// For how long from its request a write may be sent: one that waited for another of the same request has its own time.
+fn expiry(job: &Job) -> Duration {
+    DEFAULT_EXPIRY + job.since.saturating_duration_since(job.asked)
 }
 
 fn waits(handle: &DriveHandle, placed: Placed, slot: Option<u64>) -> Begun {
@@ -116,10 +122,9 @@ fn slot(
     (what, index): (Commanded, PointIndex),
     job: &Job,
     origin: Origin,
-    now: Instant,
+    (arrival, now): (Arrival, Instant),
 ) -> Begun {
     let priority = job.priority.unwrap_or(16);
-    let arrival = Arrival::now(now).asked(job.asked);
     let value = job.value.as_ref().and_then(value_of);
     if let Some(value) = value
         && let Err(refusal) = possible(handle, index, value, now)
@@ -143,12 +148,8 @@ fn slot(
                 };
                 let order = Order::Points(vec![(run, Value::Bool(false))]);
                 let id = write.id;
-                let placed = handle.place(
-                    OrderRequest::new(order, origin, Authority::Write)
-                        .arrived(arrival)
-                        .by_slot(write),
-                    now,
-                );
+                let request = OrderRequest::new(order, origin, Authority::Write).within(expiry(job));
+                let placed = handle.place(request.arrived(arrival).by_slot(write), now);
                 return waits(handle, placed, Some(id));
             }
             Follows::Order(of, entry) => {
@@ -158,14 +159,14 @@ fn slot(
                 let order = Order::Points(vec![(point, entry.value)]);
                 let own = write.entry.is_some();
                 // What comes to govern was written long ago; its order is given now.
-                let arrival = if own { arrival } else { Arrival::now(now) };
+                let mut came = arrival.clone();
+                let mut expires = expiry(job);
+                if !own {
+                    (came.asked, expires) = (now, DEFAULT_EXPIRY);
+                }
                 let as_planned = write.clone().in_favour_of(&entry);
-                let mut placed = handle.place(
-                    OrderRequest::new(order, entry.origin, Authority::Write)
-                        .arrived(arrival)
-                        .by_slot(as_planned),
-                    now,
-                );
+                let request = OrderRequest::new(order, entry.origin, Authority::Write).within(expires);
+                let mut placed = handle.place(request.arrived(came).by_slot(as_planned), now);
                 let refused = matches!(placed.answer().map(|answer| answer.outcome), Some(Outcome::Refused(_)));
                 let next = handle.priorities(|all| all.successor(&write));
                 match next.filter(|_| refused && !own) {

@@ -10,10 +10,11 @@ use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value as Json;
 use serde_json::value::RawValue;
 
-use crate::command::{Answer, Arrival, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, sets_twice, stop_of};
+use crate::command::{Answer, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, sets_twice, stop_of};
 use crate::document::nearest;
 use crate::drive::model::Kind;
 use crate::drive::{PointIndex, Profile, Value};
+use crate::order::Arrival;
 use crate::plant::{DriveHandle, OrderRequest, Placed, Plant};
 
 /// Maximum size of a command, bytes.
@@ -123,7 +124,7 @@ impl Asked {
         self.refused.is_none() && !(self.stops(profile) && whole())
     }
 
-    /// Gives it to the drive at `now`: as a whole, or its stop alone if the rest, `what`, is refused. It came at `came`.
+    /// Gives it to the drive at `now`: as a whole, or its stop alone if the rest, `what`, is refused. It came so.
     ///
     /// # Errors
     /// The answer if all of it is refused.
@@ -132,10 +133,9 @@ impl Asked {
         drive: &DriveHandle,
         what: &str,
         origin: Origin,
-        (came, now): (Instant, Instant),
+        (arrival, now): (Arrival, Instant),
     ) -> Result<Placed, Answer> {
         let (write, expiry) = (Authority::Write, self.expiry);
-        let arrival = Arrival::now(now).asked(came);
         let Some(refusal) = self.refused else {
             let request = OrderRequest::new(Order::Points(self.points), origin, write).within(expiry);
             return Ok(drive.place(request.waiting(self.wait).arrived(arrival), now));

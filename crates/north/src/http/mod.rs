@@ -70,6 +70,7 @@ use self::terms::{Terms, Tls};
 use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer};
 use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
 use super::log_throttle::LogThrottle;
+use super::reading::{Dated, Reader};
 use super::refusals::Refusals;
 use super::{NorthState, ServerError, ServerKind, tls_words};
 use crate::history::History;
@@ -227,19 +228,25 @@ impl ConnectionHandler for HttpConnections {
         })
     }
 
-    async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, place: HttpPermit) {
-        set_socket_options(&stream);
+    async fn serve(self: Arc<Self>, stream: Dated<TcpStream>, peer: SocketAddr, place: HttpPermit) {
+        set_socket_options(stream.stream());
+        let reader = stream.reader().clone();
         let terms = self.terms.load_full();
         // Without an own address the client is gone.
-        let Ok(local) = stream.local_addr() else { return };
+        let Ok(local) = stream.stream().local_addr() else {
+            return;
+        };
         let local = local.ip();
         let Some(Tls(acceptor)) = &terms.tls else {
-            return self.serve_requests(stream, peer, local, &terms, &place).await;
+            return self.serve_requests((stream, reader), peer, local, &terms, &place).await;
         };
         let handshake = timeout(HANDSHAKE.min(place.coverage.head_timeout()), acceptor.accept(stream));
         let closing = place.permit.place().closing();
         match closing.run_until_cancelled(handshake).await {
-            Some(Ok(Ok(stream))) => self.serve_requests(stream, peer, local, &terms, &place).await,
+            Some(Ok(Ok(stream))) => {
+                self.serve_requests((stream, reader), peer, local, &terms, &place)
+                    .await;
+            }
             Some(Ok(Err(error))) => {
                 let why = tls_words::explain(&error, tls_words::Peer::Client).unwrap_or_else(|| error.to_string());
                 tracing::debug!(target: "drivegate::http", %peer, "HTTP: TLS handshake failed: {why}");
@@ -255,7 +262,7 @@ impl HttpConnections {
     /// the whole server ends.
     async fn serve_requests(
         &self,
-        stream: impl AsyncRead + AsyncWrite + Unpin,
+        (stream, reader): (impl AsyncRead + AsyncWrite + Unpin, Arc<Reader>),
         peer: SocketAddr,
         local: IpAddr,
         terms: &Terms,
@@ -286,6 +293,8 @@ impl HttpConnections {
                 .set(self.operating.authority_at(peer.ip(), Instant::now()));
             request.extensions_mut().insert(client);
             request.extensions_mut().insert(reached.clone());
+            // The head has just been read.
+            request.extensions_mut().insert(reader.last());
             let command =
                 matches!(*request.method(), hyper::Method::POST | hyper::Method::DELETE).then(|| commands.token());
             let reply = router.call(request);

@@ -24,6 +24,7 @@ use crate::NorthState;
 use crate::command::{Authority, Proof, SourceKind};
 use crate::connection_limit::{ConnectionLimit, ConnectionPlace, Limits, Newcomer};
 use crate::plant::SharedPlant;
+use crate::reading::{Dated, Reader};
 
 /// Serves the connections of the local socket that speak HTTP.
 #[derive(Debug, Clone)]
@@ -43,7 +44,7 @@ impl SocketDoor {
     /// made is finished.
     pub(crate) async fn serve(
         &self,
-        stream: impl AsyncRead + AsyncWrite + Unpin,
+        (stream, reader): (impl AsyncRead + AsyncWrite + Unpin, Arc<Reader>),
         user: LocalUser,
         place: &Arc<ConnectionPlace>,
     ) {
@@ -57,6 +58,7 @@ impl SocketDoor {
             let in_use = InUse::new(place.clone());
             request.extensions_mut().insert(client);
             request.extensions_mut().insert(reached.clone());
+            request.extensions_mut().insert(reader.last());
             let reply = router.call(request);
             async move { reply.await.map(|reply| reply.map(|body| in_use.until_end_of(body))) }
         });
@@ -122,7 +124,11 @@ impl InProcess {
         let (permit, _) = acquired.ok()?;
         let (client, server) = duplex(BUFFER);
         let (door, user) = (self.door.clone(), self.user.clone());
-        tokio::spawn(async move { door.serve(server, user, permit.place()).await });
+        tokio::spawn(async move {
+            let reader = Arc::new(Reader::here());
+            let stream = Dated::new(server, reader.clone());
+            door.serve((stream, reader), user, permit.place()).await;
+        });
         Some(client)
     }
 }

@@ -7,6 +7,7 @@ use std::os::fd::AsFd;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use futures_util::FutureExt;
 use rustix::io::Errno;
 use rustix::net::{Shutdown, shutdown};
 use tokio::net::{TcpListener, TcpStream};
@@ -17,6 +18,7 @@ use super::ConnectionHandler;
 use super::state::ListenerState;
 use crate::ServerKind;
 use crate::log_throttle::LogThrottle;
+use crate::reading::{Dated, Reader, is_readable};
 
 /// Pause after an accept error of the machine: the usual one, too many open files, does not go away at once.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
@@ -80,10 +82,21 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
     /// Accepts until the socket is lost; why.
     async fn accept(&self, mut socket: impl Accept) -> io::Error {
         let log = LogThrottle::default();
+        // A client may have connected, and sent something, while this runtime stood still.
+        let reader = Reader::here();
         loop {
-            match socket.accept().await {
+            let at_once = socket.accept().now_or_never();
+            let accepted = match at_once {
+                Some(accepted) => accepted,
+                None => {
+                    reader.nothing(Instant::now(), || socket.has_client());
+                    socket.accept().await
+                }
+            };
+            match accepted {
                 Ok((stream, peer)) => {
-                    self.admit(stream, peer);
+                    reader.came(Instant::now(), false, || false);
+                    self.admit(Dated::new(stream, Arc::new(reader.accepted())), peer);
                     // Connections that yielded to this one close before the next comes.
                     tokio::task::yield_now().await;
                 }
@@ -100,7 +113,7 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
         }
     }
 
-    fn admit(&self, stream: TcpStream, peer: SocketAddr) {
+    fn admit(&self, stream: Dated<TcpStream>, peer: SocketAddr) {
         // A listener on [::] sees IPv4 clients as ::ffff:a.b.c.d.
         let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
         if let Some(permit) = self.handler.admit(peer.ip()) {
@@ -113,6 +126,9 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
 pub(super) trait Accept: Send {
     /// The next connection; cancel safe.
     fn accept(&mut self) -> impl Future<Output = io::Result<(TcpStream, SocketAddr)>> + Send;
+
+    /// Whether a client waits to be accepted.
+    fn has_client(&self) -> bool;
 }
 
 /// Listens until it is dropped.
@@ -133,6 +149,10 @@ impl Drop for ListeningSocket {
 impl Accept for ListeningSocket {
     fn accept(&mut self) -> impl Future<Output = io::Result<(TcpStream, SocketAddr)>> + Send {
         self.0.accept()
+    }
+
+    fn has_client(&self) -> bool {
+        is_readable(&self.0)
     }
 }
 

@@ -20,6 +20,10 @@ impl Accept for Failing {
             None => self.1.accept().await,
         }
     }
+
+    fn has_client(&self) -> bool {
+        false
+    }
 }
 
 /// Has one place.
@@ -40,7 +44,7 @@ impl ConnectionHandler for Recorder {
         (!taken).then_some(())
     }
 
-    async fn serve(self: Arc<Self>, mut stream: TcpStream, _: SocketAddr, (): ()) {
+    async fn serve(self: Arc<Self>, mut stream: Dated<TcpStream>, _: SocketAddr, (): ()) {
         self.events.send("served").unwrap();
         // Until the client closes.
         let _ = stream.read(&mut [0]).await;

@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use futures_util::FutureExt;
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
 use tokio::task::JoinHandle;
@@ -24,6 +25,7 @@ use crate::command::{Authority, Proof, SourceKind};
 use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Limits, Newcomer};
 use crate::http::{LocalUser, SocketDoor};
 use crate::plant::SharedPlant;
+use crate::reading::{Dated, Reader, is_readable};
 use crate::server;
 use crate::{NorthState, ServerError};
 
@@ -114,10 +116,29 @@ async fn accept(bound: Bound, door: Arc<Door>, cancel: CancellationToken) {
         listener: 0,
         cancel: &cancel,
     };
-    while let Some(accepted) = cancel.run_until_cancelled(bound.listener.accept()).await {
+    // A client may have connected, and sent something, while this runtime stood still.
+    let reader = Reader::here();
+    loop {
+        let accepted = match bound.listener.accept().now_or_never() {
+            Some(accepted) => accepted,
+            None => {
+                reader.nothing(Instant::now(), || is_readable(&bound.listener));
+                match cancel.run_until_cancelled(bound.listener.accept()).await {
+                    Some(accepted) => accepted,
+                    None => return,
+                }
+            }
+        };
+        if cancel.is_cancelled() {
+            return;
+        }
+        reader.came(Instant::now(), false, || false);
         match accepted {
             Ok((stream, _)) => match limit.acquire(newcomer, Instant::now(), || Some(Authority::Write)) {
-                Ok((permit, _)) => drop(tokio::spawn(serve(stream, door.clone(), permit))),
+                Ok((permit, _)) => {
+                    let stream = Dated::new(stream, Arc::new(reader.accepted()));
+                    drop(tokio::spawn(serve(stream, door.clone(), permit)));
+                }
                 Err(_) => turn_away(&stream),
             },
             Err(error) => {
@@ -141,14 +162,17 @@ const NOT_HTTP: &str =
     "{\"error\":\"this socket serves HTTP; try curl --unix-socket PATH http://gateway/api/v1/drives\"}\n";
 
 /// Serves one client until it leaves, goes silent or yields to another one.
-async fn serve(stream: UnixStream, door: Arc<Door>, permit: ConnectionPermit) {
+async fn serve(stream: Dated<UnixStream>, door: Arc<Door>, permit: ConnectionPermit) {
     // Without a user id the command has no owner.
-    let Ok(peer) = stream.peer_cred() else { return };
+    let Ok(peer) = stream.stream().peer_cred() else {
+        return;
+    };
+    let reader = stream.reader().clone();
     let place = permit.place();
     let mut stream = BufReader::new(stream);
     let first = timeout(FIRST_BYTE, stream.fill_buf());
     match place.closing().run_until_cancelled(first).await {
-        None if place.close_reason() == Some(CloseReason::Displaced) => turn_away(stream.get_ref()),
+        None if place.close_reason() == Some(CloseReason::Displaced) => turn_away(stream.get_ref().stream()),
         Some(Ok(Ok([first, ..]))) if first.is_ascii_uppercase() => {
             let user = LocalUser {
                 kind: SourceKind::LocalSocket,
@@ -156,7 +180,7 @@ async fn serve(stream: UnixStream, door: Arc<Door>, permit: ConnectionPermit) {
                 proof: Proof::Uid(peer.uid()),
                 control: door.control.clone(),
             };
-            door.http.serve(stream, user, place).await;
+            door.http.serve((stream, reader), user, place).await;
         }
         Some(Ok(Ok([_, ..]))) => {
             let _ = timeout(FIRST_BYTE, stream.write_all(NOT_HTTP.as_bytes())).await;

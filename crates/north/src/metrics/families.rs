@@ -27,6 +27,7 @@ pub(super) fn collect(plant: &Plant, north: &NorthState, now: Instant) -> Famili
     parameters(plant, north, &mut all);
     servers(north, &mut all);
     reload(north, &mut all);
+    pauses(plant, &mut all);
     build(plant, &mut all);
     process(&process::read(), &mut all);
     all.sort();
@@ -457,6 +458,22 @@ fn reload(stats: &NorthState, all: &mut Families) {
         "drivegate_config_last_reload_timestamp_seconds",
         "When the last reload of the configuration ended, applied or refused; startup counts as one.",
         (since_epoch.as_secs_f64() * 1e3).round() / 1e3,
+    );
+}
+
+fn pauses(plant: &Plant, all: &mut Families) {
+    let (count, time) = plant.events.pauses().total();
+    all.one(
+        Kind::Counter,
+        "drivegate_pauses_total",
+        "Times for which the gateway, or a thread of it, stood still for longer than a second.",
+        SeriesValue::Count(count),
+    );
+    all.one(
+        Kind::Counter,
+        "drivegate_paused_seconds_total",
+        "How long it stood still in them.",
+        SeriesValue::Total(time.as_secs_f64()),
     );
 }
 

@@ -25,6 +25,7 @@ use crate::connection_limit::{
     CloseReason, ConnectionLimit, ConnectionPermit, ConnectionPlace, LimitReached, Newcomer,
 };
 use crate::listener::ConnectionHandler;
+use crate::reading::{Dated, Reader};
 
 /// A peer that disappeared without closing is detected after 60 s + 3 * 10 s.
 const KEEPALIVE_IDLE: Duration = Duration::from_secs(60);
@@ -100,13 +101,14 @@ impl ConnectionHandler for Admission {
         }
     }
 
-    async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, permit: ConnectionPermit) {
-        set_socket_options(&stream);
+    async fn serve(self: Arc<Self>, stream: Dated<TcpStream>, peer: SocketAddr, permit: ConnectionPermit) {
+        set_socket_options(stream.stream());
+        let reader = stream.reader().clone();
         let write = self.policy.load().write.clone();
         match write {
-            WriteAccess::ByAddress(_) => self.serve_client(stream, peer, None, &permit).await,
+            WriteAccess::ByAddress(_) => self.serve_client((stream, reader), peer, None, &permit).await,
             WriteAccess::ByCertificate(authenticator) => {
-                self.serve_tls_client(&authenticator, stream, peer, permit).await;
+                self.serve_tls_client(&authenticator, (stream, reader), peer, permit).await;
             }
         }
     }
@@ -146,7 +148,7 @@ impl Admission {
     async fn serve_tls_client(
         &self,
         authenticator: &TlsAuthenticator,
-        stream: TcpStream,
+        (stream, reader): (Dated<TcpStream>, Arc<Reader>),
         peer: SocketAddr,
         handshake: ConnectionPermit,
     ) {
@@ -160,7 +162,7 @@ impl Admission {
             Some(Ok((stream, client))) => {
                 let admitted = self.admit_authenticated(peer, &client);
                 drop(handshake);
-                self.serve_authenticated(stream, peer, client, admitted).await;
+                self.serve_authenticated((stream, reader), peer, client, admitted).await;
             }
             Some(Err(error)) => {
                 let text = format!("client refused: TLS: {error}");
@@ -183,7 +185,7 @@ impl Admission {
     /// Serves a client with TLS; without a place, its connection is closed.
     async fn serve_authenticated(
         &self,
-        mut stream: TlsStream<TcpStream>,
+        (mut stream, reader): (TlsStream<Dated<TcpStream>>, Arc<Reader>),
         peer: SocketAddr,
         client: AuthenticatedClient,
         admitted: Option<ConnectionPermit>,
@@ -193,7 +195,7 @@ impl Admission {
             return;
         };
         let refused = pin!(client.certificate.refused());
-        let served = pin!(self.serve_client(stream, peer, Some(&client.name), &permit));
+        let served = pin!(self.serve_client((stream, reader), peer, Some(&client.name), &permit));
         if let Either::Left(((), served)) = select(refused, served).await {
             // Commands that are in progress are answered.
             permit.place().close(CloseReason::CertificateRefused);
@@ -203,7 +205,7 @@ impl Admission {
 
     async fn serve_client(
         &self,
-        stream: impl AsyncRead + AsyncWrite + Unpin,
+        stream: (impl AsyncRead + AsyncWrite + Unpin, Arc<Reader>),
         peer: SocketAddr,
         name: Option<&str>,
         permit: &ConnectionPermit,

@@ -3,6 +3,7 @@
 use std::convert::Infallible;
 use std::io;
 use std::pin::Pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::FutureExt;
@@ -16,6 +17,7 @@ use super::forwarded_request::AnsweredRequest;
 use super::frame::NotModbus;
 use super::session::ClientSession;
 use crate::connection_limit::{CloseReason, ConnectionPlace};
+use crate::reading::Reader;
 
 /// Time limit for the rest of a frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
@@ -54,7 +56,7 @@ enum End {
 /// Serves a client until it disconnects, violates the protocol, is idle for `idle_timeout`, or must yield its `place`. Requests that
 /// wait for the bus are answered then, unless the whole server is `stopping`. Returns what it spoke instead of Modbus TCP.
 pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
-    stream: S,
+    (stream, reader): (S, Arc<Reader>),
     session: ClientSession,
     idle_timeout: Option<Duration>,
     place: &ConnectionPlace,
@@ -64,7 +66,7 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     let now = Instant::now();
     let mut connection = Connection {
         now,
-        all_read: now,
+        reader,
         stream,
         dialogue: Dialogue::new(session),
         place,
@@ -103,8 +105,8 @@ struct Connection<'p, S> {
     place: &'p ConnectionPlace,
     /// The time as of the last wait; the clock is read once per request.
     now: Instant,
-    /// When nothing was there to be read, last: what is found at once may have come since.
-    all_read: Instant,
+    /// That of the stream.
+    reader: Arc<Reader>,
     /// Requests since the last yield.
     since_yield: usize,
     idle: Option<Idle>,
@@ -126,6 +128,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
                 self.used();
             }
             if !flush_at_once(&mut self.stream, &mut self.dialogue)? {
+                self.reader.ceased();
                 tokio::select! {
                     biased;
                     () = &mut closing => return Err(self.close_reason()),
@@ -168,8 +171,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
                     self.dialogue.finish(answered, self.now.into_std());
                     self.used();
                 }
-                Event::Input(0, _) => input_end = Some(End::Client),
-                Event::Input(count, came) => self.dialogue.received(count, came.into_std()),
+                Event::Input(0) => input_end = Some(End::Client),
+                Event::Input(count) => self.dialogue.received(count, self.reader.last()),
             }
         }
     }
@@ -196,23 +199,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         let waits = self.dialogue.is_waiting();
         let (space, waiting) = self.dialogue.parts();
         let reads = reading == Reading::On;
-        let room = space.len();
         if reads && let Some(count) = self.stream.read(space).now_or_never() {
-            let (count, came) = (count?, self.all_read);
-            if count < room {
-                self.all_read = Instant::now();
-            }
-            return Ok(Event::Input(count, came));
-        }
-        if reads {
-            self.all_read = Instant::now();
+            return Ok(Event::Input(count?));
         }
         // A client that waits does not flood the gateway, so it need not yield.
         self.since_yield = 0;
         tokio::select! {
             biased;
             Some(answered) = waiting.next() => Ok(Event::Answer(answered)),
-            count = self.stream.read(space), if reads => Ok(Event::Input(count?, Instant::now())),
+            count = self.stream.read(space), if reads => Ok(Event::Input(count?)),
             () = expired(half_frame_since) => Err(End::HalfFrame),
             timeout = Idle::over(self.idle.as_mut()), if !waits => Err(End::Idle(timeout)),
         }
@@ -284,8 +279,8 @@ enum Reading {
 enum Event {
     /// The bus has answered.
     Answer(AnsweredRequest),
-    /// Number of bytes from the client, 0 at the end of the stream; and since when, at the earliest, they were there.
-    Input(usize, Instant),
+    /// Number of bytes from the client, 0 at the end of the stream.
+    Input(usize),
 }
 
 /// The idle time of the client. The timer is reset only when it fires, not with each request.

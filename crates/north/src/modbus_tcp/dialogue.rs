@@ -10,6 +10,7 @@ use super::forwarded_request::{AnsweredRequest, PendingRequest};
 use super::frame::{self, MAX_FRAME, NotModbus};
 use super::session::ClientSession;
 use crate::arrivals::Arrivals;
+use crate::order::Arrival;
 
 /// Initial input buffer: two frames, so that a thousand idle clients use little memory.
 const INPUT_FIRST: usize = 2 * MAX_FRAME;
@@ -38,7 +39,7 @@ pub(super) struct Dialogue {
     filled: usize,
     /// Whether any frame arrived.
     begun: bool,
-    /// Their arrival times.
+    /// How they came.
     arrivals: Arrivals,
     pub(super) output: Vec<u8>,
 }
@@ -77,9 +78,9 @@ impl Dialogue {
             .extend(self.session.finish(answered, now, &mut self.output));
     }
 
-    /// The free part of the input buffer was filled with `count` bytes, which came at `at`.
-    pub(super) fn received(&mut self, count: usize, at: Instant) {
-        self.arrivals.came(count, at);
+    /// The free part of the input buffer was filled with `count` bytes, which came so.
+    pub(super) fn received(&mut self, count: usize, arrival: Arrival) {
+        self.arrivals.came(count, arrival);
         self.filled = (self.filled + count).min(self.input.len());
         if self.filled == self.input.len() && self.filled < INPUT_MOST {
             // A client that fills the buffer sends batches; with a larger buffer a whole batch is read and answered at
@@ -109,9 +110,9 @@ impl Dialogue {
                     self.begun = true;
                     consumed.bytes += frame.used;
                     consumed.frames += 1;
-                    let asked = self.arrivals.first().unwrap_or(now);
+                    let arrival = self.arrivals.first().cloned().unwrap_or_else(|| Arrival::now(now));
                     self.arrivals.taken(frame.used);
-                    let answer = self.session.take(&frame, asked, now, &mut self.output);
+                    let answer = self.session.take(&frame, arrival, now, &mut self.output);
                     self.waiting.extend(answer);
                 }
                 Ok(None) => break None,

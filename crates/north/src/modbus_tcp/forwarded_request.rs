@@ -11,7 +11,8 @@ use super::client::Client;
 use super::frame::Header;
 use crate::codec::n2::Object;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
-use crate::command::{Arrival, Authority, Order, Outcome, Refusal};
+use crate::command::{Authority, Order, Outcome, Refusal};
+use crate::order::Arrival;
 use crate::plant::{DriveHandle, OrderRequest, Placed};
 use crate::process_image::{Reading, Unavailable};
 
@@ -121,16 +122,14 @@ impl ForwardedRequest {
     }
 
     /// Queues its command, or the first one of several, before this returns.
-    pub(super) fn send(self, work: BusWork, client: &Client, asked: Instant, now: Instant) -> Progress {
+    pub(super) fn send(self, work: BusWork, client: &Client, arrival: Arrival, now: Instant) -> Progress {
         let mut forwarded = Box::new(self);
         match work {
-            BusWork::Order(order) => forwarded.place(order, client, client.rights.authority(), asked, now),
+            BusWork::Order(order) => forwarded.place(order, client, client.rights.authority(), arrival, now),
             BusWork::Stop(stop, refusal) => {
                 let what = describe::request(&forwarded.request);
                 let request = OrderRequest::new(stop, client.origin(), client.rights.authority());
-                let request = request
-                    .without_rest(&what, refusal)
-                    .arrived(Arrival::now(now).asked(asked));
+                let request = request.without_rest(&what, refusal).arrived(arrival);
                 let placed = forwarded.drive.place(request, now);
                 Progress::Pending(PendingRequest::Forwarded(Some(forwarded), placed))
             }
@@ -155,11 +154,11 @@ impl ForwardedRequest {
         order: Order,
         client: &Client,
         authority: Authority,
-        asked: Instant,
+        arrival: Arrival,
         now: Instant,
     ) -> Progress {
         let request = OrderRequest::new(order, client.origin(), authority);
-        let placed = self.drive.place(request.arrived(Arrival::now(now).asked(asked)), now);
+        let placed = self.drive.place(request.arrived(arrival), now);
         Progress::Pending(PendingRequest::Forwarded(Some(self), placed))
     }
 
@@ -173,7 +172,8 @@ impl ForwardedRequest {
                 ReadPart::Known(known) => read.words.extend(known),
                 ReadPart::Object { pdu, skip, take } => {
                     read.asked = (skip, take);
-                    return self.place(Order::Read(pdu), client, Authority::ReadOnly, now, now);
+                    let arrival = Arrival::now(now);
+                    return self.place(Order::Read(pdu), client, Authority::ReadOnly, arrival, now);
                 }
             }
         }

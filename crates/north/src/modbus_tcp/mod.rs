@@ -35,9 +35,11 @@ use self::command_words::CommandWords;
 use self::routes::PlantView;
 use self::tls::{Requirements, TlsAuthenticator};
 use crate::connection_limit::{ConnectionLimit, Limits};
+use crate::event::Events;
 use crate::listener::{ListenerSpec, Listeners, NewSockets};
 use crate::log_throttle::LogThrottle;
 use crate::plant::SharedPlant;
+use crate::reading::Watch;
 use crate::refusals::Refusals;
 use crate::tcp_server::{TcpServer, TcpService};
 use crate::{NorthState, ServerError, ServerKind, certificate};
@@ -173,9 +175,9 @@ impl TcpService<Options> for ModbusTcp {
         Ok(ModbusTcp {
             authenticator: None,
             state: Arc::new(ServerState::new(options.clone(), stats, cancel)),
-            plant,
             // With its tasks the thread ends.
-            own: start_thread(tasks)?,
+            own: start_thread(tasks, plant.load().events.clone())?,
+            plant,
             opened: 0,
         })
     }
@@ -299,11 +301,14 @@ impl ServerState {
 /// Starts a thread that only serves clients without TLS, until all `tasks` have ended. Metrics and TLS handshakes,
 /// which take a millisecond of computing, do not delay these clients; and a single thread serves more of them than
 /// several that hand work to each other: a fifth more on two processors with 16 clients (`benches/modbus_tcp`).
-fn start_thread(tasks: &TaskTracker) -> Result<Handle, ServerError> {
+fn start_thread(tasks: &TaskTracker, events: Events) -> Result<Handle, ServerError> {
     let (sender, receiver) = std::sync::mpsc::sync_channel(1);
     let tasks = tasks.clone();
     let serve = move || match Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => {
+            let watch = Watch::new(true);
+            watch.enter();
+            runtime.spawn(watch.run(events));
             let _ = sender.send(Ok(runtime.handle().clone()));
             runtime.block_on(tasks.wait());
         }

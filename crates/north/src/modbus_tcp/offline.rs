@@ -13,12 +13,15 @@ use super::session::ClientSession;
 use super::{Options, ServerState};
 use crate::NorthState;
 use crate::command::Authority;
+use crate::order::{Arrival, Connection};
 use crate::plant::SharedPlant;
 
 /// One client of a server without sockets. Time is an argument of [`Offline::receive`].
 #[derive(Debug)]
 pub struct Offline {
     dialogue: Dialogue,
+    /// Over which all comes, once something has.
+    connection: Option<Connection>,
     /// Input that the dialogue has no room for yet.
     backlog: Vec<u8>,
     closed: bool,
@@ -49,6 +52,7 @@ impl Offline {
     fn of(session: ClientSession) -> Offline {
         Offline {
             dialogue: Dialogue::new(session),
+            connection: None,
             backlog: Vec::new(),
             closed: false,
         }
@@ -68,7 +72,8 @@ impl Offline {
                 for (place, byte) in space.iter_mut().zip(self.backlog.drain(..count)) {
                     *place = byte;
                 }
-                self.dialogue.received(count, now);
+                let connection = self.connection.get_or_insert_with(|| Connection::opened(now));
+                self.dialogue.received(count, Arrival::over(connection.clone(), now));
             }
             self.closed = self.closed || self.dialogue.process(now).1.is_some();
             self.dialogue.collect(now);

@@ -19,6 +19,7 @@ use crate::command::{self, Authority, Order, Outcome, Verb};
 use crate::command_json::{nothing_to_stop, refuse_stop_all};
 use crate::drive::{Profile, State};
 use crate::log_throttle::LogThrottle;
+use crate::order::Arrival;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, Unavailable};
 use crate::register_map::{
@@ -100,12 +101,12 @@ impl ClientSession {
         }
     }
 
-    /// Answers a request whose first byte came at `asked` into `out`, or returns the pending request. Its command is in the queue when this returns, so
-    /// commands reach the bus in the order of their frames.
+    /// Answers a request that came so into `out`, or returns the pending request. Its command is in the queue when this
+    /// returns, so commands reach the bus in the order of their frames.
     pub(super) fn take(
         &mut self,
         frame: &Frame<'_>,
-        asked: Instant,
+        arrival: Arrival,
         now: Instant,
         out: &mut Vec<u8>,
     ) -> Option<PendingRequest> {
@@ -120,7 +121,7 @@ impl ClientSession {
             Decision::Exception(code) => self.put_exception(frame.header, frame.function, code, out),
             Decision::Drive(forwarded) => {
                 let (forwarded, work) = *forwarded;
-                let step = forwarded.send(work, &self.client, asked, now);
+                let step = forwarded.send(work, &self.client, arrival, now);
                 return self.follow(step, now, out);
             }
             Decision::StopAll(request, acknowledged) => {

@@ -18,6 +18,7 @@ use tokio_rustls::server::TlsStream;
 
 use super::crl::{self, Crls};
 use super::open_clients::{CertificateGuard, OpenClients};
+use crate::reading::Dated;
 use crate::certificate::{self, RoleError};
 use crate::identity::{FileProblem, IdentityFault, ServerIdentity, TlsFile, provider, unsupported_ca, validity};
 use crate::pem;
@@ -229,9 +230,9 @@ impl TlsAuthenticator {
     /// Why the client is refused.
     pub(super) async fn authenticate(
         &self,
-        stream: TcpStream,
+        stream: Dated<TcpStream>,
         peer: SocketAddr,
-    ) -> Result<(TlsStream<TcpStream>, AuthenticatedClient), AuthenticationError> {
+    ) -> Result<(TlsStream<Dated<TcpStream>>, AuthenticatedClient), AuthenticationError> {
         let requirements = self.clients.requirements();
         let handshake = TlsAcceptor::from(requirements.config.clone()).accept(stream);
         let stream = tokio::time::timeout(HANDSHAKE, handshake)

@@ -18,6 +18,7 @@ use crate::command::{Answer, Authority, Origin, Outcome, Proof, Refusal, SourceK
 use crate::command_json::{
     HoldReply, Id, Repetition, SharedMemory, excerpt, nothing_to_stop, refuse_stop_all, refuse_unknown, stop_all,
 };
+use crate::order::Arrival;
 use crate::plant::{Placed, Plant, Shown};
 use crate::stop_all::{StopAll, StopReport};
 
@@ -188,7 +189,8 @@ impl Commands {
                 None => number = self.memory.lock().remember(&taken, print, stops, now),
             }
         }
-        let placed = match asked.place(&drive, &what, origin, (incoming.asked.unwrap_or(now), now)) {
+        let arrival = incoming.arrival.clone().unwrap_or_else(|| Arrival::now(now));
+        let placed = match asked.place(&drive, &what, origin, (arrival, now)) {
             Ok(placed) => placed,
             Err(answer) => return refused(&answer, id),
         };

@@ -27,6 +27,8 @@ use super::keep_alive::{KEEP_ALIVE_S, Silence, Verdict};
 use super::outbox::Message;
 use super::request::Incoming;
 use super::{Broker, Options};
+use crate::order::Arrival;
+use crate::reading::{Dated, Reader};
 use crate::tls_words;
 
 /// Why a broker refuses filters with wildcards.
@@ -160,11 +162,16 @@ impl Connection {
     ) -> Connection {
         let mut mqtt = mqtt_options(options, (broker, client_id), will, tls);
         let broker = broker.clone();
-        mqtt.set_socket_connector(move |_, network| dial.clone().connect(broker.clone(), first, network));
+        let reader = Arc::new(Reader::here());
+        let of_stream = reader.clone();
+        mqtt.set_socket_connector(move |_, network| {
+            let (connecting, reader) = (dial.clone().connect(broker.clone(), first, network), of_stream.clone());
+            async move { Ok(Dated::new(connecting.await?, reader)) }
+        });
         let (client, eventloop) = AsyncClient::builder(mqtt).capacity(REQUESTS).build();
         let (sender, event) = mpsc::channel(EVENTS);
         let backlog = Arc::<Backlog>::default();
-        let task = tokio::spawn(poll(eventloop, sender, backlog.clone()));
+        let task = tokio::spawn(poll(eventloop, reader, sender, backlog.clone()));
         Connection {
             client,
             event,
@@ -371,28 +378,12 @@ fn mqtt_options(
 }
 
 /// Polls until the first error and reports the events.
-async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<Step>, backlog: Arc<Backlog>) {
+async fn poll(mut eventloop: EventLoop, reader: Arc<Reader>, event: mpsc::Sender<Step>, backlog: Arc<Backlog>) {
     let mut accepted = false;
-    // Since when, at the earliest, there was what the next event tells.
-    let mut came = Instant::now();
-    let mut all_polled = came;
     loop {
-        let was_read = !eventloop.state.events.is_empty();
-        let event_or_end = {
-            let mut polled = std::pin::pin!(eventloop.poll());
-            match (&mut polled).now_or_never() {
-                Some(polled) => {
-                    came = if was_read { came } else { all_polled };
-                    polled
-                }
-                None => {
-                    let polled = polled.await;
-                    came = Instant::now();
-                    polled
-                }
-            }
-        };
-        all_polled = Instant::now();
+        let event_or_end = eventloop.poll().await;
+        // Packets are read in batches: of all that was read and is not told yet, the earliest.
+        let arrival = reader.first();
         let item = match event_or_end {
             Ok(Event::Outgoing(Outgoing::Publish(packet))) => {
                 let left = backlog.messages.fetch_sub(1, Ordering::SeqCst).saturating_sub(1);
@@ -404,7 +395,7 @@ async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<Step>, backlog: Arc<
                 }
                 (packet != 0).then_some(Step::Sent(packet))
             }
-            Ok(event) => interpret(event, came),
+            Ok(event) => interpret(event, arrival),
             Err(ConnectionError::ConnectionRefused(ConnectReturnCode::QoSNotSupported)) => {
                 Some(Step::Refuses(Lack::Acknowledgements))
             }
@@ -418,13 +409,24 @@ async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<Step>, backlog: Arc<
         let Some(item) = item else { continue };
         accepted |= matches!(item, Step::Accepted(_));
         let end = matches!(item, Step::Lost(_) | Step::Refuses(_));
-        if event.send(item).await.is_err() || end {
+        let sent = {
+            let mut sending = std::pin::pin!(event.send(item));
+            match (&mut sending).now_or_never() {
+                Some(sent) => sent,
+                None => {
+                    // Nothing is read until the client has room.
+                    reader.ceased();
+                    sending.await
+                }
+            }
+        };
+        if sent.is_err() || end {
             return;
         }
     }
 }
 
-fn interpret(event: Event, came: Instant) -> Option<Step> {
+fn interpret(event: Event, arrival: Arrival) -> Option<Step> {
     match event {
         Event::Incoming(Packet::ConnAck(ack)) => Some(Step::Accepted(BrokerLimits::of(&ack))),
         Event::Incoming(Packet::SubAck(ack)) => {
@@ -439,7 +441,7 @@ fn interpret(event: Event, came: Instant) -> Option<Step> {
             why => Step::Refused(ack.pkid, why),
         }),
         Event::Incoming(Packet::Publish(publish)) => {
-            Incoming::of(publish, came).map(|message| Step::Message(Box::new(message)))
+            Incoming::of(publish, arrival).map(|message| Step::Message(Box::new(message)))
         }
         Event::Incoming(_) => Some(Step::Nothing),
         // A packet id was about to be used again before its acknowledgement.

@@ -9,6 +9,7 @@ use super::reply::ResponseTopics;
 use super::request::Incoming;
 use super::topics::Topics;
 use crate::command_json::SharedMemory;
+use crate::order::{Arrival, Connection};
 use crate::plant::SharedPlant;
 
 /// A message that the gateway publishes: the result of a command.
@@ -42,6 +43,8 @@ pub struct Offline {
     held: VecDeque<Incoming>,
     results: Vec<Published>,
     begun: (Instant, SystemTime),
+    /// With the broker.
+    connection: Connection,
 }
 
 impl Offline {
@@ -64,13 +67,15 @@ impl Offline {
             held: VecDeque::new(),
             results: Vec::new(),
             begun: (now, time),
+            connection: Connection::opened(now),
         }
     }
 
     /// Receives a message. Its command is in the queue of its bus when this returns, unless so many wait that the
     /// broker keeps the message until a later [`Offline::poll`].
     pub fn receive(&mut self, mut message: Incoming, now: Instant) {
-        message.asked.get_or_insert(now);
+        let connection = self.connection.clone();
+        message.arrival.get_or_insert_with(|| Arrival::over(connection, now));
         self.held.push_back(message);
         self.work(now);
     }

@@ -1,7 +1,7 @@
 //! Parses the messages on set topics.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rumqttc::Publish;
 use serde_json::Value as Json;
@@ -9,6 +9,7 @@ use serde_json::Value as Json;
 use crate::command::{DEFAULT_EXPIRY, Origin, Refusal, SourceKind};
 use crate::command_json::{self, Asked, Id, MAX_PAYLOAD, Taken, check_size, excerpt, find_id, resolve};
 use crate::drive::Profile;
+use crate::order::Arrival;
 
 /// A message on a set topic.
 #[derive(Debug, Clone, Default)]
@@ -32,13 +33,13 @@ pub struct Incoming {
     pub who: Option<String>,
     /// Number of bytes of a payload that was too long; of it, `payload` has only the `id`.
     pub oversized: Option<usize>,
-    /// When it came; none where it is taken at once.
-    pub asked: Option<Instant>,
+    /// How it came; none where it is taken at once.
+    pub arrival: Option<Arrival>,
 }
 
 impl Incoming {
-    /// A message as it came at `asked`; `None` if its topic is not UTF-8.
-    pub(super) fn of(publish: Publish, asked: Instant) -> Option<Incoming> {
+    /// A message that came so; `None` if its topic is not UTF-8.
+    pub(super) fn of(publish: Publish, arrival: Arrival) -> Option<Incoming> {
         let properties = publish.properties.unwrap_or_default();
         let who = properties.user_properties.into_iter().find(|(name, _)| name == "who");
         let mut incoming = Incoming {
@@ -52,7 +53,7 @@ impl Incoming {
             expiry: properties.message_expiry_interval,
             who: who.map(|(_, who)| who),
             oversized: None,
-            asked: Some(asked),
+            arrival: Some(arrival),
         };
         if publish.payload.len() <= MAX_PAYLOAD {
             incoming.payload = publish.payload.to_vec();
@@ -143,6 +144,8 @@ fn bare(payload: &[u8]) -> Result<Json, Refusal> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
     use super::*;
     use crate::command_json::MAX_ID;
     use crate::drive::Value;
@@ -423,7 +426,7 @@ mod tests {
     fn of_a_payload_that_is_too_long_the_id_is_kept() {
         let of = |payload: String| {
             let publish = Publish::new("t", rumqttc::mqttbytes::QoS::AtLeastOnce, payload, None);
-            Incoming::of(publish, Instant::now()).unwrap()
+            Incoming::of(publish, Arrival::now(Instant::now())).unwrap()
         };
         let padding = "x".repeat(300_000);
         let incoming = of(format!(r#"{{"pad": "{padding}", "id": 41}}"#));

@@ -13,6 +13,7 @@ use super::dialogue::Dialogue;
 use super::terms::Tool;
 use crate::connection_limit::{CloseReason, ConnectionPlace};
 use crate::line::{ServedPort, telnet_escaped};
+use crate::reading::{Dated, Source};
 
 /// Time for a tool to take an answer.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -40,7 +41,7 @@ enum End {
 
 #[derive(Debug)]
 pub(super) struct Connection<S> {
-    stream: S,
+    stream: Dated<S>,
     dialogue: Dialogue,
     port: Option<ServedPort>,
     /// What the stream is to be given.
@@ -48,9 +49,14 @@ pub(super) struct Connection<S> {
     last_request: Instant,
 }
 
-impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
+impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
     /// A connection that begins with `greeting`; with a `port` it uses telnet.
-    pub(super) fn new(stream: S, tool: Arc<Tool>, port: Option<ServedPort>, greeting: Vec<u8>) -> Connection<S> {
+    pub(super) fn new(
+        stream: Dated<S>,
+        tool: Arc<Tool>,
+        port: Option<ServedPort>,
+        greeting: Vec<u8>,
+    ) -> Connection<S> {
         Connection {
             stream,
             dialogue: Dialogue::new(tool),
@@ -132,7 +138,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             Some(port) => self.output.extend(port.take(bytes, &mut data)),
             None => data.extend_from_slice(bytes),
         }
-        if self.dialogue.received(&data, std::time::Instant::now()) {
+        let arrival = self.stream.reader().last();
+        if self.dialogue.received(&data, arrival, std::time::Instant::now()) {
             self.last_request = Instant::now();
         }
     }

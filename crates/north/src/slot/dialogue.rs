@@ -14,6 +14,7 @@ use super::terms::{Decision, Tool, Work};
 use crate::SlotOutcome;
 use crate::codec::{Protocol, Reply, RequestPdu};
 use crate::command::Outcome;
+use crate::order::Arrival;
 
 /// A tool is answered within this time from the end of its request, or not at all.
 pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(1);
@@ -35,8 +36,8 @@ struct Pending {
 #[derive(Debug)]
 struct Held {
     request: ToolRequest,
-    /// When its first byte came.
-    asked: Instant,
+    /// How it came.
+    arrival: Arrival,
     /// Stops that its drives had been given when it was whole.
     stops: u64,
     until: Instant,
@@ -81,12 +82,12 @@ impl Dialogue {
         self.pending.is_some() || self.held.is_some()
     }
 
-    /// Bytes of the tool came in at `now`. Requests that it makes are in the queue of the bus when this returns, or held until
+    /// Bytes of the tool, which came so, are read at `now`. Requests that it makes are in the queue of the bus when this returns, or held until
     /// [`Dialogue::wake_at`]. Whether there were any.
-    pub(super) fn received(&mut self, bytes: &[u8], now: Instant) -> bool {
+    pub(super) fn received(&mut self, bytes: &[u8], arrival: Arrival, now: Instant) -> bool {
         let count = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
         self.reads_at = now.checked_add(BYTE_TIME.saturating_mul(count));
-        self.framing.add(bytes, now);
+        self.framing.add(bytes, arrival, now);
         self.on_time(now)
     }
 
@@ -103,8 +104,8 @@ impl Dialogue {
             match said {
                 Said::Request(request) => {
                     any = true;
-                    let asked = self.framing.asked().unwrap_or(now);
-                    self.asked_for(request, asked, now);
+                    let arrival = self.framing.arrival().unwrap_or_else(|| Arrival::now(now));
+                    self.asked_for(request, arrival, now);
                 }
                 Said::Broken => self.tool.count(SlotOutcome::Broken),
             }
@@ -161,7 +162,7 @@ impl Dialogue {
         }
     }
 
-    fn asked_for(&mut self, request: ToolRequest, asked: Instant, now: Instant) {
+    fn asked_for(&mut self, request: ToolRequest, arrival: Arrival, now: Instant) {
         let impatient = self.is_waiting() && self.asked.is_some_and(|at| now < at + IMPATIENT);
         self.give_up(SlotOutcome::Abandoned);
         let deadline = now + ANSWER_WITHIN;
@@ -173,7 +174,7 @@ impl Dialogue {
             pace.not_before.max(haste.unwrap_or(now))
         };
         let held = Held {
-            asked,
+            arrival,
             stops: pace.stops,
             request,
             until,
@@ -192,13 +193,13 @@ impl Dialogue {
     fn go(&mut self, held: Held, now: Instant) {
         let Held {
             request,
-            asked,
+            arrival,
             stops,
             deadline,
             ..
         } = held;
         self.asked = Some(now);
-        match self.tool.decide(&request, (asked, stops), deadline, now) {
+        match self.tool.decide(&request, (arrival, stops), deadline, now) {
             Decision::Refuse(why) => {
                 self.tool.count(SlotOutcome::Refused);
                 if !request.is_broadcast(self.tool.protocol()) {

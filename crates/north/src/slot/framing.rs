@@ -10,6 +10,7 @@ use super::request::ToolRequest;
 use crate::arrivals::Arrivals;
 use crate::codec::frames::Frames;
 use crate::codec::{LineFormat, Protocol};
+use crate::order::Arrival;
 
 /// Silence behind half a frame after which the rest is no longer expected: longer than the pauses of serial programs
 /// and the delayed acknowledgements of TCP, shorter than tools wait before they ask again.
@@ -30,8 +31,8 @@ pub(super) struct Framing {
     protocol: Protocol,
     frames: Frames,
     arrivals: Arrivals,
-    /// When the first byte of the last message arrived.
-    asked: Option<Instant>,
+    /// How the first byte of the last message came.
+    arrival: Option<Arrival>,
 }
 
 impl Framing {
@@ -40,21 +41,21 @@ impl Framing {
             protocol,
             frames: Frames::new(protocol, format, HALF_FRAME),
             arrivals: Arrivals::default(),
-            asked: None,
+            arrival: None,
         }
     }
 
-    /// Bytes were received at `now`.
-    pub(super) fn add(&mut self, bytes: &[u8], now: Instant) {
+    /// Bytes that came so are read at `now`.
+    pub(super) fn add(&mut self, bytes: &[u8], arrival: Arrival, now: Instant) {
         self.frames.add(bytes, now);
-        self.arrivals.came(bytes.len(), now);
+        self.arrivals.came(bytes.len(), arrival);
     }
 
     /// The next message of the tool, as far as it is clear at `now`.
     pub(super) fn next(&mut self, now: Instant) -> Option<Said> {
         loop {
             let piece = self.frames.next(None, now)?;
-            self.asked = self.arrivals.first();
+            self.arrival = self.arrivals.first().cloned();
             self.arrivals.taken(piece.bytes.len());
             if !self.is_blank(&piece.bytes) {
                 return Some(match ToolRequest::of(self.protocol, &piece.bytes) {
@@ -65,9 +66,9 @@ impl Framing {
         }
     }
 
-    /// When the first byte of the tool's last message arrived.
-    pub(super) fn asked(&self) -> Option<Instant> {
-        self.asked
+    /// How the first byte of the tool's last message came.
+    pub(super) fn arrival(&self) -> Option<Arrival> {
+        self.arrival.clone()
     }
 
     /// Between two lines there may be blanks and line feeds.
@@ -94,6 +95,10 @@ mod tests {
     use super::super::request::{Meaning, Refused};
     use super::*;
     use crate::codec::{Exception, RequestPdu, Table, ascii, rtu};
+
+    fn add(framing: &mut Framing, bytes: &[u8], now: Instant) {
+        framing.add(bytes, Arrival::now(now), now);
+    }
 
     fn framing(protocol: Protocol) -> Framing {
         Framing::new(protocol, LineFormat::new(9600, "8N1").unwrap())
@@ -130,7 +135,7 @@ mod tests {
         let mut at = now;
         for byte in &frame {
             assert_eq!(framing.next(at), None);
-            framing.add(&[*byte], at);
+            add(&mut framing, &[*byte], at);
             at += Duration::from_millis(100);
         }
         assert_eq!(all(&mut framing, at), [asks(1, 2100, 11)]);
@@ -142,7 +147,7 @@ mod tests {
         let now = Instant::now();
         let mut framing = framing(Protocol::ModbusRtu);
         let frame = framed(1, &[3, 8, 52, 0, 11]);
-        framing.add(&frame[..5], now);
+        add(&mut framing, &frame[..5], now);
         assert_eq!(framing.next(now), None);
         assert!(framing.has_begun());
         let until = framing.patience().unwrap();
@@ -151,7 +156,7 @@ mod tests {
         let mut broken = frame.clone();
         broken[7] ^= 1;
         // Behind a broken frame and behind half of one, without a pause.
-        framing.add(&[broken.as_slice(), &frame, &frame[..4], &frame].concat(), until);
+        add(&mut framing, &[broken.as_slice(), &frame, &frame[..4], &frame].concat(), until);
         let said = all(&mut framing, until);
         assert_eq!(said, [Said::Broken, asks(1, 2100, 11), Said::Broken, asks(1, 2100, 11)]);
     }
@@ -160,7 +165,7 @@ mod tests {
     fn a_function_that_is_not_decoded_is_whole_by_silence() {
         let now = Instant::now();
         let mut framing = framing(Protocol::ModbusRtu);
-        framing.add(&framed(1, &[0x41, 1, 2, 3]), now);
+        add(&mut framing, &framed(1, &[0x41, 1, 2, 3]), now);
         assert_eq!(framing.next(now), None);
         let until = framing.patience().unwrap();
         assert!(until < now + Duration::from_millis(40), "sooner than half a frame");
@@ -179,19 +184,19 @@ mod tests {
         let mut framing = framing(Protocol::ModbusAscii);
         let mut line = Vec::new();
         ascii::encode_frame(3, &[3, 0, 32, 0, 4], &mut line);
-        framing.add(&[b"\r\n".as_slice(), &line[..7]].concat(), now);
+        add(&mut framing, &[b"\r\n".as_slice(), &line[..7]].concat(), now);
         assert!(all(&mut framing, now).is_empty());
-        framing.add(&line[7..], now);
-        framing.add(&line, now);
+        add(&mut framing, &line[7..], now);
+        add(&mut framing, &line, now);
         let mut broken = line.clone();
         broken[5] = b'7';
-        framing.add(&broken, now);
+        add(&mut framing, &broken, now);
         assert_eq!(all(&mut framing, now), [asks(3, 32, 4), asks(3, 32, 4), Said::Broken]);
         // Lower case, and a function that is not decoded.
-        framing.add(&line.to_ascii_lowercase(), now);
+        add(&mut framing, &line.to_ascii_lowercase(), now);
         let mut unknown = Vec::new();
         ascii::encode_frame(3, &[0x41, 7], &mut unknown);
-        framing.add(&unknown, now);
+        add(&mut framing, &unknown, now);
         let said = all(&mut framing, now);
         assert_eq!(said[0], asks(3, 32, 4));
         assert!(
@@ -200,7 +205,7 @@ mod tests {
         );
 
         let mut framing = self::framing(Protocol::N2);
-        framing.add(b">0111020388\r\n", now);
+        add(&mut framing, b">0111020388\r\n", now);
         let input = RequestPdu::read(Table::Input, 2, 2);
         let said = all(&mut framing, now);
         assert!(
@@ -208,7 +213,7 @@ mod tests {
             "{said:?}"
         );
         assert!(!framing.has_begun(), "a line feed begins no request");
-        framing.add(b">0111020389\r", now);
+        add(&mut framing, b">0111020389\r", now);
         assert_eq!(
             all(&mut framing, now),
             [Said::Broken],
@@ -258,7 +263,7 @@ mod tests {
             let mut framing = framing(protocol);
             let mut now = Instant::now();
             for piece in bytes.chunks(size) {
-                framing.add(piece, now);
+                add(&mut framing, piece, now);
                 all(&mut framing, now);
                 prop_assert!(framing.frames.rest().len() <= 1100);
                 now += Duration::from_millis(3);
@@ -271,7 +276,7 @@ mod tests {
                 Protocol::N2 => frame.extend(*b">0111020388\r"),
                 _ => protocol.encode_frame(9, &[3, 0, 1, 0, 2], &mut frame),
             }
-            framing.add(&frame, now);
+            add(&mut framing, &frame, now);
             let said = all(&mut framing, now);
             prop_assert!(matches!(&said[..], [Said::Request(_)]), "{:?}", said);
         }

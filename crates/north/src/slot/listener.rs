@@ -13,6 +13,7 @@ use crate::command::{Authority, Proof};
 use crate::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer};
 use crate::line::ServedPort;
 use crate::listener::ConnectionHandler;
+use crate::reading::Dated;
 use crate::refusals::Refusals;
 
 /// The tools of an address.
@@ -86,9 +87,9 @@ impl ConnectionHandler for SlotListener {
         self.refusals.acquire(&self.limit, newcomer, remedy, judge)
     }
 
-    async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, permit: ConnectionPermit) {
+    async fn serve(self: Arc<Self>, stream: Dated<TcpStream>, peer: SocketAddr, permit: ConnectionPermit) {
         let Some(served) = self.served.load_full() else { return };
-        if let Err(error) = stream.set_nodelay(true) {
+        if let Err(error) = stream.stream().set_nodelay(true) {
             tracing::debug!(target: "drivegate::north::slot", "tool slot: cannot set TCP_NODELAY: {error}");
         }
         let slot = &served.terms.slot;

@@ -9,6 +9,7 @@ use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
 use crate::NorthState;
 use crate::command::Proof;
+use crate::order::{Arrival, Connection};
 use crate::plant::SharedPlant;
 
 /// One tool of a slot without sockets.
@@ -16,6 +17,8 @@ use crate::plant::SharedPlant;
 pub struct Offline {
     terms: Arc<Terms>,
     dialogue: Dialogue,
+    /// Over which all comes, once something has.
+    connection: Option<Connection>,
 }
 
 impl Offline {
@@ -42,13 +45,16 @@ impl Offline {
         Offline {
             terms,
             dialogue: Dialogue::new(tool),
+            connection: None,
         }
     }
 
     /// Takes the bytes of the tool, if any, and returns what it is answered by `now`. What it asks for is in the queue of the
     /// bus when this returns, or waits until [`Offline::wake_at`].
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
-        self.dialogue.received(bytes, now);
+        let connection = self.connection.get_or_insert_with(|| Connection::opened(now));
+        let arrival = Arrival::over(connection.clone(), now);
+        self.dialogue.received(bytes, arrival, now);
         let mut cx = Context::from_waker(Waker::noop());
         while self.dialogue.poll(&mut cx, now).is_ready() {}
         std::mem::take(&mut self.dialogue.output)

@@ -18,6 +18,7 @@ use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
 use crate::command::Proof;
 use crate::line::Pty;
+use crate::reading::{Dated, Reader};
 
 /// Pause before a pseudo-terminal that could not be opened is tried again.
 const AGAIN: Duration = Duration::from_secs(5);
@@ -71,7 +72,7 @@ fn open(path: &Path) -> io::Result<Pty> {
 struct Port {
     pty: Pty,
     /// The same end of the pseudo-terminal. To the runtime it is a pipe: something that can be read now and then.
-    reader: pipe::Receiver,
+    reader: Dated<pipe::Receiver>,
     dialogue: Dialogue,
     /// When bytes came or went last; `None` once the port rests.
     used: Option<Instant>,
@@ -81,7 +82,10 @@ impl Port {
     fn new(pty: Pty, tool: Arc<Tool>) -> io::Result<Port> {
         let same = File::from(pty.as_fd().try_clone_to_owned()?);
         Ok(Port {
-            reader: pipe::Receiver::from_file_unchecked(same)?,
+            reader: Dated::new(
+                pipe::Receiver::from_file_unchecked(same)?,
+                Arc::new(Reader::here()),
+            ),
             pty,
             dialogue: Dialogue::new(tool),
             used: None,
@@ -110,7 +114,8 @@ impl Port {
             count = self.reader.read(&mut buffer), if reads => {
                 let bytes = count.map(|count| buffer.get(..count).unwrap_or_default())?;
                 self.used = Some(Instant::now());
-                self.dialogue.received(bytes, std::time::Instant::now())
+                let arrival = self.reader.reader().last();
+                self.dialogue.received(bytes, arrival, std::time::Instant::now())
             }
             () = sleep_until(timer) => {
                 if rests_at.is_some_and(|at| at <= Instant::now()) {

@@ -8,8 +8,9 @@ use std::time::{Duration, Instant};
 use super::request::{Meaning, Refused, ToolRequest};
 use super::{Slot, SlotAccess};
 use crate::codec::{LineFormat, Protocol, RequestPdu, describe};
-use crate::command::{self, Arrival, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
+use crate::command::{self, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
 use crate::drive::plan::WireTime;
+use crate::order::Arrival;
 use crate::plant::{
     BusHandle, DriveHandle, Exchange, OrderRequest, Placed, Plant, Question, SharedPlant, Target, turn_away,
 };
@@ -162,13 +163,13 @@ impl Tool {
             .collect()
     }
 
-    /// What becomes of a request whose first byte came at `asked`, and whose drives had been given so many `stops` when it was
+    /// What becomes of a request that came so, and whose drives had been given so many `stops` when it was
     /// whole: behind a stop that came in since it is not sent. What is given to the bus is in its queue when this returns, and
     /// is not sent after `deadline`.
     pub(super) fn decide(
         &self,
         request: &ToolRequest,
-        (asked, stops): (Instant, u64),
+        (mut arrival, stops): (Arrival, u64),
         deadline: Instant,
         now: Instant,
     ) -> Decision {
@@ -182,12 +183,14 @@ impl Tool {
         let broadcast = request.is_broadcast(self.protocol());
         // A stop that came in while it was held may have come at the same time by the clock.
         let stopped = drives.iter().map(DriveHandle::stops).sum::<u64>() != stops;
-        let before = asked.checked_sub(Duration::from_nanos(1)).filter(|_| stopped);
-        let asked = before.unwrap_or(asked);
+        if stopped {
+            let before = arrival.asked.checked_sub(Duration::from_nanos(1));
+            arrival.asked = before.unwrap_or(arrival.asked);
+        }
         let case = Case {
             plant: &plant,
             bus,
-            asked,
+            arrival,
             deadline,
             now,
         };
@@ -198,7 +201,7 @@ impl Tool {
                 Decision::Wait(self.exchange(&case, target, pdu, false))
             }
             Meaning::Write(pdu) if !broadcast && drives.len() == 1 => match drives.first() {
-                Some(drive) => self.write(drive, pdu, asked, now),
+                Some(drive) => self.write(drive, pdu, case.arrival, now),
                 None => Decision::Silent,
             },
             Meaning::Read(pdu) | Meaning::Write(pdu) | Meaning::Unchecked(pdu) => {
@@ -208,7 +211,7 @@ impl Tool {
     }
 
     /// A write to a configured drive: the same checks as those of a Modbus TCP client.
-    fn write(&self, drive: &DriveHandle, pdu: &RequestPdu, asked: Instant, now: Instant) -> Decision {
+    fn write(&self, drive: &DriveHandle, pdu: &RequestPdu, arrival: Arrival, now: Instant) -> Decision {
         if !self.writes() {
             let text = format!("the slot of bus `{}` has access = \"read\"", self.terms.slot.bus);
             return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
@@ -217,7 +220,7 @@ impl Tool {
         self.terms.paces.wrote(&self.terms.slot.bus, cost, now);
         let request =
             OrderRequest::new(Order::Write(pdu.clone()), self.origin.clone(), Authority::Write).within(EXPIRY);
-        let placed = drive.place(request.arrived(Arrival::now(now).asked(asked)), now);
+        let placed = drive.place(request.arrived(arrival), now);
         Decision::Wait(Work::Command(placed))
     }
 
@@ -247,7 +250,7 @@ impl Tool {
             // It has no reply: it was a broadcast.
             if let Some(stop) = stop_in(drive, pdu, now) {
                 let request = OrderRequest::new(stop, self.origin.clone(), Authority::Write).within(EXPIRY);
-                drop(drive.place(request, now));
+                drop(drive.place(request.arrived(case.arrival.clone()), now));
             }
         }
         for drive in drives {
@@ -268,7 +271,7 @@ impl Tool {
             target,
             pdu: pdu.clone(),
             may_write,
-            arrival: Arrival::now(case.now).asked(case.asked),
+            arrival: case.arrival.clone(),
             expires: case.deadline,
             origin: self.origin.clone(),
         };
@@ -306,7 +309,7 @@ impl Tool {
 struct Case<'c> {
     plant: &'c Plant,
     bus: &'c BusHandle,
-    asked: Instant,
+    arrival: Arrival,
     deadline: Instant,
     now: Instant,
 }

@@ -47,6 +47,8 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
         let end = |ended| TurnEnd {
             ended,
             began: rig.now,
+            at: rig.now,
+            stood: false,
             took: COST,
             mangled,
             frame: Vec::new(),

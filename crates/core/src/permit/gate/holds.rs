@@ -258,6 +258,12 @@ impl Gate {
         self.claim(origin).is_some_and(|who| who.cyclic)
     }
 
+    /// Whether a stop of that client is none, since it writes its command word all the time and its last one was a stop.
+    pub(super) fn repeats_its_word(&self, drive: DriveIndex, origin: &Origin) -> bool {
+        let Some(drive) = self.drives.get(&drive) else { return false };
+        self.claim(origin).is_some_and(|who| drive.holding.repeats(&who))
+    }
+
     /// The published state of a hold, and whether that client has it.
     pub fn hold_view(&self, drive: DriveIndex, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
         let rules = self.rules.as_ref()?;

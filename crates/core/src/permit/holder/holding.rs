@@ -520,7 +520,7 @@ impl Holding {
     }
 
     /// Whether that cyclic client's last word was a stop, too.
-    fn repeats(&self, who: &Claim) -> bool {
+    pub(crate) fn repeats(&self, who: &Claim) -> bool {
         who.cyclic && self.has_stood(who)
     }
 

@@ -37,7 +37,7 @@ impl GuardedDrives {
     }
 
     fn tripped(&self, drive: usize, seconds: f64) -> Option<String> {
-        let unmet = self.guards.tripped(DriveIndex::new(drive), self.at(seconds));
+        let unmet = self.guards.tripped(DriveIndex::new(drive), None, self.at(seconds));
         unmet.first().map(ToString::to_string)
     }
 }

@@ -1,4 +1,5 @@
 use super::*;
+use crate::order::Arrival;
 
 const NULL: Option<Datum> = None;
 

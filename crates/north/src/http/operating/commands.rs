@@ -22,6 +22,7 @@ use crate::command::{Answer, Origin, Outcome, Refusal, SourceKind};
 use crate::command_json::{self, CommandResult, Id, Repetition, Taken, excerpt, find_id};
 use crate::drive::model::Kind;
 use crate::drive::{ModelPoint, Point, PointIndex, Profile, RESTART_COMMUNICATION, Value};
+use crate::order::Arrival;
 use crate::plant::{DriveHandle, Placed, Plant, Shown};
 use crate::process_image::Access;
 
@@ -92,21 +93,21 @@ fn status(outcome: &Outcome) -> StatusCode {
     }
 }
 
-/// When a request came, as the first argument of its handler: passwords are compared, and the body is waited for, after
-/// that.
-pub(in crate::http) struct Asked(Instant);
+/// How the head of a request came: passwords are compared, and the body is waited for, after that.
+pub(in crate::http) struct Asked(Arrival);
 
 impl<S: Sync> FromRequestParts<S> for Asked {
     type Rejection = Infallible;
 
-    async fn from_request_parts(_: &mut request::Parts, _: &S) -> Result<Asked, Infallible> {
-        Ok(Asked(Instant::now()))
+    async fn from_request_parts(head: &mut request::Parts, _: &S) -> Result<Asked, Infallible> {
+        let arrival = head.extensions.get().cloned();
+        Ok(Asked(arrival.unwrap_or_else(|| Arrival::now(Instant::now()))))
     }
 }
 
 /// `POST /api/v1/drives/{name}/commands`
 pub(in crate::http) async fn command(
-    Asked(asked): Asked,
+    Asked(arrival): Asked,
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
     Commander(operator): Commander,
@@ -116,10 +117,10 @@ pub(in crate::http) async fn command(
     if let Some(drive) = restarts(&payload).then(|| plant.drive(&name)).flatten()
         && drive.image.spec.profile.counts_messages
     {
-        let (answer, shown) = restart::communication(&drive, operator.origin(), asked).await;
+        let (answer, shown) = restart::communication(&drive, operator.origin(), arrival).await;
         return Ok(CommandReply::new(None, &name, &answer, shown, SystemTime::now()));
     }
-    let times = (asked, Instant::now(), SystemTime::now());
+    let times = (arrival, Instant::now(), SystemTime::now());
     match app.operating.take(&plant, &operator, &name, &payload, times) {
         Progress::Known(reply) => Ok(reply),
         Progress::Repeated(reply) => shared(reply).await,
@@ -193,7 +194,7 @@ impl Operator {
 }
 
 impl Operating {
-    /// Takes a command whose head came at `asked_at`, at `now`, which is `time` on the calendar: it is in the queue of its bus when this returns, or its
+    /// Takes a command whose head came so, at `now`, which is `time` on the calendar: it is in the queue of its bus when this returns, or its
     /// reply is known. A repeated command is not executed again, but has the reply of the first one, or is refused; a stop
     /// is always executed, that of a command which does more without the rest.
     fn take(
@@ -202,7 +203,7 @@ impl Operating {
         operator: &Operator,
         name: &str,
         payload: &[u8],
-        (asked_at, now, time): (Instant, Instant, SystemTime),
+        (arrival, now, time): (Arrival, Instant, SystemTime),
     ) -> Progress {
         let (id, origin, what) = (find_id(payload), operator.origin(), excerpt(payload));
         let reply =
@@ -229,7 +230,7 @@ impl Operating {
                 Err(Known::Refused(why)) => asked.refused = Some(Refusal::NotAllowed(why)),
             }
         }
-        let placed = match asked.place(&drive, &what, origin, (asked_at, now)) {
+        let placed = match asked.place(&drive, &what, origin, (arrival, now)) {
             Ok(placed) => placed,
             Err(answer) => return reply(&answer),
         };

@@ -5,8 +5,9 @@ use std::future::poll_fn;
 use std::time::{Duration, Instant};
 
 use crate::codec::{Reply, RequestPdu};
-use crate::command::{Answer, Arrival, DEFAULT_EXPIRY, Origin, Outcome, Refusal};
+use crate::command::{Answer, DEFAULT_EXPIRY, Origin, Outcome, Refusal};
 use crate::drive::RESTART_COMMUNICATION;
+use crate::order::Arrival;
 use crate::plant::{DriveHandle, Question, Shown, Target};
 use crate::process_image::Access;
 
@@ -18,7 +19,7 @@ const LOOK: Duration = Duration::from_millis(50);
 const NO_ANSWER: &str = "the drive does not reply: check its power supply, wiring and address";
 
 /// Sends it, and waits until the drive replies again. Success is reported only if it was observed.
-pub(super) async fn communication(drive: &DriveHandle, origin: Origin, asked: Instant) -> (Answer, Shown) {
+pub(super) async fn communication(drive: &DriveHandle, origin: Origin, arrival: Arrival) -> (Answer, Shown) {
     let (spec, now) = (&drive.image.spec, Instant::now());
     if spec.access != Access::Control {
         let refusal = Refusal::NotAllowed(format!(
@@ -37,8 +38,8 @@ pub(super) async fn communication(drive: &DriveHandle, origin: Origin, asked: In
             data: 0,
         },
         may_write: true,
-        arrival: Arrival::now(now).asked(asked),
-        expires: now + DEFAULT_EXPIRY,
+        expires: arrival.asked + DEFAULT_EXPIRY,
+        arrival,
         origin,
     };
     let mut exchange = drive.ask_line(question, now);

@@ -13,6 +13,7 @@ use crate::NorthState;
 use crate::command::Authority;
 use crate::connection_limit::{ConnectionLimit, Limits, Newcomer};
 use crate::plant::Plant;
+use crate::reading::Dated;
 
 /// Read input register 0 of unit 255 in a plant without a bus: answered at once with 02.
 const REQUEST: [u8; 12] = [0, 1, 0, 0, 0, 6, 255, 4, 0, 0, 0, 1];
@@ -59,7 +60,9 @@ fn rig_with(pipe: usize, idle_timeout: Option<Duration>) -> PipedClient {
         .unwrap();
     let place = permit.place().clone();
     let server = tokio::spawn(async move {
-        serve(end, session, idle_timeout, permit.place(), &CancellationToken::new()).await;
+        let reader = Arc::new(Reader::here());
+        let stream = Dated::new(end, reader.clone());
+        serve((stream, reader), session, idle_timeout, permit.place(), &CancellationToken::new()).await;
     });
     PipedClient {
         client,

@@ -3,6 +3,7 @@ use std::time::Duration;
 
 use serde_json::Value as Json;
 
+use crate::order::Arrival;
 use super::super::fixture;
 use super::*;
 use crate::codec::Reply as BusReply;
@@ -481,7 +482,7 @@ fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
 fn a_start_that_came_before_a_stop_and_is_taken_behind_it_is_not_executed() {
     let mut bench = SetTopics::new();
     let mut start = set("p1/set", r#"{"id": 1, "run": true}"#);
-    start.asked = Some(bench.now);
+    start.arrival = Some(Arrival::now(bench.now));
     bench.now += Duration::from_millis(20);
     assert_eq!(bench.take(set("p1/set/run", "false")), None);
     bench.now += Duration::from_millis(20);

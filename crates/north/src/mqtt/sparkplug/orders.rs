@@ -16,6 +16,7 @@ use super::wire::{self, Metric, MetricValue, Payload};
 use crate::command::{Answer, CONFIRMED, DEFAULT_EXPIRY, Proof, Refusal, SourceKind};
 use crate::command_json::{Asked, SharedMemory, Taken, excerpt, refuse_unknown, resolve};
 use crate::drive::{ModelPoint, Profile};
+use crate::order::Arrival;
 use crate::plant::{Placed, Plant};
 
 /// Commands whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit
@@ -132,8 +133,8 @@ impl Orders {
         {
             asked.refused = Some(Refusal::NotAllowed(why.to_string()));
         }
-        let came = incoming.asked.unwrap_or(now);
-        let mut placed = match asked.place(drive, &request.what(), origin, (came, now)) {
+        let arrival = incoming.arrival.clone().unwrap_or_else(|| Arrival::now(now));
+        let mut placed = match asked.place(drive, &request.what(), origin, (arrival, now)) {
             Ok(placed) => placed,
             Err(answer) => return refused(&answer),
         };

@@ -45,7 +45,7 @@ impl OperatedPlant {
             operator,
             drive,
             body.as_bytes(),
-            (self.now, self.now, time),
+            (Arrival::now(self.now), self.now, time),
         )
     }
 
@@ -206,13 +206,13 @@ fn a_start_whose_body_comes_late_does_not_run_behind_a_stop() {
     rig.now += Duration::from_millis(20);
     let _stop = rig.take(&operator("bob", "bob#2"), "p1", "{\"run\": false}");
     rig.now += Duration::from_millis(30);
-    let times = (asked, rig.now, time);
+    let times = (Arrival::now(asked), rig.now, time);
     let outcome = |progress: Progress| match progress {
         Progress::Placed(mut waiting) => waiting.placed.answer().map(|answer| answer.outcome),
         _ => panic!("not placed"),
     };
     let start = b"{\"run\": true}";
-    let late = rig.operating.take(&rig.plant, &alice, "p1", start, times);
+    let late = rig.operating.take(&rig.plant, &alice, "p1", start, times.clone());
     assert_eq!(outcome(late), Some(Outcome::Purged));
     assert_eq!(status(&Outcome::Purged), StatusCode::CONFLICT);
     let other = rig.operating.take(&rig.plant, &alice, "p2", start, times);

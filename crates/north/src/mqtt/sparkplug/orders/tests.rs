@@ -1,3 +1,4 @@
+use crate::order::Arrival;
 use super::*;
 use crate::codec::Reply;
 use crate::command::{Order, Outcome, Urgency};
@@ -286,7 +287,7 @@ fn a_start_that_came_before_a_stop_and_is_taken_behind_it_is_not_executed() {
     let mut bench = bench();
     let run = |value| vec![named("run", MetricValue::Boolean(value))];
     let mut start = message(1, run(true));
-    start.asked = Some(bench.now);
+    start.arrival = Some(Arrival::now(bench.now));
     bench.now += Duration::from_millis(20);
     assert_eq!(bench.take(&message(2, run(false)), "p1"), None);
     assert_eq!(bench.take(&start, "p1").unwrap().code, "purged");

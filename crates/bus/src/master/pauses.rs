@@ -1,0 +1,48 @@
+//! What a stall of the thread changes: leases, what waits, what has begun.
+
+use std::time::{Duration, Instant};
+
+use super::Master;
+use crate::command::Urgency;
+use crate::order::Stood;
+
+impl Master {
+    /// The thread stood still until `now`. What waits is judged by that when it is chosen again. A command of several steps
+    /// that a pause interrupted is not continued, but for the end of a pulse.
+    pub(crate) fn stood(&mut self, stood: Stood, now: Instant) {
+        let Stood { stall, slept } = stood;
+        self.prolong(stall.length());
+        if let Some(starts) = &mut self.waits.starts {
+            starts.stood(stall);
+        }
+        let mut queue = self.bus.queue.lock();
+        if stall.is_pause() {
+            queue.gate.note_pause(stall);
+        }
+        if !slept.is_zero() {
+            queue.slept(slept);
+        }
+        drop(queue);
+        for drive in &mut self.drives {
+            for urgency in [Urgency::Command, Urgency::Read] {
+                if let Some(run) = drive.run(urgency).filter(|_| stall.is_pause()) {
+                    run.interrupted(slept, now);
+                }
+            }
+        }
+        if !slept.is_zero() {
+            for image in &self.bus.image.drives {
+                image.update(|snapshot| snapshot.slept(slept));
+            }
+        }
+    }
+
+    /// Nobody was heard for that time, since the gateway itself stood still: leases last longer by it.
+    pub(crate) fn prolong(&mut self, time: Duration) {
+        for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
+            if let Some(supervision) = &image.spec.supervision {
+                drive.supervision.prolong(time, supervision.timeout);
+            }
+        }
+    }
+}

@@ -1,0 +1,298 @@
+//! How long a thread stood still, and what that means for the date of what it reads. Pure: time is an argument.
+//!
+//! A process can stand still as a whole (it is stopped, its virtual machine is saved, the machine is suspended, the
+//! host is full), and so can one thread. What is found in a socket afterwards may have come at any time in between, in
+//! any order.
+
+use std::time::{Duration, Instant};
+
+/// A thread that reads runs at least this often.
+pub const TICK: Duration = Duration::from_millis(100);
+/// Longest time between two turns of a thread that is no stall. A tick is late by some milliseconds on any machine; by
+/// half of its time only where the thread did not get the processor. Any stall of 150 ms or more is seen.
+pub const UNNOTICED: Duration = Duration::from_millis(150);
+/// What came during a stall is read within this time after it, unless its reader finds nothing left before: a thousand
+/// connections are read in a few milliseconds.
+pub const READ_WITHIN: Duration = Duration::from_millis(250);
+/// A longer stall is a pause: clients may have given up by then (many wait for a second), and sent again. A hiccup of a
+/// busy machine is shorter.
+const PAUSE: Duration = Duration::from_secs(1);
+/// What a client's system could not deliver during a pause it sends again at intervals that double, so within as long
+/// again; never longer apart than this (RFC 6298 and Linux: 120 s).
+const RESENT_WITHIN: Duration = Duration::from_secs(120);
+/// And what is sent again has this time on its way, and to be read.
+const ON_ITS_WAY: Duration = Duration::from_secs(1);
+
+/// A time in which a thread did not run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stall {
+    /// When it ran last. Before a machine was suspended: as long ago as it really was, though the clock stood.
+    pub began: Instant,
+    /// When it ran again.
+    pub ended: Instant,
+}
+
+impl Stall {
+    /// How long it was.
+    pub fn length(&self) -> Duration {
+        self.ended.saturating_duration_since(self.began)
+    }
+
+    /// Whether it was longer than a hiccup.
+    pub fn is_pause(&self) -> bool {
+        self.length() > PAUSE
+    }
+
+    /// Until when what came during it is read.
+    pub fn read_by(&self) -> Instant {
+        self.ended + READ_WITHIN
+    }
+
+    /// Until when what clients sent before its end may still come.
+    pub fn over(&self) -> Instant {
+        self.ended + self.length().min(RESENT_WITHIN) + ON_ITS_WAY
+    }
+}
+
+/// A stall that has just been noticed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stood {
+    /// From when to when.
+    pub stall: Stall,
+    /// For how long of it the machine was suspended, in which its clock stood.
+    pub slept: Duration,
+}
+
+/// The date of what was read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Dated {
+    /// No later than it came.
+    pub asked: Instant,
+    /// The stall during which it may have come.
+    pub stall: Option<Stall>,
+    /// The last pause, as long as what was sent before its end may still come.
+    pub pause: Option<Stall>,
+}
+
+/// The stalls of one thread, or of threads that work together.
+#[derive(Debug, Clone)]
+pub struct Stalls {
+    /// When it ran last, and what the clock showed that goes on while the machine is suspended.
+    ran: Instant,
+    boot: Duration,
+    last: Option<Stall>,
+    pause: Option<Stall>,
+}
+
+impl Stalls {
+    /// Of a thread that runs at `now`; `boot` is the time since the machine was started, suspensions included.
+    pub fn new(now: Instant, boot: Duration) -> Stalls {
+        Stalls {
+            ran: now,
+            boot,
+            last: None,
+            pause: None,
+        }
+    }
+
+    /// The thread runs. Returns the stall that has ended by that.
+    pub fn observe(&mut self, now: Instant, boot: Duration) -> Option<Stood> {
+        let ran = now.saturating_duration_since(self.ran);
+        let booted = boot.saturating_sub(self.boot);
+        (self.ran, self.boot) = (self.ran.max(now), boot);
+        let gap = ran.max(booted);
+        if gap <= UNNOTICED {
+            return None;
+        }
+        let stall = Stall {
+            began: now.checked_sub(gap).unwrap_or(now),
+            ended: now,
+        };
+        self.stood(stall);
+        Some(Stood {
+            stall,
+            slept: booted.saturating_sub(ran),
+        })
+    }
+
+    /// The thread runs on, and what it did since it ran last was no stall: such as to open a port.
+    pub fn go_on(&mut self, now: Instant, boot: Duration) {
+        (self.ran, self.boot) = (now, boot);
+    }
+
+    /// A stall that was found by other means.
+    pub fn stood(&mut self, stall: Stall) {
+        if stall.is_pause() {
+            self.pause = Some(stall);
+        }
+        // What came during the one before may still be unread.
+        let before = self.last.filter(|last| stall.began < last.ended + TICK);
+        self.last = Some(Stall {
+            began: before.map_or(stall.began, |before| before.began.min(stall.began)),
+            ended: before.map_or(stall.ended, |before| before.ended.max(stall.ended)),
+        });
+    }
+
+    /// When it ran last.
+    pub fn ran(&self) -> Instant {
+        self.ran
+    }
+
+    /// The last stall.
+    pub fn last(&self) -> Option<Stall> {
+        self.last
+    }
+
+    /// The last pause, if what was sent before its end may still come.
+    pub fn pause(&self, now: Instant) -> Option<Stall> {
+        self.pause.filter(|pause| now < pause.over())
+    }
+
+    /// Until when a stall of before matters for what is read.
+    pub fn matters_until(&self) -> Option<Instant> {
+        let last = self.last.map(|last| last.read_by());
+        last.max(self.pause.map(|pause| pause.over()))
+    }
+
+    /// The date of bytes that are read at `now`. No unread byte came before `floor`: then the reader found nothing left,
+    /// or that is the date of the bytes before these. `waited`: the reader has waited for them since, so that they came just
+    /// now, unless its thread stood still.
+    pub fn date(&self, floor: Instant, waited: bool, now: Instant) -> Dated {
+        let stall = self.last.filter(|stall| floor < stall.ended && now <= stall.read_by());
+        let asked = match (waited, stall) {
+            (false, _) => floor,
+            (true, None) => now,
+            (true, Some(stall)) => floor.max(stall.began),
+        };
+        Dated {
+            asked: asked.min(now),
+            stall,
+            pause: self.pause(now),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: Duration = Duration::from_millis(1);
+
+    struct Thread {
+        start: Instant,
+        stalls: Stalls,
+    }
+
+    impl Thread {
+        fn new() -> Thread {
+            let start = Instant::now();
+            Thread {
+                start,
+                stalls: Stalls::new(start, Duration::from_secs(5000)),
+            }
+        }
+
+        fn at(&self, ms: u32) -> Instant {
+            self.start + MS * ms
+        }
+
+        /// It runs at each of these times, in milliseconds, the clock of a suspended machine being ahead by `slept`.
+        fn runs(&mut self, times: &[(u32, u32)]) -> Vec<(i64, i64, u128)> {
+            let mut all = Vec::new();
+            for (ms, slept) in times {
+                let boot = Duration::from_secs(5000) + MS * (ms + slept);
+                let stood = self.stalls.observe(self.at(*ms), boot);
+                all.extend(stood.map(|s| (self.ms(s.stall.began), self.ms(s.stall.ended), s.slept.as_millis())));
+            }
+            all
+        }
+
+        fn ms(&self, at: Instant) -> i64 {
+            let after = at.saturating_duration_since(self.start).as_millis() as i64;
+            after - self.start.saturating_duration_since(at).as_millis() as i64
+        }
+
+        /// Date, stall and pause of what is read.
+        fn reads(&self, floor: u32, waited: bool, now: u32) -> (i64, Option<(i64, i64)>, bool) {
+            let dated = self.stalls.date(self.at(floor), waited, self.at(now));
+            let stall = dated.stall.map(|s| (self.ms(s.began), self.ms(s.ended)));
+            (self.ms(dated.asked), stall, dated.pause.is_some())
+        }
+    }
+
+    #[test]
+    fn a_gap_between_two_turns_is_a_stall() {
+        for (times, stalls) in [
+            (&[(100, 0), (200, 0), (349, 0)][..], &[][..]),
+            (&[(100, 0), (251, 0)], &[(100, 251, 0)]),
+            (&[(100, 0), (3100, 0), (3200, 0)], &[(100, 3100, 0)]),
+            // Suspended for an hour: the clock stood.
+            (&[(100, 0), (150, 3_600_000)], &[(-3_599_900, 150, 3_600_000)]),
+            (&[(100, 0), (2100, 3000), (2200, 3000)], &[(-2900, 2100, 3000)]),
+            // The two clocks are not read at the same moment.
+            (&[(100, 3), (200, 0), (300, 40), (400, 0)], &[]),
+        ] {
+            assert_eq!(Thread::new().runs(times), stalls, "{times:?}");
+        }
+    }
+
+    #[test]
+    fn what_was_no_stall_is_none() {
+        let mut thread = Thread::new();
+        let boot = Duration::from_secs(5010);
+        thread.stalls.go_on(thread.at(10_000), boot);
+        assert_eq!(thread.stalls.observe(thread.at(10_100), boot + 100 * MS), None);
+    }
+
+    #[test]
+    fn the_date_of_what_is_read() {
+        let mut thread = Thread::new();
+        thread.runs(&[(100, 0), (2100, 0), (2200, 0)]);
+        let stall = Some((100, 2100));
+        for (what, floor, waited, now, expected) in [
+            ("one that waited since long before", 20, true, 2101, (100, stall, true)),
+            ("one that found nothing at last while it ran", 100, true, 2101, (100, stall, true)),
+            ("one that did not read since before", 20, false, 2101, (20, stall, true)),
+            ("the second piece, found at once", 100, false, 2102, (100, stall, true)),
+            ("it found nothing after the stall", 2101, true, 2103, (2103, None, true)),
+            ("the same, and did not read for a time", 2101, false, 2203, (2101, None, true)),
+            ("the last moment", 20, true, 2350, (100, stall, true)),
+            ("later, one that waited", 20, true, 2351, (2351, None, true)),
+            ("later, one whose bytes lay there", 20, false, 2351, (20, None, true)),
+            ("the pause is over when as long again has gone by and a second", 20, true, 5099, (5099, None, true)),
+            ("and no longer", 20, true, 5100, (5100, None, false)),
+        ] {
+            assert_eq!(thread.reads(floor, waited, now), expected, "{what}");
+        }
+    }
+
+    #[test]
+    fn a_hiccup_is_no_pause_however_often_it_comes() {
+        let mut thread = Thread::new();
+        let times: Vec<(u32, u32)> = (1..50).flat_map(|n| [(n * 500 - 100, 0), (n * 500, 0)]).collect();
+        assert_eq!(thread.runs(&times).len(), 49);
+        assert_eq!(thread.reads(0, true, 24_401), (24_000, Some((24_000, 24_400)), false));
+    }
+
+    #[test]
+    fn stalls_close_to_each_other_are_one_for_what_is_not_read_yet() {
+        let mut thread = Thread::new();
+        thread.runs(&[(100, 0), (400, 0), (480, 0), (800, 0)]);
+        assert_eq!(thread.reads(100, true, 801), (100, Some((100, 800)), false));
+        let mut thread = Thread::new();
+        thread.runs(&[(100, 0), (400, 0), (510, 0), (800, 0)]);
+        assert_eq!(thread.reads(100, true, 801), (510, Some((510, 800)), false));
+    }
+
+    #[test]
+    fn after_a_long_pause_old_connections_do_not_wait_for_ever() {
+        let now = Instant::now();
+        let stall = |seconds| Stall {
+            began: now,
+            ended: now + Duration::from_secs(seconds),
+        };
+        for (seconds, over) in [(2, 5), (100, 201), (3600, 3721)] {
+            assert_eq!(stall(seconds).over(), now + Duration::from_secs(over), "{seconds} s");
+        }
+    }
+}

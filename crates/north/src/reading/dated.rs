@@ -1,0 +1,197 @@
+//! A stream whose reader dates what it reads.
+
+use std::io;
+use std::os::fd::AsFd;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Instant;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use tokio::io::{AsyncRead, AsyncWrite, DuplexStream, ReadBuf};
+use tokio::net::unix::pipe;
+use tokio::net::{TcpStream, UnixStream};
+
+use super::Reader;
+
+/// What a stream shows beside its bytes.
+pub(crate) trait Source {
+    /// Whether there is something to read.
+    fn is_readable(&self) -> bool;
+
+    /// Whether the other end has closed or reset it, whatever is left to read. One that has only ended writing, and still
+    /// reads, looks the same before it is sent something.
+    fn has_gone(&self) -> bool;
+}
+
+fn shows(source: &impl AsFd, flags: PollFlags) -> bool {
+    let mut fds = [PollFd::new(source, flags)];
+    // Where the system does not say it, nothing is.
+    let any = poll(&mut fds, Some(&Timespec::default())).unwrap_or(0) > 0;
+    any && fds.iter().any(|fd| fd.revents().intersects(flags))
+}
+
+/// Whether there is something to read or accept.
+pub(crate) fn is_readable(source: &impl AsFd) -> bool {
+    shows(source, PollFlags::IN)
+}
+
+/// What a socket of the system shows.
+macro_rules! source {
+    ($($type:ty),*) => {$(
+        impl Source for $type {
+            fn is_readable(&self) -> bool {
+                is_readable(self)
+            }
+
+            fn has_gone(&self) -> bool {
+                shows(self, PollFlags::RDHUP | PollFlags::HUP | PollFlags::ERR)
+            }
+        }
+    )*};
+}
+
+source!(TcpStream, UnixStream);
+
+impl Source for pipe::Receiver {
+    fn is_readable(&self) -> bool {
+        is_readable(self)
+    }
+
+    /// A program that closes a pseudo-terminal may have left something to be done.
+    fn has_gone(&self) -> bool {
+        false
+    }
+}
+
+/// Within the process nothing stands still alone.
+impl Source for DuplexStream {
+    fn is_readable(&self) -> bool {
+        false
+    }
+
+    fn has_gone(&self) -> bool {
+        false
+    }
+}
+
+/// A stream with its reader.
+#[derive(Debug)]
+pub(crate) struct Dated<S> {
+    stream: S,
+    reader: Arc<Reader>,
+}
+
+impl<S> Dated<S> {
+    pub(crate) fn new(stream: S, reader: Arc<Reader>) -> Dated<S> {
+        Dated { stream, reader }
+    }
+
+    pub(crate) fn reader(&self) -> &Arc<Reader> {
+        &self.reader
+    }
+
+    pub(crate) fn stream(&self) -> &S {
+        &self.stream
+    }
+}
+
+impl<S: AsyncRead + Source + Unpin> AsyncRead for Dated<S> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        let Dated { stream, reader } = &mut *self;
+        let (room, before) = (buffer.remaining(), buffer.filled().len());
+        let polled = Pin::new(&mut *stream).poll_read(context, buffer);
+        let now = Instant::now();
+        match &polled {
+            Poll::Pending => reader.nothing(now, || stream.is_readable()),
+            Poll::Ready(Ok(())) => match buffer.filled().len() - before {
+                0 if room > 0 => reader.ended(),
+                0 => {}
+                count => reader.came(now, count < room, || stream.has_gone()),
+            },
+            Poll::Ready(Err(_)) => reader.ended(),
+        }
+        polled
+    }
+}
+
+impl<S: AsyncWrite + Unpin> AsyncWrite for Dated<S> {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write(context, bytes)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write_vectored(context, bytes)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpListener;
+
+    use super::*;
+
+    async fn pair() -> (TcpStream, Dated<TcpStream>) {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let client = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
+        let (stream, _) = listener.accept().await.unwrap();
+        (client, Dated::new(stream, Arc::new(Reader::here())))
+    }
+
+    #[tokio::test]
+    async fn a_stream_dates_what_it_reads() {
+        let (mut client, mut stream) = pair().await;
+        let before = Instant::now();
+        let writing = async {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+            client.write_all(b"late").await.unwrap();
+        };
+        let mut buffer = [0; 16];
+        let (read, ()) = tokio::join!(stream.read(&mut buffer), writing);
+        assert_eq!(read.unwrap(), 4);
+        let came = stream.reader().last().asked;
+        assert!(came >= before + Duration::from_millis(20) && came <= Instant::now());
+        client.write_all(b"at once").await.unwrap();
+        tokio::time::sleep(Duration::from_millis(20)).await;
+        stream.read(&mut buffer).await.unwrap();
+        let at_once = stream.reader().last().asked;
+        assert!(at_once >= came && at_once < came + Duration::from_millis(20), "nobody read since");
+        assert!(!stream.reader().last().connection.is_gone());
+        drop(client);
+        assert_eq!(stream.read(&mut buffer).await.unwrap(), 0);
+        assert!(stream.reader().last().connection.is_gone());
+    }
+
+    #[tokio::test]
+    async fn a_client_that_has_gone_is_seen_behind_what_it_left() {
+        let (mut client, stream) = pair().await;
+        client.write_all(b"left").await.unwrap();
+        assert!(!stream.stream().has_gone());
+        drop(client);
+        tokio::time::sleep(Duration::from_millis(20)).await;
+        assert!(stream.stream().has_gone() && stream.stream().is_readable());
+    }
+}

@@ -1,0 +1,210 @@
+//! The reader of one connection: the date of what it reads.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use super::Watch;
+use crate::line::since_boot;
+use crate::order::{Arrival, Connection, Dated};
+
+/// The reader of a connection.
+#[derive(Debug)]
+pub(crate) struct Reader {
+    watch: Arc<Watch>,
+    connection: Connection,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+struct State {
+    /// No byte that is unread came before.
+    floor: Instant,
+    /// It has found nothing, and waits.
+    waited: bool,
+    /// Of what was read last.
+    last: Dated,
+    /// Of what was read first since nothing was left.
+    first: Dated,
+    /// Nothing was left since the last read.
+    fresh: bool,
+}
+
+impl Reader {
+    /// The reader of a connection that was opened at `opened`, on the runtime that this watches.
+    pub(crate) fn new(watch: Arc<Watch>, opened: Instant) -> Reader {
+        let dated = Dated {
+            asked: opened,
+            stall: None,
+            pause: None,
+        };
+        Reader {
+            watch,
+            connection: Connection::opened(opened),
+            state: Mutex::new(State {
+                floor: opened,
+                waited: false,
+                last: dated,
+                first: dated,
+                fresh: true,
+            }),
+        }
+    }
+
+    /// The same on the runtime of this thread, for a connection that is opened now.
+    pub(crate) fn here() -> Reader {
+        Reader::new(Watch::of_this_thread(), Instant::now())
+    }
+
+    /// The reader of a connection that this one accepted last.
+    pub(crate) fn accepted(&self) -> Reader {
+        Reader::new(self.watch.clone(), self.state().last.asked)
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// It found nothing to read at `now`, and waits. The runtime may not have looked since a stall: then `is_there` says
+    /// whether there is something.
+    pub(crate) fn nothing(&self, now: Instant, is_there: impl FnOnce() -> bool) {
+        let matters = self.watch.turn(now, None);
+        let left = matters && self.watch.just_stood(now) && is_there();
+        let mut state = self.state();
+        (state.waited, state.fresh) = (true, true);
+        if !left {
+            state.floor = state.floor.max(now);
+        }
+    }
+
+    /// It does not read for a time, whatever comes.
+    pub(crate) fn ceased(&self) {
+        self.state().waited = false;
+    }
+
+    /// It read something at `now`; `all`: and nothing is left. `has_gone` says whether the client has closed or reset the
+    /// connection since.
+    pub(crate) fn came(&self, now: Instant, all: bool, has_gone: impl FnOnce() -> bool) {
+        let mut state = self.state();
+        let boot = state.waited.then(since_boot);
+        let dated = match self.watch.turn(now, boot) {
+            true => self.watch.date(state.floor, state.waited, now),
+            false => Dated {
+                asked: if state.waited { now } else { state.floor.min(now) },
+                stall: None,
+                pause: None,
+            },
+        };
+        if dated.stall.is_some() && has_gone() {
+            self.connection.hang_up();
+        }
+        state.floor = if all { now } else { state.floor.max(dated.asked) };
+        state.waited = false;
+        state.last = dated;
+        if std::mem::take(&mut state.fresh) {
+            state.first = dated;
+        }
+    }
+
+    /// The client has closed or reset the connection.
+    pub(crate) fn ended(&self) {
+        self.connection.hang_up();
+    }
+
+    /// How what was read last came.
+    pub(crate) fn last(&self) -> Arrival {
+        self.arrival(self.state().last)
+    }
+
+    /// How the first of what was read came since nothing was left: of all that is read and not taken yet, the earliest.
+    pub(crate) fn first(&self) -> Arrival {
+        self.arrival(self.state().first)
+    }
+
+    fn arrival(&self, dated: Dated) -> Arrival {
+        Arrival {
+            asked: dated.asked,
+            connection: self.connection.clone(),
+            stall: dated.stall,
+            pause: dated.pause,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    const MS: Duration = Duration::from_millis(1);
+
+    struct Rig {
+        reader: Reader,
+        start: Instant,
+    }
+
+    impl Rig {
+        fn new() -> Rig {
+            let start = Instant::now();
+            Rig {
+                reader: Reader::new(Watch::new(true), start),
+                start,
+            }
+        }
+
+        fn nothing(&self, ms: u32) {
+            self.reader.nothing(self.start + MS * ms, || false);
+        }
+
+        /// Reads at that time; the date.
+        fn came(&self, ms: u32, all: bool) -> u128 {
+            self.reader.came(self.start + MS * ms, all, || false);
+            self.ms(&self.reader.last())
+        }
+
+        fn ms(&self, arrival: &Arrival) -> u128 {
+            arrival.asked.duration_since(self.start).as_millis()
+        }
+    }
+
+    #[test]
+    fn what_is_read_dates_from_when_it_came() {
+        let rig = Rig::new();
+        assert_eq!(rig.came(5, true), 0, "it may have been there since the connection was opened");
+        assert_eq!(rig.came(7, true), 5, "and this since the read before");
+        rig.nothing(10);
+        assert_eq!(rig.came(1000, false), 1000, "what is waited for comes when it is read");
+        assert_eq!(rig.came(1001, true), 1000, "the rest of it");
+        assert_eq!(rig.ms(&rig.reader.first()), 1000);
+        assert_eq!(rig.came(1010, true), 1001);
+        assert_eq!(rig.ms(&rig.reader.first()), 1000, "all since nothing was left");
+        rig.nothing(1011);
+        rig.reader.ceased();
+        assert_eq!(rig.came(5000, true), 1011, "it did not read meanwhile");
+        assert_eq!(rig.ms(&rig.reader.first()), 1011);
+    }
+
+    #[test]
+    fn what_came_during_a_stall_is_as_old_as_that() {
+        let watch = Watch::new(true);
+        let reader = Reader::new(watch.clone(), Instant::now());
+        let start = Instant::now() + MS;
+        watch.turn(start, None);
+        let tick = |at: Instant| watch.begin_at(at);
+        tick(start);
+        reader.nothing(start + MS, || false);
+        let now = start + 2000 * MS;
+        reader.nothing(now, || true);
+        reader.came(now + MS, false, || true);
+        let first = reader.last();
+        assert_eq!(first.asked, start + MS);
+        assert!(first.stall.is_some() && first.pause.is_some());
+        assert!(first.connection.is_gone(), "its client gave up");
+        reader.came(now + 2 * MS, true, || false);
+        assert_eq!(reader.last().asked, start + MS, "the rest of it");
+        reader.came(now + 3 * MS, true, || false);
+        let since = reader.last();
+        assert_eq!((since.asked, since.stall), (now + 2 * MS, None), "nothing was left");
+        assert!(since.pause.is_some(), "its connection is older than the pause");
+    }
+}

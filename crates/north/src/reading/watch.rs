@@ -1,0 +1,290 @@
+//! Whether the threads that read sockets run. A task that wakes ten times a second shows that of a runtime; what a
+//! reader finds before that task ran again counts, too.
+//!
+//! The workers of a runtime that has several share a watch: a stall of one of them is a stall for all, since its tasks
+//! may go on at another one.
+
+use std::cell::{Cell, RefCell};
+use std::io;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use tokio::runtime::{Builder, Runtime};
+use tokio::time::MissedTickBehavior;
+
+use crate::event::Events;
+use crate::line::since_boot;
+use crate::order::{Dated, Stall, Stalls, TICK, UNNOTICED};
+
+thread_local! {
+    /// The watch of the runtime that this thread works for.
+    static WATCH: RefCell<Option<Arc<Watch>>> = const { RefCell::new(None) };
+    /// When this worker ran last, in nanoseconds of its watch, while it runs; 0 while it rests, or is not one of several.
+    static WORKER_RAN: Cell<u64> = const { Cell::new(0) };
+}
+
+/// Most pauses that are to be told at one time: they are told ten times a second.
+const MOST_UNTOLD: usize = 8;
+
+/// Watches the threads of a runtime.
+#[derive(Debug)]
+pub struct Watch {
+    base: Instant,
+    /// One thread does all: what it reads shows that it runs.
+    single: bool,
+    /// When it ran last, in nanoseconds after `base`; 0 before the watch began: until then nothing is a stall.
+    ran: AtomicU64,
+    /// By how many nanoseconds the time since the machine was started was ahead of that.
+    boot_ahead: AtomicU64,
+    /// Until when a stall of before matters.
+    matters_until: AtomicU64,
+    stalls: Mutex<Stalls>,
+    untold: Mutex<Vec<Stall>>,
+    events: OnceLock<Events>,
+}
+
+impl Watch {
+    /// For a runtime of one thread, or of several.
+    pub fn new(single: bool) -> Arc<Watch> {
+        let base = Instant::now();
+        Arc::new(Watch {
+            base,
+            single,
+            ran: AtomicU64::new(0),
+            boot_ahead: AtomicU64::new(0),
+            matters_until: AtomicU64::new(0),
+            stalls: Mutex::new(Stalls::new(base, Duration::ZERO)),
+            untold: Mutex::default(),
+            events: OnceLock::new(),
+        })
+    }
+
+    /// That of the runtime of this thread; one that sees no stalls where the runtime has none.
+    pub fn of_this_thread() -> Arc<Watch> {
+        let own = WATCH.with(|watch| watch.try_borrow().ok().and_then(|watch| watch.clone()));
+        own.unwrap_or_else(|| Watch::new(false))
+    }
+
+    /// This thread works for the runtime that is watched.
+    pub fn enter(self: &Arc<Watch>) {
+        WATCH.with(|watch| {
+            if let Ok(mut watch) = watch.try_borrow_mut() {
+                *watch = Some(self.clone());
+            }
+        });
+    }
+
+    /// Watches as long as the runtime runs, and tells of pauses.
+    pub async fn run(self: Arc<Watch>, events: Events) {
+        let beat = events.pauses().reader(Instant::now());
+        // Told by that of the first call, should there be several.
+        let _ = self.events.set(events);
+        let mut ticks = tokio::time::interval(TICK);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            ticks.tick().await;
+            let now = Instant::now();
+            beat.ran(now);
+            self.tick(now, since_boot());
+            self.tell();
+        }
+    }
+
+    fn tick(&self, now: Instant, boot: Duration) {
+        if self.ran.load(Ordering::Relaxed) != 0 {
+            self.turn(now, Some(boot));
+        }
+        self.ran_at(now, boot);
+    }
+
+    fn ran_at(&self, now: Instant, boot: Duration) {
+        let at = self.nanos(now);
+        self.boot_ahead
+            .store(in_nanos(boot).saturating_sub(at), Ordering::Relaxed);
+        self.ran.store(at, Ordering::Relaxed);
+    }
+
+    fn tell(&self) {
+        let untold = std::mem::take(&mut *self.untold.lock().unwrap_or_else(PoisonError::into_inner));
+        for pause in untold {
+            if let Some(events) = self.events.get() {
+                events.publish_pause(pause, SystemTime::now());
+            }
+        }
+    }
+
+    /// Never 0, which stands for none.
+    fn nanos(&self, at: Instant) -> u64 {
+        in_nanos(at.saturating_duration_since(self.base)).max(1)
+    }
+
+    fn stalls(&self) -> MutexGuard<'_, Stalls> {
+        self.stalls.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A reader runs at `now`; `boot` is the time since the machine was started, where it matters. Whether a stall, of
+    /// before or just now, matters for what is read.
+    pub(super) fn turn(&self, now: Instant, boot: Option<Duration>) -> bool {
+        let (at, ran) = (self.nanos(now), self.ran.load(Ordering::Relaxed));
+        if ran == 0 {
+            return false;
+        }
+        let unnoticed = in_nanos(UNNOTICED);
+        let worker = WORKER_RAN.get();
+        let ahead = self.boot_ahead.load(Ordering::Relaxed);
+        let slept = boot.is_some_and(|boot| in_nanos(boot).saturating_sub(at) > ahead.saturating_add(unnoticed));
+        let worker_stood = worker != 0 && at.saturating_sub(worker) > unnoticed;
+        if worker != 0 {
+            WORKER_RAN.set(at.max(worker));
+        }
+        if slept || worker_stood || at.saturating_sub(ran) > unnoticed {
+            self.stood(now, ran, worker_stood.then_some(worker));
+        } else if self.single {
+            self.ran.fetch_max(at, Ordering::Relaxed);
+        }
+        at <= self.matters_until.load(Ordering::Relaxed)
+    }
+
+    /// The runtime did not run since `ran`, or one of its workers.
+    fn stood(&self, now: Instant, ran: u64, worker: Option<u64>) {
+        let at = |nanos: u64| self.base + Duration::from_nanos(nanos);
+        let boot = since_boot();
+        let mut stalls = self.stalls();
+        let ahead = self.boot_ahead.load(Ordering::Relaxed);
+        stalls.go_on(at(ran), Duration::from_nanos(ran.saturating_add(ahead)));
+        let all = stalls.observe(now, boot).map(|stood| stood.stall);
+        let of_worker = worker.map(|since| Stall {
+            began: at(since),
+            ended: now,
+        });
+        if let Some(stall) = of_worker {
+            stalls.stood(stall);
+        }
+        let until = stalls.matters_until().map_or(0, |until| self.nanos(until));
+        self.matters_until.store(until, Ordering::Relaxed);
+        drop(stalls);
+        self.ran_at(now, boot);
+        let longest = all.into_iter().chain(of_worker).max_by_key(Stall::length);
+        if let Some(pause) = longest.filter(Stall::is_pause) {
+            let mut untold = self.untold.lock().unwrap_or_else(PoisonError::into_inner);
+            if untold.len() < MOST_UNTOLD {
+                untold.push(pause);
+            }
+        }
+    }
+
+    /// The date of what is read at `now`: see [`Stalls::date`].
+    pub(super) fn date(&self, floor: Instant, waited: bool, now: Instant) -> Dated {
+        self.stalls().date(floor, waited, now)
+    }
+
+    /// Whether what a reader does not find now may be there all the same, since it came during a stall just now.
+    pub(super) fn just_stood(&self, now: Instant) -> bool {
+        self.stalls().last().is_some_and(|stall| now <= stall.read_by())
+    }
+
+    #[cfg(test)]
+    pub(super) fn begin_at(&self, now: Instant) {
+        self.ran_at(now, since_boot());
+    }
+
+    fn worker_runs(&self) {
+        WORKER_RAN.set(self.nanos(Instant::now()));
+    }
+}
+
+fn in_nanos(time: Duration) -> u64 {
+    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
+}
+
+/// A runtime of several threads that is watched once [`Watch::run`] runs on it; the calling thread counts as one of it.
+///
+/// # Errors
+/// The system gives no threads.
+pub fn watched_runtime() -> io::Result<Runtime> {
+    let watch = Watch::new(false);
+    let [start, runs] = [watch.clone(), watch.clone()];
+    let runtime = Builder::new_multi_thread()
+        .enable_all()
+        .on_thread_start(move || start.enter())
+        .on_thread_unpark(move || runs.worker_runs())
+        .on_thread_park(|| WORKER_RAN.set(0))
+        .build()?;
+    watch.enter();
+    Ok(runtime)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: Duration = Duration::from_millis(1);
+
+    fn watching(single: bool) -> (Arc<Watch>, Instant) {
+        let watch = Watch::new(single);
+        let start = watch.base + MS;
+        watch.tick(start, since_boot());
+        (watch, start)
+    }
+
+    #[test]
+    fn nothing_is_a_stall_before_it_began() {
+        let watch = Watch::new(true);
+        assert!(!watch.turn(watch.base + Duration::from_secs(60), None));
+    }
+
+    /// Whichever runs first after a stall, the reader or the task, the reader knows of it.
+    #[test]
+    fn a_reader_knows_of_a_stall_that_has_just_ended() {
+        for single in [true, false] {
+            for task_first in [true, false] {
+                let (watch, start) = watching(single);
+                let now = start + 400 * MS;
+                if task_first {
+                    watch.tick(now, since_boot());
+                }
+                assert!(watch.turn(now + MS, None));
+                let dated = watch.date(start - MS, true, now + MS);
+                assert_eq!(dated.asked, start, "{single}, {task_first}");
+                assert!(dated.stall.is_some() && watch.just_stood(now + MS));
+                assert!(!watch.turn(now + 260 * MS, None) || !single, "it is over");
+            }
+        }
+    }
+
+    #[test]
+    fn one_thread_that_reads_runs() {
+        let (watch, start) = watching(true);
+        for n in 1..50 {
+            assert!(!watch.turn(start + n * 100 * MS, None));
+        }
+        let (watch, start) = watching(false);
+        let turns = (1..50).map(|n| watch.turn(start + n * 100 * MS, None));
+        assert!(turns.collect::<Vec<_>>().contains(&true), "other workers may stand still");
+    }
+
+    #[test]
+    fn a_suspended_machine_stood_still() {
+        let (watch, start) = watching(true);
+        let boot = since_boot() + Duration::from_secs(60);
+        assert!(!watch.turn(start + MS, Some(since_boot())));
+        assert!(watch.turn(start + 2 * MS, Some(boot)) || watch.just_stood(start + 2 * MS));
+    }
+
+    #[test]
+    fn a_worker_that_stood_still_is_seen_where_the_others_run() {
+        let (watch, start) = watching(false);
+        WORKER_RAN.set(watch.nanos(start));
+        let now = start + 1200 * MS;
+        // Other workers ran the task.
+        for n in 1..12 {
+            watch.ran_at(start + n * 100 * MS, since_boot());
+        }
+        assert!(watch.turn(now, None));
+        let dated = watch.date(start - MS, true, now);
+        assert_eq!((dated.asked, dated.pause.is_some()), (start, true));
+        WORKER_RAN.set(0);
+        assert!(watch.turn(now + MS, None));
+    }
+}
