@@ -79,7 +79,13 @@ impl Scene {
     fn new(line: Line, noise: Noise, seed: u64) -> Scene {
         let format = LineFormat::new(line.baud, line.format).unwrap();
         let parts = Parts::of(0, &line, seed);
-        let handle = listening(&bus::handle(0, &line, &parts.profile, format, &Arc::default()));
+        let handle = listening(&bus::handle(
+            0,
+            &line,
+            &parts.profile,
+            format,
+            (&Arc::default(), Instant::now()),
+        ));
         let mut rules = LineRules::of(line.protocol, format);
         rules.turnaround = line.turnaround;
         let slaves = Slaves::new(parts.drives, Duration::ZERO);

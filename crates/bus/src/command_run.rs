@@ -262,7 +262,11 @@ impl CommandRun {
     /// The thread stood still for long, the machine being suspended for `slept` of it. What has begun is not continued.
     pub fn interrupted(&mut self, slept: Duration, now: Instant) {
         let expires = self.expires.checked_sub(slept).unwrap_or(now);
-        self.expires = if self.reached_the_wire() { expires.min(now) } else { expires };
+        self.expires = if self.reached_the_wire() {
+            expires.min(now)
+        } else {
+            expires
+        };
     }
 
     /// Whether a client sent it, not the gateway itself.

@@ -11,12 +11,12 @@ use super::master::{Handover, Master, Purpose, Remains, Turn, TurnEnd};
 use super::news::News;
 use super::report::Report;
 use super::tap::Tap;
-use crate::order::Stalls;
 use super::transaction::Ended;
 use crate::codec::{Exception, Reply, Request};
 use crate::command::{Outcome, Urgency, WriteStats};
 use crate::drive::DriveIndex;
 use crate::event::Events;
+use crate::order::Stalls;
 use crate::plant::BusHandle;
 use crate::process_image::Taping;
 

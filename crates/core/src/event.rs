@@ -540,7 +540,8 @@ mod tests {
                 | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
                 ParametersChanged | RestoreUnfinished | Diagnosis | Guarded | Interlock | Held | Released
                 | HoldBroken => false,
-                Drill => true,
+                Drill => false,
+                Paused => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

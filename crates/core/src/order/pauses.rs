@@ -61,7 +61,9 @@ impl Pauses {
     /// A thread had this pause. Whether it is news: no other thread had it, too.
     pub fn note(&self, pause: Stall) -> bool {
         let mut state = self.state();
-        let last = state.last.filter(|last| pause.began < last.ended && last.began < pause.ended);
+        let last = state
+            .last
+            .filter(|last| pause.began < last.ended && last.began < pause.ended);
         let all = last.map_or(pause, |last| Stall {
             began: last.began.min(pause.began),
             ended: last.ended.max(pause.ended),

@@ -251,15 +251,33 @@ mod tests {
         let stall = Some((100, 2100));
         for (what, floor, waited, now, expected) in [
             ("one that waited since long before", 20, true, 2101, (100, stall, true)),
-            ("one that found nothing at last while it ran", 100, true, 2101, (100, stall, true)),
+            (
+                "one that found nothing at last while it ran",
+                100,
+                true,
+                2101,
+                (100, stall, true),
+            ),
             ("one that did not read since before", 20, false, 2101, (20, stall, true)),
             ("the second piece, found at once", 100, false, 2102, (100, stall, true)),
             ("it found nothing after the stall", 2101, true, 2103, (2103, None, true)),
-            ("the same, and did not read for a time", 2101, false, 2203, (2101, None, true)),
+            (
+                "the same, and did not read for a time",
+                2101,
+                false,
+                2203,
+                (2101, None, true),
+            ),
             ("the last moment", 20, true, 2350, (100, stall, true)),
             ("later, one that waited", 20, true, 2351, (2351, None, true)),
             ("later, one whose bytes lay there", 20, false, 2351, (20, None, true)),
-            ("the pause is over when as long again has gone by and a second", 20, true, 5099, (5099, None, true)),
+            (
+                "the pause is over when as long again has gone by and a second",
+                20,
+                true,
+                5099,
+                (5099, None, true),
+            ),
             ("and no longer", 20, true, 5100, (5100, None, false)),
         ] {
             assert_eq!(thread.reads(floor, waited, now), expected, "{what}");

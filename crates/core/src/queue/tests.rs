@@ -96,6 +96,14 @@ impl Clients {
         self.give((SourceKind::Mqtt, who), drive, Urgency::Command, points(of), false)
     }
 
+    /// When something that waits now may go.
+    fn wakes(&mut self) -> Option<Instant> {
+        let now = self.now;
+        self.pending
+            .next(Urgency::Command, now, &(), |_| Ready::Now, |_| false)
+            .wake_at
+    }
+
     fn take(&mut self) -> Option<Command> {
         next_command(&mut self.pending, Urgency::Read, self.now)
     }

@@ -150,7 +150,9 @@ impl BusGuards {
     /// Why that drive is not started by one order together with the others that it starts.
     pub fn too_close_together(&self, drive: DriveIndex, effects: &Effects) -> Option<Guarded> {
         let of = self.of_drive(drive).filter(|of| !of.guard.stagger.is_zero())?;
-        let others = self.started_by(effects).filter(|other| self.by_run(*other) != ByRun::Repeats);
+        let others = self
+            .started_by(effects)
+            .filter(|other| self.by_run(*other) != ByRun::Repeats);
         let mut others = others.filter_map(|other| self.of_drive(other));
         others.find(|other| other.machine != of.machine && other.group == of.group)?;
         Some(Guarded {
@@ -184,7 +186,9 @@ impl BusGuards {
         };
         let around = self.shared.around();
         let trips = of.interlocks.iter().filter(|interlock| interlock.trip);
-        trips.filter_map(|interlock| interlock.trips(&around, stood, now)).collect()
+        trips
+            .filter_map(|interlock| interlock.trips(&around, stood, now))
+            .collect()
     }
 
     /// Whether an interlock of that drive stops its motor.
@@ -217,7 +221,9 @@ impl BusGuards {
         let mut ledger = self.shared.lock();
         let mut changed = false;
         for of in &started {
-            let Some(motor) = ledger.motor(&of.machine) else { continue };
+            let Some(motor) = ledger.motor(&of.machine) else {
+                continue;
+            };
             if motor.by_run() == ByRun::Starts && !motor.is_cleared(number) {
                 ledger.reserve(&of.machine, number, expires, now);
                 changed = true;

@@ -8,7 +8,8 @@ use drivegate_bacnet::{Address, Datum, Error, Job};
 use super::objects::Meaning;
 use super::view::View;
 use crate::command::{
-    self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite, SourceKind,
+    self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite,
+    SourceKind,
 };
 use crate::drive::{PointIndex, Value};
 use crate::order::Arrival;
@@ -60,7 +61,12 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> B
                 let order = Order::Points(vec![(index, value)]);
                 waits(
                     handle,
-                    handle.place(OrderRequest::new(order, origin, Authority::Write).within(expiry).arrived(arrival), now),
+                    handle.place(
+                        OrderRequest::new(order, origin, Authority::Write)
+                            .within(expiry)
+                            .arrived(arrival),
+                        now,
+                    ),
                     None,
                 )
             }
@@ -75,7 +81,12 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> B
             let order = Order::Points(vec![(index, Value::Bool(true))]);
             waits(
                 handle,
-                handle.place(OrderRequest::new(order, origin, Authority::Write).within(expiry).arrived(arrival), now),
+                handle.place(
+                    OrderRequest::new(order, origin, Authority::Write)
+                        .within(expiry)
+                        .arrived(arrival),
+                    now,
+                ),
                 None,
             )
         }

@@ -244,8 +244,7 @@ impl ConnectionHandler for HttpConnections {
         let closing = place.permit.place().closing();
         match closing.run_until_cancelled(handshake).await {
             Some(Ok(Ok(stream))) => {
-                self.serve_requests((stream, reader), peer, local, &terms, &place)
-                    .await;
+                self.serve_requests((stream, reader), peer, local, &terms, &place).await;
             }
             Some(Ok(Err(error))) => {
                 let why = tls_words::explain(&error, tls_words::Peer::Client).unwrap_or_else(|| error.to_string());

@@ -108,7 +108,8 @@ impl ConnectionHandler for Admission {
         match write {
             WriteAccess::ByAddress(_) => self.serve_client((stream, reader), peer, None, &permit).await,
             WriteAccess::ByCertificate(authenticator) => {
-                self.serve_tls_client(&authenticator, (stream, reader), peer, permit).await;
+                self.serve_tls_client(&authenticator, (stream, reader), peer, permit)
+                    .await;
             }
         }
     }

@@ -18,10 +18,10 @@ use tokio_rustls::server::TlsStream;
 
 use super::crl::{self, Crls};
 use super::open_clients::{CertificateGuard, OpenClients};
-use crate::reading::Dated;
 use crate::certificate::{self, RoleError};
 use crate::identity::{FileProblem, IdentityFault, ServerIdentity, TlsFile, provider, unsupported_ca, validity};
 use crate::pem;
+use crate::reading::Dated;
 use crate::tls_words::{self, Peer};
 
 /// Time limit of a handshake.

@@ -178,7 +178,10 @@ mod tests {
         tokio::time::sleep(Duration::from_millis(20)).await;
         stream.read(&mut buffer).await.unwrap();
         let at_once = stream.reader().last().asked;
-        assert!(at_once >= came && at_once < came + Duration::from_millis(20), "nobody read since");
+        assert!(
+            at_once >= came && at_once < came + Duration::from_millis(20),
+            "nobody read since"
+        );
         assert!(!stream.reader().last().connection.is_gone());
         drop(client);
         assert_eq!(stream.read(&mut buffer).await.unwrap(), 0);

@@ -170,7 +170,11 @@ mod tests {
     #[test]
     fn what_is_read_dates_from_when_it_came() {
         let rig = Rig::new();
-        assert_eq!(rig.came(5, true), 0, "it may have been there since the connection was opened");
+        assert_eq!(
+            rig.came(5, true),
+            0,
+            "it may have been there since the connection was opened"
+        );
         assert_eq!(rig.came(7, true), 5, "and this since the read before");
         rig.nothing(10);
         assert_eq!(rig.came(1000, false), 1000, "what is waited for comes when it is read");

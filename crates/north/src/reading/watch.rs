@@ -261,7 +261,10 @@ mod tests {
         }
         let (watch, start) = watching(false);
         let turns = (1..50).map(|n| watch.turn(start + n * 100 * MS, None));
-        assert!(turns.collect::<Vec<_>>().contains(&true), "other workers may stand still");
+        assert!(
+            turns.collect::<Vec<_>>().contains(&true),
+            "other workers may stand still"
+        );
     }
 
     #[test]

@@ -51,12 +51,7 @@ pub(super) struct Connection<S> {
 
 impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
     /// A connection that begins with `greeting`; with a `port` it uses telnet.
-    pub(super) fn new(
-        stream: Dated<S>,
-        tool: Arc<Tool>,
-        port: Option<ServedPort>,
-        greeting: Vec<u8>,
-    ) -> Connection<S> {
+    pub(super) fn new(stream: Dated<S>, tool: Arc<Tool>, port: Option<ServedPort>, greeting: Vec<u8>) -> Connection<S> {
         Connection {
             stream,
             dialogue: Dialogue::new(tool),

@@ -156,7 +156,11 @@ mod tests {
         let mut broken = frame.clone();
         broken[7] ^= 1;
         // Behind a broken frame and behind half of one, without a pause.
-        add(&mut framing, &[broken.as_slice(), &frame, &frame[..4], &frame].concat(), until);
+        add(
+            &mut framing,
+            &[broken.as_slice(), &frame, &frame[..4], &frame].concat(),
+            until,
+        );
         let said = all(&mut framing, until);
         assert_eq!(said, [Said::Broken, asks(1, 2100, 11), Said::Broken, asks(1, 2100, 11)]);
     }

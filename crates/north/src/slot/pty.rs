@@ -82,10 +82,7 @@ impl Port {
     fn new(pty: Pty, tool: Arc<Tool>) -> io::Result<Port> {
         let same = File::from(pty.as_fd().try_clone_to_owned()?);
         Ok(Port {
-            reader: Dated::new(
-                pipe::Receiver::from_file_unchecked(same)?,
-                Arc::new(Reader::here()),
-            ),
+            reader: Dated::new(pipe::Receiver::from_file_unchecked(same)?, Arc::new(Reader::here())),
             pty,
             dialogue: Dialogue::new(tool),
             used: None,

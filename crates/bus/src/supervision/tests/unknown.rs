@@ -23,7 +23,7 @@ impl SupervisedDrive {
 
     /// When the client was last heard of.
     fn heard(&self) -> Instant {
-        match self.drive.supervision.lease.0 {
+        match self.drive.supervision.lease.state {
             State::Held(since) => since,
             _ => self.now - Duration::from_secs(7),
         }

@@ -260,7 +260,9 @@ impl Gate {
 
     /// Whether a stop of that client is none, since it writes its command word all the time and its last one was a stop.
     pub(super) fn repeats_its_word(&self, drive: DriveIndex, origin: &Origin) -> bool {
-        let Some(drive) = self.drives.get(&drive) else { return false };
+        let Some(drive) = self.drives.get(&drive) else {
+            return false;
+        };
         self.claim(origin).is_some_and(|who| drive.holding.repeats(&who))
     }
 

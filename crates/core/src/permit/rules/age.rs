@@ -198,63 +198,176 @@ mod tests {
             ("a healthy one", PLAIN, "go, go, go, go"),
             ("the last moment", Case { now: 21_999, ..PLAIN }, "go, go, go, go"),
             ("late", Case { now: 22_000, ..PLAIN }, "go, expired, expired, expired"),
-            ("a client that closed after it", Case { gone: true, ..PLAIN }, "go, go, go, go"),
-            ("a stop by another one before", Case { other_stop: Some(20_000), ..PLAIN }, "go, go, go, go"),
-            ("a stop by another one since", Case { other_stop: Some(20_001), ..PLAIN }, "go, purged, purged, go"),
-            ("one of its own, read before it", Case { own_stop: Some(20_050), ..PLAIN }, "go, go, go, go"),
+            (
+                "a client that closed after it",
+                Case { gone: true, ..PLAIN },
+                "go, go, go, go",
+            ),
+            (
+                "a stop by another one before",
+                Case {
+                    other_stop: Some(20_000),
+                    ..PLAIN
+                },
+                "go, go, go, go",
+            ),
+            (
+                "a stop by another one since",
+                Case {
+                    other_stop: Some(20_001),
+                    ..PLAIN
+                },
+                "go, purged, purged, go",
+            ),
+            (
+                "one of its own, read before it",
+                Case {
+                    own_stop: Some(20_050),
+                    ..PLAIN
+                },
+                "go, go, go, go",
+            ),
             (
                 "one of its own, and one of another since",
-                Case { own_stop: Some(20_050), other_stop: Some(20_010), ..PLAIN },
+                Case {
+                    own_stop: Some(20_050),
+                    other_stop: Some(20_010),
+                    ..PLAIN
+                },
                 "go, purged, purged, go",
             ),
             (
                 "the other's was before",
-                Case { own_stop: Some(20_050), other_stop: Some(19_000), ..PLAIN },
+                Case {
+                    own_stop: Some(20_050),
+                    other_stop: Some(19_000),
+                    ..PLAIN
+                },
                 "go, go, go, go",
             ),
             ("during a hiccup", HICCUP, "go, wait 20450, go, go"),
             ("when that is read", Case { now: 20_450, ..HICCUP }, "go, go, go, go"),
-            ("a stop read before it", Case { other_stop: Some(20_201), ..HICCUP }, "go, purged, purged, go"),
-            ("a stop read after it", Case { other_stop: Some(20_300), now: 20_301, ..HICCUP }, "go, purged, purged, go"),
-            ("a stop of long before", Case { other_stop: Some(19_900), ..HICCUP }, "go, wait 20450, go, go"),
-            ("its own order counts", Case { own_stop: Some(20_201), ..HICCUP }, "go, wait 20450, go, go"),
-            ("its client has gone", Case { gone: true, ..HICCUP }, "go, expired, expired, expired"),
+            (
+                "a stop read before it",
+                Case {
+                    other_stop: Some(20_201),
+                    ..HICCUP
+                },
+                "go, purged, purged, go",
+            ),
+            (
+                "a stop read after it",
+                Case {
+                    other_stop: Some(20_300),
+                    now: 20_301,
+                    ..HICCUP
+                },
+                "go, purged, purged, go",
+            ),
+            (
+                "a stop of long before",
+                Case {
+                    other_stop: Some(19_900),
+                    ..HICCUP
+                },
+                "go, wait 20450, go, go",
+            ),
+            (
+                "its own order counts",
+                Case {
+                    own_stop: Some(20_201),
+                    ..HICCUP
+                },
+                "go, wait 20450, go, go",
+            ),
+            (
+                "its client has gone",
+                Case { gone: true, ..HICCUP },
+                "go, expired, expired, expired",
+            ),
             ("after a pause", PAUSED, "go, expired, go, go"),
-            ("its client has gone in the pause", Case { gone: true, ..PAUSED }, "go, expired, expired, expired"),
-            ("a pause of three seconds", Case { stall: Some((20_000, 23_000)), pause: Some((20_000, 23_000)), now: 23_001, ..PLAIN }, "go, expired, expired, expired"),
+            (
+                "its client has gone in the pause",
+                Case { gone: true, ..PAUSED },
+                "go, expired, expired, expired",
+            ),
+            (
+                "a pause of three seconds",
+                Case {
+                    stall: Some((20_000, 23_000)),
+                    pause: Some((20_000, 23_000)),
+                    now: 23_001,
+                    ..PLAIN
+                },
+                "go, expired, expired, expired",
+            ),
             (
                 "sent later over an old connection",
-                Case { asked: 23_000, expires: 25_000, stall: None, now: 23_001, ..PAUSED },
+                Case {
+                    asked: 23_000,
+                    expires: 25_000,
+                    stall: None,
+                    now: 23_001,
+                    ..PAUSED
+                },
                 "go, expired, go, go",
             ),
             (
                 "as long again and a second after the pause",
-                Case { asked: 24_000, expires: 26_000, stall: None, now: 24_000, ..PAUSED },
+                Case {
+                    asked: 24_000,
+                    expires: 26_000,
+                    stall: None,
+                    now: 24_000,
+                    ..PAUSED
+                },
                 "go, go, go, go",
             ),
             (
                 "over a new connection",
-                Case { asked: 21_600, expires: 23_600, stall: None, opened: 21_550, now: 21_600, ..PAUSED },
+                Case {
+                    asked: 21_600,
+                    expires: 23_600,
+                    stall: None,
+                    opened: 21_550,
+                    now: 21_600,
+                    ..PAUSED
+                },
                 "go, go, go, go",
             ),
             (
                 "a new connection of which the process read late",
-                Case { opened: 21_500, ..PAUSED },
+                Case {
+                    opened: 21_500,
+                    ..PAUSED
+                },
                 "go, wait 21750, go, go",
             ),
             (
                 "it waited for its turn while the bus paused",
-                Case { waited: Some((20_050, 21_100)), now: 21_100, ..PLAIN },
+                Case {
+                    waited: Some((20_050, 21_100)),
+                    now: 21_100,
+                    ..PLAIN
+                },
                 "go, expired, go, go",
             ),
             (
                 "and its client has gone",
-                Case { waited: Some((20_050, 21_100)), now: 21_100, gone: true, ..PLAIN },
+                Case {
+                    waited: Some((20_050, 21_100)),
+                    now: 21_100,
+                    gone: true,
+                    ..PLAIN
+                },
                 "go, expired, expired, expired",
             ),
             (
                 "the bus paused before it came",
-                Case { waited: Some((18_000, 19_999)), ..PLAIN },
+                Case {
+                    waited: Some((18_000, 19_999)),
+                    ..PLAIN
+                },
                 "go, go, go, go",
             ),
         ];

@@ -1,7 +1,7 @@
 //! What came while the threads that read stood still: of several clients, in whatever sequence it is read.
 
 use super::*;
-use crate::order::{Arrival, Connection, Stall};
+use crate::order::{Arrival, Connection, Effect, Effects, Stall};
 
 const MS: Duration = Duration::from_millis(1);
 
@@ -27,10 +27,7 @@ impl Bench {
         let mut rig = Clients::new();
         let began = rig.now;
         rig.now += stood;
-        let stall = Stall {
-            began,
-            ended: rig.now,
-        };
+        let stall = Stall { began, ended: rig.now };
         Bench {
             rig,
             began,
@@ -60,21 +57,25 @@ impl Bench {
             ranges: Vec::new(),
         };
         let drive = DriveIndex::new(1);
-        let mut command = Command::new(drive, admitted, arrival.asked + EXPIRY, ticket);
+        let mut command = command(1, admitted, arrival.asked, ticket);
         let effect = Effect {
+            stops: gives == Stop,
             run: (gives != Reference).then_some(gives == Run),
             reference: gives == Reference,
             ..Effect::default()
         };
-        (command.effects, command.arrival) = (vec![(drive, effect)], Some(arrival));
-        rig.pending.push(command, rig.now);
+        command.intent.effects = Effects::on_one(drive, effect, Touched::Anything);
+        command.intent.window.arrival = arrival;
+        rig.pending.push(command, &(), rig.now);
         receiver
     }
 
     /// What is sent until so long after the stall, in order.
     fn sent(&mut self, after: Duration) -> Vec<Urgency> {
         self.rig.now = self.stall.ended + after;
-        std::iter::from_fn(|| self.rig.pop()).map(|(_, urgency)| urgency).collect()
+        std::iter::from_fn(|| self.rig.pop())
+            .map(|(_, urgency)| urgency)
+            .collect()
     }
 }
 
@@ -117,14 +118,14 @@ fn a_start_waits_until_what_came_with_it_is_read() {
     let mut bench = Bench::after(200 * MS);
     let mut start = bench.reads(0, Run);
     let read_by = bench.stall.read_by();
-    assert_eq!(bench.rig.pending.reads_end(bench.rig.now), Some(read_by));
+    assert_eq!(bench.rig.wakes(), Some(read_by));
     assert_eq!(bench.sent(249 * MS), [], "a stop may be read yet");
     let _stop = bench.reads(1, Stop);
     assert_eq!(outcome(&mut start), Some(Outcome::Purged));
     let mut bench = Bench::after(200 * MS);
     let _start = bench.reads(0, Run);
     assert_eq!(bench.sent(250 * MS), [Urgency::Command]);
-    assert_eq!(bench.rig.pending.reads_end(bench.rig.now), None);
+    assert_eq!(bench.rig.wakes(), None);
 }
 
 #[test]
@@ -135,7 +136,7 @@ fn what_waits_while_the_bus_stands_still_or_the_machine_sleeps_gets_older() {
     let mut start = bench.takes(Run, arrival.clone());
     let mut reference = bench.takes(Reference, arrival);
     bench.rig.now += 1100 * MS;
-    bench.rig.pending.note_pause(Stall {
+    bench.rig.pending.gate.note_pause(Stall {
         began: bench.began,
         ended: bench.rig.now,
     });
@@ -143,7 +144,10 @@ fn what_waits_while_the_bus_stands_still_or_the_machine_sleeps_gets_older() {
     assert_eq!(bench.rig.pop(), Some((1, Urgency::Command)));
     assert_eq!(outcome(&mut start), Some(Outcome::Expired));
     assert!(outcome(&mut reference).is_none_or(|outcome| outcome == Outcome::ShuttingDown));
-    assert!(bench.rig.pending.take_renewed(DriveIndex::new(1)), "its client was heard");
+    assert!(
+        bench.rig.pending.take_renewed(DriveIndex::new(1)),
+        "its client was heard"
+    );
     assert!(!bench.rig.pending.take_renewed(DriveIndex::new(1)));
 
     let mut bench = Bench::after(Duration::ZERO);

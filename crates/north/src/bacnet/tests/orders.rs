@@ -1,5 +1,4 @@
 use super::*;
-use crate::order::Arrival;
 
 const NULL: Option<Datum> = None;
 

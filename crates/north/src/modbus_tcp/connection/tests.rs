@@ -62,7 +62,14 @@ fn rig_with(pipe: usize, idle_timeout: Option<Duration>) -> PipedClient {
     let server = tokio::spawn(async move {
         let reader = Arc::new(Reader::here());
         let stream = Dated::new(end, reader.clone());
-        serve((stream, reader), session, idle_timeout, permit.place(), &CancellationToken::new()).await;
+        serve(
+            (stream, reader),
+            session,
+            idle_timeout,
+            permit.place(),
+            &CancellationToken::new(),
+        )
+        .await;
     });
     PipedClient {
         client,

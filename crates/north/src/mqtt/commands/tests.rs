@@ -3,13 +3,13 @@ use std::time::Duration;
 
 use serde_json::Value as Json;
 
-use crate::order::Arrival;
 use super::super::fixture;
 use super::*;
 use crate::codec::Reply as BusReply;
 use crate::command::{Order, Outcome, Receipt, Urgency};
 use crate::command_json::REMEMBERED;
 use crate::drive::Value;
+use crate::order::Arrival;
 
 struct SetTopics {
     plant: Plant,

@@ -1,4 +1,3 @@
-use crate::order::Arrival;
 use super::*;
 use crate::codec::Reply;
 use crate::command::{Order, Outcome, Urgency};
@@ -7,6 +6,7 @@ use crate::drive::{PointIndex, Value};
 use crate::mqtt::fixture;
 use crate::mqtt::sparkplug::session::Rules;
 use crate::mqtt::sparkplug::topics::Topics;
+use crate::order::Arrival;
 use drivegate_testkit::{audited, next_command};
 
 struct OrderedDrive {
@@ -268,7 +268,7 @@ fn a_stop_among_too_many_metrics_or_bad_ones_is_one() {
             let stop = next_command(&mut queue, Urgency::Stop, bench.now).unwrap();
             drop(queue);
             let stopped = Order::Points(vec![(bench.index("run"), Value::Bool(false))]);
-            assert_eq!(stop.order, stopped);
+            assert_eq!(stop.intent.order, stopped);
             drop(
                 stop.ticket
                     .acknowledge(Outcome::Acknowledged(Reply::Written), bench.now),
