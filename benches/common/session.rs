@@ -63,6 +63,7 @@ pub fn plant(name: &str, drives: u16) -> Result<Plant, Box<dyn Error>> {
         slow_cycle: Duration::from_secs(1),
     };
     let bus = BusHandle {
+        formerly: std::sync::Arc::default(),
         image: Arc::new(BusImage::new(spec, (1..=drives).map(image).collect())),
         queue: Arc::new(CommandQueue::new()?),
     };

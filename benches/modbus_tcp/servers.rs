@@ -151,6 +151,7 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
         gateway: "bench".to_string(),
         stale_after: settings.stale_after,
         buses: vec![BusHandle {
+            formerly: std::sync::Arc::default(),
             image: Arc::new(image),
             queue: Arc::new(CommandQueue::new()?),
         }],

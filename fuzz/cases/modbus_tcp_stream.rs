@@ -56,7 +56,7 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         }
         let image = BusImage::new(bus.spec.clone(), drives);
         image.update_health(|h| h.up = place == 0);
-        BusHandle { image: Arc::new(image), queue: Arc::new(CommandQueue::new().expect("a queue")) }
+        BusHandle { formerly: std::sync::Arc::default(), image: Arc::new(image), queue: Arc::new(CommandQueue::new().expect("a queue")) }
     });
     Arc::new(ArcSwap::from_pointee(Plant {
         gateway: settings.gateway.clone(),

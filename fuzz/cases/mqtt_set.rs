@@ -41,7 +41,7 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         }
         let image = BusImage::new(bus.spec.clone(), drives);
         image.update_health(|h| h.up = true);
-        BusHandle {
+        BusHandle { formerly: std::sync::Arc::default(),
             image: Arc::new(image),
             queue: Arc::new(CommandQueue::new().expect("a queue")),
         }

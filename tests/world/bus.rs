@@ -483,6 +483,7 @@ pub fn handle(
     let watched = drives.iter().map(|drive| (spec.machine(&drive.spec), drive.clone()));
     guards.watch(watched, Duration::from_secs(1), now);
     BusHandle {
+        formerly: std::sync::Arc::default(),
         image: Arc::new(BusImage::new(spec, drives)),
         queue: Arc::new(CommandQueue::new().unwrap().guarded(guarded)),
     }

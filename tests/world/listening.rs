@@ -70,6 +70,7 @@ fn listening(handle: &BusHandle) -> BusHandle {
     };
     let drives = handle.image.drives.iter().map(image).collect();
     BusHandle {
+        formerly: std::sync::Arc::default(),
         image: Arc::new(BusImage::new(handle.image.spec.clone(), drives)),
         queue: handle.queue.clone(),
     }

@@ -2,6 +2,7 @@
 
 mod exchange;
 mod hold;
+mod meaning;
 mod orders;
 mod placed;
 mod why;
@@ -15,12 +16,13 @@ use arc_swap::ArcSwap;
 use crate::drive::DriveIndex;
 use crate::drive::why::Explanation;
 use crate::event::{Event, Events};
-use crate::order::{Answer, Named, Origin, Outcome, Refusal, WriteStats};
+use crate::order::{Answer, Origin, Outcome, Refusal, WriteStats};
 use crate::permit::Priorities;
 use crate::process_image::{Access, BusImage, DriveImage, Machine, Reading};
 use crate::queue::CommandQueue;
 
 pub use self::exchange::{Exchange, Question, Target};
+pub use self::meaning::{Formerly, follow_names};
 pub use self::orders::{OrderRequest, turn_away};
 pub use self::placed::{Placed, Shown};
 pub use self::why::explain;
@@ -40,6 +42,8 @@ pub struct BusHandle {
     pub image: Arc<BusImage>,
     /// The command queue.
     pub queue: Arc<CommandQueue>,
+    /// What the names and units of its drives meant before reloads.
+    pub formerly: Arc<Formerly>,
 }
 
 impl BusHandle {
@@ -62,6 +66,7 @@ impl BusHandle {
             if let Some(image) = bus.image.drives.get(place) {
                 drive.take_over(image);
             }
+            self.formerly.take_over(index, &bus.formerly, place);
             let inheritance = bus.queue.lock().gate.inheritance(place);
             self.queue.lock().gate.inherit(index, inheritance);
             // What is only monitored from now on is sent nothing.
@@ -98,7 +103,6 @@ pub struct DriveHandle {
     stale_after: Duration,
     events: Events,
     writes: Arc<WriteStats>,
-    named: Named,
 }
 
 impl Plant {
@@ -155,7 +159,6 @@ impl Plant {
             stale_after: self.stale_after,
             events: self.events.clone(),
             writes: self.writes.clone(),
-            named: Named::This,
         }
     }
 }

@@ -31,7 +31,7 @@ use crate::history::RecorderTask;
 use crate::north::local::Control;
 use crate::north::reading::Watch;
 use crate::north::{NorthState, ServerError, bacnet, http, local, modbus_tcp, mqtt, slot};
-use crate::plant::{BusHandle, Plant, SharedPlant};
+use crate::plant::{BusHandle, Plant, SharedPlant, follow_names};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
 use crate::start_guard::{BusGuards, Guards};
 use crate::stop_all::{LOOK, StopAll};
@@ -284,6 +284,8 @@ impl Daemon {
             handovers.insert(bus.spec.name.clone(), handover);
             kept.push((bus, task));
         }
+        let begin: Vec<BusHandle> = kept.iter().map(|(_, task)| task.handle().clone()).collect();
+        follow_names(&stopped, &begin, Instant::now());
         self.parted.keep(&leases, &stopped, Instant::now());
         let after: Vec<&BusHandle> = kept.iter().map(|(_, task)| task.handle()).collect();
         for bus in &stopped {
@@ -372,7 +374,11 @@ impl Daemon {
         let guards = BusGuards::of(&self.guards, &bus.spec, &bus.drives);
         let queue = Arc::new(CommandQueue::new().map_err(failed)?.guarded(guards));
         BusTask::prepare(
-            BusHandle { image, queue },
+            BusHandle {
+                formerly: std::sync::Arc::default(),
+                image,
+                queue,
+            },
             bus.options.clone(),
             self.writes.clone(),
             self.events.clone(),

@@ -57,6 +57,7 @@ pub fn bus_spec(name: &str) -> BusSpec {
 /// A bus whose port is not open yet.
 pub fn bus(spec: BusSpec, drives: Vec<Arc<DriveImage>>) -> BusHandle {
     BusHandle {
+        formerly: std::sync::Arc::default(),
         image: Arc::new(BusImage::new(spec, drives)),
         queue: Arc::new(CommandQueue::new().unwrap()),
     }

@@ -138,6 +138,7 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
         let queue = CommandQueue::new()?;
         queue.set_authority(settings.authority.clone());
         Ok(BusHandle {
+            formerly: std::sync::Arc::default(),
             image: Arc::new(BusImage::new(bus.spec.clone(), drives)),
             queue: Arc::new(queue),
         })

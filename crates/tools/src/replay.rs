@@ -120,6 +120,7 @@ fn play(bus: &BusSettings, packets: &[Packet], stale_after: Duration) -> Result<
     let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
     let queue = CommandQueue::new().map_err(|error| format!("cannot start: {error}; free file descriptors"))?;
     let handle = BusHandle {
+        formerly: std::sync::Arc::default(),
         image: image.clone(),
         queue: Arc::new(queue),
     };

@@ -185,18 +185,6 @@ pub struct Intent {
     pub window: Window,
     /// The write to a BACnet slot from which it follows.
     pub slot: Option<SlotWrite>,
-    /// What the name of the drive means since the order came.
-    pub named: Named,
-}
-
-/// What the name, unit or object by which an order named its drive means by now.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Named {
-    /// The machine that it meant when the first byte of the order came.
-    #[default]
-    This,
-    /// Another machine, or none: a reload changed that since.
-    Formerly,
 }
 
 /// A command on its way to the bus.
@@ -229,7 +217,6 @@ impl Intent {
             ranges: Vec::new(),
             window,
             slot: None,
-            named: Named::This,
         }
     }
 

@@ -18,6 +18,9 @@ use crate::drive::DriveIndex;
 use crate::order::{Command, Intent, LastStops, Origin, Outcome, Refusal, Stall, Urgency};
 use crate::start_guard::{BusGuards, Clearance};
 
+/// Most clients of a drive that are remembered.
+const MOST_CLIENTS: usize = 64;
+
 /// A drill under way at a drive: no other order to it runs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DrillLock {
@@ -38,6 +41,11 @@ pub(super) struct DriveGate {
     stopped_by: Option<Origin>,
     /// The login of the last client command; none if there was none, or its client has no login.
     commander: Option<Arc<str>>,
+    /// The clients that commanded it, the last one last.
+    clients: Vec<Arc<str>>,
+    /// Clients that commanded another machine under the name or unit that this one has since a reload: their standing run command
+    /// does not start its motor.
+    pub(super) must_stop_first: Vec<Arc<str>>,
     pub(super) priorities: Priorities,
     pub(super) holding: Holding,
     pub(super) drill: Option<DrillLock>,
@@ -67,8 +75,20 @@ pub(crate) struct Inheritance {
     last_stops: LastStops,
     stopped_by: Option<Origin>,
     commander: Option<Arc<str>>,
+    clients: Vec<Arc<str>>,
+    must_stop_first: Vec<Arc<str>>,
     priorities: Priorities,
     holding: Holding,
+}
+
+impl DriveGate {
+    fn commanded_by(&mut self, client: &Arc<str>) {
+        self.clients.retain(|known| known != client);
+        if self.clients.len() >= MOST_CLIENTS {
+            self.clients.remove(0);
+        }
+        self.clients.push(client.clone());
+    }
 }
 
 impl Gate {
@@ -184,6 +204,10 @@ impl Gate {
             }
             if origin.kind.is_client() {
                 of_drive.commander = origin.login().cloned();
+                of_drive.commanded_by(origin.client());
+                if effect.stops {
+                    of_drive.must_stop_first.retain(|client| client != origin.client());
+                }
             }
         }
     }
@@ -276,6 +300,8 @@ impl Gate {
             last_stops: of_drive.last_stops.clone(),
             stopped_by: of_drive.stopped_by.clone(),
             commander: of_drive.commander.clone(),
+            clients: of_drive.clients.clone(),
+            must_stop_first: of_drive.must_stop_first.clone(),
             priorities: of_drive.priorities.clone(),
             holding: of_drive.holding.clone(),
         }
@@ -288,6 +314,8 @@ impl Gate {
             last_stops,
             stopped_by,
             commander,
+            clients,
+            must_stop_first,
             priorities,
             mut holding,
         } = from;
@@ -295,8 +323,26 @@ impl Gate {
         holding.set_local(false, &mut Vec::new());
         let of_drive = self.drive(drive);
         (of_drive.stops, of_drive.last_stops, of_drive.stopped_by) = (stops, last_stops, stopped_by);
-        of_drive.commander = commander;
+        (of_drive.commander, of_drive.clients) = (commander, clients);
+        of_drive.must_stop_first = must_stop_first;
         (of_drive.priorities, of_drive.holding) = (priorities, holding);
+    }
+
+    /// The clients that commanded a drive.
+    pub(crate) fn clients(&self, drive: DriveIndex) -> Vec<Arc<str>> {
+        self.drives
+            .get(&drive)
+            .map_or_else(Vec::new, |drive| drive.clients.clone())
+    }
+
+    /// Since a reload a drive has a name or unit under which these clients commanded another one.
+    pub(crate) fn stop_first(&mut self, drive: DriveIndex, clients: Vec<Arc<str>>) {
+        let of_drive = self.drive(drive);
+        for client in clients {
+            if !of_drive.must_stop_first.contains(&client) {
+                of_drive.must_stop_first.push(client);
+            }
+        }
     }
 
     /// The stops of a drive that is new count from that number on.

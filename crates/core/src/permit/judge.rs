@@ -112,9 +112,8 @@ pub(super) struct Rule {
 }
 
 /// All rules, in the order in which they are asked.
-const RULES: [Rule; 10] = [
+const RULES: [Rule; 9] = [
     rules::access::RULE,
-    rules::machine::RULE,
     rules::age::RULE,
     rules::restore_lock::RULE,
     rules::holder::RULE,

@@ -29,3 +29,4 @@ pub use holder::{
 pub use judge::{Ask, Facts, Seen, Stage, Verdict};
 pub use priorities::{Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled};
 pub use reference_limits::{LastWritten, is_reference, limits_passed};
+pub(crate) use rules::machine::refusal as meant_another;

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
+use super::meaning::Meant;
 use super::{BusHandle, DriveHandle, Placed};
 use crate::codec::{RequestPdu, Table, describe};
 use crate::drive::parameters::RawValue;
@@ -14,7 +15,7 @@ use crate::order::{
     Answer, Arrival, Authority, BackgroundRequest, Change, Command, DEFAULT_EXPIRY, Haste, Order, Origin, Outcome,
     Pace, Parts, Refusal, SlotWrite, StopEnd, Ticket, Urgency, Window, Work, WriteStats, written,
 };
-use crate::permit::{Facts, Seen, admit};
+use crate::permit::{Facts, Seen, admit, meant_another};
 use crate::process_image::{BusImage, Reading};
 
 /// An order as a way in gives it to a drive.
@@ -241,7 +242,31 @@ impl DriveHandle {
     /// offline. Refused writes are audited and published as an event.
     ///
     /// Of an order that stops and does more, the stop is carried out whatever becomes of the rest; it is audited as two.
+    ///
+    /// An order whose first byte came when a reload had not given its name to this machine yet belongs to the machine that it named
+    /// then: a stop in it is carried out there, and nothing else of it anywhere.
     pub fn place(&self, request: OrderRequest, now: Instant) -> Placed {
+        let arrival = request.arrival.clone().unwrap_or_else(|| Arrival::now(now));
+        let Some(meant) = self.meant(request.origin.kind, &arrival) else {
+            return self.place_here(request, now);
+        };
+        let refusal = meant_another();
+        let what = self.describe(&request.order);
+        if let Meant::There(there) = &meant
+            && let Some(stop) = there.stop_meant(&request.order, self)
+        {
+            let order = OrderRequest { order: stop, ..request };
+            return there.place_here(order.without_rest(&what, refusal), now);
+        }
+        let write = !matches!(request.order, Order::Read(_));
+        let (mut ticket, answer) = self.ticket(&what, Vec::new(), request.origin, write, now);
+        let placed = Placed::new(now, answer, ticket.confirmation());
+        self.turn_away(ticket, &what, Outcome::Refused(refusal), write, now);
+        placed
+    }
+
+    /// As [`DriveHandle::place`], of an order that means this machine.
+    fn place_here(&self, request: OrderRequest, now: Instant) -> Placed {
         let reading = self.reading(now);
         let OrderRequest { order, rest, .. } = request.clone();
         if let Some((what, refusal)) = rest {
@@ -393,7 +418,6 @@ impl DriveHandle {
         let profile = &self.image.spec.profile;
         let mut command = Command::new(self.index, admitted, profile, part.window, part.ticket);
         command.intent.slot = part.slot;
-        command.intent.named = self.named;
         if let Work::Stop(stop) = &mut command.work
             && part.at_once
         {

@@ -222,6 +222,9 @@ impl Gate {
     ) -> Option<Result<(), Refusal>> {
         let rules = self.rules.clone()?;
         let who = rules.claim_of(origin);
+        if matches!(verb, Verb::Take | Verb::Break) {
+            self.needs_no_stop(drive, origin);
+        }
         let acted = self.with_hold(drive, |holding, rules, told| {
             holding.act(who.as_ref(), verb, rules, now, told)
         })?;
@@ -230,8 +233,16 @@ impl Gate {
 
     /// The client stopped, though nothing is sent for it.
     pub(crate) fn hold_said_stop(&mut self, drive: DriveIndex, origin: &Origin) {
+        self.needs_no_stop(drive, origin);
         let Some(who) = self.claim(origin) else { return };
         self.with_hold(drive, |holding, _, _| holding.said_stop(&who));
+    }
+
+    /// The client knows which machine it commands.
+    fn needs_no_stop(&mut self, drive: DriveIndex, origin: &Origin) {
+        self.drive(drive)
+            .must_stop_first
+            .retain(|client| client != origin.client());
     }
 
     /// Whether the local control place of a drive has it now.

@@ -2,6 +2,7 @@
 //!
 //! A stop is asked only when it is accepted, since a word that a cyclic client repeats is no stop; an accepted stop is sent.
 
+use crate::order::{Asks, Holder, Refusal};
 use crate::permit::gate::{DriveGate, Gate};
 use crate::permit::judge::{Ask, Rule, Stage, Verdict};
 
@@ -15,5 +16,20 @@ fn judge(ask: &Ask<'_>, drive: &DriveGate, gate: &Gate) -> Verdict {
     if ask.effect().stops && ask.stage != Stage::Accept {
         return Verdict::Go;
     }
-    Verdict::unless(gate.judge_hold(drive, ask.origin, ask.asks(), ask.now))
+    let refused = gate.judge_hold(drive, ask.origin, ask.asks(), ask.now);
+    Verdict::unless(refused.or_else(|| stops_first(ask, drive)))
+}
+
+/// Why a client does not start the motor of a machine that has, since a reload, the name under which the client commanded another one.
+fn stops_first(ask: &Ask<'_>, drive: &DriveGate) -> Option<Refusal> {
+    let is_meant = ask.asks() == Asks::Run && drive.must_stop_first.contains(ask.origin.client());
+    is_meant.then(|| {
+        Refusal::NeedsTake(Box::new(Holder {
+            who: "a reload".to_string(),
+            rank: "configuration".to_string(),
+            keeps: "gave this name to another machine while this client commanded; send a stop, or take the drive, before run"
+                .to_string(),
+            left_s: None,
+        }))
+    })
 }

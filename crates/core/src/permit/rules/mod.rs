@@ -8,6 +8,6 @@ pub(super) mod guard;
 pub(super) mod holder;
 pub(super) mod interlock;
 pub(super) mod limits;
-pub(super) mod machine;
+pub(crate) mod machine;
 pub(super) mod priorities;
 pub(super) mod restore_lock;

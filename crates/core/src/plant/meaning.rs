@@ -1,0 +1,188 @@
+//! What the name or the unit of a drive meant before a reload: an order belongs to the machine that it named when its first byte
+//! came. Pure: time is an argument.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::{Duration, Instant};
+
+use super::{BusHandle, DriveHandle};
+use crate::drive::{DriveIndex, ModelPoint, Value};
+use crate::order::{Arrival, Order, Parts, SourceKind};
+use crate::process_image::BusImage;
+use crate::queue::CommandQueue;
+
+/// For so long after a reload the first bytes of an order may be from before it: connections that are silent for longer are closed.
+const REMEMBERED: Duration = Duration::from_secs(3600);
+/// Changes of meaning that are remembered of one drive.
+const MOST: usize = 8;
+
+/// How an order names its drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum By {
+    /// By the name of the drive.
+    Name,
+    /// By its unit id, or by the BACnet device that follows from that.
+    Unit,
+}
+
+impl By {
+    /// How orders that come this way name their drive; none where they name the address on the line.
+    fn of(kind: SourceKind) -> Option<By> {
+        match kind {
+            SourceKind::ModbusTcp | SourceKind::Bacnet => Some(By::Unit),
+            SourceKind::Mqtt | SourceKind::Sparkplug | SourceKind::Http | SourceKind::LocalSocket => Some(By::Name),
+            SourceKind::CommandLine
+            | SourceKind::Slot
+            | SourceKind::OtherMaster
+            | SourceKind::Schedule
+            | SourceKind::Supervision
+            | SourceKind::Shutdown
+            | SourceKind::Interlock => None,
+        }
+    }
+}
+
+/// What named the drive meant another machine, or none, until then.
+#[derive(Debug, Clone)]
+struct Former {
+    by: By,
+    until: Instant,
+    /// The machine that it meant, where that is served now.
+    machine: Option<(Weak<BusImage>, Weak<CommandQueue>, Weak<Formerly>, DriveIndex)>,
+}
+
+/// The machine that an order named, where its name means another one by now.
+#[derive(Debug)]
+pub(super) enum Meant {
+    /// It is served under another name.
+    There(Box<DriveHandle>),
+    /// It is not served any more, or there was none.
+    Gone,
+}
+
+/// What the names and units of the drives of a bus meant before reloads.
+#[derive(Debug, Default)]
+pub struct Formerly(Mutex<BTreeMap<DriveIndex, Vec<Former>>>);
+
+impl Formerly {
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<DriveIndex, Vec<Former>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What an order that came at `asked`, and names the drive so, meant; the first change after that says it.
+    fn at(&self, drive: DriveIndex, by: By, asked: Instant) -> Option<Former> {
+        let all = self.lock();
+        let mut of_drive = all.get(&drive)?.iter();
+        of_drive.find(|former| former.by == by && asked < former.until).cloned()
+    }
+
+    /// Keeps the changes that may still matter at `now`, and this one.
+    fn add(&self, drive: DriveIndex, former: Former, now: Instant) {
+        let mut all = self.lock();
+        let of_drive = all.entry(drive).or_default();
+        of_drive.retain(|former| now < former.until + REMEMBERED);
+        if of_drive.len() >= MOST {
+            of_drive.remove(0);
+        }
+        of_drive.push(former);
+    }
+
+    /// A bus takes the place of another one: what is remembered of a machine goes with it.
+    pub(super) fn take_over(&self, drive: DriveIndex, before: &Formerly, place: DriveIndex) {
+        if let Some(of_drive) = before.lock().get(&place) {
+            self.lock().insert(drive, of_drive.clone());
+        }
+    }
+}
+
+/// After a reload: keeps what the names and units of drives meant until now, and makes clients that commanded under them take the
+/// drive before they start its motor. `before` are the buses that ended, `after` those that begin.
+pub fn follow_names(before: &[BusHandle], after: &[BusHandle], now: Instant) {
+    for bus in after {
+        for (index, drive) in bus.image.drives.enumerate() {
+            let machine = bus.image.spec.machine(&drive.spec);
+            let (name, unit) = (&drive.spec.name, drive.spec.unit);
+            for by in [By::Name, By::Unit] {
+                let was = before.iter().find_map(|bus| {
+                    let place = bus.image.drives.position(|drive| match by {
+                        By::Name => drive.spec.name == *name,
+                        By::Unit => drive.spec.unit == unit,
+                    })?;
+                    let image = bus.image.drives.get(place)?;
+                    Some((bus, place, bus.image.spec.machine(&image.spec)))
+                });
+                if was.as_ref().is_some_and(|(.., was)| *was == machine) {
+                    continue;
+                }
+                let serves = |bus: &BusHandle| {
+                    let (.., was) = was.as_ref()?;
+                    let place = bus
+                        .image
+                        .drives
+                        .position(|drive| bus.image.spec.machine(&drive.spec) == *was)?;
+                    let weak = (
+                        Arc::downgrade(&bus.image),
+                        Arc::downgrade(&bus.queue),
+                        Arc::downgrade(&bus.formerly),
+                    );
+                    Some((weak.0, weak.1, weak.2, place))
+                };
+                let former = Former {
+                    by,
+                    until: now,
+                    machine: after.iter().find_map(serves),
+                };
+                bus.formerly.add(index, former, now);
+                let clients = was.map(|(bus, place, _)| bus.queue.lock().gate.clients(place));
+                bus.queue.lock().gate.stop_first(index, clients.unwrap_or_default());
+            }
+        }
+    }
+}
+
+impl DriveHandle {
+    /// The machine that an order of that kind meant which came so, if its name means another one by now.
+    pub(super) fn meant(&self, kind: SourceKind, arrival: &Arrival) -> Option<Meant> {
+        let former = self.bus.formerly.at(self.index, By::of(kind)?, arrival.asked)?;
+        let there = former.machine.and_then(|(image, queue, formerly, index)| {
+            let bus = BusHandle {
+                image: image.upgrade()?,
+                queue: queue.upgrade()?,
+                formerly: formerly.upgrade()?,
+            };
+            let image = bus.image.drives.get(index)?.clone();
+            Some(DriveHandle {
+                bus,
+                index,
+                image,
+                ..self.clone()
+            })
+        });
+        Some(there.map_or(Meant::Gone, |there| Meant::There(Box::new(there))))
+    }
+
+    /// The stop for this machine that is in an order which was read for the drive that has its name by now; none if it does not stop.
+    pub(super) fn stop_meant(&self, order: &Order, read_for: &DriveHandle) -> Option<Order> {
+        let stops = match order {
+            Order::Points(_) => is_stop(order.clone(), read_for),
+            Order::Write(_) => is_stop(order.clone(), self),
+            Order::Read(_) | Order::Parameter(_) => false,
+        };
+        let run = self.image.spec.profile.model_index(ModelPoint::Run).filter(|_| stops)?;
+        Some(Order::Points(vec![(run, Value::Bool(false))]))
+    }
+}
+
+/// Whether an order takes the run command of that drive away, whatever else it does.
+fn is_stop(order: Order, drive: &DriveHandle) -> bool {
+    let profile = &drive.image.spec.profile;
+    match Parts::of(order, profile) {
+        Parts::Two(..) => true,
+        Parts::One(Order::Points(values)) => crate::order::stop_of(&values, profile).is_some(),
+        Parts::One(Order::Write(pdu)) => crate::order::written(&pdu).is_some_and(|(table, items)| {
+            let mut items = items.iter();
+            items.any(|(address, word)| profile.is_stop(table, *address, *word))
+        }),
+        Parts::One(Order::Read(_) | Order::Parameter(_)) => false,
+    }
+}
