@@ -46,6 +46,8 @@ pub struct Pending {
     stopped_at: BTreeMap<DriveIndex, Instant>,
     /// Who gave the last of them.
     stopped_by: BTreeMap<DriveIndex, Origin>,
+    /// The number of the last command taken in that may start the drive.
+    starters: BTreeMap<DriveIndex, u64>,
     /// A drive to which nothing but stops is sent until then.
     quiet: Option<(DriveIndex, Instant)>,
     /// The bus ends and another one takes its place: stops wait for that one.
@@ -205,6 +207,10 @@ impl Pending {
                 self.set_commander(*drive, origin.login().cloned());
             }
         }
+        if command.may_start() {
+            let started = command.reach().iter().filter(|drive| !command.stops(**drive));
+            started.for_each(|drive| _ = self.starters.insert(*drive, command.number));
+        }
     }
 
     /// The login that commanded a drive last, unless another client did since.
@@ -347,8 +353,7 @@ impl Pending {
 
     /// Whether a command waits that may start the drive.
     fn may_start(&self, drive: DriveIndex) -> bool {
-        let command = |c: &Command| c.urgency == Urgency::Command && !c.reference_only;
-        let starts = |c: &Command| c.reaches(drive) && command(c) && !c.stops(drive);
+        let starts = |c: &Command| c.reaches(drive) && c.may_start() && !c.stops(drive);
         self.waiting.iter().any(starts)
     }
 
@@ -399,6 +404,11 @@ impl Pending {
 }
 
 impl Command {
+    /// Whether it may start a drive that it does not stop.
+    fn may_start(&self) -> bool {
+        self.urgency == Urgency::Command && !self.reference_only
+    }
+
     /// Until when a client waits for it; none for the gateway's own.
     fn client_waits_until(&self) -> Option<Instant> {
         let joined = self.joined.iter().map(|(ticket, expires)| (ticket, *expires));

@@ -219,6 +219,14 @@ impl Pending {
         }
     }
 
+    /// A stop of that client is taken in, as [`Pending::hold_accepted`] notes it.
+    pub(super) fn hold_stopped(&mut self, drive: DriveIndex, origin: &Origin, now: Instant) {
+        let who = self.holds.claim(origin);
+        self.holds.with(drive, |holding, rules, told| {
+            holding.accepted(who.as_ref(), Asks::Stop, rules, now, told);
+        });
+    }
+
     /// A client was received from: its heartbeat came, or its order was carried out.
     pub fn hold_renewed(&mut self, drive: DriveIndex, origin: &Origin, now: Instant) {
         let Some(who) = self.holds.claim(origin) else { return };

@@ -6,7 +6,7 @@ use std::time::Instant;
 use tokio::sync::oneshot;
 
 use super::Pending;
-use crate::command::{Command, Order, Origin, Outcome, SourceKind, Urgency};
+use crate::command::{Command, Effect, Order, Origin, Outcome, SourceKind, Urgency};
 use crate::drive::DriveIndex;
 
 /// The wish of the gateway, which is about to end, that a bus stops its drives.
@@ -98,12 +98,7 @@ impl Pending {
     pub(super) fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.drive;
         self.note_accepted(&stop, now);
-        self.remove(now, &Outcome::Purged, |c| {
-            c.reaches(drive) && c.urgency == Urgency::Command && !c.stops(drive)
-        });
-        if !self.stopped.contains(&drive) {
-            self.stopped.push(drive);
-        }
+        self.purge(drive, now);
         // A second stop waits for nothing, nor does the first one any more.
         if !stop.is_ordinary {
             let of_drive = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop;
@@ -124,6 +119,39 @@ impl Pending {
             None => {}
         }
         self.waiting.push_back(stop);
+    }
+
+    /// A stop ends what waits for its drive, and what has started.
+    fn purge(&mut self, drive: DriveIndex, now: Instant) {
+        self.remove(now, &Outcome::Purged, |c| {
+            c.reaches(drive) && c.urgency == Urgency::Command && !c.stops(drive)
+        });
+        if !self.stopped.contains(&drive) {
+            self.stopped.push(drive);
+        }
+    }
+
+    /// The number of the last command taken in that may start the drive; 0 where there was none.
+    pub(crate) fn last_starter(&self, drive: DriveIndex) -> u64 {
+        self.starters.get(&drive).copied().unwrap_or_default()
+    }
+
+    /// A stop joins one that was taken in when `last_starter` was that: it is noted as any stop, and nothing is written for it.
+    /// Whether it may: no command was taken in since that may start the drive.
+    pub(crate) fn joins_stop(&mut self, drive: DriveIndex, last_starter: u64, by: &Origin, now: Instant) -> bool {
+        let is_served = self.closed.is_none() && !self.heirs.contains_key(&drive);
+        if !is_served || self.last_starter(drive) != last_starter {
+            return false;
+        }
+        self.note_stop(drive, by.clone(), now);
+        self.hold_stopped(drive, by, now);
+        let effect = Effect {
+            run: Some(false),
+            ..Effect::default()
+        };
+        self.priorities(drive).accepted(by, effect, None, now);
+        self.purge(drive, now);
+        true
     }
 
     /// Drives for which a stop arrived since the last call: their started commands end, whatever the result of the
