@@ -186,6 +186,18 @@ impl DriveHandle {
         self.bus.queue.lock().gate.stops(self.index)
     }
 
+    /// The number of the last command taken in that may start the drive.
+    pub(crate) fn last_starter(&self) -> u64 {
+        self.bus.queue.lock().gate.last_starter(self.index)
+    }
+
+    /// See [`Pending::joins_stop`](crate::queue::Pending::joins_stop).
+    pub(crate) fn joins_stop(&self, last_starter: u64, by: &Origin, now: Instant) -> bool {
+        let joins = self.bus.queue.lock().joins_stop(self.index, last_starter, by, now);
+        self.bus.queue.wake();
+        joins
+    }
+
     /// Who gave the last stop that was taken in; none before the first one.
     pub(crate) fn last_stop_by(&self) -> Option<Origin> {
         self.bus.queue.lock().gate.last_stop_by(self.index).cloned()

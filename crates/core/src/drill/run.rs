@@ -32,8 +32,10 @@ const STEADY: Duration = Duration::from_secs(2);
 const AT_SPEED: f64 = 0.8;
 /// Assumed run-up time of a drive that does not report its speed in percent.
 const UNTOLD_SPEED: Duration = Duration::from_secs(10);
-/// Maximum time to the first read after a silence.
+/// Maximum time to the first read after a silence, or after the limit.
 const READ: Duration = Duration::from_secs(15);
+/// Time between two looks from which the gateway has paused.
+const PAUSE: Duration = Duration::from_secs(1);
 /// Maximum time for the acknowledgement of a stop, and for standstill before the next test.
 const LAST_STOP: Duration = Duration::from_secs(60);
 /// Maximum age of an interrupted drill whose motor is stopped at the next start; after that, someone may have started it since.
@@ -55,6 +57,10 @@ pub(super) struct Run {
     stops: u64,
     step: Step,
     since: Instant,
+    /// When it was looked at last.
+    looked: Instant,
+    /// The longest pause of the gateway since the stop was caused.
+    paused: Option<Duration>,
     /// When the current test began.
     began: Instant,
     /// Index of the current test.
@@ -186,6 +192,8 @@ impl Run {
             stops: 0,
             step: Step::Armed,
             since: now,
+            looked: now,
+            paused: None,
             began: now,
             at: 0,
             proofs: Vec::new(),
@@ -212,6 +220,8 @@ impl Run {
             stops: 0,
             step: Step::CutOff,
             since: now,
+            looked: now,
+            paused: None,
             began: now,
             proofs: Vec::new(),
         }
@@ -380,6 +390,8 @@ impl Run {
 
     /// Looks what became of it. Whether it goes on.
     pub(super) fn look(&mut self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
+        let gap = now.saturating_duration_since(std::mem::replace(&mut self.looked, now));
+        self.paused = self.paused.max(Some(gap).filter(|gap| *gap > PAUSE));
         if !matches!(self.step, Step::CutOff | Step::Ending(..) | Step::Over)
             && let Some(why) = self.interruption(plant, now)
         {
@@ -399,7 +411,7 @@ impl Run {
             Step::Waiting => self.give_start(now),
             Step::Starting(placed) => self.look_at_start(placed, now),
             Step::SpeedingUp(turned) => self.look_at_speed(turned, &reading, now),
-            Step::Steady => self.look_steady(now, time),
+            Step::Steady => self.look_steady(&reading, now, time),
             Step::Caused(cause, how) => self.look_at_cause(cause, how, &reading, (now, time)),
             Step::Clearing(stop) => self.look_cleared(stop, plant, now),
             Step::CutOff => self.look_cut_off(plant, now),
@@ -461,9 +473,26 @@ impl Run {
         self.step = Step::SpeedingUp(turned);
     }
 
-    fn look_steady(&mut self, now: Instant, time: SystemTime) {
+    fn look_steady(&mut self, reading: &Reading<'_>, now: Instant, time: SystemTime) {
         self.drive.heartbeat(&self.own, now);
-        if now.saturating_duration_since(self.since) < STEADY {
+        let passed = now.saturating_duration_since(self.since);
+        // What stands before its cause proves nothing.
+        let turns = match reading.standstill(Some(self.since)) {
+            Standstill::Turns(_) => true,
+            Standstill::Stands => {
+                let why = "the motor stopped before it was to be stopped".to_string();
+                return self.end(DrillState::NotProven, why, now);
+            }
+            Standstill::Unknown(why) if passed > STEADY + READ => {
+                return self.end(
+                    DrillState::NotProven,
+                    format!("the motor was not read while it ran: {why}"),
+                    now,
+                );
+            }
+            Standstill::Unknown(_) => false,
+        };
+        if passed < STEADY || !turns {
             self.step = Step::Steady;
             return;
         }
@@ -495,6 +524,7 @@ impl Run {
             }
         };
         self.stops = self.drive.stops();
+        self.paused = None;
         self.go(Step::Caused(now, cause), now);
     }
 

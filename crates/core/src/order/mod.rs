@@ -330,6 +330,11 @@ impl Command {
         matches!(&self.work, Work::Set(set) if set.reference_only)
     }
 
+    /// Whether it may start a drive that it does not stop.
+    pub(crate) fn may_start(&self) -> bool {
+        self.is_command() && !self.is_reference_only()
+    }
+
     /// What is passed on for a tool, where it is that.
     pub fn as_passed_on(&self) -> Option<&PassedOn> {
         match &self.work {

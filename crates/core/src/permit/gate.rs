@@ -15,7 +15,7 @@ use super::holder::{Claim, Holding, Rules};
 use super::judge::{self, Ask, Facts, Stage, Verdict};
 use super::priorities::Priorities;
 use crate::drive::DriveIndex;
-use crate::order::{Command, Intent, LastStops, Origin, Outcome, Refusal, Stall, Urgency};
+use crate::order::{Command, Connection, Effect, Intent, LastStops, Origin, Outcome, Refusal, Stall, Urgency};
 use crate::start_guard::{BusGuards, Clearance};
 
 /// Most clients of a drive that are remembered.
@@ -39,6 +39,8 @@ pub(super) struct DriveGate {
     pub(super) last_stops: LastStops,
     /// Who gave the last one.
     stopped_by: Option<Origin>,
+    /// The number of the last command accepted that may start the drive; 0 where there was none.
+    last_starter: u64,
     /// The login of the last client command; none if there was none, or its client has no login.
     commander: Option<Arc<str>>,
     /// The clients that commanded it, the last one last.
@@ -198,6 +200,9 @@ impl Gate {
         let origin = command.ticket.origin();
         for (drive, effect) in command.intent.effects.iter() {
             let of_drive = self.drive(drive);
+            if command.may_start() && !effect.stops {
+                of_drive.last_starter = command.intent.number;
+            }
             if !command.is_inherited() {
                 let slot = command.intent.slot.as_ref();
                 of_drive.priorities.accepted(origin, effect, slot, now);
@@ -224,6 +229,20 @@ impl Gate {
                 self.drive(drive).last_stops.note(connection, now);
             }
         }
+    }
+
+    /// A stop joins one that was accepted before, and nothing is written for it.
+    pub(crate) fn stop_joined(&mut self, drive: DriveIndex, origin: &Origin, now: Instant) {
+        self.hold_stopped(drive, origin, now);
+        let effect = Effect {
+            stops: true,
+            run: Some(false),
+            ..Effect::default()
+        };
+        let of_drive = self.drive(drive);
+        (of_drive.stops, of_drive.stopped_by) = (of_drive.stops + 1, Some(origin.clone()));
+        of_drive.last_stops.note(&Connection::opened(now), now);
+        of_drive.priorities.accepted(origin, effect, None, now);
     }
 
     /// The last pause of the bus.
@@ -257,6 +276,11 @@ impl Gate {
     /// Who gave the last stop of that drive that was accepted.
     pub(crate) fn last_stop_by(&self, drive: DriveIndex) -> Option<&Origin> {
         self.drives.get(&drive)?.stopped_by.as_ref()
+    }
+
+    /// The number of the last command accepted that may start the drive; 0 where there was none.
+    pub(crate) fn last_starter(&self, drive: DriveIndex) -> u64 {
+        self.drives.get(&drive).map_or(0, |drive| drive.last_starter)
     }
 
     /// The login that commanded a drive last, unless another client did since.

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use super::{Reading, Unavailable};
-use crate::drive::{ModelPoint, PollClass, Value};
+use crate::drive::{ModelPoint, PollClass};
 
 /// Causes (`blocks` of a point in the profile) by which a motor may turn whatever the drive does with it.
 const FED_OTHERWISE: [&str; 2] = ["bypass", "fire_mode"];
@@ -26,27 +26,40 @@ impl Reading<'_> {
     /// Whether the motor stands, by good samples that were read after `since`: at zero speed, or without output frequency, and
     /// not running.
     pub fn standstill(&self, since: Option<Instant>) -> Standstill {
+        self.standstill_read(since).0
+    }
+
+    /// The same, with the date of the last sample that it takes to show that.
+    pub fn standstill_read(&self, since: Option<Instant>) -> (Standstill, Option<Instant>) {
         if let Some(why) = self.may_turn() {
-            return Standstill::Unknown(why);
+            return (Standstill::Unknown(why), None);
         }
         let is_after = |at: Option<Instant>| since.is_none_or(|since| at.is_some_and(|at| at > since));
         let known = |point| {
             let sample = self.model(point);
-            sample.good().filter(|_| is_after(sample.at))
+            sample
+                .good()
+                .filter(|_| is_after(sample.at))
+                .map(|value| (value, sample.at))
         };
-        let running = known(ModelPoint::Running).map(Value::as_bool);
-        let at_zero = known(ModelPoint::ZeroSpeed).map(Value::as_bool);
-        let frequency = known(ModelPoint::OutputFrequency).map(|hertz| hertz.as_f64().abs());
+        let is = |point| known(point).map(|(value, at)| (value.as_bool(), at));
+        let (running, at_zero) = (is(ModelPoint::Running), is(ModelPoint::ZeroSpeed));
+        let frequency = known(ModelPoint::OutputFrequency).map(|(hertz, at)| (hertz.as_f64().abs(), at));
         match (running, at_zero, frequency) {
-            (Some(true), _, Some(hertz)) => Standstill::Turns(format!("`running` at {hertz:.1} Hz")),
-            (Some(true), _, None) => Standstill::Turns("`running`".to_string()),
-            (_, Some(true), _) => Standstill::Stands,
-            (_, _, Some(hertz)) if hertz > STANDS => Standstill::Turns(format!("`output_frequency` {hertz:.1} Hz")),
-            (Some(false), _, Some(_)) => Standstill::Stands,
-            _ if !self.tells_standstill() => Standstill::Unknown(
-                "standstill cannot be verified: the drive has neither `zero_speed` nor a frequency".to_string(),
+            (Some((true, at)), _, Some((hertz, _))) => (Standstill::Turns(format!("`running` at {hertz:.1} Hz")), at),
+            (Some((true, at)), _, None) => (Standstill::Turns("`running`".to_string()), at),
+            (_, Some((true, at)), _) => (Standstill::Stands, at),
+            (_, _, Some((hertz, at))) if hertz > STANDS => {
+                (Standstill::Turns(format!("`output_frequency` {hertz:.1} Hz")), at)
+            }
+            (Some((false, run)), _, Some((_, at))) => (Standstill::Stands, run.max(at)),
+            _ if !self.tells_standstill() => (
+                Standstill::Unknown(
+                    "standstill cannot be verified: the drive has neither `zero_speed` nor a frequency".to_string(),
+                ),
+                None,
             ),
-            _ => Standstill::Unknown("it has not been read since".to_string()),
+            _ => (Standstill::Unknown("it has not been read since".to_string()), None),
         }
     }
 

@@ -381,7 +381,7 @@ impl Pending {
 
     /// Whether a command waits that may start the drive.
     fn may_start(&self, drive: DriveIndex) -> bool {
-        let starts = |c: &Command| c.reaches(drive) && c.is_command() && !c.is_reference_only() && !c.stops(drive);
+        let starts = |c: &Command| c.reaches(drive) && c.may_start() && !c.stops(drive);
         self.waiting.iter().any(starts)
     }
 

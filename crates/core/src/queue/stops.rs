@@ -79,10 +79,7 @@ impl Pending {
     pub(super) fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.intent.drive;
         self.gate.accepted(&stop, now);
-        self.remove(now, &Outcome::Purged, |c| is_purged(c, drive));
-        if !self.stopped.contains(&drive) {
-            self.stopped.push(drive);
-        }
+        self.purge(drive, now);
         // A second stop waits for nothing, nor does the first one any more.
         if !stop.is_delayed_stop() {
             let of_drive = self.waiting.iter_mut().filter(|c| c.intent.drive == drive);
@@ -103,6 +100,26 @@ impl Pending {
             None => {}
         }
         self.waiting.push_back(stop);
+    }
+
+    /// A stop ends what waits for its drive, and what has started.
+    fn purge(&mut self, drive: DriveIndex, now: Instant) {
+        self.remove(now, &Outcome::Purged, |c| is_purged(c, drive));
+        if !self.stopped.contains(&drive) {
+            self.stopped.push(drive);
+        }
+    }
+
+    /// A stop joins one that was accepted when `last_starter` was that: it is noted as any stop, and nothing is written for it.
+    /// Whether it may: no command was accepted since that may start the drive.
+    pub(crate) fn joins_stop(&mut self, drive: DriveIndex, last_starter: u64, by: &Origin, now: Instant) -> bool {
+        let is_served = self.closed.is_none() && !self.heirs.contains_key(&drive);
+        if !is_served || self.gate.last_starter(drive) != last_starter {
+            return false;
+        }
+        self.gate.stop_joined(drive, by, now);
+        self.purge(drive, now);
+        true
     }
 
     /// Drives for which a stop arrived since the last call: their started commands end, whatever the result of the

@@ -110,8 +110,8 @@ struct UnderWay {
 }
 
 impl StopAll {
-    /// Stops all drives of `scope` as `origin`, who may write. When this returns every stop is in the queue of its bus. A drive whose
-    /// stop still waits for its acknowledgement joins that; any other has a new one, whatever is known of it.
+    /// Stops all drives of `scope` as `origin`, who may write. When this returns every stop is in the queue of its bus. Where an order
+    /// under way has stopped a drive, and nothing may have started it since, this order joins it; any other drive has a new stop.
     ///
     /// # Errors
     /// There is no such bus or group, or nothing of it is controlled.
@@ -168,15 +168,16 @@ impl StopAll {
 impl State {
     fn place(&mut self, plant: &Plant, drives: &[DriveHandle], origin: &Origin, now: Instant) {
         let machines: Vec<Machine> = drives.iter().map(DriveHandle::machine).collect();
-        let waits = |stop: &OneStop| stop.waits_for_acknowledgement();
-        let joins: Vec<Machine> = self
-            .stops
-            .iter()
-            .filter(|stop| waits(stop))
-            .map(|stop| stop.machine.clone())
-            .collect();
+        let mut joins: Vec<Machine> = Vec::new();
+        for (drive, machine) in drives.iter().zip(&machines) {
+            let stop = self.stops.iter().find(|stop| stop.machine == *machine);
+            if stop.is_some_and(|stop| stop.is_joined(drive, origin, now)) {
+                note_joined(plant, drive, origin, now);
+                joins.push(machine.clone());
+            }
+        }
         self.stops
-            .retain(|stop| waits(stop) || !machines.contains(&stop.machine));
+            .retain(|stop| joins.contains(&stop.machine) || !machines.contains(&stop.machine));
         for bus in &plant.buses {
             let is_of_bus = |machine: &&Machine| machine.port == bus.image.spec.port;
             let concerned = machines.iter().filter(is_of_bus).count();
@@ -231,6 +232,13 @@ impl State {
         // Its client may have gone.
         let _ = order.report.send(report);
     }
+}
+
+/// Adds a stop that joins another one to the audit.
+fn note_joined(plant: &Plant, drive: &DriveHandle, origin: &Origin, now: Instant) {
+    let text = "the stop that is under way is also that of this client; nothing more was written";
+    let what = (drive.image.spec.name.as_str(), "run=false");
+    plant.writes.audit().note(origin, what, ("acknowledged", text), now);
 }
 
 /// The broadcast that stops every drive of the bus, where they are known to obey it and one of them answers.

@@ -26,6 +26,10 @@ pub(crate) struct OneStop {
     pause: Duration,
     /// A read since its acknowledgement showed that the motor stands, and none since that it turns.
     stood: bool,
+    /// The motor was seen to turn after it had stood.
+    restarted: bool,
+    /// The last command that may start the drive before it was placed.
+    last_starter: u64,
 }
 
 #[derive(Debug)]
@@ -51,6 +55,8 @@ impl OneStop {
             failed: None,
             pause: AGAIN,
             stood: false,
+            restarted: false,
+            last_starter: 0,
         };
         stop.try_at(drive, now);
         stop
@@ -58,6 +64,8 @@ impl OneStop {
 
     fn try_at(&mut self, drive: &DriveHandle, now: Instant) {
         let profile = &drive.image.spec.profile;
+        // Before it: what comes in meanwhile may be sent after it.
+        self.last_starter = drive.last_starter();
         self.step = match profile.model_index(ModelPoint::Run) {
             Some(run) => {
                 let order = Order::Points(vec![(run, Value::Bool(false))]);
@@ -72,9 +80,20 @@ impl OneStop {
         };
     }
 
-    /// Whether a drive that acknowledges it acknowledges one that is ordered now.
-    pub(crate) fn waits_for_acknowledgement(&self) -> bool {
-        matches!(self.step, Step::Placed(_))
+    /// Whether a stop of that client joins it, and nothing is written for it: it waits for its acknowledgement, or has that, and
+    /// nothing has started the motor since as far as is known.
+    pub(crate) fn is_joined(&self, drive: &DriveHandle, by: &Origin, now: Instant) -> bool {
+        let stands_good = match &self.step {
+            Step::Placed(_) => true,
+            Step::Acknowledged(at) => {
+                let reading = drive.reading(now);
+                let run = reading.model(ModelPoint::Run);
+                let runs = run.good().is_some_and(|run| run.as_bool()) && run.at.is_some_and(|read| read > *at);
+                reading.snapshot.link.is_online() && !self.restarted && !runs
+            }
+            Step::Again(_) | Step::Refused => false,
+        };
+        stands_good && drive.joins_stop(self.last_starter, by, now)
     }
 
     pub(crate) fn is_acknowledged(&self) -> bool {
@@ -137,7 +156,7 @@ impl OneStop {
                     .map(|drive| drive.reading(now).standstill(Some(*at)));
                 match seen {
                     Some(Standstill::Stands) => self.stood = true,
-                    Some(Standstill::Turns(_)) => self.stood = false,
+                    Some(Standstill::Turns(_)) => self.restarted |= std::mem::take(&mut self.stood),
                     // On a slow line a value is old before the next read of it.
                     Some(Standstill::Unknown(_)) | None => {}
                 }

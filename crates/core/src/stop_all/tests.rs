@@ -1,7 +1,9 @@
 use super::*;
 use std::sync::Arc;
 
-use crate::command::SourceKind;
+use crate::command::{Authority, Order, SourceKind};
+use crate::drive::Value;
+use crate::plant::OrderRequest;
 use crate::process_image::{BusImage, DriveSpec};
 use crate::testkit::{STALE_AFTER, bus, bus_spec, image, monitored, nx, up};
 
@@ -59,6 +61,89 @@ fn an_order_reaches_the_controlled_drives_of_its_scope() {
     plant.buses[0].image = Arc::new(BusImage::new(spec, vec![monitored]));
     let error = all.order(&plant, &Scope::Gateway, &origin, WAIT, now).unwrap_err();
     assert_eq!(error, NothingToStop::NotControlled);
+}
+
+/// The plant of one drive that runs, and a stop-all under way that its drive has acknowledged; a second order after `then`: how
+/// many stops that places.
+fn second_order(then: impl Fn(&Plant, &StopAll, Instant)) -> (Plant, usize) {
+    let (mut plant, all) = (plant(), StopAll::default());
+    plant.buses.truncate(1);
+    let (origin, now) = (Origin::new(SourceKind::Http, "alice"), Instant::now());
+    let read = |at: Instant, words: &[u16]| {
+        let drive = &plant.buses[0].image.drives[0];
+        crate::testkit::read(drive, 2100, words, at);
+        drive.update(|snapshot| snapshot.store(crate::codec::Table::Holding, 2000, &[words[0] & 2 >> 1, 0, 0], at));
+    };
+    read(now, &[0x03, 0, 0, 2500]);
+    let order = |who: &Origin, now| all.order(&plant, &Scope::Gateway, who, WAIT, now);
+    order(&origin, now).unwrap();
+    let stop = crate::testkit::take_next(&plant.buses[0].queue, now).unwrap();
+    stop.answer(
+        &crate::command::Outcome::Acknowledged(crate::codec::Reply::Written),
+        now,
+    );
+    assert!(all.look(&plant, now));
+    then(&plant, &all, now);
+    let later = now + Duration::from_millis(900);
+    all.look(&plant, later);
+    let bob = Origin::new(SourceKind::Http, "bob");
+    order(&bob, later).unwrap();
+    let placed = plant.buses[0].queue.lock().len();
+    (plant, placed)
+}
+
+#[test]
+fn a_second_order_joins_the_one_under_way_unless_the_motor_may_have_started() {
+    let drive = |plant: &Plant| plant.drives().next().unwrap();
+    let read = |plant: &Plant, at, status: u16, command: u16| {
+        let image = &drive(plant).image;
+        let hertz = if status & 2 == 0 { 0 } else { 2500 };
+        crate::testkit::read(image, 2100, &[status, 0, 0, hertz], at);
+        image.update(|snapshot| snapshot.store(crate::codec::Table::Holding, 2000, &[command, 0, 0], at));
+    };
+    let after = |now: Instant, millis| now + Duration::from_millis(millis);
+    let (plant, placed) = second_order(|plant, _, now| read(plant, after(now, 500), 0x03, 0));
+    assert_eq!(placed, 0, "it slows down");
+    assert_eq!(
+        drive(&plant).last_stop_by().unwrap().who,
+        "bob",
+        "the later stop counts"
+    );
+    let audited = plant.writes.audit().recent(None);
+    assert!(
+        audited
+            .iter()
+            .any(|line| line.contains("bob") && line.contains("under way")),
+        "{audited:?}"
+    );
+    let (_, placed) = second_order(|plant, all, now| {
+        // It stood, and turns.
+        read(plant, after(now, 200), 0x41, 0);
+        all.look(plant, after(now, 250));
+        read(plant, after(now, 500), 0x03, 0);
+    });
+    assert_eq!(placed, 1, "somebody at the drive started it");
+    let (_, placed) = second_order(|plant, _, now| read(plant, after(now, 500), 0x03, 1));
+    assert_eq!(placed, 1, "it has a run command");
+    let (_, placed) = second_order(|plant, _, _| {
+        let image = &drive(plant).image;
+        image.update(|snapshot| snapshot.link = crate::process_image::Link::Offline(std::time::SystemTime::now()));
+    });
+    assert_eq!(placed, 1, "nothing is known of it");
+    for (point, value, expected) in [("run", 1.0, 1), ("speed_reference", 10.0, 0)] {
+        let (plant, placed) = second_order(|plant, _, now| {
+            read(plant, after(now, 500), 0x03, 0);
+            let drive = drive(plant);
+            let index = drive.image.spec.profile.point_index(point).unwrap();
+            let order = Order::Points(vec![(index, Value::Number(value))]);
+            let origin = Origin::new(SourceKind::Mqtt, "c");
+            let mut placed = drive.place(OrderRequest::new(order, origin, Authority::Write), now);
+            assert!(placed.answer().is_none());
+        });
+        assert_eq!(placed, expected, "{point}");
+        let left = crate::testkit::take_next(&plant.buses[0].queue, Instant::now());
+        assert!(left.is_none_or(|command| command.is_stop()), "{point} is purged");
+    }
 }
 
 #[test]

@@ -86,6 +86,134 @@ fn a_drive_that_goes_on_turning_fails() {
     );
 }
 
+/// What happens while the motor should come to stand.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Meanwhile {
+    /// The first replies behind a silence are lost; the motor stands before any comes.
+    Lost,
+    /// The process stands still.
+    Pause,
+    /// The task that looks at drills stands still, and the bus goes on.
+    PauseOfDrills,
+}
+
+#[test]
+fn what_was_not_read_in_time_is_not_proven() {
+    for (kind, when, meanwhile, says) in [
+        (Kind::Gateway, "nothing is sent", Meanwhile::Lost, "was read only"),
+        (Kind::Gateway, "nothing is sent", Meanwhile::Pause, "was read only 4."),
+        (
+            Kind::Order,
+            "a stop command",
+            Meanwhile::Pause,
+            "standstill was seen first after 6.",
+        ),
+        (
+            Kind::Order,
+            "a stop command",
+            Meanwhile::PauseOfDrills,
+            "standstill was seen first after 6.",
+        ),
+        (
+            Kind::Client,
+            "the client is silent",
+            Meanwhile::Pause,
+            "the gateway paused for 6.0 s meanwhile; after 2 s the motor still turns",
+        ),
+        (
+            Kind::Client,
+            "the client is silent",
+            Meanwhile::PauseOfDrills,
+            "standstill was seen first after 6.",
+        ),
+    ] {
+        let mut began = None;
+        let (_, report) = drill(kind, |rig, report| {
+            if !report.text.contains(when) {
+                return;
+            }
+            let first = began.is_none();
+            let since = *began.get_or_insert(rig.now);
+            if kind == Kind::Gateway && rig.now > since + LIMIT / 2 {
+                rig.drives[0].holding.insert(2100, 8);
+            }
+            match meanwhile {
+                Meanwhile::Lost => rig.drives[0].silent = rig.now < since + LIMIT + Duration::from_secs(3),
+                Meanwhile::Pause if first => {
+                    rig.drives[0]
+                        .holding
+                        .insert(2100, if kind == Kind::Gateway { 8 } else { 0 });
+                    rig.now += 3 * LIMIT;
+                }
+                Meanwhile::PauseOfDrills if first => {
+                    rig.run(LIMIT / 2);
+                    rig.drives[0]
+                        .holding
+                        .insert(2100, if kind == Kind::Gateway { 8 } else { 0 });
+                    rig.run(5 * LIMIT / 2);
+                }
+                Meanwhile::Pause | Meanwhile::PauseOfDrills => {}
+            }
+        });
+        let about = format!("{kind:?}, {meanwhile:?}: {report:#?}");
+        assert_eq!(report.state, DrillState::NotProven, "{about}");
+        assert!(report.text.contains(says), "{about}");
+        assert_eq!(report.steps[0].took_ms, None, "{about}");
+    }
+}
+
+#[test]
+fn a_standstill_counts_from_when_it_was_seen() {
+    // The motor goes on for a second after its stop, as one that is braked does.
+    let mut began = None;
+    let (_, report) = drill(Kind::Order, |rig, report| {
+        if says(report, "a stop command") {
+            let since = *began.get_or_insert(rig.now);
+            let turns = rig.now < since + Duration::from_secs(1);
+            rig.drives[0].holding.insert(2000, u16::from(turns));
+        }
+    });
+    assert_eq!(report.state, DrillState::Passed, "{report:#?}");
+    let took = report.steps[0].took_ms.unwrap();
+    assert!((1_000..1_200).contains(&took), "{took} ms");
+    // It stands just in time, and the reply that would have shown that is lost.
+    let mut began = None;
+    let (_, report) = drill(Kind::Order, |rig, report| {
+        if says(report, "a stop command") {
+            let since = *began.get_or_insert(rig.now);
+            let turns = rig.now < since + LIMIT - Duration::from_millis(50);
+            rig.drives[0].holding.insert(2000, u16::from(turns));
+            rig.drives[0].silent = !turns && rig.now < since + LIMIT + Duration::from_millis(50);
+        }
+    });
+    assert_eq!(report.state, DrillState::NotProven, "{report:#?}");
+    // One that was seen to turn after the limit has failed.
+    let mut began = None;
+    let (_, report) = drill(Kind::Order, |rig, report| {
+        if says(report, "a stop command") {
+            let since = *began.get_or_insert(rig.now);
+            let turns = rig.now < since + LIMIT + Duration::from_millis(200);
+            rig.drives[0].holding.insert(2000, u16::from(turns));
+        }
+    });
+    assert_eq!(report.state, DrillState::Failed, "{report:#?}");
+    assert!(says(&report, "after 2 s the motor still turns"), "{report:#?}");
+}
+
+#[test]
+fn a_motor_that_stands_before_its_cause_proves_nothing() {
+    let (_, report) = drill(Kind::Order, |rig, report| {
+        if says(report, "the motor turns at") {
+            rig.drives[0].holding.insert(2000, 0);
+        }
+    });
+    assert_eq!(report.state, DrillState::NotProven, "{report:#?}");
+    assert!(
+        says(&report, "the motor stopped before it was to be stopped"),
+        "{report:#?}"
+    );
+}
+
 #[test]
 fn a_switch_to_local_in_the_silence_proves_nothing() {
     let (_, report) = drill(Kind::Gateway, |rig, report| {

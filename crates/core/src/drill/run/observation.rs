@@ -1,13 +1,19 @@
-//! What a drill observes once the motor should stop, and the verdict.
+//! What a drill observes once the motor should stop, and the verdict. The date of a reading is the earliest that it can be from, since
+//! a reply may be a late one to an earlier request: it proves that the motor still turned then. That it stood is proven by the moment
+//! at which the reading is looked at; what was not seen in time is not proven.
 
 use std::time::{Duration, Instant, SystemTime};
 
 use super::interruption::{LOCAL, is_local};
 use super::{Cause, READ, Run, Step};
+use crate::command::Outcome;
 use crate::drill::{DrillState, Kind, Proof};
 use crate::plant::Placed;
 use crate::process_image::{Reading, Standstill};
 use crate::stop_all::OneStop;
+
+/// For so long after a silence the first reading of the drive shows what was so at its end: a sound line takes that long at most.
+const AT_ONCE: Duration = Duration::from_millis(500);
 
 /// The observation of a test.
 enum Seen {
@@ -28,6 +34,7 @@ impl Run {
             // Its supervision is to write no stop meanwhile.
             self.drive.heartbeat(&self.own, now);
         }
+        let by_the_gateway = !matches!(how, Cause::Gateway(_));
         let seen = match &mut how {
             Cause::Order(placed) => self.seen_of_order(cause, placed, reading, now),
             Cause::Client { stopped } => match self.seen_since(cause, cause, reading, now) {
@@ -39,14 +46,13 @@ impl Run {
             },
             Cause::Gateway(until) => self.seen_after(cause, *until, reading, now),
         };
-        let limit = self.options.limit;
         let Some(step) = self.report.steps.get_mut(self.at) else {
             return;
         };
         let kind = step.kind;
         match seen {
             Seen::Nothing => self.step = Step::Caused(cause, how),
-            Seen::Stood { took, upper_bound } if took <= limit || upper_bound => {
+            Seen::Stood { took, upper_bound } => {
                 step.state = DrillState::Passed;
                 step.took_ms = Some(u64::try_from(took.as_millis()).unwrap_or(u64::MAX));
                 step.upper_bound = upper_bound;
@@ -64,13 +70,11 @@ impl Run {
                     }
                 }
             }
-            Seen::Stood { took, .. } => {
-                let why = format!(
-                    "standstill after {:.1} s; the limit is {} s",
-                    took.as_secs_f64(),
-                    limit.as_secs_f64()
-                );
-                self.failed(kind, why, (now, time));
+            // The stop that it was to give, or to see to, may have come late by that.
+            Seen::Ended(DrillState::Failed, why) if by_the_gateway && self.paused.is_some() => {
+                let seconds = self.paused.unwrap_or_default().as_secs_f64();
+                let why = format!("the gateway paused for {seconds:.1} s meanwhile; {why}");
+                self.end(DrillState::NotProven, why, now);
             }
             Seen::Ended(DrillState::Failed, why) => self.failed(kind, why, (now, time)),
             Seen::Ended(state, why) => self.end(state, why, now),
@@ -84,33 +88,45 @@ impl Run {
 
     fn seen_of_order(&mut self, cause: Instant, placed: &mut Placed, reading: &Reading<'_>, now: Instant) -> Seen {
         let accepted = placed.accepted();
-        match placed.answer() {
-            None if now.saturating_duration_since(cause) <= self.options.limit => Seen::Nothing,
-            None => Seen::Ended(DrillState::Failed, "the stop was not acknowledged in time".to_string()),
-            Some(answer) if answer.outcome.is_ok() => self.seen_since(cause, accepted + answer.latency, reading, now),
-            Some(answer) => Seen::Ended(DrillState::Failed, format!("the stop failed: {}", answer.outcome)),
+        let why = match placed.answer() {
+            Some(answer) if answer.outcome.is_ok() => {
+                return self.seen_since(cause, accepted + answer.latency, reading, now);
+            }
+            Some(answer) if matches!(answer.outcome, Outcome::Exception(_) | Outcome::Refused(_)) => {
+                return Seen::Ended(DrillState::Failed, format!("the stop failed: {}", answer.outcome));
+            }
+            Some(answer) => format!("the stop was not acknowledged: {}", answer.outcome),
+            None if now <= cause + self.options.limit => return Seen::Nothing,
+            None => "the stop was not acknowledged in time".to_string(),
+        };
+        match self.seen_since(cause, cause, reading, now) {
+            Seen::Stood { .. } => Seen::Ended(DrillState::NotProven, why),
+            Seen::Ended(state, seen) => Seen::Ended(state, format!("{why}; {seen}")),
+            Seen::Nothing => Seen::Nothing,
         }
     }
 
-    /// Whether reads after `since` show that the motor stands.
+    /// Whether reads after `since` show that the motor stood within the limit.
     fn seen_since(&self, cause: Instant, since: Instant, reading: &Reading<'_>, now: Instant) -> Seen {
+        let (limit, due) = (self.options.limit.as_secs_f64(), cause + self.options.limit);
         let passed = now.saturating_duration_since(cause);
-        match reading.standstill(Some(since)) {
-            Standstill::Stands => Seen::Stood {
+        match reading.standstill_read(Some(since)) {
+            (Standstill::Stands, _) if now <= due => Seen::Stood {
                 took: passed,
                 upper_bound: false,
             },
-            _ if passed <= self.options.limit => Seen::Nothing,
-            Standstill::Turns(what) => {
-                let seconds = self.options.limit.as_secs_f64();
-                Seen::Ended(
-                    DrillState::Failed,
-                    format!("after {seconds} s the motor still turns: {what}"),
-                )
+            (Standstill::Stands, _) => {
+                let seconds = passed.as_secs_f64();
+                let why = format!("standstill was seen first after {seconds:.1} s; the limit is {limit} s");
+                Seen::Ended(DrillState::NotProven, why)
             }
-            Standstill::Unknown(why) => {
-                Seen::Ended(DrillState::NotProven, format!("standstill was not observed: {why}"))
+            (Standstill::Turns(what), Some(at)) if at > due => {
+                let why = format!("after {limit} s the motor still turns: {what}");
+                Seen::Ended(DrillState::Failed, why)
             }
+            _ if now <= due + READ => Seen::Nothing,
+            (Standstill::Unknown(why), _) => not_observed(&why),
+            _ => not_observed("it has not been read since"),
         }
     }
 
@@ -119,22 +135,32 @@ impl Run {
         if now < until {
             return Seen::Nothing;
         }
+        let limit = self.options.limit.as_secs_f64();
         match reading.standstill(Some(until)) {
             // Whether it was this switch that stopped it is not known.
             Standstill::Stands if is_local(reading) => Seen::Ended(DrillState::Aborted, LOCAL.to_string()),
-            Standstill::Stands => Seen::Stood {
-                took: until.saturating_duration_since(cause),
+            Standstill::Stands if now <= until + AT_ONCE => Seen::Stood {
+                took: now.saturating_duration_since(cause),
                 upper_bound: true,
             },
+            Standstill::Stands => {
+                let late = now.saturating_duration_since(until).as_secs_f64();
+                let why = format!(
+                    "the motor stands, but was read only {late:.1} s after the silence of {limit} s: replies were lost, the line was \
+                     busy, or the gateway paused"
+                );
+                Seen::Ended(DrillState::NotProven, why)
+            }
             Standstill::Turns(what) => {
-                let seconds = self.options.limit.as_secs_f64();
-                let why = format!("after a silence of {seconds} s the motor still turns: {what}");
+                let why = format!("after a silence of {limit} s the motor still turns: {what}");
                 Seen::Ended(DrillState::Failed, why)
             }
             Standstill::Unknown(_) if now < until + READ => Seen::Nothing,
-            Standstill::Unknown(why) => {
-                Seen::Ended(DrillState::NotProven, format!("standstill was not observed: {why}"))
-            }
+            Standstill::Unknown(why) => not_observed(&why),
         }
     }
+}
+
+fn not_observed(why: &str) -> Seen {
+    Seen::Ended(DrillState::NotProven, format!("standstill was not observed: {why}"))
 }

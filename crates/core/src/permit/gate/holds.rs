@@ -191,6 +191,15 @@ impl Gate {
         }
     }
 
+    /// A stop of that client joins one that was accepted before, and is noted as any stop.
+    pub(super) fn hold_stopped(&mut self, drive: DriveIndex, origin: &Origin, now: Instant) {
+        self.needs_no_stop(drive, origin);
+        let who = self.claim(origin);
+        self.with_hold(drive, |holding, rules, told| {
+            holding.accepted(who.as_ref(), Asks::Stop, rules, now, told);
+        });
+    }
+
     /// A client was received from: its heartbeat came, or its order was carried out.
     pub fn hold_renewed(&mut self, drive: DriveIndex, origin: &Origin, now: Instant) {
         let Some(who) = self.claim(origin) else { return };
