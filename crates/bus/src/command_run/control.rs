@@ -273,12 +273,16 @@ fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
             }
         }
         Some(place) => {
+            // One hold for both: the run command, and the reset as it was.
             if !stopped {
-                actions.extend([Action::Word(Word::ResetLow(setting)), hold.clone()]);
+                actions.push(Action::Word(Word::ResetLow(setting)));
             }
             let (high, low) = (setting.applied(0), low_of(&setting));
             if !setting.once {
-                actions.extend([Action::Send(write(place, low, profile)), hold.clone()]);
+                actions.push(Action::Send(write(place, low, profile)));
+            }
+            if !stopped || !setting.once {
+                actions.push(hold.clone());
             }
             actions.push(Action::ResetElsewhere(write(place, high, profile)));
             if !setting.once {
