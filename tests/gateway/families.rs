@@ -1,6 +1,7 @@
 //! Families whose profiles come from reports: the real gateway with each profile against a drive in Python that was written
 //! from what is known of the family, not from the profile. The words here are by hand, too.
 
+mod behind_its_back;
 mod cases;
 mod other_stops;
 mod words;
@@ -36,12 +37,16 @@ struct Rig {
 
 impl Rig {
     fn new(case: &Case, unprepared: bool) -> Rig {
+        Rig::polled_every("50ms", case, unprepared)
+    }
+
+    fn polled_every(cycle: &str, case: &Case, unprepared: bool) -> Rig {
         let (port, slot, raw_slot) = (free_port(), free_port(), free_port());
         let bus = LINE1
             .replace("port = \"line1\"", &format!("port = \"tcp://127.0.0.1:{port}\""))
             .replace("name = \"test\"", "name = \"test\"\nsocket = \"own.sock\"");
         let drive = format!(
-            "cycle = \"50ms\"\nslow_cycle = \"200ms\"\n[[bus.drive]]\nname = \"drive\"\naddress = 1\nprofile = \"{}\"\n\
+            "cycle = \"{cycle}\"\nslow_cycle = \"200ms\"\n[[bus.drive]]\nname = \"drive\"\naddress = 1\nprofile = \"{}\"\n\
              access = \"control\"\n[[bus.slot]]\nlisten = \"127.0.0.1:{slot}\"\naccess = \"write\"\n\
              [[bus.slot]]\nlisten = \"127.0.0.1:{raw_slot}\"\naccess = \"raw\"\n",
             case.profile

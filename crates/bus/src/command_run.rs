@@ -4,8 +4,10 @@ mod control;
 mod ending;
 mod functions;
 mod known_words;
+mod look;
 mod parameter;
 mod replies;
+mod standing;
 mod steps;
 
 use std::collections::VecDeque;
@@ -17,15 +19,16 @@ pub use self::steps::{Step, StepPurpose};
 
 use self::control::{Made, Word};
 use self::functions::other;
+use self::look::Look;
 use self::parameter::ParameterRun;
 use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_of, unsendable, write_on_change};
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
 use crate::codec::{Exception, Reply, Table};
 use crate::command::{
-    Command, Intent, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Urgency, Work,
+    Command, Intent, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Urgency, Work, written,
 };
-use crate::drive::Profile;
+use crate::drive::{ModelPoint, Profile};
 
 /// Most stops to a drive that are sent before the end of a started pulse.
 const MOST_STOPS: u32 = 8;
@@ -121,6 +124,12 @@ pub struct CommandRun {
     by_other_function: bool,
     /// The register, or coil, of the run command.
     control: Option<(Table, u16)>,
+    /// The drive is being asked whether its motor runs.
+    look: Option<Look>,
+    /// The direction that it orders, and that waits for the next start.
+    next_start: Option<bool>,
+    /// It says the direction, or starts the motor.
+    turns: bool,
     /// It waited for a late reply since its last step was chosen.
     held_up: bool,
     /// Stops that were done since it was last written.
@@ -160,7 +169,9 @@ impl CommandRun {
             names_run: matches!(&order, Order::Points(values) if names_run(profile, values)),
             running: true,
             masks: false,
+            motor: None,
         };
+        let turns = turns(profile, &order);
         let parameter = match &order {
             Order::Parameter(order) => ParameterRun::new(order.clone(), profile),
             Order::Points(_) | Order::Write(_) | Order::Read(_) => None,
@@ -209,6 +220,9 @@ impl CommandRun {
             known,
             by_other_function: false,
             control: profile.run_place().map(|place| (place.table, place.address)),
+            look: None,
+            next_start: None,
+            turns,
             held_up: false,
             overtaken: 0,
             intent,
@@ -328,6 +342,7 @@ impl CommandRun {
             if let Action::Hold(time) = action {
                 let until = now + *time;
                 self.actions.pop_front();
+                self.known.motor = None;
                 self.not_before = Some(until);
                 return Next::Wait(until);
             }
@@ -343,8 +358,16 @@ impl CommandRun {
                 Action::Word(word) => match control::word(*word, words, profile, self.known) {
                     Made::Send(step) => Some(step),
                     Made::Nothing => None,
+                    Made::Look => match self.looks(profile) {
+                        Some(step) => Some(step),
+                        None => continue,
+                    },
+                    Made::AtNextStart(reverse) => {
+                        self.keep_direction(reverse);
+                        continue;
+                    }
                     Made::Refused(refusal) => {
-                        self.give_up(Outcome::Refused(refusal));
+                        self.give_up(self.unless_in_doubt(Outcome::Refused(refusal)));
                         continue;
                     }
                 },
@@ -430,17 +453,17 @@ impl CommandRun {
         }
     }
 
-    /// Whether its write must be the next transaction: it sets a parameter and the drive just reported that its motor
-    /// is stopped, or a bit of a settings register that was just read.
+    /// Whether its write must be the next transaction: the drive just reported whether its motor runs, for a parameter or for a
+    /// word that does not say whether it is to; or it sets a bit of a settings register that was just read.
     pub fn is_checked(&mut self) -> bool {
         let settings = self.known.check == Check::Read && self.settings().is_some();
-        settings || self.parameter().is_some_and(|run| run.is_checked())
+        settings || self.known.motor.is_some() || self.parameter().is_some_and(|run| run.is_checked())
     }
 
-    /// Another transaction goes first: before a parameter is written, the motor state is read again, and so are the
+    /// Another transaction goes first: before a parameter or such a word is written, the motor state is read again, and so are the
     /// other settings in the register.
     pub fn others_go_first(&mut self) {
-        if self.settings().is_some() {
+        if self.settings().is_some() || self.known.motor.take().is_some() {
             self.known.check = Check::NotYet;
         }
         if let Some(run) = self.parameter() {
@@ -475,6 +498,8 @@ impl CommandRun {
         self.on_wire = self.on_wire.max(sent);
         if step.pdu.is_write() {
             self.overtaken = 0;
+            // It is seen again before the next write.
+            self.known.motor = None;
         }
     }
 
@@ -545,6 +570,37 @@ impl CommandRun {
     /// It has expired, and its remaining steps are not cancelled yet.
     pub fn is_late(&self, now: Instant) -> bool {
         now >= self.expires && self.may_write_on()
+    }
+}
+
+/// Whether an order says the direction, or starts the motor; a raw write that reaches one of the places of these does.
+fn turns(profile: &Profile, order: &Order) -> bool {
+    match order {
+        Order::Points(values) => {
+            let says = |point: ModelPoint, on: Option<bool>| {
+                let index = profile.model_index(point);
+                let written = index.and_then(|index| profile.points.get(index)?.write_to).or(index);
+                values
+                    .iter()
+                    .any(|(of, value)| Some(*of) == written && on.is_none_or(|on| value.as_bool() == on))
+            };
+            says(ModelPoint::Reverse, None) || says(ModelPoint::Run, Some(true))
+        }
+        Order::Write(pdu) => {
+            let control = profile.control.as_ref();
+            let places = control.map(|control| {
+                let reverse = control.reverse.and_then(|setting| setting.place);
+                [Some(control.at), Some(control.run_place()), reverse]
+            });
+            let reaches = |table: Table, address: u16| {
+                let places = places.into_iter().flatten().flatten();
+                places
+                    .into_iter()
+                    .any(|place| (place.table, place.address) == (table, address))
+            };
+            written(pdu).is_none_or(|(table, items)| items.iter().any(|(address, _)| reaches(table, *address)))
+        }
+        Order::Read(_) | Order::Parameter(_) => false,
     }
 }
 

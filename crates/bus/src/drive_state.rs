@@ -9,7 +9,7 @@ use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
 use super::vain_stops::VainStops;
 use crate::codec::Reply;
-use crate::command::{Command, Interruption, LastWritten, Origin, Outcome, Urgency};
+use crate::command::{Command, Interruption, LastWritten, Origin, Outcome, Receipt, Urgency};
 use crate::drive::ModelPoint;
 use crate::process_image::{DriveImage, Reading};
 
@@ -207,8 +207,17 @@ impl DriveState {
                 Urgency::Command if run.start.is_some() => self.acknowledged = Some(true),
                 Urgency::Command | Urgency::Read => {}
             }
-            let was_read_back = run.was_read_back();
+            run.note_direction(&mut self.words);
+            let (was_read_back, waits, begun) = (run.was_read_back(), run.waits_for_start(), run.has_begun());
             let (effects, receipts) = run.acknowledge(outcome, now);
+            if let Some(why) = waits {
+                let tell = |receipt: Receipt| match begun {
+                    true => receipt.cannot_be_seen(why),
+                    false => receipt.waits(why),
+                };
+                receipts.into_iter().for_each(tell);
+                return;
+            }
             if was_read_back {
                 receipts.into_iter().for_each(|receipt| receipt.confirm(now));
                 return;

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use self::drive::{Drive, Start};
-use super::command_run::{CommandRun, KnownWords, Next, Step};
+use super::command_run::{CommandRun, KnownWords, Next, Step, StepPurpose};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{
     Admitted, Arrival, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, WriteStats, written,
@@ -311,8 +311,14 @@ impl<'p> Case<'p> {
             reset_at: None,
         };
         if self.known {
+            // What is known of a drive that has restarted since is from when it ran.
+            let before = match self.start {
+                Start::RestartedSince => Drive::new(self.profile, self.control, Start::Running { reverse: false }),
+                _ => None,
+            };
             let at = self.control.at;
-            progress.words.learn(at.table, at.address, progress.drive.word(at));
+            let word = before.as_ref().unwrap_or(&progress.drive).word(at);
+            progress.words.learn(at.table, at.address, word);
         }
         let urgency = if self.is_stop() {
             Urgency::Stop
@@ -381,7 +387,8 @@ impl<'p> Case<'p> {
         late: Duration,
         stopped: bool,
     ) -> Result<Option<Outcome>, Box<Counterexample>> {
-        let running = progress.drive.running.is_some() && !progress.drive.fault;
+        let runs = progress.drive.running.is_some() && !progress.drive.fault;
+        let running = runs || self.start.ran();
         let step = match run.next(&progress.words, self.profile, running, progress.now + late) {
             Next::Done => return Ok(Some(run.success())),
             Next::Wait(until) => {
@@ -414,6 +421,10 @@ impl<'p> Case<'p> {
             && progress.frames.len() > 1;
         progress.now += if again { LOOK_AGAIN } else { EXCHANGE };
         self.look(&step, progress, stopped, stood)?;
+        if step.purpose == StepPurpose::Look && matches!(fate, None | Some(Fate::Repeated)) {
+            run.sees(runs);
+            return Ok(None);
+        }
         Ok(match (fate, reply) {
             (Some(Fate::Refused(code)), _) if step.pdu.is_write() && code.leaves_open() => {
                 run.failed(&step, Outcome::Unknown(code), 1)
@@ -535,7 +546,9 @@ impl<'p> Case<'p> {
         }
         let sequence = matches!(self.control.run, Run::Steps(_));
         let refused = matches!(outcome, Outcome::Exception(_) | Outcome::Refused(_));
-        if !outcome.is_ok() && runs && !progress.ran && (sequence || refused) {
+        // One that was stopped at its panel starts with whatever is written of a run command.
+        let late = self.start == Start::StoppedSince && self.says(ModelPoint::Run) == Some(true);
+        if !outcome.is_ok() && runs && !progress.ran && !late && (sequence || refused) {
             return Err(self.wrong("the command failed but the motor runs", progress));
         }
         if event != Event::None {
@@ -559,7 +572,8 @@ impl<'p> Case<'p> {
             }
         }
         let resets = self.says(ModelPoint::FaultReset) == Some(true);
-        let faulted = matches!(self.start, Start::FaultedRunning | Start::FaultedStopped);
+        use Start::{FaultedRunning, FaultedSince, FaultedStopped};
+        let faulted = matches!(self.start, FaultedRunning | FaultedStopped | FaultedSince);
         if resets && faulted && progress.drive.fault {
             return Err(self.wrong("a reset does not reset the fault", progress));
         }

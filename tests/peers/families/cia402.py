@@ -24,6 +24,9 @@ class Drive(drive.Drive):
     def tripped(self):
         self.state = FAULT
 
+    def stopped(self):
+        self.state = DISABLED
+
     def wrote(self, table, address, value):
         if address == LFR:
             self.target = abs(drive.signed(value)) / 5

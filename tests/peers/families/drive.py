@@ -1,7 +1,8 @@
 """What the simulated drives of the families share: Modbus RTU over TCP, a motor with a ramp, and a log on stdout.
 
 Address 1. Every write is printed as `wrote TABLE ADDRESS VALUE` (hexadecimal), every change of the motor as `motor forward`,
-`motor reverse` or `motor stopped`. SIGUSR1 trips the drive. An unprepared drive never becomes ready.
+`motor reverse` or `motor stopped`. SIGUSR1 trips the drive, SIGUSR2 stops it at its panel, SIGHUP switches it off and on. An
+unprepared drive never becomes ready.
 """
 
 import signal
@@ -85,6 +86,26 @@ class Drive:
             self.coast()
             self.log("tripped")
             self.tripped()
+            self.moved()
+            self.show()
+
+    def panel(self):
+        with self.lock:
+            self.coast()
+            self.log("stopped at the panel")
+            self.stopped()
+            self.moved()
+            self.show()
+
+    def stopped(self):
+        """The drive was stopped at its panel."""
+
+    def restart(self):
+        with self.lock:
+            lock, turning = self.lock, self.turning
+            self.__init__(self.unprepared)
+            self.lock, self.turning = lock, turning
+            self.log("restarted")
             self.moved()
             self.show()
 
@@ -193,7 +214,12 @@ def frames(data):
 
 
 def serve(drive, port):
-    signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=drive.trip).start())
+    for number, happens in (
+        (signal.SIGUSR1, drive.trip),
+        (signal.SIGUSR2, drive.panel),
+        (signal.SIGHUP, drive.restart),
+    ):
+        signal.signal(number, lambda *_, happens=happens: threading.Thread(target=happens).start())
 
     def turn():
         last = time.monotonic()

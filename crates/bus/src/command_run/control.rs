@@ -7,6 +7,7 @@
 use std::time::{Duration, Instant};
 
 use super::known_words::KnownWords;
+use super::standing::{Holds, Motor, Verdict, Wants, depends_on_motor, judge};
 use super::steps::{Action, Check, Known, Step, StepPurpose};
 use crate::codec::{Reply, RequestPdu, Table};
 use crate::command::Refusal;
@@ -24,6 +25,10 @@ pub(super) enum Word {
     Stop(Option<bool>),
     /// The direction alone.
     Direction(bool),
+    /// Whether the direction may be written to a place of its own; that write follows.
+    DirectionElsewhere(bool),
+    /// The direction that was kept for this start, at a place of its own.
+    KeptDirection,
     /// Runs, in that direction where the order says one.
     Run(Option<bool>),
     /// That word of a sequence.
@@ -39,9 +44,25 @@ pub(super) enum Word {
 }
 
 impl Word {
-    /// Whether it is one of a command that says whether the motor is to run.
-    fn names_run(self) -> bool {
-        matches!(self, Word::Stop(_) | Word::Run(_) | Word::Sequence(..))
+    /// The bits of a pulse that it begins, sets or ends.
+    fn pulsed(self) -> Option<Setting> {
+        match self {
+            Word::ResetLow(setting) | Word::ResetHigh(setting) | Word::ResetEnd(setting) => Some(setting),
+            _ => None,
+        }
+    }
+
+    /// What it wants to write without saying whether the motor is to run.
+    fn wants(self) -> Option<Wants> {
+        match self {
+            Word::Stop(_) | Word::KeptDirection | Word::Run(_) | Word::Sequence(..) => None,
+            Word::Direction(_) => Some(Wants::Direction),
+            Word::DirectionElsewhere(_) => Some(Wants::DirectionElsewhere),
+            Word::ResetLow(setting) if setting.place.is_some() => Some(Wants::ResetElsewhere),
+            Word::ResetLow(_) | Word::ResetHigh(_) => Some(Wants::Reset),
+            Word::ResetEnd(_) => Some(Wants::ResetEnd),
+            Word::Others(_) => Some(Wants::Others),
+        }
     }
 }
 
@@ -52,6 +73,10 @@ pub(super) enum Made {
     Send(Step),
     /// Nothing: the drive has it.
     Nothing,
+    /// Nothing before it was seen whether the motor runs.
+    Look,
+    /// Nothing: this direction is kept for the next start.
+    AtNextStart(bool),
     /// Its effect would be unknown.
     Refused(Refusal),
 }
@@ -185,9 +210,18 @@ impl Ordered {
             .reverse
             .and_then(|setting| Some((setting, setting.place?)))
             .filter(|_| !matches!(control.run, Run::Pair { .. }));
-        if let (Some(reverse), Some((setting, place))) = (self.reverse, elsewhere) {
-            let word = if reverse { setting.applied(0) } else { setting.undone(0) };
-            actions.push(Action::Send(write(place, word, profile)));
+        match (self.reverse, elsewhere) {
+            (Some(reverse), Some((setting, place))) => {
+                let word = if reverse { setting.applied(0) } else { setting.undone(0) };
+                let may = self
+                    .run
+                    .is_none()
+                    .then_some(Action::Word(Word::DirectionElsewhere(reverse)));
+                actions.extend(may);
+                actions.push(Action::Send(write(place, word, profile)));
+            }
+            (None, Some(_)) if self.run == Some(true) => actions.push(Action::Word(Word::KeptDirection)),
+            _ => {}
         }
         match (self.run, self.reverse) {
             (Some(true), reverse) => actions.extend(runs(control, profile, reverse)),
@@ -239,12 +273,16 @@ fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
             }
         }
         Some(place) => {
+            // One hold for both: the run command, and the reset as it was.
             if !stopped {
-                actions.extend([Action::Word(Word::ResetLow(setting)), hold.clone()]);
+                actions.push(Action::Word(Word::ResetLow(setting)));
             }
             let (high, low) = (setting.applied(0), low_of(&setting));
             if !setting.once {
-                actions.extend([Action::Send(write(place, low, profile)), hold.clone()]);
+                actions.push(Action::Send(write(place, low, profile)));
+            }
+            if !stopped || !setting.once {
+                actions.push(hold.clone());
             }
             actions.push(Action::ResetElsewhere(write(place, high, profile)));
             if !setting.once {
@@ -298,13 +336,7 @@ fn runs(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Acti
             None => vec![Action::Word(Word::Run(reverse))],
             Some(place) => vec![Action::Send(write(place, setting.applied(0), profile))],
         },
-        Run::Pair { forward, reverse: back } => match forward.place {
-            None => vec![Action::Word(Word::Run(reverse))],
-            Some(place) => {
-                let setting = if reverse == Some(true) { back } else { forward };
-                vec![Action::Send(write(place, setting.applied(0), profile))]
-            }
-        },
+        Run::Pair { .. } => vec![Action::Word(Word::Run(reverse))],
     }
 }
 
@@ -334,48 +366,54 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
     if asks_first(word, control, own, known) {
         return Made::Send(read_of(at));
     }
-    // A word that cannot be read may have been cleared elsewhere: a stopped motor stays stopped.
-    let is_told = known.check == Check::Read;
-    let pulsed = match word {
-        Word::ResetLow(setting) | Word::ResetHigh(setting) | Word::ResetEnd(setting) => Some(setting),
-        _ => None,
+    let pulsed = word.pulsed();
+    let released = own.map(|own| {
+        let own = control.without_reset(own);
+        pulsed.map_or(own, |pulsed| pulsed.released(own))
+    });
+    let base = released.unwrap_or(0);
+    let verdict = match may_stand(word, control, words, released, known) {
+        Ok(verdict) => verdict,
+        Err(made) => return made,
     };
-    if matches!(word, Word::ResetLow(_)) && known.running && pulsed.is_some_and(|pulsed| pulsed.place.is_some()) {
-        // The word of a motor that runs stays as it is.
-        return Made::Nothing;
-    }
-    let base = match own.map(|own| control.without_reset(own)) {
-        Some(own) => pulsed.map_or(own, |pulsed| pulsed.released(own)),
-        None if known.running && !word.names_run() => {
-            return Made::Refused(Refusal::NotKnown(
-                "the last command to the drive is unknown; include `run` true or false in this command".to_string(),
-            ));
-        }
-        None => 0,
+    let stays = match verdict {
+        Verdict::AsItStands => control.always.applied(base),
+        _ => control.resting(base),
     };
-    let kept = control.always.applied(base);
-    let stays = if is_told || known.running {
-        kept
-    } else {
-        control.stop_word(base)
-    };
-    let sent = |word: u16| Made::Send(Step::new(StepPurpose::Execute, write(at, word, profile)));
+    let runs = verdict == Verdict::AsItStands;
+    let sent = |place: ControlItem, word: u16| Made::Send(Step::new(StepPurpose::Execute, write(place, word, profile)));
     match word {
         Word::Stop(reverse) => {
             let stop = control.stop_word(base);
             let turned = reverse.map_or(stop, |reverse| control.with_direction(stop, reverse));
-            sent(if control.is_own_stop(at, turned) { turned } else { stop })
+            sent(at, if control.is_own_stop(at, turned) { turned } else { stop })
         }
         Word::Direction(reverse) => match &control.run {
-            // Kept for the next start where no bit of the drive says it; the word that stands is sent once more.
             Run::Pair { forward, reverse: back } => {
                 let run = if reverse { back } else { forward };
-                let runs = control.is_run(at, stays);
-                sent(if runs { run.applied(stays) } else { stays })
+                match runs && run.place.is_none() {
+                    true => sent(at, run.applied(stays)),
+                    // No bit of the drive says it while the motor stands.
+                    false => Made::AtNextStart(reverse),
+                }
             }
-            Run::One(_) | Run::Steps(_) => sent(control.with_direction(stays, reverse)),
+            Run::One(_) | Run::Steps(_) => sent(at, control.with_direction(stays, reverse)),
         },
-        Word::Run(reverse) => sent(run_word(control, kept, reverse, words)),
+        Word::DirectionElsewhere(_) => Made::Nothing,
+        Word::KeptDirection => {
+            let place = control.reverse.and_then(|setting| Some((setting, setting.place?)));
+            match place.zip(words.at_next_start()) {
+                Some(((setting, place), reverse)) => {
+                    let word = if reverse { setting.applied(0) } else { setting.undone(0) };
+                    sent(place, word)
+                }
+                None => Made::Nothing,
+            }
+        }
+        Word::Run(reverse) => {
+            let (place, word) = run_word(control, stays, reverse, words);
+            sent(place.unwrap_or(at), word)
+        }
         Word::Sequence(number, reverse) => {
             let Run::Steps(steps) = &control.run else {
                 return Made::Nothing;
@@ -383,14 +421,83 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
             let Some(step) = steps.get(number) else {
                 return Made::Nothing;
             };
+            let reverse = reverse.or(words.at_next_start());
             let reverse = reverse.or_else(|| own.and_then(|own| control.direction_of(own)));
-            let word = step.write.applied(kept);
-            sent(reverse.map_or(word, |reverse| control.with_direction(word, reverse)))
+            let word = step.write.applied(stays);
+            sent(
+                at,
+                reverse.map_or(word, |reverse| control.with_direction(word, reverse)),
+            )
         }
-        Word::ResetLow(reset) => reset_low(control, reset, own, base, known, sent),
-        Word::ResetHigh(reset) => sent(reset.applied(stays)),
-        Word::ResetEnd(_) => sent(stays),
-        Word::Others(bits) => sent(bits.applied(stays)),
+        Word::ResetLow(reset) | Word::ResetHigh(reset) if runs && stops_by_reset(control, reset) => {
+            Made::Refused(Refusal::NotAllowed(STOPS_BY_RESET.to_string()))
+        }
+        Word::ResetLow(_) | Word::ResetHigh(_) if runs && control.restarts_on_reset => {
+            Made::Refused(Refusal::NotAllowed(RESTARTS_ON_RESET.to_string()))
+        }
+        // The word of a motor that runs stays as it is, as does one that the drive has.
+        Word::ResetLow(reset) if runs && reset.place.is_some() || own == Some(stays) => Made::Nothing,
+        Word::ResetHigh(reset) => sent(at, reset.applied(stays)),
+        Word::ResetLow(_) | Word::ResetEnd(_) => sent(at, stays),
+        Word::Others(bits) => sent(at, bits.applied(stays)),
+    }
+}
+
+const STOPS_BY_RESET: &str = "the motor is running, and on this family a reset would stop it; nothing was written";
+const RESTARTS_ON_RESET: &str = "the motor is running, and on this family a reset starts a motor that has tripped meanwhile; \
+     nothing was written";
+
+/// Whether a reset within the control word takes the run command away.
+fn stops_by_reset(control: &Control, reset: Setting) -> bool {
+    reset.place.is_none() && control.runs().iter().any(|run| !reset.agrees(run))
+}
+
+/// What may stand in a word beside what it is made for; one that says whether the motor is to run asks nobody. `released` is the
+/// control word as it is known, without a reset.
+///
+/// # Errors
+/// The word is not made.
+fn may_stand(
+    word: Word,
+    control: &Control,
+    words: &KnownWords,
+    released: Option<u16>,
+    known: Known,
+) -> Result<Verdict, Made> {
+    let told = known.check == Check::Read;
+    let Some(wants) = word.wants() else {
+        return Ok(Verdict::AsItStands);
+    };
+    let Some(holds) = holds(control, words, released) else {
+        return Ok(Verdict::WithoutRun);
+    };
+    let motor = match known.motor {
+        None if depends_on_motor(wants, holds, told) => return Err(Made::Look),
+        motor => motor.unwrap_or(Motor::NotShown),
+    };
+    match (judge(wants, holds, told, motor), word) {
+        (Verdict::AtNextStart, Word::Direction(reverse) | Word::DirectionElsewhere(reverse)) => {
+            Err(Made::AtNextStart(reverse))
+        }
+        (Verdict::Refused(refusal), _) => Err(Made::Refused(refusal)),
+        (verdict, _) => Ok(verdict),
+    }
+}
+
+/// The run command as it is known at the drive; none where it is known to have a stop.
+fn holds(control: &Control, words: &KnownWords, released: Option<u16>) -> Option<Holds> {
+    let place = control.run_place();
+    let own = place == control.at;
+    let word = if own {
+        released
+    } else {
+        words.get(place.table, place.address)
+    };
+    match word {
+        None => Some(Holds::Unknown),
+        Some(word) if control.is_stop(place, word) => None,
+        Some(word) if control.is_run(place, word) && (!own || control.always.holds(word)) => Some(Holds::Run),
+        Some(_) => Some(Holds::Other),
     }
 }
 
@@ -403,60 +510,42 @@ fn asks_first(word: Word, control: &Control, own: Option<u16>, known: Known) -> 
     }
     match (control.own_word, word) {
         (OwnWord::Shadow, _) => false,
+        // They are no control words.
+        (_, Word::DirectionElsewhere(_) | Word::KeptDirection) => false,
         (OwnWord::Read, Word::Stop(_) | Word::ResetEnd(_)) => false,
+        (OwnWord::Read, Word::Run(_)) if control.run_place() != control.at => false,
         (OwnWord::Read, Word::ResetHigh(_) | Word::Run(_) | Word::Sequence(..)) => own.is_none(),
         (OwnWord::Read, Word::Direction(_) | Word::ResetLow(_) | Word::Others(_)) => true,
         (OwnWord::Kept, word) => own.is_none_or(|own| {
             // A run command that the order does not name may have been taken away elsewhere since the word was read, and to
             // write it would start the motor.
-            let is_taken_away = !known.running && matches!(word, Word::ResetLow(_));
+            let running = known.motor.map_or(known.running, |motor| motor == Motor::Runs);
+            let is_taken_away = !running && matches!(word, Word::ResetLow(_));
             let stops = is_taken_away || control.is_stop(control.at, own);
-            let is_low = known.running && matches!(word, Word::ResetLow(pulse) if pulse.released(own) == own);
+            let is_low = running && matches!(word, Word::ResetLow(pulse) if pulse.released(own) == own);
             !known.names_run && !stops && !is_low
         }),
     }
 }
 
-fn run_word(control: &Control, kept: u16, reverse: Option<bool>, words: &KnownWords) -> u16 {
+/// The word of a run command, and its place where that is not the control word.
+fn run_word(control: &Control, kept: u16, reverse: Option<bool>, words: &KnownWords) -> (Option<ControlItem>, u16) {
+    let ordered = reverse.or(words.at_next_start());
     match &control.run {
         Run::Pair { forward, reverse: back } => {
             let stands = control.direction_of(kept);
-            let turned = reverse.or(stands).or(words.direction).unwrap_or(false);
-            if turned {
-                back.applied(kept)
-            } else {
-                forward.applied(kept)
-            }
+            let turned = ordered.or(stands).or(words.direction).unwrap_or(false);
+            let run = if turned { back } else { forward };
+            (run.place, run.applied(if run.place.is_some() { 0 } else { kept }))
         }
         Run::One(setting) => {
             let word = setting.applied(kept);
-            reverse.map_or(word, |reverse| control.with_direction(word, reverse))
+            (
+                None,
+                ordered.map_or(word, |reverse| control.with_direction(word, reverse)),
+            )
         }
-        Run::Steps(_) => kept,
-    }
-}
-
-fn reset_low(
-    control: &Control,
-    reset: Setting,
-    own: Option<u16>,
-    base: u16,
-    known: Known,
-    sent: impl Fn(u16) -> Made,
-) -> Made {
-    let stops = reset.place.is_none() && control.runs().iter().any(|run| !reset.agrees(run));
-    if known.running && stops {
-        return Made::Refused(Refusal::NotAllowed(
-            "the motor is running, and on this family a reset would stop it; nothing was written".to_string(),
-        ));
-    }
-    let low = match known.running {
-        true => control.always.applied(base),
-        false => control.stop_word(base),
-    };
-    match own == Some(low) {
-        true => Made::Nothing,
-        false => sent(low),
+        Run::Steps(_) => (None, kept),
     }
 }
 

@@ -16,7 +16,7 @@ impl CommandRun {
         self.cut.get_or_insert(outcome);
         let phase = std::mem::replace(&mut self.phase, Phase::OnlyEnds);
         self.tries.pause = None;
-        (self.tries.failures, self.known.check) = (0, Check::NotYet);
+        (self.tries.failures, self.known.check, self.known.motor) = (0, Check::NotYet, None);
         if phase == Phase::MotorStarted {
             self.actions.push_back(Action::Word(Word::Stop(None)));
         }
@@ -87,7 +87,7 @@ impl CommandRun {
         if phase == Phase::MotorStarted && before > left {
             self.actions.push_back(Action::Word(Word::Stop(None)));
         }
-        self.tries.pause = None;
+        (self.tries.pause, self.known.motor) = (None, None);
         if before != left {
             self.cut = Some(outcome);
             self.tries.failures = 0;

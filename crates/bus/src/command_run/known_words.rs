@@ -14,6 +14,8 @@ pub struct KnownWords {
     words: BTreeMap<(Table, u16), u16>,
     /// The direction that was ordered last, where no bit of the drive keeps it until the next start.
     pub(super) direction: Option<bool>,
+    /// The word at the drive has another one: the next start has it.
+    waits_for_start: bool,
     /// Those that were ever read successfully.
     reported: BTreeSet<(Table, u16)>,
     /// The functions that it takes, which it keeps when it restarts.
@@ -65,6 +67,21 @@ impl KnownWords {
         items
             .iter()
             .any(|(address, word)| self.get(table, *address).is_some_and(|has| has != *word))
+    }
+
+    /// A direction that was ordered and not written.
+    pub(crate) fn keep_direction(&mut self, reverse: bool) {
+        (self.direction, self.waits_for_start) = (Some(reverse), true);
+    }
+
+    /// Another order has said the direction since, or started the motor.
+    pub(crate) fn forget_direction(&mut self) {
+        self.waits_for_start = false;
+    }
+
+    /// The direction that was kept for the next start.
+    pub(super) fn at_next_start(&self) -> Option<bool> {
+        self.direction.filter(|_| self.waits_for_start)
     }
 
     /// The drive may have restarted, or taken an unanswered write: its words are read again before a bit is changed.

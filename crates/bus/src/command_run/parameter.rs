@@ -2,13 +2,13 @@
 //!
 //! A write without a reply is not repeated before its effect has been read.
 
+use super::look::Look;
 use super::steps::{Step, StepPurpose};
 use crate::codec::n2::Session;
 use crate::codec::{Reply, RequestPdu, Table};
 use crate::command::{Outcome, ParameterOrder, Refusal};
-use crate::drive::model::Kind;
+use crate::drive::Profile;
 use crate::drive::parameters::RawValue;
-use crate::drive::{ModelPoint, Profile, Raw};
 
 /// Reads of a value that was acknowledged until it counts as not taken.
 const LOOKS: u32 = 3;
@@ -43,8 +43,7 @@ pub(super) enum Then {
 pub(super) struct ParameterRun {
     order: ParameterOrder,
     stage: Stage,
-    running: Raw,
-    kind: Kind,
+    look: Look,
     releases: bool,
     /// A write was sent whose effect is not known.
     in_doubt: bool,
@@ -54,11 +53,10 @@ pub(super) struct ParameterRun {
 impl ParameterRun {
     /// One that has not started; none where the family does not report whether its motor runs.
     pub(super) fn new(order: ParameterOrder, profile: &Profile) -> Option<ParameterRun> {
-        let running = profile.model_point(ModelPoint::Running)?;
+        let look = Look::at_running(profile)?;
         let mut run = ParameterRun {
             stage: Stage::Value,
-            running: running.raw()?.clone(),
-            kind: running.kind(),
+            look,
             releases: profile.releases(Table::Holding),
             in_doubt: false,
             looks: 0,
@@ -79,14 +77,7 @@ impl ParameterRun {
     pub(super) fn step(&self) -> Step {
         let (purpose, pdu) = match self.stage {
             Stage::Value => (StepPurpose::Compare, self.order.read()),
-            Stage::Running => (
-                StepPurpose::AskRunning,
-                RequestPdu::Read {
-                    table: self.running.table,
-                    start: self.running.address,
-                    count: self.running.form.items(),
-                },
-            ),
+            Stage::Running => (StepPurpose::Look, self.look.request()),
             Stage::Write => (StepPurpose::Execute, self.order.write()),
             Stage::Release => {
                 let (table, address) = (Table::Holding, self.order.address);
@@ -108,7 +99,7 @@ impl ParameterRun {
     /// Something else went on the line: whether the motor runs is asked again.
     pub(super) fn check_again(&mut self) {
         if self.stage == Stage::Write {
-            self.stage = Stage::Running;
+            self.asks_running();
         }
     }
 
@@ -120,6 +111,7 @@ impl ParameterRun {
     /// No valid reply came: what the drive has is asked before anything is written again.
     pub(super) fn begin_again(&mut self) {
         if self.stage != Stage::Release {
+            self.look.begin_again();
             self.stage = self.first();
         }
     }
@@ -161,14 +153,18 @@ impl ParameterRun {
         Then::Go
     }
 
+    /// It is asked whether the motor runs, from the first request on.
+    fn asks_running(&mut self) -> Then {
+        self.look.begin_again();
+        self.go(Stage::Running)
+    }
+
     fn heard_running(&mut self, reply: &Reply, unanswered: &Outcome) -> Then {
-        let words = reply.words().unwrap_or_default();
+        if !self.look.hears(reply) {
+            return Then::Go;
+        }
         // A reply that does not say so is no motor that stands.
-        let stands = self
-            .running
-            .decode(&words, self.kind)
-            .is_some_and(|runs| !runs.as_bool());
-        if stands {
+        if self.look.runs() == Some(false) {
             return self.go(Stage::Write);
         }
         Then::Over(match self.in_doubt && self.order.from.is_none() {
@@ -195,7 +191,7 @@ impl ParameterRun {
         if value.zip(before).is_some_and(|(value, from)| from.is_shown_by(value)) {
             // A write of before, if there was one, was not taken.
             self.in_doubt = false;
-            return self.go(Stage::Running);
+            return self.asks_running();
         }
         let shown = shown(value);
         Then::Over(match self.in_doubt {

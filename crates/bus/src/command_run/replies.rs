@@ -31,7 +31,8 @@ impl CommandRun {
             return self.parameter_answered(step, &reply, words);
         }
         // A read between the tries of a write does not make them more.
-        if !self.in_doubt() || step.purpose != StepPurpose::ReadWord {
+        let is_read = matches!(step.purpose, StepPurpose::ReadWord | StepPurpose::Look);
+        if !self.in_doubt() || !is_read {
             self.tries.failures = 0;
         }
         // An exception shows nothing about an earlier try that was not answered.
@@ -57,6 +58,13 @@ impl CommandRun {
                 _ => Some(Outcome::Exception(Exception::DEVICE_FAILURE)),
             },
             (StepPurpose::AskState, reply) => self.state_answered(&reply),
+            (StepPurpose::Look, Reply::Exception(code)) => {
+                self.not_seen(&format!("the drive refused that with {code}"), Outcome::Exception(code))
+            }
+            (StepPurpose::Look, reply) => {
+                self.looked(&reply);
+                None
+            }
             // It says nothing of an earlier try that was not answered.
             (StepPurpose::Execute, Reply::Exception(code)) if self.in_doubt() => self.ended(Outcome::Unknown(code)),
             (StepPurpose::Execute, Reply::Exception(code)) => self.ended(Outcome::Exception(code)),
@@ -107,12 +115,12 @@ impl CommandRun {
     fn waits_while_busy(&mut self, step: &Step, reply: &Reply) -> bool {
         let waits = match step.purpose {
             StepPurpose::Execute => self.urgency != Urgency::Read,
-            StepPurpose::ReadWord => self.urgency != Urgency::Stop && !self.ends_pulse(),
+            StepPurpose::ReadWord | StepPurpose::Look => self.urgency != Urgency::Stop && !self.ends_pulse(),
             _ => false,
         };
         // A read that the drive is still working on has changed nothing; it is repeated.
         let is_busy = matches!(reply, Reply::Exception(code) if code.is_busy()
-            || (*code == Exception::ACKNOWLEDGE && step.purpose == StepPurpose::ReadWord));
+            || (*code == Exception::ACKNOWLEDGE && matches!(step.purpose, StepPurpose::ReadWord | StepPurpose::Look)));
         if !(is_busy && waits) || (!self.may_write_on() && self.tries.busy >= MOST_BUSY) {
             return false;
         }
@@ -126,7 +134,7 @@ impl CommandRun {
         true
     }
 
-    fn ends_pulse(&self) -> bool {
+    pub(super) fn ends_pulse(&self) -> bool {
         self.actions.front().is_some_and(Action::ends_reset)
     }
 
@@ -219,6 +227,15 @@ impl CommandRun {
             StepPurpose::Compare if self.urgency == Urgency::Stop => {
                 self.known.check = Check::InVain;
                 return None;
+            }
+            StepPurpose::Look => {
+                let why = match self.tries.unanswered {
+                    Outcome::Garbled => "the drive's reply was garbled",
+                    _ => "no reply came",
+                };
+                return over
+                    .then(|| self.not_seen(why, self.tries.unanswered.clone()))
+                    .flatten();
             }
             StepPurpose::ReadWord if self.settings().is_some() => return over.then(|| self.without_answer()),
             StepPurpose::ReadWord if self.goes_on(false) => return None,

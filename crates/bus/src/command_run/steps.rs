@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::control::{self, AwaitedState, Ordered, Word};
 use super::known_words::KnownWords;
 use super::parameter::ParameterRun;
+use super::standing::Motor;
 use crate::codec::n2::Session;
 use crate::codec::{RequestPdu, Table};
 use crate::command::{Refusal, written};
@@ -58,10 +59,10 @@ pub enum StepPurpose {
     Execute,
     /// Gives an overridden output back to the drive's own control.
     Release,
+    /// Asks whether the motor runs, right before a parameter is written or a word that does not say whether it is to.
+    Look,
     /// Asks for the state that ends a step of a sequence.
     AskState,
-    /// Asks whether the motor runs, right before a parameter is written.
-    AskRunning,
     /// Asks whether the drive took a parameter.
     ReadBack,
 }
@@ -119,6 +120,8 @@ pub(super) struct Known {
     pub(super) running: bool,
     /// The drive changes bits of a register by itself.
     pub(super) masks: bool,
+    /// What the drive showed of its motor right before; none where it was not asked.
+    pub(super) motor: Option<Motor>,
 }
 
 /// A word and the bits of it that change.
@@ -241,7 +244,7 @@ pub(super) fn actions(
             true if raw.table == Table::Holding => Action::Word(Word::Others(setting_of(&changes))),
             _ => Action::Bits { raw, changes },
         });
-    // A stop goes first, a run command last.
+    // A stop goes first, a run command last. Without one, nothing is written before it is seen whether the words may be.
     let commands = control.actions(profile, stop, stopped);
     if stop {
         commands
@@ -250,12 +253,19 @@ pub(super) fn actions(
             .chain(numbers)
             .chain(pulses)
             .collect()
-    } else {
+    } else if names_run(profile, values) {
         numbers
             .into_iter()
             .chain(pulses)
             .chain(others)
             .chain(commands)
+            .collect()
+    } else {
+        pulses
+            .into_iter()
+            .chain(others)
+            .chain(commands)
+            .chain(numbers)
             .collect()
     }
 }

@@ -14,6 +14,7 @@ use crate::drive::{DriveIndex, Value};
 
 mod elsewhere;
 mod functions;
+mod looking;
 mod on_change;
 
 struct ObedientDrive {
@@ -72,6 +73,16 @@ impl ObedientDrive {
         (CommandRun::new(command, &self.profile), receiver)
     }
 
+    /// Its registers; the status words say that it is commanded by the bus, and whether its motor runs.
+    fn shows(&self, start: u16, count: u16) -> Reply {
+        let status = [(2100, u16::from(self.running) << 1), (2101, 1 << 13)];
+        let word = |address| {
+            let of_status = status.iter().find(|(of, _)| *of == address);
+            of_status.map_or_else(|| self.drive[&address], |(_, word)| *word)
+        };
+        Reply::Registers((start..start + count).map(word).collect())
+    }
+
     /// Runs the command against a drive that does as commanded; the writes as (ms, address, value).
     fn run(&mut self, run: &mut CommandRun) -> Vec<(u128, u16, u16)> {
         let start = self.now;
@@ -83,7 +94,7 @@ impl ObedientDrive {
                 Next::Send(step) => {
                     run.sent(&step);
                     let reply = match step.pdu {
-                        RequestPdu::Read { start, .. } => Reply::Registers(vec![self.drive[&start]]),
+                        RequestPdu::Read { start, count, .. } => self.shows(start, count),
                         RequestPdu::WriteRegister { address, value } => {
                             writes.push(((self.now - start).as_millis(), address, value));
                             self.drive.insert(address, value);
@@ -227,7 +238,9 @@ fn a_command_that_was_held_up_asks_again_for_the_word() {
     let read = sends(&bench, &mut reverse);
     let reported = Reply::Registers(vec![1]);
     assert_eq!(reverse.answered(&read, reported, &mut bench.words), None);
+    looks(&mut bench, &mut reverse);
     assert_eq!(sends(&bench, &mut reverse), word(3));
+    assert!(reverse.is_checked(), "nothing goes between");
     reverse.hold_up();
     assert!(reverse.asks_again(), "the motor may have been stopped meanwhile");
     assert!(asks(&sends(&bench, &mut reverse)));
@@ -277,6 +290,18 @@ fn sends(bench: &ObedientDrive, command: &mut CommandRun) -> Step {
         Next::Send(step) => step,
         other => panic!("{other:?}"),
     }
+}
+
+/// The command asks whether the motor runs, and is told.
+fn looks(bench: &mut ObedientDrive, command: &mut CommandRun) {
+    let step = sends(bench, command);
+    assert_eq!(step.purpose, StepPurpose::Look, "{step:?}");
+    let RequestPdu::Read { start, count, .. } = step.pdu else {
+        panic!("{step:?}");
+    };
+    let shown = bench.shows(start, count);
+    command.sent(&step);
+    assert_eq!(command.answered(&step, shown, &mut bench.words), None);
 }
 
 fn execute(pdu: RequestPdu) -> Step {

@@ -25,6 +25,15 @@ pub(super) enum Start {
     FaultedStopped,
     /// Stopped by another of its own means: that one of the words of the profile.
     StoppedOtherwise(usize),
+    /// It ran when it was polled last, and a fault came since.
+    FaultedSince,
+    /// It ran when it was polled last, and was switched off and on since.
+    RestartedSince,
+    /// It ran when it was polled last, and was stopped at its panel since; it starts whenever a command is written while its word
+    /// is a run command.
+    StoppedSince,
+    /// Its word is a run command but for the bits of `always`.
+    WithoutAlways,
     /// Commanded at its panel; the gateway's word is a stop.
     Local,
     /// The same, and the gateway's word is a run command.
@@ -42,11 +51,20 @@ impl Start {
             Start::Running { reverse: true },
             Start::FaultedRunning,
             Start::FaultedStopped,
+            Start::FaultedSince,
+            Start::RestartedSince,
+            Start::StoppedSince,
+            Start::WithoutAlways,
             Start::Local,
             Start::LocalRunning,
         ];
         all.extend((0..control.also_stop.len()).map(Start::StoppedOtherwise));
         all
+    }
+
+    /// Whether the last poll showed it running, and it has ceased since.
+    pub(super) fn ran(self) -> bool {
+        matches!(self, Start::FaultedSince | Start::RestartedSince | Start::StoppedSince)
     }
 
     pub(super) fn in_words(self) -> &'static str {
@@ -58,6 +76,10 @@ impl Start {
             Start::Running { reverse: true } => "running in reverse",
             Start::FaultedRunning => "faulted, the run command still set",
             Start::FaultedStopped => "faulted and stopped",
+            Start::FaultedSince => "faulted since the last poll, the run command still set",
+            Start::RestartedSince => "restarted since the last poll, when it ran",
+            Start::StoppedSince => "stopped at its panel since the last poll, when it ran",
+            Start::WithoutAlways => "stopped, its word a run command without the bits of `always`",
             Start::StoppedOtherwise(_) => "stopped by a word of `also_stop`",
             Start::Local => "commanded at its panel, stopped",
             Start::LocalRunning => "commanded at its panel, the run command still set",
@@ -100,7 +122,7 @@ impl<'p> Drive<'p> {
         }
         let steps = drive.steps().len();
         match start {
-            Start::PoweredUp => {}
+            Start::PoweredUp | Start::RestartedSince => {}
             Start::Stopped | Start::FaultedStopped | Start::Local => drive.put_stop(),
             Start::Prepared => {
                 let last = steps.checked_sub(2)?;
@@ -108,10 +130,21 @@ impl<'p> Drive<'p> {
                 drive.put(word.place.unwrap_or(control.at), word.value);
                 drive.prepared = last + 1;
             }
-            Start::Running { .. } | Start::FaultedRunning | Start::LocalRunning => {
+            Start::Running { .. } | Start::FaultedRunning | Start::FaultedSince | Start::LocalRunning => {
                 drive.prepared = steps;
                 drive.put_run(reverse);
                 drive.running = Some(reverse);
+            }
+            Start::StoppedSince => {
+                drive.prepared = steps;
+                drive.put_run(reverse);
+            }
+            Start::WithoutAlways => {
+                drive.prepared = steps;
+                drive.put_run(reverse);
+                let without = drive.word(control.at) & !control.always.set;
+                let is_other = without != drive.word(control.at) && !control.is_run(control.at, without);
+                drive.put(control.at, is_other.then_some(without)?);
             }
             Start::StoppedOtherwise(number) => {
                 drive.prepared = steps;
@@ -120,7 +153,8 @@ impl<'p> Drive<'p> {
                 drive.put(control.at, stop.applied(drive.word(control.at)));
             }
         }
-        drive.fault = matches!(start, Start::FaultedRunning | Start::FaultedStopped);
+        use Start::{FaultedRunning, FaultedSince, FaultedStopped};
+        drive.fault = matches!(start, FaultedRunning | FaultedStopped | FaultedSince);
         drive.local = matches!(start, Start::Local | Start::LocalRunning);
         if drive.fault || drive.local {
             (drive.running, drive.prepared) = (None, 0);

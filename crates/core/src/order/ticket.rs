@@ -63,6 +63,8 @@ pub struct Ticket {
     confirmed: Option<Duration>,
     /// Why no read can show its effect.
     unseen: Option<String>,
+    /// Nothing of it was written.
+    waits: bool,
     /// For the rest of the order whose stop this is.
     stop: Option<StopEnd>,
 }
@@ -93,6 +95,7 @@ impl Ticket {
             answered: None,
             confirmed: None,
             unseen: None,
+            waits: false,
             stop: None,
         };
         (ticket, receiver)
@@ -185,6 +188,7 @@ impl Ticket {
         let (result, text) = match self.confirmed {
             Some(_) => (CONFIRMED, "the drive acknowledged it and shows its effect".to_string()),
             None => match &self.unseen {
+                Some(why) if self.waits => (outcome.code(), why.clone()),
                 Some(why) => (outcome.code(), format!("{outcome}; {why}")),
                 None => (outcome.code(), outcome.to_string()),
             },
@@ -239,6 +243,12 @@ impl Receipt {
         if let Some(sender) = self.0.confirmation.take() {
             let _ = sender.send(Err(why.to_string()));
         }
+    }
+
+    /// Nothing was written: it takes effect later, as `why` says.
+    pub fn waits(mut self, why: &str) {
+        self.0.waits = true;
+        self.cannot_be_seen(why);
     }
 
     /// Whether no client gave it, but the gateway itself.

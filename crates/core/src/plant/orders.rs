@@ -15,7 +15,7 @@ use crate::order::{
     Answer, Arrival, Authority, BackgroundRequest, Change, Command, DEFAULT_EXPIRY, Haste, Order, Origin, Outcome,
     Pace, Parts, Refusal, SlotWrite, StopEnd, Ticket, Urgency, Window, Work, WriteStats, written,
 };
-use crate::permit::{Facts, Seen, admit, meant_another};
+use crate::permit::{Facts, Seen, Stage, Verdict, admit, meant_another};
 use crate::process_image::{BusImage, Reading};
 
 /// An order as a way in gives it to a drive.
@@ -408,22 +408,37 @@ impl DriveHandle {
             Ok(admitted) => admitted,
         };
         let is_stop = admitted.urgency == Urgency::Stop;
-        if (!is_stop && !self.bus_up()) || !self.takes_stops() {
+        if !self.takes_stops() {
             return Err((part.ticket, Outcome::BusDown));
-        }
-        // A stop goes to a drive that does not answer too: it may be back.
-        if !online && !is_stop {
-            return Err((part.ticket, Outcome::Offline));
         }
         let profile = &self.image.spec.profile;
         let mut command = Command::new(self.index, admitted, profile, part.window, part.ticket);
         command.intent.slot = part.slot;
+        // A stop goes to a drive that does not answer too: it may be back.
+        let unreachable = match (is_stop, self.bus_up(), online) {
+            (true, ..) | (false, true, true) => None,
+            (false, false, _) => Some(Outcome::BusDown),
+            (false, true, false) => Some(Outcome::Offline),
+        };
+        if let Some(outcome) = unreachable {
+            let refused = self.gate_refuses(&command, reading.now);
+            return Err((command.ticket, refused.unwrap_or(outcome)));
+        }
         if let Work::Stop(stop) = &mut command.work
             && part.at_once
         {
             stop.haste = Haste::AtOnce;
         }
         Ok(command)
+    }
+
+    /// Why a command to a drive that cannot be reached would be refused if it could.
+    fn gate_refuses(&self, command: &Command, now: Instant) -> Option<Outcome> {
+        let facts = self.bus.at_accept(self.stale_after, now);
+        match self.bus.queue.lock().gate.judge(Stage::Accept, command, &facts, now) {
+            Verdict::Refuse(outcome) => Some(outcome),
+            Verdict::Go | Verdict::Wait(_) | Verdict::LookFirst => None,
+        }
     }
 
     /// Answers an order that is not sent. Reads that nothing answers are no commands, and no event.

@@ -327,6 +327,16 @@ impl Control {
         first.unwrap_or(self.at)
     }
 
+    /// The control word without a run command, made from the present one.
+    pub fn resting(&self, own: u16) -> u16 {
+        if self.stop.place.is_none() {
+            return self.stop_word(own);
+        }
+        let runs = self.runs().into_iter().filter(|run| run.place.is_none());
+        let bits = runs.fold(0, |bits, run| bits | run.value);
+        self.always.applied(own & !bits)
+    }
+
     /// The word of a stop, made from the present word.
     pub fn stop_word(&self, own: u16) -> u16 {
         match self.stop.place {

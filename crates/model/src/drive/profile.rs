@@ -383,7 +383,7 @@ impl Profile {
     }
 
     /// The points with registers of their own that a point is, or is derived from.
-    pub(crate) fn raw_points_of(&self, point: PointIndex) -> Vec<PointIndex> {
+    pub fn raw_points_of(&self, point: PointIndex) -> Vec<PointIndex> {
         match self.points.get(point).map(|point| &point.source) {
             Some(Source::Derived(derived)) => {
                 let of = derived.rests_on();

@@ -121,7 +121,10 @@ pub(super) const FAMILIES: [Family; 16] = [
         ..family("ls", ls)
     },
     family("teco-f510", teco),
-    family("vacon-10", vacon),
+    Family {
+        restarts_on_reset: true,
+        ..family("vacon-10", vacon)
+    },
     Family {
         other: hitachi_coils,
         ..family("hitachi", hitachi)
@@ -350,6 +353,7 @@ fn teco(known: &Known<'_>, word: u16) -> Told {
     told(does, rises(known, word, 0x0008), word)
 }
 
+/// The run command that stands starts the motor after a reset.
 fn vacon(known: &Known<'_>, word: u16) -> Told {
     let does = if is(word, 1) { runs(is(word, 2)) } else { Does::Stops };
     told(does, rises(known, word, 0x0004), word)

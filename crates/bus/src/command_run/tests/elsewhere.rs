@@ -51,14 +51,18 @@ fn a_reset_brings_no_run_bit_back() {
 
 #[test]
 fn a_drive_that_does_not_tell_keeps_its_run_bit_while_its_motor_runs() {
-    for (running, written) in [(true, 3), (false, 2)] {
+    for (polled, running) in [(true, true), (false, true), (true, false), (false, false)] {
         let mut bench = bench(1);
-        bench.running = running;
+        bench.running = polled;
         let mut command = reverse(&bench);
         let read = sends(&bench, &mut command);
         let refused = Reply::Exception(Exception::ADDRESS);
         assert_eq!(command.answered(&read, refused, &mut bench.words), None);
-        assert_eq!(sends(&bench, &mut command), word(written), "running: {running}");
+        bench.running = running;
+        looks(&mut bench, &mut command);
+        let next = command.next(&bench.words, &bench.profile, polled, bench.now);
+        let expected = if running { Next::Send(word(3)) } else { Next::Done };
+        assert_eq!(next, expected, "polled: {polled}, running: {running}");
     }
     // One that is only busy, or silent, is not overruled while its motor runs.
     let mut bench = bench(1);
@@ -82,7 +86,9 @@ fn a_drive_that_does_not_tell_keeps_its_run_bit_while_its_motor_runs() {
             assert_eq!(command.failed(&read, Outcome::TimedOut, 1), outcome);
         }
         if !running {
-            assert_eq!(sends(&bench, &mut command), word(2));
+            looks(&mut bench, &mut command);
+            let next = command.next(&bench.words, &bench.profile, false, bench.now);
+            assert_eq!(next, Next::Done, "the run bit that is known is not written");
         }
     }
 }
@@ -98,37 +104,68 @@ fn each_try_of_the_write_has_a_read_of_its_own_and_there_are_no_more_of_them() {
         assert_eq!(command.answered(&read, reported, &mut bench.words), None);
     };
     report(&mut command, &mut bench, 1);
+    looks(&mut bench, &mut command);
     assert_eq!(sends(&bench, &mut command), word(3));
+    command.sent(&word(3));
     assert_eq!(command.failed(&word(3), Outcome::TimedOut, 1), None);
     report(&mut command, &mut bench, 0);
     assert_eq!(sends(&bench, &mut command), word(2));
     assert_eq!(command.failed(&word(2), Outcome::TimedOut, 1), Some(Outcome::TimedOut));
 }
 
+/// The end of a pulse is sent whatever happens; without a look at the motor it carries no run bit.
 #[test]
 fn no_read_stands_in_the_way_of_the_end_of_a_pulse() {
-    let busy = || Some(Reply::Exception(Exception::BUSY));
-    for (answer, running, written) in [(busy(), true, 1), (busy(), false, 0), (None, true, 1), (None, false, 0)] {
+    #[derive(Debug, Clone, Copy)]
+    enum Heard {
+        Word(bool),
+        Busy,
+        Nothing,
+    }
+    let busy = || Reply::Exception(Exception::BUSY);
+    for (word_told, look, written) in [
+        (true, Heard::Word(true), 1),
+        (true, Heard::Word(false), 0),
+        (true, Heard::Busy, 0),
+        (true, Heard::Nothing, 0),
+        (false, Heard::Word(true), 1),
+        (false, Heard::Word(false), 0),
+    ] {
         let mut bench = bench(1);
         let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
-        let read = sends(&bench, &mut reset);
-        let has = Reply::Registers(vec![1]);
-        assert_eq!(reset.answered(&read, has, &mut bench.words), None);
+        let tells = |reset: &mut CommandRun, bench: &mut ObedientDrive, told: bool| {
+            let read = sends(bench, reset);
+            assert!(asks(&read));
+            let reply = if told { Reply::Registers(vec![1]) } else { busy() };
+            assert_eq!(reset.answered(&read, reply, &mut bench.words), None);
+        };
+        looks(&mut bench, &mut reset);
+        tells(&mut reset, &mut bench, true);
         assert_eq!(sends(&bench, &mut reset), word(5));
+        reset.sent(&word(5));
         assert_eq!(reset.answered(&word(5), Reply::Written, &mut bench.words), None);
-        bench.now += Duration::from_millis(20);
-        bench.running = running;
         assert!(matches!(
-            reset.next(&bench.words, &bench.profile, running, bench.now),
+            reset.next(&bench.words, &bench.profile, true, bench.now),
             Next::Wait(_)
         ));
         bench.now += Duration::from_millis(20);
-        assert!(asks(&sends(&bench, &mut reset)));
-        let ended = match answer {
-            Some(reply) => reset.answered(&read, reply, &mut bench.words),
-            None => reset.failed(&read, Outcome::TimedOut, 3),
-        };
-        assert_eq!(ended, None);
-        assert_eq!(sends(&bench, &mut reset), word(written), "running: {running}");
+        tells(&mut reset, &mut bench, word_told);
+        match look {
+            Heard::Word(running) => {
+                bench.running = running;
+                looks(&mut bench, &mut reset);
+            }
+            Heard::Busy => {
+                let step = sends(&bench, &mut reset);
+                assert_eq!(reset.answered(&step, busy(), &mut bench.words), None);
+            }
+            Heard::Nothing => {
+                let step = sends(&bench, &mut reset);
+                assert_eq!(reset.failed(&step, Outcome::TimedOut, 1), None);
+                assert_eq!(sends(&bench, &mut reset), step, "it is asked again");
+                assert_eq!(reset.failed(&step, Outcome::TimedOut, 1), None);
+            }
+        }
+        assert_eq!(sends(&bench, &mut reset), word(written), "{word_told} {look:?}");
     }
 }

@@ -1,0 +1,323 @@
+//! What is read of a drive right before a word is written to it: which requests show whether its motor runs, and the replies to
+//! them. Pure.
+
+use std::collections::BTreeMap;
+
+use super::control::Word;
+use super::standing::{self, Motor};
+use super::steps::Action;
+use super::{CommandRun, KnownWords, Step, StepPurpose};
+use crate::codec::{Protocol, Reply, RequestPdu, Table};
+use crate::command::Outcome;
+use crate::drive::model::Kind;
+use crate::drive::{Derived, ModelPoint, Profile, Raw, Source, Value};
+
+/// A state of the drive, with the registers or bits that show it, whether it is one bit, a masked register or derived.
+#[derive(Debug, Clone, PartialEq)]
+struct Shown {
+    parts: Vec<(Raw, Kind)>,
+    derived: Option<Derived>,
+}
+
+impl Shown {
+    /// None where the profile does not have it.
+    fn of(profile: &Profile, point: ModelPoint) -> Option<Shown> {
+        let index = profile.model_index(point)?;
+        let derived = match &profile.points.get(index)?.source {
+            Source::Derived(derived) => Some(derived.clone()),
+            Source::Raw(_) => None,
+        };
+        let sources = derived
+            .as_ref()
+            .map_or(vec![index], |derived| derived.sources().collect());
+        let part = |index| {
+            let point = profile.points.get(index)?;
+            Some((point.raw()?.clone(), point.kind()))
+        };
+        let parts: Option<Vec<(Raw, Kind)>> = sources.into_iter().map(part).collect();
+        parts.map(|parts| Shown { parts, derived })
+    }
+
+    fn value(&self, words: &BTreeMap<(Table, u16), u16>) -> Option<bool> {
+        let part = |(raw, kind): &(Raw, Kind)| {
+            let of = raw.addresses().map(|address| words.get(&(raw.table, address)).copied());
+            raw.decode(&of.collect::<Option<Vec<u16>>>()?, *kind)
+        };
+        let values = self.parts.iter().map(part).collect::<Option<Vec<Value>>>()?;
+        match &self.derived {
+            Some(derived) => derived.value(values, None).map(Value::as_bool),
+            None => values.first().copied().map(Value::as_bool),
+        }
+    }
+}
+
+/// A look at a drive: what is left to read, and what was read.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Look {
+    running: Shown,
+    fault: Option<Shown>,
+    remote: Option<Shown>,
+    first: RequestPdu,
+    more: Vec<RequestPdu>,
+    /// How many of them were answered.
+    answered: usize,
+    words: BTreeMap<(Table, u16), u16>,
+}
+
+impl Look {
+    /// Whether the motor runs; none where the family does not report that.
+    pub(super) fn at_running(profile: &Profile) -> Option<Look> {
+        Look::of(profile, &[])
+    }
+
+    /// Whether it runs by the bus: a faulted drive may show its motor as it was before the fault, and one that is commanded at its
+    /// panel does not run by a word of the gateway.
+    pub(super) fn at_motor(profile: &Profile) -> Option<Look> {
+        Look::of(profile, &[ModelPoint::Fault, ModelPoint::Remote])
+    }
+
+    /// Whether it runs is read last.
+    fn of(profile: &Profile, more: &[ModelPoint]) -> Option<Look> {
+        let shown = |point: ModelPoint| more.contains(&point).then(|| Shown::of(profile, point)).flatten();
+        let running = Shown::of(profile, ModelPoint::Running)?;
+        let (fault, remote) = (shown(ModelPoint::Fault), shown(ModelPoint::Remote));
+        let all = [&fault, &remote].into_iter().flatten().chain([&running]);
+        let mut more = Vec::new();
+        for (raw, _) in all.flat_map(|shown| &shown.parts) {
+            read_with(&mut more, profile, raw);
+        }
+        if more.is_empty() {
+            return None;
+        }
+        let first = more.remove(0);
+        Some(Look {
+            running,
+            fault,
+            remote,
+            first,
+            more,
+            answered: 0,
+            words: BTreeMap::new(),
+        })
+    }
+
+    /// The next request.
+    pub(super) fn request(&self) -> RequestPdu {
+        let more = self.answered.checked_sub(1).and_then(|number| self.more.get(number));
+        more.unwrap_or(&self.first).clone()
+    }
+
+    /// The reply to that. Whether all were answered.
+    pub(super) fn hears(&mut self, reply: &Reply) -> bool {
+        if let RequestPdu::Read { table, start, .. } = self.request() {
+            let words = reply.words().unwrap_or_default();
+            let words = (start..=u16::MAX).zip(words);
+            self.words.extend(words.map(|(address, word)| ((table, address), word)));
+        }
+        self.answered += 1;
+        self.answered > self.more.len()
+    }
+
+    /// Everything is asked anew.
+    pub(super) fn begin_again(&mut self) {
+        self.answered = 0;
+        self.words.clear();
+    }
+
+    /// Whether the motor runs; none where the replies do not say so.
+    pub(super) fn runs(&self) -> Option<bool> {
+        self.running.value(&self.words)
+    }
+
+    /// How the motor stands to the gateway's word.
+    pub(super) fn motor(&self) -> Motor {
+        let is = |shown: &Option<Shown>| shown.as_ref().and_then(|shown| shown.value(&self.words));
+        match (self.runs(), is(&self.fault), is(&self.remote)) {
+            (None, ..) => Motor::NotShown,
+            (Some(false), ..) | (_, Some(true), _) => Motor::Stands,
+            (Some(true), _, Some(false)) => Motor::RunsElsewise,
+            (Some(true), ..) => Motor::Runs,
+        }
+    }
+}
+
+impl CommandRun {
+    /// The request of a look at the motor; none where the family does not report whether it runs.
+    pub(super) fn looks(&mut self, profile: &Profile) -> Option<Step> {
+        if self.look.is_none() {
+            self.look = Look::at_motor(profile);
+        }
+        let pdu = self.look.as_ref().map(Look::request);
+        if pdu.is_none() {
+            self.known.motor = Some(Motor::NotShown);
+        }
+        pdu.map(|pdu| Step::new(StepPurpose::Look, pdu))
+    }
+
+    /// The drive answered a request of a look.
+    pub(super) fn looked(&mut self, reply: &Reply) {
+        if let Some(look) = self.look.take_if(|look| look.hears(reply)) {
+            self.known.motor = Some(look.motor());
+        }
+    }
+
+    /// What a look shows where nothing is decoded.
+    pub(crate) fn sees(&mut self, runs: bool) {
+        self.look = None;
+        self.known.motor = Some(if runs { Motor::Runs } else { Motor::Stands });
+    }
+
+    /// A look brought nothing: nothing is written, but the end of a pulse, which then carries no run command.
+    pub(super) fn not_seen(&mut self, why: &str, begun: Outcome) -> Option<Outcome> {
+        self.look = None;
+        if self.ends_pulse() {
+            self.known.motor = Some(Motor::NotShown);
+            self.tries.failures = 0;
+            return None;
+        }
+        let unsent = Outcome::Refused(standing::not_seen(why));
+        let outcome = if self.has_begun() { begun } else { unsent };
+        Some(self.cut.clone().unwrap_or_else(|| self.unless_in_doubt(outcome)))
+    }
+
+    /// What is told of an earlier try that was not answered goes before that outcome.
+    pub(super) fn unless_in_doubt(&self, outcome: Outcome) -> Outcome {
+        match self.in_doubt() {
+            true => self.tries.unanswered.clone(),
+            false => outcome,
+        }
+    }
+
+    /// The direction is kept for the next start, and its write left out.
+    pub(super) fn keep_direction(&mut self, reverse: bool) {
+        if self.in_doubt() {
+            self.give_up(self.tries.unanswered.clone());
+            return;
+        }
+        let elsewhere = matches!(self.actions.front(), Some(Action::Word(Word::DirectionElsewhere(_))));
+        self.pop();
+        if elsewhere {
+            self.pop();
+        }
+        if matches!(self.actions.front(), Some(Action::Release(_))) {
+            self.pop();
+        }
+        self.known.motor = None;
+        self.next_start = Some(reverse);
+        // What is shown of the rest would pass for its effect.
+        self.effects.clear();
+    }
+
+    /// The direction that it ordered is kept or, where it says another one, no longer.
+    pub(crate) fn note_direction(&self, words: &mut KnownWords) {
+        match self.next_start {
+            Some(reverse) => words.keep_direction(reverse),
+            None if self.turns => words.forget_direction(),
+            None => {}
+        }
+    }
+
+    /// What is to be told of an order whose direction waits for the next start.
+    pub(crate) fn waits_for_start(&self) -> Option<&'static str> {
+        self.next_start.map(|_| standing::AT_NEXT_START)
+    }
+}
+
+/// Adds the read of a raw value, to the read before it where one request takes both.
+fn read_with(reads: &mut Vec<RequestPdu>, profile: &Profile, raw: &Raw) {
+    let (table, start, count) = (raw.table, raw.address, raw.form.items());
+    let end = start.saturating_add(count);
+    let covers = |read: &RequestPdu| matches!(read, RequestPdu::Read { table: of, start: first, count } if *of == table && *first <= start && first.saturating_add(*count) >= end);
+    if reads.iter().any(covers) {
+        return;
+    }
+    let most = profile.range(table, start).map_or(0, |range| range.read);
+    let is_n2 = profile.protocols.contains(&Protocol::N2);
+    if let Some(RequestPdu::Read {
+        table: of,
+        start: first,
+        count: before,
+    }) = reads.last_mut()
+        && *of == table
+        && first.saturating_add(*before) == start
+        && before.saturating_add(count) <= most
+        && profile.range(table, *first) == profile.range(table, start)
+        && !is_n2
+    {
+        *before += count;
+        return;
+    }
+    reads.push(RequestPdu::Read { table, start, count });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::drive::profile::Profiles;
+
+    fn look(name: &str) -> Look {
+        Look::at_motor(Profiles::built_in().get(name).unwrap()).unwrap()
+    }
+
+    /// The drive of a family answers each request with the words that it has at these addresses.
+    fn motor(name: &str, at: &[(u16, u16)]) -> (Motor, Vec<(u16, u16)>) {
+        let (mut look, mut asked) = (look(name), Vec::new());
+        loop {
+            let RequestPdu::Read { table, start, count } = look.request() else {
+                panic!("{look:?}");
+            };
+            asked.push((start, count));
+            let word = |address| at.iter().find(|(of, _)| *of == address).map_or(0, |(_, word)| *word);
+            let words = (start..start + count).map(word);
+            let reply = match table.is_bits() {
+                true => Reply::Bits(words.map(|word| word != 0).collect()),
+                false => Reply::Registers(words.collect()),
+            };
+            if look.hears(&reply) {
+                return (look.motor(), asked);
+            }
+        }
+    }
+
+    /// By hand from the manuals: a bit, a masked register, alternatives, a stop that still turns, coils, bits of N2.
+    #[test]
+    fn every_kind_of_family_shows_its_motor() {
+        use Motor::{Runs, RunsElsewise, Stands};
+        for (name, at, expected) in [
+            ("vacon-10", &[(2100, 0x03)][..], Runs),
+            ("vacon-10", &[(2100, 0x01)], Stands),
+            ("vacon-10", &[(2100, 0x0B)], Stands),
+            ("danfoss-fc", &[(50199, 0x0A00)], Runs),
+            ("danfoss-fc", &[(50199, 0x0800)], RunsElsewise),
+            ("danfoss-fc", &[(50199, 0x0A08)], Stands),
+            ("schneider-altivar", &[(3201, 0x0237)], Runs),
+            ("schneider-altivar", &[(3201, 0x0233)], Stands),
+            ("abb-acs550", &[(3, 0x0207)], Runs),
+            ("abb-acs550", &[(3, 0x0201)], Stands),
+            ("delta-ms300", &[(0x2101, 0x0403)], Runs),
+            ("delta-ms300", &[(0x2101, 0x0401)], Runs),
+            ("delta-ms300", &[(0x2101, 0x0003)], RunsElsewise),
+            ("delta-ms300", &[(0x2101, 0x0403), (0x2100, 4)], Stands),
+            ("invt-goodrive", &[(0x2100, 1)], Runs),
+            ("invt-goodrive", &[(0x2100, 2)], Runs),
+            ("invt-goodrive", &[(0x2100, 3)], Stands),
+            ("invt-goodrive", &[(0x2100, 4)], Stands),
+            ("hitachi-wj200", &[(14, 1)], Runs),
+            ("hitachi-wj200", &[(14, 1), (23, 1)], Stands),
+            ("hitachi-wj200", &[(23, 0)], Stands),
+        ] {
+            assert_eq!(motor(name, at).0, expected, "{name} {at:x?}");
+        }
+        assert_eq!(motor("danfoss-fc", &[]).1, [(50199, 1)], "all in one request");
+    }
+
+    #[test]
+    fn every_family_that_is_commanded_is_asked_in_few_requests_and_a_lost_word_shows_nothing() {
+        for profile in Profiles::built_in().iter().filter(|profile| profile.control.is_some()) {
+            let mut look = look(&profile.name);
+            assert!(look.more.len() < 3, "{}: {look:?}", profile.name);
+            while !look.hears(&Reply::Registers(Vec::new())) {}
+            assert_eq!(look.motor(), Motor::NotShown, "{}", profile.name);
+        }
+    }
+}

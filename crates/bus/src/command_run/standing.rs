@@ -1,0 +1,201 @@
+//! Whether a drive stands as an order takes it to stand that does not say whether the motor is to run: what may be written of a run
+//! command that the gateway remembers. Pure.
+//!
+//! A drive that restarted, or was stopped at its panel, stands, and its run command is gone: the word from memory would start it.
+
+use crate::command::Refusal;
+
+/// What the drive showed of its motor, in the same command and right before the write.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Motor {
+    /// It runs by the bus, as far as the drive shows who commands it.
+    Runs,
+    /// It runs, and is commanded elsewhere.
+    RunsElsewise,
+    /// It stands, or the drive has a fault.
+    Stands,
+    /// No status says it.
+    NotShown,
+}
+
+/// The run command in the drive's word as it is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Holds {
+    /// It is set.
+    Run,
+    /// The word is neither a run command nor a stop.
+    Other,
+    Unknown,
+}
+
+/// What an order wants to write without saying whether the motor is to run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Wants {
+    /// The direction, within the control word.
+    Direction,
+    /// The direction, at a place of its own.
+    DirectionElsewhere,
+    /// A reset within the control word.
+    Reset,
+    /// The control word before a reset that has a place of its own.
+    ResetElsewhere,
+    /// The end of a reset, which is sent whatever happens.
+    ResetEnd,
+    /// Other bits of the control word.
+    Others,
+}
+
+/// What may be written.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Verdict {
+    /// The word with the run command that stands.
+    AsItStands,
+    /// The word without a run command.
+    WithoutRun,
+    /// Nothing: the direction is kept for the next start.
+    AtNextStart,
+    Refused(Refusal),
+}
+
+/// What an order may write to a drive whose known word is no stop. `told`: the drive itself said in this command what its word is;
+/// that of one which runs is then no memory, whoever commands it.
+pub(super) fn judge(wants: Wants, holds: Holds, told: bool, motor: Motor) -> Verdict {
+    use Verdict::{AsItStands, AtNextStart, WithoutRun};
+
+    let motor = match motor {
+        Motor::RunsElsewise if told && holds == Holds::Run => Motor::Runs,
+        motor => motor,
+    };
+    match (wants, holds, motor) {
+        (Wants::Others, Holds::Run | Holds::Other, _) if told => AsItStands,
+        (Wants::ResetElsewhere, Holds::Unknown, Motor::Runs) => AsItStands,
+        (Wants::ResetEnd, Holds::Unknown | Holds::Other, _) => WithoutRun,
+        (Wants::DirectionElsewhere, _, Motor::Runs) | (_, Holds::Run, Motor::Runs) => AsItStands,
+        (Wants::DirectionElsewhere, ..) | (Wants::Direction, Holds::Run, _) => AtNextStart,
+        (Wants::ResetEnd, Holds::Run, _) => WithoutRun,
+        (_, Holds::Unknown, Motor::Runs) => Verdict::Refused(Refusal::NotKnown(
+            "the last command to the drive is unknown; include `run` true or false in this command".to_string(),
+        )),
+        (Wants::Direction, _, Motor::Runs | Motor::RunsElsewise) => AtNextStart,
+        (_, _, Motor::Runs | Motor::RunsElsewise) => refused("the motor runs, but by no run command of this gateway"),
+        (Wants::Others, Holds::Run, Motor::Stands | Motor::NotShown) => {
+            refused("the motor is not seen to run, and this command would repeat a run command")
+        }
+        (_, _, Motor::Stands | Motor::NotShown) => WithoutRun,
+    }
+}
+
+/// Whether that depends on how the motor stands.
+pub(super) fn depends_on_motor(wants: Wants, holds: Holds, told: bool) -> bool {
+    !matches!((wants, holds), (Wants::ResetEnd, Holds::Other | Holds::Unknown)) && !(wants == Wants::Others && told)
+}
+
+fn refused(why: &str) -> Verdict {
+    Verdict::Refused(Refusal::NotAllowed(format!(
+        "{why}; no control word was written; include `run` true or false in this command"
+    )))
+}
+
+/// The refusal of an order whose look at the drive brought nothing.
+pub(super) fn not_seen(why: &str) -> Refusal {
+    Refusal::NotKnown(format!(
+        "whether the motor runs was asked right before the control word would have been written, and {why}; the word was not sent"
+    ))
+}
+
+/// Told with a direction that is kept for the next start.
+pub(super) const AT_NEXT_START: &str = "the direction takes effect with the next start: the motor is not seen to run by a run command \
+     of this gateway, and no control word was written";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WANTS: [Wants; 6] = [
+        Wants::Direction,
+        Wants::DirectionElsewhere,
+        Wants::Reset,
+        Wants::ResetElsewhere,
+        Wants::ResetEnd,
+        Wants::Others,
+    ];
+    const MOTORS: [Motor; 4] = [Motor::Runs, Motor::RunsElsewise, Motor::Stands, Motor::NotShown];
+    const HELD: [Holds; 3] = [Holds::Run, Holds::Other, Holds::Unknown];
+
+    /// r as it stands, w without run, n at the next start, x refused, ? refused as unknown. One column for each of `WANTS`.
+    const TABLE: &str = "\
+        Run     told Runs         r r r r r r
+        Run     told RunsElsewise r r r r r r
+        Run     told Stands       n n w w w r
+        Run     told NotShown     n n w w w r
+        Run     kept Runs         r r r r r r
+        Run     kept RunsElsewise n n x x w x
+        Run     kept Stands       n n w w w x
+        Run     kept NotShown     n n w w w x
+        Other   told Runs         n r x x w r
+        Other   told RunsElsewise n n x x w r
+        Other   told Stands       w n w w w r
+        Other   told NotShown     w n w w w r
+        Other   kept Runs         n r x x w x
+        Other   kept RunsElsewise n n x x w x
+        Other   kept Stands       w n w w w w
+        Other   kept NotShown     w n w w w w
+        Unknown kept Runs         ? r ? r w ?
+        Unknown kept RunsElsewise n n x x w x
+        Unknown kept Stands       w n w w w w
+        Unknown kept NotShown     w n w w w w";
+
+    #[test]
+    fn what_an_order_without_run_may_write() {
+        let mut rows = 0;
+        for row in TABLE.lines() {
+            let mut cells = row.split_whitespace();
+            let mut cell = || cells.next().unwrap();
+            let (holds, told, motor) = (cell(), cell() == "told", cell());
+            let holds = HELD.into_iter().find(|of| format!("{of:?}") == holds).unwrap();
+            let motor = MOTORS.into_iter().find(|of| format!("{of:?}") == motor).unwrap();
+            for (wants, expected) in WANTS.into_iter().zip(cells) {
+                let verdict = match judge(wants, holds, told, motor) {
+                    Verdict::AsItStands => "r",
+                    Verdict::WithoutRun => "w",
+                    Verdict::AtNextStart => "n",
+                    Verdict::Refused(Refusal::NotKnown(_)) => "?",
+                    Verdict::Refused(_) => "x",
+                };
+                assert_eq!(verdict, expected, "{wants:?} {holds:?} told: {told} {motor:?}");
+                rows += 1;
+            }
+        }
+        assert_eq!(rows, 6 * 20);
+    }
+
+    /// Where nobody looks, the answer is the same whatever the motor does.
+    #[test]
+    fn a_look_is_spared_only_where_it_decides_nothing() {
+        for (wants, holds) in WANTS.into_iter().flat_map(|wants| HELD.map(|holds| (wants, holds))) {
+            for told in [true, false]
+                .into_iter()
+                .filter(|told| !told || holds != Holds::Unknown)
+            {
+                let all = MOTORS.map(|motor| judge(wants, holds, told, motor));
+                let same = all.iter().all(|verdict| *verdict == all[0]);
+                assert_eq!(
+                    same,
+                    !depends_on_motor(wants, holds, told),
+                    "{wants:?} {holds:?} {told}"
+                );
+            }
+        }
+    }
+
+    /// Whatever is wanted: a run command from memory goes only to a motor that is seen to run.
+    #[test]
+    fn no_run_command_from_memory_reaches_a_motor_that_is_not_seen_to_run() {
+        for wants in WANTS {
+            for motor in [Motor::RunsElsewise, Motor::Stands, Motor::NotShown] {
+                let verdict = judge(wants, Holds::Run, false, motor);
+                assert_ne!(verdict, Verdict::AsItStands, "{wants:?} {motor:?}");
+            }
+        }
+    }
+}
