@@ -160,3 +160,42 @@ fn a_disk_that_takes_nothing_refuses_starts_and_no_stops() {
     stop(&site);
     starts(&site, "pump-1");
 }
+
+/// A reload that is refused, with another group and stagger and another place for the starts, changes none of them.
+#[test]
+fn a_refused_reload_leaves_the_guards_as_they_were() {
+    let line = LINE1.replace("profile_dirs", "state_dir = \"state\"\nprofile_dirs");
+    let guarded = "group = \"both\"\nguard = { starts_per_hour = 5, stagger = \"20s\" }";
+    let drives = controlled("pump-1", 1, guarded) + &controlled("fan-2", 2, guarded);
+    let site = Site::of(&[&line, &drives, MODBUS_TCP, HTTP, USERS]);
+    site.add_user("alice");
+    let _simulator = site.simulate(&["--addresses", "1-2", "--baud", "38400"]);
+    let gateway = site.run_ready();
+    site.until_state("pump-1", "ready");
+    site.until_state("fan-2", "ready");
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    site.change(
+        &format!("127.0.0.1:{}", site.modbus),
+        &taken.local_addr().unwrap().to_string(),
+    );
+    // Each drive in a group of its own.
+    let text = std::fs::read_to_string(site.config()).unwrap();
+    site.write(
+        "drivegate.conf",
+        &text.replacen("group = \"both\"", "group = \"own\"", 1),
+    );
+    site.change("stagger = \"20s\"", "stagger = \"1s\"");
+    site.change("state_dir = \"state\"", "state_dir = \"elsewhere\"");
+    gateway.signal("HUP");
+    let log = gateway.until_printed("keeping the current configuration");
+    assert!(log.contains("another program uses it"), "{log}");
+    starts(&site, "pump-1");
+    let (status, answer) = curl(&site, "fan-2", "{\"run\": true}");
+    assert_eq!((status, &answer["result"]), (409, &json!("guarded")), "{answer}");
+    assert!(answer["retry_after_ms"].as_u64() > Some(5_000), "{answer}");
+    assert!(
+        site.file("state/starts.json").exists(),
+        "its starts are counted where they were"
+    );
+    assert!(!site.file("elsewhere/starts.json").exists());
+}

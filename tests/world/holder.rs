@@ -346,6 +346,68 @@ fn authority_delays_no_stop() {
     }
 }
 
+/// A controller that writes reference and run by turns does not start the motor that an operator stopped.
+#[test]
+fn a_reference_does_not_let_a_run_go_on_behind_a_stop() {
+    let mut play = Play::new(0);
+    play.rig.until("online", PATIENCE, |rig| rig.is_whole());
+    let run = [("run", 1.0), ("speed_reference", 10.0)];
+    let mut started = play.place(0, 0, &run);
+    assert!(play.rig.answered(&mut started).is_ok());
+    play.rig.run(SECOND);
+    let mut stopped = play.place(1, 0, &[("run", 0.0)]);
+    assert!(play.rig.answered(&mut stopped).is_ok());
+    // Past the reservation.
+    for _ in 0..100 {
+        let mut reference = play.place(0, 0, &[("speed_reference", 10.0)]);
+        play.rig.run(Duration::from_millis(50));
+        let mut again = play.place(0, 0, &run);
+        play.rig.run(Duration::from_millis(50));
+        let _ = (reference.answer(), again.answer());
+    }
+    assert!(!play.rig.with_drive(1, |drive, _| drive.state().running));
+    let handle = play.rig.drive(1);
+    handle
+        .hold(Verb::Take, &origin(0), Authority::Write, play.rig.now)
+        .unwrap();
+    let mut taken = play.place(0, 0, &run);
+    assert!(play.rig.answered(&mut taken).is_ok());
+}
+
+/// A cyclic client that repeats an acknowledged stop leaves the motor of another alone, when the hold of that has lapsed too.
+#[test]
+fn a_repeated_stop_of_a_cyclic_client_is_not_on_the_wire() {
+    let mut play = Play::new(0);
+    let mut cyclic = (*rules()).clone();
+    cyclic.principals[0].cyclic = true;
+    play.rig.bus.handle.queue.set_authority(Some(Arc::new(cyclic)));
+    play.rig.until("online", PATIENCE, |rig| rig.is_whole());
+    let mut first = play.place(0, 0, &[("run", 0.0)]);
+    assert!(play.rig.answered(&mut first).is_ok());
+    play.rig.run(SECOND);
+    let mut started = play.place(1, 0, &[("run", 1.0), ("speed_reference", 11.0)]);
+    assert!(play.rig.answered(&mut started).is_ok());
+    play.rig.bus.wire.record(100_000);
+    let stop = [6, 0x07, 0xD0];
+    for _ in 0..100 {
+        let mut again = play.place(0, 0, &[("run", 0.0)]);
+        play.rig.run(Duration::from_millis(100));
+        let answer = again.answer().map(|answer| answer.outcome.code());
+        assert_eq!(answer, Some("held_by_other"));
+    }
+    assert_eq!(play.holder(0).0, HoldState::Free, "the lease has ended");
+    let stops = play.rig.requests();
+    let stops = stops.iter().filter(|frame| frame.bytes.get(1..4) == Some(&stop[..]));
+    assert_eq!(stops.count(), 0);
+    assert!(play.rig.with_drive(1, |drive, _| drive.state().running));
+    // A new stop is one.
+    let _run = play.place(0, 0, &[("run", 1.0)]);
+    let mut new = play.place(0, 0, &[("run", 0.0)]);
+    assert!(play.rig.answered(&mut new).is_ok());
+    play.rig.run(10 * SECOND);
+    assert!(!play.rig.with_drive(1, |drive, _| drive.state().running));
+}
+
 #[test]
 fn only_the_holder_is_on_the_wire_and_every_stop() {
     let mut all = BTreeMap::new();

@@ -80,19 +80,14 @@ impl Scene {
     fn new(line: Line, noise: Noise, seed: u64) -> Scene {
         let format = LineFormat::new(line.baud, line.format).unwrap();
         let parts = Parts::of(0, &line, seed);
-        let handle = listening(&bus::handle(
-            0,
-            &line,
-            &parts.profile,
-            format,
-            (&Arc::default(), Instant::now()),
-        ));
+        let began = Instant::now();
+        let handle = listening(&bus::handle(0, &line, &parts.profile, format, (&Arc::default(), began)));
         let mut rules = LineRules::of(line.protocol, format);
         rules.turnaround = line.turnaround;
         let slaves = Slaves::new(parts.drives, Duration::ZERO);
         let mut wire = HalfDuplex::new(rules, slaves, parts.faults, Transcript::new(0));
         wire.take_acts();
-        let (events, writes, began) = (Events::default(), Arc::new(WriteStats::default()), Instant::now());
+        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let options = BusOptions {
             response_timeout: PATIENCE,
             retries: 1,

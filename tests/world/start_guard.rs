@@ -540,3 +540,98 @@ fn repeated_stops_of_a_cyclic_client_wait_for_min_run() {
         assert!(stops.iter_mut().all(|stop| rig.answered(stop).is_ok()));
     }
 }
+
+/// One drive with that guard, ready.
+fn ready(spec: fn(&mut DriveSpec)) -> Rig {
+    let mut rig = Rig::of(&Line {
+        spec,
+        ..line("vacon-nx", Protocol::ModbusRtu, 19_200, 1)
+    });
+    rig.until_state(1, State::Ready);
+    rig.run(SECOND);
+    assert!(rig.set(1, &[("speed_reference", 20.0)]).is_ok());
+    rig
+}
+
+/// A PLC writes its run word ten times a second for that long: how many were refused.
+fn holds_run(rig: &mut Rig, time: Duration) -> u32 {
+    let until = rig.now + time;
+    let mut refused = 0;
+    while rig.now < until {
+        let order = rig.points(1, &[("run", 1.0)]);
+        let mut placed = rig.place(1, order);
+        rig.run(Duration::from_millis(100));
+        let answer = placed.answer().map(|answer| answer.outcome);
+        refused += u32::from(matches!(answer, Some(Outcome::Refused(Refusal::Guarded(_)))));
+    }
+    refused
+}
+
+#[test]
+fn a_run_word_that_is_held_makes_one_start() {
+    let mut rig = ready(|spec| {
+        spec.guard = Some(Guard {
+            starts_per_hour: Some(2),
+            min_off: SECOND / 2,
+            ..Guard::default()
+        });
+    });
+    for start in 0..2 {
+        assert_eq!(holds_run(&mut rig, 10 * SECOND), 0, "start {start}");
+        assert_eq!(rig.state(1), State::Running);
+        assert!(rig.set(1, &[("run", 0.0)]).is_ok());
+        rig.until_state(1, State::Ready);
+        rig.run(SECOND);
+    }
+    assert!(holds_run(&mut rig, SECOND) > 0, "two of two");
+}
+
+#[test]
+fn a_run_word_that_is_held_at_a_fault_uses_no_start_up() {
+    let mut rig = ready(|spec| {
+        spec.guard = Some(Guard {
+            starts_per_hour: Some(1),
+            ..Guard::default()
+        });
+    });
+    rig.with_drive(1, |drive, _| drive.trip(9));
+    rig.until_state(1, State::Fault);
+    assert_eq!(holds_run(&mut rig, 10 * SECOND), 0);
+    assert_eq!(rig.state(1), State::Fault);
+    assert!(rig.set(1, &[("run", 0.0)]).is_ok());
+    assert!(rig.set(1, &[("fault_reset", 1.0)]).is_ok());
+    rig.until_state(1, State::Ready);
+    rig.run(SECOND);
+    assert_eq!(holds_run(&mut rig, 5 * SECOND), 0, "the one start of the hour is left");
+    assert_eq!(rig.state(1), State::Running);
+    assert!(rig.set(1, &[("run", 0.0)]).is_ok());
+    rig.until_state(1, State::Ready);
+    assert!(holds_run(&mut rig, SECOND) > 0, "and it counts once");
+}
+
+#[test]
+fn the_clearance_of_an_order_ends_with_its_bus() {
+    let mut rig = ready(|spec| {
+        spec.guard = Some(Guard {
+            min_off: Duration::from_secs(8),
+            ..Guard::default()
+        });
+    });
+    rig.run(8 * SECOND);
+    // The first order of its bus.
+    assert!(rig.set(1, &[("run", 1.0), ("speed_reference", 20.0)]).is_ok());
+    rig.until_state(1, State::Running);
+    assert!(rig.set(1, &[("run", 0.0)]).is_ok());
+    rig.until_state(1, State::Ready);
+    rig.restart();
+    rig.until_state(1, State::Ready);
+    let order = rig.points(1, &[("run", 1.0)]);
+    let origin = Origin::new(SourceKind::Mqtt, "test");
+    let request = OrderRequest::new(order, origin, Authority::Write).within(20 * SECOND).waiting();
+    let mut placed = rig.drive(1).place(request, rig.now);
+    rig.bus.command_came(rig.now);
+    rig.run(2 * SECOND);
+    assert!(placed.answer().is_none(), "it waits for min_off");
+    assert!(!rig.with_drive(1, |drive, _| drive.state().running));
+    assert!(rig.answered(&mut placed).is_ok());
+}

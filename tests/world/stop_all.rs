@@ -126,6 +126,60 @@ fn what_is_said_to_stand_stands_and_all_stands_in_the_end() {
     }
 }
 
+/// The stops of single drives on the wire since so many requests; with `broadcasts`, those to all too.
+fn stops_since(rig: &Rig, before: usize, broadcasts: bool) -> usize {
+    let requests = rig.requests();
+    let is_stop = |frame: &&Recorded| {
+        let is_meant = broadcasts || frame.bytes.first() != Some(&0);
+        is_meant && frame.bytes.get(1) == Some(&6)
+    };
+    requests[before..].iter().filter(is_stop).count()
+}
+
+#[test]
+fn a_second_order_joins_and_one_behind_a_start_does_not() {
+    let mut rig = Rig::recorded(&works(), Parts::of(0, &works(), 4));
+    start_all(&mut rig);
+    rig.run(Duration::from_secs(5));
+    let orders = rig.plant.stop_all.clone();
+    let order = |rig: &mut Rig, who: &str| {
+        let origin = Origin::new(SourceKind::Http, who);
+        let wait = Duration::from_secs(20);
+        let order = orders
+            .order(&rig.plant, &Scope::Gateway, &origin, wait, rig.now)
+            .unwrap();
+        rig.bus.command_came(rig.now);
+        order
+    };
+    let look = |rig: &mut Rig, time: Duration| {
+        let until = rig.now + time;
+        while rig.now < until {
+            rig.run(LOOK);
+            orders.look(&rig.plant, rig.now);
+            rig.bus.command_came(rig.now);
+        }
+    };
+    let mut first = order(&mut rig, "alice");
+    look(&mut rig, Duration::from_millis(500));
+    let before = rig.requests().len();
+    let mut second = order(&mut rig, "bob");
+    look(&mut rig, Duration::from_millis(200));
+    assert_eq!(stops_since(&rig, before, true), 0, "it joins");
+    assert!(turns(&mut rig, 1), "it slows down");
+    // Somebody starts one of them before the motors stand.
+    let started = rig.set(1, &[("run", 1.0)]);
+    assert!(started.is_ok(), "{started}");
+    let before = rig.requests().len();
+    let mut third = order(&mut rig, "carol");
+    look(&mut rig, Duration::from_millis(500));
+    assert_eq!(stops_since(&rig, before, false), 1, "one drive may have been started");
+    look(&mut rig, Duration::from_secs(20));
+    for report in [&mut first, &mut second, &mut third].map(|order| order.report.try_recv().unwrap()) {
+        assert!(report.ok && report.drives.len() == usize::from(DRIVES), "{report:?}");
+    }
+    assert!((1..=DRIVES).all(|address| !turns(&mut rig, address)));
+}
+
 /// A third of 132 drives on three lines, each of which has its own schedule: from the order to the last stop on the wire, against
 /// the time that the characters, the silences between frames and the drives' own turnaround take. Where all obey it, one broadcast
 /// stops the motors first.
