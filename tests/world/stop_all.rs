@@ -141,7 +141,7 @@ fn a_second_order_joins_and_one_behind_a_start_does_not() {
     let mut rig = Rig::recorded(&works(), Parts::of(0, &works(), 4));
     start_all(&mut rig);
     rig.run(Duration::from_secs(5));
-    let orders = rig.plant.stop_all.clone();
+    let orders = StopAll::default();
     let order = |rig: &mut Rig, who: &str| {
         let origin = Origin::new(SourceKind::Http, who);
         let wait = Duration::from_secs(20);
