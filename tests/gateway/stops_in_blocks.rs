@@ -8,7 +8,7 @@ use std::time::Duration;
 use drivegate::codec::{Protocol, ascii, rtu};
 use serde_json::{Value as Json, json};
 
-use crate::support::process::{PATIENCE, Running, free_port, until};
+use crate::support::process::{PATIENCE, Running, drivegate, free_port, until};
 use crate::support::site::{HTTP, MODBUS_TCP, MQTT, Site, USERS, curl, nx_in_ascii};
 use crate::support::tools::{feed, python, root, run_well, tool};
 
@@ -141,6 +141,8 @@ enum Way {
     /// The body, and the status of the reply.
     Http(&'static str, u16),
     Socket(&'static str, u16),
+    /// Arguments of `drivegate write`, and the word of its error.
+    CommandLine(&'static [&'static str], &'static str),
     /// Object, value and priority of writes, and class and code of the error.
     Bacnet(&'static [(&'static str, f64)], [u8; 2]),
     /// A PDU at the slot of the bus at that place, and the exception.
@@ -172,7 +174,7 @@ fn coils(start: u16, states: &[bool]) -> Vec<u8> {
 }
 
 fn ways() -> Vec<(&'static str, Way)> {
-    use Way::{Bacnet, Coils, Http, Mqtt, Registers, Slot, Socket, Sparkplug};
+    use Way::{Bacnet, Coils, CommandLine, Http, Mqtt, Registers, Slot, Socket, Sparkplug};
     let states = |before: usize, after: usize| [vec![true; before], vec![false], vec![true; after]].concat();
     let mut ways = Vec::new();
     // The common model: over the register of the hold, whatever stands there, over what does not exist, and over bad values.
@@ -231,6 +233,10 @@ fn ways() -> Vec<(&'static str, Way)> {
     ));
     ways.push(("pump", Http(r#"{"speed_reference": Infinity, "run": 0}"#, 422)));
     ways.push(("pump", Socket(r#"{"nonsense": 5, "run": false, "wait": 3}"#, 422)));
+    ways.push((
+        "pump",
+        CommandLine(&["nonsense=5", "run=false", "speed_reference=x"], "nonsense"),
+    ));
     let many: &[(&str, f64)] = &[
         ("analog-value,99", 5.0),
         ("binary-value,1", 0.0),
@@ -307,6 +313,16 @@ impl Plant {
                 );
                 let (status, answer) = curl(&["--unix-socket", &socket, "-d", body, &url]);
                 format!("{status} {}", answer["result"])
+            }
+            Way::CommandLine(values, word) => {
+                let config = self.site.config();
+                let arguments = [&["write", "--config", &config, drive][..], values].concat();
+                let output = drivegate(&arguments).output().unwrap();
+                let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+                match errors.contains(word) && !output.status.success() {
+                    true => (*word).to_string(),
+                    false => format!("{output:?}"),
+                }
             }
             Way::Bacnet(writes, _) => self.bacpypes(writes),
             Way::Slot(at, pdu, _) => {
@@ -410,6 +426,7 @@ impl Way {
             Way::Registers(.., code) | Way::Coils(.., code) | Way::Slot(.., code) => format!("exception {code}"),
             Way::Mqtt(.., code) => format!("\"stop_only\" \"{code}\""),
             Way::Sparkplug(_) => "not_writable".to_string(),
+            Way::CommandLine(_, word) => (*word).to_string(),
             Way::Http(_, status) | Way::Socket(_, status) => format!("{status} \"stop_only\""),
             Way::Bacnet(_, [class, code]) => format!("{{\"error\": [{class}, {code}]}}"),
         }

@@ -8,7 +8,7 @@ use super::drive_access::{Needs, OneDrive, Target, Way, point};
 use super::failure::{Failure, Outcome};
 use super::{printable, report};
 use crate::drive::model::Kind;
-use crate::drive::{Point, Profile, RESTART_COMMUNICATION, Value};
+use crate::drive::{ModelPoint, Point, Profile, RESTART_COMMUNICATION, Value};
 use crate::process_image::value_or_null;
 
 /// Commands a drive once, through the running gateway or directly.
@@ -65,9 +65,22 @@ struct WriteError {
 pub(super) fn run(args: &Args) -> Outcome {
     let target = args.drive.target()?;
     let setting = |text: &String| parse(target.profile().map(|profile| &**profile), text);
-    let settings: Result<Vec<Setting>, String> = args.values.iter().map(setting).collect();
-    let settings = settings.map_err(Failure::Misused)?;
-    Ok(report::print(&command(&target, &settings)?))
+    let (mut settings, mut mistake) = (Vec::new(), None);
+    for parsed in args.values.iter().map(setting) {
+        match parsed {
+            Ok(setting) => settings.push(setting),
+            Err(why) => mistake = mistake.or(Some(why)),
+        }
+    }
+    let Some(mistake) = mistake else {
+        return Ok(report::print(&command(&target, &settings)?));
+    };
+    // A stop is carried out whatever else is wrong.
+    settings.retain(|setting| setting.point == ModelPoint::Run.name());
+    if !settings.is_empty() && settings.iter().all(|setting| setting.value == false) {
+        report::print(&command(&target, &settings)?);
+    }
+    Err(Failure::Misused(mistake))
 }
 
 /// `speed_reference=50`, `run=true`, `mode=auto`.

@@ -249,7 +249,7 @@ impl Dialogue {
         }
         let answer = match (outcome, frame) {
             (Outcome::Acknowledged(_) | Outcome::Exception(_) | Outcome::Unknown(_), Some(frame)) => Some(frame),
-            _ => frame_of(protocol, pending, outcome),
+            _ => frame_of(protocol, &pending.request, &pending.pdu, outcome),
         };
         let Some(answer) = answer else {
             // As on a line: whatever the reason, nothing comes.
@@ -278,14 +278,13 @@ fn counted(outcome: &Outcome) -> SlotOutcome {
 /// The frame of an answer whose bytes were not kept: to a command that may have taken several transactions. An
 /// acknowledgement is the same anyone who makes it. Of a write whose stop alone was carried out the tool learns that the rest
 /// was not; silence tells that nobody knows.
-fn frame_of(protocol: Protocol, pending: &Pending, outcome: &Outcome) -> Option<Vec<u8>> {
-    let request = &pending.request;
+fn frame_of(protocol: Protocol, request: &ToolRequest, pdu: &RequestPdu, outcome: &Outcome) -> Option<Vec<u8>> {
     match outcome {
         Outcome::Acknowledged(Reply::Written) if protocol == Protocol::N2 => Some(b"A\r".to_vec()),
         Outcome::Acknowledged(reply) if protocol != Protocol::N2 => {
-            let (mut pdu, mut frame) = (Vec::new(), Vec::new());
-            reply.encode(&pending.pdu, &mut pdu);
-            protocol.encode_frame(request.address, &pdu, &mut frame);
+            let (mut answer, mut frame) = (Vec::new(), Vec::new());
+            reply.encode(pdu, &mut answer);
+            protocol.encode_frame(request.address, &answer, &mut frame);
             Some(frame)
         }
         Outcome::Exception(code) if protocol == Protocol::N2 => {
@@ -297,7 +296,83 @@ fn frame_of(protocol: Protocol, pending: &Pending, outcome: &Outcome) -> Option<
             Outcome::TimedOut | Outcome::Garbled | Outcome::Interrupted(_) => None,
             _ => Some(request.refusal(protocol, Refused::Exception(outcome.exception()?))),
         },
-        Outcome::StopFailed(stop) => frame_of(protocol, pending, stop),
+        Outcome::StopFailed(stop) => frame_of(protocol, request, pdu, stop),
         _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::codec::Exception;
+    use crate::command::{Interruption, Refusal};
+
+    /// Exception or error code of the answer to a write of two registers; 0 acknowledges it, none is silence.
+    fn told(protocol: Protocol, outcome: &Outcome) -> Option<u8> {
+        let pdu = RequestPdu::WriteRegisters {
+            start: 2000,
+            values: vec![0, 9000],
+        };
+        let request = ToolRequest {
+            address: 1,
+            function: if protocol == Protocol::N2 { 0 } else { 16 },
+            meaning: Meaning::Write(pdu.clone()),
+        };
+        let frame = frame_of(protocol, &request, &pdu, outcome)?;
+        match protocol {
+            Protocol::N2 if frame == b"A\r" => Some(0),
+            Protocol::N2 => std::str::from_utf8(frame.get(1..3)?).ok()?.parse().ok(),
+            Protocol::ModbusAscii => code(&crate::codec::ascii::open_frame(&frame)?.1),
+            Protocol::ModbusRtu => code(crate::codec::rtu::open_frame(&frame)?.1),
+        }
+    }
+
+    fn code(pdu: &[u8]) -> Option<u8> {
+        match pdu {
+            [0x90, code] => Some(*code),
+            [16, ..] => Some(0),
+            _ => None,
+        }
+    }
+
+    #[test]
+    fn the_rest_of_a_stop_is_told_unless_nobody_knows_its_fate() {
+        let refused = |refusal: fn(String) -> Refusal| Outcome::Refused(refusal(String::new()));
+        let only = |rest| Outcome::StopOnly(Box::new(rest));
+        let failed = |stop| Outcome::StopFailed(Box::new(stop));
+        for (outcome, modbus, n2) in [
+            (Outcome::Acknowledged(Reply::Written), Some(0), Some(0)),
+            (only(refused(Refusal::NotAllowed)), Some(1), Some(11)),
+            (only(refused(Refusal::NotWritable)), Some(2), Some(11)),
+            (only(refused(Refusal::BadValue)), Some(3), Some(10)),
+            (
+                only(Outcome::Refused(Refusal::HeldByOther(Box::default()))),
+                Some(6),
+                Some(11),
+            ),
+            (only(Outcome::Exception(Exception::VALUE)), Some(3), Some(10)),
+            (only(Outcome::Exception(Exception::DEVICE_FAILURE)), Some(4), Some(11)),
+            (only(Outcome::Purged), Some(6), Some(11)),
+            (only(Outcome::QueueFull), Some(6), Some(11)),
+            (only(Outcome::Expired), Some(0x0B), Some(11)),
+            (only(Outcome::TimedOut), None, None),
+            (only(Outcome::Garbled), None, None),
+            (only(Outcome::Interrupted(Interruption::Stop)), None, None),
+            (failed(Outcome::TimedOut), None, None),
+            (failed(Outcome::BusDown), None, None),
+            (failed(Outcome::Exception(Exception::VALUE)), Some(3), None),
+            (failed(refused(Refusal::NotAllowed)), Some(1), Some(11)),
+            // As a line is silent.
+            (Outcome::TimedOut, None, None),
+            (Outcome::Purged, None, None),
+        ] {
+            for protocol in [Protocol::ModbusRtu, Protocol::ModbusAscii] {
+                assert_eq!(told(protocol, &outcome), modbus, "{protocol:?} {outcome:?}");
+            }
+            assert_eq!(told(Protocol::N2, &outcome), n2, "N2 {outcome:?}");
+        }
+        let of = |outcome| counted(&outcome);
+        assert_eq!(of(only(refused(Refusal::BadValue))), SlotOutcome::Refused);
+        assert_eq!(of(only(Outcome::Purged)), SlotOutcome::Exception);
     }
 }

@@ -144,7 +144,8 @@ pub struct Holding {
     stood: Vec<Stood>,
     /// Whose run command was accepted last.
     starter: Option<Claim>,
-    /// One that is not cyclic and ended the hold of another by a stop that repeated its last one.
+    /// One that is not cyclic and ended the hold of another by a stop that repeated its last one, by a way in that programs use
+    /// cyclically.
     repeater: Option<Arc<str>>,
 }
 
@@ -256,7 +257,7 @@ impl Holding {
         let repeats = asks == Asks::Stop && who.is_some_and(|who| self.repeats(who));
         let is_other = |by: &Claim| who.is_some_and(|who| !by.is(who));
         let ends = asks == Asks::Stop && !repeats && self.held(now).is_some_and(|(by, _)| is_other(by));
-        if let Some(who) = who.filter(|who| ends && self.has_stood(who)) {
+        if let Some(who) = who.filter(|who| ends && who.may_repeat && self.has_stood(who)) {
             self.repeater = Some(who.name.clone());
         }
         self.note_word(who, asks);
@@ -297,6 +298,7 @@ impl Holding {
             name: SUPERVISION.into(),
             rank: silent.rank,
             cyclic: false,
+            may_repeat: false,
             breaks: false,
         };
         if !matches!(&self.state, State::Reserved(by, _) if stopper.is_below(by)) {

@@ -56,6 +56,7 @@ impl KeptReservation {
             name: self.who.as_str().into(),
             rank,
             cyclic: false,
+            may_repeat: false,
             breaks: false,
         };
         (left > Duration::ZERO).then(|| Some((who, now.checked_add(left)?)))?

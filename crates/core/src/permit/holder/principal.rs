@@ -24,7 +24,8 @@ pub struct Principal {
     pub name: Arc<str>,
     /// Place of its rank; 0 is the highest.
     pub rank: usize,
-    /// It writes its command word all the time: one that repeats its last stop is no new stop.
+    /// It writes its command word all the time: one that repeats its last stop is no new stop. Those over HTTP and the local socket
+    /// are always new ones.
     pub cyclic: bool,
     /// Its addresses over Modbus TCP and TCP slots.
     pub modbus_tcp: Vec<IpNet>,
@@ -67,8 +68,10 @@ pub struct Claim {
     pub name: Arc<str>,
     /// Place of its rank; 0 is the highest.
     pub rank: usize,
-    /// See [`Principal::cyclic`].
+    /// See [`Principal::cyclic`]; never where it may not repeat itself.
     pub cyclic: bool,
+    /// It commands by a way in that programs use cyclically, so that a stop of it may be a repetition.
+    pub may_repeat: bool,
     /// Its commands break the hold of a lower rank by themselves: in BACnet the priority is the act.
     pub breaks: bool,
 }
@@ -93,6 +96,15 @@ impl Claim {
     pub fn is_below(&self, other: &Claim) -> bool {
         self.rank > other.rank
     }
+
+    /// The same, whose stops are all new ones.
+    fn never_repeating(self) -> Claim {
+        Claim {
+            cyclic: false,
+            may_repeat: false,
+            ..self
+        }
+    }
 }
 
 /// `[authority]` of the configuration, if on.
@@ -114,10 +126,7 @@ impl Rules {
     /// The principal that sent a command; none if unknown.
     pub(crate) fn claim_of(&self, origin: &Origin) -> Option<Claim> {
         let claim = self.claim(origin.proof())?;
-        Some(Claim {
-            cyclic: claim.cyclic && !origin.insists(),
-            ..claim
-        })
+        Some(if origin.insists() { claim.never_repeating() } else { claim })
     }
 
     /// The principal of a client; none if unknown.
@@ -130,10 +139,13 @@ impl Rules {
                 named(&|p| matches(&p.certificate, name)).or_else(|| self.at(*address, |p| &p.modbus_tcp))
             }
             Proof::Address(address) => self.at(*address, |p| &p.modbus_tcp),
-            Proof::User(user) => named(&|p| matches(&p.http_user, user)),
+            Proof::User(user) => named(&|p| matches(&p.http_user, user)).map(Claim::never_repeating),
             Proof::Topic(who) => named(&|p| matches(&p.mqtt, who)),
             Proof::Sparkplug => named(&|p| p.sparkplug),
-            Proof::Uid(uid) => named(&|p| p.socket == Some(*uid)).or_else(|| Some(first(format!("socket:{uid}")))),
+            Proof::Uid(uid) => {
+                let known = named(&|p| p.socket == Some(*uid)).unwrap_or_else(|| first(format!("socket:{uid}")));
+                Some(known.never_repeating())
+            }
             Proof::Pty(path) => Some(first(format!("slot:{path}"))),
             Proof::Bacnet(address, priority) => {
                 let claim = self.at(*address, |p| &p.bacnet)?;
@@ -186,6 +198,7 @@ fn claim_of(principal: &Principal) -> Claim {
         name: principal.name.clone(),
         rank: principal.rank,
         cyclic: principal.cyclic,
+        may_repeat: true,
         breaks: false,
     }
 }
@@ -196,6 +209,7 @@ fn first(name: String) -> Claim {
         name: name.into(),
         rank: 0,
         cyclic: false,
+        may_repeat: false,
         breaks: false,
     }
 }

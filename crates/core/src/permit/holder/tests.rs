@@ -48,6 +48,7 @@ impl Drive {
             name: known.name.clone(),
             rank: known.rank,
             cyclic: known.cyclic,
+            may_repeat: true,
             breaks: false,
         })
     }
@@ -480,6 +481,69 @@ fn a_repeated_stop_is_not_sent_while_the_motor_was_started_by_another() {
             .starts_with("op (operator) started the motor, and this only repeats an earlier stop"),
         "{refusal}"
     );
+}
+
+/// Of whom a stop may be a repetition, and who may be advised to say so: no person.
+#[test]
+fn a_stop_over_http_or_the_socket_is_never_a_repetition() {
+    let address = "10.0.0.5".parse().unwrap();
+    let network = || vec!["10.0.0.0/24".parse().unwrap()];
+    let mut rules = rules(Mode::Exclusive);
+    rules.principals = vec![
+        Principal {
+            cyclic: true,
+            modbus_tcp: network(),
+            bacnet: network(),
+            certificate: Some("line".to_string()),
+            http_user: Some("line".to_string()),
+            mqtt: Some("line".to_string()),
+            sparkplug: true,
+            socket: Some(7),
+            ..Principal::new("line", 2)
+        },
+        Principal::new("op", 1),
+    ];
+    let name = || "line".into();
+    for (proof, repeats) in [
+        (Proof::Address(address), true),
+        (Proof::Certificate(name(), address), true),
+        (Proof::Topic(name()), true),
+        (Proof::Sparkplug, true),
+        (Proof::Bacnet(address, 9), true),
+        (Proof::User(name()), false),
+        (Proof::Uid(7), false),
+        (Proof::Uid(8), false),
+        (Proof::Pty("tool".into()), false),
+    ] {
+        let claim = rules.claim(&proof).unwrap();
+        assert_eq!((claim.cyclic, claim.may_repeat), (repeats, repeats), "{proof:?}");
+        let mut drive = Drive::new();
+        drive.rules = rules.clone();
+        let stop = |drive: &mut Drive, claim: &Claim| {
+            let judged = drive.holding.judge(Some(claim), Asks::Stop, &drive.rules, drive.now);
+            if judged.is_ok() {
+                let Drive {
+                    holding,
+                    rules,
+                    now,
+                    told,
+                } = drive;
+                holding.accepted(Some(claim), Asks::Stop, rules, *now, told);
+            }
+            judged.is_ok()
+        };
+        assert!(stop(&mut drive, &claim));
+        drive.act("op", Verb::Break);
+        drive.act("op", Verb::Take);
+        assert_eq!(stop(&mut drive, &claim), !repeats, "{proof:?}");
+        // One that is not said to be cyclic is found out where it may repeat itself.
+        let plain = Claim { cyclic: false, ..claim };
+        drive.act("op", Verb::Break);
+        drive.act("op", Verb::Take);
+        assert!(stop(&mut drive, &plain));
+        let found = drive.holding.repeater().is_some();
+        assert_eq!(found, repeats, "{proof:?}");
+    }
 }
 
 #[test]

@@ -44,7 +44,7 @@ keys! {
         bacnet: Vec<IpNet> = NETWORKS, default [];
         /// Its user name or user id at the local socket. Anyone else there has the first rank.
         socket: String = STRING, or "none";
-        /// It writes its command word cyclically, as most PLCs do: a word that repeats its last stop is not a new stop. Stops over HTTP and the socket always are.
+        /// It writes its command word cyclically, as most PLCs do: a word that repeats its last stop is not a new stop. Not over HTTP and the socket.
         cyclic: bool = Flag, default false;
     }
 }
