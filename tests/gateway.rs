@@ -30,6 +30,7 @@ mod gateway {
     mod openapi;
     mod operators;
     mod parameters;
+    mod pauses;
     mod recordings;
     mod reload;
     mod replay;

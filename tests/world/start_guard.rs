@@ -627,7 +627,9 @@ fn the_clearance_of_an_order_ends_with_its_bus() {
     rig.until_state(1, State::Ready);
     let order = rig.points(1, &[("run", 1.0)]);
     let origin = Origin::new(SourceKind::Mqtt, "test");
-    let request = OrderRequest::new(order, origin, Authority::Write).within(20 * SECOND).waiting(true);
+    let request = OrderRequest::new(order, origin, Authority::Write)
+        .within(20 * SECOND)
+        .waiting(true);
     let mut placed = rig.drive(1).place(request, rig.now);
     rig.bus.command_came(rig.now);
     rig.run(2 * SECOND);

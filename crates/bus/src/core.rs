@@ -136,15 +136,15 @@ impl BusCore {
     pub fn ran(&mut self, now: Instant, boot: Duration) -> bool {
         let stalls = self.stalls.get_or_insert_with(|| Stalls::new(now, boot));
         let before = stalls.ran();
-        let Some(stood) = stalls.observe(now, boot) else {
+        let Some(stall) = stalls.observe(now, boot) else {
             if self.report.is_deaf(now) {
                 self.master.prolong(now.saturating_duration_since(before));
             }
             return false;
         };
         self.stood = true;
-        self.master.stood(stood, now);
-        self.report.stood(stood.stall);
+        self.master.stood(stall, now);
+        self.report.stood(stall);
         true
     }
 

@@ -401,14 +401,14 @@ impl Worker {
         while !self.stopping() {
             let now = Instant::now();
             let stood = stalls.observe(now, line::since_boot());
-            since = since.or(stood.map(|stood| stood.stall.began));
+            since = since.or(stood.map(|stall| stall.began));
             let until = core.on_time(now).min(now + BEAT);
             match line.wait(until, Some(self.handle.queue.wake_fd()))? {
                 Woken::Readable => {
                     let count = line.receive(&mut buffer)?;
                     let now = Instant::now();
                     let stood = stalls.observe(now, line::since_boot());
-                    let came = since.take().or(stood.map(|stood| stood.stall.began));
+                    let came = since.take().or(stood.map(|stall| stall.began));
                     core.on_bytes(buffer.get(..count).unwrap_or_default(), came.unwrap_or(now));
                 }
                 Woken::Command => {

@@ -539,8 +539,7 @@ mod tests {
                 | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised
                 | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
                 ParametersChanged | RestoreUnfinished | Diagnosis | Guarded | Interlock | Held | Released
-                | HoldBroken => false,
-                Drill => false,
+                | HoldBroken | Drill => false,
                 Paused => true,
             };
             assert_eq!(kind as usize, place);

@@ -188,3 +188,28 @@ fn an_n2_line_without_wire_time_is_believed_after_three_replies() {
         assert!(rig.believes(EARLY), "no wire");
     }
 }
+
+/// The process stood still between the reply and its reading.
+#[test]
+fn a_reply_is_dated_no_later_than_it_can_have_left_the_drive() {
+    for late in [Duration::ZERO, Duration::from_secs(10)] {
+        let mut bench = DoublingLine::new();
+        let request = Request::new(1, RequestPdu::read(Table::Holding, 0, 1));
+        let mut frame = Vec::new();
+        bench.protocol.encode(&request, &mut frame);
+        let sending = Sending {
+            response_timeout: Duration::from_millis(100),
+            could_be_doubled: false,
+            late_may_come: false,
+        };
+        let now = bench.now;
+        bench.line.send(request, frame, sending, N2LateReplies::default(), now);
+        let (sent, deadline) = (bench.line.quiet_since(), bench.line.deadline().unwrap());
+        let read = sent + REGULAR + late;
+        let over = bench.line.heard(&reply(), read).unwrap();
+        assert!(matches!(over.ended, Ended::Reply(_)));
+        assert_eq!(over.at, read.min(deadline));
+        assert!(deadline <= sent + Duration::from_millis(100 + 10), "timeout and reply");
+        assert!(over.heard_at <= deadline && over.took <= deadline - now + Duration::from_millis(4));
+    }
+}

@@ -4,13 +4,13 @@ use std::time::{Duration, Instant};
 
 use super::Master;
 use crate::command::Urgency;
-use crate::order::Stood;
+use crate::order::Stall;
 
 impl Master {
     /// The thread stood still until `now`. What waits is judged by that when it is chosen again. A command of several steps
     /// that a pause interrupted is not continued, but for the end of a pulse.
-    pub(crate) fn stood(&mut self, stood: Stood, now: Instant) {
-        let Stood { stall, slept } = stood;
+    pub(crate) fn stood(&mut self, stall: Stall, now: Instant) {
+        let slept = stall.slept;
         self.prolong(stall.length());
         if let Some(starts) = &mut self.waits.starts {
             starts.stood(stall);

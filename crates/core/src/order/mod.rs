@@ -44,7 +44,7 @@ pub use passed_on::{BackgroundRequest, NO_DRIVE, Pace, PassedOn};
 pub use pauses::{Heartbeat, Pauses};
 pub use raw::written;
 pub use slot_write::{Commanded, Entry, SlotWrite};
-pub use stalls::{Dated, READ_WITHIN, Stall, Stalls, Stood, TICK, UNNOTICED};
+pub use stalls::{Dated, READ_WITHIN, Stall, Stalls, TICK, UNNOTICED};
 pub use ticket::{Receipt, Ticket, WriteStats};
 pub use touched::Touched;
 

@@ -64,9 +64,8 @@ impl Pauses {
         let last = state
             .last
             .filter(|last| pause.began < last.ended && last.began < pause.ended);
-        let all = last.map_or(pause, |last| Stall {
-            began: last.began.min(pause.began),
-            ended: last.ended.max(pause.ended),
+        let all = last.map_or(pause, |last| {
+            Stall::new(last.began.min(pause.began), last.ended.max(pause.ended))
         });
         state.time += all.length() - last.map_or(Duration::ZERO, |last| last.length());
         state.count += u64::from(last.is_none());
@@ -109,12 +108,7 @@ mod tests {
     #[test]
     fn a_pause_that_several_threads_had_is_one() {
         let (pauses, now) = (Pauses::default(), Instant::now());
-        let had = |from, to| {
-            pauses.note(Stall {
-                began: now + SECOND * from,
-                ended: now + SECOND * to,
-            })
-        };
+        let had = |from, to| pauses.note(Stall::new(now + SECOND * from, now + SECOND * to));
         assert!(had(1, 4));
         assert!(!had(1, 4), "another thread");
         assert!(!had(2, 5), "one that ran later");

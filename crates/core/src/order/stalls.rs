@@ -30,9 +30,20 @@ pub struct Stall {
     pub began: Instant,
     /// When it ran again.
     pub ended: Instant,
+    /// For how long of it the machine was suspended, in which its clock stood: what is dated before is older by it.
+    pub slept: Duration,
 }
 
 impl Stall {
+    /// One of a machine that was not suspended.
+    pub fn new(began: Instant, ended: Instant) -> Stall {
+        Stall {
+            began,
+            ended,
+            slept: Duration::ZERO,
+        }
+    }
+
     /// How long it was.
     pub fn length(&self) -> Duration {
         self.ended.saturating_duration_since(self.began)
@@ -52,15 +63,6 @@ impl Stall {
     pub fn over(&self) -> Instant {
         self.ended + self.length().min(RESENT_WITHIN) + ON_ITS_WAY
     }
-}
-
-/// A stall that has just been noticed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Stood {
-    /// From when to when.
-    pub stall: Stall,
-    /// For how long of it the machine was suspended, in which its clock stood.
-    pub slept: Duration,
 }
 
 /// The date of what was read.
@@ -96,7 +98,7 @@ impl Stalls {
     }
 
     /// The thread runs. Returns the stall that has ended by that.
-    pub fn observe(&mut self, now: Instant, boot: Duration) -> Option<Stood> {
+    pub fn observe(&mut self, now: Instant, boot: Duration) -> Option<Stall> {
         let ran = now.saturating_duration_since(self.ran);
         let booted = boot.saturating_sub(self.boot);
         (self.ran, self.boot) = (self.ran.max(now), boot);
@@ -107,12 +109,13 @@ impl Stalls {
         let stall = Stall {
             began: now.checked_sub(gap).unwrap_or(now),
             ended: now,
+            // The two clocks are not read at the same moment.
+            slept: Some(booted.saturating_sub(ran))
+                .filter(|slept| *slept > TICK)
+                .unwrap_or_default(),
         };
         self.stood(stall);
-        Some(Stood {
-            stall,
-            slept: booted.saturating_sub(ran),
-        })
+        Some(stall)
     }
 
     /// The thread runs on, and what it did since it ran last was no stall: such as to open a port.
@@ -130,6 +133,7 @@ impl Stalls {
         self.last = Some(Stall {
             began: before.map_or(stall.began, |before| before.began.min(stall.began)),
             ended: before.map_or(stall.ended, |before| before.ended.max(stall.ended)),
+            slept: stall.slept + before.map_or(Duration::ZERO, |before| before.slept),
         });
     }
 
@@ -158,7 +162,10 @@ impl Stalls {
     /// or that is the date of the bytes before these. `waited`: the reader has waited for them since, so that they came just
     /// now, unless its thread stood still.
     pub fn date(&self, floor: Instant, waited: bool, now: Instant) -> Dated {
-        let stall = self.last.filter(|stall| floor < stall.ended && now <= stall.read_by());
+        let since = self.last.filter(|stall| floor < stall.ended);
+        let slept = since.map_or(Duration::ZERO, |stall| stall.slept);
+        let floor = floor.checked_sub(slept).unwrap_or(floor);
+        let stall = since.filter(|stall| now <= stall.read_by());
         let asked = match (waited, stall) {
             (false, _) => floor,
             (true, None) => now,
@@ -202,7 +209,7 @@ mod tests {
             for (ms, slept) in times {
                 let boot = Duration::from_secs(5000) + MS * (ms + slept);
                 let stood = self.stalls.observe(self.at(*ms), boot);
-                all.extend(stood.map(|s| (self.ms(s.stall.began), self.ms(s.stall.ended), s.slept.as_millis())));
+                all.extend(stood.map(|s| (self.ms(s.began), self.ms(s.ended), s.slept.as_millis())));
             }
             all
         }
@@ -285,6 +292,22 @@ mod tests {
     }
 
     #[test]
+    fn what_came_before_the_machine_was_suspended_is_as_old_as_that() {
+        let mut thread = Thread::new();
+        thread.runs(&[(100, 0), (150, 60_000)]);
+        let stall = Some((-59_900, 150));
+        assert_eq!(thread.reads(90, true, 151), (-59_900, stall, true));
+        assert_eq!(
+            thread.reads(120, true, 151),
+            (-59_880, stall, true),
+            "it found nothing after that"
+        );
+        assert_eq!(thread.reads(50, false, 151), (-59_950, stall, true), "it did not read");
+        assert_eq!(thread.reads(50, false, 500), (-59_950, None, true));
+        assert_eq!(thread.reads(150, true, 160), (160, None, true));
+    }
+
+    #[test]
     fn a_hiccup_is_no_pause_however_often_it_comes() {
         let mut thread = Thread::new();
         let times: Vec<(u32, u32)> = (1..50).flat_map(|n| [(n * 500 - 100, 0), (n * 500, 0)]).collect();
@@ -305,10 +328,7 @@ mod tests {
     #[test]
     fn after_a_long_pause_old_connections_do_not_wait_for_ever() {
         let now = Instant::now();
-        let stall = |seconds| Stall {
-            began: now,
-            ended: now + Duration::from_secs(seconds),
-        };
+        let stall = |seconds| Stall::new(now, now + Duration::from_secs(seconds));
         for (seconds, over) in [(2, 5), (100, 201), (3600, 3721)] {
             assert_eq!(stall(seconds).over(), now + Duration::from_secs(over), "{seconds} s");
         }

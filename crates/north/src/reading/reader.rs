@@ -193,9 +193,7 @@ mod tests {
         let watch = Watch::new(true);
         let reader = Reader::new(watch.clone(), Instant::now());
         let start = Instant::now() + MS;
-        watch.turn(start, None);
-        let tick = |at: Instant| watch.begin_at(at);
-        tick(start);
+        watch.begin_at(start);
         reader.nothing(start + MS, || false);
         let now = start + 2000 * MS;
         reader.nothing(now, || true);

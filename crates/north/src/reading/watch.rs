@@ -139,7 +139,8 @@ impl Watch {
             WORKER_RAN.set(at.max(worker));
         }
         if slept || worker_stood || at.saturating_sub(ran) > unnoticed {
-            self.stood(now, ran, worker_stood.then_some(worker));
+            let boot = boot.unwrap_or_else(since_boot);
+            self.stood((now, boot), ran, worker_stood.then_some(worker));
         } else if self.single {
             self.ran.fetch_max(at, Ordering::Relaxed);
         }
@@ -147,17 +148,13 @@ impl Watch {
     }
 
     /// The runtime did not run since `ran`, or one of its workers.
-    fn stood(&self, now: Instant, ran: u64, worker: Option<u64>) {
+    fn stood(&self, (now, boot): (Instant, Duration), ran: u64, worker: Option<u64>) {
         let at = |nanos: u64| self.base + Duration::from_nanos(nanos);
-        let boot = since_boot();
         let mut stalls = self.stalls();
         let ahead = self.boot_ahead.load(Ordering::Relaxed);
         stalls.go_on(at(ran), Duration::from_nanos(ran.saturating_add(ahead)));
-        let all = stalls.observe(now, boot).map(|stood| stood.stall);
-        let of_worker = worker.map(|since| Stall {
-            began: at(since),
-            ended: now,
-        });
+        let all = stalls.observe(now, boot);
+        let of_worker = worker.map(|since| Stall::new(at(since), now));
         if let Some(stall) = of_worker {
             stalls.stood(stall);
         }
@@ -224,8 +221,17 @@ mod tests {
     fn watching(single: bool) -> (Arc<Watch>, Instant) {
         let watch = Watch::new(single);
         let start = watch.base + MS;
-        watch.tick(start, since_boot());
+        watch.tick(start, boot(&watch, start));
         (watch, start)
+    }
+
+    /// A machine that was never suspended.
+    fn boot(watch: &Watch, now: Instant) -> Duration {
+        Duration::from_secs(5000) + now.duration_since(watch.base)
+    }
+
+    fn turn(watch: &Watch, now: Instant) -> bool {
+        watch.turn(now, Some(boot(watch, now)))
     }
 
     #[test]
@@ -242,13 +248,17 @@ mod tests {
                 let (watch, start) = watching(single);
                 let now = start + 400 * MS;
                 if task_first {
-                    watch.tick(now, since_boot());
+                    watch.tick(now, boot(&watch, now));
                 }
-                assert!(watch.turn(now + MS, None));
+                assert!(turn(&watch, now + MS));
                 let dated = watch.date(start - MS, true, now + MS);
                 assert_eq!(dated.asked, start, "{single}, {task_first}");
                 assert!(dated.stall.is_some() && watch.just_stood(now + MS));
-                assert!(!watch.turn(now + 260 * MS, None) || !single, "it is over");
+                for later in [100, 200, 251] {
+                    let at = now + later * MS;
+                    watch.tick(at, boot(&watch, at));
+                }
+                assert!(!turn(&watch, now + 252 * MS), "it is over");
             }
         }
     }
@@ -257,22 +267,21 @@ mod tests {
     fn one_thread_that_reads_runs() {
         let (watch, start) = watching(true);
         for n in 1..50 {
-            assert!(!watch.turn(start + n * 100 * MS, None));
+            assert!(!turn(&watch, start + n * 100 * MS));
         }
         let (watch, start) = watching(false);
-        let turns = (1..50).map(|n| watch.turn(start + n * 100 * MS, None));
-        assert!(
-            turns.collect::<Vec<_>>().contains(&true),
-            "other workers may stand still"
-        );
+        let mut turns = (1..50).map(|n| turn(&watch, start + n * 100 * MS));
+        assert!(turns.any(|stood| stood), "other workers may stand still");
     }
 
     #[test]
     fn a_suspended_machine_stood_still() {
         let (watch, start) = watching(true);
-        let boot = since_boot() + Duration::from_secs(60);
-        assert!(!watch.turn(start + MS, Some(since_boot())));
-        assert!(watch.turn(start + 2 * MS, Some(boot)) || watch.just_stood(start + 2 * MS));
+        assert!(!turn(&watch, start + MS));
+        let now = start + 2 * MS;
+        assert!(watch.turn(now, Some(boot(&watch, now) + Duration::from_secs(60))));
+        let dated = watch.date(start, true, now);
+        assert!(dated.asked < start && dated.pause.is_some());
     }
 
     #[test]
@@ -282,12 +291,13 @@ mod tests {
         let now = start + 1200 * MS;
         // Other workers ran the task.
         for n in 1..12 {
-            watch.ran_at(start + n * 100 * MS, since_boot());
+            let at = start + n * 100 * MS;
+            watch.ran_at(at, boot(&watch, at));
         }
-        assert!(watch.turn(now, None));
+        assert!(turn(&watch, now));
         let dated = watch.date(start - MS, true, now);
         assert_eq!((dated.asked, dated.pause.is_some()), (start, true));
         WORKER_RAN.set(0);
-        assert!(watch.turn(now + MS, None));
+        assert!(turn(&watch, now + MS));
     }
 }

@@ -83,6 +83,7 @@ impl Claim {
             name: "nobody".into(),
             rank: usize::MAX,
             cyclic: false,
+            may_repeat: false,
             breaks: false,
         }
     }
@@ -126,7 +127,11 @@ impl Rules {
     /// The principal that sent a command; none if unknown.
     pub(crate) fn claim_of(&self, origin: &Origin) -> Option<Claim> {
         let claim = self.claim(origin.proof())?;
-        Some(if origin.insists() { claim.never_repeating() } else { claim })
+        Some(if origin.insists() {
+            claim.never_repeating()
+        } else {
+            claim
+        })
     }
 
     /// The principal of a client; none if unknown.

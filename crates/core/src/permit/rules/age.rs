@@ -153,10 +153,7 @@ mod tests {
     /// The verdict on a stop, a start, a reference, and a read.
     fn verdicts(case: Case) -> String {
         let start = Instant::now();
-        let stall = |(began, ended): (u64, u64)| Stall {
-            began: at(start, began),
-            ended: at(start, ended),
-        };
+        let stall = |(began, ended): (u64, u64)| Stall::new(at(start, began), at(start, ended));
         let connection = Connection::opened(at(start, case.opened));
         if case.gone {
             connection.hang_up();

@@ -27,7 +27,7 @@ impl Bench {
         let mut rig = Clients::new();
         let began = rig.now;
         rig.now += stood;
-        let stall = Stall { began, ended: rig.now };
+        let stall = Stall::new(began, rig.now);
         Bench {
             rig,
             began,
@@ -136,10 +136,11 @@ fn what_waits_while_the_bus_stands_still_or_the_machine_sleeps_gets_older() {
     let mut start = bench.takes(Run, arrival.clone());
     let mut reference = bench.takes(Reference, arrival);
     bench.rig.now += 1100 * MS;
-    bench.rig.pending.gate.note_pause(Stall {
-        began: bench.began,
-        ended: bench.rig.now,
-    });
+    bench
+        .rig
+        .pending
+        .gate
+        .note_pause(Stall::new(bench.began, bench.rig.now));
     assert!(!bench.rig.pending.take_renewed(DriveIndex::new(1)));
     assert_eq!(bench.rig.pop(), Some((1, Urgency::Command)));
     assert_eq!(outcome(&mut start), Some(Outcome::Expired));
