@@ -87,7 +87,10 @@ pub(super) fn judge(wants: Wants, holds: Holds, told: bool, motor: Motor) -> Ver
 
 /// Whether that depends on how the motor stands.
 pub(super) fn depends_on_motor(wants: Wants, holds: Holds, told: bool) -> bool {
-    !matches!((wants, holds), (Wants::ResetEnd, Holds::Other | Holds::Unknown)) && !(wants == Wants::Others && told)
+    match (wants, holds) {
+        (Wants::ResetEnd, Holds::Other | Holds::Unknown) => false,
+        _ => wants != Wants::Others || !told,
+    }
 }
 
 fn refused(why: &str) -> Verdict {

@@ -25,8 +25,8 @@ const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);
 /// What was chosen for the line: a command to drives that waited among their others, or a background request.
 #[derive(Debug)]
 pub(super) enum Sending {
-    Command(Command),
-    Request(BackgroundRequest),
+    Command(Box<Command>),
+    Request(Box<BackgroundRequest>),
 }
 
 /// A background transaction that has its turn.
@@ -109,9 +109,9 @@ impl Begun {
     /// Reports the outcome, with the frame of the reply for a tool.
     fn answer(self, outcome: Outcome, frame: Vec<u8>, now: Instant) {
         let (ticket, passed_on) = match self.sending {
-            Sending::Command(Command { ticket, work, .. }) => match work {
-                Work::PassedOn(passed_on) => (ticket, Some(passed_on)),
-                Work::Stop(_) | Work::Set(_) | Work::Read => (ticket, None),
+            Sending::Command(command) => match command.work {
+                Work::PassedOn(passed_on) => (command.ticket, Some(passed_on)),
+                Work::Stop(_) | Work::Set(_) | Work::Read => (command.ticket, None),
             },
             Sending::Request(request) => (request.ticket, request.passed_on),
         };
@@ -157,8 +157,8 @@ impl Master {
             return;
         };
         match begun.sending {
-            Sending::Command(command) => self.bus.queue.lock().put_back(command, now),
-            Sending::Request(request) => self.bus.queue.background().put_back(request, now),
+            Sending::Command(command) => self.bus.queue.lock().put_back(*command, now),
+            Sending::Request(request) => self.bus.queue.background().put_back(*request, now),
         }
     }
 
@@ -205,7 +205,7 @@ impl Master {
             return Err(blocked);
         };
         let begun = self.background.insert(Begun {
-            sending: Sending::Request(request),
+            sending: Sending::Request(Box::new(request)),
             admission: Some(admission),
             sent: false,
         });

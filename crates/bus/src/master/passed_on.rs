@@ -103,7 +103,7 @@ impl Master {
             return None;
         }
         let begun = self.background.insert(Begun {
-            sending: Sending::Command(command),
+            sending: Sending::Command(Box::new(command)),
             admission,
             sent: false,
         });

@@ -182,7 +182,7 @@ impl Run {
             steps: kinds.map(step).collect(),
         };
         Run {
-            own: who.clone().as_drill(format!("drill of {}", who.who)),
+            own: who.clone().of_drill(format!("drill of {}", who.who)),
             who: who.clone(),
             report,
             machine,

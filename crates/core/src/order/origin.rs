@@ -180,7 +180,7 @@ impl Origin {
     }
 
     /// The drill that this client armed, which appears under that name in audit and events.
-    pub(crate) fn as_drill(mut self, who: String) -> Origin {
+    pub(crate) fn of_drill(mut self, who: String) -> Origin {
         (self.who, self.acting) = (who, Acting::Drill);
         self
     }

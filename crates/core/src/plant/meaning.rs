@@ -42,13 +42,22 @@ impl By {
     }
 }
 
+/// A machine that a bus serves, as long as the bus exists.
+#[derive(Debug, Clone)]
+struct Served {
+    image: Weak<BusImage>,
+    queue: Weak<CommandQueue>,
+    formerly: Weak<Formerly>,
+    place: DriveIndex,
+}
+
 /// What named the drive meant another machine, or none, until then.
 #[derive(Debug, Clone)]
 struct Former {
     by: By,
     until: Instant,
     /// The machine that it meant, where that is served now.
-    machine: Option<(Weak<BusImage>, Weak<CommandQueue>, Weak<Formerly>, DriveIndex)>,
+    machine: Option<Served>,
 }
 
 /// The machine that an order named, where its name means another one by now.
@@ -120,12 +129,12 @@ pub fn follow_names(before: &[BusHandle], after: &[BusHandle], now: Instant) {
                         .image
                         .drives
                         .position(|drive| bus.image.spec.machine(&drive.spec) == *was)?;
-                    let weak = (
-                        Arc::downgrade(&bus.image),
-                        Arc::downgrade(&bus.queue),
-                        Arc::downgrade(&bus.formerly),
-                    );
-                    Some((weak.0, weak.1, weak.2, place))
+                    Some(Served {
+                        image: Arc::downgrade(&bus.image),
+                        queue: Arc::downgrade(&bus.queue),
+                        formerly: Arc::downgrade(&bus.formerly),
+                        place,
+                    })
                 };
                 let former = Former {
                     by,
@@ -144,12 +153,13 @@ impl DriveHandle {
     /// The machine that an order of that kind meant which came so, if its name means another one by now.
     pub(super) fn meant(&self, kind: SourceKind, arrival: &Arrival) -> Option<Meant> {
         let former = self.bus.formerly.at(self.index, By::of(kind)?, arrival.asked)?;
-        let there = former.machine.and_then(|(image, queue, formerly, index)| {
+        let there = former.machine.and_then(|served| {
             let bus = BusHandle {
-                image: image.upgrade()?,
-                queue: queue.upgrade()?,
-                formerly: formerly.upgrade()?,
+                image: served.image.upgrade()?,
+                queue: served.queue.upgrade()?,
+                formerly: served.formerly.upgrade()?,
             };
+            let index = served.place;
             let image = bus.image.drives.get(index)?.clone();
             Some(DriveHandle {
                 bus,

@@ -309,7 +309,10 @@ impl DriveHandle {
             at_once: request.at_once,
         };
         match self.command(order, part, reading, request.authority) {
-            Err((ticket, outcome)) => self.turn_away(ticket, &what, outcome, write, now),
+            Err(refused) => {
+                let (ticket, outcome) = *refused;
+                self.turn_away(ticket, &what, outcome, write, now);
+            }
             Ok(command) => {
                 let origin = command.ticket.origin().clone();
                 let facts = self.bus.at_accept(self.stale_after, now);
@@ -350,7 +353,8 @@ impl DriveHandle {
         };
         let stop = match self.command(stop, part(ticket), reading, request.authority) {
             Ok(stop) => stop,
-            Err((ticket, outcome)) => {
+            Err(refused) => {
+                let (ticket, outcome) = *refused;
                 self.turn_away(ticket, &of_stop, outcome, true, now);
                 rest_ticket.answer(Outcome::NotStopped, now);
                 return placed;
@@ -359,7 +363,7 @@ impl DriveHandle {
         let facts = self.bus.at_accept(self.stale_after, now);
         let rest = match rest {
             Ok(order) => self.command(order, part(rest_ticket), reading, request.authority),
-            Err(refusal) => Err((rest_ticket, Outcome::Refused(refusal))),
+            Err(refusal) => Err(Box::new((rest_ticket, Outcome::Refused(refusal)))),
         };
         match rest {
             Ok(mut rest) => {
@@ -370,7 +374,8 @@ impl DriveHandle {
                 self.tell_refused(&of_stop, of_stop_refused, &request.origin, now);
                 self.tell_refused(what, of_rest, &request.origin, now);
             }
-            Err((ticket, outcome)) => {
+            Err(unsent) => {
+                let (ticket, outcome) = *unsent;
                 let refused = self.bus.queue.submit(stop, &facts, now);
                 self.tell_refused(&of_stop, refused, &request.origin, now);
                 self.turn_away(ticket, what, outcome, true, now);
@@ -399,17 +404,17 @@ impl DriveHandle {
         part: Part,
         reading: &Reading<'_>,
         authority: Authority,
-    ) -> Result<Command, (Ticket, Outcome)> {
+    ) -> Result<Command, Box<(Ticket, Outcome)>> {
         let online = reading.snapshot.link.is_online();
         let admitted = match admit(order, reading, authority) {
-            Err(Refusal::NotKnown(_)) if !self.bus_up() => return Err((part.ticket, Outcome::BusDown)),
-            Err(Refusal::NotKnown(_)) if !online => return Err((part.ticket, Outcome::Offline)),
-            Err(refusal) => return Err((part.ticket, Outcome::Refused(refusal))),
+            Err(Refusal::NotKnown(_)) if !self.bus_up() => return Err(Box::new((part.ticket, Outcome::BusDown))),
+            Err(Refusal::NotKnown(_)) if !online => return Err(Box::new((part.ticket, Outcome::Offline))),
+            Err(refusal) => return Err(Box::new((part.ticket, Outcome::Refused(refusal)))),
             Ok(admitted) => admitted,
         };
         let is_stop = admitted.urgency == Urgency::Stop;
         if !self.takes_stops() {
-            return Err((part.ticket, Outcome::BusDown));
+            return Err(Box::new((part.ticket, Outcome::BusDown)));
         }
         let profile = &self.image.spec.profile;
         let mut command = Command::new(self.index, admitted, profile, part.window, part.ticket);
@@ -422,7 +427,7 @@ impl DriveHandle {
         };
         if let Some(outcome) = unreachable {
             let refused = self.gate_refuses(&command, reading.now);
-            return Err((command.ticket, refused.unwrap_or(outcome)));
+            return Err(Box::new((command.ticket, refused.unwrap_or(outcome))));
         }
         if let Work::Stop(stop) = &mut command.work
             && part.at_once

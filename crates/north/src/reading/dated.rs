@@ -176,7 +176,7 @@ mod tests {
         assert!(came >= before + Duration::from_millis(20) && came <= Instant::now());
         client.write_all(b"at once").await.unwrap();
         tokio::time::sleep(Duration::from_millis(20)).await;
-        stream.read(&mut buffer).await.unwrap();
+        assert_eq!(stream.read(&mut buffer).await.unwrap(), 7);
         let at_once = stream.reader().last().asked;
         assert!(
             at_once >= came && at_once < came + Duration::from_millis(20),

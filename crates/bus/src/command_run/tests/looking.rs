@@ -120,12 +120,15 @@ impl<'p> AnyDrive<'p> {
     }
 }
 
+/// The words that started a motor, each with its place.
+type Started = Vec<(u16, u16)>;
+
 /// Runs the order against the drive, as far as it was polled before all this.
 fn carries_out(
     profile: &Arc<Profile>,
     since: Since,
     points: &[(ModelPoint, f64)],
-) -> Option<(Outcome, Vec<(u16, u16)>, CommandRun)> {
+) -> Option<(Outcome, Started, CommandRun)> {
     let mut drive = AnyDrive::new(profile);
     let (place, word) = drive.run_word();
     let mut bench = ObedientDrive::new(0);

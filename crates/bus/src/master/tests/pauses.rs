@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::command::Interruption;
-use crate::order::{Arrival, Connection, Stall};
+use crate::order::{Arrival, Connection, Stall, Window};
 
 const MS: Duration = Duration::from_millis(1);
 const FIRST: DriveIndex = DriveIndex::new(0);
@@ -133,8 +133,13 @@ fn a_sequence_that_a_pause_interrupted_is_not_continued() {
         let admitted = admit(order, &image.reading(rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "client");
         let (ticket, mut answer) = Ticket::new(origin, "d", String::new(), true, rig.now, rig.stats.clone());
-        let command = Command::new(FIRST, admitted, rig.now + 10_000 * MS, ticket);
-        rig.bus.queue.submit(command, rig.now);
+        let window = Window {
+            arrival: Arrival::now(rig.now),
+            expires: rig.now + 10_000 * MS,
+            waits: false,
+        };
+        let command = Command::new(FIRST, admitted, &image.spec.profile, window, ticket);
+        rig.bus.queue.submit(command, &(), rig.now);
         let turn = rig.next_turn(|turn| turn.pdu().is_write());
         let began = rig.now;
         rig.stands(MS * time);
@@ -179,13 +184,16 @@ fn a_start_that_came_in_a_stall_goes_when_what_came_with_it_is_read() {
     let admitted = admit(order, &image.reading(rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
     let origin = Origin::new(SourceKind::Mqtt, "client");
     let (ticket, _answer) = Ticket::new(origin, "d", String::new(), true, rig.now, rig.stats.clone());
-    let mut command = Command::new(FIRST, admitted, began + DEFAULT_EXPIRY, ticket);
-    command.effects = vec![(FIRST, crate::command::Effect::of(&command.order, &image.spec.profile))];
-    command.arrival = Some(Arrival {
-        stall: Some(stall),
-        ..Arrival::over(Connection::opened(began), began)
-    });
-    rig.bus.queue.submit(command, rig.now);
+    let window = Window {
+        arrival: Arrival {
+            stall: Some(stall),
+            ..Arrival::over(Connection::opened(began), began)
+        },
+        expires: began + DEFAULT_EXPIRY,
+        waits: false,
+    };
+    let command = Command::new(FIRST, admitted, &image.spec.profile, window, ticket);
+    rig.bus.queue.submit(command, &(), rig.now);
     while !rig.runs(0) {
         rig.step();
         assert!(rig.now < stall.read_by() + 100 * MS);

@@ -42,7 +42,7 @@ enum Progress {
     /// It repeats another command and gets the same reply.
     Repeated(SharedReply),
     /// It is in the queue of the bus.
-    Placed(Waiting),
+    Placed(Box<Waiting>),
 }
 
 /// A command whose result is pending.
@@ -234,13 +234,13 @@ impl Operating {
             Ok(placed) => placed,
             Err(answer) => return reply(&answer),
         };
-        Progress::Placed(Waiting {
+        Progress::Placed(Box::new(Waiting {
             placed,
             drive,
             runs,
             shared,
             id,
-        })
+        }))
     }
 
     /// Remembers a command that does more than stop.

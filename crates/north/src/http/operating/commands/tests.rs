@@ -78,7 +78,7 @@ fn no_stop_is_refused_for_what_waits() {
     );
     for _ in 0..100 {
         let stop = rig.take(&alice, "p1", "{\"run\": false}");
-        assert!(matches!(stop, Progress::Placed(Waiting { shared: None, .. })));
+        assert!(matches!(stop, Progress::Placed(waiting) if waiting.shared.is_none()));
     }
     assert!(rig.waiting() >= 1);
 }
