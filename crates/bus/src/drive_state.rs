@@ -267,11 +267,18 @@ impl DriveState {
         }
     }
 
-    /// Another client took the drive: started commands that `refuses` rejects end.
-    pub(super) fn taken(&mut self, refuses: impl Fn(&Origin) -> Option<Refusal>, image: &DriveImage, now: Instant) {
+    /// Another client took the drive, or its client lost the right to write: a started command that `refuses` rejects
+    /// ends, `why`.
+    pub(super) fn taken(
+        &mut self,
+        refuses: impl Fn(&Origin) -> Option<Refusal>,
+        why: Interruption,
+        image: &DriveImage,
+        now: Instant,
+    ) {
         let taken = |run: &mut CommandRun| {
             let refusal = run.origins().find_map(&refuses)?;
-            run.taken(refusal)
+            run.taken(refusal, why)
         };
         let outcome = self.run(Urgency::Command).and_then(taken);
         if let Some(outcome) = outcome {

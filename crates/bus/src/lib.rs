@@ -47,6 +47,7 @@ mod vain_stops;
 use drivegate_core::command;
 use drivegate_core::diagnosis;
 use drivegate_core::event;
+use drivegate_core::permit;
 use drivegate_core::plant;
 use drivegate_core::process_image;
 use drivegate_core::start_guard;

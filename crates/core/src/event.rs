@@ -93,10 +93,12 @@ pub enum EventKind {
     HoldBroken,
     /// A drill has ended.
     Drill,
+    /// A BACnet client lost its right to write, and with it what it had in a slot.
+    SlotVoid,
 }
 
 impl EventKind {
-    pub const ALL: [EventKind; 31] = [
+    pub const ALL: [EventKind; 32] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -128,6 +130,7 @@ impl EventKind {
         EventKind::Released,
         EventKind::HoldBroken,
         EventKind::Drill,
+        EventKind::SlotVoid,
     ];
 
     /// Whether someone should look: the log has it as a warning.
@@ -146,6 +149,7 @@ impl EventKind {
             | EventKind::Diagnosis
             | EventKind::RestoreUnfinished
             | EventKind::Interlock
+            | EventKind::SlotVoid
             | EventKind::ReloadRefused => true,
             EventKind::Online
             | EventKind::FaultEnd
@@ -201,6 +205,7 @@ impl EventKind {
             EventKind::Released => "released",
             EventKind::HoldBroken => "hold_broken",
             EventKind::Drill => "drill",
+            EventKind::SlotVoid => "slot_void",
         }
     }
 }
@@ -512,8 +517,8 @@ mod tests {
                 | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised
                 | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
                 ParametersChanged | RestoreUnfinished | Diagnosis | Guarded | Interlock | Held | Released
-                | HoldBroken => false,
-                Drill => true,
+                | HoldBroken | Drill => false,
+                SlotVoid => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

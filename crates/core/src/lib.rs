@@ -8,6 +8,7 @@ pub mod files;
 pub mod hex;
 pub mod history;
 pub mod parameters;
+pub mod permit;
 pub mod plant;
 pub mod process_image;
 pub mod spec;

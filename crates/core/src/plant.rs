@@ -4,6 +4,7 @@ mod exchange;
 mod hold;
 mod orders;
 mod placed;
+mod slots;
 mod why;
 
 use std::sync::Arc;

@@ -51,11 +51,11 @@ impl CommandRun {
         self.actions.is_empty().then(|| self.success())
     }
 
-    /// Another client took the drive: the command ends, but the motor is left as it is. Returns the outcome if that
-    /// ends it at once.
-    pub fn taken(&mut self, refusal: Refusal) -> Option<Outcome> {
+    /// Another client took the drive, or the right of its client is lost: the command ends, but the motor is left as it
+    /// is. Returns the outcome if that ends it at once.
+    pub fn taken(&mut self, refusal: Refusal, why: Interruption) -> Option<Outcome> {
         self.leave_motor();
-        self.cut_off(self.unless_begun(Outcome::Refused(refusal), Interruption::Taken));
+        self.cut_off(self.unless_begun(Outcome::Refused(refusal), why));
         self.actions.is_empty().then(|| self.success())
     }
 

@@ -6,12 +6,14 @@ use super::{Master, Purpose, Turn, TurnEnd};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{
-    BackgroundRequest, Effect, Interruption, NO_DRIVE, Outcome, Pace, SourceKind, Touched, Urgency, written,
+    BackgroundRequest, Effect, Interruption, NO_DRIVE, Outcome, Pace, Refusal, SourceKind, Touched, Urgency, written,
 };
 use crate::drive::plan::WireTime;
 use crate::drive::{DriveIndex, PlannedRead, PollClass};
 use crate::n2_session::Progress;
 use crate::news::News;
+use crate::permit::Moment;
+use crate::permit::rules::client_access;
 use crate::schedule::Admission;
 use crate::start_gate::Start;
 use crate::stop_of_line::BROADCAST_PAUSE;
@@ -100,6 +102,12 @@ impl Master {
         if !queue.is_empty() {
             queue.remove(now, &Outcome::Expired, |r| r.expires <= now);
             queue.remove(now, &Outcome::Replaced, BackgroundRequest::is_unwanted);
+            let bus = &bus.image.spec.name;
+            let lost = |request: &BackgroundRequest| lost_right(request, Moment::Turn, bus);
+            let refusal = queue.iter().find_map(lost);
+            if let Some(refusal) = refusal {
+                queue.remove(now, &Outcome::Refused(refusal), |request| lost(request).is_some());
+            }
             queue.remove(now, &Outcome::Offline, |r| {
                 r.drive != NO_DRIVE && !schedule.is_online(r.drive)
             });
@@ -159,6 +167,10 @@ impl Master {
         let Some(begun) = self.background.as_ref().filter(|begun| begun.request.expires > now) else {
             return false;
         };
+        if lost_right(&begun.request, Moment::Write, &self.bus.image.spec.name).is_some() {
+            // It is refused when it is chosen again.
+            return false;
+        }
         let orders = begun.request.passed_on.as_ref().filter(|_| begun.ordered.is_some());
         orders.is_none_or(|passed_on| {
             let reach = passed_on.reach.iter();
@@ -388,4 +400,10 @@ impl Master {
             self.note_write(turn.drive, table, &items, now);
         }
     }
+}
+
+/// Why a write for a tool is not sent any more, if its client has lost the right to write to that bus.
+fn lost_right(request: &BackgroundRequest, moment: Moment, bus: &str) -> Option<Refusal> {
+    request.passed_on.as_ref().filter(|passed_on| passed_on.may_write)?;
+    client_access(moment, false, request.ticket.origin(), bus).err()
 }

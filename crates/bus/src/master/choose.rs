@@ -12,6 +12,8 @@ use crate::command::{
 use crate::command_run::{CommandRun, Step};
 use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::{DriveState, Wanted};
+use crate::permit::Moment;
+use crate::permit::rules::client_access;
 use crate::schedule::{Decision, Poll};
 
 /// Transactions of one rank in a row, while a lower one waits, before that has its turn.
@@ -195,7 +197,7 @@ impl Master {
         for index in pending {
             if let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) {
                 let refuses = |origin: &Origin| self.bus.queue.lock().hold_ends_run(index, origin, now);
-                drive.taken(refuses, image, now);
+                drive.taken(refuses, Interruption::Taken, image, now);
             }
         }
     }
@@ -206,6 +208,10 @@ impl Master {
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if !drive.has_runs() {
                 continue;
+            }
+            if lost_right(drive, &image.spec.bus) {
+                let refuses = |origin: &Origin| may_not_write(origin, &image.spec.bus);
+                drive.taken(refuses, Interruption::RightLost, image, now);
             }
             let mut wanted = drive.wanted(image, &waits.n2_late, now);
             while let Some(starts) = &mut waits.starts
@@ -438,6 +444,12 @@ impl Master {
             // It is refused when it is chosen again.
             return false;
         }
+        if slot == Urgency::Command
+            && let Some(drive) = self.drives.get_mut(turn.drive)
+            && lost_right(drive, &self.bus.image.spec.name)
+        {
+            return false;
+        }
         let run = self.drives.get_mut(turn.drive).and_then(|drive| drive.run(slot));
         let Some(run) = run.filter(|run| !run.is_late(now)) else {
             return false;
@@ -454,6 +466,17 @@ impl Master {
         }
         true
     }
+}
+
+/// Whether a reload took the right of the client away whose started command may write on.
+fn lost_right(drive: &mut DriveState, bus: &str) -> bool {
+    let run = drive.run(Urgency::Command).filter(|run| run.may_write_on());
+    run.is_some_and(|run| run.origins().any(|origin| may_not_write(origin, bus).is_some()))
+}
+
+/// Why that client writes no more to a drive of that bus.
+fn may_not_write(origin: &Origin, bus: &str) -> Option<Refusal> {
+    client_access(Moment::Write, false, origin, bus).err()
 }
 
 fn range_changed() -> Refusal {

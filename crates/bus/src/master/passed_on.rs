@@ -119,7 +119,7 @@ impl Master {
     ) -> Option<Turn> {
         let held = command.passed_on.as_ref().and_then(|p| held(p, &self.bus.image.drives));
         let away = command.drive != NO_DRIVE && !self.schedule.is_online(command.drive);
-        let lost = || self.bus.queue.lock().hold_at_turn(&command, now).map(Outcome::Refused);
+        let lost = || self.bus.judges_turn(&command, now).0.map(Outcome::Refused);
         let in_vain = held.or(away.then_some(Outcome::Offline)).or_else(lost);
         if let Some(outcome) = in_vain {
             command.answer(&outcome, now);

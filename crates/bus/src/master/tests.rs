@@ -19,6 +19,7 @@ mod background;
 mod drill;
 mod hold;
 mod late_replies;
+mod rights;
 mod shutdown;
 mod stop_all;
 

@@ -18,6 +18,7 @@ mod outcome;
 mod parameter;
 mod priorities;
 mod queue;
+mod right;
 mod standing;
 mod ticket;
 mod touched;
@@ -37,9 +38,10 @@ pub use origin::{Authority, Origin, SourceKind};
 pub use outcome::{Answer, Holder, Interruption, Outcome, Refusal};
 pub use parameter::ParameterOrder;
 pub use priorities::{
-    Commanded, Effect, Entry, Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, SlotWrite,
+    Commanded, Effect, Entry, Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, SlotWrite, VoidSlot,
 };
 pub use queue::{CAPACITY, Chosen, CommandQueue, NotStopped, Pending, Stopping, Unheld};
+pub use right::{Grants, Right};
 pub use standing::{LastWritten, is_reference, limits_passed, still_keeps_limits};
 pub use ticket::{Receipt, Ticket, WriteStats};
 pub use touched::Touched;

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::Proof;
+use super::{Proof, Right};
 
 /// Where a command comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -101,6 +101,7 @@ pub struct Origin {
     login: Option<Arc<str>>,
     pub(super) proof: Proof,
     pub(super) insists: bool,
+    right: Right,
 }
 
 impl Origin {
@@ -127,6 +128,7 @@ impl Origin {
             login: None,
             proof: Proof::Nothing,
             insists: false,
+            right: Right::lasting(),
         }
     }
 
@@ -146,6 +148,22 @@ impl Origin {
     pub(crate) fn insisting(mut self) -> Origin {
         self.insists = true;
         self
+    }
+
+    /// The same with that right to write.
+    pub fn with_right(mut self, right: Right) -> Origin {
+        self.right = right;
+        self
+    }
+
+    /// The same for what has begun and has to come to its end, whatever a reload takes away.
+    pub fn lasting(self) -> Origin {
+        self.with_right(Right::lasting())
+    }
+
+    /// Its right to write.
+    pub fn right(&self) -> &Right {
+        &self.right
     }
 
     /// The proof from its connection.

@@ -15,6 +15,8 @@ use crate::command::{
     written,
 };
 use crate::drive::DriveIndex;
+use crate::permit::Moment;
+use crate::permit::rules::client_access;
 use crate::process_image::DriveImage;
 
 /// Who on the line is asked.
@@ -126,9 +128,16 @@ impl BusHandle {
         let touched = heard().next().map_or(Touched::Anything, |(_, drive)| {
             Touched::of(&order, &[], &drive.spec.profile)
         });
+        let allowed = client_access(Moment::Accept, false, &question.origin, &spec.name);
         let (ticket, answer) = Ticket::new(question.origin, &name, what, may_write, now, writes.clone());
         let ticket = ticket.with_runs(runs);
         let (sender, frame) = oneshot::channel();
+        if let Err(refusal) = allowed
+            && may_write
+        {
+            ticket.answer(Outcome::Refused(refusal), now);
+            return Exchange { answer, frame };
+        }
         let request = BackgroundRequest {
             drive,
             pdu: question.pdu,

@@ -10,6 +10,8 @@ use crate::command::{
 use crate::drive::DriveIndex;
 use crate::drive::why::{Cause, Explanation};
 use crate::event::{Event, EventKind, Events};
+use crate::permit::Moment;
+use crate::permit::rules::client_access;
 
 impl BusHandle {
     /// Whether a command of that client renews the lease of a drive.
@@ -72,6 +74,13 @@ impl BusHandle {
 
     /// Why a command that was accepted is not started at its turn, and whether it renews the lease of its drive.
     pub fn judges_turn(&self, command: &Command, now: Instant) -> (Option<Refusal>, bool) {
+        let is_stop = command.urgency == Urgency::Stop;
+        let origin = command.ticket.origin();
+        if command.urgency != Urgency::Read
+            && let Err(refusal) = client_access(Moment::Turn, is_stop, origin, &self.image.spec.name)
+        {
+            return (Some(refusal), true);
+        }
         if !self.queue.is_guarded() {
             return (None, true);
         }
@@ -129,6 +138,7 @@ impl DriveHandle {
 
     fn act(&self, verb: Verb, origin: &Origin, authority: Authority, now: Instant) -> Result<HoldView, Refusal> {
         command::authority(&self.reading(now), authority)?;
+        client_access(Moment::Accept, false, origin, &self.image.spec.bus)?;
         if let (Some(why), Verb::Take | Verb::Break) = (self.image.hold.why(), verb) {
             return Err(Refusal::NotAllowed(why.to_string()));
         }

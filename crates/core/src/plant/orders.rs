@@ -14,6 +14,8 @@ use crate::command::{
 use crate::drive::parameters::RawValue;
 use crate::drive::{DriveIndex, ModelPoint, PointIndex, Value};
 use crate::event::RefusedCommand;
+use crate::permit::Moment;
+use crate::permit::rules::client_access;
 use crate::process_image::Reading;
 
 /// Who gives a command, what that client may do at all, until when it may be sent, when its head came, and now.
@@ -326,10 +328,14 @@ impl DriveHandle {
             Err(Refusal::NotKnown(_)) if !online => return Err(Outcome::Offline),
             admitted => admitted.map_err(Outcome::Refused)?,
         };
+        let is_stop = admitted.urgency == Urgency::Stop;
+        if admitted.urgency != Urgency::Read {
+            let bus = &self.image.spec.bus;
+            client_access(Moment::Accept, is_stop, origin, bus).map_err(Outcome::Refused)?;
+        }
         if let Some(refusal) = self.hold_refuses(&admitted, origin, reading.now) {
             return Err(Outcome::Refused(refusal));
         }
-        let is_stop = admitted.urgency == Urgency::Stop;
         if (!is_stop && !self.bus_up()) || !self.takes_stops() {
             return Err(Outcome::BusDown);
         }

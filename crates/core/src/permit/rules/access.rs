@@ -1,0 +1,84 @@
+//! Whether the client of a command may write at all. Judged by the configuration of now: what a reload has taken away
+//! since the first byte of a request no longer counts when the request is complete, and a command that waits, or a
+//! sequence that has begun, goes no further.
+//!
+//! A stop needs the right when it is accepted. Once accepted it is sent: the motor that it is to stop may run by nobody
+//! else's will.
+
+use crate::command::{Origin, Refusal};
+use crate::permit::Moment;
+
+/// Judges a command at that moment; `may_write` is what its client is allowed now.
+///
+/// # Errors
+/// The refusal.
+pub fn access(moment: Moment, is_stop: bool, may_write: bool) -> Result<(), Refusal> {
+    let why = match (moment, may_write) {
+        (_, true) => return Ok(()),
+        (Moment::Turn | Moment::Write, false) if is_stop => return Ok(()),
+        (Moment::Accept, false) => "this client may no longer write: a reload took its right away",
+        (Moment::Turn | Moment::Write, false) => {
+            "a reload took the right of this client to write away while the command waited"
+        }
+    };
+    Err(Refusal::NotAllowed(format!("{why}; nothing was written")))
+}
+
+/// Judges a command of that client for a drive of that bus.
+///
+/// # Errors
+/// The refusal.
+pub fn client_access(moment: Moment, is_stop: bool, origin: &Origin, bus: &str) -> Result<(), Refusal> {
+    access(moment, is_stop, origin.right().allows(bus))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    use super::*;
+    use crate::command::{Right, SourceKind};
+
+    #[test]
+    fn whoever_has_lost_the_right_writes_nothing_but_the_stop_that_was_accepted() {
+        use Moment::{Accept, Turn, Write};
+        let table = [
+            (Accept, false, true, true),
+            (Accept, true, true, true),
+            (Accept, false, false, false),
+            (Accept, true, false, false),
+            (Turn, false, true, true),
+            (Turn, true, true, true),
+            (Turn, false, false, false),
+            (Turn, true, false, true),
+            (Write, false, true, true),
+            (Write, true, true, true),
+            (Write, false, false, false),
+            (Write, true, false, true),
+        ];
+        for (moment, is_stop, may_write, passes) in table {
+            let judged = access(moment, is_stop, may_write);
+            assert_eq!(judged.is_ok(), passes, "{moment:?} stop {is_stop} right {may_write}");
+            if let Err(refusal) = judged {
+                assert_eq!(refusal.code(), "not_allowed");
+                assert!(refusal.to_string().contains("a reload took"), "{refusal}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_right_is_that_of_now() {
+        let grants = Arc::new(AtomicBool::new(true));
+        let own = Origin::new(SourceKind::Mqtt, "cloud");
+        let client = own.clone().with_right(Right::of(grants.clone()));
+        let judged = |origin: &Origin| client_access(Moment::Turn, false, origin, "line1").is_ok();
+        assert!(judged(&own) && judged(&client));
+        grants.store(false, Ordering::Release);
+        assert!(judged(&own) && !judged(&client));
+        assert!(judged(&client.clone().lasting()), "what has to come to its end");
+        grants.store(true, Ordering::Release);
+        assert!(judged(&client));
+        assert_eq!(own, client.lasting(), "a client is the same with any right");
+    }
+}
