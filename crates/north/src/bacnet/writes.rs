@@ -6,12 +6,15 @@ use std::time::Instant;
 use drivegate_bacnet::{Address, Datum, Error, Job};
 
 use super::objects::Meaning;
+use super::rights::HostRights;
 use super::view::View;
 use crate::command::{
     self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite,
     SourceKind,
 };
 use crate::drive::{PointIndex, Value};
+use crate::permit::Moment;
+use crate::permit::rules::client_access;
 use crate::plant::{DriveHandle, Placed};
 use crate::process_image::Machine;
 
@@ -38,13 +41,14 @@ pub(super) struct Waiting {
 }
 
 /// The client, whatever port it uses.
-pub(super) fn origin(from: &Address, priority: Option<u8>) -> Origin {
+pub(super) fn origin(rights: &HostRights, from: &Address, priority: Option<u8>) -> Origin {
     let client = match &from.remote {
         None => format!("bacnet {}", from.ip()),
         Some(_) => format!("bacnet {} behind {}", from.remote_text(), from.ip()),
     };
     let proof = Proof::Bacnet(from.ip().into(), priority.unwrap_or(LOWEST));
-    Origin::of(Arc::from(client), SourceKind::Bacnet, from.to_string()).proven(proof)
+    let origin = Origin::of(Arc::from(client), SourceKind::Bacnet, from.to_string());
+    origin.proven(proof).with_right(rights.of(from))
 }
 
 /// Takes up a write.
@@ -52,7 +56,12 @@ pub(super) fn begin(view: &View, job: &Job, now: Instant) -> Begun {
     let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
         return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
     };
-    let origin = origin(&job.from, job.priority);
+    let origin = origin(&view.rights, &job.from, job.priority);
+    // A reload may have come since the request was received, or between two of its writes.
+    if let Err(refusal) = client_access(Moment::Accept, false, &origin, &handle.image.spec.bus) {
+        handle.refuse(&described(job), refusal, origin, now);
+        return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
+    }
     match (meaning, &job.value) {
         (Meaning::Point(index), Some(value)) => match value_of(value) {
             Some(value) => {

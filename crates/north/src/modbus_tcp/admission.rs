@@ -18,7 +18,7 @@ use super::frame::NotModbus;
 use super::routes::PlantView;
 use super::session::ClientSession;
 use super::tls::{AuthenticatedClient, Role, TlsAuthenticator};
-use super::{ServerState, connection};
+use super::{Listener, ServerState, connection};
 use crate::ConnectionRefusal;
 use crate::command::Authority;
 use crate::connection_limit::{
@@ -98,6 +98,20 @@ impl ConnectionHandler for Admission {
             WriteAccess::ByAddress(_) => self.acquire(&self.state.connections, client, remedy, judge),
             WriteAccess::ByCertificate(_) => self.acquire(&self.state.handshakes, client, handshake_remedy, judge),
         }
+    }
+
+    fn retire(&self) {
+        let options = self.state.options.load();
+        let write = &self.policy.load().write;
+        self.state
+            .connections
+            .review(self.listener, |place| match (write, &options.tls) {
+                (WriteAccess::ByAddress(_), _) => authority_of(&options.listeners, place.address()),
+                (WriteAccess::ByCertificate(_), Some(tls)) => {
+                    contains(&tls.allow, place.address()).then(|| place.rights().authority())
+                }
+                (WriteAccess::ByCertificate(_), None) => None,
+            });
     }
 
     async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, permit: ConnectionPermit) {
@@ -192,6 +206,7 @@ impl Admission {
             connection::close(&mut stream).await;
             return;
         };
+        client.certificate.watch(permit.place().rights());
         let refused = pin!(client.certificate.refused());
         let served = pin!(self.serve_client(stream, peer, Some(&client.name), &permit));
         if let Either::Left(((), served)) = select(refused, served).await {
@@ -245,6 +260,17 @@ fn remedy(reached: LimitReached) -> String {
 
 fn handshake_remedy(_: LimitReached) -> String {
     "their TLS handshakes are not complete; they have 10 s for them".to_string()
+}
+
+/// The most that any of the listeners allows that address; `None` if it may connect to none.
+fn authority_of(listeners: &[Listener], address: IpAddr) -> Option<Authority> {
+    let mut of = listeners.iter().filter(|listener| contains(&listener.allow, address));
+    let first = of.next()?;
+    let writes = |listener: &Listener| contains(&listener.write, address);
+    Some(match writes(first) || of.any(writes) {
+        true => Authority::Write,
+        false => Authority::ReadOnly,
+    })
 }
 
 fn contains(networks: &[IpNet], address: IpAddr) -> bool {

@@ -9,18 +9,13 @@ use axum::http::StatusCode;
 use axum::response::IntoResponse;
 
 use super::super::app_state::AppState;
-use super::super::body::Payload;
 use super::super::replies::{Replied, not_found, refused};
-use super::asker::Commander;
+use super::asker::Ordered;
 use crate::command_json::stop_all;
 use crate::stop_all::NothingToStop;
 
 /// 200 if every drive stands, 504 if one is not proven to.
-pub(in crate::http) async fn stop(
-    State(app): State<Arc<AppState>>,
-    Commander(operator): Commander,
-    Payload(payload): Payload,
-) -> Replied {
+pub(in crate::http) async fn stop(State(app): State<Arc<AppState>>, Ordered(operator, payload): Ordered) -> Replied {
     let (scope, wait) = stop_all(&payload).map_err(|why| refused(StatusCode::UNPROCESSABLE_ENTITY, why))?;
     let plant = app.plant.load_full();
     let order = plant

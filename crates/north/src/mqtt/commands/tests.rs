@@ -98,6 +98,7 @@ fn rules(require_id: bool) -> Rules {
     Rules {
         responses: ResponseTopics::new("drivegate", "hall", Vec::new()),
         require_id,
+        right: Right::lasting(),
     }
 }
 
