@@ -316,6 +316,36 @@ mod tests {
     }
 
     #[test]
+    fn who_loses_its_listener_keeps_what_another_one_allows() {
+        let listener = |allow: &[&str], write: &[&str]| {
+            let networks = |all: &[&str]| all.iter().map(|text| text.parse().unwrap()).collect();
+            Listener {
+                section: String::new(),
+                listen: Vec::new(),
+                allow: networks(allow),
+                write: networks(write),
+                buses: None,
+            }
+        };
+        let address = "10.0.0.5".parse().unwrap();
+        let (all, own, other) = (&["10.0.0.0/8"][..], &["10.0.0.5/32"][..], &["10.0.0.6/32"][..]);
+        let table = [
+            (vec![], None),
+            (vec![listener(other, own)], None),
+            (vec![listener(all, other)], Some(Authority::ReadOnly)),
+            (vec![listener(all, own)], Some(Authority::Write)),
+            (vec![listener(all, other), listener(all, own)], Some(Authority::Write)),
+            (
+                vec![listener(all, other), listener(other, own)],
+                Some(Authority::ReadOnly),
+            ),
+        ];
+        for (listeners, expected) in table {
+            assert_eq!(authority_of(&listeners, address), expected, "{listeners:?}");
+        }
+    }
+
+    #[test]
     fn networks() {
         let networks = ["127.0.0.0/8".parse().unwrap(), "fd00::/8".parse().unwrap()];
         for (ip, inside) in [

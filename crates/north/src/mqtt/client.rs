@@ -469,4 +469,4 @@ impl session::Client for PlainClient {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

@@ -51,3 +51,86 @@ impl BrokerRights {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mqtt::client::tests::options;
+    use crate::mqtt::{Broker, sparkplug};
+
+    #[test]
+    fn a_right_ends_with_what_gave_it_and_comes_back_as_another_one() {
+        let broker = |port| Broker {
+            host: "127.0.0.1".to_string(),
+            port,
+        };
+        let before = Options {
+            brokers: vec![broker(1), broker(2)],
+            commands: true,
+            sparkplug: Some(sparkplug::Options {
+                group: "plant".to_string(),
+                node: "hall".to_string(),
+                primary_host: String::new(),
+                alias: true,
+                history: false,
+                state_dir: "/nonexistent".into(),
+            }),
+            ..options(None)
+        };
+        let table = [
+            ("nothing", Some(before.clone()), (true, true)),
+            (
+                "an interval",
+                Some(Options {
+                    min_interval: std::time::Duration::from_secs(9),
+                    ..before.clone()
+                }),
+                (true, true),
+            ),
+            (
+                "one broker less",
+                Some(Options {
+                    brokers: vec![broker(2)],
+                    ..before.clone()
+                }),
+                (true, true),
+            ),
+            ("no [mqtt]", None, (false, false)),
+            (
+                "commands",
+                Some(Options {
+                    commands: false,
+                    ..before.clone()
+                }),
+                (false, false),
+            ),
+            (
+                "another broker",
+                Some(Options {
+                    brokers: vec![broker(3)],
+                    ..before.clone()
+                }),
+                (false, false),
+            ),
+            (
+                "Sparkplug",
+                Some(Options {
+                    sparkplug: None,
+                    ..before.clone()
+                }),
+                (true, false),
+            ),
+        ];
+        for (what, next, expected) in table {
+            let rights = BrokerRights::default();
+            let (topics, node) = rights.begin(&before);
+            let allowed = || (topics.allows("line1"), node.allows("line1"));
+            assert_eq!(allowed(), (true, true));
+            rights.reload(&before, next.as_ref());
+            assert_eq!(allowed(), expected, "{what}");
+            // A later client has a right of its own where this one has ended.
+            let (later, _) = rights.begin(&before);
+            assert_eq!((allowed(), later.allows("line1")), (expected, true), "{what}");
+        }
+    }
+}

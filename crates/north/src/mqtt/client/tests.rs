@@ -5,7 +5,7 @@ use super::*;
 use crate::event::{BURST, EventKind};
 use crate::process_image::{BusImage, BusSpec};
 
-fn options(buffer: Option<Buffer>) -> Options {
+pub(in crate::mqtt) fn options(buffer: Option<Buffer>) -> Options {
     Options {
         brokers: vec![Broker {
             host: "127.0.0.1".to_string(),
