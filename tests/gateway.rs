@@ -36,6 +36,7 @@ mod gateway {
     mod replay;
     mod restart;
     mod restoring;
+    mod rights;
     mod slow_log;
     mod start_guard;
     mod stop_all;

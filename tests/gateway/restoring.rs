@@ -6,6 +6,7 @@ use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 use std::time::Duration;
 
+use drivegate::codec::{Reply, RequestPdu, Table};
 use drivegate::sim::wire::SimulatedBus;
 
 use super::parameters::few;
@@ -227,6 +228,40 @@ fn a_gateway_that_was_killed_in_the_middle_holds_the_drive_until_that_is_settled
     assert!(!plant.held());
     let (code, _, said) = settle(&plant, &["write", "pump-1", "run=true"]);
     assert_eq!(code, Some(0), "{said}");
+}
+
+/// A journal as an earlier version wrote it, killed in the middle of a restore of 7 parameters: it names no machine.
+const EARLIER: &str = include_str!("restore_1.journal");
+
+#[test]
+fn a_restore_that_an_earlier_version_began_is_resumed_and_undone() {
+    for (how, place) in [("--resume", 2), ("--undo", 1)] {
+        let plant = plant(WRITABLE);
+        let journal = plant.site.file("state/params/pump-1/restore.journal");
+        fs::create_dir_all(journal.parent().unwrap()).unwrap();
+        fs::write(&journal, EARLIER).unwrap();
+        let _gateway = plant.site.run_ready();
+        assert!(plant.held());
+        // Some of the values were written before it was killed.
+        let rows: Vec<Vec<u16>> = EARLIER
+            .lines()
+            .filter_map(|line| line.split_once(" kept "))
+            .map(|(row, _)| row.split(' ').map(|word| word.parse().unwrap()).collect())
+            .collect();
+        assert_eq!(rows.len(), 7);
+        for row in &rows[..3] {
+            let write = RequestPdu::write_register(row[0], row[2]);
+            let written = plant.line.with_drive(1, |drive, now| drive.answer(&write, now));
+            assert_eq!(written.unwrap(), Some(Reply::Written));
+        }
+        plant.well(&["restore", how, "pump-1"]);
+        assert!(!plant.held() && !journal.exists(), "{how}");
+        for row in &rows {
+            let read = RequestPdu::read(Table::Holding, row[0], 1);
+            let has = plant.line.with_drive(1, |drive, now| drive.answer(&read, now));
+            assert_eq!(has.unwrap(), Some(Reply::Registers(vec![row[place]])), "{how} {row:?}");
+        }
+    }
 }
 
 /// Function and first byte of the answer to a write of one register by Modbus TCP.

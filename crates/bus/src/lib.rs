@@ -48,6 +48,7 @@ use drivegate_core::command;
 use drivegate_core::diagnosis;
 use drivegate_core::event;
 use drivegate_core::order;
+use drivegate_core::permit;
 use drivegate_core::plant;
 use drivegate_core::process_image;
 use drivegate_core::start_guard;

@@ -97,10 +97,12 @@ pub enum EventKind {
     Drill,
     /// The process, or a thread of it, stood still for longer than a second.
     Paused,
+    /// A BACnet client lost its right to write, and with it what it had in a slot.
+    SlotVoid,
 }
 
 impl EventKind {
-    pub const ALL: [EventKind; 32] = [
+    pub const ALL: [EventKind; 33] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -133,6 +135,7 @@ impl EventKind {
         EventKind::HoldBroken,
         EventKind::Drill,
         EventKind::Paused,
+        EventKind::SlotVoid,
     ];
 
     /// Whether someone should look: the log has it as a warning.
@@ -152,6 +155,7 @@ impl EventKind {
             | EventKind::RestoreUnfinished
             | EventKind::Interlock
             | EventKind::Paused
+            | EventKind::SlotVoid
             | EventKind::ReloadRefused => true,
             EventKind::Online
             | EventKind::FaultEnd
@@ -208,6 +212,7 @@ impl EventKind {
             EventKind::HoldBroken => "hold_broken",
             EventKind::Drill => "drill",
             EventKind::Paused => "paused",
+            EventKind::SlotVoid => "slot_void",
         }
     }
 }
@@ -540,7 +545,8 @@ mod tests {
                 | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
                 ParametersChanged | RestoreUnfinished | Diagnosis | Guarded | Interlock | Held | Released
                 | HoldBroken | Drill => false,
-                Paused => true,
+                Paused => false,
+                SlotVoid => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

@@ -5,6 +5,7 @@ mod hold;
 mod meaning;
 mod orders;
 mod placed;
+mod slots;
 mod why;
 
 use std::sync::Arc;

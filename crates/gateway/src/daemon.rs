@@ -7,6 +7,7 @@ mod keepers;
 mod leases;
 mod pulse;
 mod reservations;
+mod rights;
 mod server;
 mod servers;
 
@@ -172,6 +173,7 @@ impl Daemon {
         daemon.apply_drills(&settings);
         reservations::restore(&daemon.reservations, &daemon.plant.load());
         daemon.apply_mqtt(&settings).await?;
+        daemon.discard_kept_slots(&settings).await;
         // The servers that report readiness come last.
         let servers = daemon.prepare_servers(&settings).await?;
         daemon.commit_servers(servers).await;
@@ -228,9 +230,11 @@ impl Daemon {
         self.apply_guards(&settings).await;
         self.apply_params(&settings);
         self.hold_unfinished(&settings).await;
+        self.end_rights(&settings);
         self.commit_servers(servers).await;
         self.end_drill_of_changed_bus(&settings).await;
         self.replace_buses(&settings, prepared).await;
+        self.void_slots();
         self.apply_reservations(&settings);
         self.apply_drills(&settings);
         self.apply_mqtt(&settings).await?;

@@ -206,8 +206,11 @@ impl ConnectionPlace {
         self.why.get().copied()
     }
 
-    /// Ends the connection; the first reason counts.
+    /// Ends the connection; the first reason counts. Its client may write no more, unless the place only goes to another.
     pub(super) fn close(&self, why: CloseReason) {
+        if why != CloseReason::Displaced {
+            self.rights.set(Authority::ReadOnly);
+        }
         let _ = self.why.set(why);
         self.closing.cancel();
     }

@@ -38,6 +38,7 @@ use drivegate_core::hex;
 use drivegate_core::history;
 use drivegate_core::order;
 use drivegate_core::parameters;
+use drivegate_core::permit;
 use drivegate_core::plant;
 use drivegate_core::process_image;
 use drivegate_core::start_guard;

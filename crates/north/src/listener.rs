@@ -32,6 +32,10 @@ pub(crate) trait ConnectionHandler: Send + Sync + 'static {
     /// A place for a connection of this client. `None` refuses it; the handler counts and logs that.
     fn admit(&self, client: IpAddr) -> Option<Self::Permit>;
 
+    /// The configuration has the listener no more: ends the rights of its clients, as far as it does not give them in
+    /// another way.
+    fn retire(&self) {}
+
     /// Serves a connection until it ends.
     fn serve(
         self: Arc<Self>,
@@ -277,6 +281,7 @@ impl<H: ConnectionHandler> Listeners<H> {
         }
         for listener in before {
             tracing::info!(target: "drivegate::north::listener", address = %listener.bound, "{}: no longer listening", self.server.title());
+            listener.handler.retire();
             listener.stop.cancel();
             listener.cancel.cancel();
         }
@@ -286,6 +291,7 @@ impl<H: ConnectionHandler> Listeners<H> {
     pub(super) async fn close(&mut self) {
         for mut listener in std::mem::take(&mut self.open) {
             tracing::info!(target: "drivegate::north::listener", address = %listener.bound, "{}: no longer listening", self.server.title());
+            listener.handler.retire();
             listener.stop.cancel();
             listener.cancel.cancel();
             if let Some(stopped) = listener.stopped.take() {

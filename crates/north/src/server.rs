@@ -32,6 +32,10 @@ pub trait Server: Sized + std::fmt::Debug {
         cancel: CancellationToken,
     ) -> Result<Self, ServerError>;
 
+    /// A reload is about to end it, for one with the options `next` if there is one: rights that its clients do not have
+    /// then end now.
+    fn end_rights(&self, _next: Option<&Self::Options>) {}
+
     /// Waits until it has stopped, after the cancellation.
     async fn stopped(self);
 }

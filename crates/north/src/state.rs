@@ -1,11 +1,12 @@
 //! What the servers share.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use super::command_json::SharedMemory;
 use super::http::SharedReply;
 use super::listener::ListenerStates;
-use super::mqtt::Handover;
+use super::mqtt::{BrokerRights, Handover};
 use super::stats::{BacnetStats, ModbusTcpStats, MqttStats, RefusalStats, ReloadStats, SlotStats};
 use crate::drill::Drills;
 use crate::history::{History, Recordings};
@@ -41,8 +42,12 @@ pub struct NorthState {
     pub reload: ReloadStats,
     /// Recent commands.
     pub(super) commands: RememberedCommands,
+    /// The slots that BACnet clients had before the start were taken up, or are void: none of them comes back.
+    pub(super) kept_slots_read: AtomicBool,
     /// What an MQTT client leaves to the next one.
     pub mqtt_left: Handover,
+    /// Of those who publish to the broker.
+    pub(super) broker_rights: BrokerRights,
 }
 
 /// The recent commands of all ways that recognise a repetition. They outlive the servers that a reload replaces.

@@ -54,7 +54,7 @@ pub(crate) trait TcpService<Options>: Debug + Sized {
         listeners: &mut Listeners<Self::Handler>,
     );
 
-    /// Ends what serves clients without a listener.
+    /// Ends what serves clients without a listener, and the rights of all clients.
     fn retire(&mut self) {}
 }
 
@@ -154,8 +154,8 @@ impl<S: TcpService<O>, O: Clone + PartialEq + Debug> Reconfigure for TcpServer<S
 
     /// Closes the listeners and their connections; requests that wait for the bus are answered.
     async fn retire(&mut self) {
-        self.listeners.close().await;
         self.service.retire();
+        self.listeners.close().await;
     }
 
     fn is_drained(&self) -> bool {

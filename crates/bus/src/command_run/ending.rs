@@ -34,6 +34,12 @@ impl CommandRun {
                 self.leave_motor();
                 self.unless_begun(Outcome::Purged, Interruption::Stop)
             }
+            Outcome::Interrupted(Interruption::RightLost) => {
+                self.leave_motor();
+                let why = "a reload took the right of this client to write away; nothing was written";
+                let refusal = Refusal::NotAllowed(why.to_string());
+                self.unless_begun(Outcome::Refused(refusal), Interruption::RightLost)
+            }
             Outcome::Expired => self.unless_begun(Outcome::Expired, Interruption::Expired),
             outcome => outcome,
         };

@@ -7,13 +7,14 @@ use super::{Master, Purpose, Turn, TurnEnd};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{
-    BackgroundRequest, Command, Interruption, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, SourceKind, Stage,
-    Urgency, Verdict, Work, written,
+    BackgroundRequest, Command, Interruption, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind,
+    Stage, Urgency, Verdict, Work, written,
 };
 use crate::drive::plan::WireTime;
 use crate::drive::{DriveIndex, PlannedRead, PollClass};
 use crate::n2_session::Progress;
 use crate::news::News;
+use crate::permit::client_access;
 use crate::schedule::Admission;
 use crate::start_gate::Start;
 use crate::stop_of_line::BROADCAST_PAUSE;
@@ -169,6 +170,12 @@ impl Master {
         if !queue.is_empty() {
             queue.remove(now, &Outcome::Expired, |r| r.expires <= now);
             queue.remove(now, &Outcome::Replaced, BackgroundRequest::is_unwanted);
+            let bus = &bus.image.spec.name;
+            let lost = |request: &BackgroundRequest| lost_right(request, Stage::Turn, bus);
+            let refusal = queue.iter().find_map(lost);
+            if let Some(refusal) = refusal {
+                queue.remove(now, &Outcome::Refused(refusal), |request| lost(request).is_some());
+            }
             queue.remove(now, &Outcome::Offline, |r| {
                 r.drive != NO_DRIVE && !schedule.is_online(r.drive)
             });
@@ -225,7 +232,12 @@ impl Master {
         let Some(begun) = self.background.as_ref().filter(|begun| begun.expires() > now) else {
             return false;
         };
-        let Some(command) = begun.command() else { return true };
+        let bus = &self.bus.image.spec.name;
+        let command = match &begun.sending {
+            Sending::Command(command) => command,
+            // It is refused when it is chosen again.
+            Sending::Request(request) => return lost_right(request, Stage::Write, bus).is_none(),
+        };
         let facts = AtTurn::of(&self.drives, &self.bus.image.drives, now);
         let mut pending = self.bus.queue.lock();
         // A stop that came in while the line went silent.
@@ -448,4 +460,10 @@ impl Master {
             self.note_write(turn.drive, table, &items, now);
         }
     }
+}
+
+/// Why a write for a tool is not sent any more, if its client has lost the right to write to that bus.
+fn lost_right(request: &BackgroundRequest, stage: Stage, bus: &str) -> Option<Refusal> {
+    request.passed_on.as_ref().filter(|passed_on| passed_on.may_write)?;
+    client_access(stage, false, request.ticket.origin(), bus).err()
 }

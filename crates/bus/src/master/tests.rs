@@ -20,6 +20,7 @@ mod drill;
 mod hold;
 mod late_replies;
 mod pauses;
+mod rights;
 mod shutdown;
 mod stop_all;
 

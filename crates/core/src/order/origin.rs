@@ -3,6 +3,8 @@
 use std::net::IpAddr;
 use std::sync::Arc;
 
+use super::Right;
+
 /// Where a command comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum SourceKind {
@@ -144,6 +146,7 @@ pub struct Origin {
     login: Option<Arc<str>>,
     proof: Proof,
     acting: Acting,
+    right: Right,
 }
 
 impl Origin {
@@ -170,6 +173,7 @@ impl Origin {
             login: None,
             proof: Proof::Nothing,
             acting: Acting::Usual,
+            right: Right::lasting(),
         }
     }
 
@@ -199,6 +203,22 @@ impl Origin {
     /// Whether a drill gives the order.
     pub(crate) fn is_drill(&self) -> bool {
         self.acting == Acting::Drill
+    }
+
+    /// The same with that right to write.
+    pub fn with_right(mut self, right: Right) -> Origin {
+        self.right = right;
+        self
+    }
+
+    /// The same for what has begun and has to come to its end, whatever a reload takes away.
+    pub fn lasting(self) -> Origin {
+        self.with_right(Right::lasting())
+    }
+
+    /// Its right to write.
+    pub fn right(&self) -> &Right {
+        &self.right
     }
 
     /// The proof from its connection.

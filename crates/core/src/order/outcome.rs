@@ -22,6 +22,8 @@ pub enum Interruption {
     ShuttingDown,
     /// Another client took the drive.
     Taken,
+    /// A reload took the right of its client away.
+    RightLost,
 }
 
 /// How a command ended.
@@ -182,6 +184,7 @@ impl fmt::Display for Outcome {
                     Interruption::Offline => "the drive went offline",
                     Interruption::ShuttingDown => "the gateway is shutting down",
                     Interruption::Taken => "another client took the drive",
+                    Interruption::RightLost => "a reload took the right of its client away",
                 };
                 write!(
                     f,

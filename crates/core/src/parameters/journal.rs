@@ -9,7 +9,7 @@
 //! address: 1
 //! family: vacon-nx
 //! identification: none
-//! started: 2026-03-02T07:40:12Z
+//! begun: 2026-03-02T07:40:12Z
 //! by: local_socket uid 0
 //! phase: writing
 //! done: 1
@@ -424,6 +424,48 @@ pub(super) mod tests {
         );
         assert_eq!(Journal::parse(&text, &profile), Ok(journal.clone()));
         assert_eq!(Owner::parse(&text), Ok(journal.of));
+    }
+
+    #[test]
+    fn one_of_an_earlier_version_is_taken_up_by_the_drive_with_its_name() {
+        let profile = profile();
+        let folder = tempfile::tempdir().unwrap();
+        let file = JournalFile::new(folder.path(), "pump-1");
+        let earlier = Journal {
+            of: Owner {
+                machine: None,
+                bus: String::new(),
+                ..owner_at(1)
+            },
+            ..journal(vec![write(102, 5000, 10_000)])
+        };
+        let write = |of: &Owner, text: &str| file.write(of, text);
+        write(&earlier.of, &earlier.text(&profile)).unwrap();
+        for other in [
+            Owner {
+                drive: "pump-2".to_string(),
+                ..owner_at(1)
+            },
+            Owner {
+                family: "vacon-cx".to_string(),
+                ..owner_at(1)
+            },
+        ] {
+            let why = write(&other, "other").unwrap_err().to_string();
+            assert!(why.contains("`pump-1`, profile `vacon-nx`"), "{why}");
+            file.remove(&other).unwrap();
+            assert_eq!(file.read().unwrap(), Some(earlier.text(&profile)));
+        }
+        // Resumed, it says where it belongs; another machine of that name no longer takes it.
+        let taken_up = Journal {
+            of: owner_at(1),
+            ..earlier
+        };
+        write(&taken_up.of, &taken_up.text(&profile)).unwrap();
+        assert_eq!(file.read().unwrap(), Some(taken_up.text(&profile)));
+        assert!(write(&owner_at(2), "other").is_err());
+        file.remove(&taken_up.of).unwrap();
+        assert_eq!(file.read().unwrap(), None);
     }
 
     #[test]

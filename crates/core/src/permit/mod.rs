@@ -27,6 +27,7 @@ pub use holder::{
     Claim, Denial, HoldState, HoldView, Holding, KeptReservation, Mode, Principal, Rules, Told, Verb, What,
 };
 pub use judge::{Ask, Facts, Seen, Stage, Verdict};
-pub use priorities::{Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled};
+pub use priorities::{Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, VoidSlot};
 pub use reference_limits::{LastWritten, is_reference, limits_passed};
+pub use rules::access::{access, client_access};
 pub(crate) use rules::machine::refusal as meant_another;

@@ -5,11 +5,15 @@
 //! no slot; when it is accepted it withdraws what it overrules, so that nothing starts later by itself. The arrays are
 //! part of the gate of the bus, so that they and the commands have one order of acceptance.
 
+mod void;
+
 use std::sync::Arc;
 use std::time::Instant;
 
 use crate::drive::{ModelPoint, Value};
 use crate::order::{Commanded, Effect, Entry, Origin, Outcome, SlotWrite, SourceKind};
+
+pub use void::VoidSlot;
 
 /// Priorities of an array.
 pub const PRIORITIES: usize = 16;
@@ -138,16 +142,16 @@ impl Priorities {
             .get_mut(usize::from(priority).checked_sub(1)?)
     }
 
-    fn slots_mut(&mut self) -> impl Iterator<Item = (Commanded, &mut Slot)> {
+    fn slots_mut(&mut self) -> impl Iterator<Item = (Commanded, u8, &mut Slot)> {
         let arrays = self.arrays.iter_mut().flat_map(|arrays| arrays.0.iter_mut());
         Commanded::ALL
             .into_iter()
             .zip(arrays)
-            .flat_map(|(what, array)| array.iter_mut().map(move |slot| (what, slot)))
+            .flat_map(|(what, array)| (1u8..).zip(array).map(move |(priority, slot)| (what, priority, slot)))
     }
 
     fn tidy(&mut self) {
-        if self.slots_mut().all(|(_, slot)| slot.is_empty()) {
+        if self.slots_mut().all(|(.., slot)| slot.is_empty()) {
             self.arrays = None;
         }
     }
@@ -263,7 +267,7 @@ impl Priorities {
 
     /// How a write that was accepted ended, at `now`.
     pub fn settle(&mut self, id: u64, settled: Settled, now: Instant) {
-        for (_, slot) in self.slots_mut() {
+        for (.., slot) in self.slots_mut() {
             let Some(place) = slot.asked.iter().position(|(asked, _)| *asked == id) else {
                 continue;
             };
@@ -287,7 +291,7 @@ impl Priorities {
 
     /// Settles uncertain entries by readings: `reads` gives a value read since then, if there is one.
     pub fn resolve(&mut self, reads: impl Fn(Commanded, Instant) -> Option<Value>) {
-        for (what, slot) in self.slots_mut() {
+        for (what, _, slot) in self.slots_mut() {
             let Some((entry, since)) = &slot.uncertain else {
                 continue;
             };
@@ -353,20 +357,23 @@ impl Priorities {
         if origin.kind == SourceKind::Supervision {
             self.silenced();
         }
-        for (what, slot) in self.slots_mut() {
+        for (what, priority, slot) in self.slots_mut() {
+            // A start and a reference leave what protects people, also where another slot governs. A stop ends every
+            // active: nothing starts later by itself.
+            let protects = priority <= PROTECTING;
             match what {
-                Commanded::Run => {
-                    if let Some(run) = effect.run {
-                        slot.clear_if(|entry| entry.value.as_bool() != run);
-                    }
-                }
+                Commanded::Run => match effect.run {
+                    Some(true) if !protects => slot.clear_if(|entry| !entry.value.as_bool()),
+                    Some(false) => slot.clear_if(|entry| entry.value.as_bool()),
+                    Some(true) | None => {}
+                },
                 Commanded::Reverse => {
                     if let Some(reverse) = effect.reverse {
                         slot.clear_if(|entry| entry.value.as_bool() != reverse);
                     }
                 }
                 Commanded::SpeedReference | Commanded::FrequencyReference => {
-                    if effect.reference {
+                    if effect.reference && !protects {
                         slot.clear_if(|_| true);
                     }
                 }
@@ -386,7 +393,7 @@ impl Priorities {
 
     /// Empties the slots of a client.
     pub fn empty(&mut self, client: &Arc<str>) {
-        for (_, slot) in self.slots_mut() {
+        for (.., slot) in self.slots_mut() {
             slot.clear_if(|entry| entry.origin.client() == client);
         }
         self.tidy();

@@ -15,6 +15,7 @@ use crate::order::{
     Answer, Arrival, BackgroundRequest, Command, Effect, Effects, Intent, NO_DRIVE, Order, Origin, Outcome, Pace,
     PassedOn, Ticket, Touched, Window, WriteStats, written,
 };
+use crate::permit::{Stage, client_access};
 use crate::process_image::DriveImage;
 use crate::queue::Denied;
 
@@ -127,6 +128,11 @@ impl BusHandle {
             frame: sender,
         };
         if !may_write || reach.is_empty() {
+            let allowed = client_access(Stage::Accept, false, ticket.origin(), &spec.name);
+            if let (true, Err(refusal)) = (may_write, allowed) {
+                ticket.answer(Outcome::Refused(refusal), now);
+                return Exchange { answer, frame };
+            }
             let request = BackgroundRequest {
                 drive,
                 pdu: question.pdu,

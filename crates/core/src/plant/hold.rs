@@ -7,7 +7,9 @@ use crate::drive::DriveIndex;
 use crate::drive::why::{Cause, Explanation};
 use crate::event::{Event, EventKind, Events};
 use crate::order::{Asks, Authority, Command, Origin, Refusal};
-use crate::permit::{self, Claim, HoldState, HoldView, KeptReservation, Rules, Told, Unheld, Verb, What};
+use crate::permit::{
+    self, Claim, HoldState, HoldView, KeptReservation, Rules, Stage, Told, Unheld, Verb, What, client_access,
+};
 
 impl BusHandle {
     /// Whether a command of that client renews the lease of a drive.
@@ -116,6 +118,7 @@ impl DriveHandle {
 
     fn act(&self, verb: Verb, origin: &Origin, authority: Authority, now: Instant) -> Result<HoldView, Refusal> {
         permit::authority(&self.reading(now), authority)?;
+        client_access(Stage::Accept, false, origin, &self.image.spec.bus)?;
         if let (Some(why), Verb::Take | Verb::Break) = (self.image.hold.why(), verb) {
             return Err(Refusal::NotAllowed(why.to_string()));
         }

@@ -90,6 +90,11 @@ impl Background {
         self.waiting.iter().any(|request| !request.is_of_gateway())
     }
 
+    /// Those that wait, in order.
+    pub fn iter(&self) -> impl Iterator<Item = &BackgroundRequest> {
+        self.waiting.iter()
+    }
+
     /// Whether none waits.
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()

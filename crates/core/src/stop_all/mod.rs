@@ -124,7 +124,7 @@ impl StopAll {
         now: Instant,
     ) -> Result<StopOrder, NothingToStop> {
         let drives = scope.drives(plant)?;
-        let origin = &origin.clone().insisting();
+        let origin = &origin.clone().insisting().lasting();
         let (acknowledged, acknowledgement) = oneshot::channel();
         let (report, reported) = oneshot::channel();
         let mut state = self.state();

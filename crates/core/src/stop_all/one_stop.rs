@@ -50,7 +50,8 @@ impl OneStop {
         let mut stop = OneStop {
             machine,
             drive: drive.image.spec.name.clone(),
-            origin: origin.clone(),
+            // Once begun it comes to its end, whatever a reload takes away.
+            origin: origin.clone().lasting(),
             step: Step::Refused,
             failed: None,
             pause: AGAIN,

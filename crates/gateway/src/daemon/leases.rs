@@ -52,6 +52,11 @@ impl Parted {
         (leases, self.buses.iter().rev().map(|(_, bus)| bus.clone()).collect())
     }
 
+    /// The buses that reloads have stopped, as far as they are still known.
+    pub(super) fn buses(&self) -> impl Iterator<Item = &BusHandle> {
+        self.buses.iter().map(|(_, bus)| bus)
+    }
+
     /// After it: what no bus continued, and the buses that were stopped.
     pub(super) fn keep(&mut self, leases: &Leases, stopped: &[BusHandle], now: Instant) {
         self.leases.clone_from(&leases.parted);

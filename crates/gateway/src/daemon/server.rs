@@ -69,6 +69,13 @@ impl<S: Server> ServerSlot<S> {
         Ok(())
     }
 
+    /// A reload is about to make the server run as configured: ends the rights of its clients that they do not have then.
+    pub(super) fn end_rights(&self, configured: Option<&S::Options>) {
+        if let Some(running) = self.0.as_ref().filter(|running| Some(&running.options) != configured) {
+            running.server.end_rights(configured);
+        }
+    }
+
     /// Stops the server if it runs.
     pub(super) async fn stop(&mut self) {
         if let Some(running) = self.0.take() {

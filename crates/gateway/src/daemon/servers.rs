@@ -3,7 +3,7 @@
 use super::Daemon;
 use super::server::Prepared;
 use crate::config::Settings;
-use crate::north::{ServerError, bacnet, http, local, modbus_tcp, slot};
+use crate::north::{ServerError, bacnet, http, modbus_tcp, slot};
 
 /// The servers that listen on the network, prepared.
 #[derive(Default)]
@@ -65,10 +65,7 @@ impl Daemon {
     /// Opens the local socket if one is configured. The gateway runs without it if it cannot be opened; a reload tries
     /// again.
     pub(super) async fn apply_local(&mut self, settings: &Settings) {
-        let options = (settings.socket != local::SocketPath::Off).then(|| local::Options {
-            socket: settings.socket.clone(),
-            control: self.control.clone(),
-        });
+        let options = self.local_options(settings);
         if let Err(error) = self.local.apply(options.as_ref(), &self.plant, &self.north).await {
             tracing::warn!(
                 target: "drivegate::local",

@@ -9,6 +9,7 @@ use std::time::Instant;
 use drivegate_bacnet::{Application as _, Options as ServerOptions, Server};
 
 use super::Options;
+use super::rights::HostRights;
 use super::view::View;
 use super::writes::{self, Begun, Waiting};
 use crate::command::{Outcome, Settled};
@@ -75,8 +76,8 @@ fn server_of((address, prefix): At, view: &View, now: Instant) -> Server {
 }
 
 impl Desk {
-    pub(super) fn new(options: Arc<Options>, plant: SharedPlant, at: At, now: Instant) -> Desk {
-        let view = View::new(plant.load_full(), options);
+    pub(super) fn new(options: Arc<Options>, rights: HostRights, plant: SharedPlant, at: At, now: Instant) -> Desk {
+        let view = View::new(plant.load_full(), options, rights);
         Desk {
             server: server_of(at, &view, now),
             plant,
@@ -112,7 +113,7 @@ impl Desk {
 
     /// Shows the plant as it is now, with these options.
     pub(super) fn see(&mut self, options: Arc<Options>) {
-        self.view = View::new(self.plant.load_full(), options);
+        self.view = View::new(self.plant.load_full(), options, self.view.rights.clone());
         self.server.set_devices(self.view.devices());
     }
 

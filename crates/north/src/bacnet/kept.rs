@@ -1,22 +1,32 @@
 //! State kept across a restart with `keep_priorities`: inactives of `run` at the priorities that protect people. They
 //! refuse starts as before; nothing is written to a drive.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant, SystemTime};
 
+use futures_util::FutureExt as _;
 use serde::{Deserialize, Serialize};
+use tokio::task::JoinHandle;
 
+use super::rights::HostRights;
+use crate::NorthState;
 use crate::command::{Commanded, Entry, Origin, PROTECTING, SourceKind};
 use crate::drive::Value;
+use crate::event::{Event, EventKind, Events};
 use crate::files;
-use crate::plant::Plant;
+use crate::plant::{BusHandle, Plant};
 use crate::process_image::{Access, Machine};
 
 /// The name of the file in `state_dir`.
 pub(super) const FILE: &str = "bacnet-priorities.json";
 /// Longest file that is read.
 const LONGEST: u64 = 4 << 20;
+/// Time between two tries to write the file.
+const AGAIN: Duration = Duration::from_secs(10);
+/// Longest wait for the disk at the start, and at the end.
+const DISK: Duration = Duration::from_secs(2);
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct KeptSlot {
@@ -46,14 +56,15 @@ pub(super) fn of_plant(plant: &Plant) -> Vec<KeptSlot> {
     all
 }
 
-/// Puts them into their slots again, those of drives that are there.
-pub(super) fn restore(plant: &Plant, slots: &[KeptSlot], now: Instant) {
+/// Puts them into their slots again. Those whose client may no longer write, or whose drive is gone, are void.
+pub(super) fn restore(plant: &Plant, rights: &HostRights, slots: &[KeptSlot], now: Instant, time: SystemTime) {
     for slot in slots.iter().filter(|slot| (1..=PROTECTING).contains(&slot.priority)) {
-        let drive = plant.drive_at(&slot.machine);
-        let Some(drive) = drive.filter(|drive| drive.image.spec.access == Access::Control) else {
+        let Some(drive) = plant.drive_at(&slot.machine) else {
+            plant.events.publish(slot.void(time));
             continue;
         };
         let origin = Origin::of(Arc::from(slot.client.as_str()), SourceKind::Bacnet, slot.who.clone());
+        let origin = origin.with_right(rights.of_name(&slot.who));
         drive.priorities(|all| {
             if all.stands(Commanded::Run, slot.priority).is_none() {
                 all.restore(
@@ -63,6 +74,21 @@ pub(super) fn restore(plant: &Plant, slots: &[KeptSlot], now: Instant) {
                 );
             }
         });
+    }
+    let void = |bus: &BusHandle| bus.void_slots(Some(&plant.events), time);
+    plant.buses.iter().for_each(void);
+}
+
+impl KeptSlot {
+    /// The event for one that is not taken up.
+    fn void(&self, time: SystemTime) -> Event {
+        let Machine { port, address, .. } = &self.machine;
+        let text = format!(
+            "BACnet client {} held `run` inactive at priority {} of the drive at address {address} on {port} before the \
+             restart; as the gateway is configured now it may not, so that slot is void",
+            self.who, self.priority
+        );
+        Event::new(EventKind::SlotVoid, time, text)
     }
 }
 
@@ -81,9 +107,113 @@ pub(super) fn load(path: &Path) -> Result<Vec<KeptSlot>, String> {
 ///
 /// # Errors
 /// It cannot be written.
-pub(super) fn save(path: &Path, slots: &[KeptSlot]) -> Result<(), String> {
+fn save(path: &Path, slots: &[KeptSlot]) -> Result<(), String> {
     let text = serde_json::to_vec_pretty(slots).map_err(|error| error.to_string())?;
     files::replace(path, &text).map_err(|error| error.to_string())
+}
+
+fn remove(path: &Path) -> Result<(), String> {
+    match std::fs::remove_file(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error.to_string()),
+        _ => Ok(()),
+    }
+}
+
+/// At the start of a gateway that keeps no slots: those of an earlier run are void. No later configuration revives them.
+pub async fn discard(stats: &NorthState, state_dir: &Path, events: &Events) {
+    stats.kept_slots_read.store(true, Ordering::Relaxed);
+    let (path, events) = (state_dir.join(FILE), events.clone());
+    let discard = move || {
+        for slot in load(&path).unwrap_or_default() {
+            events.publish(slot.void(SystemTime::now()));
+        }
+        if let Err(why) = remove(&path) {
+            tracing::error!(
+                target: "drivegate::bacnet",
+                "cannot remove {}: {why}; remove it, or its slots come back with keep_priorities", path.display()
+            );
+        }
+    };
+    // On a slow disk it is done later.
+    let _ = tokio::time::timeout(DISK, tokio::task::spawn_blocking(discard)).await;
+}
+
+/// Slots, and the file that has them.
+type Kept = (PathBuf, Vec<KeptSlot>);
+
+/// The file as a server keeps it up to date, one write behind the other.
+#[derive(Debug, Default)]
+pub(super) struct KeptFile {
+    /// What is known to be on disk, and where.
+    written: Option<Kept>,
+    writing: Option<JoinHandle<Result<Option<Kept>, String>>>,
+    /// When a write that failed is tried again.
+    again: Option<Instant>,
+}
+
+impl KeptFile {
+    /// It was read.
+    pub(super) fn read(&mut self, path: PathBuf, slots: Vec<KeptSlot>) {
+        self.written = Some((path, slots));
+    }
+
+    /// Writes these slots to `path` if they are not there; without `path` what was kept is removed.
+    pub(super) fn keep(&mut self, path: Option<PathBuf>, plant: &Plant, now: Instant) {
+        if let Some(done) = self.writing.take_if(|writing| writing.is_finished()) {
+            match done.now_or_never() {
+                Some(Ok(Ok(written))) => (self.written, self.again) = (written, None),
+                Some(Ok(Err(why))) => self.failed(&why, now),
+                // A thread that panicked has logged that.
+                _ => self.again = Some(now + AGAIN),
+            }
+        }
+        if self.writing.is_some() || self.again.is_some_and(|again| now < again) {
+            return;
+        }
+        let wanted = path.map(|path| (path, of_plant(plant)));
+        if wanted == self.written {
+            return;
+        }
+        let before = self.written.as_ref().map(|(path, _)| path.clone());
+        self.writing = Some(tokio::task::spawn_blocking(move || {
+            let path = wanted.as_ref().map(|(path, _)| path);
+            if let Some(outdated) = before.as_ref().filter(|before| Some(*before) != path) {
+                remove(outdated)?;
+            }
+            if let Some((path, slots)) = &wanted {
+                save(path, slots)?;
+            }
+            Ok(wanted)
+        }));
+    }
+
+    fn failed(&mut self, why: &str, now: Instant) {
+        if self.again.replace(now + AGAIN).is_none() {
+            tracing::error!(
+                target: "drivegate::bacnet",
+                "cannot keep {FILE} up to date: {why}; slots may not survive a restart; retrying every {} s",
+                AGAIN.as_secs()
+            );
+        }
+    }
+
+    /// Writes it once more and waits for that, for the time that a disk may take.
+    pub(super) async fn finish(&mut self, path: Option<PathBuf>, plant: &Plant) {
+        let until = tokio::time::Instant::now() + DISK;
+        loop {
+            if let Some(writing) = self.writing.take() {
+                match tokio::time::timeout_at(until, writing).await {
+                    Ok(Ok(Ok(written))) => self.written = written,
+                    _ => return,
+                }
+            }
+            self.again = None;
+            self.keep(path.clone(), plant, Instant::now());
+            if self.writing.is_none() {
+                return;
+            }
+        }
+    }
 }
 
 #[cfg(test)]

@@ -10,6 +10,7 @@ mod kept;
 pub mod listing;
 pub mod objects;
 mod offline;
+mod rights;
 mod sockets;
 mod task;
 mod units;
@@ -19,7 +20,7 @@ mod writes;
 #[cfg(test)]
 mod tests;
 
-use std::net::{SocketAddr, SocketAddrV4};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -29,8 +30,10 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+pub use self::kept::discard as discard_kept_slots;
 pub use self::offline::Offline;
 
+use self::rights::HostRights;
 use self::sockets::Sockets;
 use self::task::{Task, ToTask};
 use super::{NorthState, ServerError, ServerKind};
@@ -111,6 +114,18 @@ impl Options {
             .is_none_or(|buses| buses.iter().any(|name| name == bus))
     }
 
+    /// Whether that host may ask.
+    fn admits(&self, host: Ipv4Addr) -> bool {
+        let host = IpAddr::V4(host);
+        self.allow.iter().any(|network| network.contains(&host))
+    }
+
+    /// Whether that host may write.
+    fn may_write(&self, host: Ipv4Addr) -> bool {
+        let writes = || self.write.iter().any(|network| network.contains(&IpAddr::V4(host)));
+        self.commands && self.admits(host) && writes()
+    }
+
     /// Files that the server has open.
     pub fn files(&self) -> usize {
         3
@@ -129,6 +144,7 @@ pub struct Server {
     options: Options,
     address: SocketAddr,
     to_task: mpsc::UnboundedSender<ToTask>,
+    rights: HostRights,
     busy: Arc<AtomicBool>,
     stats: Arc<NorthState>,
     _state: ListenerState,
@@ -168,13 +184,21 @@ impl server::Server for Server {
         tracing::info!(target: "drivegate::bacnet", %address, network = options.network, device = options.device, "BACnet/IP: listening");
         let (to_task, from_server) = mpsc::unbounded_channel();
         let (busy, tasks) = (Arc::new(AtomicBool::new(false)), TaskTracker::new());
-        let task = Task::new(options.clone(), sockets, plant, stats.clone(), busy.clone());
+        let rights = HostRights::new(&options);
+        let task = Task::new(
+            options.clone(),
+            (sockets, rights.clone()),
+            plant,
+            stats.clone(),
+            busy.clone(),
+        );
         tasks.spawn(task.run(from_server, cancel));
         tasks.close();
         Ok(Server {
             options,
             address,
             to_task,
+            rights,
             busy,
             _state: stats.listeners.add(ServerKind::Bacnet, address),
             stats,
@@ -214,6 +238,8 @@ impl Reconfigure for Server {
             self.address = SocketAddr::V4(sockets.address);
             self._state = self.stats.listeners.add(ServerKind::Bacnet, self.address);
         }
+        // Before the task knows of it: what is under way is judged by it at once.
+        self.rights.set(Some(&options));
         self.options = options.clone();
         // A task that has ended ends with the process.
         let _ = self.to_task.send(ToTask::Apply(Box::new(options), sockets));
@@ -221,6 +247,7 @@ impl Reconfigure for Server {
 
     /// Accepts no more requests; those in progress complete.
     async fn retire(&mut self) {
+        self.rights.set(None);
         let _ = self.to_task.send(ToTask::Retire);
     }
 

@@ -8,6 +8,7 @@ use drivegate_bacnet::To;
 
 use super::Options;
 use super::desk::{Desk, Ended};
+use super::rights::HostRights;
 use super::writes::Waiting;
 use crate::plant::SharedPlant;
 
@@ -23,7 +24,7 @@ impl Offline {
     /// A server at the address of `options`, on a network with a mask of 8 bits.
     pub fn new(options: Options, plant: SharedPlant, now: Instant) -> Offline {
         let (options, at) = (Arc::new(options.clone()), (options.listen, 8));
-        let mut desk = Desk::new(options.clone(), plant, at, now);
+        let mut desk = Desk::new(options.clone(), HostRights::new(&options), plant, at, now);
         desk.start(now);
         Offline {
             options,

@@ -18,13 +18,15 @@ use tokio::time::{MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
 use super::desk::{Desk, Ended};
-use super::kept::{self, KeptSlot};
+use super::kept::{self, KeptFile};
+use super::rights::HostRights;
 use super::sockets::Sockets;
 use super::writes::Waiting;
 use super::{NorthState, Options};
 use crate::command::Commanded;
 use crate::drive::ModelPoint;
 use crate::event::{Event, EventKind};
+use crate::files;
 use crate::plant::SharedPlant;
 use crate::process_image::Snapshot;
 use crate::reading::{Reader, is_readable};
@@ -65,7 +67,7 @@ pub(super) struct Task {
     news: Arc<Notify>,
     /// The last snapshot of each drive with subscriptions.
     seen: HashMap<u32, Arc<Snapshot>>,
-    kept: Vec<KeptSlot>,
+    kept: KeptFile,
     /// Devices with a slot of before the restart against which the motor may run.
     watched: BTreeSet<u32>,
     resolved: Option<Instant>,
@@ -77,13 +79,13 @@ pub(super) struct Task {
 impl Task {
     pub(super) fn new(
         options: Options,
-        sockets: Sockets,
+        (sockets, rights): (Sockets, HostRights),
         plant: SharedPlant,
         stats: Arc<NorthState>,
         busy: Arc<AtomicBool>,
     ) -> Task {
         let options = Arc::new(options);
-        let desk = Desk::new(options.clone(), plant, sockets.place(), Instant::now());
+        let desk = Desk::new(options.clone(), rights, plant, sockets.place(), Instant::now());
         Task {
             options,
             sockets,
@@ -94,7 +96,7 @@ impl Task {
             writes: FuturesUnordered::new(),
             news: Arc::default(),
             seen: HashMap::new(),
-            kept: Vec::new(),
+            kept: KeptFile::default(),
             watched: BTreeSet::new(),
             resolved: None,
             lookup: None,
@@ -137,7 +139,8 @@ impl Task {
             self.take_up_jobs();
         }
         self.answer_what_was_begun().await;
-        self.save().await;
+        let (path, plant) = (self.keep_file(), self.desk.newest_plant());
+        self.kept.finish(path, &plant).await;
         self.stats.bacnet.set(None);
     }
 
@@ -211,7 +214,8 @@ impl Task {
         }));
         self.find_bbmd(now);
         self.take_bbmd(now);
-        self.keep();
+        let path = self.keep_file();
+        self.kept.keep(path, &self.desk.view.plant, now);
     }
 
     /// Shows another plant, or the same with other options.
@@ -243,53 +247,38 @@ impl Task {
         }
     }
 
+    /// Where slots are kept; none where they are not, or a reload takes the server away and with it what they were for.
     fn keep_file(&self) -> Option<std::path::PathBuf> {
-        self.options
-            .keep_priorities
-            .then(|| self.options.state_dir.join(kept::FILE))
+        let keeps = self.options.keep_priorities && self.desk.view.rights.are_there();
+        keeps.then(|| self.options.state_dir.join(kept::FILE))
     }
 
+    /// Takes up the slots of before the start. A server that a reload starts takes up none: they were void before.
     fn load(&mut self) {
         let Some(path) = self.keep_file() else { return };
+        if self.stats.kept_slots_read.swap(true, Ordering::Relaxed) {
+            return;
+        }
         match kept::load(&path) {
             Ok(slots) => {
-                kept::restore(&self.desk.view.plant, &slots, Instant::now());
-                self.kept = kept::of_plant(&self.desk.view.plant);
+                let view = &self.desk.view;
+                kept::restore(&view.plant, &view.rights, &slots, Instant::now(), SystemTime::now());
+                self.kept.read(path, slots);
                 let protected = |device: &u32| {
                     let drive = self.desk.view.drives.get(device);
                     drive.is_some_and(|drive| drive.handle.priorities(|all| all.kept().next().is_some()))
                 };
                 self.watched = self.desk.view.drives.keys().copied().filter(protected).collect();
             }
-            Err(why) => tracing::error!(
-                target: "drivegate::bacnet",
-                "cannot read {}: {why}; the slots from before the restart are lost; write them again, or remove the \
-                 file", path.display()
-            ),
+            Err(why) => {
+                let aside = files::set_aside(&path, &path.with_extension("damaged"));
+                tracing::error!(
+                    target: "drivegate::bacnet",
+                    "cannot read {}: {why}; the slots from before the restart are lost, write them again; {aside}",
+                    path.display()
+                );
+            }
         }
-    }
-
-    /// Saves the kept state if it changed.
-    fn keep(&mut self) {
-        let Some(path) = self.keep_file() else { return };
-        let slots = kept::of_plant(&self.desk.view.plant);
-        if slots != self.kept {
-            self.kept.clone_from(&slots);
-            tokio::task::spawn_blocking(move || {
-                if let Err(why) = kept::save(&path, &slots) {
-                    tracing::error!(
-                        target: "drivegate::bacnet", "cannot write {}: {why}; slots will not survive a restart", path.display()
-                    );
-                }
-            });
-        }
-    }
-
-    async fn save(&mut self) {
-        let Some(path) = self.keep_file() else { return };
-        let slots = kept::of_plant(&self.desk.newest_plant());
-        // A thread that panicked has logged that.
-        let _ = tokio::task::spawn_blocking(move || kept::save(&path, &slots)).await;
     }
 
     /// Raises an event if a motor runs against a slot from before the restart.

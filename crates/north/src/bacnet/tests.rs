@@ -30,7 +30,7 @@ fn spec(name: &str) -> DriveSpec {
     }
 }
 
-fn options() -> Options {
+pub(super) fn options() -> Options {
     let everywhere = || vec!["127.0.0.0/8".parse().unwrap()];
     Options {
         listen: "127.0.0.1:0".parse().unwrap(),
@@ -62,7 +62,7 @@ impl ControlledDrive {
             .update_health(|health| (health.up, health.tried) = (true, true));
         let plant = Plant::new("hall", STALE_AFTER, vec![bus]);
         let rig = ControlledDrive {
-            view: View::new(Arc::new(plant), Arc::new(options())),
+            view: View::new(Arc::new(plant), Arc::new(options()), HostRights::new(&options())),
             now: Instant::now(),
         };
         rig.read(0);

@@ -2,7 +2,7 @@
 
 use std::cell::Cell;
 use std::collections::HashMap;
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -14,6 +14,7 @@ use drivegate_bacnet::{
 use subtle::ConstantTimeEq as _;
 
 use super::objects::{self, Meaning, Shown};
+use super::rights::HostRights;
 use super::{Options, WhenOffline};
 use crate::codec::Table;
 use crate::command::{self, Commanded, Entry, Origin, Priorities, Refusal, SourceKind};
@@ -35,6 +36,7 @@ pub(super) struct ShownDrive {
 pub(super) struct View {
     pub(super) plant: Arc<Plant>,
     pub(super) options: Arc<Options>,
+    pub(super) rights: HostRights,
     gateway: Shown,
     pub(super) drives: HashMap<u32, ShownDrive>,
     buses: Vec<BusHandle>,
@@ -43,7 +45,7 @@ pub(super) struct View {
 }
 
 impl View {
-    pub(super) fn new(plant: Arc<Plant>, options: Arc<Options>) -> View {
+    pub(super) fn new(plant: Arc<Plant>, options: Arc<Options>, rights: HostRights) -> View {
         let name = plant.gateway.clone();
         let gateway = (name.as_str(), options.device);
         let is_served = |bus: &BusHandle| options.serves(&bus.image.spec.name);
@@ -61,6 +63,7 @@ impl View {
             buses,
             plant,
             options,
+            rights,
             now: Cell::new((Instant::now(), SystemTime::now())),
         }
     }
@@ -264,13 +267,11 @@ fn governed(reading: &Reading<'_>, all: &Priorities, what: Commanded, index: Poi
 
 impl Application for View {
     fn admits(&self, host: Ipv4Addr) -> bool {
-        let host = IpAddr::V4(host);
-        self.options.allow.iter().any(|network| network.contains(&host))
+        self.options.admits(host)
     }
 
     fn may_write(&self, host: Ipv4Addr) -> bool {
-        let host = IpAddr::V4(host);
-        self.options.commands && self.options.write.iter().any(|network| network.contains(&host))
+        self.options.may_write(host)
     }
 
     fn clock(&self) -> DateTime {
@@ -344,7 +345,7 @@ impl Application for View {
         // Its answer says no more than that.
         drive
             .handle
-            .refuse(&what, refusal, super::writes::origin(from, None), now);
+            .refuse(&what, refusal, super::writes::origin(&self.rights, from, None), now);
     }
 
     fn stops(&self, device: u32, write: &WriteItem) -> bool {

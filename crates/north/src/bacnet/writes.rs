@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use drivegate_bacnet::{Address, Datum, Error, Job};
 
 use super::objects::Meaning;
+use super::rights::HostRights;
 use super::view::View;
 use crate::command::{
     self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite,
@@ -13,6 +14,7 @@ use crate::command::{
 };
 use crate::drive::{PointIndex, Value};
 use crate::order::Arrival;
+use crate::permit::{Stage, client_access};
 use crate::plant::{DriveHandle, OrderRequest, Placed};
 use crate::process_image::Machine;
 
@@ -39,13 +41,14 @@ pub(super) struct Waiting {
 }
 
 /// The client, whatever port it uses.
-pub(super) fn origin(from: &Address, priority: Option<u8>) -> Origin {
+pub(super) fn origin(rights: &HostRights, from: &Address, priority: Option<u8>) -> Origin {
     let client = match &from.remote {
         None => format!("bacnet {}", from.ip()),
         Some(_) => format!("bacnet {} behind {}", from.remote_text(), from.ip()),
     };
     let proof = Proof::Bacnet(from.ip().into(), priority.unwrap_or(LOWEST));
-    Origin::of(Arc::from(client), SourceKind::Bacnet, from.to_string()).proven(proof)
+    let origin = Origin::of(Arc::from(client), SourceKind::Bacnet, from.to_string());
+    origin.proven(proof).with_right(rights.of(from))
 }
 
 /// Takes up a write whose request came so.
@@ -53,8 +56,13 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> B
     let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
         return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
     };
-    let origin = origin(&job.from, job.priority);
+    let origin = origin(&view.rights, &job.from, job.priority);
     let expiry = expiry(job);
+    // A reload may have come since the request was received, or between two of its writes.
+    if let Err(refusal) = client_access(Stage::Accept, false, &origin, &handle.image.spec.bus) {
+        handle.refuse(&described(job), refusal, origin, now);
+        return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
+    }
     match (meaning, &job.value) {
         (Meaning::Point(index), Some(value)) => match value_of(value) {
             Some(value) => {

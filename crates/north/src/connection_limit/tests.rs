@@ -257,3 +257,26 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn who_is_closed_for_its_right_has_none_and_who_yields_keeps_it() {
+    let mut places = LimitedPlaces::new(Limits::new(8, 8));
+    let permits: Vec<ConnectionPermit> = (1..=4).map(|n| places.operator(n).unwrap().0).collect();
+    let rights: Vec<Rights> = permits.iter().map(|permit| permit.place().rights().clone()).collect();
+    let may_write = || {
+        rights
+            .iter()
+            .map(|rights| rights.authority() == Authority::Write)
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(may_write(), [true; 4]);
+    permits[0].place().close(CloseReason::CertificateRefused);
+    permits[1].place().close(CloseReason::Displaced);
+    let judge = |place: &ConnectionPlace| match place.address() {
+        address if address == host(3) => None,
+        address if address == host(4) => Some(Authority::ReadOnly),
+        _ => Some(place.rights().authority()),
+    };
+    places.limit.review(0, judge);
+    assert_eq!(may_write(), [false, true, false, false]);
+}

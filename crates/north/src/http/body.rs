@@ -14,15 +14,15 @@ use crate::command_json::MAX_PAYLOAD;
 /// Time limit for the body of a request, from its head on.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// A body of at most so many bytes, as an argument of a handler.
-pub(super) struct Payload<const MOST_BYTES: usize = MAX_PAYLOAD>(pub(super) Bytes);
+/// A body, as an argument of a handler.
+pub(super) struct Payload(pub(super) Bytes);
 
-impl<S: Sync, const MOST_BYTES: usize> FromRequest<S> for Payload<MOST_BYTES> {
+impl<S: Sync> FromRequest<S> for Payload {
     type Rejection = Refused;
 
-    async fn from_request(request: Request, _: &S) -> Replied<Payload<MOST_BYTES>> {
+    async fn from_request(request: Request, _: &S) -> Replied<Payload> {
         let (parts, body) = request.into_parts();
-        Ok(Payload(read(body, &Reached::of(&parts)?, MOST_BYTES).await?))
+        Ok(Payload(read(body, &Reached::of(&parts)?, MAX_PAYLOAD).await?))
     }
 }
 

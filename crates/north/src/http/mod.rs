@@ -160,6 +160,11 @@ impl TcpService<Options> for HttpService {
             (handler, Handle::current())
         });
     }
+
+    /// Without the server nobody commands by it, requests that are still coming in included.
+    fn retire(&mut self) {
+        self.operating.set_users(None);
+    }
 }
 
 /// Serves the connections of a listener.

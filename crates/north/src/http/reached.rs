@@ -10,7 +10,7 @@ use super::access::Access;
 use super::hosts::Hosts;
 use super::limits::{HEAD_TIMEOUT, HEALTH_HEAD_TIMEOUT};
 use super::replies::Replied;
-use crate::command::{Proof, SourceKind};
+use crate::command::{Proof, Right, SourceKind};
 use crate::connection_limit::ConnectionPlace;
 use crate::local::control::Control;
 use crate::log_throttle::LogThrottle;
@@ -49,6 +49,8 @@ pub(crate) struct LocalUser {
     pub(crate) who: Arc<str>,
     /// The proof from its connection.
     pub(crate) proof: Proof,
+    /// Its right to write.
+    pub(crate) right: Right,
     /// The gateway itself, where that has a configuration file.
     pub(crate) control: Option<Control>,
 }

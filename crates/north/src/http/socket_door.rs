@@ -21,7 +21,7 @@ use super::operating::Operating;
 use super::reached::{Client, Coverage, LocalUser, Reached};
 use super::routes;
 use crate::NorthState;
-use crate::command::{Authority, Proof, SourceKind};
+use crate::command::{Authority, Proof, Right, SourceKind};
 use crate::connection_limit::{ConnectionLimit, ConnectionPlace, Limits, Newcomer};
 use crate::plant::SharedPlant;
 use crate::reading::{Dated, Reader};
@@ -103,6 +103,7 @@ impl InProcess {
             who: who.into(),
             // Anyone who may open the port holds it as anyone who opens the socket does.
             proof: Proof::Uid(rustix::process::geteuid().as_raw()),
+            right: Right::lasting(),
             control: None,
         };
         InProcess {

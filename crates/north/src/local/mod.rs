@@ -11,6 +11,7 @@ mod path;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use futures_util::FutureExt;
@@ -21,7 +22,7 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use self::path::Bound;
-use crate::command::{Authority, Proof, SourceKind};
+use crate::command::{Authority, Proof, Right, SourceKind};
 use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Limits, Newcomer};
 use crate::http::{LocalUser, SocketDoor};
 use crate::plant::SharedPlant;
@@ -55,12 +56,15 @@ pub struct Options {
 struct Door {
     http: SocketDoor,
     control: Option<Control>,
+    right: Arc<AtomicBool>,
 }
 
 /// The running server.
 #[derive(Debug)]
 pub struct Local {
     path: PathBuf,
+    /// Whether those who reached it may still write.
+    right: Arc<AtomicBool>,
     task: JoinHandle<()>,
 }
 
@@ -91,13 +95,20 @@ impl server::Server for Local {
             .await
             .map_err(|cause| ServerError::Local { path: first, cause })?;
         let path = bound.path.clone();
+        let right = Arc::new(AtomicBool::new(true));
         let door = Arc::new(Door {
+            right: right.clone(),
             http: SocketDoor::new(&plant, &stats, cancel.clone()),
             control: options.control,
         });
         tracing::info!(target: "drivegate::local", path = %path.display(), "local socket: listening");
         let task = tokio::spawn(accept(bound, door, cancel));
-        Ok(Local { path, task })
+        Ok(Local { path, right, task })
+    }
+
+    /// Its file says who may command, and is there no more: another one may be open to others.
+    fn end_rights(&self, _: Option<&Options>) {
+        self.right.store(false, Ordering::Release);
     }
 
     /// Its file is removed; a request that is being carried out gets its response from the bus.
@@ -178,6 +189,7 @@ async fn serve(stream: Dated<UnixStream>, door: Arc<Door>, permit: ConnectionPer
                 kind: SourceKind::LocalSocket,
                 who: format!("uid {}", peer.uid()).into(),
                 proof: Proof::Uid(peer.uid()),
+                right: Right::of(door.right.clone()),
                 control: door.control.clone(),
             };
             door.http.serve((stream, reader), user, place).await;

@@ -18,7 +18,7 @@ use super::frame::NotModbus;
 use super::routes::PlantView;
 use super::session::ClientSession;
 use super::tls::{AuthenticatedClient, Role, TlsAuthenticator};
-use super::{ServerState, connection};
+use super::{Listener, ServerState, connection};
 use crate::ConnectionRefusal;
 use crate::command::Authority;
 use crate::connection_limit::{
@@ -99,6 +99,20 @@ impl ConnectionHandler for Admission {
             WriteAccess::ByAddress(_) => self.acquire(&self.state.connections, client, remedy, judge),
             WriteAccess::ByCertificate(_) => self.acquire(&self.state.handshakes, client, handshake_remedy, judge),
         }
+    }
+
+    fn retire(&self) {
+        let options = self.state.options.load();
+        let write = &self.policy.load().write;
+        self.state
+            .connections
+            .review(self.listener, |place| match (write, &options.tls) {
+                (WriteAccess::ByAddress(_), _) => authority_of(&options.listeners, place.address()),
+                (WriteAccess::ByCertificate(_), Some(tls)) => {
+                    contains(&tls.allow, place.address()).then(|| place.rights().authority())
+                }
+                (WriteAccess::ByCertificate(_), None) => None,
+            });
     }
 
     async fn serve(self: Arc<Self>, stream: Dated<TcpStream>, peer: SocketAddr, permit: ConnectionPermit) {
@@ -195,6 +209,7 @@ impl Admission {
             connection::close(&mut stream).await;
             return;
         };
+        client.certificate.watch(permit.place().rights());
         let refused = pin!(client.certificate.refused());
         let served = pin!(self.serve_client((stream, reader), peer, Some(&client.name), &permit));
         if let Either::Left(((), served)) = select(refused, served).await {
@@ -250,6 +265,17 @@ fn handshake_remedy(_: LimitReached) -> String {
     "their TLS handshakes are not complete; they have 10 s for them".to_string()
 }
 
+/// The most that any of the listeners allows that address; `None` if it may connect to none.
+fn authority_of(listeners: &[Listener], address: IpAddr) -> Option<Authority> {
+    let mut of = listeners.iter().filter(|listener| contains(&listener.allow, address));
+    let first = of.next()?;
+    let writes = |listener: &Listener| contains(&listener.write, address);
+    Some(match writes(first) || of.any(writes) {
+        true => Authority::Write,
+        false => Authority::ReadOnly,
+    })
+}
+
 fn contains(networks: &[IpNet], address: IpAddr) -> bool {
     networks.iter().any(|network| network.contains(&address))
 }
@@ -290,6 +316,36 @@ mod tests {
         assert_eq!(sockopt::tcp_keepintvl(&accepted).unwrap(), Duration::from_secs(10));
         assert_eq!(sockopt::tcp_keepcnt(&accepted).unwrap(), 3);
         drop(client);
+    }
+
+    #[test]
+    fn who_loses_its_listener_keeps_what_another_one_allows() {
+        let listener = |allow: &[&str], write: &[&str]| {
+            let networks = |all: &[&str]| all.iter().map(|text| text.parse().unwrap()).collect();
+            Listener {
+                section: String::new(),
+                listen: Vec::new(),
+                allow: networks(allow),
+                write: networks(write),
+                buses: None,
+            }
+        };
+        let address = "10.0.0.5".parse().unwrap();
+        let (all, own, other) = (&["10.0.0.0/8"][..], &["10.0.0.5/32"][..], &["10.0.0.6/32"][..]);
+        let table = [
+            (vec![], None),
+            (vec![listener(other, own)], None),
+            (vec![listener(all, other)], Some(Authority::ReadOnly)),
+            (vec![listener(all, own)], Some(Authority::Write)),
+            (vec![listener(all, other), listener(all, own)], Some(Authority::Write)),
+            (
+                vec![listener(all, other), listener(other, own)],
+                Some(Authority::ReadOnly),
+            ),
+        ];
+        for (listeners, expected) in table {
+            assert_eq!(authority_of(&listeners, address), expected, "{listeners:?}");
+        }
     }
 
     #[test]

@@ -3,7 +3,8 @@
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use crate::command::{Origin, Proof, SourceKind};
+use super::routes::PlantView;
+use crate::command::{Authority, Grants, Origin, Proof, Right, SourceKind};
 use crate::connection_limit::Rights;
 
 /// A connected client.
@@ -15,6 +16,20 @@ pub(super) struct Client {
     /// The same without the port: all connections of a client share it.
     client: Arc<str>,
     proof: Proof,
+    right: Right,
+}
+
+/// What a client may write to: as its address or certificate allows, on the buses that its listener shows.
+#[derive(Debug)]
+struct ClientRight {
+    rights: Rights,
+    view: Arc<PlantView>,
+}
+
+impl Grants for ClientRight {
+    fn may_write(&self, bus: &str) -> bool {
+        self.rights.authority() == Authority::Write && self.view.shows(bus)
+    }
 }
 
 impl Client {
@@ -33,19 +48,29 @@ impl Client {
                 Some(name) => Proof::Certificate(name.into(), ip),
                 None => Proof::Address(ip),
             },
+            right: Right::lasting(),
         }
+    }
+
+    /// The same at a listener with that view.
+    pub(super) fn seeing(mut self, view: &Arc<PlantView>) -> Client {
+        self.right = Right::of(Arc::new(ClientRight {
+            rights: self.rights.clone(),
+            view: view.clone(),
+        }));
+        self
     }
 
     /// The origin of its commands.
     pub(super) fn origin(&self) -> Origin {
-        Origin::of(self.client.clone(), SourceKind::ModbusTcp, self.who.as_str()).proven(self.proof.clone())
+        let origin = Origin::of(self.client.clone(), SourceKind::ModbusTcp, self.who.as_str());
+        origin.proven(self.proof.clone()).with_right(self.right.clone())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::command::Authority;
 
     #[test]
     fn the_connections_of_a_client_share_its_name() {

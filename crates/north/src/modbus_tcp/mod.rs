@@ -265,6 +265,16 @@ impl TcpService<Options> for ModbusTcp {
             (admission, runtime)
         });
     }
+
+    /// Without the server nobody commands by it.
+    fn retire(&mut self) {
+        let options = self.state.options.load_full();
+        self.state.options.store(Arc::new(Options {
+            listeners: Vec::new(),
+            tls: None,
+            ..(*options).clone()
+        }));
+    }
 }
 
 /// The state shared by all connections.

@@ -10,6 +10,8 @@ use tokio_util::sync::CancellationToken;
 
 use super::tls::{Requirements, Role};
 use crate::certificate;
+use crate::command::Authority;
+use crate::connection_limit::Rights;
 use crate::identity::seconds;
 
 /// Longest time between two looks at the calendar, which can be set at any time.
@@ -35,6 +37,8 @@ struct OpenClient {
     /// For the log.
     who: String,
     refused: CancellationToken,
+    /// Its rights, once it has a place.
+    rights: Option<Rights>,
 }
 
 impl OpenClient {
@@ -49,6 +53,9 @@ impl OpenClient {
 
     fn disconnect(&self, why: &str) {
         tracing::warn!(target: "drivegate::north::modbus_tcp", client = %self.who, "Modbus TCP: disconnecting a client: {why}");
+        if let Some(rights) = &self.rights {
+            rights.set(Authority::ReadOnly);
+        }
         self.refused.cancel();
     }
 }
@@ -105,6 +112,7 @@ impl OpenClients {
             role,
             who,
             refused: refused.clone(),
+            rights: None,
         };
         state.open.insert(id, client);
         let guard = CertificateGuard {
@@ -132,6 +140,17 @@ pub(super) struct CertificateGuard {
 }
 
 impl CertificateGuard {
+    /// These are its rights: they end with its certificate or its role.
+    pub(super) fn watch(&self, rights: &Rights) {
+        let mut state = self.clients.lock();
+        if let Some(client) = state.open.get_mut(&self.id) {
+            client.rights = Some(rights.clone());
+        }
+        if self.refused.is_cancelled() {
+            rights.set(Authority::ReadOnly);
+        }
+    }
+
     /// Waits until the client may not stay: a reload no longer admits it, or a certificate of its chain has expired.
     pub(super) async fn refused(&self) {
         tokio::select! {

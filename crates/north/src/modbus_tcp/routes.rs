@@ -38,6 +38,15 @@ impl PlantView {
         }
     }
 
+    /// Whether that bus is visible.
+    pub(super) fn shows(&self, bus: &str) -> bool {
+        let buses = self.buses.load();
+        buses
+            .as_ref()
+            .as_ref()
+            .is_none_or(|buses| buses.iter().any(|name| name == bus))
+    }
+
     /// The routes of the current plant; after a reload, the first client that asks rebuilds them for all.
     pub(super) fn routes(&self) -> Arc<Routes> {
         let routes = self.routes.load_full();

@@ -70,7 +70,7 @@ impl ClientSession {
     /// Counts the client as connected until the session is dropped.
     pub(super) fn new(state: Arc<ServerState>, view: Arc<PlantView>, client: Client) -> ClientSession {
         state.stats.modbus_tcp.connected();
-        let routes = view.routes();
+        let (routes, client) = (view.routes(), client.seeing(&view));
         ClientSession {
             state,
             view,

@@ -32,6 +32,7 @@ use super::session::{self, Client as _, Common, Will};
 use super::store::{Loaded, Store};
 use super::topics::Topics;
 use super::{Buffer, History, Options};
+use crate::command::Right;
 use crate::event::{BURST, Event, EventKind};
 use crate::files::names::{MQTT_EVENTS, MQTT_HISTORY};
 use crate::log_throttle::LogThrottle;
@@ -59,7 +60,7 @@ fn seconds(expiry: Duration) -> u32 {
 
 /// Runs the MQTT client until `cancel`.
 pub(super) async fn run(
-    options: Options,
+    options: (Options, Right),
     plant: SharedPlant,
     stats: Arc<NorthState>,
     events: Receiver<Arc<Event>>,
@@ -102,7 +103,12 @@ struct PlainClient {
 }
 
 impl PlainClient {
-    fn new(options: Options, plant: SharedPlant, stats: Arc<NorthState>, events: Receiver<Arc<Event>>) -> PlainClient {
+    fn new(
+        (options, right): (Options, Right),
+        plant: SharedPlant,
+        stats: Arc<NorthState>,
+        events: Receiver<Arc<Event>>,
+    ) -> PlainClient {
         let kept = stats.mqtt_left.lock().broker.take();
         let link = BrokerLink::new(options.clone(), options.client_id.clone(), "", kept.as_ref());
         let common = Common::new(link, plant, stats);
@@ -119,6 +125,7 @@ impl PlainClient {
         let rules = Rules {
             responses: ResponseTopics::new(&options.base, &observed.gateway, options.response_topics.clone()),
             require_id: options.require_id,
+            right,
         };
         let delivery = Delivery {
             telemetry: options.telemetry_qos,
@@ -468,4 +475,4 @@ impl session::Client for PlainClient {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

@@ -14,11 +14,12 @@ use super::outbox::Message;
 use super::reply::{Reply, ResponseTopics};
 use super::request::{self, Incoming};
 use super::topics::{Target, Topics};
-use crate::command::{Answer, Authority, Origin, Outcome, Proof, Refusal, SourceKind, Verb};
+use crate::command::{Answer, Authority, Origin, Outcome, Proof, Refusal, Right, SourceKind, Verb};
 use crate::command_json::{
     HoldReply, Id, Repetition, SharedMemory, excerpt, nothing_to_stop, refuse_stop_all, refuse_unknown, stop_all,
 };
 use crate::order::Arrival;
+use crate::permit::{Stage, access};
 use crate::plant::{Placed, Plant, Shown};
 use crate::stop_all::{StopAll, StopReport};
 
@@ -56,6 +57,8 @@ pub(super) struct Rules {
     pub(super) responses: ResponseTopics,
     /// Commands without an `id` are refused, except stops.
     pub(super) require_id: bool,
+    /// Of all who publish to the set topics.
+    pub(super) right: Right,
 }
 
 /// Pending results that a client hands over to its successor.
@@ -205,7 +208,8 @@ impl Commands {
 
     fn origin(&self, incoming: &Incoming, as_whom: Option<&str>) -> Origin {
         let proof = as_whom.map_or(Proof::Nothing, |who| Proof::Topic(who.into()));
-        incoming.origin(&self.client, SourceKind::Mqtt).proven(proof)
+        let origin = incoming.origin(&self.client, SourceKind::Mqtt).proven(proof);
+        origin.with_right(self.rules.right.clone())
     }
 
     /// Takes, renews, releases or breaks the hold of a drive; answered at once.
@@ -255,6 +259,10 @@ impl Commands {
             Ok(wanted) => wanted,
             Err(refusal) => return refuse(refusal),
         };
+        // A client whose `commands` a reload turned off ends, and still receives what was on its way.
+        if let Err(refusal) = access(Stage::Accept, true, self.rules.right.allows("")) {
+            return refuse(refusal);
+        }
         match self.stop_all.order(plant, &scope, origin, wait, now) {
             Ok(order) => {
                 let report = order.report;

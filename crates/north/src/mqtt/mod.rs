@@ -40,6 +40,7 @@ mod record;
 mod reply;
 mod request;
 mod retry;
+mod rights;
 mod rounds;
 mod session;
 pub mod sparkplug;
@@ -64,6 +65,7 @@ pub use self::handover::Handover;
 pub use self::offline::{Offline, Published};
 pub use self::record::whole_records;
 pub use self::request::Incoming;
+pub use self::rights::BrokerRights;
 
 /// A secret that is not printed in logs.
 #[derive(Clone, PartialEq, Eq)]
@@ -201,7 +203,11 @@ impl Buffer {
 
 /// The running MQTT client.
 #[derive(Debug, Default)]
-pub struct Mqtt(Vec<JoinHandle<()>>);
+pub struct Mqtt {
+    tasks: Vec<JoinHandle<()>>,
+    /// How it runs, and where the rights of its clients are.
+    rights: Option<(Options, Arc<NorthState>)>,
+}
 
 impl server::Server for Mqtt {
     const NAME: &'static str = "MQTT";
@@ -218,9 +224,15 @@ impl server::Server for Mqtt {
         Ok(start(options, plant, stats, cancel))
     }
 
+    fn end_rights(&self, next: Option<&Options>) {
+        if let Some((options, stats)) = &self.rights {
+            stats.broker_rights.reload(options, next);
+        }
+    }
+
     /// At most about half a second after the cancellation, in which it publishes `offline` and disconnects.
     async fn stopped(self) {
-        for task in self.0 {
+        for task in self.tasks {
             if let Err(error) = task.await {
                 tracing::error!(target: "drivegate::north::mqtt", "the MQTT client ended unexpectedly: {error}");
             }
@@ -234,6 +246,8 @@ pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthState>, c
     options.buffer = options.buffer.or_else(Buffer::of_system);
     // Subscribed here and not in the task, so that no event after this call is missed. What the client before this one left
     // unread comes first.
+    let (topics, hosts) = stats.broker_rights.begin(&options);
+    let kept = options.clone();
     let events = plant.load().events.subscribe();
     let unread = stats.mqtt_left.lock().unread.take();
     let events = unread.filter(|unread| unread.same_channel(&events)).unwrap_or(events);
@@ -241,12 +255,15 @@ pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthState>, c
         let broker = options.clone();
         tokio::spawn(sparkplug::run(
             node,
-            broker,
+            (broker, hosts),
             plant.clone(),
             stats.clone(),
             cancel.clone(),
         ))
     });
-    let client = tokio::spawn(client::run(options, plant, stats, events, cancel));
-    Mqtt([client].into_iter().chain(node).collect())
+    let client = tokio::spawn(client::run((options, topics), plant, stats.clone(), events, cancel));
+    Mqtt {
+        tasks: [client].into_iter().chain(node).collect(),
+        rights: Some((kept, stats)),
+    }
 }

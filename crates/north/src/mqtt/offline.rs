@@ -8,6 +8,7 @@ use super::outbox::Message;
 use super::reply::ResponseTopics;
 use super::request::Incoming;
 use super::topics::Topics;
+use crate::command::Right;
 use crate::command_json::SharedMemory;
 use crate::order::{Arrival, Connection};
 use crate::plant::SharedPlant;
@@ -54,6 +55,7 @@ impl Offline {
         let rules = Rules {
             responses: ResponseTopics::new(base, &gateway, Vec::new()),
             require_id: false,
+            right: Right::lasting(),
         };
         Offline {
             plant,

@@ -330,7 +330,8 @@ fn start(
         plant,
         vault,
         restoration,
-        origin,
+        // Judged when it began, so that no reload leaves it half done.
+        origin: origin.lasting(),
     };
     tokio::spawn(run.carry_on());
 }

@@ -11,6 +11,7 @@ mod listener;
 mod offline;
 mod pty;
 mod request;
+mod rights;
 mod terms;
 
 use std::net::SocketAddr;
@@ -18,6 +19,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use arc_swap::ArcSwap;
 use ipnet::IpNet;
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
@@ -39,7 +41,7 @@ pub use self::offline::Offline;
 pub const MAX_TOOLS: usize = 4;
 
 /// The rights of the tools of a slot.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub enum SlotAccess {
     #[default]
     Read,
@@ -131,6 +133,8 @@ pub type Server = TcpServer<Slots, Options>;
 #[derive(Debug)]
 pub struct Slots {
     ptys: Vec<RunningPty>,
+    /// The slots as they are now.
+    current: Arc<ArcSwap<Options>>,
     plant: SharedPlant,
     stats: Arc<NorthState>,
     paces: Arc<WritePaces>,
@@ -188,6 +192,7 @@ impl TcpService<Options> for Slots {
     ) -> Result<Slots, ServerError> {
         Ok(Slots {
             ptys: Vec::new(),
+            current: Arc::default(),
             plant,
             paces: Arc::default(),
             refusals: Arc::new(Refusals::new(ServerKind::Slot, stats.clone())),
@@ -215,9 +220,11 @@ impl TcpService<Options> for Slots {
 
     /// Tools of a slot that serves as before stay connected.
     fn commit(&mut self, options: Options, (): (), sockets: NewSockets, listeners: &mut Listeners<SlotListener>) {
+        self.current.store(Arc::new(options.clone()));
         let terms = |slot: &Slot| {
             Arc::new(Terms {
                 slot: slot.clone(),
+                current: self.current.clone(),
                 plant: self.plant.clone(),
                 stats: self.stats.clone(),
                 paces: self.paces.clone(),
@@ -259,6 +266,7 @@ impl TcpService<Options> for Slots {
     }
 
     fn retire(&mut self) {
+        self.current.store(Arc::default());
         self.ptys.drain(..).for_each(|pty| pty.cancel.cancel());
     }
 }

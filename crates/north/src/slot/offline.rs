@@ -4,9 +4,11 @@ use std::sync::Arc;
 use std::task::{Context, Waker};
 use std::time::Instant;
 
-use super::Slot;
+use arc_swap::ArcSwap;
+
 use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
+use super::{Options, Slot, SlotAccess};
 use crate::NorthState;
 use crate::command::Proof;
 use crate::order::{Arrival, Connection};
@@ -26,6 +28,9 @@ impl Offline {
     pub fn new(slot: Slot, plant: SharedPlant, stats: Arc<NorthState>, peer: &str) -> Offline {
         Offline::of(
             Arc::new(Terms {
+                current: Arc::new(ArcSwap::from_pointee(Options {
+                    slots: vec![slot.clone()],
+                })),
                 slot,
                 plant,
                 stats,
@@ -33,6 +38,15 @@ impl Offline {
             }),
             peer,
         )
+    }
+
+    /// From now on the slot has that access.
+    pub fn reload(&self, access: SlotAccess) {
+        let slot = Slot {
+            access,
+            ..self.terms.slot.clone()
+        };
+        self.terms.current.store(Arc::new(Options { slots: vec![slot] }));
     }
 
     /// Another tool of the same slot.

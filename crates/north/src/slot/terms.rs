@@ -5,12 +5,16 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
+use arc_swap::ArcSwap;
+
 use super::request::{Meaning, Refused, ToolRequest};
-use super::{Slot, SlotAccess};
+use super::rights::ToolRights;
+use super::{Options, Slot, SlotAccess};
 use crate::codec::{LineFormat, Protocol, RequestPdu, describe};
 use crate::command::{self, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
 use crate::drive::plan::WireTime;
 use crate::order::Arrival;
+use crate::permit::{Stage, client_access};
 use crate::plant::{
     BusHandle, DriveHandle, Exchange, OrderRequest, Placed, Plant, Question, SharedPlant, Target, turn_away,
 };
@@ -79,6 +83,8 @@ impl WritePaces {
 #[derive(Debug)]
 pub(super) struct Terms {
     pub(super) slot: Slot,
+    /// The slots of all buses as they are now.
+    pub(super) current: Arc<ArcSwap<Options>>,
     pub(super) plant: SharedPlant,
     pub(super) stats: Arc<NorthState>,
     pub(super) paces: Arc<WritePaces>,
@@ -88,7 +94,10 @@ pub(super) struct Terms {
 #[derive(Debug)]
 pub(super) struct Tool {
     terms: Arc<Terms>,
+    /// With the right to write.
     origin: Origin,
+    /// With the right to send what cannot be checked.
+    raw: Origin,
 }
 
 impl Tool {
@@ -96,8 +105,11 @@ impl Tool {
     pub(super) fn new(terms: Arc<Terms>, peer: &str, client: &str, proof: Proof) -> Tool {
         let (kind, bus) = (SourceKind::Slot, &terms.slot.bus);
         let client: Arc<str> = format!("{} {bus} {client}", kind.name()).into();
+        let rights = ToolRights::new(&terms.current, bus, &proof);
         let origin = Origin::of(client, kind, format!("{peer} at {bus}")).proven(proof);
-        Tool { terms, origin }
+        let raw = origin.clone().with_right(rights.of(SlotAccess::Raw));
+        let origin = origin.with_right(rights.of(SlotAccess::Write));
+        Tool { terms, origin, raw }
     }
 
     pub(super) fn protocol(&self) -> Protocol {
@@ -216,6 +228,9 @@ impl Tool {
             let text = format!("the slot of bus `{}` has access = \"read\"", self.terms.slot.bus);
             return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
         }
+        if let Err(refusal) = client_access(Stage::Accept, false, &self.origin, &self.terms.slot.bus) {
+            return self.refuse(drive, pdu, refusal, now);
+        }
         let cost = cost(drive, pdu);
         self.terms.paces.wrote(&self.terms.slot.bus, cost, now);
         let request =
@@ -235,6 +250,9 @@ impl Tool {
         if self.terms.slot.access != SlotAccess::Raw {
             let text = format!("{why}; only a slot with access = \"raw\" forwards it");
             return self.refuse_any(case, request, drives, pdu, Refusal::NotAllowed(text));
+        }
+        if let Err(refusal) = client_access(Stage::Accept, false, &self.raw, &self.terms.slot.bus) {
+            return self.refuse_any(case, request, drives, pdu, refusal);
         }
         for drive in drives {
             let spec = &drive.image.spec;
@@ -273,7 +291,7 @@ impl Tool {
             may_write,
             arrival: case.arrival.clone(),
             expires: case.deadline,
-            origin: self.origin.clone(),
+            origin: if may_write { &self.raw } else { &self.origin }.clone(),
         };
         Work::Exchange(case.bus.ask(question, &case.plant.writes, case.now))
     }

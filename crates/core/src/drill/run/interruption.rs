@@ -30,6 +30,9 @@ impl Run {
         if !there.is_some_and(|there| Arc::ptr_eq(&there.image, &self.drive.image)) {
             return Some("a reload changed the drive or its bus".to_string());
         }
+        if !self.who.right().allows(&self.report.bus) {
+            return Some("a reload took the right of its client to write away".to_string());
+        }
         if let Some(why) = self.others() {
             return Some(why);
         }

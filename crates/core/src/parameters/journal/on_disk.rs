@@ -49,10 +49,14 @@ impl JournalFile {
         name.to_string_lossy().into_owned()
     }
 
-    /// The journal that is there must not be that of another machine than `of`.
+    /// The journal that is there must not be that of another machine than `of`. One of an earlier version names no machine: it
+    /// is that of the drive with its name, which takes it up and from then on has its machine in it.
     fn is_free(&self, of: &Owner) -> io::Result<()> {
         let there = self.read()?.and_then(|text| Owner::parse(&text).ok());
-        let is_same = |there: &Owner| there.machine == of.machine;
+        let is_same = |there: &Owner| match &there.machine {
+            Some(_) => there.machine == of.machine,
+            None => (&there.drive, &there.family) == (&of.drive, &of.family),
+        };
         match there.filter(|there| !is_same(there)) {
             None => Ok(()),
             Some(there) => Err(io::Error::other(format!(

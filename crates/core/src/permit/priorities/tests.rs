@@ -172,6 +172,90 @@ fn a_reference_from_elsewhere_withdraws_those_that_do_not_protect() {
     assert!(elsewhere(&mut all, SourceKind::Http, effect(None, true)));
 }
 
+/// The slots of both arrays that an order from elsewhere leaves, at each priority, behind an active that governs.
+#[test]
+fn what_protects_people_stays_also_behind_an_active_that_governs() {
+    for priority in 2..=16 {
+        let stays = priority <= PROTECTING;
+        for kind in [
+            SourceKind::Mqtt,
+            SourceKind::ModbusTcp,
+            SourceKind::Slot,
+            SourceKind::Http,
+        ] {
+            let mut all = Priorities::default();
+            write(&mut all, Run, "a", 1, Some(1.0));
+            write(&mut all, Run, "guard", priority, Some(0.0));
+            let (_, pending) = asked(&mut all, Run, "guard", 16, Some(0.0));
+            assert!(elsewhere(&mut all, kind, effect(Some(true), false)));
+            all.settle(pending.id, Settled::Done, Instant::now());
+            let left = if stays {
+                vec![(1, 1.0), (priority, 0.0)]
+            } else {
+                vec![(1, 1.0)]
+            };
+            assert_eq!(standing(&all, Run), left, "{kind:?} at {priority}");
+            // What stays governs as soon as the active is given back, and refuses starts then.
+            write(&mut all, Run, "a", 1, NULL);
+            assert_eq!(elsewhere(&mut all, kind, effect(Some(true), false)), !stays);
+        }
+    }
+    // A reference of the gateway itself is not refused, and leaves another client's that protects people.
+    for priority in 1..=16 {
+        let mut all = Priorities::default();
+        write(&mut all, Run, "silent", 8, Some(1.0));
+        write(&mut all, SpeedReference, "guard", priority, Some(20.0));
+        assert!(elsewhere(&mut all, SourceKind::Supervision, effect(None, true)));
+        assert_eq!(
+            standing(&all, SpeedReference).len(),
+            usize::from(priority <= PROTECTING)
+        );
+        assert_eq!(standing(&all, Run), [], "the lease of its client ended");
+    }
+}
+
+#[test]
+fn what_nobody_may_release_is_void() {
+    let mut all = Priorities::default();
+    let now = Instant::now();
+    write(&mut all, Run, "gone", 3, Some(0.0));
+    write(&mut all, Run, "stays", 8, Some(1.0));
+    write(&mut all, SpeedReference, "gone", 8, Some(50.0));
+    let (_, under_way) = asked(&mut all, Reverse, "gone", 9, Some(1.0));
+    let (_, uncertain) = asked(&mut all, FrequencyReference, "gone", 16, Some(5.0));
+    all.settle(uncertain.id, Settled::Unknown, now);
+    // A slot that its client is about to give back is given back.
+    write(&mut all, Run, "gone", 12, Some(0.0));
+    let (_, null) = asked(&mut all, Run, "gone", 12, NULL);
+    let keeps = |what: Commanded, entry: &Entry| what == Run && entry.origin.who == "stays";
+    let void: Vec<(Commanded, u8)> = all
+        .end_without_right(keeps)
+        .into_iter()
+        .map(|void| (void.what, void.priority))
+        .collect();
+    assert_eq!(
+        void,
+        [
+            (Run, 3),
+            (Run, 12),
+            (Reverse, 9),
+            (SpeedReference, 8),
+            (FrequencyReference, 16)
+        ]
+    );
+    all.settle(under_way.id, Settled::Done, now);
+    all.settle(null.id, Settled::Done, now);
+    all.resolve(|_, _| Some(Value::Number(5.0)));
+    assert_eq!(standing(&all, Run), [(8, 1.0)]);
+    assert!(
+        [Reverse, SpeedReference, FrequencyReference]
+            .iter()
+            .all(|what| standing(&all, *what).is_empty())
+    );
+    assert!(all.end_without_right(keeps).is_empty(), "each is told once");
+    assert!(elsewhere(&mut all, SourceKind::Mqtt, effect(Some(true), false)));
+}
+
 #[test]
 fn a_lease_that_ends_empties_all_slots_of_its_client() {
     let mut all = Priorities::default();

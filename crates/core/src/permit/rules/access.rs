@@ -1,18 +1,106 @@
-//! Whether the client may write at all, this drive and this point.
+//! Whether the client of a command may write at all. Judged by the configuration of now: what a reload has taken away
+//! since the first byte of a request no longer counts when the request is complete, and a command that waits, or a
+//! sequence that has begun, goes no further.
 //!
-//! At accept, where an order is checked and converted by what the configuration and the profile let through, [`crate::permit::admit`]
-//! answers this before anything else, since what an order does is only known then. What it let through is not asked again: a
-//! reload that changes the access of a drive or a point starts the bus anew, and what waits there ends.
+//! A stop needs the right when it is accepted. Once accepted it is sent: the motor that it is to stop may run by nobody
+//! else's will.
 
+//! What the profile, the access of the drive and that of the point let through, [`crate::permit::admit`] answers before this is asked,
+//! since what an order does is only known then. That is not asked again: a reload that changes the access of a drive or a point
+//! starts the bus anew, and what waits there ends.
+
+use crate::order::{Interruption, Order, Origin, Outcome, Refusal};
 use crate::permit::gate::{DriveGate, Gate};
 use crate::permit::judge::{Ask, Rule, Stage, Verdict};
 
 pub(in crate::permit) const RULE: Rule = Rule {
-    stages: &[Stage::Turn, Stage::Write],
+    stages: &[Stage::Accept, Stage::Turn, Stage::Write],
     binds_stops: true,
     judge,
 };
 
-fn judge(_: &Ask<'_>, _: &DriveGate, _: &Gate) -> Verdict {
-    Verdict::Go
+fn judge(ask: &Ask<'_>, _: &DriveGate, _: &Gate) -> Verdict {
+    let Some(seen) = ask.seen.filter(|_| !matches!(ask.intent.order, Order::Read(_))) else {
+        return Verdict::Go;
+    };
+    match client_access(ask.stage, ask.effect().stops, ask.origin, &seen.reading.spec.bus) {
+        Ok(()) => Verdict::Go,
+        Err(_) if ask.stage == Stage::Write => Verdict::Refuse(Outcome::Interrupted(Interruption::RightLost)),
+        Err(refusal) => Verdict::refuse(refusal),
+    }
+}
+
+/// Judges a command at that stage; `may_write` is what its client is allowed now.
+///
+/// # Errors
+/// The refusal.
+pub fn access(stage: Stage, is_stop: bool, may_write: bool) -> Result<(), Refusal> {
+    let why = match (stage, may_write) {
+        (_, true) => return Ok(()),
+        (Stage::Turn | Stage::Write, false) if is_stop => return Ok(()),
+        (Stage::Accept, false) => "this client may no longer write: a reload took its right away",
+        (Stage::Turn | Stage::Write, false) => {
+            "a reload took the right of this client to write away while the command waited"
+        }
+    };
+    Err(Refusal::NotAllowed(format!("{why}; nothing was written")))
+}
+
+/// Judges a command of that client for a drive of that bus.
+///
+/// # Errors
+/// The refusal.
+pub fn client_access(stage: Stage, is_stop: bool, origin: &Origin, bus: &str) -> Result<(), Refusal> {
+    access(stage, is_stop, origin.right().allows(bus))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    use super::*;
+    use crate::command::{Right, SourceKind};
+
+    #[test]
+    fn whoever_has_lost_the_right_writes_nothing_but_the_stop_that_was_accepted() {
+        use Stage::{Accept, Turn, Write};
+        let table = [
+            (Accept, false, true, true),
+            (Accept, true, true, true),
+            (Accept, false, false, false),
+            (Accept, true, false, false),
+            (Turn, false, true, true),
+            (Turn, true, true, true),
+            (Turn, false, false, false),
+            (Turn, true, false, true),
+            (Write, false, true, true),
+            (Write, true, true, true),
+            (Write, false, false, false),
+            (Write, true, false, true),
+        ];
+        for (stage, is_stop, may_write, passes) in table {
+            let judged = access(stage, is_stop, may_write);
+            assert_eq!(judged.is_ok(), passes, "{stage:?} stop {is_stop} right {may_write}");
+            if let Err(refusal) = judged {
+                assert_eq!(refusal.code(), "not_allowed");
+                assert!(refusal.to_string().contains("a reload took"), "{refusal}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_right_is_that_of_now() {
+        let grants = Arc::new(AtomicBool::new(true));
+        let own = Origin::new(SourceKind::Mqtt, "cloud");
+        let client = own.clone().with_right(Right::of(grants.clone()));
+        let judged = |origin: &Origin| client_access(Stage::Turn, false, origin, "line1").is_ok();
+        assert!(judged(&own) && judged(&client));
+        grants.store(false, Ordering::Release);
+        assert!(judged(&own) && !judged(&client));
+        assert!(judged(&client.clone().lasting()), "what has to come to its end");
+        grants.store(true, Ordering::Release);
+        assert!(judged(&client));
+        assert_eq!(own, client.lasting(), "a client is the same with any right");
+    }
 }

@@ -167,12 +167,12 @@ fn buses_and_hosts_are_those_of_the_configuration() {
         buses: Some(vec!["other".to_string()]),
         ..options()
     };
-    let view = View::new(rig.view.plant.clone(), Arc::new(none));
+    let view = View::new(rig.view.plant.clone(), Arc::new(none), rig.view.rights.clone());
     assert_eq!(view.devices().len(), 1, "the gateway alone");
     let off = Options {
         commands: false,
         ..options()
     };
-    let view = View::new(rig.view.plant.clone(), Arc::new(off));
+    let view = View::new(rig.view.plant.clone(), Arc::new(off), rig.view.rights.clone());
     assert!(!view.may_write("127.0.0.1".parse().unwrap()));
 }

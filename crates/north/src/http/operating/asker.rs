@@ -1,20 +1,27 @@
-//! Who gives a request, as an argument of its handler.
+//! Who gives a request, as an argument of its handler. Whoever may change something is judged by the head of the request,
+//! and once more when its body is complete: a reload may have come in between.
 
 use std::sync::Arc;
 
-use axum::extract::FromRequestParts;
+use axum::body::Bytes;
+use axum::extract::{FromRequest, FromRequestParts, Request};
 use axum::http::request::Parts;
 
 use super::super::app_state::AppState;
+use super::super::body;
 use super::super::reached::Reached;
 use super::super::replies::{Refused, Replied};
-use super::state::Operator;
+use super::state::{Denied, Operator};
+use crate::command_json::MAX_PAYLOAD;
 
 /// Who may see what commands are for.
 pub(in crate::http) struct Viewer(pub(in crate::http) Operator);
 
 /// Who may give a request that changes something.
 pub(in crate::http) struct Commander(pub(super) Operator);
+
+/// The same with the whole request: its body of at most so many bytes.
+pub(in crate::http) struct Ordered<const MOST_BYTES: usize = MAX_PAYLOAD>(pub(super) Operator, pub(super) Bytes);
 
 impl FromRequestParts<Arc<AppState>> for Viewer {
     type Rejection = Refused;
@@ -33,5 +40,19 @@ impl FromRequestParts<Arc<AppState>> for Commander {
         let reached = Reached::of(parts)?;
         let (headers, cookies) = (&parts.headers, app.cookies(&reached));
         Ok(Commander(app.operating.commander(headers, &cookies, &reached).await?))
+    }
+}
+
+impl<const MOST_BYTES: usize> FromRequest<Arc<AppState>> for Ordered<MOST_BYTES> {
+    type Rejection = Refused;
+
+    async fn from_request(request: Request, app: &Arc<AppState>) -> Replied<Ordered<MOST_BYTES>> {
+        let (mut parts, body) = request.into_parts();
+        let Commander(operator) = Commander::from_request_parts(&mut parts, app).await?;
+        let body = body::read(body, &Reached::of(&parts)?, MOST_BYTES).await?;
+        match operator.is_still_one() {
+            true => Ok(Ordered(operator, body)),
+            false => Err(Denied::RightLost.into()),
+        }
     }
 }

@@ -110,6 +110,7 @@ pub(in crate::http) async fn command(
     Asked(arrival): Asked,
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
+    // Judged once more where the command is placed, so that a refusal is audited.
     Commander(operator): Commander,
     Payload(payload): Payload,
 ) -> Replied<CommandReply> {
@@ -184,12 +185,18 @@ impl Operator {
     pub(in crate::http) fn origin(&self) -> Origin {
         if self.kind != SourceKind::Http {
             let origin = Origin::new(self.kind, self.user.to_string());
-            return origin.with_login(self.login.clone()).proven(self.proof.clone());
+            return origin
+                .with_login(self.login.clone())
+                .proven(self.proof.clone())
+                .with_right(self.right.clone());
         }
         let client = format!("{} {}", self.kind.name(), self.user);
         let who = format!("{} {}", self.user, self.address);
         let origin = Origin::of(client.into(), self.kind, who);
-        origin.with_login(self.login.clone()).proven(self.proof.clone())
+        origin
+            .with_login(self.login.clone())
+            .proven(self.proof.clone())
+            .with_right(self.right.clone())
     }
 }
 

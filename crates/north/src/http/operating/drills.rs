@@ -9,10 +9,9 @@ use axum::http::StatusCode;
 use axum::response::IntoResponse;
 
 use super::super::app_state::AppState;
-use super::super::body::Payload;
 use super::super::messages::DrillWish;
 use super::super::replies::{Refused, Replied, not_found, refused};
-use super::asker::Commander;
+use super::asker::{Commander, Ordered};
 use crate::drill::{DrillRefusal, DrillReport, Kind};
 
 /// All that are known, the newest first.
@@ -32,8 +31,7 @@ pub(in crate::http) async fn drill(
 /// Arms one; 201.
 pub(in crate::http) async fn arm_drill(
     State(app): State<Arc<AppState>>,
-    Commander(operator): Commander,
-    Payload(payload): Payload,
+    Ordered(operator, payload): Ordered,
 ) -> Replied {
     let wish: DrillWish = serde_json::from_slice(&payload).map_err(|error| {
         let form = "{\"drive\": …, \"kinds\": [\"order\", \"client\", \"gateway\"], \"speed\": …}";

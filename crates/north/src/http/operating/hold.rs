@@ -9,10 +9,9 @@ use axum::http::StatusCode;
 use axum::response::IntoResponse;
 
 use super::super::app_state::AppState;
-use super::super::body::Payload;
 use super::super::messages::HoldAct;
 use super::super::replies::{Replied, refused};
-use super::asker::{Commander, Viewer};
+use super::asker::{Ordered, Viewer};
 use crate::command::{Authority, Verb};
 use crate::command_json::HoldReply;
 
@@ -36,8 +35,7 @@ pub(in crate::http) async fn hold_of(
 pub(in crate::http) async fn hold(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
-    Commander(operator): Commander,
-    Payload(payload): Payload,
+    Ordered(operator, payload): Ordered,
 ) -> Replied {
     let wanted = serde_json::from_slice::<HoldAct>(&payload).ok();
     let verb = wanted.and_then(|wanted| Verb::of(&wanted.action)).ok_or_else(|| {

@@ -62,7 +62,7 @@ impl From<Denied> for Refused {
             Denied::Busy => {
                 headers.insert(header::RETRY_AFTER, 1.into());
             }
-            Denied::OtherOrigin | Denied::NoToken => {}
+            Denied::OtherOrigin | Denied::RightLost | Denied::NoToken => {}
         }
         response.into()
     }

@@ -8,10 +8,9 @@ use axum::http::StatusCode;
 use serde::de::DeserializeOwned;
 
 use super::super::app_state::AppState;
-use super::super::body::Payload;
 use super::super::messages::{ParameterReading, ReadParameters, Restore, RestoreAct};
 use super::super::replies::{Refused, Replied, refused};
-use super::asker::Commander;
+use super::asker::Ordered;
 use crate::command::{Origin, Pace};
 use crate::parameter_jobs::{Again, How, begin_reading, carry_out, prepare, release, take_up};
 use crate::parameters::{Id, ParameterFile, Wishes};
@@ -24,8 +23,7 @@ const MAX_BODY: usize = 256 * 1024;
 pub(in crate::http) async fn read(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
-    Commander(operator): Commander,
-    Payload(body): Payload<MAX_BODY>,
+    Ordered(operator, body): Ordered<MAX_BODY>,
 ) -> Replied<Json<ParameterReading>> {
     let how: ReadParameters = understood(&body)?;
     let drive = app.drive(&name)?;
@@ -49,8 +47,7 @@ pub(in crate::http) async fn progress(
 pub(in crate::http) async fn restore(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
-    Commander(operator): Commander,
-    Payload(body): Payload<MAX_BODY>,
+    Ordered(operator, body): Ordered<MAX_BODY>,
 ) -> Replied<Json<Restore>> {
     let act: RestoreAct = understood(&body)?;
     let drive = app.drive(&name)?;

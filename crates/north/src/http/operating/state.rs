@@ -22,7 +22,7 @@ use super::sessions::{IDLE, Secrets, Session, Sessions};
 use super::throttle::{Source, Throttle};
 use super::verifier::Verifier;
 use crate::NorthState;
-use crate::command::{Authority, Proof, SourceKind};
+use crate::command::{Authority, Grants, Proof, Right, SourceKind};
 use crate::log_throttle::LogThrottle;
 /// A password that a program sends with each request is not hashed again for that long.
 const VERIFIED: Duration = Duration::from_secs(300);
@@ -38,7 +38,7 @@ const CSRF: &str = "x-csrf-token";
 #[derive(Debug)]
 pub(in crate::http) struct Operating {
     /// `None`: commands are off.
-    pub(super) users: ArcSwapOption<Users>,
+    pub(super) users: Arc<ArcSwapOption<Users>>,
     state: Mutex<State>,
     verifier: Verifier,
     /// For names as keys of the throttle.
@@ -71,11 +71,17 @@ pub(in crate::http) struct Operator {
     /// The interface.
     pub(super) kind: SourceKind,
     pub(super) proof: Proof,
+    pub(super) right: Right,
     /// The cookie of its session; `None` for a program.
     pub(super) cookie: Option<String>,
 }
 
 impl Operator {
+    /// Whether it may still give requests that change something; the right of a user is the same for every bus.
+    pub(super) fn is_still_one(&self) -> bool {
+        self.right.allows("")
+    }
+
     /// A user of the local socket.
     fn local(local: &LocalUser, address: IpAddr) -> Operator {
         Operator {
@@ -84,6 +90,7 @@ impl Operator {
             address,
             kind: local.kind,
             proof: local.proof.clone(),
+            right: local.right.clone(),
             cookie: None,
         }
     }
@@ -110,6 +117,9 @@ pub(in crate::http) enum Denied {
     /// A page of someone else.
     #[error("the request comes from another origin")]
     OtherOrigin,
+    /// Its user was one when the request began.
+    #[error("a reload took the right of this user away while the request came in; nothing was done")]
+    RightLost,
     /// The token of the session is missing or wrong.
     #[error("the header X-CSRF-Token does not have the token of this session")]
     NoToken,
@@ -121,7 +131,7 @@ impl Denied {
             Denied::NotLoggedIn | Denied::SessionEnded | Denied::Wrong => StatusCode::UNAUTHORIZED,
             Denied::TooMany(_) => StatusCode::TOO_MANY_REQUESTS,
             Denied::Busy => StatusCode::SERVICE_UNAVAILABLE,
-            Denied::OtherOrigin | Denied::NoToken => StatusCode::FORBIDDEN,
+            Denied::OtherOrigin | Denied::RightLost | Denied::NoToken => StatusCode::FORBIDDEN,
         }
     }
 }
@@ -137,7 +147,7 @@ pub(in crate::http) struct Credentials {
 impl Operating {
     pub(in crate::http) fn new(north: Arc<NorthState>) -> Operating {
         Operating {
-            users: ArcSwapOption::empty(),
+            users: Arc::default(),
             state: Mutex::default(),
             verifier: Verifier::default(),
             hasher: RandomState::default(),
@@ -156,6 +166,8 @@ impl Operating {
     /// Sets the users who may command; `None`: commands are off. Sessions of users who were removed, or have a new
     /// password, end.
     pub(in crate::http) fn set_users(&self, users: Option<Users>) {
+        // A session is looked up under the same lock: it ends together with its user.
+        let mut state = self.state();
         let before = self.users.swap(users.map(Arc::new));
         let after = self.users.load_full();
         let of = |users: &Option<Arc<Users>>, name: &str| users.as_ref().and_then(|users| users.named(name)).cloned();
@@ -163,7 +175,6 @@ impl Operating {
             let user: Option<User> = of(&after, name);
             user.is_some() && user == of(&before, name)
         };
-        let mut state = self.state();
         state.sessions.keep(stays);
         state.verified.retain(|_, (user, _)| stays(user));
         state.operators.retain(|_, (user, _)| stays(user));
@@ -199,10 +210,13 @@ impl Operating {
         }
         if headers.contains_key(header::AUTHORIZATION) {
             let credentials = basic(headers).ok_or(Denied::NotLoggedIn)?;
+            // As it is before the password is compared, which takes a while.
+            let right = self.right_of(&credentials.user);
             let user = self.verified(&credentials, address, Source::of(address)).await?;
             return Ok(Operator {
                 login: user.clone(),
                 proof: Proof::User(user.clone()),
+                right: right.ok_or(Denied::Wrong)?,
                 user,
                 address,
                 kind: SourceKind::Http,
@@ -210,15 +224,27 @@ impl Operating {
             });
         }
         let cookie = cookies.session(headers).ok_or(Denied::NotLoggedIn)?;
-        let session = self.session(&cookie, Instant::now()).ok_or(Denied::SessionEnded)?;
+        let state = self.state();
+        let session = state.sessions.find(&cookie, Instant::now()).cloned();
+        let session = session.ok_or(Denied::SessionEnded)?;
+        let right = self.right_of(&session.user).ok_or(Denied::SessionEnded)?;
+        drop(state);
         Ok(Operator {
             proof: Proof::User(session.user.clone()),
+            right,
             user: session.user,
             login: session.login,
             address,
             kind: SourceKind::Http,
             cookie: Some(cookie),
         })
+    }
+
+    /// The right of that user to write: as long as the file of users has it with this password.
+    fn right_of(&self, user: &str) -> Option<Right> {
+        let user = self.users.load().as_ref()?.named(user)?.clone();
+        let users = self.users.clone();
+        Some(Right::of(Arc::new(UserRight { users, user })))
     }
 
     pub(super) fn session(&self, cookie: &str, now: Instant) -> Option<Session> {
@@ -353,6 +379,7 @@ impl Operating {
             address,
             kind: SourceKind::Http,
             proof: Proof::User(user.clone()),
+            right: Right::lasting(),
             cookie: Some(cookie.clone()),
         };
         self.used(&operator, now);
@@ -361,6 +388,21 @@ impl Operating {
 
     pub(super) fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[derive(Debug)]
+struct UserRight {
+    users: Arc<ArcSwapOption<Users>>,
+    user: User,
+}
+
+impl Grants for UserRight {
+    fn may_write(&self, _: &str) -> bool {
+        let users = self.users.load();
+        users
+            .as_ref()
+            .is_some_and(|users| users.named(&self.user.name) == Some(&self.user))
     }
 }
 

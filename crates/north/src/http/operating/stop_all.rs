@@ -9,19 +9,14 @@ use axum::http::StatusCode;
 use axum::response::IntoResponse;
 
 use super::super::app_state::AppState;
-use super::super::body::Payload;
 use super::super::replies::{Replied, not_found, refused};
-use super::asker::Commander;
+use super::asker::Ordered;
 use crate::command::Refusal;
 use crate::command_json::{nothing_to_stop, refuse_stop_all, stop_all};
 use crate::stop_all::NothingToStop;
 
 /// 200 if every drive stands, 504 if one is not proven to.
-pub(in crate::http) async fn stop(
-    State(app): State<Arc<AppState>>,
-    Commander(operator): Commander,
-    Payload(payload): Payload,
-) -> Replied {
+pub(in crate::http) async fn stop(State(app): State<Arc<AppState>>, Ordered(operator, payload): Ordered) -> Replied {
     let (plant, origin, now) = (app.plant.load_full(), operator.origin(), Instant::now());
     let refuse = |refusal: Refusal| refuse_stop_all(&plant, refusal, &origin, now);
     let (scope, wait) =

@@ -309,7 +309,7 @@ const words = {
   not_confirmed: "nicht bestätigt", restarted: "neu gestartet", unlike_profile: "anders als Profil", selection_differs: "Prozessdaten anders als Profil", foreign_command: "fremder Befehl",
   parameters_changed: "Parameter geändert", restore_unfinished: "Rückspielen unvollendet", recording: "Aufzeichnung", bus_up: "Leitung verbunden",
   bus_down: "Leitung unterbrochen", diagnosis: "Diagnose", guarded: "Start zu früh", interlock: "Verriegelung", reload_refused: "Neuladen abgelehnt", lost: "verloren", refused_stop: "Stopp abgelehnt",
-  released: "freigegeben", hold_broken: "übernommen", drill: "Übung", paused: "Gateway stand still", line_errors: "Leitungsfehler", point: "Grenzwert", command: "Befehl",
+  released: "freigegeben", hold_broken: "übernommen", slot_void: "BACnet-Platz ungültig", drill: "Übung", paused: "Gateway stand still", line_errors: "Leitungsfehler", point: "Grenzwert", command: "Befehl",
   // Why a drive does not run.
   no_dc_link: "kein Zwischenkreis", held: "belegt", reserved: "nach Stopp reserviert", order_refused: "Startbefehl abgelehnt", order_expired: "Startbefehl abgelaufen",
   order_unanswered: "Startbefehl unbeantwortet", stopped_by_order: "durch Befehl gestoppt", fault_was_reset: "Störung wurde quittiert",

@@ -5,14 +5,14 @@ import { t } from "./texts.js";
 
 export const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", warning: "amber", supervision: "amber", supervision_failed: "red", unsupervised: "amber",
   refused_command: "amber", restarted: "amber", unlike_profile: "amber", selection_differs: "amber", not_confirmed: "amber", reload_refused: "amber",
-  foreign_command: "amber", parameters_changed: "amber", restore_unfinished: "amber", diagnosis: "amber", guarded: "amber", interlock: "amber", paused: "amber", fault_end: "green", warning_end: "green", online: "green", bus_up: "green",
+  foreign_command: "amber", parameters_changed: "amber", restore_unfinished: "amber", diagnosis: "amber", guarded: "amber", interlock: "amber", slot_void: "amber", paused: "amber", fault_end: "green", warning_end: "green", online: "green", bus_up: "green",
   started: "blue", stopped: "blue", recording: "blue" };
 
 // All that the gateway knows; it refuses to search for others.
 const KINDS = [
   "fault", "fault_end", "warning", "warning_end", "online", "offline", "started", "stopped", "control_place", "supervision", "supervision_failed", "unsupervised",
   "refused_command", "guarded", "interlock", "not_confirmed", "restarted", "unlike_profile", "selection_differs", "foreign_command", "parameters_changed", "restore_unfinished", "recording",
-  "held", "released", "hold_broken", "drill", "paused", "bus_up",
+  "held", "released", "hold_broken", "slot_void", "drill", "paused", "bus_up",
   "bus_down", "diagnosis", "reload_refused",
 ];
 const PAGE = 100;

@@ -5,7 +5,7 @@ use super::*;
 use crate::event::{BURST, EventKind};
 use crate::process_image::{BusImage, BusSpec};
 
-fn options(buffer: Option<Buffer>) -> Options {
+pub(in crate::mqtt) fn options(buffer: Option<Buffer>) -> Options {
     Options {
         brokers: vec![Broker {
             host: "127.0.0.1".to_string(),
@@ -46,7 +46,7 @@ async fn client(buffer: Option<Buffer>) -> PlainClient {
 async fn client_with(options: Options) -> PlainClient {
     let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(fixture::plant(&["p1"])));
     let events = plant.load().events.subscribe();
-    PlainClient::new(options, plant, Arc::default(), events)
+    PlainClient::new((options, Right::lasting()), plant, Arc::default(), events)
 }
 
 fn lost_events(client: &mut PlainClient) -> u64 {

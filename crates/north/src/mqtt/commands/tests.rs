@@ -113,6 +113,7 @@ fn rules(require_id: bool) -> Rules {
     Rules {
         responses: ResponseTopics::new("drivegate", "hall", Vec::new()),
         require_id,
+        right: Right::lasting(),
     }
 }
 
@@ -141,6 +142,39 @@ fn a_command_is_executed_and_answered() {
     );
     assert!(result["latency_ms"].is_number() && result.get("error").is_none());
     assert!(bench.commands.is_idle());
+}
+
+/// A client whose `commands` a reload turned off still receives what was on its way.
+#[test]
+fn what_was_on_its_way_when_the_right_went_is_refused() {
+    use std::sync::atomic::{AtomicBool, Ordering};
+    let mut bench = SetTopics::new();
+    let right = Arc::new(AtomicBool::new(true));
+    bench.commands.rules.right = Right::of(right.clone());
+    assert_eq!(bench.take(set("p1/set", r#"{"id": 1, "speed_reference": 20}"#)), None);
+    assert_eq!(bench.queued(), 1);
+    right.store(false, Ordering::Release);
+    for payload in [
+        r#"{"id": 2, "run": true}"#,
+        r#"{"id": 3, "speed_reference": 9}"#,
+        r#"{"id": 4, "run": false}"#,
+    ] {
+        let result = json(&bench.take(set("p1/set", payload)).unwrap());
+        assert_eq!(result["error"]["code"], "not_allowed", "{result}");
+    }
+    let stop_all = Incoming {
+        topic: "drivegate/hall/set/stop".to_string(),
+        ..Incoming::default()
+    };
+    let refused = json(&bench.take(stop_all).unwrap());
+    assert!(
+        refused["error"]
+            .as_str()
+            .unwrap()
+            .contains("a reload took its right away"),
+        "{refused}"
+    );
+    assert_eq!(bench.queued(), 1);
 }
 
 #[test]

@@ -27,6 +27,7 @@ use super::session::{Packet, REBIRTH_METRIC, Rules, Session};
 use super::topics::{Received, StateForm, Topics};
 use super::wire::{MetricValue, Payload};
 use super::{Options, model::COMMAND_ERROR, model::COMMAND_RESULT};
+use crate::command::Right;
 use crate::log_throttle::LogThrottle;
 use crate::plant::{Plant, SharedPlant};
 use crate::process_image::Snapshot;
@@ -51,7 +52,7 @@ fn births_at() -> Instant {
 /// Runs the edge node until `cancel`.
 pub(in crate::mqtt) async fn run(
     options: Options,
-    broker: BrokerOptions,
+    broker: (BrokerOptions, Right),
     plant: SharedPlant,
     stats: Arc<NorthState>,
     cancel: CancellationToken,
@@ -103,7 +104,12 @@ struct NodeClient {
 }
 
 impl NodeClient {
-    fn new(options: Options, broker: BrokerOptions, plant: SharedPlant, stats: Arc<NorthState>) -> NodeClient {
+    fn new(
+        options: Options,
+        (broker, right): (BrokerOptions, Right),
+        plant: SharedPlant,
+        stats: Arc<NorthState>,
+    ) -> NodeClient {
         let topics = Topics::new(&options.group, &options.node, &options.primary_host);
         let now = Instant::now();
         let rules = Rules {
@@ -121,7 +127,7 @@ impl NodeClient {
         let mut client = NodeClient {
             topics,
             broker,
-            orders: Orders::new(stats.commands.mqtt.clone(), orders),
+            orders: Orders::new(stats.commands.mqtt.clone(), right, orders),
             common: Common::new(link, plant, stats),
             session: Session::new(rules),
             drives: Vec::new(),

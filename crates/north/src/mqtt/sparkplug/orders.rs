@@ -13,7 +13,7 @@ use super::super::request::Incoming;
 use super::model::DriveMetrics;
 use super::session::Session;
 use super::wire::{self, Metric, MetricValue, Payload};
-use crate::command::{Answer, CONFIRMED, DEFAULT_EXPIRY, Proof, Refusal, SourceKind};
+use crate::command::{Answer, CONFIRMED, DEFAULT_EXPIRY, Proof, Refusal, Right, SourceKind};
 use crate::command_json::{Asked, SharedMemory, Taken, excerpt, refuse_unknown, resolve};
 use crate::drive::{ModelPoint, Profile};
 use crate::order::Arrival;
@@ -34,6 +34,8 @@ pub(super) struct Orders {
     client: Arc<str>,
     awaited: VecDeque<Awaited>,
     memory: SharedMemory,
+    /// Of all hosts.
+    right: Right,
 }
 
 /// Commands whose results a node leaves to its successor.
@@ -78,11 +80,12 @@ impl Finished {
 impl Orders {
     /// `memory` outlives this client, so that a command is recognised after a reload; `left` are those of the client
     /// before.
-    pub(super) fn new(memory: SharedMemory, left: Option<NodeOrdersLeft>) -> Orders {
+    pub(super) fn new(memory: SharedMemory, right: Right, left: Option<NodeOrdersLeft>) -> Orders {
         Orders {
             client: SourceKind::Sparkplug.name().into(),
             awaited: left.map(|left| left.0).unwrap_or_default(),
             memory,
+            right,
         }
     }
 
@@ -104,7 +107,8 @@ impl Orders {
     ) -> Option<Finished> {
         let origin = incoming
             .origin(&self.client, SourceKind::Sparkplug)
-            .proven(Proof::Sparkplug);
+            .proven(Proof::Sparkplug)
+            .with_right(self.right.clone());
         let Some((place, metrics)) = target else {
             refuse_unknown(plant, device, UNREAD, origin, now);
             return None;

@@ -14,6 +14,7 @@ fn operator(user: &str, login: &str) -> Operator {
         address: [192, 0, 2, 1].into(),
         kind: SourceKind::Http,
         proof: crate::command::Proof::User(user.into()),
+        right: crate::command::Right::lasting(),
         cookie: None,
     }
 }

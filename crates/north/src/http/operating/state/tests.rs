@@ -134,6 +134,63 @@ async fn users_come_and_go() {
     );
 }
 
+/// Each way by which the right of a user goes, and what leaves it.
+#[tokio::test]
+async fn the_right_of_a_user_is_that_of_the_file_of_now() {
+    let user = |name: &str, password: &str| User::new(name, password).unwrap().to_string();
+    let (alice, bob) = (user("alice", "correct horse"), user("bob", "correct horse"));
+    let users = |lines: &[&String]| {
+        let lines: Vec<&str> = lines.iter().map(|line| line.as_str()).collect();
+        Some(Users::parse(&lines.join("\n")).unwrap())
+    };
+    let table = [
+        ("the same", users(&[&alice, &bob]), true),
+        ("another one is removed", users(&[&alice]), true),
+        ("removed", users(&[&bob]), false),
+        (
+            "another password",
+            users(&[&user("alice", "another horse"), &bob]),
+            false,
+        ),
+        (
+            "the same password with another salt",
+            users(&[&user("alice", "correct horse")]),
+            false,
+        ),
+        ("commands are off", None, false),
+    ];
+    for (what, then, stays) in table {
+        let operating = Operating::new(Arc::default());
+        operating.set_users(users(&[&alice, &bob]));
+        let basic = basic_authorization("alice:correct horse");
+        let cookies = Cookies::of("hall", false);
+        let reached = Reached::within(None, None);
+        let with_password = headers(&[("authorization", &basic)]);
+        let by_password = operating.operator(&with_password, &cookies, &reached).await.unwrap();
+        let (_, cookie) = operating
+            .begin(&"alice".into(), [192, 0, 2, 1].into(), Instant::now())
+            .unwrap();
+        let set = cookies.set_session(&cookie).unwrap();
+        let sent = set.to_str().unwrap().split(';').next().unwrap().to_string();
+        let by_session = operating
+            .operator(&headers(&[("cookie", &sent)]), &cookies, &reached)
+            .await;
+        let by_session = by_session.unwrap();
+        assert!(by_password.is_still_one() && by_session.is_still_one());
+        operating.set_users(then);
+        assert_eq!(
+            (by_password.is_still_one(), by_session.is_still_one()),
+            (stays, stays),
+            "{what}"
+        );
+        assert_eq!(by_password.origin().right().allows("line1"), stays, "{what}");
+        let again = operating
+            .operator(&headers(&[("cookie", &sent)]), &cookies, &reached)
+            .await;
+        assert_eq!(again.is_ok(), stays, "{what}");
+    }
+}
+
 #[tokio::test]
 async fn a_password_that_was_right_is_not_held_up_by_guesses_at_its_address() {
     let operating = Operating::new(Arc::default());

@@ -30,7 +30,7 @@ fn bench() -> OrderedDrive {
     });
     session.adopt(Vec::new(), vec![("p1".to_string(), definitions)]);
     OrderedDrive {
-        orders: Orders::new(SharedMemory::default(), None),
+        orders: Orders::new(SharedMemory::default(), Right::lasting(), None),
         plant,
         session,
         drive,
@@ -225,7 +225,7 @@ fn a_repeated_command_is_refused_and_a_stop_never() {
     assert_eq!(again.code, "not_allowed");
     assert!(again.error.contains("repeats"), "{again:?}");
     assert_eq!((bench.take(&stop, "p1"), bench.take(&stop, "p1")), (None, None));
-    bench.orders = Orders::new(bench.orders.memory.clone(), None);
+    bench.orders = Orders::new(bench.orders.memory.clone(), Right::lasting(), None);
     assert_eq!(bench.take(&run, "p1").unwrap().code, "not_allowed", "after a reload");
     let later = message(2, vec![named("run", MetricValue::Boolean(true))]);
     assert_eq!(bench.take(&later, "p1"), None, "with its own time it is a new one");

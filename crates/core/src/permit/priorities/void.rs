@@ -1,0 +1,39 @@
+//! Slots whose client has lost its right to write: nobody could release them any more. Pure.
+
+use super::{Commanded, Entry, Priorities, Slot};
+
+/// An entry that a slot no longer has.
+#[derive(Debug, Clone, PartialEq)]
+pub struct VoidSlot {
+    /// Whose array.
+    pub what: Commanded,
+    /// 1..=16.
+    pub priority: u8,
+    /// What was in it.
+    pub entry: Entry,
+}
+
+impl Priorities {
+    /// Empties the slots whose entry `stays` rejects, those included whose write is still under way. A right that comes
+    /// back later brings none of them back. Nothing follows for the drive: no reload starts or stops a motor by a slot.
+    pub fn end_without_right(&mut self, stays: impl Fn(Commanded, &Entry) -> bool) -> Vec<VoidSlot> {
+        let mut void = Vec::new();
+        for (what, priority, slot) in self.slots_mut() {
+            let lost = |entry: &&Entry| !stays(what, entry);
+            let entry = slot.entries().find(lost).cloned();
+            void.extend(entry.map(|entry| VoidSlot { what, priority, entry }));
+            slot.clear_if(|entry| lost(&entry));
+        }
+        self.tidy();
+        void
+    }
+}
+
+impl Slot {
+    /// All that it has or may get, the latest first.
+    fn entries(&self) -> impl Iterator<Item = &Entry> {
+        let asked = self.asked.iter().rev().filter_map(|(_, entry)| entry.as_ref());
+        let uncertain = self.uncertain.iter().map(|(entry, _)| entry);
+        asked.chain(&self.stands).chain(uncertain)
+    }
+}

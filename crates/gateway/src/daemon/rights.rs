@@ -1,0 +1,40 @@
+//! What ends with a right that a reload takes away.
+
+use std::time::SystemTime;
+
+use super::Daemon;
+use crate::config::Settings;
+use crate::north::{bacnet, local};
+
+impl Daemon {
+    /// The new configuration is certain: what the broker's clients and those of the local socket may no longer do ends
+    /// before anything else changes. The servers that listen on the network end it themselves when they take their options.
+    pub(super) fn end_rights(&self, settings: &Settings) {
+        self.mqtt.end_rights(settings.mqtt.as_ref());
+        self.local.end_rights(self.local_options(settings).as_ref());
+    }
+
+    /// Slots that no BACnet client may release any more are void, also those of drives that an earlier reload has left out
+    /// and a later one may bring back.
+    pub(super) fn void_slots(&self) {
+        let time = SystemTime::now();
+        let there = self.buses.iter().map(|(_, task)| task.handle());
+        there.for_each(|bus| bus.void_slots(Some(&self.events), time));
+        self.parted.buses().for_each(|bus| bus.void_slots(None, time));
+    }
+
+    /// Where no slots are kept, those of an earlier run of the gateway are void.
+    pub(super) async fn discard_kept_slots(&self, settings: &Settings) {
+        let keeps = settings.bacnet.as_ref().is_some_and(|options| options.keep_priorities);
+        if !keeps {
+            bacnet::discard_kept_slots(&self.north, &settings.state_dir, &self.events).await;
+        }
+    }
+
+    pub(super) fn local_options(&self, settings: &Settings) -> Option<local::Options> {
+        (settings.socket != local::SocketPath::Off).then(|| local::Options {
+            socket: settings.socket.clone(),
+            control: self.control.clone(),
+        })
+    }
+}

@@ -1,0 +1,136 @@
+//! The rights of those who publish to the broker. They belong to the configuration and not to the client, which a reload
+//! replaces: commands that wait, and messages that a client still receives while it ends, are judged by what comes next.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::Options;
+use crate::command::Right;
+
+/// Who may command: by the set topics, and as a Sparkplug host.
+#[derive(Debug, Default)]
+pub struct BrokerRights {
+    topics: Revocable,
+    node: Revocable,
+}
+
+#[derive(Debug, Default)]
+struct Revocable(Mutex<Arc<AtomicBool>>);
+
+impl Revocable {
+    fn begin(&self, may_write: bool) -> Right {
+        let right = self.0.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        right.store(may_write, Ordering::Release);
+        Right::of(right)
+    }
+
+    /// What comes later is another right: none of what this one has placed comes back with it.
+    fn end(&self) {
+        let mut right = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        right.store(false, Ordering::Release);
+        *right = Arc::default();
+    }
+}
+
+impl BrokerRights {
+    /// A client begins: the rights over the set topics, and of a Sparkplug host.
+    pub(super) fn begin(&self, options: &Options) -> (Right, Right) {
+        let node = options.commands && options.sparkplug.is_some();
+        (self.topics.begin(options.commands), self.node.begin(node))
+    }
+
+    /// A reload puts a client with the options `next` in the place of the one before, or none.
+    pub(super) fn reload(&self, before: &Options, next: Option<&Options>) {
+        let same_brokers = |next: &&Options| before.brokers.iter().any(|broker| next.brokers.contains(broker));
+        let next = next.filter(|next| next.commands).filter(same_brokers);
+        if next.is_none() {
+            self.topics.end();
+        }
+        if next.is_none_or(|next| next.sparkplug.is_none()) {
+            self.node.end();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mqtt::client::tests::options;
+    use crate::mqtt::{Broker, sparkplug};
+
+    #[test]
+    fn a_right_ends_with_what_gave_it_and_comes_back_as_another_one() {
+        let broker = |port| Broker {
+            host: "127.0.0.1".to_string(),
+            port,
+        };
+        let before = Options {
+            brokers: vec![broker(1), broker(2)],
+            commands: true,
+            sparkplug: Some(sparkplug::Options {
+                group: "plant".to_string(),
+                node: "hall".to_string(),
+                primary_host: String::new(),
+                alias: true,
+                history: false,
+                state_dir: "/nonexistent".into(),
+            }),
+            ..options(None)
+        };
+        let table = [
+            ("nothing", Some(before.clone()), (true, true)),
+            (
+                "an interval",
+                Some(Options {
+                    min_interval: std::time::Duration::from_secs(9),
+                    ..before.clone()
+                }),
+                (true, true),
+            ),
+            (
+                "one broker less",
+                Some(Options {
+                    brokers: vec![broker(2)],
+                    ..before.clone()
+                }),
+                (true, true),
+            ),
+            ("no [mqtt]", None, (false, false)),
+            (
+                "commands",
+                Some(Options {
+                    commands: false,
+                    ..before.clone()
+                }),
+                (false, false),
+            ),
+            (
+                "another broker",
+                Some(Options {
+                    brokers: vec![broker(3)],
+                    ..before.clone()
+                }),
+                (false, false),
+            ),
+            (
+                "Sparkplug",
+                Some(Options {
+                    sparkplug: None,
+                    ..before.clone()
+                }),
+                (true, false),
+            ),
+        ];
+        for (what, next, expected) in table {
+            let rights = BrokerRights::default();
+            let (topics, node) = rights.begin(&before);
+            let allowed = || (topics.allows("line1"), node.allows("line1"));
+            assert_eq!(allowed(), (true, true));
+            rights.reload(&before, next.as_ref());
+            assert_eq!(allowed(), expected, "{what}");
+            // A later client has a right of its own where this one has ended.
+            let (later, _) = rights.begin(&before);
+            assert_eq!((allowed(), later.allows("line1")), (expected, true), "{what}");
+        }
+    }
+}

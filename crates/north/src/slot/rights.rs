@@ -1,0 +1,228 @@
+//! What a tool may send, as its slot is configured now: a reload counts also for a request that waits for its share of the
+//! line, or of which half has come.
+
+use std::net::IpAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use arc_swap::ArcSwap;
+
+use super::{Options, Slot, SlotAccess};
+use crate::command::{Grants, Proof, Right};
+
+/// By which way a tool came.
+#[derive(Debug, Clone)]
+enum Way {
+    Address(IpAddr),
+    Pty(PathBuf),
+    /// None: a test without sockets.
+    Within,
+}
+
+/// The rights of one tool.
+#[derive(Debug, Clone)]
+pub(super) struct ToolRights {
+    current: Arc<ArcSwap<Options>>,
+    bus: Arc<str>,
+    way: Way,
+}
+
+impl ToolRights {
+    pub(super) fn new(current: &Arc<ArcSwap<Options>>, bus: &str, proof: &Proof) -> ToolRights {
+        ToolRights {
+            current: current.clone(),
+            bus: bus.into(),
+            way: match proof {
+                Proof::Address(address) => Way::Address(*address),
+                Proof::Pty(path) => Way::Pty(PathBuf::from(&**path)),
+                _ => Way::Within,
+            },
+        }
+    }
+
+    /// The right to send what needs that access.
+    pub(super) fn of(&self, needs: SlotAccess) -> Right {
+        Right::of(Arc::new(ToolRight {
+            rights: self.clone(),
+            needs,
+        }))
+    }
+}
+
+#[derive(Debug)]
+struct ToolRight {
+    rights: ToolRights,
+    needs: SlotAccess,
+}
+
+impl Grants for ToolRight {
+    fn may_write(&self, bus: &str) -> bool {
+        let ToolRights { current, bus: own, way } = &self.rights;
+        let serves = |slot: &Slot| match way {
+            Way::Address(address) => {
+                slot.addresses().next().is_some() && slot.allow.iter().any(|network| network.contains(address))
+            }
+            Way::Pty(path) => slot.pty.as_ref() == Some(path),
+            Way::Within => true,
+        };
+        let current = current.load();
+        let mut slots = current.slots.iter();
+        bus == &**own && slots.any(|slot| slot.bus == bus && slot.access >= self.needs && serves(slot))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, Instant};
+
+    use drivegate_testkit::{nx_plant, online, read_nx};
+
+    use super::super::Offline;
+    use super::*;
+    use crate::codec::{LineFormat, Protocol, RequestPdu, rtu};
+    use crate::plant::SharedPlant;
+
+    fn slot(access: SlotAccess) -> Slot {
+        Slot {
+            bus: "line1".to_string(),
+            protocol: Protocol::ModbusRtu,
+            format: LineFormat::new(9600, "8N1").unwrap(),
+            listen: Some("127.0.0.1:0".parse().unwrap()),
+            rfc2217: None,
+            pty: Some("/tmp/tool".into()),
+            access,
+            allow: vec!["127.0.0.0/8".parse().unwrap()],
+            idle_timeout: None,
+        }
+    }
+
+    #[test]
+    fn a_right_is_that_of_the_slot_as_it_is_now() {
+        use SlotAccess::{Raw, Read, Write};
+        let current = Arc::new(ArcSwap::from_pointee(Options::default()));
+        let ways = [Proof::Address([127, 0, 0, 1].into()), Proof::Pty("/tmp/tool".into())];
+        let others = [Proof::Address([10, 0, 0, 1].into()), Proof::Pty("/tmp/other".into())];
+        for proof in ways.iter().chain(&others) {
+            let rights = ToolRights::new(&current, "line1", proof);
+            for access in [Read, Write, Raw] {
+                current.store(Arc::new(Options {
+                    slots: vec![slot(access)],
+                }));
+                for needs in [Write, Raw] {
+                    let right = rights.of(needs);
+                    let expected = ways.contains(proof) && access >= needs;
+                    assert_eq!(right.allows("line1"), expected, "{proof:?} {access:?} {needs:?}");
+                    assert!(!right.allows("line2"));
+                }
+            }
+            current.store(Arc::default());
+            assert!(!rights.of(Write).allows("line1"), "the slot is gone");
+        }
+    }
+
+    struct Tool {
+        tool: Offline,
+        plant: SharedPlant,
+        now: Instant,
+    }
+
+    impl Tool {
+        fn new(access: SlotAccess) -> Tool {
+            let (plant, now) = (nx_plant(&["p1"]), Instant::now());
+            let image = plant.drive("p1").unwrap().image;
+            online(&image);
+            read_nx(&plant, "p1", 1, 0, now);
+            let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
+            Tool {
+                tool: Offline::new(slot(access), plant.clone(), Arc::default(), "127.0.0.1:1"),
+                plant,
+                now,
+            }
+        }
+
+        fn waiting(&self) -> usize {
+            let plant = self.plant.load();
+            let queue = &plant.buses[0].queue;
+            let background = queue.background().iter().count();
+            queue.lock().writes() + background
+        }
+    }
+
+    fn frame(address: u8, pdu: &RequestPdu) -> Vec<u8> {
+        let (mut bytes, mut frame) = (Vec::new(), Vec::new());
+        pdu.encode(&mut bytes);
+        rtu::encode_frame(address, &bytes, &mut frame);
+        frame
+    }
+
+    /// When the right goes: behind the first half of the frame, or while the write waits for its share of the line.
+    #[derive(Debug, Clone, Copy, PartialEq)]
+    enum Goes {
+        Half,
+        Held,
+    }
+
+    #[test]
+    fn a_request_that_had_begun_has_the_right_of_its_end() {
+        use SlotAccess::{Raw, Read, Write};
+        let start = RequestPdu::write_register(2000, 1);
+        let reference = RequestPdu::write_register(2002, 1000);
+        let undecoded = RequestPdu::Other(vec![0x43, 1]);
+        // Address, what is sent, the access before and after, and whether it goes to the bus.
+        let table = [
+            (1, &start, Write, Write, true),
+            (1, &start, Write, Read, false),
+            (1, &start, Raw, Write, true),
+            (1, &start, Raw, Read, false),
+            (0, &start, Raw, Raw, true),
+            (0, &start, Raw, Write, false),
+            (77, &start, Raw, Raw, true),
+            (77, &start, Raw, Write, false),
+            (1, &undecoded, Raw, Raw, true),
+            (1, &undecoded, Raw, Write, false),
+        ];
+        for goes in [Goes::Half, Goes::Held] {
+            for (address, pdu, before, after, passes) in table {
+                let mut rig = Tool::new(before);
+                let what = format!("{goes:?} {address} {pdu:?} {before:?} {after:?}");
+                let bytes = frame(address, pdu);
+                let (first, rest) = bytes.split_at(bytes.len() / 2);
+                let count = match goes {
+                    Goes::Half => {
+                        assert!(rig.tool.receive(first, rig.now).is_empty());
+                        rig.tool.reload(after);
+                        0
+                    }
+                    Goes::Held => {
+                        // It uses up the share of the tools.
+                        rig.tool.receive(&frame(1, &reference), rig.now);
+                        rig.now += Duration::from_millis(50);
+                        rig.tool.receive(first, rig.now);
+                        let count = rig.waiting();
+                        rig.tool.receive(rest, rig.now);
+                        rig.tool.reload(after);
+                        count
+                    }
+                };
+                let (rest, mut reply) = match goes {
+                    Goes::Half => (rest, Vec::new()),
+                    Goes::Held => (&[][..], Vec::new()),
+                };
+                for bytes in [rest, &[], &[]] {
+                    reply.extend(rig.tool.receive(bytes, rig.now));
+                    rig.now = rig.tool.wake_at().unwrap_or(rig.now).max(rig.now);
+                    if rig.waiting() > count {
+                        break;
+                    }
+                }
+                // What is not decoded does not wait for a share: it went before the reload.
+                let went = goes == Goes::Held && matches!(pdu, RequestPdu::Other(_));
+                let expected = passes || went;
+                assert_eq!(rig.waiting() > count, expected, "{what}");
+                if !expected && address != 0 {
+                    assert_eq!(reply[1..3], [bytes[1] | 0x80, 1], "{what}: {reply:?}");
+                }
+            }
+        }
+    }
+}
