@@ -30,7 +30,6 @@ mod gateway {
     mod openapi;
     mod operators;
     mod parameters;
-    mod pauses;
     mod recordings;
     mod reload;
     mod replay;

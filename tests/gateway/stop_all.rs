@@ -2,8 +2,7 @@
 
 use serde_json::{Value as Json, json};
 
-use crate::support::mqtt::client;
-use crate::support::process::{Running, drivegate, get, mbpoll_read, mbpoll_write, until, write_registers};
+use crate::support::process::{Running, drivegate, mbpoll_read, mbpoll_write, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, PASSWORD, Site, USERS, controlled, drive};
 use crate::support::tools::{run, tool};
 
@@ -163,49 +162,4 @@ fn from_every_side() {
     let (code, text) = ran(&["stop-all"], &alice);
     assert_eq!((code, text.as_str()), (0, "pump-1: standing\nfan-1: standing\n"));
     plant.all_stand();
-}
-
-/// The broker would repeat it at each connection of the gateway. The topic is cleared by such a message, too.
-#[test]
-fn a_retained_stop_of_all_stops_nothing_and_is_told() {
-    let plant = plant();
-    plant.start();
-    let heard = |topic| Running::spawn(client("mosquitto_sub", plant.site.mqtt).args(["-t", topic, "-F", "%p"]));
-    let results = heard("drivegate/test/result");
-    let events = heard("drivegate/test/drive/pump-1/event");
-    // Both have subscribed when a stop that is not understood is answered.
-    until("the subscriptions", || {
-        plant.site.publish(&["-t", "drivegate/test/set/stop", "-m", "[]"]);
-        (results.output().contains("no stop was sent") && events.output().contains("refused stop all")).then_some(())
-    });
-    let refusals = || {
-        let audit = plant.site.audit().into_iter();
-        let own = audit.filter(|record| record["drive"] == "all drives" && record["result"] == "not_allowed");
-        own.filter_map(|record| record["count"].as_u64()).sum::<u64>()
-    };
-    for (times, payload) in [(1, &["-n"][..]), (2, &["-m", "{}"]), (3, &["-n"])] {
-        plant
-            .site
-            .publish(&[&["-r", "-t", "drivegate/test/set/stop"], payload].concat());
-        until("a result", || {
-            (results.output().matches("the message was retained").count() == times).then_some(())
-        });
-        // Refusals of one client are counted, each second anew.
-        until("the audit", || (refusals() == times as u64).then_some(()));
-    }
-    until("an event", || {
-        events.output().contains("the message was retained").then_some(())
-    });
-    let (_, log) = get(plant.site.http, "/api/v1/events/log?kind=refused_command").unwrap();
-    let log: Json = serde_json::from_str(&log).unwrap();
-    let entry = log.as_array().unwrap().iter().find(|event| {
-        event["text"]
-            .as_str()
-            .is_some_and(|text| text.contains("the message was retained"))
-    });
-    let entry = entry.unwrap_or_else(|| panic!("{log}"));
-    assert!(entry["drive"].is_null(), "it is for no drive in particular: {entry}");
-    for name in ["pump-1", "fan-1"] {
-        assert_eq!(plant.site.point(name, "running"), true, "{name}");
-    }
 }

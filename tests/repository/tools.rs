@@ -98,7 +98,7 @@ fn a_fault_that_fits_no_function_is_named_with_what_may_be_meant() {
         (
             "elsewhere",
             "fn = 'Waiting::push_stop'\nreturns = '()'",
-            "core::command::queue::stops::Pending::push_stop in",
+            "core::queue::stops::Pending::push_stop in",
         ),
         (
             "twice",

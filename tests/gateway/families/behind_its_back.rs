@@ -23,7 +23,7 @@ const ORDERS: [&[&str]; 4] = [
         "{\"speed_reference\": 50}",
     ],
     &["{\"fault_reset\": true}", "{\"reverse\": true}"],
-    &["{\"fault_reset\": true, \"reverse\": true}"],
+    &["{\"fault_reset\": true, \"reverse\": true, \"expires_ms\": 10000}"],
 ];
 
 fn stays_as_it_is(case: &Case) {

@@ -179,16 +179,27 @@ impl Ledger {
             .max_by_key(|wait| wait.retry_after)
     }
 
+    fn members<'a>(&'a self, group: &'a Arc<str>) -> impl Iterator<Item = &'a Entry> + 'a {
+        self.motors.values().filter(move |entry| entry.group == *group)
+    }
+
+    /// Whether a start in that group is decided whose word was not sent yet.
+    fn awaits_word(&self, group: &Arc<str>) -> bool {
+        self.members(group).any(|entry| entry.motor.reserved.is_some())
+    }
+
     fn too_close(&self, name: &Arc<str>, guard: &Guard, now: Instant) -> Option<Guarded> {
         if guard.stagger.is_zero() {
             return None;
         }
-        let members = || self.motors.values().filter(|entry| entry.group == *name);
-        let retry_after = match members().any(|entry| entry.motor.reserved.is_some()) {
+        let retry_after = match self.awaits_word(name) {
             // It may be written at any time.
             true => guard.stagger,
             false => {
-                let last = members().filter_map(|entry| entry.motor.starts().max()).max()?;
+                let last = self
+                    .members(name)
+                    .filter_map(|entry| entry.motor.starts().max())
+                    .max()?;
                 (last + guard.stagger).saturating_duration_since(now)
             }
         };

@@ -89,7 +89,7 @@ impl Task {
         Task {
             options,
             sockets,
-            readers: [Reader::here(), Reader::here()],
+            readers: [waiting_reader(), waiting_reader()],
             stats,
             busy,
             desk,
@@ -322,7 +322,7 @@ impl Task {
                 self.options = Arc::from(options);
                 if let Some(sockets) = sockets {
                     self.sockets = sockets;
-                    self.readers = [Reader::here(), Reader::here()];
+                    self.readers = [waiting_reader(), waiting_reader()];
                 }
                 self.see();
                 let now = Instant::now();
@@ -380,6 +380,13 @@ impl Task {
 async fn ending(token: u64, mut waiting: Waiting) -> Ended {
     let outcome = waiting.placed.answered().await.outcome;
     Ended::of(token, waiting, outcome)
+}
+
+/// The reader of a socket that is new: what comes from now on is waited for.
+fn waiting_reader() -> Reader {
+    let reader = Reader::here();
+    reader.nothing(Instant::now(), || false);
+    reader
 }
 
 /// Waits for a broadcast.

@@ -533,6 +533,7 @@ fn a_stop_over_http_or_the_socket_is_never_a_repetition() {
             judged.is_ok()
         };
         assert!(stop(&mut drive, &claim));
+        drive.holding.stop_acknowledged(&claim);
         drive.act("op", Verb::Break);
         drive.act("op", Verb::Take);
         assert_eq!(stop(&mut drive, &claim), !repeats, "{proof:?}");

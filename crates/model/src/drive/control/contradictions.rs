@@ -66,7 +66,7 @@ impl Control {
         if stop.place.is_some() || stop.once || self.stop.place.is_some() || self.at.table != Table::Holding {
             return Some((
                 key,
-                format!("{is} is no word of a control register that also takes the stop"),
+                format!("{is} is not in the register to which `stop` is written"),
                 "write only `mask` and `value` of words of the control register",
             ));
         }

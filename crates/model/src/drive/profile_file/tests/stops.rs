@@ -111,12 +111,12 @@ fn wrong_words_of_other_stops_are_reported() {
         (
             bits,
             "{ bit = 1, point = \"other\" }",
-            "is no word of a control register that also takes the stop",
+            "is not in the register to which `stop` is written",
         ),
         (
             bits,
             "{ bit = 1, once = true }",
-            "is no word of a control register that also takes the stop",
+            "is not in the register to which `stop` is written",
         ),
         (sequence, "{ bit = 11 }", "0x0800 in 0x0800: a run command"),
         (sequence, "{ bit = 2 }", "0x0004 in 0x0004: a run command"),
