@@ -29,6 +29,7 @@ mod gateway {
     mod messages;
     mod openapi;
     mod operators;
+    mod other_machines;
     mod parameters;
     mod recordings;
     mod reload;

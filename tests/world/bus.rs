@@ -204,7 +204,7 @@ impl WorldBus {
 
     /// The bus as a reload starts it anew, with the same drives on the same line.
     pub fn restart(&mut self, index: usize, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
-        self.handle.queue.begin_handover(now);
+        self.handle.queue.begin_handover(Vec::new(), now);
         let leaving: Vec<_> = self.handle.image.drives.iter().cloned().collect();
         self.guards.expect(&leaving, now);
         let before = self.core.ended(now);

@@ -501,7 +501,7 @@ fn a_stop_is_taken_while_the_bus_ends_and_before_its_port_is_open_again() {
     let before = rig.drive(1);
     let order = rig.points(1, &[("run", 0.0)]);
     let ends = rig.bus.handle.clone();
-    ends.queue.begin_handover(rig.now);
+    ends.queue.begin_handover(Vec::new(), rig.now);
     let mut while_it_ends = before.place(
         OrderRequest::new(order.clone(), Origin::new(SourceKind::Mqtt, "test"), Authority::Write),
         rig.now,

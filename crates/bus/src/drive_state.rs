@@ -312,6 +312,11 @@ impl DriveState {
         self.stopped = None;
     }
 
+    /// Whether a stop was started and is not over.
+    pub(super) fn is_stopping(&self) -> bool {
+        self.runs.iter().flatten().any(|run| run.urgency() == Urgency::Stop)
+    }
+
     /// A client's started stop, for the bus that replaces this one.
     pub(super) fn take_stop(&mut self, now: Instant) -> Option<Command> {
         let run = self.runs.get_mut(slot(Urgency::Stop))?.take()?;

@@ -13,6 +13,7 @@ use super::master::Handover;
 use super::{BusOptions, Mode};
 use crate::codec::LineFormat;
 use crate::command::{Outcome, WriteStats};
+use crate::drive::DriveIndex;
 use crate::event::Events;
 use crate::line::{self, Arrival, Line, LineOptions, Lost, Names, OpenError, Receiver, Woken};
 use crate::order::Stalls;
@@ -116,9 +117,15 @@ impl BusTask {
     }
 
     /// The same for a bus that another one replaces: stops wait for it, handed over by [`BusHandle::take_over`].
-    /// Returns the handover.
-    pub fn make_room(mut self) -> Handover {
-        self.handle.queue.begin_handover(Instant::now());
+    /// The stops of the drives of `last`, which none serves any more, are sent before; a drive that does not answer is not waited
+    /// for longer than two seconds. Returns the handover.
+    pub fn make_room(mut self, last: Vec<DriveIndex>) -> Handover {
+        let began = Instant::now();
+        let queue = self.handle.queue.clone();
+        queue.begin_handover(last, began);
+        while queue.has_last_stops() && began.elapsed() < LAST_STOPS {
+            std::thread::sleep(LOOK_AGAIN);
+        }
         self.halt()
     }
 
@@ -140,6 +147,11 @@ impl Drop for BusTask {
         self.halt();
     }
 }
+
+/// The time for the stops of drives that no bus serves any more.
+const LAST_STOPS: Duration = Duration::from_secs(2);
+/// The time between two looks at them.
+const LOOK_AGAIN: Duration = Duration::from_millis(5);
 
 /// Time for the log to be written before the process ends.
 const LAST_WORDS: Duration = Duration::from_millis(200);

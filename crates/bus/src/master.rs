@@ -317,7 +317,10 @@ impl Master {
         if let Some(starts) = &mut self.waits.starts {
             news.append(&mut starts.take_told());
         }
-        let denied = self.bus.queue.lock().take_denied();
+        let mut queue = self.bus.queue.lock();
+        queue.settle_stops(|drive| self.drives.get(drive).is_some_and(DriveState::is_stopping));
+        let denied = queue.take_denied();
+        drop(queue);
         news.extend(denied.into_iter().map(News::Denied));
         next.map_err(|until| until.min(now + LOOK_ROUND))
     }

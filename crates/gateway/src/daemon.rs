@@ -21,11 +21,12 @@ use self::leases::Parted;
 pub use self::pulse::Pulse;
 use self::reservations::ReservationsFile;
 use self::server::{ServerSlot, within};
-use crate::bus::BusTask;
+use crate::bus::{BusTask, Mode};
 use crate::bus::line_state::Learned;
 use crate::bus::master::Handover;
 use crate::command::{CommandQueue, NotStopped, Outcome, WriteStats};
 use crate::config::{BusSettings, Settings};
+use crate::drive::DriveIndex;
 use crate::event::{Event, EventKind, Events};
 use crate::files::Keeper;
 use crate::history::RecorderTask;
@@ -266,7 +267,12 @@ impl Daemon {
         let stopped: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
         let leaving = stopped.iter().flat_map(|bus| bus.image.drives.iter().cloned());
         self.guards.expect(&leaving.collect::<Vec<_>>(), Instant::now());
-        for (before, left) in at_once(removed, BusTask::make_room).await {
+        let removed = removed.into_iter().map(|(bus, task)| {
+            let last = unserved(task.handle(), settings);
+            (bus, (task, last))
+        });
+        let make_room = |(task, last): (BusTask, Vec<DriveIndex>)| task.make_room(last);
+        for (before, left) in at_once(removed.collect(), make_room).await {
             learned.extend(left.learned.map(|learned| (before.spec.port.clone(), learned)));
             leases.left(&before, left.leases);
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
@@ -494,11 +500,11 @@ impl Daemon {
 }
 
 /// Stops buses, all at the same time, away from the runtime: each takes up to a second. What they leave.
-async fn at_once<T: Send + 'static>(
-    buses: Vec<(BusSettings, BusTask)>,
-    end: fn(BusTask) -> T,
+async fn at_once<B: Send + 'static, T: Send + 'static>(
+    buses: Vec<(BusSettings, B)>,
+    end: fn(B) -> T,
 ) -> Vec<(BusSettings, T)> {
-    let stop = |(settings, task): (BusSettings, BusTask)| {
+    let stop = |(settings, task): (BusSettings, B)| {
         tracing::info!(target: "drivegate::daemon", bus = %settings.spec.name, "stopping the bus");
         tokio::task::spawn_blocking(move || (settings, end(task)))
     };
@@ -506,6 +512,25 @@ async fn at_once<T: Send + 'static>(
     // A bus thread that panicked has ended the process.
     let stopped = futures_util::future::join_all(stopping).await;
     stopped.into_iter().filter_map(Result::ok).collect()
+}
+
+/// The drives of a bus that no bus sends a stop to with these settings: removed, moved, only monitored, or on a line that another
+/// master owns.
+fn unserved(bus: &BusHandle, settings: &Settings) -> Vec<DriveIndex> {
+    let image = &bus.image;
+    let is_served = |drive: &DriveImage| {
+        let machine = image.spec.machine(&drive.spec);
+        let of_bus = |bus: &BusSettings| {
+            let mut drives = bus.drives.iter().filter(|drive| drive.access == Access::Control);
+            bus.options.mode == Mode::Master && drives.any(|drive| bus.spec.machine(drive) == machine)
+        };
+        settings.buses.iter().any(of_bus)
+    };
+    let drives = image.drives.enumerate();
+    drives
+        .filter(|(_, drive)| !is_served(drive))
+        .map(|(index, _)| index)
+        .collect()
 }
 
 /// Watches the commands that stop all drives.

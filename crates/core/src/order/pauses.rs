@@ -5,11 +5,19 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
+use tokio::sync::Notify;
+
 use super::{Stall, UNNOTICED};
 
 /// The pauses of the process. Clones are the same ones.
 #[derive(Debug, Clone, Default)]
-pub struct Pauses(Arc<Mutex<State>>);
+pub struct Pauses(Arc<Shared>);
+
+#[derive(Debug, Default)]
+struct Shared {
+    state: Mutex<State>,
+    stops: Notify,
+}
 
 #[derive(Debug, Default)]
 struct State {
@@ -55,7 +63,18 @@ impl Beat {
 
 impl Pauses {
     fn state(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A stop was accepted. Each thread that reads orders shows that it runs: what it reads after a stall that begins now came
+    /// after the stop, so that no healthy client's order is purged by it.
+    pub fn note_stop(&self) {
+        self.0.stops.notify_waiters();
+    }
+
+    /// Waits for the next stop that is accepted.
+    pub async fn next_stop(&self) {
+        self.0.stops.notified().await;
     }
 
     /// A thread had this pause. Whether it is news: no other thread had it, too.

@@ -314,10 +314,13 @@ impl DriveHandle {
                 self.turn_away(ticket, &what, outcome, write, now);
             }
             Ok(command) => {
-                let origin = command.ticket.origin().clone();
+                let (origin, stops) = (command.ticket.origin().clone(), command.is_stop());
                 let facts = self.bus.at_accept(self.stale_after, now);
                 let refusal = self.bus.queue.submit(command, &facts, now);
                 self.tell_refused(&what, refusal, &origin, now);
+                if stops {
+                    self.events.pauses().note_stop();
+                }
             }
         }
         placed
@@ -381,6 +384,7 @@ impl DriveHandle {
                 self.turn_away(ticket, what, outcome, true, now);
             }
         }
+        self.events.pauses().note_stop();
         placed
     }
 

@@ -14,6 +14,17 @@ impl Pending {
         self.ending
     }
 
+    /// Whether a stop of a drive is under way or waits that no bus sends after this one.
+    fn has_last_stops(&self) -> bool {
+        let begun = |drive: &DriveIndex| self.begun_stops.contains(drive);
+        self.last.iter().any(begun) || self.waiting.iter().any(|c| c.is_stop() && self.is_last(c))
+    }
+
+    /// Whether no bus sends anything to the drive of a command after this one.
+    pub(super) fn is_last(&self, command: &Command) -> bool {
+        self.last.contains(&command.intent.drive)
+    }
+
     /// A stop that the bus had started when it ended: the bus that takes its place sends it.
     ///
     /// # Errors
@@ -50,14 +61,25 @@ impl Command {
 }
 
 impl CommandQueue {
-    /// The bus is about to be replaced: stops wait for the next bus, everything else ends.
-    pub fn begin_handover(&self, now: Instant) {
+    /// The bus is about to be replaced: stops wait for the next bus, those of the drives of `last`, which have none, for nothing;
+    /// everything else ends.
+    pub fn begin_handover(&self, last: Vec<DriveIndex>, now: Instant) {
         let outcome = Outcome::ShuttingDown;
         self.background().close(&outcome, now);
         let mut pending = self.lock();
         pending.remove(now, &outcome, |c| !c.is_stop());
         pending.closed = Some(outcome);
         pending.ending = true;
+        let hurried = pending.waiting.iter_mut().filter(|c| last.contains(&c.intent.drive));
+        hurried.for_each(Command::hurry);
+        pending.last = last;
+        drop(pending);
+        self.wake();
+    }
+
+    /// Whether the bus that is about to be replaced still has to send a stop which no other bus sends.
+    pub fn has_last_stops(&self) -> bool {
+        self.lock().has_last_stops()
     }
 
     /// From now on the stops of that drive are those of another queue, in which it has that place: those that wait, and those

@@ -45,6 +45,10 @@ pub struct Pending {
     stopped: Vec<DriveIndex>,
     /// The bus ends and another one takes its place: stops wait for that one.
     ending: bool,
+    /// Drives that no bus sends a stop to after this one: their stops are sent before it ends.
+    last: Vec<DriveIndex>,
+    /// Drives with a stop that was taken, until the bus says that it is over.
+    begun_stops: Vec<DriveIndex>,
     /// The queues that took over the stops of drives, and their places there.
     heirs: BTreeMap<DriveIndex, (Arc<CommandQueue>, DriveIndex)>,
     /// The stops that the gateway wants before it ends, until the bus takes note of it.
@@ -348,6 +352,9 @@ impl Pending {
     pub fn take(&mut self, chosen: Chosen) -> Option<Command> {
         let index = self.waiting.iter().position(|c| c.intent.number == chosen.number)?;
         let command = self.waiting.remove(index)?;
+        if command.is_stop() {
+            self.begun_stops.push(command.intent.drive);
+        }
         for older in self.waiting.iter_mut().take(index) {
             if older.urgency() >= command.urgency() {
                 older.overtaken += 1;

@@ -106,6 +106,7 @@ impl CommandQueue {
         let keeps_stops = pending.ending && outcome == Outcome::BusDown;
         pending.remove(now, &outcome, |c| !keeps_stops || !c.is_stop());
         pending.ending = keeps_stops;
+        pending.begun_stops.clear();
         pending.closed = Some(outcome);
     }
 

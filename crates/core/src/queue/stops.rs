@@ -48,7 +48,7 @@ impl Pending {
     /// A stop that `min_run` delays, or that repeats such a one for a cyclic client, waits: that is no second stop.
     pub(super) fn delay(&self, command: &mut Command) {
         let is_usual = matches!(&command.work, Work::Stop(stop) if stop.haste == Haste::Usual);
-        let delays = is_usual && (self.gate.may_be_delayed(command) || self.repeats(command));
+        let delays = is_usual && (self.gate.may_be_delayed(command) || self.repeats(command)) && !self.is_last(command);
         if let Work::Stop(stop) = &mut command.work
             && delays
         {
@@ -72,6 +72,11 @@ impl Pending {
             .iter()
             .any(delayed)
             .then(|| self.gate.stop_waits(drive, now))?
+    }
+
+    /// The stops that were taken are over, but those of the drives that are still `stopping`.
+    pub fn settle_stops(&mut self, stopping: impl Fn(DriveIndex) -> bool) {
+        self.begun_stops.retain(|drive| stopping(*drive));
     }
 
     /// Of each drive one stop waits that does nothing else, and one that does. Later ones join theirs if they ask for

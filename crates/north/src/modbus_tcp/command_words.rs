@@ -1,19 +1,52 @@
 //! The words last written at 0x8100.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
-/// The word last written at 0x8100 by any client, by drive name: a fault reset is a change of its bit 2.
+use crate::spec::Machine;
+
+/// The word last written at 0x8100 of each unit by any client, and the machine that it was written to: a fault reset is a change of
+/// its bit 2. Behind a reload that puts another machine at a unit, a word that a client repeats changes nothing there.
 #[derive(Debug, Default)]
-pub(super) struct CommandWords(Mutex<HashMap<String, Option<u16>>>);
+pub(super) struct CommandWords(Mutex<BTreeMap<u8, (Machine, Option<u16>)>>);
 
 impl CommandWords {
-    /// Calls `update` with the word of a drive while no other client can change it.
-    pub(super) fn update<T>(&self, drive: &str, update: impl FnOnce(&mut Option<u16>) -> T) -> T {
+    /// Calls `update` with the word last written to that machine at that unit while no other client can change it; none where
+    /// the unit meant another machine when it was written last.
+    pub(super) fn update<T>(&self, unit: u8, machine: Machine, update: impl FnOnce(&mut Option<u16>) -> T) -> T {
         let mut words = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut word = words.get(drive).copied().unwrap_or_default();
+        let last = words.remove(&unit).filter(|(of, _)| *of == machine);
+        let mut word = last.and_then(|(_, word)| word);
         let result = update(&mut word);
-        words.insert(drive.to_string(), word);
+        words.insert(unit, (machine, word));
         result
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn machine(address: u8) -> Machine {
+        Machine {
+            port: "/dev/ttyUSB0".to_string(),
+            address,
+            profile: "vacon-nx".to_string(),
+        }
+    }
+
+    #[test]
+    fn a_word_belongs_to_the_machine_that_the_unit_meant() {
+        let words = CommandWords::default();
+        let write = |unit, address, word| {
+            words.update(unit, machine(address), |last| std::mem::replace(last, Some(word)))
+        };
+        assert_eq!(write(2, 1, 1), None);
+        assert_eq!(write(2, 1, 5), Some(1));
+        assert_eq!(write(3, 2, 1), None, "another unit");
+        // A reload swaps the two, and swaps them back.
+        assert_eq!(write(2, 2, 5), None);
+        assert_eq!(write(2, 1, 5), None);
+        assert_eq!(write(2, 1, 1), Some(5));
     }
 }

@@ -171,9 +171,7 @@ impl ClientSession {
         let ForwardedRequest { header, request, .. } = forwarded;
         let drive = &forwarded.drive.image.spec.name;
         if forwarded.resets && !outcome.is_ok() {
-            self.state
-                .command_words
-                .update(drive, |word| *word = word.map(register_map::without_reset));
+            self.last_word(&forwarded.drive, |word| *word = word.map(register_map::without_reset));
         }
         if let Outcome::Exception(code) = outcome
             && *code > Exception::GATEWAY_TARGET
@@ -397,6 +395,12 @@ impl ClientSession {
         }
     }
 
+    /// Calls `update` with the word last written at 0x8100 of that drive.
+    fn last_word<T>(&self, drive: &DriveHandle, update: impl FnOnce(&mut Option<u16>) -> T) -> T {
+        let unit = drive.image.spec.unit;
+        self.state.command_words.update(unit, drive.machine(), update)
+    }
+
     /// A write to the blocks from 0x8000 on by a client that may write to the drive.
     fn command(
         &self,
@@ -416,7 +420,7 @@ impl ClientSession {
         }
         let spec = &drive.image.spec;
         let fault = drive.reading(now).state() == Some(State::Fault);
-        let write = self.state.command_words.update(&spec.name, |last| {
+        let write = self.last_word(drive, |last| {
             let before = register_map::CommandContext { word: *last, fault };
             let write = register_map::command(&spec.profile, start, values, before)?;
             let resets = write.refused.is_none() && write.word.is_some_and(|word| before.resets(word));

@@ -1,5 +1,5 @@
-//! Whether the threads that read sockets run. A task that wakes ten times a second shows that of a runtime; what a
-//! reader finds before that task ran again counts, too.
+//! Whether the threads that read sockets run. A task that wakes ten times a second, and with every stop, shows that of a
+//! runtime; what a reader finds before that task ran again counts, too.
 //!
 //! The workers of a runtime that has several share a watch: a stall of one of them is a stall for all, since its tasks
 //! may go on at another one.
@@ -77,13 +77,17 @@ impl Watch {
 
     /// Watches as long as the runtime runs, and tells of pauses.
     pub async fn run(self: Arc<Watch>, events: Events) {
-        let beat = events.pauses().reader(Instant::now());
+        let pauses = events.pauses().clone();
+        let beat = pauses.reader(Instant::now());
         // Told by that of the first call, should there be several.
         let _ = self.events.set(events);
         let mut ticks = tokio::time::interval(TICK);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
-            ticks.tick().await;
+            tokio::select! {
+                _ = ticks.tick() => {}
+                () = pauses.next_stop() => {}
+            }
             let now = Instant::now();
             beat.ran(now);
             self.tick(now, since_boot());

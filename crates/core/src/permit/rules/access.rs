@@ -4,7 +4,7 @@
 //!
 //! A stop needs the right when it is accepted. Once accepted it is sent: the motor that it is to stop may run by nobody
 //! else's will.
-
+//!
 //! What the profile, the access of the drive and that of the point let through, [`crate::permit::admit`] answers before this is asked,
 //! since what an order does is only known then. That is not asked again: a reload that changes the access of a drive or a point
 //! starts the bus anew, and what waits there ends.

@@ -194,7 +194,7 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
     let (old, new) = (CommandQueue::new().unwrap(), Arc::new(CommandQueue::new().unwrap()));
     let mut waits = give(&old, 3, Urgency::Stop);
     let mut run = give(&old, 2, Urgency::Command);
-    old.begin_handover(now);
+    old.begin_handover(Vec::new(), now);
     assert_eq!(outcome(&mut run), Some(Outcome::ShuttingDown));
     let (mut late, mut gone) = (give(&old, 2, Urgency::Stop), give(&old, 4, Urgency::Stop));
     // The port may go, and come, in its last moments.

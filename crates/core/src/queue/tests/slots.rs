@@ -116,7 +116,7 @@ fn a_stop_that_another_bus_takes_over_withdraws_there() {
     let now = Instant::now();
     let (old, new) = (CommandQueue::new().unwrap(), Arc::new(CommandQueue::new().unwrap()));
     stand(&mut old.lock(), 3, 8, true, now);
-    old.begin_handover(now);
+    old.begin_handover(Vec::new(), now);
     let inheritance = old.lock().gate.inheritance(DriveIndex::new(3));
     new.lock().gate.inherit(DriveIndex::new(0), inheritance);
     old.hand_over(DriveIndex::new(3), &new, DriveIndex::new(0), now);

@@ -1,0 +1,235 @@
+//! Reloads that give names and units to other machines, or take a machine away: what a client had begun, holds or waits for
+//! belongs to the machine that it named. What drives were told is read from the line.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::os::unix::net::UnixStream;
+use std::time::Duration;
+
+use drivegate::sim::statistics::Direction;
+use drivegate::sim::wire::SimulatedBus;
+
+use crate::support::process::{PATIENCE, Running, api, until};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled};
+
+const MS: Duration = Duration::from_millis(1);
+/// The register of the control word of a Vacon NX.
+const CONTROL_WORD: [u8; 2] = [0x07, 0xD0];
+
+struct Plant {
+    site: Site,
+    line: SimulatedBus,
+    gateway: Running,
+    reloads: usize,
+}
+
+impl Plant {
+    /// Two drives at addresses 1 and 2, whose names and units are as the sections say.
+    fn new(drives: &str) -> Plant {
+        let site = Site::new();
+        let line = site.line(&[1, 2]);
+        configure(&site, drives);
+        let gateway = site.run_ready();
+        for name in ["pump-1", "pump-2"] {
+            site.until_state(name, "ready");
+        }
+        Plant {
+            site,
+            line,
+            gateway,
+            reloads: 0,
+        }
+    }
+
+    fn reload(&mut self, drives: &str) {
+        configure(&self.site, drives);
+        self.reload_file();
+    }
+
+    fn reload_file(&mut self) {
+        self.gateway.signal("HUP");
+        self.reloads += 1;
+        until("the reload", || {
+            let output = self.gateway.output();
+            assert!(!output.contains("reload rejected"), "{output}");
+            (output.matches("configuration reloaded").count() == self.reloads).then_some(())
+        });
+    }
+
+    /// The control words that the drive at that address was sent.
+    fn words(&self, address: u8) -> Vec<u16> {
+        let mut frames = self.line.transcript();
+        frames.retain(|frame| frame.direction == Direction::ToDrives);
+        let words = frames.iter().filter_map(|frame| match *frame.bytes.as_slice() {
+            [to, 6, high, low, a, b, ..] if to == address && [high, low] == CONTROL_WORD => Some([a, b]),
+            [to, 16, high, low, _, _, _, a, b, ..] if to == address && [high, low] == CONTROL_WORD => Some([a, b]),
+            _ => None,
+        });
+        words.map(u16::from_be_bytes).collect()
+    }
+
+    fn runs(&self, address: u8) -> bool {
+        self.words(address).last().is_some_and(|word| word & 1 != 0)
+    }
+
+    fn modbus(&self) -> TcpStream {
+        let stream = TcpStream::connect(("127.0.0.1", self.site.modbus)).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        stream
+    }
+}
+
+fn configure(site: &Site, drives: &str) {
+    let socket = format!("[gateway]\nsocket = \"{}\"\n", site.path("socket"));
+    let line = LINE1.replace("[gateway]\n", &socket);
+    site.configure(&[&line, drives, MODBUS_TCP, HTTP]);
+}
+
+fn pair(one: &str, other: &str) -> String {
+    controlled(one, 1, "unit = 11") + &controlled(other, 2, "unit = 12")
+}
+
+/// The same names; the units are swapped.
+fn swapped_units() -> String {
+    controlled("pump-1", 1, "unit = 12") + &controlled("pump-2", 2, "unit = 11")
+}
+
+/// Writes that word to 0x8100 of a unit; the reply.
+fn write(stream: &mut TcpStream, unit: u8, word: u16) -> Vec<u8> {
+    let [high, low] = word.to_be_bytes();
+    stream
+        .write_all(&[0, 1, 0, 0, 0, 6, unit, 6, 0x81, 0, high, low])
+        .unwrap();
+    reply(stream)
+}
+
+fn reply(stream: &mut impl Read) -> Vec<u8> {
+    let mut reply = vec![0; 4096];
+    let count = stream.read(&mut reply).unwrap();
+    reply.truncate(count);
+    reply
+}
+
+/// The head of a command over HTTP at the local socket; the gateway waits for the body.
+fn begin_over_http(site: &Site, drive: &str, body: &str) -> UnixStream {
+    let mut stream = UnixStream::connect(site.file("socket")).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let head = format!(
+        "POST /api/v1/drives/{drive}/commands HTTP/1.1\r\nHost: localhost\r\nContent-Length: {}\r\nExpect: \
+         100-continue\r\n\r\n",
+        body.len()
+    );
+    stream.write_all(head.as_bytes()).unwrap();
+    let mut reply = [0; 25];
+    stream.read_exact(&mut reply).unwrap();
+    stream
+}
+
+/// The head of an order comes, a reload gives its name to the other machine, the rest comes.
+#[test]
+fn an_order_belongs_to_the_machine_that_its_first_byte_named() {
+    let mut plant = Plant::new(&pair("pump-1", "pump-2"));
+    let mut names = [pair("pump-2", "pump-1"), pair("pump-1", "pump-2")].into_iter().cycle();
+    let stop = "{\"run\": false}";
+    for body in ["{\"run\": true}", "{\"reverse\": true}", "{\"speed_reference\": 20}"] {
+        let mut begun = begin_over_http(&plant.site, "pump-1", body);
+        plant.reload(&names.next().unwrap());
+        begun.write_all(body.as_bytes()).unwrap();
+        let reply = reply(&mut begun);
+        let text = String::from_utf8_lossy(&reply);
+        assert!(text.starts_with("HTTP/1.1 404"), "{body}: {text}");
+        assert!(text.contains("meant another machine"), "{text}");
+        std::thread::sleep(200 * MS);
+        assert_eq!((plant.words(1), plant.words(2)), (vec![], vec![]), "{body}");
+        plant.reload(&names.next().unwrap());
+    }
+    // Half a frame, and a reload that swaps the units.
+    for rest in [[6, 0x81, 0, 0, 1], [6, 0x81, 1, 7, 0xD0]] {
+        let mut stream = plant.modbus();
+        stream.write_all(&[0, 1, 0, 0, 0, 6, 11]).unwrap();
+        std::thread::sleep(50 * MS);
+        plant.reload(&swapped_units());
+        stream.write_all(&rest).unwrap();
+        assert_eq!(reply(&mut stream), [0, 1, 0, 0, 0, 3, 11, 0x86, 0x0A], "{rest:?}");
+        std::thread::sleep(200 * MS);
+        assert_eq!((plant.words(1), plant.words(2)), (vec![], vec![]), "{rest:?}");
+        plant.reload(&pair("pump-1", "pump-2"));
+    }
+    // A stop goes to the machine that was meant, and to no other.
+    let mut plc = plant.modbus();
+    for unit in [11, 12] {
+        assert_eq!(write(&mut plc, unit, 1)[7], 6, "unit {unit}");
+    }
+    let mut begun = begin_over_http(&plant.site, "pump-1", stop);
+    plant.reload(&pair("pump-2", "pump-1"));
+    begun.write_all(stop.as_bytes()).unwrap();
+    reply(&mut begun);
+    assert_eq!((plant.runs(1), plant.runs(2)), (false, true));
+    let mut half = plant.modbus();
+    half.write_all(&[0, 1, 0, 0, 0, 6, 12]).unwrap();
+    std::thread::sleep(50 * MS);
+    plant.reload(&swapped_units());
+    half.write_all(&[6, 0x81, 0, 0, 0]).unwrap();
+    reply(&mut half);
+    assert_eq!((plant.runs(1), plant.runs(2)), (false, false));
+}
+
+/// A controller holds run and reset bit at a unit; a reload puts another drive there.
+#[test]
+fn a_bit_that_a_controller_holds_is_no_edge_at_another_machine() {
+    let mut plant = Plant::new(&pair("pump-1", "pump-2"));
+    let mut plc = plant.modbus();
+    assert_eq!(write(&mut plc, 12, 1)[7], 6);
+    assert_eq!(write(&mut plc, 11, 5)[7], 6);
+    let before = plant.words(2).len();
+    assert!(plant.line.with_drive(2, |drive, _| drive.trip(9)).is_some());
+    plant.site.until_state("pump-2", "fault");
+    plant.reload(&swapped_units());
+    plant.site.until_state("pump-2", "fault");
+    for _ in 0..3 {
+        write(&mut plc, 11, 5);
+        std::thread::sleep(100 * MS);
+    }
+    let sent = plant.words(2).split_off(before);
+    assert_eq!(sent, Vec::<u16>::new(), "no reset, and no start");
+    assert_eq!(api(plant.site.http, "pump-2")["state"], "fault");
+    // A stop of its own, and the bit is an edge again.
+    assert_eq!(write(&mut plc, 11, 0)[7], 6);
+    assert_eq!(write(&mut plc, 11, 4)[7], 6);
+    plant.site.until_state("pump-2", "ready");
+}
+
+/// A stop waits until the motor has run for `min_run`; then no bus sends anything to the drive any more.
+#[test]
+fn a_stop_that_waits_is_sent_before_its_machine_is_given_up() {
+    let guard = "unit = 11\nguard = { min_run = \"60s\" }";
+    let both = controlled("pump-1", 1, guard) + &controlled("pump-2", 2, "unit = 12");
+    let only_other = controlled("pump-2", 2, "unit = 12");
+    let monitored = controlled("pump-1", 1, "unit = 11").replace("control", "monitor") + &only_other;
+    let moved = controlled("pump-1", 3, guard) + &only_other;
+    let listening = both.replace("guard = { min_run = \"60s\" }", "").replace("control", "monitor");
+    let table = [
+        ("removed", only_other, false),
+        ("only monitored", monitored, false),
+        ("at another address", moved, false),
+        ("on a line of another master", listening, true),
+    ];
+    for (what, after, listens) in table {
+        let mut plant = Plant::new(&both);
+        let mut plc = plant.modbus();
+        assert_eq!(write(&mut plc, 11, 1)[7], 6, "{what}");
+        plant.site.until_state("pump-1", "running");
+        plc.write_all(&[0, 1, 0, 0, 0, 6, 11, 6, 0x81, 0, 0, 0]).unwrap();
+        until("the stop waits", || {
+            api(plant.site.http, "pump-1")["stop_waits_ms"].as_u64()
+        });
+        assert!(plant.runs(1), "{what}");
+        configure(&plant.site, &after);
+        if listens {
+            plant.site.change("[[bus]]\n", "[[bus]]\nmode = \"listen\"\n");
+        }
+        plant.reload_file();
+        assert!(!plant.runs(1), "{what}");
+        assert_eq!(reply(&mut plc)[7], 6, "{what}: its client is told so");
+    }
+}
