@@ -102,7 +102,7 @@ fn a_fault_that_fits_no_function_is_named_with_what_may_be_meant() {
         ),
         (
             "twice",
-            "fn = 'not_held'\nreturns = 'Ok(())'",
+            "fn = 'pulse'\nreturns = 'Ok(())'",
             "2 functions have this name",
         ),
         (

@@ -3,14 +3,15 @@
 //! against the worst drive that has such a profile. Pure: the time of day is only where its own time begins.
 
 mod drive;
+mod frame;
 
-use std::fmt::Write as _;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use self::drive::{Drive, Start};
+use self::frame::{Fate, Frame, different, in_words};
 use super::command_run::{CommandRun, KnownWords, Next, Step, StepPurpose};
-use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::codec::{Exception, Reply, Table};
 use crate::command::{
     Admitted, Arrival, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, WriteStats, written,
 };
@@ -70,16 +71,6 @@ impl Counterexample {
             false => format!("{what} (drive {state}; command {command}; {frames})"),
         }
     }
-}
-
-/// The fate of a request.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Fate {
-    RequestLost,
-    ReplyLost,
-    Refused(Exception),
-    /// It arrives twice.
-    Repeated,
 }
 
 const FATES: [Fate; 9] = [
@@ -222,7 +213,7 @@ struct Progress<'p> {
     drive: Drive<'p>,
     words: KnownWords,
     now: Instant,
-    frames: Vec<String>,
+    frames: Vec<Frame>,
     /// When the reset was set.
     reset_at: Option<Instant>,
     /// It ran when the command was given, or at a stop in between.
@@ -297,7 +288,7 @@ impl<'p> Case<'p> {
     }
 
     /// Runs the command to its end with that event; its requests.
-    fn run(&self, event: Event) -> Result<Vec<String>, Box<Counterexample>> {
+    fn run(&self, event: Event) -> Result<Vec<Frame>, Box<Counterexample>> {
         let now = Instant::now();
         let Some(drive) = Drive::new(self.profile, self.control, self.start) else {
             return Ok(Vec::new());
@@ -365,7 +356,7 @@ impl<'p> Case<'p> {
         let expires = progress.now + LONGEST;
         let stop = Order::Points(vec![(run, Value::Bool(false))]);
         let mut stop = self.begin(stop, Urgency::Stop, progress.now, expires);
-        progress.frames.push("(a stop comes in)".to_string());
+        progress.frames.push(Frame::Stop);
         for _ in 0..MOST_FRAMES {
             if self.step(&mut stop, progress, None, Duration::ZERO, true)?.is_some() {
                 break;
@@ -412,13 +403,7 @@ impl<'p> Case<'p> {
             Some(Fate::ReplyLost) | None => Some(progress.drive.receives(&step.pdu)),
         };
         // The drive changes nothing between two looks at its state, so there need not be many.
-        let again = progress
-            .frames
-            .iter()
-            .rev()
-            .take(2)
-            .all(|frame| frame.starts_with("read "))
-            && progress.frames.len() > 1;
+        let again = progress.frames.iter().rev().take(2).all(Frame::is_read) && progress.frames.len() > 1;
         progress.now += if again { LOOK_AGAIN } else { EXCHANGE };
         self.look(&step, progress, stopped, stood)?;
         if step.purpose == StepPurpose::Look && matches!(fate, None | Some(Fate::Repeated)) {
@@ -435,19 +420,9 @@ impl<'p> Case<'p> {
         })
     }
 
-    /// The frame, as text; and whether a pulse had its time.
+    /// Keeps the frame; checks whether a pulse had its time.
     fn note(&self, step: &Step, fate: Option<Fate>, progress: &mut Progress<'p>) -> Result<(), Box<Counterexample>> {
-        let mut text = in_words(&step.pdu);
-        let fate = match fate {
-            None => String::new(),
-            Some(Fate::RequestLost) => " (lost)".to_string(),
-            Some(Fate::ReplyLost) => " (its reply is lost)".to_string(),
-            Some(Fate::Repeated) => " (arrives twice)".to_string(),
-            Some(Fate::Refused(code)) => format!(" (refused: {code})"),
-        };
-        // Writing to a String cannot fail.
-        let _ = write!(text, "{fate}");
-        progress.frames.push(text);
+        progress.frames.push(Frame::Request(step.pdu.clone(), fate));
         let Some(reset) = self.control.fault_reset else {
             return Ok(());
         };
@@ -534,8 +509,7 @@ impl<'p> Case<'p> {
         if self.is_stop() && event == Event::None {
             // Bits of a word stay as the drive has them, which takes a read before where that is not known.
             let reads = usize::from(self.control.own_word == OwnWord::Kept && !self.known);
-            let writes = |frame: &&String| frame.contains(" = ");
-            let first = progress.frames.iter().take(1 + reads).find(writes);
+            let first = progress.frames.iter().take(1 + reads).find(|frame| frame.is_write());
             if !outcome.is_ok() || runs || first.is_none() {
                 return Err(self.wrong("a stop does not stop the motor in one request", progress));
             }
@@ -594,35 +568,13 @@ impl<'p> Case<'p> {
             what: what.to_string(),
             state: format!("{}{known}", self.start.in_words()),
             command,
-            frames: progress.frames.clone(),
+            frames: progress.frames.iter().map(Frame::to_string).collect(),
         })
     }
 }
 
-/// The requests that something is to happen to: of a state that is read again and again the first and the last read.
-fn different(frames: &[String]) -> Vec<usize> {
-    let other = |one: usize, by: Option<usize>| by.and_then(|by| frames.get(by)) != frames.get(one);
-    let all = 0..frames.len();
-    all.filter(|number| other(*number, number.checked_sub(1)) || other(*number, Some(number + 1)))
-        .collect()
-}
-
 fn is_coil(place: ControlItem) -> bool {
     matches!(place.table, Table::Coil | Table::DiscreteInput)
-}
-
-/// `holding 8501 = 0x000f`, or `read holding 3201`.
-fn in_words(pdu: &RequestPdu) -> String {
-    if let RequestPdu::Read { table, start, .. } = pdu {
-        return format!("read {table} {start}");
-    }
-    let Some((table, items)) = written(pdu) else {
-        return "another request".to_string();
-    };
-    let items = items
-        .iter()
-        .map(|(address, word)| format!("{table} {address} = {word:#06x}"));
-    items.collect::<Vec<_>>().join(", ")
 }
 
 #[cfg(test)]

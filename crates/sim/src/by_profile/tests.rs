@@ -201,12 +201,12 @@ fn faults_are_reset_and_start_nothing() {
     }
 }
 
-/// Fuji: a reset with a run command that stands starts the motor; with others the command has to come anew.
+/// Fuji and Vacon 10: a reset with a run command that stands starts the motor; with others the command has to come anew.
 #[test]
 fn a_reset_with_a_run_command() {
     for (name, orders, starts) in [
         ("fuji-frenic", [Word(0x0706, 1), Word(0x0706, 0x8001)], true),
-        ("vacon-10", [Word(2000, 1), Word(2000, 5)], false),
+        ("vacon-10", [Word(2000, 1), Word(2000, 5)], true),
         ("weg-cfw", [Word(682, 0x17), Word(682, 0x97)], false),
     ] {
         let mut rig = ProfiledDrive::named(name);

@@ -59,6 +59,7 @@ write = 1
 # at = "holding 0"
 # run = { bit = 0 }           # or { mask = 0x0F, value = 0x02 }, { forward_bit = 0, reverse_bit = 1 }, { steps = [..] }
 # stop = { bit = 0, is = 0 }
+# always = { clear = [3] }    # bits of every word
 # also_stop = [{ bit = 3, is = 1 }]    # coast or quick stop, as another master may write it
 # reverse = { bit = 1 }
 # fault_reset = { bit = 2, hold = "100ms" }
@@ -86,7 +87,7 @@ mod tests {
         };
         assert_eq!(read(&frame("our-drive")).unwrap().name, "our-drive");
         let commands = FRAME.replace("\n# [control]", "\n[control]");
-        let commands = ["at", "run", "stop", "also_stop", "reverse", "fault_reset"]
+        let commands = ["at", "run", "stop", "always", "also_stop", "reverse", "fault_reset"]
             .iter()
             .fold(commands, |text, key| {
                 text.replace(&format!("\n# {key} = "), &format!("\n{key} = "))

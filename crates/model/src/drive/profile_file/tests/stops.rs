@@ -145,5 +145,8 @@ fn a_coil_or_a_stop_elsewhere_has_no_other_stops() {
     let elsewhere = "run = { bit = 0 }\nstop = { point = \"other\", bit = 0 }\nalways = { clear = [3] }\n\
                      also_stop = [{ bit = 3 }]";
     let found = mistakes("p.toml", &source(elsewhere));
-    assert!(found.contains("is no word of a control register"), "{found}");
+    assert!(
+        found.contains("is not in the register to which `stop` is written"),
+        "{found}"
+    );
 }
