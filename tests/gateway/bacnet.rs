@@ -562,7 +562,7 @@ fn a_slot_is_void_with_the_right_of_its_client_and_does_not_come_back_with_it() 
 fn kept_slots_are_void_at_a_start_that_gives_no_right() {
     let mut plant = pumps("keep_priorities = true");
     let config = std::fs::read_to_string(plant.site.config()).unwrap();
-    let mut restart = |plant: &mut Plant, config: &str| {
+    let restart = |plant: &mut Plant, config: &str| {
         plant.gateway.signal("TERM");
         assert!(plant.gateway.ended().success());
         plant.site.write("drivegate.conf", config);

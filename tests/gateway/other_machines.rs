@@ -207,7 +207,9 @@ fn a_stop_that_waits_is_sent_before_its_machine_is_given_up() {
     let only_other = controlled("pump-2", 2, "unit = 12");
     let monitored = controlled("pump-1", 1, "unit = 11").replace("control", "monitor") + &only_other;
     let moved = controlled("pump-1", 3, guard) + &only_other;
-    let listening = both.replace("guard = { min_run = \"60s\" }", "").replace("control", "monitor");
+    let listening = both
+        .replace("guard = { min_run = \"60s\" }", "")
+        .replace("control", "monitor");
     let table = [
         ("removed", only_other, false),
         ("only monitored", monitored, false),

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
-use crate::spec::Machine;
+use crate::process_image::Machine;
 
 /// The word last written at 0x8100 of each unit by any client, and the machine that it was written to: a fault reset is a change of
 /// its bit 2. Behind a reload that puts another machine at a unit, a word that a client repeats changes nothing there.
@@ -38,9 +38,8 @@ mod tests {
     #[test]
     fn a_word_belongs_to_the_machine_that_the_unit_meant() {
         let words = CommandWords::default();
-        let write = |unit, address, word| {
-            words.update(unit, machine(address), |last| std::mem::replace(last, Some(word)))
-        };
+        let write =
+            |unit, address, word| words.update(unit, machine(address), |last| std::mem::replace(last, Some(word)));
         assert_eq!(write(2, 1, 1), None);
         assert_eq!(write(2, 1, 5), Some(1));
         assert_eq!(write(3, 2, 1), None, "another unit");
