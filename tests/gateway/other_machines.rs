@@ -156,6 +156,9 @@ fn an_order_belongs_to_the_machine_that_its_first_byte_named() {
         plant.reload(&pair("pump-1", "pump-2"));
     }
     // A stop goes to the machine that was meant, and to no other.
+    for name in ["pump-1", "pump-2"] {
+        plant.site.until_state(name, "ready");
+    }
     let mut plc = plant.modbus();
     for unit in [11, 12] {
         assert_eq!(write(&mut plc, unit, 1)[7], 6, "unit {unit}");

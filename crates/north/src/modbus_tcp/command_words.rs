@@ -38,8 +38,7 @@ mod tests {
     #[test]
     fn a_word_belongs_to_the_machine_that_the_unit_meant() {
         let words = CommandWords::default();
-        let write =
-            |unit, address, word| words.update(unit, machine(address), |last| std::mem::replace(last, Some(word)));
+        let write = |unit, address, word| words.update(unit, machine(address), |last| last.replace(word));
         assert_eq!(write(2, 1, 1), None);
         assert_eq!(write(2, 1, 5), Some(1));
         assert_eq!(write(3, 2, 1), None, "another unit");
