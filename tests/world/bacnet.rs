@@ -324,9 +324,11 @@ impl Rules {
     fn elsewhere(&mut self, run: Option<bool>, sets: bool) {
         if let Some(run) = run {
             let other = |slot: &(f64, usize)| (slot.0 != 0.0) != run;
-            self.run
-                .iter_mut()
-                .for_each(|slot| *slot = slot.filter(|slot| !other(slot)));
+            // What protects people outlives a start, also behind an active that governs.
+            let protects = |place: usize| run && place < 5;
+            for (place, slot) in self.run.iter_mut().enumerate() {
+                *slot = slot.filter(|slot| !other(slot) || protects(place));
+            }
         }
         if sets {
             self.speed = Default::default();
