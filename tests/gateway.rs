@@ -31,6 +31,7 @@ mod gateway {
     mod operators;
     mod other_machines;
     mod parameters;
+    mod pauses;
     mod recordings;
     mod reload;
     mod replay;

@@ -2,7 +2,8 @@
 
 use serde_json::{Value as Json, json};
 
-use crate::support::process::{Running, drivegate, mbpoll_read, mbpoll_write, until, write_registers};
+use crate::support::mqtt::client;
+use crate::support::process::{Running, drivegate, get, mbpoll_read, mbpoll_write, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, PASSWORD, Site, USERS, controlled, drive};
 use crate::support::tools::{run, tool};
 
@@ -162,4 +163,42 @@ fn from_every_side() {
     let (code, text) = ran(&["stop-all"], &alice);
     assert_eq!((code, text.as_str()), (0, "pump-1: standing\nfan-1: standing\n"));
     plant.all_stand();
+}
+
+/// The broker would repeat it at each connection of the gateway. The topic is cleared by such a message, too.
+#[test]
+fn a_retained_stop_of_all_stops_nothing_and_is_told() {
+    let plant = plant();
+    plant.start();
+    let heard = |topic| Running::spawn(client("mosquitto_sub", plant.site.mqtt).args(["-t", topic, "-F", "%p"]));
+    let results = heard("drivegate/test/result");
+    // It has subscribed when a stop that is not understood is answered.
+    until("the subscription", || {
+        plant.site.publish(&["-t", "drivegate/test/set/stop", "-m", "[]"]);
+        results.output().contains("no stop was sent").then_some(())
+    });
+    for (times, payload) in [(1, &["-n"][..]), (2, &["-m", "{}"]), (3, &["-n"])] {
+        plant
+            .site
+            .publish(&[&["-r", "-t", "drivegate/test/set/stop"], payload].concat());
+        until("a result", || {
+            (results.output().matches("the message was retained").count() == times).then_some(())
+        });
+    }
+    // Further refusals of one client are counted.
+    let of_all = |record: &Json| record["drive"] == "all drives" && record["result"] == "not_allowed";
+    assert!(plant.site.audit().iter().any(of_all));
+    let (_, log) = get(plant.site.http, "/api/v1/events/log?kind=refused_command").unwrap();
+    let log: Json = serde_json::from_str(&log).unwrap();
+    let told = |event: &&Json| {
+        event["text"]
+            .as_str()
+            .is_some_and(|text| text.contains("the message was retained"))
+    };
+    let entry = log.as_array().unwrap().iter().find(told);
+    let entry = entry.unwrap_or_else(|| panic!("{log}"));
+    assert!(entry["drive"].is_null(), "it is for no drive in particular: {entry}");
+    for name in ["pump-1", "fan-1"] {
+        assert_eq!(plant.site.point(name, "running"), true, "{name}");
+    }
 }

@@ -8,9 +8,10 @@ use super::late_replies::LateReplies;
 use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
 use super::vain_stops::VainStops;
-use crate::codec::Reply;
+use crate::codec::{Reply, Table};
 use crate::command::{Command, Interruption, LastWritten, Origin, Outcome, Receipt, Urgency};
 use crate::drive::ModelPoint;
+use crate::drive::control::Control;
 use crate::process_image::{DriveImage, Reading};
 
 /// A status older than this, or than three rounds of the line, does not show whether the motor runs.
@@ -304,6 +305,12 @@ impl DriveState {
                 run.abandon(Outcome::Offline, Interruption::Offline, now);
             }
         }
+    }
+
+    /// The drive may have taken these words, or not.
+    pub(super) fn may_have_taken(&mut self, table: Table, items: &[(u16, u16)], control: Option<&Control>) {
+        self.words.in_doubt(table, items, control);
+        self.stopped = None;
     }
 
     /// The drive has restarted: everything known about it is void.

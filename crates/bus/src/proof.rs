@@ -16,8 +16,7 @@ use crate::command::{
     Admitted, Arrival, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, WriteStats, written,
 };
 use crate::drive::control::{Control, ControlItem, OwnWord, Run, Setting};
-use crate::drive::profile::Form;
-use crate::drive::{DriveIndex, ModelPoint, PointIndex, Profile, Raw, Value};
+use crate::drive::{DriveIndex, ModelPoint, PointIndex, Profile, Value};
 
 /// Requests after which a command should have ended, reads of a state for which it waits among them.
 const MOST_FRAMES: usize = 1000;
@@ -121,7 +120,7 @@ pub fn prove(profile: &Profile) -> Result<Proof, Box<Counterexample>> {
     let Some(control) = &profile.control else {
         return Ok(Proof::default());
     };
-    overlaps(profile, control)?;
+    overlaps(profile)?;
     explore(profile, control)
 }
 
@@ -157,43 +156,31 @@ impl Proof {
     }
 }
 
-/// No other writable point may share a register with the commands, but one that has bits of its own in a word whose other bits are
-/// kept.
-fn overlaps(profile: &Profile, control: &Control) -> Result<(), Box<Counterexample>> {
-    let is_own = |point: ModelPoint| profile.model_index(point);
-    let own = [ModelPoint::Run, ModelPoint::Reverse, ModelPoint::FaultReset].map(is_own);
-    let points = profile.points.enumerate();
-    for (index, point) in points.filter(|(_, point)| point.is_commanded()) {
-        let shares = |raw: &Raw| match raw.form {
-            Form::Bit { bit, .. } if control.own_word == OwnWord::Kept => takes(control, 1u16 << bit.min(15)),
-            _ => true,
-        };
-        let covers = point.raw().is_some_and(|raw| {
-            !own.contains(&Some(index)) && raw.covers(control.at.table, control.at.address) && shares(raw)
-        });
-        if covers {
-            return Err(Box::new(Counterexample {
-                what: format!("point `{}` writes into the control word, past [control]", point.name),
-                state: "any".to_string(),
-                command: format!("{} = …", point.name),
-                frames: Vec::new(),
-            }));
+/// Neither a writable point nor a parameter may share a register with the commands, but a point that has bits of its own in a word
+/// whose other bits are kept.
+fn overlaps(profile: &Profile) -> Result<(), Box<Counterexample>> {
+    let found = |what: String, command: String| {
+        Err(Box::new(Counterexample {
+            what: format!("{what} writes into the control word, past [control]"),
+            state: "any".to_string(),
+            command,
+            frames: Vec::new(),
+        }))
+    };
+    for (index, point) in profile.points.enumerate() {
+        if point.is_commanded() && profile.is_past_commands(index) {
+            return found(format!("point `{}`", point.name), format!("{} = …", point.name));
+        }
+    }
+    for parameter in &profile.parameters.named {
+        if profile.commands_in(parameter.address, 1) {
+            return found(
+                format!("parameter {}", parameter.id),
+                format!("params restore of {}", parameter.id),
+            );
         }
     }
     Ok(())
-}
-
-/// Whether a command has these bits of the control word.
-fn takes(control: &Control, bits: u16) -> bool {
-    let reset = control.fault_reset.map(|reset| reset.setting);
-    let all = control
-        .runs()
-        .into_iter()
-        .chain([control.stop])
-        .chain(control.reverse)
-        .chain(reset);
-    all.filter(|setting| setting.place.is_none())
-        .any(|setting| setting.mask & bits != 0)
 }
 
 /// One command to a drive in one state.

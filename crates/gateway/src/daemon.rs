@@ -256,6 +256,7 @@ impl Daemon {
 
     /// Stops the buses that are removed or changed, and starts the `prepared` ones.
     async fn replace_buses(&mut self, settings: &Settings, prepared: Vec<(BusSettings, BusTask)>) {
+        let former: Vec<BusHandle> = self.buses.iter().map(|(_, task)| task.handle().clone()).collect();
         let (mut kept, removed): (Vec<_>, Vec<_>) = std::mem::take(&mut self.buses)
             .into_iter()
             .partition(|(before, _)| settings.buses.contains(before));
@@ -295,7 +296,7 @@ impl Daemon {
             kept.push((bus, task));
         }
         let begin: Vec<BusHandle> = kept.iter().map(|(_, task)| task.handle().clone()).collect();
-        follow_names(&stopped, &begin, Instant::now());
+        follow_names(&former, &begin, Instant::now());
         self.parted.keep(&leases, &stopped, Instant::now());
         let after: Vec<&BusHandle> = kept.iter().map(|(_, task)| task.handle()).collect();
         for bus in &stopped {

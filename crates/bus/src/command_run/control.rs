@@ -362,7 +362,11 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
         return Made::Nothing;
     };
     let at = control.at;
-    let own = words.get(at.table, at.address).map(|own| control.standing(own));
+    let either = || words.stop_by_either().filter(|_| matches!(word, Word::Stop(_)));
+    let own = words
+        .get(at.table, at.address)
+        .map(|own| control.standing(own))
+        .or_else(either);
     if asks_first(word, control, own, known) {
         return Made::Send(read_of(at));
     }

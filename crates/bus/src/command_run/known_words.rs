@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::functions::TakenFunctions;
 use crate::codec::{RequestPdu, Table};
 use crate::command::written;
+use crate::drive::control::Control;
 
 /// The registers and coils of a drive whose bits are commanded, as the drive has them.
 ///
@@ -12,6 +13,8 @@ use crate::command::written;
 #[derive(Debug, Default)]
 pub struct KnownWords {
     words: BTreeMap<(Table, u16), u16>,
+    /// The stop word by each of the control words that the drive may have, where they are two.
+    stop: Option<u16>,
     /// The direction that was ordered last, where no bit of the drive keeps it until the next start.
     pub(super) direction: Option<bool>,
     /// The word at the drive has another one: the next start has it.
@@ -28,11 +31,13 @@ impl KnownWords {
         if matches!(table, Table::Holding | Table::Coil) {
             self.words.insert((table, address), word);
             self.reported.insert((table, address));
+            self.stop = None;
         }
     }
 
     /// Acknowledged words are known from then on.
     pub fn written(&mut self, sent: &RequestPdu) {
+        self.stop = None;
         if let RequestPdu::MaskWrite { address, .. } = sent {
             // Its other bits may have been changed since.
             self.words.remove(&(Table::Holding, *address));
@@ -43,6 +48,25 @@ impl KnownWords {
         }) {
             self.words.insert((table, address), word);
         }
+    }
+
+    /// The drive may have taken these words, or not: none of them is known from now on. A stop needs no word that is known where
+    /// it is the same by the control word of before and by this one.
+    pub(crate) fn in_doubt(&mut self, table: Table, items: &[(u16, u16)], control: Option<&Control>) {
+        for (address, word) in items {
+            let before = self.words.remove(&(table, *address));
+            let here = |control: &&Control| (control.at.table, control.at.address) == (table, *address);
+            if let Some(control) = control.filter(here) {
+                let by = |word: u16| control.stop_word(control.standing(word));
+                let before = before.map(by).or(self.stop);
+                self.stop = before.filter(|before| *before == by(*word));
+            }
+        }
+    }
+
+    /// The stop word, where the control word of the drive is one of two, and it is that by either.
+    pub(super) fn stop_by_either(&self) -> Option<u16> {
+        self.stop
     }
 
     /// Whether the drive reported that word, at any time.
@@ -87,5 +111,6 @@ impl KnownWords {
     /// The drive may have restarted, or taken an unanswered write: its words are read again before a bit is changed.
     pub fn forget(&mut self) {
         self.words.clear();
+        self.stop = None;
     }
 }

@@ -363,7 +363,8 @@ impl Master {
         }
     }
 
-    /// A request that may have written anything: the command words of all drives that received it are unknown.
+    /// A write that is not checked: what it wrote is unknown of all drives that received it, and every command word where it is not
+    /// known what that was.
     fn unchecked_write(&mut self, begun: &Begun, turn: &Turn, outcome: &Outcome, now: Instant) {
         let writes = written(&turn.pdu);
         for index in begun.command().into_iter().flat_map(Command::reach) {
@@ -375,12 +376,22 @@ impl Master {
             if matches!(outcome, Outcome::Exception(_)) {
                 continue;
             }
-            drive.restarted();
-            self.schedule.read_again(index, now);
             match &writes {
-                Some((table, items)) => self.note_write(index, *table, items, now),
-                None => drive.written.range = Some(now),
+                Some((table, items)) => {
+                    let image = self.bus.image.drives.get(index);
+                    drive.may_have_taken(
+                        *table,
+                        items,
+                        image.and_then(|image| image.spec.profile.control.as_ref()),
+                    );
+                    self.note_write(index, *table, items, now);
+                }
+                None => {
+                    drive.restarted();
+                    drive.written.range = Some(now);
+                }
             }
+            self.schedule.read_again(index, now);
         }
     }
 

@@ -42,6 +42,7 @@ fn refused(text: &str) -> Option<String> {
 /// The wrong profiles that a user is likely to write.
 #[test]
 fn wrong_profiles_are_refused_with_what_is_wrong() {
+    let bit = "run = { bit = 0 }\nstop = { bit = 0, is = 0 }";
     let cia = "stop = { bit = 3, is = 0 }\nreverse = { bit = 11 }\nfault_reset = { mask = 0x8F, value = 0x80 }\n\
                run = { steps = [{ write = 6, until = { point = \"status_word\", mask = 0x6F, is = 0x21 } }, \
                { write = 7, until = { point = \"status_word\", mask = 0x6F, is = 0x23 } }, { write = 0xF }] }";
@@ -71,6 +72,16 @@ fn wrong_profiles_are_refused_with_what_is_wrong() {
             "a sequence whose first word runs already",
             cia.replace("write = 6,", "write = 15,"),
             "run",
+        ),
+        (
+            "a parameter at the control word",
+            format!("{bit}\n[parameters]\nlist = [\"P1, 0, Command, , 1\"]"),
+            "parameter P1 writes into the control word",
+        ),
+        (
+            "a reference at the place of the direction",
+            format!("{bit}\nreverse = {{ point = \"speed_reference\", bit = 0 }}"),
+            "point `speed_reference` writes into the control word",
         ),
     ] {
         let found = refused(&with(&control));

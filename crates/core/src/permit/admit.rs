@@ -73,6 +73,12 @@ fn parameter(drive: &Reading<'_>, order: &ParameterOrder) -> Result<(), Refusal>
         )));
     }
     let words = order.to.words().len();
+    if spec
+        .profile
+        .commands_in(order.address, u16::try_from(words).unwrap_or(u16::MAX))
+    {
+        return Err(past_commands(drive, &format!("parameter {id}")));
+    }
     let takes = |range: &AddressRange| usize::from(range.write) >= words;
     if !spec.profile.range(Table::Holding, order.address).is_some_and(takes) {
         return Err(Refusal::NotWritable(format!(
@@ -81,6 +87,14 @@ fn parameter(drive: &Reading<'_>, order: &ParameterOrder) -> Result<(), Refusal>
         )));
     }
     Ok(())
+}
+
+/// The refusal of a write that would command the drive, though it is no command.
+fn past_commands(drive: &Reading<'_>, what: &str) -> Refusal {
+    Refusal::NotWritable(format!(
+        "{what} of `{}` lies where the drive is commanded, so writing it could start the motor; nothing was written",
+        drive.spec.name
+    ))
 }
 
 /// Whether parameters of a drive may be restored.
@@ -150,6 +164,9 @@ fn points(drive: &Reading<'_>, values: Vec<(PointIndex, Value)>) -> Result<Admit
         let value = checked(drive, index, point, value)?;
         let asked = index;
         let (index, value) = resolve(drive, index, point, value)?;
+        if profile.is_past_commands(index) {
+            return Err(past_commands(drive, &format!("`{}`", point.name)));
+        }
         related_limits(drive, asked, index, value)?;
         if resolved.iter().any(|(other, _)| *other == index) {
             return Err(sets_twice(profile.points.get(index).map_or("", |p| p.name.as_str())));

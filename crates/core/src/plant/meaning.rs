@@ -105,7 +105,7 @@ impl Formerly {
 }
 
 /// After a reload: keeps what the names and units of drives meant until now, and makes clients that commanded under them take the
-/// drive before they start its motor. `before` are the buses that ended, `after` those that begin.
+/// drive before they start its motor. `before` are all buses before it, `after` all of now, those that run on among both.
 pub fn follow_names(before: &[BusHandle], after: &[BusHandle], now: Instant) {
     for bus in after {
         for (index, drive) in bus.image.drives.enumerate() {

@@ -1,5 +1,6 @@
 //! Drives as data: points, profiles and the requests that read them. Pure.
 
+mod command_places;
 pub mod commissioning;
 pub mod control;
 pub(crate) mod derive;

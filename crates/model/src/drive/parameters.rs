@@ -191,10 +191,10 @@ impl RawValue {
 }
 
 impl Profile {
-    /// Whether the parameter at that address can be written.
+    /// Whether the parameter at that address can be written: one where the drive is commanded cannot.
     pub fn parameter_is_writable(&self, address: u16) -> bool {
-        let range = self.range(Table::Holding, address);
-        range.is_some_and(|range| range.write >= self.parameter_words())
+        let (range, words) = (self.range(Table::Holding, address), self.parameter_words());
+        range.is_some_and(|range| range.write >= words) && !self.commands_in(address, words)
     }
 
     /// Registers of a parameter: two where it is an object of N2.

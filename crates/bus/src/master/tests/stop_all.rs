@@ -77,6 +77,30 @@ fn a_broadcast_goes_before_all_and_each_drive_is_proven_to_stand() {
     }
 }
 
+/// Each drive has the word of before, which is known, or that of the broadcast: both make the stop the same.
+#[test]
+fn a_stop_behind_the_broadcast_reads_no_word_that_was_known() {
+    let mut rig = running(3);
+    let started: Vec<_> = (0..3)
+        .map(|k| rig.order(k, "plc", ModelPoint::Run, Value::Bool(true)))
+        .collect();
+    rig.run(Duration::from_secs(1));
+    for mut answer in started {
+        assert!(answer.try_recv().unwrap().outcome.is_ok());
+    }
+    let (plant, stop_all) = (plant(&rig), StopAll::default());
+    let from = rig.wire.len();
+    let mut order = order(&rig, &plant, &stop_all, &Scope::Gateway);
+    assert!(answered(&mut rig, &plant, &stop_all, &mut order).ok);
+    let of_word = |turn: &&Turn| {
+        let is_poll = matches!(turn.purpose, Purpose::Poll(_));
+        !is_poll && matches!(turn.pdu(), RequestPdu::Read { start: 2000, .. })
+    };
+    let sent: Vec<&Turn> = rig.wire[from..].iter().map(|(_, turn)| turn).collect();
+    assert_eq!(sent.iter().filter(|turn| turn.pdu().is_write()).count(), 4);
+    assert_eq!(sent.into_iter().find(of_word), None);
+}
+
 #[test]
 fn no_broadcast_reaches_a_drive_that_is_not_concerned() {
     let in_group = |spec: DriveSpec| DriveSpec {

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use super::*;
 use crate::codec::{Exception, RequestPdu};
 use crate::drive::RawWrites;
+use crate::drive::parameters::RawValue;
 use crate::drive::profile::Profiles;
 use crate::drive::{PointIndex, Profile};
 use crate::process_image::{DriveImage, DriveSpec, Link};
@@ -329,6 +330,38 @@ fn addresses_and_counts() {
 }
 
 /// Limits in Hz and what 50 Hz are in percent rest on the drive's maximum frequency, which may change at its panel.
+/// A backup made while the motor ran would start it.
+#[test]
+fn a_parameter_where_the_drive_is_commanded_is_not_written() {
+    let profile = testkit::nx();
+    let spec = DriveSpec {
+        access: Access::Control,
+        params: ParamsAccess::Write,
+        ..DriveSpec::new("pump-1", "line1", 1, Arc::clone(&profile))
+    };
+    let hold = Arc::new(Hold::default());
+    hold.set(Some("it is being restored".to_string()));
+    let image = DriveImage::new(spec, Duration::from_secs(1)).with_hold(hold);
+    let reading = image.reading(Instant::now(), Duration::from_secs(1));
+    for (address, passes) in [(100, true), (2000, false), (2002, true)] {
+        let order = ParameterOrder {
+            id: "x".to_string(),
+            address,
+            from: None,
+            to: RawValue::Word(1),
+        };
+        let refused = parameter(&reading, &order).err();
+        assert_eq!(refused.is_none(), passes, "{address}: {refused:?}");
+        assert_eq!(profile.parameter_is_writable(address), passes, "{address}");
+        if let Some(refused) = refused {
+            assert!(
+                refused.to_string().contains("lies where the drive is commanded"),
+                "{refused}"
+            );
+        }
+    }
+}
+
 #[test]
 fn no_command_rests_on_an_old_parameter() {
     let start = Instant::now();
