@@ -152,6 +152,9 @@ impl Plant {
     }
 }
 
+/// Opens a connection of a client.
+type Opens = fn(&Plant) -> Client;
+
 trait Stream: Read + Write {}
 impl<S: Read + Write> Stream for S {}
 
@@ -222,7 +225,7 @@ impl Client {
 fn a_client_that_gave_up_starts_nothing() {
     let plant = Plant::new();
     for pause in PAUSES {
-        let by: [(&str, Option<fn(&Plant) -> Client>); 5] = [
+        let by: [(&str, Option<Opens>); 5] = [
             ("Modbus TCP", Some(Plant::modbus)),
             ("a slot", Some(Plant::slot)),
             ("HTTP", Some(Plant::http)),
