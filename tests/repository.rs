@@ -15,6 +15,7 @@ mod repository {
     mod fuzz_seeds;
     mod packages;
     mod packaging;
+    mod permission;
     mod tools;
     mod words;
 }

@@ -12,7 +12,7 @@ use tempfile::TempDir;
 
 const DRIVEGATE: &str = env!("CARGO_BIN_EXE_drivegate");
 
-fn read(path: &Path) -> String {
+pub(super) fn read(path: &Path) -> String {
     fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
@@ -26,7 +26,7 @@ fn documents() -> Vec<PathBuf> {
 }
 
 /// All files below `dir` with that extension.
-fn files(dir: &Path, extension: &str) -> Vec<PathBuf> {
+pub(super) fn files(dir: &Path, extension: &str) -> Vec<PathBuf> {
     let mut found = Vec::new();
     for entry in fs::read_dir(dir).unwrap() {
         let path = entry.unwrap().path();

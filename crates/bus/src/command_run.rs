@@ -391,12 +391,31 @@ impl CommandRun {
                 // Nothing to take away: the pulse starts at once, without the pause behind. Nothing to change: nothing is
                 // overridden that would have to be released.
                 None => {
+                    let fell = self.low_since(words, profile);
                     self.pop();
+                    if let (Some(fell), Some(Action::Hold(time))) = (fell, self.actions.front())
+                        && now < fell + *time
+                    {
+                        self.not_before = Some(fell + *time);
+                        self.actions.pop_front();
+                        return Next::Wait(fell + *time);
+                    }
                     if matches!(self.actions.front(), Some(Action::Hold(_) | Action::Release(_))) {
                         self.pop();
                     }
                 }
             }
+        }
+    }
+
+    /// When the command before took away the bits that are pulsed next: between two pulses they are low as long as in one.
+    fn low_since(&self, words: &KnownWords, profile: &Profile) -> Option<Instant> {
+        let at = profile.control.as_ref()?.at;
+        match self.actions.front() {
+            Some(Action::Word(Word::ResetLow(reset))) if reset.place.is_none() => {
+                words.fell(at.table, at.address, reset.value)
+            }
+            _ => None,
         }
     }
 

@@ -172,7 +172,8 @@ impl DriveState {
     }
 
     /// The drive replied to a step of a started command. Returns the outcome when the command has ended.
-    pub(super) fn answered(&mut self, urgency: Urgency, step: &Step, reply: Reply) -> Option<Outcome> {
+    pub(super) fn answered(&mut self, urgency: Urgency, step: &Step, reply: Reply, now: Instant) -> Option<Outcome> {
+        self.words.come_to(now);
         let run = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut)?;
         run.answered(step, reply, &mut self.words)
     }

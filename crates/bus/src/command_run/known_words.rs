@@ -1,6 +1,7 @@
 //! The known command words of a drive.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::time::Instant;
 
 use super::functions::TakenFunctions;
 use crate::codec::{RequestPdu, Table};
@@ -13,6 +14,10 @@ use crate::drive::control::Control;
 #[derive(Debug, Default)]
 pub struct KnownWords {
     words: BTreeMap<(Table, u16), u16>,
+    /// The bits that a write took away last, and when, of each word.
+    fell: BTreeMap<(Table, u16), (u16, Instant)>,
+    /// When the reply that is applied came.
+    now: Option<Instant>,
     /// The stop word by each of the control words that the drive may have, where they are two.
     stop: Option<u16>,
     /// The direction that was ordered last, where no bit of the drive keeps it until the next start.
@@ -46,8 +51,23 @@ impl KnownWords {
             let place = move |(address, word)| (table, address, word);
             items.into_iter().map(place)
         }) {
-            self.words.insert((table, address), word);
+            let before = self.words.insert((table, address), word);
+            let fell = before.map_or(!word, |before| before & !word);
+            if let Some(now) = self.now.filter(|_| fell != 0) {
+                self.fell.insert((table, address), (fell, now));
+            }
         }
+    }
+
+    /// The reply that is applied next came at `now`.
+    pub(crate) fn come_to(&mut self, now: Instant) {
+        self.now = Some(now);
+    }
+
+    /// When the last write took one of these bits of a word away, if it did.
+    pub(super) fn fell(&self, table: Table, address: u16, bits: u16) -> Option<Instant> {
+        let (fell, at) = self.fell.get(&(table, address))?;
+        (fell & bits != 0).then_some(*at)
     }
 
     /// The drive may have taken these words, or not: none of them is known from now on. A stop needs no word that is known where

@@ -14,6 +14,8 @@ use crate::command::{Outcome, Urgency};
 const LOOK_AGAIN: Duration = Duration::from_millis(100);
 /// First and longest pause before a step that the drive was too busy for is tried again.
 const BUSY_PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_millis(500));
+/// The longest one before a stop: the gateway that is about to end has little time for it.
+const BUSY_STOP: Duration = Duration::from_millis(100);
 /// Tries in a row of the end of a pulse, which has no other end.
 const MOST_BUSY: u32 = 10;
 
@@ -124,7 +126,10 @@ impl CommandRun {
         if !(is_busy && waits) || (!self.may_write_on() && self.tries.busy >= MOST_BUSY) {
             return false;
         }
-        let (first, longest) = BUSY_PAUSE;
+        let (first, longest) = match self.urgency {
+            Urgency::Stop => (BUSY_PAUSE.0, BUSY_STOP),
+            Urgency::Command | Urgency::Read => BUSY_PAUSE,
+        };
         self.tries.pause = Some((first * (1 << self.tries.busy.min(5))).min(longest));
         self.tries.busy = self.tries.busy.saturating_add(1);
         if self.known.check == Check::Read {

@@ -102,6 +102,7 @@ impl ObedientDrive {
                         }
                         _ => unreachable!(),
                     };
+                    self.words.come_to(self.now);
                     if run.answered(&step, reply, &mut self.words).is_some() {
                         return writes;
                     }
@@ -377,6 +378,21 @@ fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
     assert_eq!(sends(&bench, &mut start), read, "it is asked again");
 }
 
+/// A drive looks at its control word once in an update period: a bit that was taken away by the word before and is set again at
+/// once is no edge to it.
+#[test]
+fn a_reset_bit_that_a_stop_took_away_is_low_as_long_as_between_two_pulses() {
+    for (late, expected) in [(0, 20), (15, 5), (5000, 0)] {
+        let mut bench = ObedientDrive::new(5);
+        bench.words.learn(Table::Holding, 2000, 5);
+        let (mut stop, _a) = bench.begin(&[("run", 0.0)], Urgency::Stop);
+        assert_eq!(bench.run(&mut stop), [(0, 2000, 0)]);
+        bench.now += Duration::from_millis(late);
+        let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
+        assert_eq!(bench.run(&mut reset)[0], (expected, 2000, 4), "{late} ms later");
+    }
+}
+
 /// The drive is too busy for the write of a command, which is tried again: how long after its beginning, and how it ends.
 fn busy(points: &[(&str, f64)], urgency: Urgency, times: usize) -> (Vec<u128>, Outcome) {
     let mut bench = ObedientDrive::new(0);
@@ -403,13 +419,15 @@ fn busy(points: &[(&str, f64)], urgency: Urgency, times: usize) -> (Vec<u128>, O
 #[test]
 fn a_drive_that_is_busy_is_written_again_until_the_time_of_the_command_is_over() {
     let acknowledged = Outcome::Acknowledged(Reply::Written);
-    for (points, urgency) in [
-        (&[("run", 0.0)], Urgency::Stop),
-        (&[("speed_reference", 1.0)], Urgency::Command),
+    // A stop has only the second in which the gateway ends.
+    assert_eq!(busy(&[("run", 0.0)], Urgency::Stop, 9).0.last(), Some(&850));
+    for (points, urgency, all) in [
+        (&[("run", 0.0)], Urgency::Stop, &[0, 50, 150, 250, 350][..]),
+        (&[("speed_reference", 1.0)], Urgency::Command, &[0, 50, 150, 350, 750]),
     ] {
         assert_eq!(busy(points, urgency, 2), (vec![0, 50, 150], acknowledged.clone()));
         let (tries, outcome) = busy(points, urgency, usize::MAX);
-        assert_eq!(tries, [0, 50, 150, 350, 750]);
+        assert_eq!(tries[..5], *all);
         assert_eq!(outcome, Outcome::Exception(Exception::BUSY), "it did not take it");
     }
     // What was sent before and not answered may have been taken.

@@ -373,7 +373,7 @@ impl Master {
         {
             image.note_written(&items, now);
         }
-        let outcome = drive.answered(slot, step, reply);
+        let outcome = drive.answered(slot, step, reply, now);
         if let Some(outcome) = outcome {
             drive.end(slot, &outcome, image, now);
         }

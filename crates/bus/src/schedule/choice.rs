@@ -111,7 +111,8 @@ impl Schedule {
             .collect();
         waiting.sort();
         waiting.into_iter().find_map(|(_, index)| {
-            let read = self.drives.get(index)?.items.first()?.read;
+            let drive = self.drives.get(index)?;
+            let read = drive.probe().or_else(|| drive.items.first().map(|item| item.read))?;
             Some(Poll {
                 drive: index,
                 read,

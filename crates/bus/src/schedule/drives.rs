@@ -22,6 +22,9 @@ const EARLY_PROBES: [Duration; 3] = [
 /// it soon has, one that never has it must not take time from others.
 const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 
+/// First and longest pause before a request that is not answered, while the drive answers others, is tried again.
+pub(super) const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
+
 /// Pause before a read that no manual states is tried: where it failed, and where its reply proved nothing.
 pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(20));
 
@@ -49,6 +52,8 @@ pub(super) struct Item {
     pub(super) wanted: bool,
     /// Never answered so far.
     pub(super) unread: bool,
+    /// Answered since the drive came online.
+    pub(super) heard: bool,
     /// Since when a command changed what it reads: it goes before the round, so that the command is confirmed soon.
     pub(super) asked: Option<Instant>,
     /// When the parts of a refused block may be joined again: perhaps it was refused by mistake.
@@ -80,6 +85,8 @@ pub(super) struct DriveSchedule {
     /// The last failed poll of process data.
     pub(super) troubled: Option<Instant>,
     pub(super) items: Vec<Item>,
+    /// Probes without success since it was online: each asks for something else.
+    pub(super) vain_probes: usize,
     /// Those that decide its state.
     pub(super) behind_state: Vec<PlannedRead>,
     /// Reads that are longer than a manual states, and those of them that no reply has proved since the drive came online.
@@ -171,6 +178,7 @@ impl Item {
             failed_at: None,
             wanted: read.class != PollClass::Fault,
             unread: !matches!(read.class, PollClass::Fault | PollClass::Monitor),
+            heard: false,
             asked: None,
             whole_again: None,
         }
@@ -210,10 +218,39 @@ impl DriveSchedule {
             unanswered: false,
             troubled: None,
             items,
+            vain_probes: 0,
             behind_state,
             unproved: trials.clone(),
             trials,
         }
+    }
+
+    /// What the next probe reads: a drive may answer some of what is polled, and never the rest.
+    pub(super) fn probe(&self) -> Option<PlannedRead> {
+        let polled = |item: &&Item| matches!(item.read.class, PollClass::Fast | PollClass::Slow);
+        let count = self.items.iter().filter(polled).count();
+        let place = self.vain_probes.checked_rem(count)?;
+        self.items.iter().filter(polled).nth(place).map(|item| item.read)
+    }
+
+    /// Whether a drive that answers other reads has never answered this one since it came online.
+    pub(super) fn is_mute(&self, read: &PlannedRead) -> bool {
+        let mut items = self.items.iter();
+        let heard = items.any(|item| item.heard && item.read != *read);
+        heard && self.items.iter().any(|item| !item.heard && item.read == *read)
+    }
+
+    /// A read that is not answered, while the drive answers others, is tried again later, and then later still.
+    pub(super) fn not_heard(&mut self, read: &PlannedRead, retries: u32, now: Instant) {
+        let Some(item) = self.items.iter_mut().find(|item| item.read == *read) else {
+            return;
+        };
+        item.failures += 1;
+        item.failed_at = Some(now);
+        item.due = match item.failures.checked_sub(retries + 1) {
+            Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
+            None => now,
+        };
     }
 
     /// Whether that read is longer than a manual states, and no reply has proved it.
@@ -297,8 +334,9 @@ impl DriveSchedule {
         self.unanswered && self.has_fast()
     }
 
+    /// Whether it answers process data, so that this shows that it is there.
     pub(super) fn has_fast(&self) -> bool {
-        self.items.iter().any(|i| i.read.class == PollClass::Fast)
+        self.items.iter().any(|i| i.read.class == PollClass::Fast && i.heard)
     }
 
     /// Splits a refused block until the bad point is found, which is retried slowly.

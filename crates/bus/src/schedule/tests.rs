@@ -39,8 +39,11 @@ struct PolledLine {
     schedule: Schedule,
     now: Instant,
     dead: Vec<usize>,
+    /// Reads that no drive answers, by their first address.
+    silent: Vec<u16>,
     log: Vec<(Instant, Decision)>,
     offline: Vec<usize>,
+    online: Vec<usize>,
 }
 
 impl PolledLine {
@@ -58,8 +61,10 @@ impl PolledLine {
             schedule,
             now,
             dead: Vec::new(),
+            silent: Vec::new(),
             log: Vec::new(),
             offline: Vec::new(),
+            online: Vec::new(),
         }
     }
 
@@ -76,12 +81,14 @@ impl PolledLine {
                 self.schedule.command_done(urgency, COST);
             }
             Decision::Poll(poll) => {
-                let dead = self.dead.contains(&poll.drive.place());
+                let dead = self.dead.contains(&poll.drive.place()) || self.silent.contains(&poll.read.start);
                 let took = if dead { COST * 10 } else { COST };
                 self.now += took;
                 let polled = if dead { Polled::Failed } else { Polled::Ok };
-                if self.schedule.poll_done(&poll, polled, took, self.now) == Change::Offline {
-                    self.offline.push(poll.drive.place());
+                match self.schedule.poll_done(&poll, polled, took, self.now) {
+                    Change::Offline => self.offline.push(poll.drive.place()),
+                    Change::Online => self.online.push(poll.drive.place()),
+                    _ => {}
                 }
             }
         }

@@ -139,3 +139,6 @@ pub(super) fn judge(ask: &Ask<'_>, drive: &DriveGate, gate: &Gate) -> Verdict {
     }
     verdict
 }
+
+#[cfg(test)]
+mod tests;

@@ -361,3 +361,37 @@ fn what_a_bad_line_swallowed_is_due_once_process_data_was_sound_for_a_while() {
     drive.troubled = Some(now);
     assert_eq!(drive.due(&answered), now + 60 * second);
 }
+
+/// A drive that answers anything is there: what it never answers is that point's trouble.
+#[test]
+fn a_drive_is_online_by_whatever_it_answers() {
+    for silent in [2100, 2000] {
+        let mut rig = PolledLine::new(1, Duration::from_millis(100));
+        rig.silent = vec![silent];
+        rig.run(Duration::from_secs(60));
+        assert_eq!((rig.online.clone(), rig.offline.clone()), (vec![0], vec![]), "{silent}");
+        let from = rig.now - Duration::from_secs(30);
+        let polls = |wanted: bool| {
+            let late = rig.log.iter().filter(|(at, _)| *at >= from);
+            late.filter(|(_, decision)| {
+                matches!(decision, Decision::Poll(poll) if (poll.read.start == silent) == wanted)
+            })
+            .count()
+        };
+        assert!(polls(true) <= 3, "{silent}: what is silent is asked now and then");
+        assert!(polls(false) >= 25, "{silent}: the rest goes on");
+        // One that is away is told so, and is found again.
+        rig.dead = vec![0];
+        rig.run(Duration::from_secs(5));
+        assert_eq!(rig.offline, [0], "{silent}");
+        rig.dead.clear();
+        rig.run(Duration::from_secs(20));
+        assert_eq!(rig.online, [0, 0], "{silent}");
+    }
+    // The process data ceases while the drive answers the rest.
+    let mut rig = PolledLine::new(1, Duration::from_millis(100));
+    rig.run(Duration::from_secs(10));
+    rig.silent = vec![2100];
+    rig.run(Duration::from_secs(60));
+    assert_eq!((rig.online.len(), rig.offline.len()), (2, 1));
+}

@@ -1,0 +1,280 @@
+//! Every rule by a drive at which it alone refuses: which orders, at which moments.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use super::*;
+use crate::codec::RequestPdu;
+use crate::drive::{ModelPoint, PointIndex, Value};
+use crate::order::{
+    Admitted, Arrival, Command, Commanded, Connection, Entry, Proof, Right, SourceKind, Ticket, Urgency, Window,
+};
+use crate::permit::{DrillLock, Mode, Principal, Rules, Verb};
+use crate::process_image::{DriveImage, Hold};
+use crate::start_guard::{BusGuards, Guard, Guards, Interlock};
+use crate::testkit::{bus_spec, controlled, image, nx, read};
+
+const SECOND: Duration = Duration::from_secs(1);
+const DRIVE: usize = 0;
+
+/// What keeps orders from the drive.
+#[derive(Debug, Clone, Copy)]
+enum Why {
+    Nothing,
+    RightLost,
+    StoppedSince,
+    Expired,
+    Restoring,
+    Held,
+    Protected,
+    Drill,
+    Interlock,
+    Guard,
+}
+
+/// What is ordered.
+const ORDERS: [&str; 5] = ["start", "reference", "reset", "stop", "read"];
+
+struct Rig {
+    gate: Gate,
+    image: Arc<DriveImage>,
+    right: Arc<AtomicBool>,
+    /// When the orders come, and when they are judged.
+    asked: Instant,
+    now: Instant,
+}
+
+impl Facts for Rig {
+    fn seen(&self, _: DriveIndex) -> Option<Seen<'_>> {
+        let reading = self.image.reading(self.now, 10 * SECOND);
+        Some(Seen { reading, written: None })
+    }
+}
+
+fn rules() -> Rules {
+    let user = |name: &str, rank| Principal {
+        http_user: Some(name.to_string()),
+        ..Principal::new(name, rank)
+    };
+    Rules {
+        mode: Mode::Exclusive,
+        ranks: ["site", "operator"].map(Into::into).to_vec(),
+        lease: 30 * SECOND,
+        stop_at_local: true,
+        principals: vec![user("alice", 1), user("bob", 1)],
+    }
+}
+
+fn client(name: &str) -> Origin {
+    Origin::new(SourceKind::Http, name).proven(Proof::User(name.into()))
+}
+
+impl Rig {
+    fn new(why: Why) -> Rig {
+        let (profile, bus, asked) = (nx(), bus_spec("b"), Instant::now() + 100 * SECOND);
+        let mut spec = controlled("d1", "b", 1, &profile);
+        let drive = DriveIndex::new(DRIVE);
+        match why {
+            Why::Guard => {
+                spec.guard = Some(Guard {
+                    starts_per_hour: Some(1),
+                    ..Guard::default()
+                });
+            }
+            Why::Interlock => {
+                spec.interlocks = vec![Interlock {
+                    drive: "d1".to_string(),
+                    point: "ready".to_string(),
+                    is: true,
+                    trip: false,
+                }];
+            }
+            _ => {}
+        }
+        let hold = Arc::new(Hold::default());
+        let drive_image = image(spec);
+        let drive_image = match why {
+            Why::Restoring => {
+                hold.set(Some("it is being restored".to_string()));
+                Arc::new(DriveImage::new(drive_image.spec.clone(), SECOND).with_hold(hold))
+            }
+            _ => drive_image,
+        };
+        let mut rig = Rig {
+            gate: Gate::default(),
+            image: drive_image,
+            right: Arc::new(AtomicBool::new(true)),
+            asked,
+            now: asked + Duration::from_millis(10),
+        };
+        // It stands, and is not ready.
+        read(&rig.image, 2100, &[0x40, 0, 0, 0], asked);
+        let shared = Arc::new(Guards::default());
+        if let Some(guards) = BusGuards::of(&shared, &bus, [&rig.image.spec]) {
+            guards.begin();
+            shared.watch([(bus.machine(&rig.image.spec), rig.image.clone())].into_iter(), 10 * SECOND, asked);
+            guards.look(drive, &rig.image.reading(asked, 10 * SECOND));
+            rig.gate.set_starts(Some(guards));
+        }
+        match why {
+            Why::Nothing | Why::Expired | Why::Restoring | Why::Interlock => {}
+            Why::RightLost => rig.right.store(false, Ordering::Release),
+            Why::StoppedSince => {
+                let stop = rig.command("stop", "bob", asked + Duration::from_millis(5));
+                rig.gate.accepted(&stop, asked + Duration::from_millis(5));
+            }
+            Why::Held => {
+                rig.gate.set_rules(Some(Arc::new(rules())));
+                rig.gate.hold_act(drive, &client("bob"), Verb::Take, asked).unwrap().unwrap();
+            }
+            Why::Protected => {
+                let origin = Origin::new(SourceKind::Bacnet, "fire");
+                let entry = Entry::new(Value::Bool(false), origin, asked);
+                rig.gate.priorities(drive).restore(Commanded::Run, 2, entry);
+            }
+            Why::Drill => {
+                let drill = DrillLock {
+                    who: "drill 1".to_string(),
+                    quiet_until: None,
+                };
+                rig.gate.set_drill(drive, Some(drill));
+            }
+            Why::Guard => {
+                // The one start of the hour.
+                let first = rig.command("start", "bob", asked);
+                let (mut gate, now) = (std::mem::take(&mut rig.gate), asked);
+                assert_eq!(gate.judge(Stage::Turn, &first, &rig, now), Verdict::Go);
+                let guards = gate.starts().unwrap().clone();
+                guards.start_written(drive, first.intent.number, &Arc::from("bob"), now);
+                read(&rig.image, 2100, &[0x03, 0, 0, 2500], now + Duration::from_millis(1));
+                guards.look(drive, &rig.image.reading(now + Duration::from_millis(1), 10 * SECOND));
+                read(&rig.image, 2100, &[0x41, 0, 0, 0], now + Duration::from_millis(2));
+                guards.look(drive, &rig.image.reading(now + Duration::from_millis(2), 10 * SECOND));
+                rig.gate = gate;
+            }
+        }
+        if matches!(why, Why::Expired) {
+            rig.now = asked + 3 * SECOND;
+        }
+        rig
+    }
+
+    fn command(&self, what: &str, who: &str, asked: Instant) -> Command {
+        let profile = nx();
+        let point = |point: ModelPoint| -> PointIndex { profile.model_index(point).unwrap() };
+        let (order, urgency) = match what {
+            "start" => (Order::Points(vec![(point(ModelPoint::Run), Value::Bool(true))]), Urgency::Command),
+            "stop" => (Order::Points(vec![(point(ModelPoint::Run), Value::Bool(false))]), Urgency::Stop),
+            "reset" => (Order::Points(vec![(point(ModelPoint::FaultReset), Value::Bool(true))]), Urgency::Command),
+            "reference" => {
+                let to = Value::Number(20.0);
+                (Order::Points(vec![(point(ModelPoint::SpeedReference), to)]), Urgency::Command)
+            }
+            _ => {
+                let read = RequestPdu::Read {
+                    table: crate::codec::Table::Holding,
+                    start: 2100,
+                    count: 1,
+                };
+                (Order::Read(read), Urgency::Read)
+            }
+        };
+        let admitted = Admitted {
+            order,
+            urgency,
+            reference_only: what == "reference",
+            ranges: Vec::new(),
+        };
+        let window = Window {
+            arrival: Arrival::over(Connection::opened(asked), asked),
+            expires: asked + 2 * SECOND,
+            waits: false,
+        };
+        let origin = client(who).with_right(Right::of(self.right.clone()));
+        let (ticket, _) = Ticket::new(origin, "d1", String::new(), true, asked, Arc::default());
+        Command::new(DriveIndex::new(DRIVE), admitted, &profile, window, ticket)
+    }
+}
+
+/// What becomes of each order of Alice, by moment: its code where it is refused.
+fn refused(why: Why) -> Vec<String> {
+    let stages = [Stage::Accept, Stage::Turn, Stage::Write];
+    let row = |what: &&str| {
+        let told = stages.map(|stage| {
+            // Each moment is asked of a gate that has judged nothing.
+            let mut rig = Rig::new(why);
+            let command = rig.command(what, "alice", rig.asked);
+            let (mut gate, now) = (std::mem::take(&mut rig.gate), rig.now);
+            match gate.judge(stage, &command, &rig, now) {
+                Verdict::Refuse(outcome) => outcome.code().to_string(),
+                _ => "-".to_string(),
+            }
+        });
+        format!("{what}: {}", told.join(" "))
+    };
+    ORDERS.iter().map(row).filter(|row| !row.ends_with(": - - -")).collect()
+}
+
+#[test]
+fn each_rule_is_asked_at_its_moments_and_of_its_orders() {
+    let table: [(Why, &[&str]); 10] = [
+        (Why::Nothing, &[]),
+        (
+            Why::RightLost,
+            &[
+                "start: not_allowed not_allowed interrupted",
+                "reference: not_allowed not_allowed interrupted",
+                "reset: not_allowed not_allowed interrupted",
+                "stop: not_allowed - -",
+            ],
+        ),
+        (
+            Why::StoppedSince,
+            &[
+                "start: purged purged purged",
+                "reference: purged purged purged",
+                "reset: purged purged purged",
+            ],
+        ),
+        (
+            Why::Expired,
+            &[
+                "start: expired expired -",
+                "reference: expired expired -",
+                "reset: expired expired -",
+                "read: expired expired -",
+            ],
+        ),
+        (
+            Why::Restoring,
+            &[
+                "start: not_allowed not_allowed not_allowed",
+                "reference: not_allowed not_allowed not_allowed",
+                "reset: not_allowed not_allowed not_allowed",
+            ],
+        ),
+        (
+            Why::Held,
+            &[
+                "start: held_by_other held_by_other held_by_other",
+                "reference: held_by_other held_by_other held_by_other",
+                "reset: held_by_other held_by_other held_by_other",
+            ],
+        ),
+        (Why::Protected, &["start: held_by_other held_by_other held_by_other"]),
+        (
+            Why::Drill,
+            &[
+                "start: held_by_other held_by_other held_by_other",
+                "reference: held_by_other held_by_other held_by_other",
+                "reset: held_by_other held_by_other held_by_other",
+            ],
+        ),
+        (Why::Interlock, &["start: interlocked interlocked interlocked"]),
+        (Why::Guard, &["start: guarded guarded guarded"]),
+    ];
+    for (why, expected) in table {
+        assert_eq!(refused(why), expected, "{why:?}");
+    }
+}
