@@ -298,6 +298,11 @@ impl Daemon {
         let begin: Vec<BusHandle> = kept.iter().map(|(_, task)| task.handle().clone()).collect();
         follow_names(&former, &begin, Instant::now());
         self.parted.keep(&leases, &stopped, Instant::now());
+        let parted = self.parted.clone();
+        tokio::spawn(async move {
+            tokio::time::sleep(parted.forget(Instant::now()) + Duration::from_secs(1)).await;
+            parted.forget(Instant::now());
+        });
         let after: Vec<&BusHandle> = kept.iter().map(|(_, task)| task.handle()).collect();
         for bus in &stopped {
             bus.end_holds(&after, &self.events, Instant::now(), SystemTime::now());

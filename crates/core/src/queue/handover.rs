@@ -1,12 +1,33 @@
 //! A reload: another bus takes the place of the one that serves a queue, and the stops that wait in it are handed over.
 
 use std::collections::VecDeque;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Instant;
 
 use super::{CommandQueue, Pending};
 use crate::drive::DriveIndex;
 use crate::order::{Command, Effects, Outcome, Touched, Work};
+
+/// The queue that serves a drive now, and its place there, for all queues before it: after any number of reloads the first one finds
+/// the last one, and those between are gone.
+#[derive(Debug, Clone)]
+pub(super) struct Heir(Arc<Mutex<(Weak<CommandQueue>, DriveIndex)>>);
+
+impl Heir {
+    fn new(queue: &Arc<CommandQueue>, place: DriveIndex) -> Heir {
+        Heir(Arc::new(Mutex::new((Arc::downgrade(queue), place))))
+    }
+
+    fn set(&self, queue: &Arc<CommandQueue>, place: DriveIndex) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = (Arc::downgrade(queue), place);
+    }
+
+    /// The queue; none where no bus serves the drive any more.
+    pub(super) fn served_by(&self) -> Option<(Arc<CommandQueue>, DriveIndex)> {
+        let served_by = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        Some((served_by.0.upgrade()?, served_by.1))
+    }
+}
 
 impl Pending {
     /// Whether another bus takes the place of this one.
@@ -100,7 +121,11 @@ impl CommandQueue {
             }
         }
         drop(of_heir);
-        pending.heirs.insert(drive, (heir.clone(), place));
+        let found_by = pending.found_by.remove(&drive);
+        let served_by = found_by.unwrap_or_else(|| Heir::new(heir, place));
+        served_by.set(heir, place);
+        heir.lock().found_by.insert(place, served_by.clone());
+        pending.heirs.insert(drive, served_by);
         heir.wake();
     }
 }

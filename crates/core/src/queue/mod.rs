@@ -9,6 +9,7 @@ mod shared;
 mod stops;
 
 pub use background::{BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background};
+use handover::Heir;
 pub use shared::CommandQueue;
 pub use stops::{NotStopped, Stopping};
 
@@ -49,8 +50,10 @@ pub struct Pending {
     last: Vec<DriveIndex>,
     /// Drives with a stop that was taken, until the bus says that it is over.
     begun_stops: Vec<DriveIndex>,
-    /// The queues that took over the stops of drives, and their places there.
-    heirs: BTreeMap<DriveIndex, (Arc<CommandQueue>, DriveIndex)>,
+    /// The drives whose stops another queue took over.
+    heirs: BTreeMap<DriveIndex, Heir>,
+    /// Where the queues before this one find the drives that it took over from them.
+    found_by: BTreeMap<DriveIndex, Heir>,
     /// The stops that the gateway wants before it ends, until the bus takes note of it.
     stopping: Option<Stopping>,
     /// Commands that were refused at their turn, to be reported.
@@ -115,8 +118,7 @@ impl Pending {
     /// Returns the refusal where the gate refused it; it is answered then.
     pub fn push(&mut self, mut command: Command, facts: &dyn Facts, now: Instant) -> Option<Refusal> {
         let is_stop = command.is_stop();
-        if is_stop && let Some((queue, place)) = self.heirs.get(&command.intent.drive) {
-            let (queue, place) = (queue.clone(), *place);
+        if is_stop && let Some((queue, place)) = self.heirs.get(&command.intent.drive).and_then(Heir::served_by) {
             command.move_to(place);
             return queue.submit(command, facts, now);
         }

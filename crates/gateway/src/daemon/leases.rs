@@ -3,6 +3,7 @@
 //! former file back does, goes on with what was left. Pure.
 
 use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
 use crate::bus::supervision::Lease;
@@ -31,41 +32,63 @@ struct Left {
     drive: String,
 }
 
-/// What drives had that reloads have left out.
+/// What drives had that reloads have left out. Clones are the same.
+#[derive(Debug, Default, Clone)]
+pub(super) struct Parted(Arc<Mutex<Kept>>);
+
 #[derive(Debug, Default)]
-pub(super) struct Parted {
+struct Kept {
     leases: BTreeMap<Machine, (Instant, Lease)>,
     buses: Vec<(Instant, BusHandle)>,
 }
 
-impl Parted {
-    /// For a reload at `now`: the leases that may continue, and the buses that know who commanded their drives, the
-    /// latest first.
-    pub(super) fn recall(&mut self, now: Instant) -> (Leases, Vec<BusHandle>) {
+impl Kept {
+    /// Drops what is too old for a return.
+    fn forget(&mut self, now: Instant) {
         let is_kept = |at: &Instant| now.saturating_duration_since(*at) <= RETURN;
         self.leases.retain(|_, (at, _)| is_kept(at));
         self.buses.retain(|(at, _)| is_kept(at));
+    }
+}
+
+impl Parted {
+    fn lock(&self) -> MutexGuard<'_, Kept> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Drops what is too old for a return: buses that ended hold memory. How long that is after a reload.
+    pub(super) fn forget(&self, now: Instant) -> Duration {
+        self.lock().forget(now);
+        RETURN
+    }
+
+    /// For a reload at `now`: the leases that may continue, and the buses that know who commanded their drives, the
+    /// latest first.
+    pub(super) fn recall(&self, now: Instant) -> (Leases, Vec<BusHandle>) {
+        let mut kept = self.lock();
+        kept.forget(now);
         let leases = Leases {
             left: BTreeMap::new(),
-            parted: std::mem::take(&mut self.leases),
+            parted: std::mem::take(&mut kept.leases),
         };
-        (leases, self.buses.iter().rev().map(|(_, bus)| bus.clone()).collect())
+        (leases, kept.buses.iter().rev().map(|(_, bus)| bus.clone()).collect())
     }
 
     /// The buses that reloads have stopped, as far as they are still known.
-    pub(super) fn buses(&self) -> impl Iterator<Item = &BusHandle> {
-        self.buses.iter().map(|(_, bus)| bus)
+    pub(super) fn buses(&self) -> Vec<BusHandle> {
+        self.lock().buses.iter().map(|(_, bus)| bus.clone()).collect()
     }
 
     /// After it: what no bus continued, and the buses that were stopped.
-    pub(super) fn keep(&mut self, leases: &Leases, stopped: &[BusHandle], now: Instant) {
-        self.leases.clone_from(&leases.parted);
+    pub(super) fn keep(&self, leases: &Leases, stopped: &[BusHandle], now: Instant) {
+        let mut kept = self.lock();
+        kept.leases.clone_from(&leases.parted);
         let left = leases.left.iter().filter(|(_, left)| left.lease.ends().is_some());
-        self.leases
+        kept.leases
             .extend(left.map(|(machine, left)| (machine.clone(), (now, left.lease))));
-        self.buses.extend(stopped.iter().map(|bus| (now, bus.clone())));
-        let excess = self.buses.len().saturating_sub(MOST_BUSES);
-        self.buses.drain(..excess);
+        kept.buses.extend(stopped.iter().map(|bus| (now, bus.clone())));
+        let excess = kept.buses.len().saturating_sub(MOST_BUSES);
+        kept.buses.drain(..excess);
     }
 }
 

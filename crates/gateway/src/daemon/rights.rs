@@ -20,7 +20,7 @@ impl Daemon {
         let time = SystemTime::now();
         let there = self.buses.iter().map(|(_, task)| task.handle());
         there.for_each(|bus| bus.void_slots(Some(&self.events), time));
-        self.parted.buses().for_each(|bus| bus.void_slots(None, time));
+        self.parted.buses().iter().for_each(|bus| bus.void_slots(None, time));
     }
 
     /// Where no slots are kept, those of an earlier run of the gateway are void.

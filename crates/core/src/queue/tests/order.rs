@@ -217,3 +217,35 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
         assert!(outcome(answer).is_some_and(|outcome| outcome.is_ok()));
     }
 }
+
+/// A client that asks nothing keeps the first queue: the last one gets its stop, and those between are gone.
+#[test]
+fn a_stop_finds_the_last_of_many_buses_and_keeps_none_between() {
+    let (stats, now): (Arc<WriteStats>, _) = (Arc::default(), Instant::now());
+    let first = Arc::new(CommandQueue::new().unwrap());
+    let (mut last, mut between) = (first.clone(), Vec::new());
+    for place in 0..20 {
+        let next = Arc::new(CommandQueue::new().unwrap());
+        last.begin_handover(Vec::new(), now);
+        last.hand_over(DriveIndex::new(place), &next, DriveIndex::new(place + 1), now);
+        last.close(Outcome::ShuttingDown, now);
+        between.push(Arc::downgrade(&last));
+        last = next;
+    }
+    assert_eq!(between.iter().filter(|queue| queue.strong_count() > 0).count(), 1);
+    let give = || {
+        let (ticket, receiver) = ticket(&stats, now);
+        let admitted = Admitted {
+            order: points(&[1]),
+            urgency: Urgency::Stop,
+            reference_only: false,
+            ranges: Vec::new(),
+        };
+        first.submit(command(0, admitted, now, ticket), &(), now);
+        receiver
+    };
+    let _answer = give();
+    assert_eq!(crate::testkit::take_next(&last, now).unwrap().intent.drive, DriveIndex::new(20));
+    drop(last);
+    assert_eq!(outcome(&mut give()), Some(Outcome::ShuttingDown), "no bus serves it any more");
+}

@@ -79,7 +79,7 @@ fn a_lease_goes_with_the_machine_and_where_it_ends_that_is_told() {
 
 /// Reloads from the first bus to the last one, each so long after the one before; how long ago the lease of `pump-1` was renewed then.
 fn over(buses: &[&BusSettings], pause: Duration) -> Option<Duration> {
-    let (mut parted, mut now) = (Parted::default(), Instant::now());
+    let (parted, mut now) = (Parted::default(), Instant::now());
     let mut held = vec![Lease::held(now); buses[0].drives.len()];
     for pair in buses.windows(2) {
         now += pause;
