@@ -249,6 +249,11 @@ impl Publisher {
         let all = self.look(now, |drive| {
             let fresh = drive.is_fresh();
             let reading = drive.drive.reading(now);
+            if reading.age().is_none() {
+                // It was never read, so that there is nothing that happened then.
+                drive.look_at = Some(now + LOOK);
+                return;
+            }
             let shown = drive.shown(&reading);
             let points = (drive.names.as_slice(), drive.indices.as_slice(), drive.fits);
             let render = |shown: &StateContent| render(points, &reading, shown, wall, true);

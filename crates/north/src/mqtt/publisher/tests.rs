@@ -436,3 +436,17 @@ fn arrays_of_the_history_fit_into_the_packets_of_the_broker() {
     }
     assert_eq!(entries, 30);
 }
+
+#[test]
+fn a_drive_that_was_never_read_has_no_history() {
+    let mut bench = PublishedPlant::new();
+    assert!(bench.plant.drives().count() > 1);
+    for n in 0..5 {
+        bench.now += Duration::from_millis(200);
+        bench.read(0x0023, 2500 + n);
+        let _ = bench.publisher.record(bench.now, bench.wall);
+    }
+    let recorded = bench.publisher.recorded();
+    assert!(!recorded.is_empty());
+    assert!(recorded.iter().all(|update| update.topic.contains("/p1/")), "{recorded:?}");
+}
