@@ -10,8 +10,8 @@ use std::error::Error;
 use std::process::ExitCode;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::command::{Authority, Order, Origin, SourceKind};
 use drivegate::drive::Value;
+use drivegate::order::{Authority, Order, Origin, SourceKind};
 use drivegate::plant::OrderRequest;
 use drivegate::process_image::Direction;
 

@@ -28,15 +28,16 @@
 
 pub use drivegate_bacnet as bacnet;
 pub use drivegate_bus as bus;
-pub use drivegate_core::command;
 pub use drivegate_core::diagnosis;
 pub use drivegate_core::drill;
 pub use drivegate_core::event;
 pub use drivegate_core::files;
 pub use drivegate_core::history;
+pub use drivegate_core::order;
 pub use drivegate_core::parameters;
 pub use drivegate_core::plant;
 pub use drivegate_core::process_image;
+pub use drivegate_core::queue;
 pub use drivegate_core::spec;
 pub use drivegate_core::start_guard;
 pub use drivegate_core::stop_all;

@@ -6,11 +6,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate::codec::{LineFormat, Protocol, Table};
-use drivegate::command::CommandQueue;
 use drivegate::drive::profile::Profiles;
 use drivegate::north::mqtt::{Broker, History, Options, Qos, Telemetry};
 use drivegate::plant::{BusHandle, Plant};
 use drivegate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, Link};
+use drivegate::queue::CommandQueue;
 
 /// States and events as by default, without TLS, commands and Sparkplug.
 pub fn options(client_id: &str, host: &str, port: u16) -> Options {

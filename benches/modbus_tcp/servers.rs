@@ -10,12 +10,12 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::Table;
-use drivegate::command::CommandQueue;
 use drivegate::config::Settings;
 use drivegate::north::Server as _;
 use drivegate::north::modbus_tcp;
 use drivegate::plant::{BusHandle, Plant};
 use drivegate::process_image::{BusImage, DriveImage, Link};
+use drivegate::queue::CommandQueue;
 use drivegate::sim::statistics::Direction;
 use tokio_modbus::prelude::*;
 use tokio_modbus::server::tcp::{Server, accept_tcp_connection};

@@ -7,7 +7,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::{Reply, Table};
-use drivegate::command::{Ready, CommandQueue, Order, Outcome, Urgency};
+use drivegate::order::{Order, Outcome, Urgency};
+use drivegate::queue::{Ready, CommandQueue};
 use drivegate::config::Settings;
 use drivegate::north::mqtt::{Incoming, Offline};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};

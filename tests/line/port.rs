@@ -8,10 +8,10 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
 
 use drivegate::codec::LineFormat;
-use drivegate::command::{Interruption, Outcome};
 use drivegate::drive::{ModelPoint, State, Value};
 use drivegate::event::EventKind;
 use drivegate::line::{Line, LineOptions, Rs485};
+use drivegate::order::{Interruption, Outcome};
 use drivegate::sim::endpoint::EndpointOptions;
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::statistics::Direction;

@@ -17,10 +17,14 @@ fn code(text: &str) -> impl Iterator<Item = (usize, &str)> {
 /// Whether a line builds such a refusal with something in it. Patterns name what they match, and lists of all codes hold empty
 /// ones.
 fn builds(line: &str) -> bool {
-    let is_pattern = ["=>", "matches!", "if let ", "let "].iter().any(|word| line.contains(word));
+    let is_pattern = ["=>", "matches!", "if let ", "let "]
+        .iter()
+        .any(|word| line.contains(word));
     let empty = ["_)", "String::new()", "Box::default()", "Box::<Holder>::default()"];
     OF_THE_GATE.iter().any(|variant| {
-        let mut uses = line.match_indices(&format!("Refusal::{variant}(")).map(|(at, found)| &line[at + found.len()..]);
+        let mut uses = line
+            .match_indices(&format!("Refusal::{variant}("))
+            .map(|(at, found)| &line[at + found.len()..]);
         uses.any(|rest| !is_pattern && !empty.iter().any(|empty| rest.starts_with(empty)))
     })
 }
@@ -32,7 +36,9 @@ fn refusals_of_the_gate_are_built_in_one_place() {
     assert!(!builds("    | Refusal::HeldByOther(_)"));
     let gate = root().join("crates/core/src/permit");
     let is_test = |path: &Path| {
-        let mut parts = path.components().map(|part| part.as_os_str().to_string_lossy().into_owned());
+        let mut parts = path
+            .components()
+            .map(|part| part.as_os_str().to_string_lossy().into_owned());
         parts.any(|part| part == "tests" || part == "tests.rs")
     };
     let mut found = Vec::new();
@@ -45,5 +51,9 @@ fn refusals_of_the_gate_are_built_in_one_place() {
         let here = code(&text).filter(|(_, line)| builds(line));
         found.extend(here.map(|(number, line)| format!("{}:{}: {}", own.display(), number + 1, line.trim())));
     }
-    assert_eq!(found, Vec::<String>::new(), "a rule for orders belongs into core/permit");
+    assert_eq!(
+        found,
+        Vec::<String>::new(),
+        "a rule for orders belongs into core/permit"
+    );
 }

@@ -25,10 +25,10 @@ use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
 use crate::codec::{Exception, Reply, Table};
-use crate::command::{
+use crate::drive::{ModelPoint, Profile};
+use crate::order::{
     Command, Intent, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Urgency, Work, written,
 };
-use crate::drive::{ModelPoint, Profile};
 
 /// Most stops to a drive that are sent before the end of a started pulse.
 const MOST_STOPS: u32 = 8;

@@ -2,9 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use crate::command::{Order, Receipt, written};
 use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, PointIndex, PollClass, Profile, Value};
+use crate::order::{Order, Receipt, written};
 use crate::process_image::Reading;
 
 /// Commands to one drive that are watched at one time; beyond that the oldest stays "acknowledged".

@@ -13,10 +13,9 @@ use super::report::Report;
 use super::tap::Tap;
 use super::transaction::Ended;
 use crate::codec::{Exception, Reply, Request};
-use crate::command::{Outcome, Urgency, WriteStats};
 use crate::drive::DriveIndex;
 use crate::event::Events;
-use crate::order::Stalls;
+use crate::order::{Outcome, Stalls, Urgency, WriteStats};
 use crate::plant::BusHandle;
 use crate::process_image::Taping;
 

@@ -8,10 +8,10 @@ use tokio::sync::oneshot::Receiver;
 use tokio::sync::oneshot::error::TryRecvError;
 
 use crate::codec::Reply;
-use crate::command::{Answer, BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket, WriteStats};
 use crate::diagnosis::CountedByDrive;
 use crate::drive::DriveIndex;
 use crate::line_diagnosis::LineDiagnosis;
+use crate::order::{Answer, BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket, WriteStats};
 use crate::plant::BusHandle;
 
 /// Pause between two readings of a drive.

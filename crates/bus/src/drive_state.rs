@@ -9,9 +9,10 @@ use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
 use super::vain_stops::VainStops;
 use crate::codec::{Reply, Table};
-use crate::command::{Command, Interruption, LastWritten, Origin, Outcome, Receipt, Urgency};
 use crate::drive::ModelPoint;
 use crate::drive::control::Control;
+use crate::order::{Command, Interruption, Origin, Outcome, Receipt, Urgency};
+use crate::permit::LastWritten;
 use crate::process_image::{DriveImage, Reading};
 
 /// A status older than this, or than three rounds of the line, does not show whether the motor runs.

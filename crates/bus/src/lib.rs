@@ -44,13 +44,13 @@ mod tap;
 pub mod transaction;
 mod vain_stops;
 
-use drivegate_core::command;
 use drivegate_core::diagnosis;
 use drivegate_core::event;
 use drivegate_core::order;
 use drivegate_core::permit;
 use drivegate_core::plant;
 use drivegate_core::process_image;
+use drivegate_core::queue;
 use drivegate_core::start_guard;
 pub use drivegate_core::stop_all::stop_of_line;
 use drivegate_line as line;

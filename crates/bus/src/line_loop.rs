@@ -12,11 +12,10 @@ use super::listener::ListenCore;
 use super::master::Handover;
 use super::{BusOptions, Mode};
 use crate::codec::LineFormat;
-use crate::command::{Outcome, WriteStats};
 use crate::drive::DriveIndex;
 use crate::event::Events;
 use crate::line::{self, Arrival, Line, LineOptions, Lost, Names, OpenError, Receiver, Woken};
-use crate::order::Stalls;
+use crate::order::{Outcome, Stalls, WriteStats};
 use crate::plant::BusHandle;
 
 /// First and longest pause between two tries to open the port.

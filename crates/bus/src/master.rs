@@ -41,9 +41,9 @@ use super::supervision::{Demand, Lease, Orders};
 use super::transaction::Ended;
 use crate::codec::n2::Session;
 use crate::codec::{Protocol, RequestPdu};
-use crate::command::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Urgency, WriteStats};
 use crate::drive::plan::WireTime;
 use crate::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
+use crate::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Urgency, WriteStats};
 use crate::plant::{BusHandle, turn_away};
 use crate::process_image::DriveImage;
 

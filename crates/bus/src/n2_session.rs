@@ -11,8 +11,8 @@ use std::time::Instant;
 use super::transaction::Ended;
 use crate::codec::n2::{N2Options, Session};
 use crate::codec::{Exception, Reply};
-use crate::command::Urgency;
 use crate::drive::{DriveIndex, PerDrive};
+use crate::order::Urgency;
 
 /// Polls in which a drive has to report all its changes.
 pub const MOST_POLLS: u8 = 16;

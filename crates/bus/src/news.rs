@@ -4,8 +4,9 @@ use std::time::{Duration, Instant};
 
 use super::confirm::Unconfirmed;
 use crate::codec::Exception;
-use crate::command::{Denied, Refusal};
 use crate::drive::{DriveIndex, PlannedRead};
+use crate::order::Refusal;
+use crate::queue::Denied;
 
 /// One piece of news. Drives are named by their place on the bus.
 #[derive(Debug, Clone, PartialEq)]

@@ -12,11 +12,11 @@ use self::drive::{Drive, Start};
 use self::frame::{Fate, Frame, different, in_words};
 use super::command_run::{CommandRun, KnownWords, Next, Step, StepPurpose};
 use crate::codec::{Exception, Reply, Table};
-use crate::command::{
-    Admitted, Arrival, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, WriteStats, written,
-};
 use crate::drive::control::{Control, ControlItem, OwnWord, Run, Setting};
 use crate::drive::{DriveIndex, ModelPoint, PointIndex, Profile, Value};
+use crate::order::{
+    Admitted, Arrival, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, WriteStats, written,
+};
 
 /// Requests after which a command should have ended, reads of a state for which it waits among them.
 const MOST_FRAMES: usize = 1000;

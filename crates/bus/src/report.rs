@@ -17,10 +17,9 @@ use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
 use super::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::{Exception, Reply, Request, Table};
-use crate::command::WriteStats;
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, PointIndex, PollClass, Value};
 use crate::event::{EventKind, Events};
-use crate::order::Stall;
+use crate::order::{Stall, WriteStats};
 use crate::process_image::{
     Access, BusImage, DriveImage, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Verdict,
 };

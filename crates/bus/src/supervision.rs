@@ -14,12 +14,12 @@ use tokio::sync::oneshot::error::TryRecvError;
 
 use super::command_run::KnownWords;
 use super::news::{Adopted, News};
-use crate::command::{Answer, Outcome, Refusal};
 use crate::drive::control::ControlItem;
 use crate::drive::{
     COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, DriveIndex, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass,
     Quality, Value,
 };
+use crate::order::{Answer, Outcome, Refusal};
 use crate::process_image::{LeaseAction, Reading, Unavailable};
 
 /// How long an action that was not acknowledged waits before it is written again.

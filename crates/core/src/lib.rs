@@ -17,13 +17,6 @@ pub mod start_guard;
 pub mod stop_all;
 pub mod version;
 
-/// Orders, the rules that judge them, and the queue in which they wait.
-pub mod command {
-    pub use crate::order::*;
-    pub use crate::permit::*;
-    pub use crate::queue::*;
-}
-
 use drivegate_model::drive;
 use drivegate_proto as codec;
 

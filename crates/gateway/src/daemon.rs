@@ -24,7 +24,6 @@ use self::server::{ServerSlot, within};
 use crate::bus::line_state::Learned;
 use crate::bus::master::Handover;
 use crate::bus::{BusTask, Mode};
-use crate::command::{CommandQueue, NotStopped, Outcome, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::drive::DriveIndex;
 use crate::event::{Event, EventKind, Events};
@@ -33,8 +32,10 @@ use crate::history::RecorderTask;
 use crate::north::local::Control;
 use crate::north::reading::Watch;
 use crate::north::{NorthState, ServerError, bacnet, http, local, modbus_tcp, mqtt, slot};
+use crate::order::{Outcome, WriteStats};
 use crate::plant::{BusHandle, Plant, SharedPlant, follow_names};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
+use crate::queue::{CommandQueue, NotStopped};
 use crate::start_guard::{BusGuards, Guards};
 use crate::stop_all::{LOOK, StopAll};
 

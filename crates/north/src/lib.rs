@@ -29,7 +29,6 @@ mod stats;
 mod tcp_server;
 mod tls_words;
 
-use drivegate_core::command;
 use drivegate_core::diagnosis;
 use drivegate_core::drill;
 use drivegate_core::event;

@@ -8,7 +8,7 @@ use std::time::Instant;
 use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer, NoPlace};
 use super::log_throttle::LogThrottle;
 use super::{ConnectionRefusal, NorthState, ServerKind};
-use crate::command::Authority;
+use crate::order::Authority;
 
 /// The refusals of one server.
 #[derive(Debug)]

@@ -11,9 +11,9 @@ pub(crate) use command::{CommandContext, CommandWrite, command, without_reset};
 pub use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, gateway};
 
 use crate::codec::Exception;
-use crate::command::{HoldState, HoldView};
 use crate::drive::tidy;
 use crate::drive::{ModelPoint, State, Value};
+use crate::permit::{HoldState, HoldView};
 use crate::process_image::Reading;
 
 /// First address that does not belong to the drive.

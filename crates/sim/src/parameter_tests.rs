@@ -10,10 +10,10 @@ use super::slave::{Heard, Slaves};
 use super::*;
 use crate::codec::n2::Session;
 use crate::codec::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
-use crate::command::Outcome;
 use crate::drive::Profile;
 use crate::drive::parameters::RawValue;
 use crate::drive::profile::Profiles;
+use crate::order::Outcome;
 use crate::parameters::{Names, Next, ParameterFile, ParameterWrite, Plan, Reading, Wishes, differences, plan};
 
 const ADDRESS: u8 = 1;

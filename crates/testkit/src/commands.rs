@@ -3,10 +3,8 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate_core::command::{
-    Answer, Arrival, Audit, Command, CommandQueue, Origin, Pending, Ready, SourceKind, Ticket, Urgency, Window,
-    WriteStats,
-};
+use drivegate_core::order::{Answer, Arrival, Audit, Command, Origin, SourceKind, Ticket, Urgency, Window, WriteStats};
+use drivegate_core::queue::{CommandQueue, Pending, Ready};
 use serde_json::Value;
 use tokio::sync::oneshot::Receiver;
 

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate_core::command::CommandQueue;
 use drivegate_core::plant::{BusHandle, Plant};
 use drivegate_core::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link};
+use drivegate_core::queue::CommandQueue;
 use drivegate_model::drive::Profile;
 use drivegate_model::drive::profile::Profiles;
 use drivegate_proto::{LineFormat, Protocol, Table};

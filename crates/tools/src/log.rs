@@ -18,8 +18,8 @@ use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
 use self::journal::Journal;
 pub(super) use self::journal::reads_stderr;
 use self::line::{Form, LogLine};
-use crate::command::SENT;
 use crate::config::{LogFormat, LogSettings};
+use crate::order::SENT;
 
 /// Where commands are logged (`command::AuditRecord`), and the level of their lines.
 const AUDIT: &str = "audit";

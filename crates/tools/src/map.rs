@@ -13,11 +13,11 @@ use std::sync::Arc;
 use self::rows::{Row, gateway_rows};
 use super::failure::{Failure, Outcome};
 use super::{DEFAULT_CONFIG, report};
-use crate::command::CommandQueue;
 use crate::config::{BusSettings, Settings};
 use crate::north::modbus_tcp::Role;
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{BusImage, DriveImage, DriveSpec};
+use crate::queue::CommandQueue;
 
 /// Prints the Modbus TCP register map of a configuration, or its BACnet objects, for the SCADA engineer.
 #[derive(Debug, clap::Args)]

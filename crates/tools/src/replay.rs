@@ -10,12 +10,13 @@ use tokio::sync::broadcast;
 use super::failure::{self, Failure};
 use super::{ConfigFile, EXIT_CONFIG, EXIT_DATA, report};
 use crate::bus::listener::ListenCore;
-use crate::command::{CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings, environment};
 use crate::event::{Event, Events};
 use crate::history::capture::{self, Packet};
+use crate::order::WriteStats;
 use crate::plant::BusHandle;
 use crate::process_image::{BusImage, DriveImage, Outcome, public_points, value_or_null};
+use crate::queue::CommandQueue;
 
 /// Largest capture that is read.
 const MOST_BYTES: u64 = 1 << 30;

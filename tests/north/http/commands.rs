@@ -3,9 +3,9 @@
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use drivegate::command::{Authority, Order, Origin, Outcome, SourceKind};
 use drivegate::drive::Value;
 use drivegate::north::http::{Options, Scope, Token, Tokens, User, Users};
+use drivegate::order::{Authority, Order, Origin, Outcome, SourceKind};
 use drivegate::plant::OrderRequest;
 use drivegate::process_image::{Access, LeaseAction, Supervision};
 use drivegate_testkit::{image, monitored};

@@ -8,7 +8,6 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::{Exception, Table};
-use drivegate::command;
 use drivegate::diagnosis::{Cause, Certainty, Counted, Diagnosis, Verdict};
 use drivegate::drive::model::Kind;
 use drivegate::drive::{ModelPoint, Profile};
@@ -16,6 +15,7 @@ use drivegate::event::{Event, EventKind};
 use drivegate::north::http::{self, Http, Options};
 use drivegate::north::{NorthState, SlotOutcome};
 use drivegate::north::{Reconfigure as _, Server as _};
+use drivegate::order;
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{DriveImage, DriveSpec, LeaseAction, Link, Outcome, PollCycle, Supervision};
 use drivegate_testkit::{bus_spec, image, monitored, profile, read_all, ticket};
@@ -185,7 +185,7 @@ pub(crate) fn secretive() -> Arc<DriveImage> {
 /// One command that was answered.
 pub(crate) fn count_a_write(plant: &Plant) {
     let (ticket, _answer) = ticket(&plant.writes, Instant::now());
-    ticket.answer(command::Outcome::TimedOut, Instant::now() + Duration::from_millis(20));
+    ticket.answer(order::Outcome::TimedOut, Instant::now() + Duration::from_millis(20));
 }
 
 /// Figures of all north sides.

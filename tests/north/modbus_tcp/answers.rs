@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use std::time::{Duration, SystemTime};
 
 use drivegate::codec::Exception;
-use drivegate::command::Outcome;
 use drivegate::north::modbus_tcp::Uncached;
+use drivegate::order::Outcome;
 use drivegate::process_image::{Access, Link};
 
 use drivegate_testkit::{number, rows};

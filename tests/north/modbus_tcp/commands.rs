@@ -6,9 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use drivegate::codec::Table;
-use drivegate::command::{CAPACITY, Order, Outcome, SourceKind};
 use drivegate::drive::Value;
 use drivegate::event::EventKind;
+use drivegate::order::{CAPACITY, Order, Outcome, SourceKind};
 
 use super::rig::{Rig, acknowledge, frame, registers, until, words, write};
 

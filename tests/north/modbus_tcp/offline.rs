@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::{RequestPdu, Table};
-use drivegate::command::{Authority, Command, Order};
 use drivegate::north::modbus_tcp::Offline;
+use drivegate::order::{Authority, Command, Order};
 use drivegate::plant::{Plant, SharedPlant};
 use drivegate_testkit::take_next;
 

@@ -3,8 +3,8 @@
 use std::time::SystemTime;
 
 use drivegate::codec::{Exception, RequestPdu, Table};
-use drivegate::command::{Order, Outcome};
 use drivegate::north::modbus_tcp::Uncached;
+use drivegate::order::{Order, Outcome};
 use drivegate::process_image::Link;
 
 use super::rig::{Client, Rig, n2_plant, options, registers, words, write};

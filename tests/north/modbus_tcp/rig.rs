@@ -8,14 +8,15 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
-use drivegate::command::{Command, CommandQueue, Order, Outcome};
 use drivegate::drive::RawWrites;
 use drivegate::drive::profile::Profile;
 use drivegate::north::modbus_tcp::{self, Listener, Options, Server, Uncached};
 use drivegate::north::{NorthState, ServerError};
 use drivegate::north::{Reconfigure as _, Server as _};
+use drivegate::order::{Command, Order, Outcome};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{Access, BusSpec, DriveImage, DriveSpec, LeaseAction, Link, Supervision};
+use drivegate::queue::CommandQueue;
 use drivegate_testkit::{bus_spec, monitored, nx, profile, take_next};
 use rustix::event::{PollFd, PollFlags, poll};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};

@@ -7,8 +7,8 @@ use std::time::Instant;
 use arc_swap::ArcSwap;
 use drivegate::codec::RequestPdu;
 use drivegate::codec::Table;
-use drivegate::command::Authority;
 use drivegate::north::modbus_tcp::{Offline, Uncached};
+use drivegate::order::Authority;
 use proptest::prelude::*;
 use tokio_modbus::{Request, Response};
 

@@ -11,11 +11,11 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::Reply;
-use drivegate::command::{Order, Outcome};
 use drivegate::drive::{PointIndex, Value};
 use drivegate::event::{Event, EventKind};
 use drivegate::north::mqtt::{self, History, Mqtt, Options, Qos, Telemetry};
 use drivegate::north::{NorthState, Server as _};
+use drivegate::order::{Order, Outcome};
 use drivegate::plant::{Plant, SharedPlant};
 use drivegate::process_image::Access;
 use drivegate_testkit::{bus, bus_spec, controlled, image, nx, read_nx, take_next, up};

@@ -10,10 +10,10 @@ use super::known_words::KnownWords;
 use super::standing::{Holds, Motor, Verdict, Wants, depends_on_motor, judge};
 use super::steps::{Action, Check, Known, Step, StepPurpose};
 use crate::codec::{Reply, RequestPdu, Table};
-use crate::command::Refusal;
 use crate::drive::control::{self, Control, ControlItem, Mask, OwnWord, Run, Setting, Until};
 use crate::drive::model::Kind;
 use crate::drive::{ModelPoint, PointIndex, Profile, Raw, Value};
+use crate::order::Refusal;
 
 /// Pause between two looks at a state for which a sequence waits.
 pub(super) const LOOK_PAUSE: Duration = Duration::from_millis(20);

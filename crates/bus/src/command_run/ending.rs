@@ -6,8 +6,8 @@ use super::control::Word;
 use super::steps::{Action, Check};
 use super::{CommandRun, Phase};
 use crate::codec::Exception;
-use crate::command::{Interruption, Outcome, Receipt, Refusal};
 use crate::confirm::Effect;
+use crate::order::{Interruption, Outcome, Receipt, Refusal};
 
 impl CommandRun {
     /// It goes no further, and ends with that outcome; a motor that it started is stopped.

@@ -5,8 +5,8 @@ use std::time::Instant;
 
 use super::functions::TakenFunctions;
 use crate::codec::{RequestPdu, Table};
-use crate::command::written;
 use crate::drive::control::Control;
+use crate::order::written;
 
 /// The registers and coils of a drive whose bits are commanded, as the drive has them.
 ///

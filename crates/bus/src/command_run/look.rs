@@ -8,9 +8,9 @@ use super::standing::{self, Motor};
 use super::steps::Action;
 use super::{CommandRun, KnownWords, Step, StepPurpose};
 use crate::codec::{Protocol, Reply, RequestPdu, Table};
-use crate::command::Outcome;
 use crate::drive::model::Kind;
 use crate::drive::{Derived, ModelPoint, Profile, Raw, Source, Value};
+use crate::order::Outcome;
 
 /// A state of the drive, with the registers or bits that show it, whether it is one bit, a masked register or derived.
 #[derive(Debug, Clone, PartialEq)]

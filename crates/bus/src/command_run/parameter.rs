@@ -6,9 +6,9 @@ use super::look::Look;
 use super::steps::{Step, StepPurpose};
 use crate::codec::n2::Session;
 use crate::codec::{Reply, RequestPdu, Table};
-use crate::command::{Outcome, ParameterOrder, Refusal};
 use crate::drive::Profile;
 use crate::drive::parameters::RawValue;
+use crate::order::{Outcome, ParameterOrder, Refusal};
 
 /// Reads of a value that was acknowledged until it counts as not taken.
 const LOOKS: u32 = 3;

@@ -8,7 +8,7 @@ use super::parameter::Then;
 use super::steps::{Action, Check};
 use super::{CommandRun, Doubt, KnownWords, Phase, Step, StepPurpose};
 use crate::codec::{Exception, Reply, RequestPdu};
-use crate::command::{Outcome, Urgency};
+use crate::order::{Outcome, Urgency};
 
 /// Pause before a parameter is read back once more.
 const LOOK_AGAIN: Duration = Duration::from_millis(100);

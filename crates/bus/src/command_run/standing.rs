@@ -3,7 +3,7 @@
 //!
 //! A drive that restarted, or was stopped at its panel, stands, and its run command is gone: the word from memory would start it.
 
-use crate::command::Refusal;
+use crate::order::Refusal;
 
 /// What the drive showed of its motor, in the same command and right before the write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

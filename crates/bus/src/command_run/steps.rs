@@ -9,10 +9,10 @@ use super::parameter::ParameterRun;
 use super::standing::Motor;
 use crate::codec::n2::Session;
 use crate::codec::{RequestPdu, Table};
-use crate::command::{Refusal, written};
 use crate::drive::control::Setting;
 use crate::drive::profile::Form;
 use crate::drive::{Point, PointIndex, Profile, Raw, Value};
+use crate::order::{Refusal, written};
 
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Action {

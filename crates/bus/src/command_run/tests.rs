@@ -8,9 +8,9 @@ use tokio::sync::oneshot::Receiver;
 use super::*;
 use crate::codec::RequestPdu;
 use crate::codec::Table;
-use crate::command::{Admitted, Answer, Origin, SourceKind, WriteStats};
 use crate::drive::profile::Profiles;
 use crate::drive::{DriveIndex, Value};
+use crate::order::{Admitted, Answer, Origin, SourceKind, WriteStats};
 
 mod elsewhere;
 mod functions;

@@ -5,7 +5,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::codec::{Reply, RequestPdu, Table};
-use crate::command::{Outcome, WriteStats};
+use crate::order::{Outcome, WriteStats};
 use crate::process_image::{DriveImage, DriveSpec};
 
 struct CommandedDrive {

@@ -6,9 +6,9 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use crate::codec::{Protocol, Reply, RequestPdu, Table, describe};
-use crate::command::{Change, Outcome, written};
 use crate::drive::ModelPoint;
 use crate::drive::model::Kind;
+use crate::order::{Change, Outcome, written};
 use crate::process_image::DriveSpec;
 use crate::transaction::Ended;
 

@@ -9,11 +9,11 @@ use super::commands::{Commanded, Commands};
 use super::decoder::{Decoder, Exchange, Heard};
 use crate::BusOptions;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table};
-use crate::command::{Origin, Outcome, Refusal, SourceKind, Ticket, WriteStats};
 use crate::core::Closed;
 use crate::drive::{DriveIndex, PerDrive, Profile};
 use crate::event::{EventKind, Events};
 use crate::news::News;
+use crate::order::{Origin, Outcome, Refusal, SourceKind, Ticket, WriteStats};
 use crate::plant::BusHandle;
 use crate::process_image::{Cadence, Outcome as Counted};
 use crate::report::Report;
@@ -122,7 +122,7 @@ impl ListenCore {
         self.report.bus_down(why, now);
     }
 
-    /// Answers whatever came into the queue all the same, which [`crate::command::admit`] prevents, and a gateway that is about to
+    /// Answers whatever came into the queue all the same, which [`crate::permit::admit`] prevents, and a gateway that is about to
     /// end: there is nothing to stop.
     pub(crate) fn refuse_all(&mut self, now: Instant) {
         let name = &self.bus.image.spec.name;

@@ -6,15 +6,15 @@ use super::permission::AtTurn;
 use super::{Master, Purpose, Turn, TurnEnd};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{
-    BackgroundRequest, Command, Interruption, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind,
-    Stage, Urgency, Verdict, Work, written,
-};
 use crate::drive::plan::WireTime;
 use crate::drive::{DriveIndex, PlannedRead, PollClass};
 use crate::n2_session::Progress;
 use crate::news::News;
-use crate::permit::client_access;
+use crate::order::{
+    BackgroundRequest, Command, Interruption, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind,
+    Urgency, Work, written,
+};
+use crate::permit::{Stage, Verdict, client_access};
 use crate::schedule::Admission;
 use crate::start_gate::Start;
 use crate::stop_of_line::BROADCAST_PAUSE;

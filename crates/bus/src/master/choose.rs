@@ -6,10 +6,11 @@ use super::passed_on::{drop_unwanted, is_ready};
 use super::permission::{AtTurn, wanted};
 use super::{Before, Master, Purpose, Turn};
 use crate::codec::RequestPdu;
-use crate::command::{Chosen, Command, DEFAULT_EXPIRY, Interruption, Order, Outcome, Ready, StopEnd, Urgency, Work};
 use crate::command_run::{CommandRun, Step};
 use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::{DriveState, Wanted};
+use crate::order::{Command, DEFAULT_EXPIRY, Interruption, Order, Outcome, StopEnd, Urgency, Work};
+use crate::queue::{Chosen, Ready};
 use crate::schedule::{Decision, Poll};
 
 /// Transactions of one rank in a row, while a lower one waits, before that has its turn.

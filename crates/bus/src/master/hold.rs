@@ -3,9 +3,9 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use crate::command::{DEFAULT_EXPIRY, Origin, SourceKind, WriteStats};
 use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::drive_state::DriveState;
+use crate::order::{DEFAULT_EXPIRY, Origin, SourceKind, WriteStats};
 use crate::plant::BusHandle;
 use crate::process_image::{DriveImage, Reading};
 use crate::supervision::written_run;

@@ -6,9 +6,10 @@ use super::background::{Begun, Sending};
 use super::permission::AtTurn;
 use super::waits::Waits;
 use super::{Master, Turn};
-use crate::command::{Choice, Command, NO_DRIVE, Order, Outcome, Pace, PassedOn, Pending, Ready};
 use crate::drive::PerDrive;
 use crate::drive_state::DriveState;
+use crate::order::{Command, NO_DRIVE, Order, Outcome, Pace, PassedOn};
+use crate::queue::{Choice, Pending, Ready};
 use crate::schedule::Admission;
 
 /// Ends passed-on requests whose tool has disconnected, or has sent another one.

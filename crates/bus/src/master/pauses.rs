@@ -3,8 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::Master;
-use crate::command::Urgency;
-use crate::order::Stall;
+use crate::order::{Stall, Urgency};
 
 impl Master {
     /// The thread stood still until `now`. What waits is judged by that when it is chosen again. A command of several steps

@@ -4,12 +4,14 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::Master;
-use crate::command::{Ask, Denied, Facts, LastWritten, Outcome, Seen, Stage, Urgency, Verdict};
 use crate::command_run::CommandRun;
 use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::{DriveState, Wanted};
+use crate::order::{Outcome, Urgency};
+use crate::permit::{Ask, Facts, LastWritten, Seen, Stage, Verdict};
 use crate::plant::BusHandle;
 use crate::process_image::DriveImage;
+use crate::queue::Denied;
 
 /// How old a frequency range may be on which a command rests whose turn came. Whether it was too old for the command
 /// was decided when that was accepted.

@@ -5,12 +5,13 @@ use std::time::{Duration, Instant};
 use super::{Before, Master, Purpose, Turn, TurnEnd};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, is_reference, written};
 use crate::command_run::{Step, StepPurpose, read_place};
 use crate::drive::{DriveIndex, PlannedRead, Point, PointIndex, Raw};
 use crate::n2_late_replies::Asked;
 use crate::n2_session::Progress;
 use crate::news::News;
+use crate::order::{Command, Outcome, Pace, Urgency, is_range_end, written};
+use crate::permit::is_reference;
 use crate::schedule::{Change, Poll, Polled, TRIAL_PAUSE};
 use crate::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 

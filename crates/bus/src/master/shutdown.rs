@@ -8,11 +8,12 @@ use tokio::sync::oneshot::Receiver;
 use tokio::sync::oneshot::error::TryRecvError;
 
 use super::Master;
-use crate::command::{Answer, NotStopped, Origin, Outcome, SourceKind, Stopping, WriteStats};
 use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::drive_state::FRESH;
+use crate::order::{Answer, Origin, Outcome, SourceKind, WriteStats};
 use crate::plant::{BusHandle, Exchange, Question};
 use crate::process_image::{Access, DriveImage, OnShutdown};
+use crate::queue::{NotStopped, Stopping};
 use crate::stop_of_line::stop_of_line;
 
 /// How long the stops wait for a broadcast that goes before them: a transaction that is on the line, the broadcast, and

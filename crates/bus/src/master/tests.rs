@@ -9,9 +9,10 @@ use tokio::sync::oneshot::Receiver;
 use super::*;
 use crate::codec::wire::Silence;
 use crate::codec::{Exception, Reply, Table};
-use crate::command::{Answer, Authority, Command, NO_DRIVE, Order, Ticket, admit};
 use crate::drive::{DriveIndex, ModelPoint, PollClass, Value};
 use crate::line::LineOptions;
+use crate::order::{Answer, Authority, Command, NO_DRIVE, Order, Ticket};
+use crate::permit::admit;
 use crate::process_image::{BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings};
 use crate::transaction::MAY_BE_LATE;
 

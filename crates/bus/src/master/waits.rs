@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use crate::codec::RequestPdu;
-use crate::command::{BackgroundRequest, Command, Order, PassedOn, Ready, Urgency};
 use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::DriveState;
 use crate::late_replies::LateReplies;
 use crate::n2_late_replies::N2LateReplies;
 use crate::n2_session::N2Sessions;
+use crate::order::{BackgroundRequest, Command, Order, PassedOn, Urgency};
+use crate::queue::Ready;
 use crate::start_gate::StartGate;
 
 /// What a transaction may have to wait for.

@@ -4,9 +4,9 @@
 use std::collections::BTreeMap;
 
 use crate::codec::{Reply, RequestPdu};
-use crate::command::written;
 use crate::drive::control::{Control, ControlItem, Run, Setting, Step, Until};
 use crate::drive::{PointIndex, Profile};
+use crate::order::written;
 
 /// In which state a proof begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

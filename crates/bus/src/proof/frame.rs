@@ -3,7 +3,7 @@
 use std::fmt;
 
 use crate::codec::{Exception, RequestPdu};
-use crate::command::written;
+use crate::order::written;
 
 /// The fate of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

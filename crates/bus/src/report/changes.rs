@@ -3,9 +3,9 @@
 use std::time::{Duration, Instant, SystemTime};
 
 use super::{RECENT, Report};
-use crate::command::Origin;
 use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::event::{Event, EventKind};
+use crate::order::Origin;
 
 /// Time from a command to the poll that shows the motor running, ramps and slow polls included.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);

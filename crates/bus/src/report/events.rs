@@ -3,13 +3,13 @@
 use std::time::{Instant, SystemTime};
 
 use super::{RECENT, Report, goes_offline};
-use crate::command::Denied;
 use crate::confirm::Unconfirmed;
 use crate::drive::DriveIndex;
 use crate::event::{Event, EventKind, RefusedCommand};
 use crate::news::Adopted;
 use crate::plant::explain;
 use crate::process_image::{LeaseAction, Snapshot};
+use crate::queue::Denied;
 
 impl Report {
     /// Reports an event of a drive; `text` makes the words from its name.

@@ -204,7 +204,7 @@ fn supervision_tells_what_it_is_about_to_do_and_what_came_of_it() {
 /// A motor that starts and stops: the words of the status register, and who is told to have been the cause.
 #[test]
 fn an_event_tells_who_started_and_stopped_a_motor() {
-    use crate::command::{Origin, Outcome, SourceKind, Ticket};
+    use crate::order::{Origin, Outcome, SourceKind, Ticket};
     const SECOND: Duration = Duration::from_secs(1);
     let image = image(1);
     let (events, writes) = (Events::default(), Arc::<WriteStats>::default());
@@ -221,7 +221,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
     let order = |run: bool, outcome: Outcome, now: Instant| {
         let origin = Origin::new(SourceKind::Mqtt, "operator");
         let (ticket, _) = Ticket::new(origin, "d1", "run".to_string(), true, now, writes.clone());
-        let change = crate::command::Change {
+        let change = crate::order::Change {
             point: "run".to_string(),
             old: None,
             new: Value::Bool(run),

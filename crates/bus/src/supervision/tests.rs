@@ -5,16 +5,17 @@ use std::time::SystemTime;
 use super::*;
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{
-    Authority, Command, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats,
-    admit, written,
-};
 use crate::command_run::{CommandRun, Next, Step};
 use crate::drive::profile::Profiles;
 use crate::drive::{Derived, DriveIndex, Profile, Source};
 use crate::drive_state::{DriveState, Wanted};
 use crate::master::supervise;
 use crate::n2_late_replies::N2LateReplies;
+use crate::order::{
+    Authority, Command, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats,
+    written,
+};
+use crate::permit::admit;
 use crate::plant::BusHandle;
 use crate::process_image::{Access, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
 

@@ -3,8 +3,9 @@
 use std::time::SystemTime;
 
 use super::BusHandle;
-use crate::command::{Commanded, Entry, Mode, Rules, VoidSlot};
 use crate::event::{Event, EventKind, Events};
+use crate::order::{Commanded, Entry};
+use crate::permit::{Mode, Rules, VoidSlot};
 use crate::process_image::{Access, DriveImage};
 
 impl BusHandle {
@@ -64,8 +65,9 @@ mod tests {
     use std::time::{Duration, Instant};
 
     use super::*;
-    use crate::command::{Origin, Principal, Proof, Right, SourceKind};
     use crate::drive::Value;
+    use crate::order::{Origin, Proof, Right, SourceKind};
+    use crate::permit::Principal;
     use crate::testkit::{bus, bus_spec, controlled, image, monitored, profile};
 
     const NOW: SystemTime = SystemTime::UNIX_EPOCH;

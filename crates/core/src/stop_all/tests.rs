@@ -1,8 +1,8 @@
 use super::*;
 use std::sync::Arc;
 
-use crate::command::{Authority, Order, SourceKind};
 use crate::drive::Value;
+use crate::order::{Authority, Order, SourceKind};
 use crate::plant::OrderRequest;
 use crate::process_image::{BusImage, DriveSpec};
 use crate::testkit::{STALE_AFTER, bus, bus_spec, image, monitored, nx, up};
@@ -78,10 +78,7 @@ fn second_order(then: impl Fn(&Plant, &StopAll, Instant)) -> (Plant, usize) {
     let order = |who: &Origin, now| all.order(&plant, &Scope::Gateway, who, WAIT, now);
     order(&origin, now).unwrap();
     let stop = crate::testkit::take_next(&plant.buses[0].queue, now).unwrap();
-    stop.answer(
-        &crate::command::Outcome::Acknowledged(crate::codec::Reply::Written),
-        now,
-    );
+    stop.answer(&crate::order::Outcome::Acknowledged(crate::codec::Reply::Written), now);
     assert!(all.look(&plant, now));
     then(&plant, &all, now);
     let later = now + Duration::from_millis(900);

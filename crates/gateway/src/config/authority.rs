@@ -10,8 +10,8 @@ use super::bus;
 use super::keys::{AUTHORITY, PRINCIPAL};
 use super::settings::Unusable;
 use super::together::Clients;
-use crate::command::{Mode, Principal, Rules};
 use crate::document::{Finding, Reader, nearest};
+use crate::permit::{Mode, Principal, Rules};
 
 /// Where the system keeps its users.
 const PASSWD: &str = "/etc/passwd";

@@ -4,9 +4,9 @@ use std::path::Path;
 
 use super::keys::{AUDIT, LOG, LogFormat};
 use super::values;
-use crate::command::AuditFileOptions;
 use crate::document::Reader;
 use crate::files::names;
+use crate::order::AuditFileOptions;
 
 /// The settings of the log.
 #[derive(Debug, Clone, PartialEq, Eq)]

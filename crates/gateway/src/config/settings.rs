@@ -8,7 +8,6 @@ use super::log::LogSettings;
 use super::params::ParamsSettings;
 use crate::bus::predict::{self, Prediction};
 use crate::bus::{BusOptions, Mode};
-use crate::command::{AuditFileOptions, Rules};
 use crate::drill::DrillOptions;
 use crate::drive::profile::Profiles;
 use crate::history::RecorderOptions;
@@ -17,6 +16,8 @@ use crate::north::{
     bacnet as bacnet_server, http as http_server, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client,
     slot as slot_server,
 };
+use crate::order::AuditFileOptions;
+use crate::permit::Rules;
 use crate::process_image::{BusSpec, DriveSpec};
 
 /// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.

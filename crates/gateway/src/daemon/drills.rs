@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::command::{Origin, SourceKind};
 use crate::drill::{DrillState, Drills, LOOK, SavedDrills};
 use crate::files;
 use crate::files::names::DRILLS;
+use crate::order::{Origin, SourceKind};
 use crate::plant::SharedPlant;
 
 /// How often an armed drill is looked at.

@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use super::server::within;
 use super::{Daemon, STOP_AUDIT, StartError, drills, reservations};
-use crate::command::AuditFile;
 use crate::config::Settings;
 use crate::files::Keeper;
 use crate::history::{self, RecorderTask};
 use crate::north::parameter_jobs::{hold_unfinished, keep_reading};
+use crate::order::AuditFile;
 use crate::parameters::Store;
 use crate::start_guard;
 

@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::command::KeptReservation;
 use crate::files;
 use crate::files::names::RESERVATIONS;
+use crate::permit::KeptReservation;
 use crate::plant::{Plant, SharedPlant};
 
 /// How often they are looked at.

@@ -12,8 +12,8 @@ use super::Options;
 use super::rights::HostRights;
 use super::view::View;
 use super::writes::{self, Begun, Waiting};
-use crate::command::{Outcome, Settled};
-use crate::order::{Arrival, Connection};
+use crate::order::{Arrival, Connection, Outcome};
+use crate::permit::Settled;
 use crate::plant::{Plant, SharedPlant};
 use crate::process_image::{LeaseAction, Machine};
 

@@ -12,10 +12,11 @@ use tokio::task::JoinHandle;
 
 use super::rights::HostRights;
 use crate::NorthState;
-use crate::command::{Commanded, Entry, Origin, PROTECTING, SourceKind};
 use crate::drive::Value;
 use crate::event::{Event, EventKind, Events};
 use crate::files;
+use crate::order::{Commanded, Entry, Origin, SourceKind};
+use crate::permit::PROTECTING;
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{Access, Machine};
 

@@ -7,10 +7,10 @@ use std::sync::Arc;
 use drivegate_bacnet::{Access as Written, Device, Kind, Mac, Object, ObjectId, ObjectType};
 
 use super::units;
-use crate::command::Commanded;
 use crate::drive::model::Kind as Values;
 use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, Point, PointIndex, PollClass, Source, State};
+use crate::order::Commanded;
 use crate::process_image::{Access, BusSpec, DriveSpec};
 use crate::register_map::STATUS_BITS;
 

@@ -9,7 +9,7 @@ use arc_swap::ArcSwapOption;
 use drivegate_bacnet::Address;
 
 use super::Options;
-use crate::command::{Grants, Right};
+use crate::order::{Grants, Right};
 
 /// The rights of all hosts; none of them may write once the server retires.
 #[derive(Debug, Clone)]

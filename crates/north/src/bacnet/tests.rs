@@ -8,9 +8,9 @@ use super::view::View;
 use super::writes::{Begun, Waiting};
 use super::*;
 use crate::codec::{Reply, Table};
-use crate::command::{Authority, Commanded, Follows, Order, Origin, Outcome, Refusal, Settled, SlotWrite, SourceKind};
 use crate::drive::{ModelPoint, PointIndex, Value};
-use crate::order::Arrival;
+use crate::order::{Arrival, Authority, Commanded, Order, Origin, Outcome, Refusal, SlotWrite, SourceKind};
+use crate::permit::{Follows, Settled};
 use crate::plant::{DriveHandle, OrderRequest, Plant};
 use crate::process_image::{DriveSpec, Link};
 

@@ -17,8 +17,9 @@ use super::objects::{self, Meaning, Shown};
 use super::rights::HostRights;
 use super::{Options, WhenOffline};
 use crate::codec::Table;
-use crate::command::{self, Commanded, Entry, Origin, Priorities, Refusal, SourceKind};
 use crate::drive::{ModelPoint, PointIndex, Quality, Source, Value};
+use crate::order::{Commanded, Entry, Origin, Refusal, SourceKind};
+use crate::permit::{self, Priorities};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{Reading, Unavailable};
 
@@ -262,7 +263,7 @@ fn governed(reading: &Reading<'_>, all: &Priorities, what: Commanded, index: Poi
         return Some(datum_of(entry.value));
     }
     let from = reading.spec.profile.model_index(of.point())?;
-    command::converted(reading, (from, entry.value), index).map(datum_of)
+    permit::converted(reading, (from, entry.value), index).map(datum_of)
 }
 
 impl Application for View {

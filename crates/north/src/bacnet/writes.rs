@@ -8,13 +8,11 @@ use drivegate_bacnet::{Address, Datum, Error, Job};
 use super::objects::Meaning;
 use super::rights::HostRights;
 use super::view::View;
-use crate::command::{
-    self, Authority, Commanded, DEFAULT_EXPIRY, Entry, Follows, Order, Origin, Outcome, Proof, Refusal, SlotWrite,
-    SourceKind,
-};
 use crate::drive::{PointIndex, Value};
-use crate::order::Arrival;
-use crate::permit::{Stage, client_access};
+use crate::order::{
+    Arrival, Authority, Commanded, DEFAULT_EXPIRY, Entry, Order, Origin, Outcome, Proof, Refusal, SlotWrite, SourceKind,
+};
+use crate::permit::{self, Follows, Stage, client_access};
 use crate::plant::{DriveHandle, OrderRequest, Placed};
 use crate::process_image::Machine;
 
@@ -205,7 +203,7 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
             return None;
         }
         all.ask(write);
-        all.settle(write.id, command::Settled::Done, now);
+        all.settle(write.id, permit::Settled::Done, now);
         Some(all.client() == Some(origin.client()))
     })?;
     if governs {
@@ -230,7 +228,7 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
 /// Whether the drive could be given that value at all; what is not known yet is judged when it becomes a command.
 fn possible(handle: &DriveHandle, index: PointIndex, value: Value, now: Instant) -> Result<(), Refusal> {
     let order = Order::Points(vec![(index, value)]);
-    match command::admit(order, &handle.reading(now), Authority::Write) {
+    match permit::admit(order, &handle.reading(now), Authority::Write) {
         Err(refusal @ (Refusal::BadValue(_) | Refusal::NotWritable(_))) => Err(refusal),
         _ => Ok(()),
     }

@@ -3,7 +3,8 @@
 use serde::Serialize;
 
 use super::result::ErrorObject;
-use crate::command::{HoldView, Refusal};
+use crate::order::Refusal;
+use crate::permit::HoldView;
 
 /// Who holds a drive, and the result of an act upon that.
 #[derive(Debug, Clone, Serialize, utoipa::ToSchema)]

@@ -10,11 +10,11 @@ use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value as Json;
 use serde_json::value::RawValue;
 
-use crate::command::{Answer, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, sets_twice, stop_of};
 use crate::document::nearest;
 use crate::drive::model::Kind;
 use crate::drive::{PointIndex, Profile, Value};
-use crate::order::Arrival;
+use crate::order::{Answer, Arrival, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, stop_of};
+use crate::permit::sets_twice;
 use crate::plant::{DriveHandle, OrderRequest, Placed, Plant};
 
 /// Maximum size of a command, bytes.

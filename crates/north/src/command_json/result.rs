@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 use serde::Serialize;
 
 use super::Id;
-use crate::command::{Answer, CONFIRMED, Outcome, Refusal, milliseconds, milliseconds_or_null};
+use crate::order::{Answer, CONFIRMED, Outcome, Refusal, milliseconds, milliseconds_or_null};
 use crate::plant::Shown;
 
 /// The one result of a command: `confirmed` if a read showed the effect in time, else the answer of the bus.

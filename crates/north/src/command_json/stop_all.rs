@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::excerpt;
-use crate::command::{Origin, Outcome, Refusal};
 use crate::event::RefusedCommand;
+use crate::order::{Origin, Outcome, Refusal};
 use crate::plant::{Plant, turn_away};
 use crate::stop_all::{LONGEST_WAIT, NothingToStop, Scope, WAIT};
 

@@ -12,8 +12,8 @@ use super::operating::Viewer;
 use super::query;
 use super::replies::{Replied, not_found};
 use crate::codec::{Reply, RequestPdu};
-use crate::command::{self, Authority, Order, Origin};
 use crate::drive::{Point, PointIndex, PollClass, Profile, Quality, Raw, Sample, Source};
+use crate::order::{self, Authority, Order, Origin};
 use crate::plant::{DriveHandle, OrderRequest};
 use crate::process_image::{Link, Reading, Unavailable, public_points};
 
@@ -137,8 +137,8 @@ async fn forwarded(drive: &DriveHandle, point: &Point, raw: &Raw, origin: Origin
     );
     let outcome = placed.answered().await.outcome;
     let words: Option<Vec<u16>> = match &outcome {
-        command::Outcome::Acknowledged(Reply::Registers(words)) => Some(words.clone()),
-        command::Outcome::Acknowledged(Reply::Bits(bits)) => Some(bits.iter().map(|b| u16::from(*b)).collect()),
+        order::Outcome::Acknowledged(Reply::Registers(words)) => Some(words.clone()),
+        order::Outcome::Acknowledged(Reply::Bits(bits)) => Some(bits.iter().map(|b| u16::from(*b)).collect()),
         _ => None,
     };
     let was_read = words.is_some();

@@ -10,10 +10,10 @@ use super::access::Access;
 use super::hosts::Hosts;
 use super::limits::{HEAD_TIMEOUT, HEALTH_HEAD_TIMEOUT};
 use super::replies::Replied;
-use crate::command::{Proof, Right, SourceKind};
 use crate::connection_limit::ConnectionPlace;
 use crate::local::control::Control;
 use crate::log_throttle::LogThrottle;
+use crate::order::{Proof, Right, SourceKind};
 
 /// What a connection may request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

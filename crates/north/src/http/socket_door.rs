@@ -21,8 +21,8 @@ use super::operating::Operating;
 use super::reached::{Client, Coverage, LocalUser, Reached};
 use super::routes;
 use crate::NorthState;
-use crate::command::{Authority, Proof, Right, SourceKind};
 use crate::connection_limit::{ConnectionLimit, ConnectionPlace, Limits, Newcomer};
+use crate::order::{Authority, Proof, Right, SourceKind};
 use crate::plant::SharedPlant;
 use crate::reading::{Dated, Reader};
 

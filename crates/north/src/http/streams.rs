@@ -25,9 +25,9 @@ use super::reached::Client;
 use super::replies::{Replied, no_bus};
 use super::{messages, query};
 use crate::codec::{Protocol, describe};
-use crate::command::Authority;
 use crate::connection_limit::{ConnectionPermit, LimitReached, Newcomer, NoPlace};
 use crate::event::Event;
+use crate::order::Authority;
 use crate::process_image::{Direction, FrameRecord};
 
 /// Time after which a browser reconnects.

@@ -22,9 +22,9 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use self::path::Bound;
-use crate::command::{Authority, Proof, Right, SourceKind};
 use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Limits, Newcomer};
 use crate::http::{LocalUser, SocketDoor};
+use crate::order::{Authority, Proof, Right, SourceKind};
 use crate::plant::SharedPlant;
 use crate::reading::{Dated, Reader, is_readable};
 use crate::server;

@@ -20,11 +20,11 @@ use super::session::ClientSession;
 use super::tls::{AuthenticatedClient, Role, TlsAuthenticator};
 use super::{Listener, ServerState, connection};
 use crate::ConnectionRefusal;
-use crate::command::Authority;
 use crate::connection_limit::{
     CloseReason, ConnectionLimit, ConnectionPermit, ConnectionPlace, LimitReached, Newcomer,
 };
 use crate::listener::ConnectionHandler;
+use crate::order::Authority;
 use crate::reading::{Dated, Reader};
 
 /// A peer that disappeared without closing is detected after 60 s + 3 * 10 s.

@@ -4,8 +4,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use super::routes::PlantView;
-use crate::command::{Authority, Grants, Origin, Proof, Right, SourceKind};
 use crate::connection_limit::Rights;
+use crate::order::{Authority, Grants, Origin, Proof, Right, SourceKind};
 
 /// A connected client.
 #[derive(Debug, Clone)]

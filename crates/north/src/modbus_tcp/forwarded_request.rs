@@ -11,8 +11,7 @@ use super::client::Client;
 use super::frame::Header;
 use crate::codec::n2::Object;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
-use crate::command::{Authority, Order, Outcome, Refusal};
-use crate::order::Arrival;
+use crate::order::{Arrival, Authority, Order, Outcome, Refusal};
 use crate::plant::{DriveHandle, OrderRequest, Placed};
 use crate::process_image::{Reading, Unavailable};
 

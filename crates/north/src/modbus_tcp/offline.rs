@@ -12,8 +12,7 @@ use super::routes::PlantView;
 use super::session::ClientSession;
 use super::{Options, ServerState};
 use crate::NorthState;
-use crate::command::Authority;
-use crate::order::{Arrival, Connection};
+use crate::order::{Arrival, Authority, Connection};
 use crate::plant::SharedPlant;
 
 /// One client of a server without sockets. Time is an argument of [`Offline::receive`].

@@ -10,9 +10,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::tls::{Requirements, Role};
 use crate::certificate;
-use crate::command::Authority;
 use crate::connection_limit::Rights;
 use crate::identity::seconds;
+use crate::order::Authority;
 
 /// Longest time between two looks at the calendar, which can be set at any time.
 const LOOK: Duration = Duration::from_secs(60);

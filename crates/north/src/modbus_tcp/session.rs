@@ -15,11 +15,11 @@ use super::{ServerState, Uncached};
 use crate::ModbusTcpStats;
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{self, Authority, Order, Outcome, Verb};
 use crate::command_json::{nothing_to_stop, refuse_stop_all};
 use crate::drive::{Profile, State};
 use crate::log_throttle::LogThrottle;
-use crate::order::Arrival;
+use crate::order::{self, Arrival, Authority, Order, Outcome};
+use crate::permit::Verb;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, Unavailable};
 use crate::register_map::{
@@ -308,7 +308,7 @@ impl ClientSession {
             return Err(Exception::FUNCTION);
         }
         let request = RequestPdu::decode(frame.pdu)?;
-        let written = command::written(&request).filter(|(table, _)| *table == Table::Holding);
+        let written = order::written(&request).filter(|(table, _)| *table == Table::Holding);
         let mut items = written.map(|(_, items)| items).unwrap_or_default().into_iter();
         let (_, value) = items
             .find(|(address, _)| *address == STOP_ALL)
@@ -458,7 +458,7 @@ fn forwarded(header: Header, drive: &DriveHandle, request: RequestPdu, work: Bus
 
 /// Whether a write that stops all drives names no other register.
 fn stops_all_only(request: &RequestPdu) -> bool {
-    command::written(request).is_some_and(|(_, items)| items.len() == 1)
+    order::written(request).is_some_and(|(_, items)| items.len() == 1)
 }
 
 /// Whether the family has the table that a function code accesses. No family supports 22 and 23.

@@ -32,10 +32,10 @@ use super::session::{self, Client as _, Common, Will};
 use super::store::{Loaded, Store};
 use super::topics::Topics;
 use super::{Buffer, History, Options};
-use crate::command::Right;
 use crate::event::{BURST, Event, EventKind};
 use crate::files::names::{MQTT_EVENTS, MQTT_HISTORY};
 use crate::log_throttle::LogThrottle;
+use crate::order::Right;
 use crate::plant::{Plant, SharedPlant};
 use crate::{MqttKind, NorthState};
 

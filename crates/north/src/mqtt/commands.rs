@@ -14,12 +14,11 @@ use super::outbox::Message;
 use super::reply::{Reply, ResponseTopics};
 use super::request::{self, Incoming};
 use super::topics::{Target, Topics};
-use crate::command::{Answer, Authority, Origin, Outcome, Proof, Refusal, Right, SourceKind, Verb};
 use crate::command_json::{
     HoldReply, Id, Repetition, SharedMemory, excerpt, nothing_to_stop, refuse_stop_all, refuse_unknown, stop_all,
 };
-use crate::order::Arrival;
-use crate::permit::{Stage, access};
+use crate::order::{Answer, Arrival, Authority, Origin, Outcome, Proof, Refusal, Right, SourceKind};
+use crate::permit::{Stage, Verb, access};
 use crate::plant::{Placed, Plant, Shown};
 use crate::stop_all::{StopAll, StopReport};
 

@@ -8,9 +8,8 @@ use super::outbox::Message;
 use super::reply::ResponseTopics;
 use super::request::Incoming;
 use super::topics::Topics;
-use crate::command::Right;
 use crate::command_json::SharedMemory;
-use crate::order::{Arrival, Connection};
+use crate::order::{Arrival, Connection, Right};
 use crate::plant::SharedPlant;
 
 /// A message that the gateway publishes: the result of a command.
@@ -125,8 +124,8 @@ mod tests {
     use super::super::fixture;
     use super::*;
     use crate::codec::Reply;
-    use crate::command::{Order, Outcome, Urgency};
     use crate::drive::Value;
+    use crate::order::{Order, Outcome, Urgency};
 
     #[test]
     fn forty_pairs_in_virtual_time() {

@@ -6,10 +6,10 @@ use std::time::{Duration, SystemTime};
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
 use super::topics::Topics;
-use crate::command::HoldView;
 use crate::command_json::HoldFields;
 use crate::drive::{ModelPoint, Point, PointIndex, Profile, Quality, State, Value};
 use crate::event::Event;
+use crate::permit::HoldView;
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, Reading, value_or_null};
 

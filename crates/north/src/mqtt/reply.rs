@@ -4,8 +4,8 @@ use std::time::SystemTime;
 
 use super::outbox::Message;
 use super::request::Incoming;
-use crate::command::Answer;
 use crate::command_json::{CommandResult, Id};
+use crate::order::Answer;
 use crate::plant::Shown;
 
 /// Maximum number of levels of a response topic.

@@ -6,10 +6,9 @@ use std::time::Duration;
 use rumqttc::Publish;
 use serde_json::Value as Json;
 
-use crate::command::{DEFAULT_EXPIRY, Origin, Refusal, SourceKind};
 use crate::command_json::{self, Asked, Id, MAX_PAYLOAD, Taken, check_size, excerpt, find_id, resolve};
 use crate::drive::Profile;
-use crate::order::Arrival;
+use crate::order::{Arrival, DEFAULT_EXPIRY, Origin, Refusal, SourceKind};
 
 /// A message on a set topic.
 #[derive(Debug, Clone, Default)]

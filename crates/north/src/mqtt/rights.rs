@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::Options;
-use crate::command::Right;
+use crate::order::Right;
 
 /// Who may command: by the set topics, and as a Sparkplug host.
 #[derive(Debug, Default)]

@@ -10,9 +10,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 pub use self::restore::{Again, carry_out, prepare, release, take_up};
 pub use self::unfinished::{hold_unfinished, orphans};
-use crate::command::{Origin, Pace, SourceKind};
 use crate::drive::parameters::RawValue;
 use crate::event::{Event, EventKind};
+use crate::order::{Origin, Pace, SourceKind};
 use crate::parameters::{
     Difference, NO_IDENTIFICATION, NOT_KNOWN, Names, Next, ParameterFile, Reading, Store, Vault, differences,
 };

@@ -10,13 +10,14 @@ use std::time::{Duration, Instant, SystemTime};
 use super::unfinished::{concerning, held_unfinished, not_understood, unfinished_event};
 use super::{Looks, identification, read};
 use crate::codec::RequestPdu;
-use crate::command::{Authority, Order, Origin, Pace, ParameterOrder, limits_passed, may_restore, written};
 use crate::drive::Profile;
 use crate::drive::plan::WireTime;
+use crate::order::{Authority, Order, Origin, Pace, ParameterOrder, written};
 use crate::parameters::{
     End, Journal, JournalFile, NO_IDENTIFICATION, NOT_KNOWN, Owner, ParameterFile, Phase, Plan, Prepared, Reading,
     Restoration, RestoreStage, Then, Vault, Wanted, Wishes, plan,
 };
+use crate::permit::{limits_passed, may_restore};
 use crate::plant::{DriveHandle, OrderRequest, Plant, SharedPlant};
 use crate::process_image::Machine;
 

@@ -495,7 +495,7 @@ fn blocks_have_no_gap() {
 
 #[test]
 fn the_hold_is_mapped_where_authority_is_on() {
-    use crate::command::{HoldState, HoldView};
+    use crate::permit::{HoldState, HoldView};
     let now = Instant::now();
     let image = running(now);
     let reading = image.reading(now, STALE_AFTER);

@@ -13,8 +13,7 @@ use super::request::{Meaning, Refused, ToolRequest};
 use super::terms::{Decision, Tool, Work};
 use crate::SlotOutcome;
 use crate::codec::{Protocol, Reply, RequestPdu};
-use crate::command::Outcome;
-use crate::order::Arrival;
+use crate::order::{Arrival, Outcome};
 
 /// A tool is answered within this time from the end of its request, or not at all.
 pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(1);
@@ -305,7 +304,7 @@ fn frame_of(protocol: Protocol, request: &ToolRequest, pdu: &RequestPdu, outcome
 mod tests {
     use super::*;
     use crate::codec::Exception;
-    use crate::command::{Interruption, Refusal};
+    use crate::order::{Interruption, Refusal};
 
     /// Exception or error code of the answer to a write of two registers; 0 acknowledges it, none is silence.
     fn told(protocol: Protocol, outcome: &Outcome) -> Option<u8> {

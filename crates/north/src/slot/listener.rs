@@ -9,10 +9,10 @@ use tokio_util::sync::CancellationToken;
 
 use super::terms::{Terms, Tool};
 use super::{MAX_TOOLS, connection, limits};
-use crate::command::{Authority, Proof};
 use crate::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer};
 use crate::line::ServedPort;
 use crate::listener::ConnectionHandler;
+use crate::order::{Authority, Proof};
 use crate::reading::Dated;
 use crate::refusals::Refusals;
 

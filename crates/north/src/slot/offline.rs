@@ -10,8 +10,7 @@ use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
 use super::{Options, Slot, SlotAccess};
 use crate::NorthState;
-use crate::command::Proof;
-use crate::order::{Arrival, Connection};
+use crate::order::{Arrival, Connection, Proof};
 use crate::plant::SharedPlant;
 
 /// One tool of a slot without sockets.

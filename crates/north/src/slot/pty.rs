@@ -16,8 +16,8 @@ use tokio_util::sync::CancellationToken;
 use super::connection::sleep_until;
 use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
-use crate::command::Proof;
 use crate::line::Pty;
+use crate::order::Proof;
 use crate::reading::{Dated, Reader};
 
 /// Pause before a pseudo-terminal that could not be opened is tried again.

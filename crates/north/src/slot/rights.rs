@@ -8,7 +8,7 @@ use std::sync::Arc;
 use arc_swap::ArcSwap;
 
 use super::{Options, Slot, SlotAccess};
-use crate::command::{Grants, Proof, Right};
+use crate::order::{Grants, Proof, Right};
 
 /// By which way a tool came.
 #[derive(Debug, Clone)]

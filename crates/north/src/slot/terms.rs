@@ -11,10 +11,9 @@ use super::request::{Meaning, Refused, ToolRequest};
 use super::rights::ToolRights;
 use super::{Options, Slot, SlotAccess};
 use crate::codec::{LineFormat, Protocol, RequestPdu, describe};
-use crate::command::{self, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
 use crate::drive::plan::WireTime;
-use crate::order::Arrival;
-use crate::permit::{Stage, client_access};
+use crate::order::{Arrival, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
+use crate::permit::{self, Stage, client_access};
 use crate::plant::{
     BusHandle, DriveHandle, Exchange, OrderRequest, Placed, Plant, Question, SharedPlant, Target, turn_away,
 };
@@ -152,7 +151,7 @@ impl Tool {
         // What is refused anyway, is at once.
         let admitted = drives
             .iter()
-            .all(|drive| command::admit(Order::Write(pdu.clone()), &drive.reading(now), Authority::Write).is_ok());
+            .all(|drive| permit::admit(Order::Write(pdu.clone()), &drive.reading(now), Authority::Write).is_ok());
         if self.writes() && !pace.is_stop && admitted {
             pace.not_before = self
                 .terms
@@ -275,7 +274,7 @@ impl Tool {
             let whole = Order::Write(pdu.clone());
             // Limits hold for each of them.
             if let Meaning::Write(_) = &request.meaning
-                && let Err(refusal) = command::admit(whole, &drive.reading(now), Authority::Write)
+                && let Err(refusal) = permit::admit(whole, &drive.reading(now), Authority::Write)
             {
                 return self.refuse(drive, pdu, refusal, now);
             }
@@ -339,7 +338,7 @@ fn target(request: &ToolRequest, drive: Option<&DriveHandle>) -> Target {
 /// The stop of a write that takes the run command of the drive away, if it is admitted: the write itself, or the part of it.
 fn stop_in(drive: &DriveHandle, pdu: &RequestPdu, now: Instant) -> Option<Order> {
     let (Parts::One(stop) | Parts::Two(stop, _)) = Parts::of(Order::Write(pdu.clone()), &drive.image.spec.profile);
-    let admitted = command::admit(stop.clone(), &drive.reading(now), Authority::Write).ok()?;
+    let admitted = permit::admit(stop.clone(), &drive.reading(now), Authority::Write).ok()?;
     (admitted.urgency == Urgency::Stop).then_some(stop)
 }
 

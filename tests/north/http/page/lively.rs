@@ -5,13 +5,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use drivegate::codec::{Reply, crc16};
-use drivegate::command::{self, Origin, SourceKind, Ticket};
 use drivegate::drive::profile::Profiles;
 use drivegate::event::{Event, EventKind};
 use drivegate::history::assemble::assemble;
 use drivegate::history::recorder::{Note, NoteBody};
 use drivegate::history::{Clock, Recorder, RecorderOptions, RecorderTask, Store};
 use drivegate::north::NorthState;
+use drivegate::order::{self, Origin, SourceKind, Ticket};
 use drivegate::plant::{BusHandle, Plant};
 use drivegate::process_image::{BusImage, DriveImage, Outcome, TapedFrame, TapedRead, Verdict};
 
@@ -243,8 +243,8 @@ fn tell(plant: &Plant) {
         });
     }
     for (what, outcome) in [
-        ("run=true speed_reference=62", command::Outcome::TimedOut),
-        ("speed_reference=84", command::Outcome::Acknowledged(Reply::Written)),
+        ("run=true speed_reference=62", order::Outcome::TimedOut),
+        ("speed_reference=84", order::Outcome::Acknowledged(Reply::Written)),
     ] {
         let origin = Origin::new(SourceKind::Mqtt, "scada");
         let at = Instant::now();

@@ -2,9 +2,9 @@
 //! is commanded, stopped or restarted behind the gateway's back.
 
 use super::*;
-use crate::command::{Arrival, Window, written};
 use crate::drive::control::{Control, ControlItem, OwnWord, Run};
 use crate::drive::{Derived, PointIndex, Raw, Source};
+use crate::order::{Arrival, Window, written};
 
 /// What became of the drive since it was polled last, when its motor ran by a word of the gateway.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,8 +1,8 @@
 //! Background exchanges: what they take of the line, and what they never do.
 
 use super::*;
-use crate::command::{BackgroundRequest, Pace};
 use crate::drive::DriveIndex;
+use crate::order::{BackgroundRequest, Pace};
 
 /// A register that no poll reads.
 const REGISTER: u16 = 700;

@@ -1,8 +1,9 @@
 //! Who holds a drive, on the line: no order of one who does not hold it, every stop.
 
 use super::*;
-use crate::command::{Mode, Principal, Proof, Refusal, Rules, Verb};
 use crate::drive::DriveIndex;
+use crate::order::{Proof, Refusal};
+use crate::permit::{Mode, Principal, Rules, Verb};
 use crate::plant::{DriveHandle, OrderRequest, Plant};
 use std::time::Duration as Time;
 

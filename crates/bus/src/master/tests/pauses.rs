@@ -1,8 +1,7 @@
 //! The thread of the bus stands still, and goes on.
 
 use super::*;
-use crate::command::Interruption;
-use crate::order::{Arrival, Connection, Stall, Window};
+use crate::order::{Arrival, Connection, Interruption, Stall, Window};
 
 const MS: Duration = Duration::from_millis(1);
 const FIRST: DriveIndex = DriveIndex::new(0);

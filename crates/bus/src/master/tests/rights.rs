@@ -3,8 +3,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::*;
-use crate::command::Right;
-use crate::order::Arrival;
+use crate::order::{Arrival, Right};
 use crate::plant::{Exchange, OrderRequest, Plant, Question, Target};
 
 struct Client {

@@ -373,9 +373,9 @@ fn a_drive_is_online_by_whatever_it_answers() {
         let from = rig.now - Duration::from_secs(30);
         let polls = |wanted: bool| {
             let late = rig.log.iter().filter(|(at, _)| *at >= from);
-            late.filter(|(_, decision)| {
-                matches!(decision, Decision::Poll(poll) if (poll.read.start == silent) == wanted)
-            })
+            late.filter(
+                |(_, decision)| matches!(decision, Decision::Poll(poll) if (poll.read.start == silent) == wanted),
+            )
             .count()
         };
         assert!(polls(true) <= 3, "{silent}: what is silent is asked now and then");

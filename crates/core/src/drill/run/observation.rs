@@ -6,8 +6,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::interruption::{LOCAL, is_local};
 use super::{Cause, READ, Run, Step};
-use crate::command::Outcome;
 use crate::drill::{DrillState, Kind, Proof};
+use crate::order::Outcome;
 use crate::plant::Placed;
 use crate::process_image::{Reading, Standstill};
 use crate::stop_all::OneStop;

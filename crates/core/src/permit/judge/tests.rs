@@ -113,7 +113,11 @@ impl Rig {
         let shared = Arc::new(Guards::default());
         if let Some(guards) = BusGuards::of(&shared, &bus, [&rig.image.spec]) {
             guards.begin();
-            shared.watch([(bus.machine(&rig.image.spec), rig.image.clone())].into_iter(), 10 * SECOND, asked);
+            shared.watch(
+                [(bus.machine(&rig.image.spec), rig.image.clone())].into_iter(),
+                10 * SECOND,
+                asked,
+            );
             guards.look(drive, &rig.image.reading(asked, 10 * SECOND));
             rig.gate.set_starts(Some(guards));
         }
@@ -126,7 +130,10 @@ impl Rig {
             }
             Why::Held => {
                 rig.gate.set_rules(Some(Arc::new(rules())));
-                rig.gate.hold_act(drive, &client("bob"), Verb::Take, asked).unwrap().unwrap();
+                rig.gate
+                    .hold_act(drive, &client("bob"), Verb::Take, asked)
+                    .unwrap()
+                    .unwrap();
             }
             Why::Protected => {
                 let origin = Origin::new(SourceKind::Bacnet, "fire");
@@ -164,12 +171,24 @@ impl Rig {
         let profile = nx();
         let point = |point: ModelPoint| -> PointIndex { profile.model_index(point).unwrap() };
         let (order, urgency) = match what {
-            "start" => (Order::Points(vec![(point(ModelPoint::Run), Value::Bool(true))]), Urgency::Command),
-            "stop" => (Order::Points(vec![(point(ModelPoint::Run), Value::Bool(false))]), Urgency::Stop),
-            "reset" => (Order::Points(vec![(point(ModelPoint::FaultReset), Value::Bool(true))]), Urgency::Command),
+            "start" => (
+                Order::Points(vec![(point(ModelPoint::Run), Value::Bool(true))]),
+                Urgency::Command,
+            ),
+            "stop" => (
+                Order::Points(vec![(point(ModelPoint::Run), Value::Bool(false))]),
+                Urgency::Stop,
+            ),
+            "reset" => (
+                Order::Points(vec![(point(ModelPoint::FaultReset), Value::Bool(true))]),
+                Urgency::Command,
+            ),
             "reference" => {
                 let to = Value::Number(20.0);
-                (Order::Points(vec![(point(ModelPoint::SpeedReference), to)]), Urgency::Command)
+                (
+                    Order::Points(vec![(point(ModelPoint::SpeedReference), to)]),
+                    Urgency::Command,
+                )
             }
             _ => {
                 let read = RequestPdu::Read {

@@ -323,7 +323,7 @@ fn inactives_that_protect_outlive_a_restart() {
 
 #[test]
 fn outcomes_settle_slots() {
-    use crate::command::{Interruption, Refusal};
+    use crate::order::{Interruption, Refusal};
     let cases = [
         (Outcome::Acknowledged(crate::codec::Reply::Written), Settled::Done),
         (Outcome::TimedOut, Settled::Unknown),

@@ -60,7 +60,7 @@ mod tests {
     use std::sync::atomic::{AtomicBool, Ordering};
 
     use super::*;
-    use crate::command::{Right, SourceKind};
+    use crate::order::{Right, SourceKind};
 
     #[test]
     fn whoever_has_lost_the_right_writes_nothing_but_the_stop_that_was_accepted() {

@@ -245,7 +245,14 @@ fn a_stop_finds_the_last_of_many_buses_and_keeps_none_between() {
         receiver
     };
     let _answer = give();
-    assert_eq!(crate::testkit::take_next(&last, now).unwrap().intent.drive, DriveIndex::new(20));
+    assert_eq!(
+        crate::testkit::take_next(&last, now).unwrap().intent.drive,
+        DriveIndex::new(20)
+    );
     drop(last);
-    assert_eq!(outcome(&mut give()), Some(Outcome::ShuttingDown), "no bus serves it any more");
+    assert_eq!(
+        outcome(&mut give()),
+        Some(Outcome::ShuttingDown),
+        "no bus serves it any more"
+    );
 }

@@ -68,7 +68,7 @@ fn what_failed_leaves_the_slot_and_what_is_unknown_leaves_what_is_read() {
 #[test]
 fn errors_say_what_happened() {
     use crate::codec::Exception;
-    use crate::command::Interruption;
+    use crate::order::Interruption;
     let cases = [
         (
             Outcome::Exception(Exception::DEVICE_FAILURE),

@@ -18,11 +18,10 @@ use super::super::replies::{Replied, refused};
 use super::asker::{Commander, Viewer};
 use super::restart;
 use super::state::{Operating, Operator};
-use crate::command::{Answer, Origin, Outcome, Refusal, SourceKind};
 use crate::command_json::{self, CommandResult, Id, Repetition, Taken, excerpt, find_id};
 use crate::drive::model::Kind;
 use crate::drive::{ModelPoint, Point, PointIndex, Profile, RESTART_COMMUNICATION, Value};
-use crate::order::Arrival;
+use crate::order::{Answer, Arrival, Origin, Outcome, Refusal, SourceKind};
 use crate::plant::{DriveHandle, Placed, Plant, Shown};
 use crate::process_image::Access;
 

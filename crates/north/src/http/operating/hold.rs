@@ -12,8 +12,9 @@ use super::super::app_state::AppState;
 use super::super::messages::HoldAct;
 use super::super::replies::{Replied, refused};
 use super::asker::{Ordered, Viewer};
-use crate::command::{Authority, Verb};
 use crate::command_json::HoldReply;
+use crate::order::Authority;
+use crate::permit::Verb;
 
 /// Who holds the drive.
 pub(in crate::http) async fn hold_of(

@@ -11,7 +11,7 @@ use super::super::app_state::AppState;
 use super::super::messages::{ParameterReading, ReadParameters, Restore, RestoreAct};
 use super::super::replies::{Refused, Replied, refused};
 use super::asker::Ordered;
-use crate::command::{Origin, Pace};
+use crate::order::{Origin, Pace};
 use crate::parameter_jobs::{Again, How, begin_reading, carry_out, prepare, release, take_up};
 use crate::parameters::{Id, ParameterFile, Wishes};
 use crate::plant::DriveHandle;

@@ -5,9 +5,8 @@ use std::future::poll_fn;
 use std::time::{Duration, Instant};
 
 use crate::codec::{Reply, RequestPdu};
-use crate::command::{Answer, DEFAULT_EXPIRY, Origin, Outcome, Refusal};
 use crate::drive::RESTART_COMMUNICATION;
-use crate::order::Arrival;
+use crate::order::{Answer, Arrival, DEFAULT_EXPIRY, Origin, Outcome, Refusal};
 use crate::plant::{DriveHandle, Question, Shown, Target};
 use crate::process_image::Access;
 

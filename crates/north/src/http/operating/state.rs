@@ -22,8 +22,8 @@ use super::sessions::{IDLE, Secrets, Session, Sessions};
 use super::throttle::{Source, Throttle};
 use super::verifier::Verifier;
 use crate::NorthState;
-use crate::command::{Authority, Grants, Proof, Right, SourceKind};
 use crate::log_throttle::LogThrottle;
+use crate::order::{Authority, Grants, Proof, Right, SourceKind};
 /// A password that a program sends with each request is not hashed again for that long.
 const VERIFIED: Duration = Duration::from_secs(300);
 /// Most of them, and most addresses that are known to belong to someone who may command.
@@ -65,7 +65,7 @@ pub(super) struct State {
 #[derive(Debug, Clone)]
 pub(in crate::http) struct Operator {
     pub(super) user: Arc<str>,
-    /// See [`crate::command::Origin::with_login`].
+    /// See [`crate::order::Origin::with_login`].
     pub(super) login: Arc<str>,
     pub(super) address: IpAddr,
     /// The interface.

@@ -11,8 +11,8 @@ use axum::response::IntoResponse;
 use super::super::app_state::AppState;
 use super::super::replies::{Replied, not_found, refused};
 use super::asker::Ordered;
-use crate::command::Refusal;
 use crate::command_json::{nothing_to_stop, refuse_stop_all, stop_all};
+use crate::order::Refusal;
 use crate::stop_all::NothingToStop;
 
 /// 200 if every drive stands, 504 if one is not proven to.

@@ -10,8 +10,8 @@ use super::super::routes::PlantView;
 use super::super::{Options, ServerState, Uncached};
 use super::*;
 use crate::NorthState;
-use crate::command::Authority;
 use crate::connection_limit::{ConnectionLimit, Limits, Newcomer};
+use crate::order::Authority;
 use crate::plant::Plant;
 use crate::reading::Dated;
 

@@ -6,10 +6,9 @@ use serde_json::Value as Json;
 use super::super::fixture;
 use super::*;
 use crate::codec::Reply as BusReply;
-use crate::command::{Order, Outcome, Receipt, Urgency};
 use crate::command_json::REMEMBERED;
 use crate::drive::Value;
-use crate::order::Arrival;
+use crate::order::{Arrival, Order, Outcome, Receipt, Urgency};
 
 struct SetTopics {
     plant: Plant,
@@ -228,7 +227,7 @@ fn refusals_are_reported_audited_and_answered_and_nothing_is_queued() {
         (&result["error"]["code"], &result["id"]),
         (&"unknown_drive".into(), &21.into())
     );
-    let unknown = (crate::command::SourceKind::Mqtt, "unknown_drive");
+    let unknown = (crate::order::SourceKind::Mqtt, "unknown_drive");
     assert_eq!(bench.plant.writes.results().get(&unknown), Some(&1));
     let record = audited(bench.plant.writes.audit()).pop().unwrap();
     assert_eq!(
@@ -399,7 +398,7 @@ fn messages_beyond_the_limit_stay_with_the_broker() {
 #[test]
 fn a_refusal_of_the_queue_has_its_reason() {
     let mut bench = SetTopics::new();
-    let results: Vec<Json> = (0..crate::command::CAPACITY + 2)
+    let results: Vec<Json> = (0..crate::order::CAPACITY + 2)
         .filter_map(|_| bench.take(set("p1/set/run", "1")))
         .map(|message| json(&message))
         .collect();
@@ -407,7 +406,7 @@ fn a_refusal_of_the_queue_has_its_reason() {
     assert_eq!(results[0]["error"]["code"], "queue_full");
     let text = results[0]["error"]["message"].as_str().unwrap();
     assert!(text.starts_with("64 commands are already waiting"), "{text}");
-    assert_eq!(bench.queued(), crate::command::CAPACITY);
+    assert_eq!(bench.queued(), crate::order::CAPACITY);
 }
 
 #[test]

@@ -448,5 +448,8 @@ fn a_drive_that_was_never_read_has_no_history() {
     }
     let recorded = bench.publisher.recorded();
     assert!(!recorded.is_empty());
-    assert!(recorded.iter().all(|update| update.topic.contains("/p1/")), "{recorded:?}");
+    assert!(
+        recorded.iter().all(|update| update.topic.contains("/p1/")),
+        "{recorded:?}"
+    );
 }

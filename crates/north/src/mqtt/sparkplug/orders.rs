@@ -13,10 +13,9 @@ use super::super::request::Incoming;
 use super::model::DriveMetrics;
 use super::session::Session;
 use super::wire::{self, Metric, MetricValue, Payload};
-use crate::command::{Answer, CONFIRMED, DEFAULT_EXPIRY, Proof, Refusal, Right, SourceKind};
 use crate::command_json::{Asked, SharedMemory, Taken, excerpt, refuse_unknown, resolve};
 use crate::drive::{ModelPoint, Profile};
-use crate::order::Arrival;
+use crate::order::{Answer, Arrival, CONFIRMED, DEFAULT_EXPIRY, Proof, Refusal, Right, SourceKind};
 use crate::plant::{Placed, Plant};
 
 /// Commands whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit

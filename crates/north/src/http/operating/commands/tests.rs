@@ -13,8 +13,8 @@ fn operator(user: &str, login: &str) -> Operator {
         login: login.into(),
         address: [192, 0, 2, 1].into(),
         kind: SourceKind::Http,
-        proof: crate::command::Proof::User(user.into()),
-        right: crate::command::Right::lasting(),
+        proof: crate::order::Proof::User(user.into()),
+        right: crate::order::Right::lasting(),
         cookie: None,
     }
 }
@@ -155,9 +155,9 @@ fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
     )];
     let _placed = drive.place(
         OrderRequest::new(
-            crate::command::Order::Points(points),
+            crate::order::Order::Points(points),
             origin,
-            crate::command::Authority::Write,
+            crate::order::Authority::Write,
         )
         .within(Duration::from_secs(1)),
         rig.now,
@@ -167,7 +167,7 @@ fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
 
 #[test]
 fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
-    use crate::command::Urgency;
+    use crate::order::Urgency;
     let rig = OperatedPlant::new();
     let alice = operator("alice", "alice#1");
     let bodies = [
