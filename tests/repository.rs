@@ -16,6 +16,7 @@ mod repository {
     mod packages;
     mod packaging;
     mod permission;
+    mod rooms;
     mod tools;
     mod words;
 }

@@ -15,9 +15,10 @@ use super::transaction::Ended;
 use crate::codec::{Exception, Reply, Request};
 use crate::drive::DriveIndex;
 use crate::event::Events;
-use crate::order::{Outcome, Stalls, Urgency, WriteStats};
+use crate::order::{Outcome, Urgency, WriteStats};
 use crate::plant::BusHandle;
 use crate::process_image::Taping;
+use crate::stalls::Stalls;
 
 /// What to do with the port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -51,6 +51,7 @@ use drivegate_core::permit;
 use drivegate_core::plant;
 use drivegate_core::process_image;
 use drivegate_core::queue;
+use drivegate_core::stalls;
 use drivegate_core::start_guard;
 pub use drivegate_core::stop_all::stop_of_line;
 use drivegate_line as line;

@@ -15,8 +15,9 @@ use crate::codec::LineFormat;
 use crate::drive::DriveIndex;
 use crate::event::Events;
 use crate::line::{self, Arrival, Line, LineOptions, Lost, Names, OpenError, Receiver, Woken};
-use crate::order::{Outcome, Stalls, WriteStats};
+use crate::order::{Outcome, WriteStats};
 use crate::plant::BusHandle;
+use crate::stalls::Stalls;
 
 /// First and longest pause between two tries to open the port.
 const REOPEN: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(3));

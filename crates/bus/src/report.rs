@@ -19,10 +19,11 @@ use super::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::{Exception, Reply, Request, Table};
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, PointIndex, PollClass, Value};
 use crate::event::{EventKind, Events};
-use crate::order::{Stall, WriteStats};
+use crate::order::WriteStats;
 use crate::process_image::{
     Access, BusImage, DriveImage, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Verdict,
 };
+use crate::stalls::Stall;
 
 /// The load of the line is calculated over this time.
 const LOAD_WINDOW: Duration = Duration::from_secs(1);

@@ -13,9 +13,10 @@ use super::news::News;
 use super::supervision::written_run;
 use crate::codec::RequestPdu;
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, Profile, Value};
-use crate::order::{Answer, DEFAULT_EXPIRY, Intent, Origin, Outcome, SourceKind, Stall, WriteStats, written};
+use crate::order::{Answer, DEFAULT_EXPIRY, Intent, Origin, Outcome, SourceKind, WriteStats, written};
 use crate::plant::{BusHandle, turn_away};
 use crate::process_image::{DriveImage, Reading};
+use crate::stalls::Stall;
 use crate::start_guard::BusGuards;
 
 /// First and longest pause before a motor that an interlock stopped and that runs on is stopped again.

@@ -12,7 +12,7 @@ use std::time::{Instant, SystemTime};
 use serde::{Deserialize, Serialize};
 use tokio::sync::broadcast;
 
-use crate::order::{Pauses, Stall};
+use crate::stalls::{Pauses, Stall};
 
 pub use fair_ring::{FairRing, in_order};
 pub use log::{Before, LineError, Search, from_line};

@@ -13,6 +13,7 @@ pub mod plant;
 pub mod process_image;
 pub mod queue;
 pub mod spec;
+pub mod stalls;
 pub mod start_guard;
 pub mod stop_all;
 pub mod version;

@@ -40,6 +40,7 @@ use drivegate_core::parameters;
 use drivegate_core::permit;
 use drivegate_core::plant;
 use drivegate_core::process_image;
+use drivegate_core::stalls;
 use drivegate_core::start_guard;
 use drivegate_core::stop_all;
 use drivegate_core::version;

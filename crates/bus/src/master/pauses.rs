@@ -3,7 +3,8 @@
 use std::time::{Duration, Instant};
 
 use super::Master;
-use crate::order::{Stall, Urgency};
+use crate::order::Urgency;
+use crate::stalls::Stall;
 
 impl Master {
     /// The thread stood still until `now`. What waits is judged by that when it is chosen again. A command of several steps

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use super::Stall;
+use crate::stalls::Stall;
 
 /// A way in: a TCP connection, a UDP socket, a pseudo-terminal, a connection to a broker. Clones are the same one.
 #[derive(Debug, Clone)]

@@ -20,11 +20,9 @@ mod outcome;
 mod parameter;
 mod parts;
 mod passed_on;
-mod pauses;
 mod raw;
 mod right;
 mod slot_write;
-mod stalls;
 mod ticket;
 mod touched;
 
@@ -42,11 +40,9 @@ pub use outcome::{Answer, Holder, Interruption, Outcome, Refusal};
 pub use parameter::ParameterOrder;
 pub use parts::{Parts, StopEnd, joined, stop_of};
 pub use passed_on::{BackgroundRequest, NO_DRIVE, Pace, PassedOn};
-pub use pauses::{Heartbeat, Pauses};
 pub use raw::written;
 pub use right::{Grants, Right};
 pub use slot_write::{Commanded, Entry, SlotWrite};
-pub use stalls::{Dated, READ_WITHIN, Stall, Stalls, TICK, UNNOTICED};
 pub use ticket::{Receipt, Ticket, WriteStats};
 pub use touched::Touched;
 

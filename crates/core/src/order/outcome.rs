@@ -205,7 +205,9 @@ impl fmt::Display for Outcome {
             Outcome::BusDown => f.write_str("the bus is down; it was not sent"),
             Outcome::Offline => f.write_str("the drive is offline; it was not sent"),
             Outcome::QueueFull => write!(f, "{CAPACITY} commands are already waiting; it was not sent, try again"),
-            Outcome::ShuttingDown => f.write_str("the gateway shuts down, or a reload starts its bus anew; it was not sent"),
+            Outcome::ShuttingDown => {
+                f.write_str("the gateway shuts down, or a reload starts its bus anew; it was not sent")
+            }
         }
     }
 }

@@ -15,7 +15,8 @@ use super::holder::{Claim, Holding, Rules};
 use super::judge::{self, Ask, Facts, Stage, Verdict};
 use super::priorities::Priorities;
 use crate::drive::DriveIndex;
-use crate::order::{Command, Connection, Effect, Intent, LastStops, Origin, Outcome, Refusal, Stall, Urgency};
+use crate::order::{Command, Connection, Effect, Intent, LastStops, Origin, Outcome, Refusal, Urgency};
+use crate::stalls::Stall;
 use crate::start_guard::{BusGuards, Clearance};
 
 /// Most clients of a drive that are remembered.

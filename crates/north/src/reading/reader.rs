@@ -5,7 +5,8 @@ use std::time::Instant;
 
 use super::Watch;
 use crate::line::since_boot;
-use crate::order::{Arrival, Connection, Dated};
+use crate::order::{Arrival, Connection};
+use crate::stalls::Dated;
 
 /// The reader of a connection.
 #[derive(Debug)]

@@ -15,7 +15,7 @@ use tokio::time::MissedTickBehavior;
 
 use crate::event::Events;
 use crate::line::since_boot;
-use crate::order::{Dated, Stall, Stalls, TICK, UNNOTICED};
+use crate::stalls::{Dated, Stall, Stalls, TICK, UNNOTICED};
 
 thread_local! {
     /// The watch of the runtime that this thread works for.

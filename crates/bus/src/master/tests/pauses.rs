@@ -1,7 +1,8 @@
 //! The thread of the bus stands still, and goes on.
 
 use super::*;
-use crate::order::{Arrival, Connection, Interruption, Stall, Window};
+use crate::order::{Arrival, Connection, Interruption, Window};
+use crate::stalls::Stall;
 
 const MS: Duration = Duration::from_millis(1);
 const FIRST: DriveIndex = DriveIndex::new(0);

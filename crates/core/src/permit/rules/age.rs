@@ -5,9 +5,10 @@
 
 use std::time::Instant;
 
-use crate::order::{Arrival, Asks, LastStops, Order, Outcome, Stall};
+use crate::order::{Arrival, Asks, LastStops, Order, Outcome};
 use crate::permit::gate::{DriveGate, Gate};
 use crate::permit::judge::{Ask, Rule, Stage, Verdict};
+use crate::stalls::Stall;
 
 pub(in crate::permit) const RULE: Rule = Rule {
     stages: &[Stage::Accept, Stage::Turn, Stage::Write],

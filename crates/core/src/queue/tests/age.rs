@@ -1,7 +1,8 @@
 //! What came while the threads that read stood still: of several clients, in whatever sequence it is read.
 
 use super::*;
-use crate::order::{Arrival, Connection, Effect, Effects, Stall};
+use crate::order::{Arrival, Connection, Effect, Effects};
+use crate::stalls::Stall;
 
 const MS: Duration = Duration::from_millis(1);
 

@@ -4,7 +4,11 @@
 //! host is full), and so can one thread. What is found in a socket afterwards may have come at any time in between, in
 //! any order.
 
+mod pauses;
+
 use std::time::{Duration, Instant};
+
+pub use self::pauses::{Heartbeat, Pauses};
 
 /// A thread that reads runs at least this often.
 pub const TICK: Duration = Duration::from_millis(100);
