@@ -80,6 +80,20 @@ impl Running {
         );
     }
 
+    /// Stops it with all its threads: on a busy machine that takes a moment.
+    pub(crate) fn stand(&self) {
+        self.signal("STOP");
+        let tasks = format!("/proc/{}/task", self.child.id());
+        let stands = |task: std::io::Result<std::fs::DirEntry>| {
+            let stat = std::fs::read_to_string(task.unwrap().path().join("stat")).unwrap_or_default();
+            // The state follows the name, which is in parentheses.
+            stat.rsplit(") ").next().is_none_or(|rest| rest.starts_with('T'))
+        };
+        until("standstill", || {
+            std::fs::read_dir(&tasks).unwrap().all(stands).then_some(())
+        });
+    }
+
     /// Waits for its end.
     pub(crate) fn ended(&mut self) -> ExitStatus {
         until("the end of the process", || self.child.try_wait().unwrap())
