@@ -22,8 +22,9 @@ fn builds(line: &str) -> bool {
         .any(|word| line.contains(word));
     let empty = ["_)", "String::new()", "Box::default()", "Box::<Holder>::default()"];
     OF_THE_GATE.iter().any(|variant| {
+        let variant = format!("Refusal::{variant}(");
         let mut uses = line
-            .match_indices(&format!("Refusal::{variant}("))
+            .match_indices(&variant)
             .map(|(at, found)| &line[at + found.len()..]);
         uses.any(|rest| !is_pattern && !empty.iter().any(|empty| rest.starts_with(empty)))
     })

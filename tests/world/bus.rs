@@ -9,13 +9,14 @@ use drivegate_world::bus::master::{Handover, Purpose};
 use drivegate_world::bus::predict::predict;
 use drivegate_world::codec::wire::Silence;
 use drivegate_world::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
-use drivegate_world::command::{CommandQueue, NO_DRIVE, WriteStats};
 use drivegate_world::drive::profile::Profiles;
 use drivegate_world::drive::{DriveIndex, PollClass, Profile};
 use drivegate_world::event::Events;
 use drivegate_world::line::LineOptions;
+use drivegate_world::order::{NO_DRIVE, WriteStats};
 use drivegate_world::plant::BusHandle;
 use drivegate_world::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
+use drivegate_world::queue::CommandQueue;
 use drivegate_world::sim::faults::FaultPlan;
 use drivegate_world::sim::half_duplex::{Delivery, HalfDuplex, LineRules};
 use drivegate_world::sim::random::Random;
@@ -214,9 +215,7 @@ impl WorldBus {
             handle(index, &self.line, &self.profile, format, (&self.guards, now)),
         );
         self.handle.take_over(std::slice::from_ref(&stopped), now);
-        stopped
-            .queue
-            .close(drivegate_world::command::Outcome::ShuttingDown, now);
+        stopped.queue.close(drivegate_world::order::Outcome::ShuttingDown, now);
         let (bus, options) = (self.handle.clone(), &self.options);
         self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
         if self.open {

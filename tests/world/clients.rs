@@ -5,10 +5,10 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate_world::command::Authority;
 use drivegate_world::north::modbus_tcp::{self, Uncached};
 use drivegate_world::north::mqtt::Incoming;
 use drivegate_world::north::{NorthState, mqtt};
+use drivegate_world::order::Authority;
 use drivegate_world::plant::{Placed, SharedPlant};
 
 use super::scenario::Habit;

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use drivegate_world::codec::{Exception, Protocol, RequestPdu};
-use drivegate_world::command::{Order, Outcome, Refusal};
 use drivegate_world::drive::{ModelPoint, State, Value};
+use drivegate_world::order::{Order, Outcome, Refusal};
 use drivegate_world::sim::faults::FaultPlan;
 
 use super::rig::{PATIENCE, Rig, line, write};

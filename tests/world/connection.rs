@@ -4,10 +4,10 @@ use std::time::Duration;
 
 use drivegate_world::bus::core::Closed;
 use drivegate_world::codec::Protocol;
-use drivegate_world::command::Outcome;
 use drivegate_world::diagnosis::Cause;
 use drivegate_world::drive::{ModelPoint, State, Value};
 use drivegate_world::event::EventKind;
+use drivegate_world::order::Outcome;
 
 use super::bus::{Parts, Seen};
 use super::rig::{PATIENCE, Rig, line};

@@ -5,9 +5,9 @@
 use std::time::Duration;
 
 use drivegate_world::codec::Protocol;
-use drivegate_world::command::Outcome;
 use drivegate_world::drive::profile::Profiles;
 use drivegate_world::drive::{ModelPoint, State};
+use drivegate_world::order::Outcome;
 use drivegate_world::sim::faults::FaultPlan;
 use drivegate_world::sim::random::Random;
 

@@ -5,8 +5,8 @@ use std::time::Duration;
 use drivegate_world::bus::predict::predict;
 use drivegate_world::codec::wire::Silence;
 use drivegate_world::codec::{Protocol, RequestPdu};
-use drivegate_world::command::{Order, Urgency};
 use drivegate_world::drive::{ModelPoint, PollClass, Value};
+use drivegate_world::order::{Order, Urgency};
 use drivegate_world::plant::Placed;
 use drivegate_world::process_image::DriveSpec;
 

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_world::codec::Protocol;
-use drivegate_world::command::{Authority, Origin, Outcome, SourceKind};
 use drivegate_world::drill::{DrillOptions, DrillReport, DrillState, Drills, Kind, LOOK, SavedDrills};
 use drivegate_world::drive::ModelPoint;
+use drivegate_world::order::{Authority, Origin, Outcome, SourceKind};
 use drivegate_world::plant::OrderRequest;
 use drivegate_world::process_image::{LeaseAction, Supervision};
 use drivegate_world::sim::faults::FaultPlan;

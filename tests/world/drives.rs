@@ -4,7 +4,7 @@ use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use drivegate_world::codec::RequestPdu;
-use drivegate_world::command::written;
+use drivegate_world::order::written;
 
 use super::orders::{Unique, sets};
 

@@ -6,10 +6,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_world::codec::{Protocol, Table};
-use drivegate_world::command::{
-    Authority, DEFAULT_EXPIRY, HoldState, Mode, Order, Origin, Outcome, Principal, Proof, Refusal, Rules, SourceKind,
-    Verb, written,
-};
+use drivegate_world::order::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Proof, Refusal, SourceKind, written};
+use drivegate_world::permit::{HoldState, Mode, Principal, Rules, Verb};
 use drivegate_world::plant::{OrderRequest, Placed};
 use drivegate_world::process_image::DriveSpec;
 use drivegate_world::sim::faults::FaultPlan;

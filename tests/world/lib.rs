@@ -4,7 +4,8 @@
 pub use drivegate_bacnet as bacnet;
 pub use drivegate_bus as bus;
 pub use drivegate_core::{
-    command, diagnosis, drill, event, history, parameters, plant, process_image, start_guard, stop_all,
+    diagnosis, drill, event, history, order, parameters, permit, plant, process_image, queue, stalls, start_guard,
+    stop_all,
 };
 pub use drivegate_line as line;
 pub use drivegate_model::drive;

@@ -10,9 +10,9 @@ use std::time::Duration;
 
 use drivegate_world::codec::wire::Silence;
 use drivegate_world::codec::{Protocol, Table};
-use drivegate_world::command::{Order, Outcome};
 use drivegate_world::drive::Point;
 use drivegate_world::drive::profile::{Profile, Profiles};
+use drivegate_world::order::{Order, Outcome};
 use drivegate_world::plant::Placed;
 use drivegate_world::sim::faults::{Fault, FaultPlan};
 use drivegate_world::sim::half_duplex::Delivery;

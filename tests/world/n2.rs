@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use drivegate_world::codec::{Exception, Protocol, n2};
-use drivegate_world::command::Outcome;
 use drivegate_world::drive::{ModelPoint, Profile, Quality, State, Value};
 use drivegate_world::event::EventKind;
+use drivegate_world::order::Outcome;
 use drivegate_world::sim::faults::FaultPlan;
 
 use super::bus::Parts;

@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use drivegate_world::codec::{Exception, Protocol, RequestPdu};
-use drivegate_world::command::{Authority, Order, Origin, Outcome, Refusal, SourceKind};
 use drivegate_world::drive::{ModelPoint, Quality, State, Value};
 use drivegate_world::event::EventKind;
+use drivegate_world::order::{Authority, Order, Origin, Outcome, Refusal, SourceKind};
 use drivegate_world::plant::OrderRequest;
 use drivegate_world::process_image::{Access, LeaseAction, Supervision};
 use drivegate_world::sim::faults::{Fault, FaultPlan};

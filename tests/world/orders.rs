@@ -3,8 +3,8 @@
 use std::time::Instant;
 
 use drivegate_world::codec::{RequestPdu, Table};
-use drivegate_world::command::{Order, written};
 use drivegate_world::drive::{ModelPoint, Point, PointIndex, Profile, Value};
+use drivegate_world::order::{Order, written};
 use drivegate_world::sim::random::Random;
 
 /// What an order wants.

@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 use drivegate_world::codec::{Protocol, RequestPdu, Table};
-use drivegate_world::command::{BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket};
 use drivegate_world::drive::{DriveIndex, ModelPoint};
+use drivegate_world::order::{BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket};
 use drivegate_world::parameters::{Entry, Names, Next, ParameterFile, Reading, differences};
 use drivegate_world::sim::faults::FaultPlan;
 use drivegate_world::sim::random::Random;

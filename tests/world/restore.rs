@@ -6,8 +6,8 @@ use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use drivegate_world::codec::{Protocol, Reply, RequestPdu};
-use drivegate_world::command::{Authority, Order, Origin, Outcome, ParameterOrder, SourceKind};
 use drivegate_world::drive::ModelPoint;
+use drivegate_world::order::{Authority, Order, Origin, Outcome, ParameterOrder, SourceKind};
 use drivegate_world::parameters::{
     End, Journal, NO_IDENTIFICATION, Names, Next, Owner, ParameterFile, Phase, Plan, Reading, Restoration, Then,
     Wanted, Wishes, differences, plan,

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate_world::codec::{Protocol, Reply, RequestPdu, Table};
-use drivegate_world::command::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
 use drivegate_world::drive::{ModelPoint, PollClass, Sample, State, Value};
 use drivegate_world::event::Events;
+use drivegate_world::order::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
 use drivegate_world::plant::{DriveHandle, OrderRequest, Placed, Plant, SharedPlant};
 use drivegate_world::process_image::{OnShutdown, Outcome as Counted};
 use drivegate_world::sim::SimTime;

@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use drivegate_world::codec::{Protocol, Reply, Table};
-use drivegate_world::command::{Order, Outcome};
 use drivegate_world::drive::{ModelPoint, Value};
+use drivegate_world::order::{Order, Outcome};
 use drivegate_world::plant::Placed;
 use drivegate_world::process_image::{LeaseAction, Supervision};
 use drivegate_world::sim::faults::FaultPlan;

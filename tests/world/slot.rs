@@ -7,10 +7,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use drivegate_world::codec::{LineFormat, Protocol, RequestPdu, Table};
-use drivegate_world::command::Urgency;
 use drivegate_world::drive::{DriveIndex, ModelPoint};
 use drivegate_world::north::slot::{Offline, Slot, SlotAccess};
 use drivegate_world::north::{NorthState, SlotOutcome};
+use drivegate_world::order::Urgency;
 use drivegate_world::process_image::Access;
 use drivegate_world::sim::random::Random;
 use drivegate_world::sim::simulated_drive::{DriveOptions, ModelOptions};

@@ -7,10 +7,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_world::codec::{Protocol, RequestPdu, Table};
-use drivegate_world::command::{
-    Authority, Mode, Order, Origin, Outcome, Principal, Proof, Refusal, Rules, SourceKind, written,
-};
 use drivegate_world::drive::{ModelPoint, State, Value};
+use drivegate_world::order::{Authority, Order, Origin, Outcome, Proof, Refusal, SourceKind, written};
+use drivegate_world::permit::{Mode, Principal, Rules};
 use drivegate_world::plant::{OrderRequest, Placed};
 use drivegate_world::process_image::DriveSpec;
 use drivegate_world::sim::faults::FaultPlan;

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use drivegate_world::codec::Protocol;
-use drivegate_world::command::{Origin, SourceKind};
+use drivegate_world::order::{Origin, SourceKind};
 use drivegate_world::process_image::Access;
 use drivegate_world::sim::faults::FaultPlan;
 use drivegate_world::sim::statistics::Recorded;

@@ -17,12 +17,10 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate_world::codec::{Protocol, Reply, RequestPdu};
-use drivegate_world::command::{
-    Authority, CAPACITY, NO_DRIVE, Order, Origin, Outcome, SourceKind, WriteStats, written,
-};
 use drivegate_world::drive::{ModelPoint, Quality, RawWrites, Value};
 use drivegate_world::event::{EventKind, Events};
 use drivegate_world::north::mqtt::Incoming;
+use drivegate_world::order::{Authority, CAPACITY, NO_DRIVE, Order, Origin, Outcome, SourceKind, WriteStats, written};
 use drivegate_world::plant::{Plant, SharedPlant};
 use drivegate_world::process_image::{LeaseAction, OnShutdown};
 use drivegate_world::sim::random::Random;

@@ -393,12 +393,14 @@ impl CommandRun {
                 None => {
                     let fell = self.low_since(words, profile);
                     self.pop();
-                    if let (Some(fell), Some(Action::Hold(time))) = (fell, self.actions.front())
-                        && now < fell + *time
-                    {
-                        self.not_before = Some(fell + *time);
+                    let hold = match self.actions.front() {
+                        Some(Action::Hold(time)) => *time,
+                        _ => Duration::ZERO,
+                    };
+                    if let Some(high_at) = fell.map(|fell| fell + hold).filter(|at| now < *at) {
+                        self.not_before = Some(high_at);
                         self.actions.pop_front();
-                        return Next::Wait(fell + *time);
+                        return Next::Wait(high_at);
                     }
                     if matches!(self.actions.front(), Some(Action::Hold(_) | Action::Release(_))) {
                         self.pop();

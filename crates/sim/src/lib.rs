@@ -44,8 +44,8 @@ pub(crate) mod teco;
 pub mod wire;
 
 #[cfg(test)]
-#[cfg(test)]
 use drivegate_core::order;
+#[cfg(test)]
 use drivegate_core::parameters;
 use drivegate_line as line;
 use drivegate_model::document;

@@ -1,8 +1,8 @@
 //! What a tool broadcasts is an order to every drive of the bus, with its place among their others.
 
-use drivegate_world::command::Outcome;
 use drivegate_world::drive::RawWrites;
 use drivegate_world::event::{Event, EventKind};
+use drivegate_world::order::Outcome;
 use drivegate_world::process_image::{LeaseAction, Supervision};
 
 use super::*;

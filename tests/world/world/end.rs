@@ -1,6 +1,6 @@
 //! The end of the gateway.
 
-use drivegate_world::command::NotStopped;
+use drivegate_world::queue::NotStopped;
 
 use super::*;
 

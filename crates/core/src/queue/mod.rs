@@ -14,7 +14,6 @@ pub use shared::CommandQueue;
 pub use stops::{NotStopped, Stopping};
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::Arc;
 use std::time::Instant;
 
 use crate::drive::DriveIndex;

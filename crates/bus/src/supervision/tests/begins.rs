@@ -94,7 +94,7 @@ fn what_did_not_reach_the_wire_and_what_no_client_wanted_renews_nothing() {
     rig.begin();
     rig.look(100, true);
     let (urgency, step) = rig.send();
-    let ended = rig.drive.answered(urgency, &step, Reply::Written);
+    let ended = rig.drive.answered(urgency, &step, Reply::Written, rig.now);
     rig.end(&ended.expect("the end"));
     for _ in 0..20 {
         assert!(rig.after(1_000, true).is_none(), "once");

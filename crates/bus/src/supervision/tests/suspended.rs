@@ -24,7 +24,7 @@ fn an_order_that_reaches_the_wire_takes_the_place_of_an_action_that_waits() {
         rig.begin();
         rig.look(10, true);
         let (urgency, step) = rig.send();
-        let ended = rig.drive.answered(urgency, &step, Reply::Written);
+        let ended = rig.drive.answered(urgency, &step, Reply::Written, rig.now);
         rig.end(&ended.expect("the end"));
         assert_eq!(order.try_recv().unwrap().outcome, acknowledged());
         assert!(rig.after(4_900, true).is_none(), "it commands the drive");

@@ -113,11 +113,7 @@ impl Rig {
         let shared = Arc::new(Guards::default());
         if let Some(guards) = BusGuards::of(&shared, &bus, [&rig.image.spec]) {
             guards.begin();
-            shared.watch(
-                [(bus.machine(&rig.image.spec), rig.image.clone())].into_iter(),
-                10 * SECOND,
-                asked,
-            );
+            shared.watch([(bus.machine(&rig.image.spec), rig.image.clone())], 10 * SECOND, asked);
             guards.look(drive, &rig.image.reading(asked, 10 * SECOND));
             rig.gate.set_starts(Some(guards));
         }
