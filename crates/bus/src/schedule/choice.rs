@@ -111,8 +111,7 @@ impl Schedule {
             .collect();
         waiting.sort();
         waiting.into_iter().find_map(|(_, index)| {
-            let drive = self.drives.get(index)?;
-            let read = drive.probe().or_else(|| drive.items.first().map(|item| item.read))?;
+            let read = self.drives.get(index)?.items.first()?.read;
             Some(Poll {
                 drive: index,
                 read,

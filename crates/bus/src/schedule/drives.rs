@@ -85,8 +85,6 @@ pub(super) struct DriveSchedule {
     /// The last failed poll of process data.
     pub(super) troubled: Option<Instant>,
     pub(super) items: Vec<Item>,
-    /// Probes without success since it was online: each asks for something else.
-    pub(super) vain_probes: usize,
     /// Those that decide its state.
     pub(super) behind_state: Vec<PlannedRead>,
     /// Reads that are longer than a manual states, and those of them that no reply has proved since the drive came online.
@@ -218,19 +216,10 @@ impl DriveSchedule {
             unanswered: false,
             troubled: None,
             items,
-            vain_probes: 0,
             behind_state,
             unproved: trials.clone(),
             trials,
         }
-    }
-
-    /// What the next probe reads: a drive may answer some of what is polled, and never the rest.
-    pub(super) fn probe(&self) -> Option<PlannedRead> {
-        let polled = |item: &&Item| matches!(item.read.class, PollClass::Fast | PollClass::Slow);
-        let count = self.items.iter().filter(polled).count();
-        let place = self.vain_probes.checked_rem(count)?;
-        self.items.iter().filter(polled).nth(place).map(|item| item.read)
     }
 
     /// Whether a drive that answers other reads has never answered this one since it came online.

@@ -34,7 +34,6 @@ impl Schedule {
                 item.failures = 0;
                 item.heard = false;
             }
-            drive.vain_probes = 0;
         }
         if let Some(item) = drive.items.iter_mut().find(|item| item.read == poll.read) {
             item.heard = true;
@@ -79,7 +78,6 @@ impl Schedule {
             }
             let first = !drive.tried;
             drive.tried = true;
-            drive.vain_probes += 1;
             drive.is_away(now, took);
             return if first { Change::Offline } else { Change::None };
         }

@@ -182,7 +182,7 @@ impl fmt::Display for Outcome {
                     Interruption::Expired => "it expired",
                     Interruption::BusDown => "the bus went down",
                     Interruption::Offline => "the drive went offline",
-                    Interruption::ShuttingDown => "the gateway shuts down, or a reload starts its bus anew",
+                    Interruption::ShuttingDown => "the gateway shuts down, or a reload restarts its bus",
                     Interruption::Taken => "another client took the drive",
                     Interruption::RightLost => "a reload took the right of its client away",
                 };
@@ -206,7 +206,7 @@ impl fmt::Display for Outcome {
             Outcome::Offline => f.write_str("the drive is offline; it was not sent"),
             Outcome::QueueFull => write!(f, "{CAPACITY} commands are already waiting; it was not sent, try again"),
             Outcome::ShuttingDown => {
-                f.write_str("the gateway shuts down, or a reload starts its bus anew; it was not sent")
+                f.write_str("the gateway shuts down, or a reload restarts its bus; it was not sent")
             }
         }
     }
