@@ -22,9 +22,6 @@ const EARLY_PROBES: [Duration; 3] = [
 /// it soon has, one that never has it must not take time from others.
 const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 
-/// First and longest pause before a request that is not answered, while the drive answers others, is tried again.
-pub(super) const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
-
 /// Pause before a read that no manual states is tried: where it failed, and where its reply proved nothing.
 pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(20));
 
@@ -52,8 +49,6 @@ pub(super) struct Item {
     pub(super) wanted: bool,
     /// Never answered so far.
     pub(super) unread: bool,
-    /// Answered since the drive came online.
-    pub(super) heard: bool,
     /// Since when a command changed what it reads: it goes before the round, so that the command is confirmed soon.
     pub(super) asked: Option<Instant>,
     /// When the parts of a refused block may be joined again: perhaps it was refused by mistake.
@@ -176,7 +171,6 @@ impl Item {
             failed_at: None,
             wanted: read.class != PollClass::Fault,
             unread: !matches!(read.class, PollClass::Fault | PollClass::Monitor),
-            heard: false,
             asked: None,
             whole_again: None,
         }
@@ -220,26 +214,6 @@ impl DriveSchedule {
             unproved: trials.clone(),
             trials,
         }
-    }
-
-    /// Whether a drive that answers other reads has never answered this one since it came online.
-    pub(super) fn is_mute(&self, read: &PlannedRead) -> bool {
-        let mut items = self.items.iter();
-        let heard = items.any(|item| item.heard && item.read != *read);
-        heard && self.items.iter().any(|item| !item.heard && item.read == *read)
-    }
-
-    /// A read that is not answered, while the drive answers others, is tried again later, and then later still.
-    pub(super) fn not_heard(&mut self, read: &PlannedRead, retries: u32, now: Instant) {
-        let Some(item) = self.items.iter_mut().find(|item| item.read == *read) else {
-            return;
-        };
-        item.failures += 1;
-        item.failed_at = Some(now);
-        item.due = match item.failures.checked_sub(retries + 1) {
-            Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
-            None => now,
-        };
     }
 
     /// Whether that read is longer than a manual states, and no reply has proved it.
@@ -323,9 +297,8 @@ impl DriveSchedule {
         self.unanswered && self.has_fast()
     }
 
-    /// Whether it answers process data, so that this shows that it is there.
     pub(super) fn has_fast(&self) -> bool {
-        self.items.iter().any(|i| i.read.class == PollClass::Fast && i.heard)
+        self.items.iter().any(|i| i.read.class == PollClass::Fast)
     }
 
     /// Splits a refused block until the bad point is found, which is retried slowly.

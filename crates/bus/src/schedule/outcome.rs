@@ -3,10 +3,12 @@
 
 use std::time::{Duration, Instant};
 
-use super::drives::{MUTE_PAUSE, Presence};
+use super::drives::Presence;
 use super::{Change, Poll, Polled, Schedule};
 use crate::drive::{DriveIndex, PollClass};
 
+/// First and longest pause before a slow request that is not answered, while the drive answers others, is tried again.
+const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 /// Garbled answers in a row after which a drive counts as away: something is there, but nothing comes of it.
 const MOST_GARBLED: u32 = 8;
 
@@ -32,11 +34,7 @@ impl Schedule {
                 item.wanted = item.read.class != PollClass::Fault;
                 item.due = now;
                 item.failures = 0;
-                item.heard = false;
             }
-        }
-        if let Some(item) = drive.items.iter_mut().find(|item| item.read == poll.read) {
-            item.heard = true;
         }
         let mut change = Change::None;
         if let Polled::Refused(exception) = polled {
@@ -85,13 +83,15 @@ impl Schedule {
         let presence_counts = poll.read.class == PollClass::Fast || !drive.has_fast();
         if !presence_counts {
             // A request that is never answered must not take the drive away while its process data comes.
-            drive.not_heard(&poll.read, retries, now);
+            if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
+                item.failures += 1;
+                item.failed_at = Some(now);
+                item.due = match item.failures.checked_sub(retries + 1) {
+                    Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
+                    None => now,
+                };
+            }
             self.ask_whether_it_answers(poll.drive, now);
-            return Change::None;
-        }
-        if drive.is_mute(&poll.read) {
-            // It is no sign that the drive is away; what it does answer shows that.
-            drive.not_heard(&poll.read, retries, now);
             return Change::None;
         }
         drive.failures += 1;

@@ -39,11 +39,8 @@ struct PolledLine {
     schedule: Schedule,
     now: Instant,
     dead: Vec<usize>,
-    /// Reads that no drive answers, by their first address.
-    silent: Vec<u16>,
     log: Vec<(Instant, Decision)>,
     offline: Vec<usize>,
-    online: Vec<usize>,
 }
 
 impl PolledLine {
@@ -61,10 +58,8 @@ impl PolledLine {
             schedule,
             now,
             dead: Vec::new(),
-            silent: Vec::new(),
             log: Vec::new(),
             offline: Vec::new(),
-            online: Vec::new(),
         }
     }
 
@@ -81,14 +76,12 @@ impl PolledLine {
                 self.schedule.command_done(urgency, COST);
             }
             Decision::Poll(poll) => {
-                let dead = self.dead.contains(&poll.drive.place()) || self.silent.contains(&poll.read.start);
+                let dead = self.dead.contains(&poll.drive.place());
                 let took = if dead { COST * 10 } else { COST };
                 self.now += took;
                 let polled = if dead { Polled::Failed } else { Polled::Ok };
-                match self.schedule.poll_done(&poll, polled, took, self.now) {
-                    Change::Offline => self.offline.push(poll.drive.place()),
-                    Change::Online => self.online.push(poll.drive.place()),
-                    _ => {}
+                if self.schedule.poll_done(&poll, polled, took, self.now) == Change::Offline {
+                    self.offline.push(poll.drive.place());
                 }
             }
         }

@@ -361,35 +361,3 @@ fn what_a_bad_line_swallowed_is_due_once_process_data_was_sound_for_a_while() {
     drive.troubled = Some(now);
     assert_eq!(drive.due(&answered), now + 60 * second);
 }
-
-/// What a drive never answers is that point's trouble, also where it is process data.
-#[test]
-fn process_data_that_is_never_answered_takes_no_drive_away() {
-    let mut plan = plan();
-    plan.reads.insert(1, read(PollClass::Fast, 8500, 2));
-    let mut rig = PolledLine::new(1, Duration::from_millis(100));
-    let cadence = Cadence {
-        fast: Duration::from_millis(100),
-        slow: Duration::from_secs(1),
-        retries: 1,
-    };
-    rig.schedule = Schedule::new(cadence, &[&plan], |_, _| COST, rig.now);
-    rig.silent = vec![8500];
-    rig.run(Duration::from_secs(60));
-    assert_eq!((rig.online.len(), rig.offline.len()), (1, 0));
-    let from = rig.now - Duration::from_secs(30);
-    let polls = |start: u16| {
-        let late = rig.log.iter().filter(|(at, _)| *at >= from);
-        late.filter(|(_, decision)| matches!(decision, Decision::Poll(poll) if poll.read.start == start))
-            .count()
-    };
-    assert!(polls(8500) <= 3, "what is silent is asked now and then");
-    assert!(polls(2100) >= 250 && polls(2000) >= 25, "the rest goes on");
-    // One that is away is told so, and is found again.
-    rig.dead = vec![0];
-    rig.run(Duration::from_secs(5));
-    assert_eq!(rig.offline.len(), 1);
-    rig.dead.clear();
-    rig.run(Duration::from_secs(20));
-    assert_eq!((rig.online.len(), rig.offline.len()), (2, 1));
-}
