@@ -4,7 +4,7 @@
 //! soften it: after eight commands in a row a due poll goes first; commands, and what they cause, have no more of a
 //! line that is busy with polls than process data; slow polls that had less than their share of the time
 //! ([`slow_share`]) go before fast ones; background transactions have the time that is left over and else a small share
-//! ([`crate::command::Pace`]); a drive that does not answer is asked so seldom that it costs at most 2 %.
+//! ([`crate::order::Pace`]); a drive that does not answer is asked so seldom that it costs at most 2 %.
 
 mod background;
 mod choice;
@@ -21,8 +21,8 @@ pub(crate) use self::drives::TRIAL_PAUSE;
 use self::drives::{DriveSchedule, Item, Presence, singles};
 use self::share::CommandShare;
 use crate::codec::Exception;
-use crate::command::Urgency;
 use crate::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
+use crate::order::Urgency;
 
 /// Commands in a row before a due poll goes first.
 pub const COMMANDS_IN_A_ROW: u32 = 8;

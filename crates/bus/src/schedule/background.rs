@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::{Schedule, Turn};
-use crate::command::Pace;
+use crate::order::Pace;
 
 /// What the shares have earned and not used, in seconds of wire time; less than nothing after a transaction that took
 /// longer than it had earned.

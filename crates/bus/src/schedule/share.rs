@@ -6,7 +6,7 @@
 use std::time::Duration;
 
 use super::COMMANDS_IN_A_ROW;
-use crate::command::Urgency;
+use crate::order::Urgency;
 
 /// Time of the line that was taken ahead of those who pay for it.
 #[derive(Debug, Default)]
