@@ -1,0 +1,187 @@
+//! What a started command needs next. Pure: time is an argument.
+
+use std::time::{Duration, Instant};
+
+use super::control::{self, Made, Word};
+use super::functions::other;
+use super::steps::{Action, Step, step_of};
+use super::{CommandRun, KnownWords, Next, Phase};
+use crate::codec::Exception;
+use crate::drive::Profile;
+use crate::order::{Interruption, Outcome};
+
+/// What becomes of the first action.
+enum First {
+    /// This step is sent.
+    Step(Box<Step>),
+    /// It changes nothing: the next one is looked at.
+    Nothing,
+    /// It was taken away, or another one stands in its place.
+    Changed,
+}
+
+impl CommandRun {
+    /// What the command needs next. `running` is what the drive last reported. Once it has expired nothing more is
+    /// sent, except to clear a reset bit that is set.
+    pub fn next(&mut self, words: &KnownWords, profile: &Profile, running: bool, now: Instant) -> Next {
+        (self.known.running, self.known.masks) = (running, words.functions.masks(profile));
+        self.end_late(now);
+        if let Some(at) = self.pauses_until(now) {
+            return Next::Wait(at);
+        }
+        while let Some(action) = self.actions.front() {
+            if let Action::Hold(time) = action {
+                let until = now + *time;
+                self.known.motor = None;
+                return self.hold_until(until);
+            }
+            match self.first(words, profile, running, now) {
+                First::Step(step) => return Next::Send(self.formed(*step, words, profile)),
+                First::Changed => {}
+                First::Nothing => {
+                    if let Some(high_at) = self.pass_over(words, profile, now) {
+                        return self.hold_until(high_at);
+                    }
+                }
+            }
+        }
+        Next::Done
+    }
+
+    /// One that has expired sends nothing more than the end of a pulse.
+    fn end_late(&mut self, now: Instant) {
+        if !self.is_late(now) {
+            return;
+        }
+        let outcome = if self.tries.failures > 0 || self.in_doubt() {
+            self.tries.unanswered.clone()
+        } else if self.tries.busy > 0 {
+            Outcome::Exception(Exception::BUSY)
+        } else {
+            self.unless_begun(Outcome::Expired, Interruption::Expired)
+        };
+        self.cut_off(outcome);
+    }
+
+    /// Until when nothing is sent, if that is not over.
+    fn pauses_until(&mut self, now: Instant) -> Option<Instant> {
+        if let Some(pause) = self.tries.pause.take() {
+            let end = if self.may_write_on() { self.expires } else { now + pause };
+            self.not_before = Some((now + pause).min(end));
+        }
+        self.not_before = self.not_before.filter(|at| now < *at);
+        self.not_before
+    }
+
+    /// The first action is a pause, which ends then.
+    fn hold_until(&mut self, until: Instant) -> Next {
+        self.actions.pop_front();
+        self.not_before = Some(until);
+        Next::Wait(until)
+    }
+
+    fn first(&mut self, words: &KnownWords, profile: &Profile, running: bool, now: Instant) -> First {
+        let step = match self.actions.front() {
+            None => None,
+            Some(Action::Await(_)) => match self.awaits(now) {
+                Some(step) => Some(step),
+                None => return First::Changed,
+            },
+            Some(Action::Word(Word::Sequence(0, reverse))) if control::is_prepared(profile, words, running) => {
+                self.only_last_word(*reverse, profile);
+                return First::Changed;
+            }
+            Some(Action::Word(word)) => match control::word(*word, words, profile, self.known) {
+                Made::Send(step) => Some(step),
+                Made::Nothing => None,
+                Made::Look => match self.looks(profile) {
+                    Some(step) => Some(step),
+                    None => return First::Changed,
+                },
+                Made::AtNextStart(reverse) => {
+                    self.keep_direction(reverse);
+                    return First::Changed;
+                }
+                Made::Refused(refusal) => {
+                    self.give_up(self.unless_in_doubt(Outcome::Refused(refusal)));
+                    return First::Changed;
+                }
+            },
+            Some(action) => step_of(action, words, profile, self.known),
+        };
+        step.map_or(First::Nothing, |step| First::Step(Box::new(step)))
+    }
+
+    /// The step in the form that the drive takes.
+    fn formed(&mut self, mut step: Step, words: &KnownWords, profile: &Profile) -> Step {
+        step.pdu = words.functions.form(step.pdu, profile);
+        if let Some(other) = other(&step.pdu).filter(|_| self.by_other_function) {
+            step.pdu = other;
+        }
+        if let Some(Action::Word(Word::Sequence(number, _))) = self.actions.front()
+            && self.phase == Phase::Steps
+            && step.pdu.is_write()
+            && control::is_last(profile, *number)
+        {
+            self.phase = Phase::MotorStarted;
+        }
+        step
+    }
+
+    /// The first action changes nothing. Nothing to take away: the pulse starts at once, without the pause behind, unless its bits
+    /// fell just now; until when they stay low then. Nothing to change: nothing is overridden that would have to be released.
+    fn pass_over(&mut self, words: &KnownWords, profile: &Profile, now: Instant) -> Option<Instant> {
+        let fell = self.low_since(words, profile);
+        self.pop();
+        let hold = match self.actions.front() {
+            Some(Action::Hold(time)) => *time,
+            _ => Duration::ZERO,
+        };
+        let high_at = fell.map(|fell| fell + hold).filter(|at| now < *at);
+        if high_at.is_none() && matches!(self.actions.front(), Some(Action::Hold(_) | Action::Release(_))) {
+            self.pop();
+        }
+        high_at
+    }
+
+    /// When the command before took away the bits that are pulsed next: between two pulses they are low as long as in one.
+    fn low_since(&self, words: &KnownWords, profile: &Profile) -> Option<Instant> {
+        let at = profile.control.as_ref()?.at;
+        match self.actions.front() {
+            Some(Action::Word(Word::ResetLow(reset))) if reset.place.is_none() => {
+                words.fell(at.table, at.address, reset.value)
+            }
+            _ => None,
+        }
+    }
+
+    /// A sequence waits for a state: the read of it, as long as its time is not over.
+    fn awaits(&mut self, now: Instant) -> Option<Step> {
+        let Some(Action::Await(state)) = self.actions.front_mut() else {
+            return None;
+        };
+        let since = *state.since.get_or_insert(now);
+        if now.saturating_duration_since(since) < state.timeout {
+            return Some(state.look());
+        }
+        let why = state.not_reached();
+        self.give_up(Outcome::NotTaken(why));
+        None
+    }
+
+    /// The motor runs by this very command: of a sequence the last word alone is sent, which changes nothing or the direction.
+    fn only_last_word(&mut self, reverse: Option<bool>, profile: &Profile) {
+        let last = |action: &Action| matches!(action, Action::Word(Word::Sequence(number, _)) if control::is_last(profile, *number));
+        while self.actions.front().is_some_and(|action| !last(action)) {
+            self.pop();
+        }
+        if let Some(Action::Word(word @ Word::Sequence(..))) = self.actions.front_mut() {
+            let Word::Sequence(number, _) = *word else { return };
+            // Not the first word any more, even where the sequence has but one.
+            *word = match number {
+                0 => Word::Run(reverse),
+                number => Word::Sequence(number, reverse),
+            };
+        }
+    }
+}
