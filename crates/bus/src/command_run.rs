@@ -18,14 +18,12 @@ pub use self::control::read_place;
 pub use self::known_words::KnownWords;
 pub use self::steps::{Step, StepPurpose};
 
-use self::control::{Made, Word};
-use self::functions::other;
 use self::look::Look;
 use self::parameter::ParameterRun;
-use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_of, unsendable, write_on_change};
+use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, unsendable, write_on_change};
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
-use crate::codec::{Exception, Reply, Table};
+use crate::codec::{Reply, Table};
 use crate::drive::{ModelPoint, Profile};
 use crate::order::{
     Command, Intent, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Urgency, Work, written,

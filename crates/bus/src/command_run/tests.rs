@@ -6,8 +6,7 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
-use crate::codec::RequestPdu;
-use crate::codec::Table;
+use crate::codec::{Exception, RequestPdu, Table};
 use crate::drive::profile::Profiles;
 use crate::drive::{DriveIndex, Value};
 use crate::order::{Admitted, Answer, Origin, SourceKind, WriteStats};

@@ -1,6 +1,7 @@
 //! An order that does not say whether the motor is to run looks at it before it writes a run command from memory: every family that
 //! is commanded, stopped or restarted behind the gateway's back.
 
+use super::super::control::Made;
 use super::*;
 use crate::drive::control::{Control, ControlItem, OwnWord, Run};
 use crate::drive::{Derived, PointIndex, Raw, Source};
