@@ -1,4 +1,4 @@
-//! Process image, commands, events, history, diagnosis and parameters of drivegate.
+//! Orders, the rules that let them through, process image, events, history, diagnosis and parameters of drivegate.
 
 pub mod diagnosis;
 pub mod drill;
