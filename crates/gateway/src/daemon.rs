@@ -12,6 +12,8 @@ mod server;
 mod servers;
 
 use std::collections::BTreeMap;
+use std::io::ErrorKind;
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -61,6 +63,18 @@ pub enum StartError {
     /// The system does not provide a thread for the recorder.
     #[error("cannot start the recorder: {0}; free memory or threads")]
     Recorder(std::io::Error),
+}
+
+impl StartError {
+    /// The address of the configuration that another program listens on.
+    pub fn address_in_use(&self) -> Option<SocketAddr> {
+        match self {
+            StartError::Server(ServerError::Listen { address, cause, .. }) if cause.kind() == ErrorKind::AddrInUse => {
+                Some(*address)
+            }
+            _ => None,
+        }
+    }
 }
 
 /// A running gateway.
@@ -189,12 +203,12 @@ impl Daemon {
     }
 
     /// The address that the HTTP server listens on.
-    pub fn http_address(&self) -> Option<std::net::SocketAddr> {
+    pub fn http_address(&self) -> Option<SocketAddr> {
         self.http.server().and_then(http::Http::address)
     }
 
     /// The addresses that the Modbus TCP server listens on without TLS.
-    pub fn modbus_tcp_addresses(&self) -> Vec<std::net::SocketAddr> {
+    pub fn modbus_tcp_addresses(&self) -> Vec<SocketAddr> {
         let server = self.modbus_tcp.server();
         server.map(modbus_tcp::Server::addresses).unwrap_or_default()
     }

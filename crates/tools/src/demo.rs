@@ -3,6 +3,7 @@
 mod welcome;
 mod written;
 
+use std::io::ErrorKind;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -205,21 +206,41 @@ impl Sides {
 }
 
 async fn start(place: &DemoPlace, cancel: &CancellationToken) -> Result<(Daemon, Broker, Sides), String> {
-    let mqtt = free_port("the MQTT broker", MQTT)?;
-    let broker = Broker::start(mqtt, cancel.child_token());
-    let broker = broker
-        .await
-        .map_err(|e| format!("cannot start the MQTT broker on {mqtt}: {e}"))?;
-    let sides = Sides {
-        mqtt,
-        modbus: free_port("Modbus TCP", MODBUS_TCP)?,
-        http: free_port("HTTP", HTTP)?,
-    };
-    let loaded = Settings::parse("demo.toml", &configuration(place, &sides), std::iter::empty());
-    report::errors(&loaded.errors);
-    let settings = loaded.settings.ok_or("the configuration of the demo is not valid")?;
-    let daemon = Daemon::start(settings).await.map_err(|e| e.to_string())?;
-    Ok((daemon, broker, sides))
+    let (mqtt, broker) = start_broker(cancel).await?;
+    let [mut modbus, mut http] = [MODBUS_TCP, HTTP];
+    loop {
+        let sides = Sides {
+            mqtt,
+            modbus: free_port("Modbus TCP", modbus)?,
+            http: free_port("HTTP", http)?,
+        };
+        let loaded = Settings::parse("demo.toml", &configuration(place, &sides), std::iter::empty());
+        report::errors(&loaded.errors);
+        let settings = loaded.settings.ok_or("the configuration of the demo is not valid")?;
+        let failed = match Daemon::start(settings).await {
+            Ok(daemon) => return Ok((daemon, broker, sides)),
+            Err(error) => error,
+        };
+        // Another program may have taken a port since it was found free.
+        match failed.address_in_use() {
+            Some(taken) if taken == sides.modbus => modbus = taken.port().saturating_add(1),
+            Some(taken) if taken == sides.http => http = taken.port().saturating_add(1),
+            _ => return Err(failed.to_string()),
+        }
+    }
+}
+
+/// Starts the broker at the first free port.
+async fn start_broker(cancel: &CancellationToken) -> Result<(SocketAddr, Broker), String> {
+    let mut port = MQTT;
+    loop {
+        let address = free_port("the MQTT broker", port)?;
+        match Broker::start(address, cancel.child_token()).await {
+            Ok(broker) => return Ok((address, broker)),
+            Err(error) if error.kind() == ErrorKind::AddrInUse => port = address.port().saturating_add(1),
+            Err(error) => return Err(format!("cannot start the MQTT broker on {address}: {error}")),
+        }
+    }
 }
 
 fn start_lines(speed: Speed, written: Option<&Written>) -> std::io::Result<Vec<SimulatedBus>> {

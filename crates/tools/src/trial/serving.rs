@@ -37,15 +37,12 @@ pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Outcome {
     settings.socket = SocketPath::Off;
     settings.recordings.max_count = 0;
     settings.keeps_history = false;
-    settings.http = Some(http::Options::at(demo::free_port("the status page", HTTP)?));
     let _log = crate::log::start(&LogSettings {
         level: "error".to_string(),
         format: LogFormat::Auto,
     });
     let runtime = crate::runtime()?;
-    let daemon = runtime
-        .block_on(Daemon::start(settings))
-        .map_err(|error| error.to_string())?;
+    let daemon = runtime.block_on(start(settings))?;
     runtime.block_on(first_values(&daemon.plant(), stop));
     report::print(&values(&daemon.plant()));
     if let Some(address) = daemon.http_address() {
@@ -60,6 +57,20 @@ pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Outcome {
     runtime.block_on(daemon.stop());
     offered?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Starts the gateway with its status page at the first free port.
+async fn start(mut settings: Settings) -> Result<Daemon, String> {
+    let mut port = HTTP;
+    loop {
+        let address = demo::free_port("the status page", port)?;
+        settings.http = Some(http::Options::at(address));
+        match Daemon::start(settings.clone()).await {
+            // Another program took the port since it was found free.
+            Err(error) if error.address_in_use().is_some() => port = address.port().saturating_add(1),
+            started => return started.map_err(|error| error.to_string()),
+        }
+    }
 }
 
 /// Waits until each drive that answers has values.
