@@ -332,21 +332,36 @@ impl WorldBus {
 
     /// Lets the bus go on as far as it can at `now`.
     pub fn step(&mut self, now: Instant, seen: &mut Vec<Seen>) {
-        self.deliver(now, seen);
+        self.deliver(now, false, seen);
         while self.open {
             match self.core.poll(now) {
                 Action::Send => self.send(now, seen),
                 Action::Wait { until, commands, .. } => {
-                    self.note_over(seen);
                     assert!(until > now, "idle until a time that is past");
-                    (self.until, self.commands) = (until, commands);
-                    return;
+                    return self.waits(until, commands, seen);
                 }
             }
         }
     }
 
-    fn send(&mut self, now: Instant, seen: &mut Vec<Seen>) {
+    /// When the wire is to be looked at next.
+    pub fn wire_wakes(&self) -> Option<Instant> {
+        self.wire.wake().map(|wake| self.began + wake.at)
+    }
+
+    /// The wire and the drives go on, whatever the bus does.
+    pub fn wire_runs(&mut self, now: Instant, seen: &mut Vec<Seen>) {
+        self.wire.on_time(self.sim(now));
+        self.note_acts(seen);
+    }
+
+    /// Its thread sleeps until then, or until an order comes.
+    pub fn waits(&mut self, until: Instant, commands: bool, seen: &mut Vec<Seen>) {
+        self.note_over(seen);
+        (self.until, self.commands) = (until, commands);
+    }
+
+    pub fn send(&mut self, now: Instant, seen: &mut Vec<Seen>) {
         self.note_over(seen);
         let frame = self.core.sending(now).to_vec();
         self.exchanges += 1;
@@ -376,8 +391,9 @@ impl WorldBus {
         self.note_acts(seen);
     }
 
-    /// What is due on the wire reaches the drives, and the gateway.
-    fn deliver(&mut self, now: Instant, seen: &mut Vec<Seen>) {
+    /// What is due on the wire reaches the drives, and the gateway, which reads it even if there is nothing when it `stood`
+    /// still.
+    pub fn deliver(&mut self, now: Instant, stood: bool, seen: &mut Vec<Seen>) {
         let sim = self.sim(now);
         self.wire.on_time(sim);
         self.note_acts(seen);
@@ -387,7 +403,7 @@ impl WorldBus {
             let place = self.dice.within(0..=bytes.len() as u64 - 1) as usize;
             bytes[place] ^= 1 << self.dice.within(0..=7);
         }
-        if self.open && !bytes.is_empty() {
+        if self.open && (stood || !bytes.is_empty()) {
             seen.push(Seen::Heard(bytes.clone()));
             self.core.heard(&bytes, now);
             self.note_over(seen);
@@ -464,14 +480,19 @@ pub fn handle(
         slow_cycle: line.slow_cycle,
     };
     let drive = |address: u8| {
+        let place = if line.swapped {
+            line.drives + 1 - address
+        } else {
+            address
+        };
         let mut spec = DriveSpec {
             access: Access::Control,
-            unit: index as u8 * 40 + address,
+            unit: index as u8 * 40 + place,
             supervision: line.supervision.clone(),
             on_shutdown: line.on_shutdown,
             turnaround: line.turnaround,
             frequency_range: (line.protocol == Protocol::N2).then_some(0.0..=50.0),
-            ..DriveSpec::new(&format!("d{index}-{address}"), &name, address, profile.clone())
+            ..DriveSpec::new(&format!("d{index}-{place}"), &name, address, profile.clone())
         };
         (line.spec)(&mut spec);
         Arc::new(DriveImage::new(spec, line.slow_cycle))

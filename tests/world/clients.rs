@@ -7,6 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_world::north::modbus_tcp::{self, Uncached};
 use drivegate_world::north::mqtt::Incoming;
+use drivegate_world::north::reading::Watch;
 use drivegate_world::north::{NorthState, mqtt};
 use drivegate_world::order::Authority;
 use drivegate_world::plant::{Placed, SharedPlant};
@@ -97,6 +98,11 @@ impl Servers {
         let stats = Arc::<NorthState>::default();
         let modbus_tcp = modbus_tcp::Offline::new(options, plant.clone(), stats, address(250, 0), Authority::Write);
         Servers { plant, modbus_tcp }
+    }
+
+    /// Shows whether the thread runs that reads the connections.
+    pub fn watch(&self) -> &Arc<Watch> {
+        self.modbus_tcp.watch()
     }
 
     /// A connection of a Modbus TCP client. Those of [`Habit::Shares`] are of two clients, one of them with a certificate.

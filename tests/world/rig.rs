@@ -73,6 +73,7 @@ pub fn line(family: &'static str, protocol: Protocol, baud: u32, drives: u8) -> 
         supervision: None,
         on_shutdown: OnShutdown::Hold,
         dead: Vec::new(),
+        swapped: false,
         refuses: None,
         spec: |_| {},
     }

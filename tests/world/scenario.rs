@@ -44,6 +44,8 @@ pub struct Line {
     pub on_shutdown: OnShutdown,
     /// Addresses where nobody answers.
     pub dead: Vec<u8>,
+    /// The names and units of its drives stand in the opposite order.
+    pub swapped: bool,
     /// A register that the first drive refuses to report.
     pub refuses: Option<&'static str>,
     /// What else is different about its drives.
@@ -208,6 +210,7 @@ impl Line {
             } else {
                 Vec::new()
             },
+            swapped: false,
             refuses: (!calm && dice.chance(0.15)).then_some("running"),
             // Without the dice: the rest of the world is the same.
             spec: match drives % 3 {

@@ -343,6 +343,7 @@ fn stops_come_as_soon_as_without_guards() {
         let mut play = Play::new("vacon-nx", 77);
         if !guarded {
             let unguarded = Line {
+                swapped: false,
                 spec: |_| {},
                 ..works("vacon-nx")
             };

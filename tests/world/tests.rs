@@ -43,6 +43,7 @@ mod scenario;
 mod selection;
 mod situations;
 mod slot;
+mod stalls;
 mod start_guard;
 mod stop_all;
 mod world;

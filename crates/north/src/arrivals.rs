@@ -19,26 +19,33 @@ impl Arrivals {
         }
         let full = self.0.len() >= MOST_PIECES;
         match self.0.back_mut() {
-            Some((last, known)) if full || *known == arrival => *last += count,
+            Some((last, known)) if *known == arrival => *last += count,
+            Some((last, known)) if full => {
+                *last += count;
+                *known = known.clone().completed(&arrival);
+            }
             _ => self.0.push_back((count, arrival)),
         }
     }
 
-    /// How the first byte came.
-    pub(super) fn first(&self) -> Option<&Arrival> {
-        self.0.front().map(|(_, arrival)| arrival)
-    }
-
-    /// The first bytes are taken.
-    pub(super) fn taken(&mut self, mut count: usize) {
-        while let Some((of_first, _)) = self.0.front_mut() {
+    /// How the first bytes came, which are taken: dated from the first of them, with the last stall among them. None if there are
+    /// none.
+    pub(super) fn take(&mut self, mut count: usize) -> Option<Arrival> {
+        let mut taken: Option<Arrival> = None;
+        while count > 0 {
+            let (of_first, arrival) = self.0.front_mut()?;
+            taken = Some(match taken {
+                None => arrival.clone(),
+                Some(taken) => taken.completed(arrival),
+            });
             if *of_first > count {
                 *of_first -= count;
-                return;
+                break;
             }
             count -= *of_first;
             self.0.pop_front();
         }
+        taken
     }
 }
 
@@ -48,6 +55,7 @@ mod tests {
 
     use super::*;
     use crate::order::Connection;
+    use crate::stalls::Stall;
 
     fn over(connection: &Connection, asked: Instant) -> Arrival {
         Arrival::over(connection.clone(), asked)
@@ -59,20 +67,42 @@ mod tests {
         let connection = Connection::opened(began);
         let at = |ms| over(&connection, began + Duration::from_millis(ms));
         let mut arrivals = Arrivals::default();
-        assert_eq!(arrivals.first(), None);
+        assert_eq!(arrivals.take(1), None);
         arrivals.came(3, at(0));
         arrivals.came(0, at(5));
         arrivals.came(7, at(10));
-        assert_eq!(arrivals.first(), Some(&at(0)));
-        arrivals.taken(2);
-        assert_eq!(arrivals.first(), Some(&at(0)));
-        arrivals.taken(1);
-        assert_eq!(arrivals.first(), Some(&at(10)));
+        assert_eq!(arrivals.take(2), Some(at(0)));
+        assert_eq!(
+            arrivals.take(2),
+            Some(at(0)),
+            "the last byte of the first piece, and one of the second"
+        );
+        assert_eq!(arrivals.take(1), Some(at(10)));
         arrivals.came(1, at(20));
-        arrivals.taken(7);
-        assert_eq!(arrivals.first(), Some(&at(20)));
-        arrivals.taken(9);
-        assert_eq!(arrivals.first(), None);
+        assert_eq!(arrivals.take(5), Some(at(10)));
+        assert_eq!(arrivals.take(1), Some(at(20)));
+        assert_eq!(arrivals.take(1), None);
+    }
+
+    #[test]
+    fn one_that_ends_behind_a_pause_has_that_pause() {
+        let began = Instant::now();
+        let connection = Connection::opened(began);
+        let at = |ms| began + Duration::from_millis(ms);
+        let stall = Some(Stall::new(at(100), at(3100)));
+        let behind = Arrival {
+            stall,
+            pause: stall,
+            ..over(&connection, at(100))
+        };
+        let mut arrivals = Arrivals::default();
+        arrivals.came(5, over(&connection, at(50)));
+        arrivals.came(7, behind);
+        arrivals.came(12, over(&connection, at(9000)));
+        let first = arrivals.take(12).unwrap();
+        assert_eq!((first.asked, first.stall, first.pause), (at(50), stall, stall));
+        let next = arrivals.take(12).unwrap();
+        assert_eq!((next.asked, next.stall, next.pause), (at(9000), None, None));
     }
 
     #[test]
@@ -84,9 +114,8 @@ mod tests {
         }
         assert_eq!(arrivals.0.len(), MOST_PIECES);
         for ms in 0..1000 {
-            assert!(arrivals.first().unwrap().asked <= began + Duration::from_millis(ms));
-            arrivals.taken(1);
+            assert!(arrivals.take(1).unwrap().asked <= began + Duration::from_millis(ms));
         }
-        assert_eq!(arrivals.first(), None);
+        assert_eq!(arrivals.take(1), None);
     }
 }

@@ -75,4 +75,14 @@ impl Arrival {
             pause: None,
         }
     }
+
+    /// The same order, whose last byte came so: what a client sends in two parts it may have given up in between.
+    #[must_use]
+    pub fn completed(self, last: &Arrival) -> Arrival {
+        Arrival {
+            stall: last.stall.or(self.stall),
+            pause: last.pause.or(self.pause),
+            ..self
+        }
+    }
 }

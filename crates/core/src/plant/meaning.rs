@@ -82,7 +82,9 @@ impl Formerly {
     fn at(&self, drive: DriveIndex, by: By, asked: Instant) -> Option<Former> {
         let all = self.lock();
         let mut of_drive = all.get(&drive)?.iter();
-        of_drive.find(|former| former.by == by && asked < former.until).cloned()
+        of_drive
+            .find(|former| former.by == by && asked <= former.until)
+            .cloned()
     }
 
     /// Keeps the changes that may still matter at `now`, and this one.

@@ -299,6 +299,7 @@ impl HttpConnections {
             request.extensions_mut().insert(reached.clone());
             // The head has just been read.
             request.extensions_mut().insert(reader.last());
+            request.extensions_mut().insert(reader.clone());
             let command =
                 matches!(*request.method(), hyper::Method::POST | hyper::Method::DELETE).then(|| commands.token());
             let reply = router.call(request);

@@ -59,6 +59,7 @@ impl SocketDoor {
             request.extensions_mut().insert(client);
             request.extensions_mut().insert(reached.clone());
             request.extensions_mut().insert(reader.last());
+            request.extensions_mut().insert(reader.clone());
             let reply = router.call(request);
             async move { reply.await.map(|reply| reply.map(|body| in_use.until_end_of(body))) }
         });

@@ -110,8 +110,7 @@ impl Dialogue {
                     self.begun = true;
                     consumed.bytes += frame.used;
                     consumed.frames += 1;
-                    let arrival = self.arrivals.first().cloned().unwrap_or_else(|| Arrival::now(now));
-                    self.arrivals.taken(frame.used);
+                    let arrival = self.arrivals.take(frame.used).unwrap_or_else(|| Arrival::now(now));
                     let answer = self.session.take(&frame, arrival, now, &mut self.output);
                     self.waiting.extend(answer);
                 }

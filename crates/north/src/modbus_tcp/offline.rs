@@ -12,15 +12,17 @@ use super::routes::PlantView;
 use super::session::ClientSession;
 use super::{Options, ServerState};
 use crate::NorthState;
-use crate::order::{Arrival, Authority, Connection};
+use crate::order::Authority;
 use crate::plant::SharedPlant;
+use crate::reading::{Reader, Watch};
 
 /// One client of a server without sockets. Time is an argument of [`Offline::receive`].
 #[derive(Debug)]
 pub struct Offline {
     dialogue: Dialogue,
-    /// Over which all comes, once something has.
-    connection: Option<Connection>,
+    watch: Arc<Watch>,
+    /// Since the connection was opened.
+    reader: Option<Reader>,
     /// Input that the dialogue has no room for yet.
     backlog: Vec<u8>,
     closed: bool,
@@ -40,27 +42,51 @@ impl Offline {
             PlantView::new(plant, Arc::default(), None),
         );
         let client = Client::new(peer, None, authority);
-        Offline::of(ClientSession::new(Arc::new(state), Arc::new(view), client))
+        let session = ClientSession::new(Arc::new(state), Arc::new(view), client);
+        Offline::of(session, Watch::in_virtual_time())
     }
 
     /// Another client of the same server, by the `name` in its certificate if it has shown one.
     pub fn beside(&self, peer: SocketAddr, name: Option<&str>, authority: Authority) -> Offline {
-        Offline::of(self.dialogue.session().beside(Client::new(peer, name, authority)))
+        let session = self.dialogue.session().beside(Client::new(peer, name, authority));
+        Offline::of(session, self.watch.clone())
     }
 
-    fn of(session: ClientSession) -> Offline {
+    fn of(session: ClientSession, watch: Arc<Watch>) -> Offline {
         Offline {
             dialogue: Dialogue::new(session),
-            connection: None,
+            watch,
+            reader: None,
             backlog: Vec::new(),
             closed: false,
         }
     }
 
+    /// Shows whether the thread runs that reads what all its clients send. One that was never told that it runs sees no stalls.
+    pub fn watch(&self) -> &Arc<Watch> {
+        &self.watch
+    }
+
     /// Processes `bytes` and returns the answers available so far; requests that wait for the bus are answered by a
-    /// later call, with or without further input. Commands are in the queue of their bus when this returns.
+    /// later call, with or without further input. Commands are in the queue of their bus when this returns. The first call
+    /// opens the connection.
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
+        self.take(bytes, false, now)
+    }
+
+    /// As [`Offline::receive`], from a client that has closed the connection behind `bytes`.
+    pub fn receive_last(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
+        let answers = self.take(bytes, true, now);
+        if let Some(reader) = &self.reader {
+            reader.ended();
+        }
+        answers
+    }
+
+    fn take(&mut self, bytes: &[u8], has_gone: bool, now: Instant) -> Vec<u8> {
         self.backlog.extend_from_slice(bytes);
+        let opens = || Reader::new(self.watch.clone(), now);
+        let reader = self.reader.get_or_insert_with(opens);
         let mut answers = Vec::new();
         loop {
             if self.closed {
@@ -71,16 +97,24 @@ impl Offline {
                 for (place, byte) in space.iter_mut().zip(self.backlog.drain(..count)) {
                     *place = byte;
                 }
-                let connection = self.connection.get_or_insert_with(|| Connection::opened(now));
-                self.dialogue.received(count, Arrival::over(connection.clone(), now));
+                if count > 0 {
+                    reader.came(now, self.backlog.is_empty(), || has_gone);
+                    self.dialogue.received(count, reader.last());
+                }
             }
             self.closed = self.closed || self.dialogue.process(now).1.is_some();
             self.dialogue.collect(now);
             answers.append(&mut self.dialogue.output);
             if self.closed || self.dialogue.is_full() || (self.backlog.is_empty() && !self.dialogue.has_more()) {
-                return answers;
+                break;
             }
         }
+        if self.backlog.is_empty() && !self.dialogue.is_full() {
+            reader.nothing(now, || false);
+        } else {
+            reader.ceased();
+        }
+        answers
     }
 
     /// Whether the input was not Modbus: a server reads no more of it, and closes the connection when the requests

@@ -4,7 +4,6 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use super::Watch;
-use crate::line::since_boot;
 use crate::order::{Arrival, Connection};
 use crate::stalls::Dated;
 
@@ -86,7 +85,7 @@ impl Reader {
     /// connection since.
     pub(crate) fn came(&self, now: Instant, all: bool, has_gone: impl FnOnce() -> bool) {
         let mut state = self.state();
-        let boot = state.waited.then(since_boot);
+        let boot = state.waited.then(|| self.watch.since_boot());
         let dated = match self.watch.turn(now, boot) {
             true => self.watch.date(state.floor, state.waited, now),
             false => Dated {

@@ -31,6 +31,8 @@ const MOST_UNTOLD: usize = 8;
 #[derive(Debug)]
 pub struct Watch {
     base: Instant,
+    /// The time since the machine was started, suspensions included.
+    boot: fn() -> Duration,
     /// One thread does all: what it reads shows that it runs.
     single: bool,
     /// When it ran last, in nanoseconds after `base`; 0 before the watch began: until then nothing is a stall.
@@ -47,9 +49,19 @@ pub struct Watch {
 impl Watch {
     /// For a runtime of one thread, or of several.
     pub fn new(single: bool) -> Arc<Watch> {
+        Watch::by(single, since_boot)
+    }
+
+    /// For readers in virtual time, in which no machine is suspended: see [`Watch::runs`].
+    pub fn in_virtual_time() -> Arc<Watch> {
+        Watch::by(true, Duration::default)
+    }
+
+    fn by(single: bool, boot: fn() -> Duration) -> Arc<Watch> {
         let base = Instant::now();
         Arc::new(Watch {
             base,
+            boot,
             single,
             ran: AtomicU64::new(0),
             boot_ahead: AtomicU64::new(0),
@@ -90,9 +102,19 @@ impl Watch {
             }
             let now = Instant::now();
             beat.ran(now);
-            self.tick(now, since_boot());
+            self.runs(now);
             self.tell();
         }
+    }
+
+    /// The thread runs at `now`, in virtual time. It says so ten times a second while it does.
+    pub fn runs(&self, now: Instant) {
+        self.tick(now, (self.boot)());
+    }
+
+    /// The time since the machine was started.
+    pub(super) fn since_boot(&self) -> Duration {
+        (self.boot)()
     }
 
     fn tick(&self, now: Instant, boot: Duration) {
@@ -143,7 +165,7 @@ impl Watch {
             WORKER_RAN.set(at.max(worker));
         }
         if slept || worker_stood || at.saturating_sub(ran) > unnoticed {
-            let boot = boot.unwrap_or_else(since_boot);
+            let boot = boot.unwrap_or_else(|| self.since_boot());
             self.stood((now, boot), ran, worker_stood.then_some(worker));
         } else if self.single {
             self.ran.fetch_max(at, Ordering::Relaxed);

@@ -31,7 +31,7 @@ pub(super) struct Framing {
     protocol: Protocol,
     frames: Frames,
     arrivals: Arrivals,
-    /// How the first byte of the last message came.
+    /// How the last message came, dated from its first byte.
     arrival: Option<Arrival>,
 }
 
@@ -55,8 +55,7 @@ impl Framing {
     pub(super) fn next(&mut self, now: Instant) -> Option<Said> {
         loop {
             let piece = self.frames.next(None, now)?;
-            self.arrival = self.arrivals.first().cloned();
-            self.arrivals.taken(piece.bytes.len());
+            self.arrival = self.arrivals.take(piece.bytes.len());
             if !self.is_blank(&piece.bytes) {
                 return Some(match ToolRequest::of(self.protocol, &piece.bytes) {
                     Some(request) => Said::Request(request),
@@ -66,7 +65,7 @@ impl Framing {
         }
     }
 
-    /// How the first byte of the tool's last message came.
+    /// How the tool's last message came, dated from its first byte.
     pub(super) fn arrival(&self) -> Option<Arrival> {
         self.arrival.clone()
     }

@@ -275,6 +275,12 @@ impl ProfileDrive {
         self.body.latch.obeys(false);
     }
 
+    /// Somebody else than the bus lets it stand: it does not run by the word of before, though that is read back still.
+    fn stand(&mut self) {
+        self.halt();
+        self.word = 0;
+    }
+
     /// The reference, Hz, with its sign.
     fn reference(&self) -> f64 {
         let hertz = |model: ModelPoint, factor: f64| self.commanded(model).map(|value| value * factor);
@@ -301,8 +307,7 @@ impl ProfileDrive {
     fn give_to_bus(&mut self, on: bool) {
         if self.remote != on {
             (self.remote, self.position) = (on, 0);
-            self.run = None;
-            self.body.latch.obeys(false);
+            self.stand();
         }
     }
 }
@@ -406,7 +411,7 @@ impl Model for ProfileDrive {
                 (self.run, self.reverse, self.coasts) = (Some(command.reverse), command.reverse, false);
                 self.position = self.steps().saturating_sub(1);
             }
-            false => self.halt(),
+            false => self.stand(),
         }
         let percent = f64::from(command.reference) / 100.0;
         self.set_reference(percent);

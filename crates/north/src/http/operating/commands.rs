@@ -24,6 +24,7 @@ use crate::drive::{ModelPoint, Point, PointIndex, Profile, RESTART_COMMUNICATION
 use crate::order::{Answer, Arrival, Origin, Outcome, Refusal, SourceKind};
 use crate::plant::{DriveHandle, Placed, Plant, Shown};
 use crate::process_image::Access;
+use crate::reading::Reader;
 
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct CommandReply {
@@ -92,28 +93,39 @@ fn status(outcome: &Outcome) -> StatusCode {
     }
 }
 
-/// How the head of a request came: passwords are compared, and the body is waited for, after that.
-pub(in crate::http) struct Asked(Arrival);
+/// How the head of a request came, and who reads its body: passwords are compared, and the body is waited for, after that.
+pub(in crate::http) struct Asked(Arrival, Option<Arc<Reader>>);
+
+impl Asked {
+    /// How the request came, once its body is read.
+    fn complete(self) -> Arrival {
+        match self.1 {
+            Some(reader) => self.0.completed(&reader.last()),
+            None => self.0,
+        }
+    }
+}
 
 impl<S: Sync> FromRequestParts<S> for Asked {
     type Rejection = Infallible;
 
     async fn from_request_parts(head: &mut request::Parts, _: &S) -> Result<Asked, Infallible> {
         let arrival = head.extensions.get().cloned();
-        Ok(Asked(arrival.unwrap_or_else(|| Arrival::now(Instant::now()))))
+        let arrival = arrival.unwrap_or_else(|| Arrival::now(Instant::now()));
+        Ok(Asked(arrival, head.extensions.get().cloned()))
     }
 }
 
 /// `POST /api/v1/drives/{name}/commands`
 pub(in crate::http) async fn command(
-    Asked(arrival): Asked,
+    asked: Asked,
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
     // Judged once more where the command is placed, so that a refusal is audited.
     Commander(operator): Commander,
     Payload(payload): Payload,
 ) -> Replied<CommandReply> {
-    let plant = app.plant.load_full();
+    let (plant, arrival) = (app.plant.load_full(), asked.complete());
     if let Some(drive) = restarts(&payload).then(|| plant.drive(&name)).flatten()
         && drive.image.spec.profile.counts_messages
     {

@@ -1,0 +1,727 @@
+//! Worlds in which threads stand still, names and units move to other machines, and drives restart between two polls.
+//!
+//! The clients are bytes on connections that somebody has to read: what they send while the reading thread stands still waits,
+//! and they may close the connection before it is read. A shadow model (`promised`) knows what each of them wanted of which
+//! machine, and when. Every run that a drive is told, and every motor that starts, must rest on an order that its client
+//! still wanted.
+
+mod promised;
+
+use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use arc_swap::ArcSwap;
+use drivegate_world::bus::core::Action;
+use drivegate_world::codec::Protocol;
+use drivegate_world::drive::profile::Profiles;
+use drivegate_world::drive::{ModelPoint, Value};
+use drivegate_world::event::Events;
+use drivegate_world::north::modbus_tcp::Offline;
+use drivegate_world::order::{Authority, Order, Origin, SourceKind, WriteStats};
+use drivegate_world::plant::{OrderRequest, Placed, Plant, SharedPlant, follow_names};
+use drivegate_world::sim::random::Random;
+use drivegate_world::sim::simulated_drive::{Command, ModelOptions};
+use drivegate_world::stalls::{Heartbeat, TICK};
+
+use self::promised::{Does, Promised};
+use super::bus::{Asked, Parts, Seen, WorldBus};
+use super::clients::{Servers, answers, write_frame};
+use super::history::History;
+use super::rig::line;
+use super::scenario::{Habit, Line};
+
+/// Seeds of every test run.
+const FIXED: u64 = 240;
+/// A thread shows at least this often that it runs.
+const BEAT: Duration = Duration::from_millis(100);
+/// Longest time of a request and its reply on the slowest wire.
+const ON_THE_WIRE: Duration = Duration::from_millis(250);
+/// Time in which everything is well again.
+const HEALED: Duration = Duration::from_secs(20);
+
+/// A connection of a client, as the system keeps it.
+struct Connection {
+    /// Which of all it is.
+    number: usize,
+    offline: Offline,
+    /// The gateway has accepted it.
+    open: bool,
+    /// Bytes that nobody has read yet, each with the order whose first or last byte is among them.
+    inbox: VecDeque<(Instant, Vec<u8>, Option<usize>)>,
+    /// The client has closed it.
+    closed: Option<Instant>,
+    /// The rest of a request that is sent later.
+    rest: Option<(Instant, Vec<u8>, usize)>,
+    transactions: Vec<(u16, usize)>,
+    next: Instant,
+}
+
+/// Whoever stands still, and until when.
+#[derive(Debug, Clone, Copy, Default)]
+struct Standing {
+    readers: Option<Instant>,
+    bus: Option<Instant>,
+}
+
+struct World {
+    seed: u64,
+    dice: Random,
+    began: Instant,
+    now: Instant,
+    /// One client, and nothing but hiccups: then no order may be lost.
+    healthy: bool,
+    bus: WorldBus,
+    plant: SharedPlant,
+    servers: Servers,
+    beat: Heartbeat,
+    next_tick: Instant,
+    bus_ran: Instant,
+    connections: Vec<Connection>,
+    /// How many connections there were.
+    clients: usize,
+    /// The last transaction.
+    number: u16,
+    placed: Vec<Placed>,
+    standing: Standing,
+    next_stall: Instant,
+    next_incident: Instant,
+    reloads: bool,
+    wants_reload: bool,
+    promised: Promised,
+    history: History,
+    calm: bool,
+}
+
+fn families() -> Vec<String> {
+    let built_in = Profiles::built_in();
+    let can = |profile: &&Arc<drivegate_world::drive::Profile>| {
+        profile.protocols.contains(&Protocol::ModbusRtu)
+            && profile.run_place().is_some()
+            && ModelOptions::of_profile(profile).is_some()
+    };
+    built_in
+        .iter()
+        .filter(can)
+        .map(|profile| profile.name.clone())
+        .collect()
+}
+
+impl World {
+    fn new(seed: u64) -> World {
+        let mut dice = Random::new(seed);
+        let all = families();
+        let family = all[seed as usize % all.len()].clone().leak();
+        let drives = if dice.chance(0.6) { 2 } else { dice.within(1..=3) as u8 };
+        let baud = [9_600, 19_200, 38_400, 115_200][dice.within(0..=3) as usize];
+        let line = Line {
+            spec: |spec| {
+                spec.frequency_range = spec
+                    .profile
+                    .point_index("maximum_frequency")
+                    .is_none()
+                    .then_some(0.0..=60.0)
+            },
+            // Not all of its time, so that slow polls come in time, too.
+            cycle: Duration::from_millis(200),
+            ..line(family, Protocol::ModbusRtu, baud, drives)
+        };
+        let now = Instant::now();
+        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
+        let bus = WorldBus::new(0, &line, Parts::of(0, &line, seed), &events, &writes, now);
+        let beat = events.pauses().reader(now);
+        let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(Plant {
+            gateway: "world".to_string(),
+            stale_after: Duration::from_secs(1),
+            buses: vec![bus.handle.clone()],
+            events,
+            writes,
+        }));
+        let healthy = dice.chance(0.25);
+        let mut world = World {
+            seed,
+            healthy,
+            began: now,
+            now,
+            servers: Servers::new(plant.clone()),
+            plant,
+            beat,
+            next_tick: now,
+            bus_ran: now,
+            connections: Vec::new(),
+            clients: 0,
+            number: 0,
+            placed: Vec::new(),
+            standing: Standing::default(),
+            next_stall: now + Duration::from_secs(3),
+            next_incident: now + Duration::from_secs(4),
+            reloads: !healthy && dice.chance(0.5),
+            wants_reload: false,
+            promised: Promised::new(drives),
+            history: History::default(),
+            calm: false,
+            bus,
+            dice,
+        };
+        let clients = if healthy { 1 } else { world.dice.within(1..=3) };
+        (0..clients).for_each(|_| world.connect());
+        world
+    }
+
+    fn run(mut self) {
+        if let Err(cause) = catch_unwind(AssertUnwindSafe(|| self.live())) {
+            println!("{:#?}", self.bus.line.family);
+            println!("{}", self.history.take());
+            println!(
+                "FAILED: seed {} at {:?} (STALLS_SEED={})",
+                self.seed,
+                self.now - self.began,
+                self.seed
+            );
+            resume_unwind(cause)
+        }
+    }
+
+    fn live(&mut self) {
+        let end = self.began + Duration::from_millis(self.dice.within(20_000..=60_000));
+        while self.now < end {
+            self.step();
+        }
+        self.heal();
+    }
+
+    /// No more faults: stops are carried out, and everything is good.
+    fn heal(&mut self) {
+        self.calm = true;
+        let quiet = self
+            .standing
+            .readers
+            .max(self.standing.bus)
+            .unwrap_or(self.now)
+            .max(self.now);
+        self.run_until(quiet + Duration::from_secs(2));
+        self.connect();
+        let last = self.connections.len() - 1;
+        let stops: Vec<usize> = (1..=self.bus.line.drives)
+            .map(|unit| self.write(last, unit, 0x8100, 0, false))
+            .collect();
+        self.run_until(self.now + HEALED);
+        for id in stops {
+            let answer = self.promised.orders[id].answer;
+            assert!(
+                matches!(answer, Some((_, None))),
+                "the stop {id} behind it all is answered {answer:?}"
+            );
+        }
+        let plant = self.plant.load();
+        for drive in plant.drives() {
+            let reading = drive.reading(self.now);
+            let running = reading.model(ModelPoint::Running);
+            assert_eq!(
+                running.good(),
+                Some(Value::Bool(false)),
+                "{}: {running:?}",
+                drive.image.spec.name
+            );
+        }
+    }
+
+    fn run_until(&mut self, until: Instant) {
+        while self.now < until {
+            self.step();
+        }
+    }
+
+    fn note(&mut self, words: impl FnOnce() -> String + 'static) {
+        self.history.note(self.now - self.began, words);
+    }
+
+    fn chance(&mut self, share: f64) -> bool {
+        self.dice.chance(share)
+    }
+
+    fn ms(&mut self, range: std::ops::RangeInclusive<u64>) -> Duration {
+        Duration::from_millis(self.dice.within(range))
+    }
+
+    /// The next thing that happens.
+    fn step(&mut self) {
+        self.now = self.now.max(self.next());
+        let now = self.now;
+        for standing in [&mut self.standing.readers, &mut self.standing.bus] {
+            *standing = standing.filter(|until| *until > now);
+        }
+        let mut seen = Vec::new();
+        self.bus.wire_runs(now, &mut seen);
+        for what in seen {
+            self.check_line(&what);
+        }
+        // Which of two threads runs first behind a pause of both, nobody knows.
+        let bus_first = self.chance(0.5);
+        if bus_first {
+            self.run_bus();
+        }
+        self.run_readers();
+        self.run_bus();
+        self.check_motors();
+        self.incidents();
+        for index in 0..self.connections.len() {
+            self.act(index);
+        }
+    }
+
+    fn next(&self) -> Instant {
+        let bus = self
+            .bus
+            .wake_at()
+            .min(self.bus_ran + BEAT)
+            .max(self.standing.bus.unwrap_or(self.now));
+        let inbox = self
+            .connections
+            .iter()
+            .filter_map(|connection| connection.inbox.front().map(|(at, ..)| *at));
+        let reads = inbox
+            .chain([self.next_tick])
+            .min()
+            .unwrap_or(self.now)
+            .max(self.standing.readers.unwrap_or(self.now));
+        let acts = |connection: &&Connection| connection.open && connection.closed.is_none() && !self.calm;
+        let clients = self.connections.iter().filter(acts).map(|connection| connection.next);
+        let rests = self
+            .connections
+            .iter()
+            .filter_map(|connection| connection.rest.as_ref().map(|(at, ..)| *at));
+        // What is there already waits for the bus.
+        let wire = self.bus.wire_wakes().filter(|at| *at > self.now);
+        clients
+            .chain(rests)
+            .chain(wire)
+            .chain([bus, reads, self.next_stall, self.next_incident])
+            .min()
+            .unwrap_or(bus)
+    }
+
+    /// The thread of the bus, as long as it runs.
+    fn run_bus(&mut self) {
+        let now = self.now;
+        if self.standing.bus.is_some() || self.bus.wake_at().min(self.bus_ran + BEAT) > now {
+            return;
+        }
+        self.bus_ran = now;
+        let (mut seen, mut stands) = (Vec::new(), false);
+        let stood = self.bus.core.ran(now, Duration::ZERO);
+        self.bus.deliver(now, stood, &mut seen);
+        while self.bus.open {
+            match self.bus.core.poll(now) {
+                // It may stand still just before it sends.
+                Action::Send if !self.calm && !self.healthy && self.dice.chance(0.000_5) => {
+                    stands = true;
+                    break;
+                }
+                Action::Send => self.bus.send(now, &mut seen),
+                Action::Wait { until, commands, .. } => {
+                    self.bus.waits(until, commands, &mut seen);
+                    break;
+                }
+            }
+        }
+        if stands {
+            let time = self.ms(100..=4_000);
+            self.standing.bus = Some(now + time);
+            self.note(move || format!("the bus stands still for {time:?} before it sends"));
+        }
+        for what in seen {
+            self.check_line(&what);
+        }
+    }
+
+    fn check_line(&mut self, seen: &Seen) {
+        let (now, began) = (self.now, self.began);
+        match seen {
+            Seen::Sent(asked) if !asked.is_poll => {
+                let (drive, pdu) = (asked.drive, asked.pdu.clone());
+                self.note(move || format!("sent to place {drive}: {pdu:?}"));
+            }
+            Seen::Acted(asked) => self.check_acted(asked),
+            Seen::Over(asked) if asked.is_poll => {
+                let image = self
+                    .bus
+                    .handle
+                    .image
+                    .drives
+                    .get(drivegate_world::drive::DriveIndex::new(asked.drive));
+                let read = image
+                    .zip(first_word(asked))
+                    .and_then(|(image, (table, at))| image.snapshot().read_at(table, at));
+                if let Some(read) = read.filter(|read| asked.last_read != Some(*read)) {
+                    let latest = asked.at + self.bus.line.response_timeout + ON_THE_WIRE;
+                    assert!(
+                        read <= now.min(latest),
+                        "a value is dated {:?}, and was asked for at {:?}; it is {:?} now",
+                        read - began,
+                        asked.at - began,
+                        now - began
+                    );
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// A drive has carried a request out.
+    fn check_acted(&mut self, asked: &Asked) {
+        if !asked.pdu.is_write() {
+            return;
+        }
+        self.promised.told(asked.acted, asked.at);
+    }
+
+    /// No motor starts by itself.
+    fn check_motors(&mut self) {
+        let (now, sim) = (self.now, self.bus.sim(self.now));
+        for machine in 1..=self.bus.line.drives {
+            let drive = self.bus.wire.slaves().drive(machine).unwrap();
+            drive.advance(sim);
+            let running = drive.state().running;
+            if self.promised.runs(machine, running) {
+                self.note(move || {
+                    format!(
+                        "the motor of drive {machine} {}",
+                        if running { "starts" } else { "stands" }
+                    )
+                });
+                self.promised.must_want_start(machine, now);
+            }
+        }
+    }
+
+    /// The thread that reads the connections, as long as it runs.
+    fn run_readers(&mut self) {
+        let now = self.now;
+        if self.standing.readers.is_some() {
+            return;
+        }
+        let ticks_first = self.chance(0.5);
+        if ticks_first {
+            self.tick();
+        }
+        for index in 0..self.connections.len() {
+            self.read(index);
+        }
+        self.tick();
+        for index in 0..self.connections.len() {
+            let connection = &mut self.connections[index];
+            connection.open = true;
+            let answered = connection.offline.receive(&[], now);
+            self.answered(index, &answered);
+        }
+        self.connections.retain(|connection| {
+            connection
+                .closed
+                .is_none_or(|closed| closed + Duration::from_secs(5) > now)
+        });
+        self.placed.retain_mut(|placed| placed.answer().is_none());
+    }
+
+    fn tick(&mut self) {
+        if self.next_tick <= self.now {
+            self.next_tick = self.now + TICK;
+            self.beat.ran(self.now);
+            self.servers.watch().runs(self.now);
+        }
+    }
+
+    /// Reads what a client has sent.
+    fn read(&mut self, index: usize) {
+        let now = self.now;
+        let connection = &mut self.connections[index];
+        let is_there = connection.inbox.front().is_some_and(|(at, ..)| *at <= now);
+        if !is_there {
+            return;
+        }
+        let mut bytes = Vec::new();
+        for (_, of, order) in connection.inbox.drain(..) {
+            bytes.extend(of);
+            if let Some(id) = order {
+                self.promised.read(id, now);
+            }
+        }
+        let answered = match connection.closed {
+            Some(_) => connection.offline.receive_last(&bytes, now),
+            None => connection.offline.receive(&bytes, now),
+        };
+        self.bus.command_came(now);
+        self.answered(index, &answered);
+    }
+
+    fn answered(&mut self, index: usize, bytes: &[u8]) {
+        for (transaction, exception) in answers(bytes) {
+            let open = &mut self.connections[index].transactions;
+            let place = open
+                .iter()
+                .position(|(number, _)| *number == transaction)
+                .expect("an answer to a request");
+            let (_, id) = open.remove(place);
+            self.note(move || format!("order {id} is answered {exception:02X?}"));
+            self.promised.answered(id, self.now, exception);
+            let order = &self.promised.orders[id];
+            assert!(
+                !self.healthy || exception.is_none(),
+                "order {id} of a healthy client was lost in a hiccup: {exception:02X?}, {order:?}"
+            );
+        }
+    }
+
+    fn connect(&mut self) {
+        let now = self.now;
+        self.clients += 1;
+        self.connections.push(Connection {
+            number: self.clients,
+            offline: self.servers.connection(Habit::ModbusTcp, self.clients),
+            open: false,
+            inbox: VecDeque::new(),
+            closed: None,
+            rest: None,
+            transactions: Vec::new(),
+            next: now + Duration::from_millis(1_500),
+        });
+    }
+
+    /// What a client does.
+    fn act(&mut self, index: usize) {
+        let now = self.now;
+        if let Some((_, bytes, id)) = self.connections[index].rest.take_if(|(at, ..)| *at <= now) {
+            self.promised.complete(id, now);
+            self.connections[index].inbox.push_back((now, bytes, Some(id)));
+        }
+        let connection = &self.connections[index];
+        if self.calm || !connection.open || connection.next > now || connection.closed.is_some() {
+            return;
+        }
+        let busy = connection.rest.is_some() || connection.transactions.len() > 3;
+        let waits = self.healthy && !connection.transactions.is_empty();
+        let pause = if self.chance(0.4) {
+            self.ms(1..=60)
+        } else {
+            self.ms(50..=1_500)
+        };
+        self.connections[index].next = now + pause;
+        if busy || waits {
+            return;
+        }
+        if !self.healthy && self.chance(0.04) {
+            return self.hang_up(index);
+        }
+        if !self.healthy && self.chance(0.1) {
+            return self.by_name();
+        }
+        let unit = self.dice.within(1..=u64::from(self.bus.line.drives)) as u8;
+        let in_parts = !self.healthy && self.chance(0.15);
+        match self.dice.within(0..=9) {
+            0..=3 => self.write(index, unit, 0x8100, 1, in_parts),
+            4..=6 => self.write(index, unit, 0x8100, 0, in_parts),
+            7 if !self.healthy => {
+                self.write(index, unit, 0x8100, 1, false);
+                self.write(index, unit, 0x8100, 0, false)
+            }
+            8 if !self.healthy => self.write(index, unit, 0x8100, 4, in_parts),
+            _ => self.write(index, unit, 0x8101, 2_000, in_parts),
+        };
+    }
+
+    /// A request over a connection; the rest of it may come later. The number of its order.
+    fn write(&mut self, index: usize, unit: u8, register: u16, value: u16, in_parts: bool) -> usize {
+        let now = self.now;
+        let does = match (register, value) {
+            (0x8100, 0) => Does::Stop,
+            (0x8100, value) if value & 1 == 1 => Does::Run,
+            _ => Does::Other,
+        };
+        let drives = self.bus.line.drives;
+        let machine = if self.bus.line.swapped { drives + 1 - unit } else { unit };
+        let id = self.promised.wants(self.connections[index].number, machine, does, now);
+        self.number = self.number.wrapping_add(1);
+        let frame = write_frame(self.number, unit, register, value);
+        let connection = &mut self.connections[index];
+        connection.transactions.push((self.number, id));
+        if in_parts {
+            let at = self.dice.within(1..=frame.len() as u64 - 1) as usize;
+            let later = now + Duration::from_millis(self.dice.within(1..=1_200));
+            let connection = &mut self.connections[index];
+            connection.inbox.push_back((now, frame[..at].to_vec(), None));
+            connection.rest = Some((later, frame[at..].to_vec(), id));
+            self.wants_reload |= self.reloads && self.dice.chance(0.6);
+        } else {
+            connection.inbox.push_back((now, frame, Some(id)));
+        }
+        self.note(move || {
+            format!("order {id}: {does:?} of machine {machine} by 0x{register:04X} = {value} of unit {unit}")
+        });
+        id
+    }
+
+    /// The client closes its connection, and another one comes.
+    fn hang_up(&mut self, index: usize) {
+        let connection = &mut self.connections[index];
+        connection.closed = Some(self.now);
+        if let Some((_, _, id)) = connection.rest.take() {
+            self.promised.never_sent(id);
+        }
+        for (_, id) in &connection.transactions {
+            self.promised.closed(*id, self.now);
+        }
+        self.note(move || format!("the client of connection {index} hangs up"));
+        self.connect();
+    }
+
+    /// An order by name that starts nothing.
+    fn by_name(&mut self) {
+        let now = self.now;
+        let name = format!("d0-{}", self.dice.within(1..=u64::from(self.bus.line.drives)));
+        let (point, value) = match self.dice.within(0..=2) {
+            0 => (ModelPoint::Reverse, Value::Bool(self.dice.chance(0.5))),
+            1 => (ModelPoint::FaultReset, Value::Bool(true)),
+            _ => (
+                ModelPoint::SpeedReference,
+                Value::Number(self.dice.within(5..=60) as f64),
+            ),
+        };
+        // A program of this machine stands still with the whole process, or not at all.
+        let Some(index) = self
+            .bus
+            .profile
+            .model_index(point)
+            .filter(|_| self.standing.readers.is_none())
+        else {
+            return;
+        };
+        let origin = Origin::new(SourceKind::CommandLine, "panel");
+        let drive = self.plant.load().drive(&name).unwrap();
+        let order = Order::Points(vec![(index, value)]);
+        self.placed
+            .push(drive.place(OrderRequest::new(order, origin, Authority::Write), now));
+        self.bus.command_came(now);
+        self.note(move || format!("{} = {value} of {name}", point.name()));
+    }
+
+    /// What befalls threads, drives and names.
+    fn incidents(&mut self) {
+        let now = self.now;
+        if self.calm {
+            (self.next_stall, self.next_incident) = (now + HEALED, now + HEALED);
+            return;
+        }
+        if self.next_stall <= now {
+            self.stall();
+        }
+        if self.next_incident <= now {
+            self.next_incident = now + self.ms(300..=5_000);
+            if !self.healthy {
+                self.incident();
+            }
+        }
+        if self.wants_reload && self.standing.bus.is_none() && self.bus.core.asked().is_none() {
+            self.wants_reload = false;
+            self.swap();
+        }
+    }
+
+    fn stall(&mut self) {
+        let now = self.now;
+        let time = match (self.healthy, self.dice.within(0..=9)) {
+            (true, _) => self.ms(20..=290),
+            (_, 0..=3) => self.ms(20..=300),
+            (_, 4..=6) => self.ms(300..=1_500),
+            (_, 7 | 8) => self.ms(1_000..=8_000),
+            _ => self.ms(8_000..=60_000),
+        };
+        let until = Some(now + time);
+        let who = match self.dice.within(0..=3) {
+            0 => {
+                self.standing.readers = until;
+                "the readers"
+            }
+            1 => {
+                self.standing.bus = self.standing.bus.max(until);
+                "the bus"
+            }
+            _ => {
+                // Threads do not go on at the same moment.
+                self.standing.readers = until.map(|until| until + Duration::from_millis(self.dice.within(0..=4)));
+                self.standing.bus = self.standing.bus.max(until);
+                "the process"
+            }
+        };
+        self.next_stall = now + time + self.ms(500..=6_000);
+        self.note(move || format!("{who} stands still for {time:?}"));
+    }
+
+    fn incident(&mut self) {
+        let machine = self.dice.within(1..=u64::from(self.bus.line.drives)) as u8;
+        let sim = self.bus.sim(self.now);
+        let kind = self.dice.within(0..=3);
+        let drive = self.bus.wire.slaves().drive(machine).unwrap();
+        drive.advance(sim);
+        let what = match kind {
+            0 => {
+                drive.power_off();
+                drive.power_on(sim);
+                "restarts"
+            }
+            1 | 2 => {
+                let reference = 0;
+                drive.command(Command {
+                    run: false,
+                    reverse: false,
+                    reference,
+                });
+                "is stopped by somebody else"
+            }
+            _ => {
+                self.wants_reload = self.reloads;
+                return;
+            }
+        };
+        drive.advance(sim);
+        self.promised.runs(machine, drive.state().running);
+        self.note(move || format!("drive {machine} {what}"));
+    }
+
+    /// A reload gives the names and units of the drives to the machines in the opposite order.
+    fn swap(&mut self) {
+        let now = self.now;
+        self.bus.line.swapped = !self.bus.line.swapped;
+        let plant = self.plant.load_full();
+        let before = self.bus.handle.clone();
+        self.bus.restart(0, &plant.events, &plant.writes, now);
+        follow_names(&[before], &[self.bus.handle.clone()], now);
+        self.plant.store(Arc::new(Plant {
+            gateway: plant.gateway.clone(),
+            stale_after: plant.stale_after,
+            buses: vec![self.bus.handle.clone()],
+            events: plant.events.clone(),
+            writes: plant.writes.clone(),
+        }));
+        self.note(|| "a reload swaps names and units".to_string());
+    }
+}
+
+/// The table and the address of the first word of a read.
+fn first_word(asked: &Asked) -> Option<(drivegate_world::codec::Table, u16)> {
+    match asked.pdu {
+        drivegate_world::codec::RequestPdu::Read { table, start, .. } => Some((table, start)),
+        _ => None,
+    }
+}
+
+#[test]
+fn no_motor_starts_that_nobody_wants_to_run() {
+    let seeds = match super::number("STALLS_SEED") {
+        Some(seed) => seed..seed + 1,
+        None => 0..super::number("STALLS_SEEDS").unwrap_or(FIXED),
+    };
+    for seed in seeds {
+        World::new(seed).run();
+    }
+}

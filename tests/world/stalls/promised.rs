@@ -1,0 +1,175 @@
+//! What the clients of a world wanted of which machine, and what must follow from that.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+/// An order is not begun later than this after it was sent (2 s), and what it does may take several exchanges.
+const WANTED: Duration = Duration::from_millis(3_500);
+/// A client that closed its connection this long before it was read has given up; sooner, nobody can know.
+const UNNOTICED: Duration = Duration::from_millis(160);
+/// A longer stall is a pause: what was sent before its end starts nothing.
+const PAUSE: Duration = Duration::from_millis(1_010);
+
+/// A motor starts within this time after the write that makes it run was sent.
+const FOLLOWS: Duration = Duration::from_millis(400);
+
+/// What an order does to a motor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Does {
+    Run,
+    Stop,
+    /// It starts nothing.
+    Other,
+}
+
+#[derive(Debug, Clone, Copy)]
+pub struct Order {
+    pub connection: usize,
+    pub machine: u8,
+    pub does: Does,
+    /// Its first byte was sent.
+    pub sent: Instant,
+    /// Its last byte was sent.
+    pub complete: Instant,
+    /// Its last byte was read.
+    pub read: Option<Instant>,
+    /// Its client closed the connection before that.
+    pub closed: Option<Instant>,
+    /// With the exception, if it was one.
+    pub answer: Option<(Instant, Option<u8>)>,
+}
+
+/// What all clients wanted, and what the drives did.
+pub struct Promised {
+    pub orders: Vec<Order>,
+    /// When each drive was sent the writes that it carried out.
+    told: BTreeMap<u8, Vec<Instant>>,
+    running: Vec<bool>,
+}
+
+impl Promised {
+    pub fn new(drives: u8) -> Promised {
+        Promised {
+            orders: Vec::new(),
+            told: BTreeMap::new(),
+            running: vec![false; usize::from(drives)],
+        }
+    }
+
+    /// A client begins to send an order.
+    pub fn wants(&mut self, connection: usize, machine: u8, does: Does, now: Instant) -> usize {
+        self.orders.push(Order {
+            connection,
+            machine,
+            does,
+            sent: now,
+            complete: now,
+            read: None,
+            closed: None,
+            answer: None,
+        });
+        self.orders.len() - 1
+    }
+
+    /// The last of it is sent.
+    pub fn complete(&mut self, id: usize, now: Instant) {
+        self.orders[id].complete = now;
+    }
+
+    /// The gateway has read all of it.
+    pub fn read(&mut self, id: usize, now: Instant) {
+        self.orders[id].read = Some(now);
+    }
+
+    /// Its client has closed the connection.
+    pub fn closed(&mut self, id: usize, now: Instant) {
+        self.orders[id].closed.get_or_insert(now);
+    }
+
+    /// The rest of it is never sent.
+    pub fn never_sent(&mut self, id: usize) {
+        self.orders[id].does = Does::Other;
+    }
+
+    pub fn answered(&mut self, id: usize, now: Instant, exception: Option<u8>) {
+        assert!(self.orders[id].answer.is_none(), "order {id} was answered twice");
+        self.orders[id].answer = Some((now, exception));
+    }
+
+    /// The drive has carried out a write that was sent at `at`.
+    pub fn told(&mut self, machine: u8, at: Instant) {
+        self.told.entry(machine).or_default().push(at);
+    }
+
+    /// Whether its motor started or ended just now.
+    pub fn runs(&mut self, machine: u8, running: bool) -> bool {
+        std::mem::replace(&mut self.running[usize::from(machine) - 1], running) != running
+    }
+
+    /// If the motor has started: by a write that some client wanted when it was sent.
+    pub fn must_want_start(&self, machine: u8, now: Instant) {
+        let told = self.told.get(&machine).into_iter().flatten().rev();
+        // The motor follows its drive by an update of it or two.
+        let told: Vec<Instant> = told.take_while(|at| now - **at < FOLLOWS).copied().collect();
+        if !self.running[usize::from(machine) - 1] || told.iter().any(|at| self.is_wanted(machine, *at)) {
+            return;
+        }
+        let at = told.first().copied().unwrap_or(now);
+        let runs = self
+            .orders
+            .iter()
+            .enumerate()
+            .rev()
+            .filter(|(_, order)| order.does == Does::Run);
+        let why = runs.filter_map(|(id, order)| {
+            let not = self.unwanted(id, order, machine, at)?;
+            Some(format!("order {id} {not}: {order:?}"))
+        });
+        let why: Vec<String> = why.take(6).collect();
+        panic!(
+            "the motor of machine {machine} started, which nobody wants:\n{}",
+            why.join("\n")
+        );
+    }
+
+    fn is_wanted(&self, machine: u8, at: Instant) -> bool {
+        let mut orders = self.orders.iter().enumerate().rev();
+        orders.any(|(id, order)| order.does == Does::Run && self.unwanted(id, order, machine, at).is_none())
+    }
+
+    /// Why the order cannot be the cause of a run of that machine that was sent at `at`.
+    fn unwanted(&self, id: usize, order: &Order, machine: u8, at: Instant) -> Option<String> {
+        let Some(read) = order.read.filter(|read| *read <= at) else {
+            return Some("was not read yet".to_string());
+        };
+        if order.machine != machine {
+            return Some("means another machine".to_string());
+        }
+        if let Some((answered, exception)) = order.answer.filter(|(answered, _)| *answered < at) {
+            return Some(format!("was answered {exception:02X?} {:?} before", at - answered));
+        }
+        if at - order.sent > WANTED {
+            return Some(format!("was sent {:?} before", at - order.sent));
+        }
+        let waited = read - order.complete;
+        if order.closed.is_some_and(|closed| closed <= read) && waited > UNNOTICED {
+            return Some("is of a client that has given up".to_string());
+        }
+        if waited > PAUSE {
+            return Some(format!("lay unread for {waited:?}"));
+        }
+        let stops = self.orders.iter().enumerate();
+        let mut stops = stops.filter(|(_, stop)| stop.does == Does::Stop && stop.machine == machine);
+        let stopped = stops.find(|(place, stop)| {
+            let later = if stop.connection == order.connection {
+                *place > id
+            } else {
+                // A hiccup that is not noticed orders nothing across connections.
+                let since = if waited > UNNOTICED { order.sent } else { read };
+                stop.read.is_some_and(|stopped| stopped > since)
+            };
+            later && stop.read.is_some_and(|read| read <= at)
+        });
+        stopped.map(|(place, _)| format!("was stopped by order {place}"))
+    }
+}
