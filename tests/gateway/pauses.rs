@@ -178,9 +178,9 @@ struct Client {
 }
 
 impl Client {
-    /// Sends a run command, 1 or 0, and does not wait.
-    fn gives(&mut self, run: u16) {
-        let bytes = match self.how {
+    /// A run command, 1 or 0.
+    fn command(&self, run: u16) -> Vec<u8> {
+        match self.how {
             How::Modbus => vec![0, run as u8, 0, 0, 0, 6, 1, 6, 0x81, 0x00, 0, run as u8],
             How::Slot => {
                 let mut frame = Vec::new();
@@ -196,7 +196,12 @@ impl Client {
                 )
                 .into_bytes()
             }
-        };
+        }
+    }
+
+    /// Sends a run command, 1 or 0, and does not wait.
+    fn gives(&mut self, run: u16) {
+        let bytes = self.command(run);
         self.stream.write_all(&bytes).unwrap();
     }
 
@@ -267,6 +272,29 @@ fn a_client_that_gave_up_starts_nothing() {
     assert!((87.0..95.0).contains(&total("drivegate_paused_seconds_total ")));
     let (_, events) = get(plant.site.http, "/api/v1/events/log?limit=100").unwrap();
     assert_eq!(events.matches("\"paused\"").count(), 18, "{events}");
+}
+
+/// Nor does an order that was begun before the pause, and completed in it.
+#[test]
+fn what_is_completed_in_a_pause_starts_nothing() {
+    let plant = Plant::new();
+    let by: [(&str, Opens); 3] = [
+        ("Modbus TCP", Plant::modbus),
+        ("a slot", Plant::slot),
+        ("HTTP", Plant::http),
+    ];
+    for (name, open) in by {
+        let mut client = open(&plant);
+        let bytes = client.command(1);
+        // Of HTTP the head is complete.
+        let (begin, rest) = bytes.split_at(bytes.len() - 3);
+        client.stream.write_all(begin).unwrap();
+        std::thread::sleep(100 * MS);
+        plant.stands(Duration::from_millis(1500), || client.stream.write_all(rest).unwrap());
+        assert!(client.answer().is_err(), "{name}: it is refused");
+        assert!(!plant.runs(), "{name}");
+        assert!(client.says(0), "{name}: a stop passes");
+    }
 }
 
 /// Two clients in one pause: the one that stops wins, in whatever sequence they are read; of one client its own order counts.

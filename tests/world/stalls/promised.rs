@@ -6,12 +6,15 @@ use std::time::{Duration, Instant};
 /// An order is not begun later than this after it was sent (2 s), and what it does may take several exchanges.
 const WANTED: Duration = Duration::from_millis(3_500);
 /// A client that closed its connection this long before it was read has given up; sooner, nobody can know.
-const UNNOTICED: Duration = Duration::from_millis(160);
+pub const UNNOTICED: Duration = Duration::from_millis(160);
 /// A longer stall is a pause: what was sent before its end starts nothing.
 const PAUSE: Duration = Duration::from_millis(1_010);
 
 /// A motor starts within this time after the write that makes it run was sent.
 const FOLLOWS: Duration = Duration::from_millis(400);
+
+/// Between the reading that a write rests on and the write there is one exchange.
+const LOOKED: Duration = Duration::from_millis(60);
 
 /// What an order does to a motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,6 +48,8 @@ pub struct Promised {
     /// When each drive was sent the writes that it carried out.
     told: BTreeMap<u8, Vec<Instant>>,
     running: Vec<bool>,
+    /// When each drive was last stopped by something else than the line.
+    befell: BTreeMap<u8, Instant>,
 }
 
 impl Promised {
@@ -53,6 +58,7 @@ impl Promised {
             orders: Vec::new(),
             told: BTreeMap::new(),
             running: vec![false; usize::from(drives)],
+            befell: BTreeMap::new(),
         }
     }
 
@@ -101,6 +107,11 @@ impl Promised {
         self.told.entry(machine).or_default().push(at);
     }
 
+    /// The drive was stopped by something else than the line.
+    pub fn befell(&mut self, machine: u8, now: Instant) {
+        self.befell.insert(machine, now);
+    }
+
     /// Whether its motor started or ended just now.
     pub fn runs(&mut self, machine: u8, running: bool) -> bool {
         std::mem::replace(&mut self.running[usize::from(machine) - 1], running) != running
@@ -115,6 +126,14 @@ impl Promised {
             return;
         }
         let at = told.first().copied().unwrap_or(now);
+        // What was read just before says that it runs: the word that keeps its run bit is on its way.
+        if self
+            .befell
+            .get(&machine)
+            .is_some_and(|befell| at.saturating_duration_since(*befell) < LOOKED)
+        {
+            return;
+        }
         let runs = self
             .orders
             .iter()

@@ -1,0 +1,110 @@
+//! What befalls threads, drives and names.
+
+use super::*;
+
+impl World {
+    /// What befalls threads, drives and names.
+    pub(super) fn incidents(&mut self) {
+        let now = self.now;
+        if self.calm {
+            (self.next_stall, self.next_incident) = (now + HEALED, now + HEALED);
+            return;
+        }
+        if self.next_stall <= now {
+            self.stall();
+        }
+        if self.next_incident <= now {
+            self.next_incident = now + self.ms(300..=5_000);
+            if !self.healthy {
+                self.incident();
+            }
+        }
+        // What is read late by a hiccup that nobody notices means what its name means then.
+        let unnoticed = self.standing.readers.is_some() && self.stalled_for <= promised::UNNOTICED;
+        if self.wants_reload && !unnoticed && self.standing.bus.is_none() && self.bus.core.asked().is_none() {
+            self.wants_reload = false;
+            self.swap();
+        }
+    }
+
+    fn stall(&mut self) {
+        let now = self.now;
+        let time = match (self.healthy, self.dice.within(0..=9)) {
+            (true, _) => self.ms(20..=290),
+            (_, 0..=3) => self.ms(20..=300),
+            (_, 4..=6) => self.ms(300..=1_500),
+            (_, 7 | 8) => self.ms(1_000..=8_000),
+            _ => self.ms(8_000..=60_000),
+        };
+        self.stalled_for = time;
+        let until = Some(now + time);
+        let who = match self.dice.within(0..=3) {
+            0 => {
+                self.standing.readers = until;
+                "the readers"
+            }
+            1 => {
+                self.standing.bus = self.standing.bus.max(until);
+                "the bus"
+            }
+            _ => {
+                // Threads do not go on at the same moment.
+                self.standing.readers = until.map(|until| until + Duration::from_millis(self.dice.within(0..=4)));
+                self.standing.bus = self.standing.bus.max(until);
+                "the process"
+            }
+        };
+        self.next_stall = now + time + self.ms(500..=6_000);
+        self.note(move || format!("{who} stands still for {time:?}"));
+    }
+
+    fn incident(&mut self) {
+        let machine = self.dice.within(1..=u64::from(self.bus.line.drives)) as u8;
+        let sim = self.bus.sim(self.now);
+        let kind = self.dice.within(0..=3);
+        let drive = self.bus.wire.slaves().drive(machine).unwrap();
+        drive.advance(sim);
+        let what = match kind {
+            0 => {
+                drive.power_off();
+                drive.power_on(sim);
+                "restarts"
+            }
+            1 | 2 => {
+                let reference = 0;
+                drive.command(Command {
+                    run: false,
+                    reverse: false,
+                    reference,
+                });
+                "is stopped by somebody else"
+            }
+            _ => {
+                self.wants_reload = self.reloads;
+                return;
+            }
+        };
+        drive.advance(sim);
+        self.promised.runs(machine, drive.state().running);
+        self.promised.befell(machine, self.now);
+        self.note(move || format!("drive {machine} {what}"));
+    }
+
+    /// A reload gives the names and units of the drives to the machines in the opposite order.
+    fn swap(&mut self) {
+        let now = self.now;
+        self.bus.line.swapped = !self.bus.line.swapped;
+        let plant = self.plant.load_full();
+        let before = self.bus.handle.clone();
+        self.bus.restart(0, &plant.events, &plant.writes, now);
+        follow_names(&[before], std::slice::from_ref(&self.bus.handle), now);
+        self.plant.store(Arc::new(Plant {
+            gateway: plant.gateway.clone(),
+            stale_after: plant.stale_after,
+            buses: vec![self.bus.handle.clone()],
+            events: plant.events.clone(),
+            writes: plant.writes.clone(),
+        }));
+        self.note(|| "a reload swaps names and units".to_string());
+    }
+}

@@ -1,0 +1,137 @@
+//! What the clients do.
+
+use super::*;
+
+impl World {
+    pub(super) fn connect(&mut self) {
+        let now = self.now;
+        self.clients += 1;
+        self.connections.push(Connection {
+            number: self.clients,
+            offline: self.servers.connection(Habit::ModbusTcp, self.clients),
+            open: false,
+            inbox: VecDeque::new(),
+            closed: None,
+            rest: None,
+            transactions: Vec::new(),
+            next: now + Duration::from_millis(1_500),
+        });
+    }
+
+    /// What a client does.
+    pub(super) fn act(&mut self, index: usize) {
+        let now = self.now;
+        if let Some((_, bytes, id)) = self.connections[index].rest.take_if(|(at, ..)| *at <= now) {
+            self.promised.complete(id, now);
+            self.connections[index].inbox.push_back((now, bytes, Some(id)));
+        }
+        let connection = &self.connections[index];
+        if self.calm || !connection.open || connection.next > now || connection.closed.is_some() {
+            return;
+        }
+        let busy = connection.rest.is_some() || connection.transactions.len() > 3;
+        let waits = self.healthy && !connection.transactions.is_empty();
+        let pause = if self.chance(0.4) {
+            self.ms(1..=60)
+        } else {
+            self.ms(50..=1_500)
+        };
+        self.connections[index].next = now + pause;
+        if busy || waits {
+            return;
+        }
+        if !self.healthy && self.chance(0.04) {
+            return self.hang_up(index);
+        }
+        if !self.healthy && self.chance(0.1) {
+            return self.by_name();
+        }
+        let unit = self.dice.within(1..=u64::from(self.bus.line.drives)) as u8;
+        let in_parts = !self.healthy && self.chance(0.15);
+        match self.dice.within(0..=9) {
+            0..=3 => self.write(index, unit, 0x8100, 1, in_parts),
+            4..=6 => self.write(index, unit, 0x8100, 0, in_parts),
+            7 if !self.healthy => {
+                self.write(index, unit, 0x8100, 1, false);
+                self.write(index, unit, 0x8100, 0, false)
+            }
+            8 if !self.healthy => self.write(index, unit, 0x8100, 4, in_parts),
+            _ => self.write(index, unit, 0x8101, 2_000, in_parts),
+        };
+    }
+
+    /// A request over a connection; the rest of it may come later. The number of its order.
+    pub(super) fn write(&mut self, index: usize, unit: u8, register: u16, value: u16, in_parts: bool) -> usize {
+        let now = self.now;
+        let does = match (register, value) {
+            (0x8100, 0) => Does::Stop,
+            (0x8100, value) if value & 1 == 1 => Does::Run,
+            _ => Does::Other,
+        };
+        let drives = self.bus.line.drives;
+        let machine = if self.bus.line.swapped { drives + 1 - unit } else { unit };
+        let id = self.promised.wants(self.connections[index].number, machine, does, now);
+        self.number = self.number.wrapping_add(1);
+        let frame = write_frame(self.number, unit, register, value);
+        let connection = &mut self.connections[index];
+        connection.transactions.push((self.number, id));
+        if in_parts {
+            let at = self.dice.within(1..=frame.len() as u64 - 1) as usize;
+            let later = now + Duration::from_millis(self.dice.within(1..=1_200));
+            let connection = &mut self.connections[index];
+            connection.inbox.push_back((now, frame[..at].to_vec(), None));
+            connection.rest = Some((later, frame[at..].to_vec(), id));
+            self.wants_reload |= self.reloads && self.dice.chance(0.6);
+        } else {
+            connection.inbox.push_back((now, frame, Some(id)));
+        }
+        self.note(move || {
+            format!("order {id}: {does:?} of machine {machine} by 0x{register:04X} = {value} of unit {unit}")
+        });
+        id
+    }
+
+    /// The client closes its connection, and another one comes.
+    pub(super) fn hang_up(&mut self, index: usize) {
+        let connection = &mut self.connections[index];
+        connection.closed = Some(self.now);
+        if let Some((_, _, id)) = connection.rest.take() {
+            self.promised.never_sent(id);
+        }
+        for (_, id) in &connection.transactions {
+            self.promised.closed(*id, self.now);
+        }
+        self.note(move || format!("the client of connection {index} hangs up"));
+        self.connect();
+    }
+
+    /// An order by name that starts nothing.
+    fn by_name(&mut self) {
+        let now = self.now;
+        let name = format!("d0-{}", self.dice.within(1..=u64::from(self.bus.line.drives)));
+        let (point, value) = match self.dice.within(0..=2) {
+            0 => (ModelPoint::Reverse, Value::Bool(self.dice.chance(0.5))),
+            1 => (ModelPoint::FaultReset, Value::Bool(true)),
+            _ => (
+                ModelPoint::SpeedReference,
+                Value::Number(self.dice.within(5..=60) as f64),
+            ),
+        };
+        // A program of this machine stands still with the whole process, or not at all.
+        let Some(index) = self
+            .bus
+            .profile
+            .model_index(point)
+            .filter(|_| self.standing.readers.is_none())
+        else {
+            return;
+        };
+        let origin = Origin::new(SourceKind::CommandLine, "panel");
+        let drive = self.plant.load().drive(&name).unwrap();
+        let order = Order::Points(vec![(index, value)]);
+        self.placed
+            .push(drive.place(OrderRequest::new(order, origin, Authority::Write), now));
+        self.bus.command_came(now);
+        self.note(move || format!("{} = {value} of {name}", point.name()));
+    }
+}
