@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
-"""Shows that the seeded world finds faults: puts those of mutants.toml into a copy of the tree and runs the fixed seeds,
-then, where none of them found it, the other scenarios in virtual time. With --check it builds nothing and says only which
-of them name no function, or more than one.
+"""Shows that the seeded world finds faults: puts those of mutants.toml into a copy of the tree and runs the seeds in which
+threads stand still, the fixed seeds and then, where none of them found it, the other scenarios in virtual time. What only
+the unit tests of a crate can see (`by`) they have to find. With --check it builds nothing and says only which of them name
+no function, or more than one.
 
 All faults are built into one program, each behind a switch (the variable MUTANT names the one that is on), so that there
 is one build for all of them, in target/mutants. With none switched on the same program must pass all seeds. Prints one
@@ -65,7 +66,7 @@ def anchored(tree, mutants):
     names = [mutant["name"] for mutant in mutants]
     wrong += [f"{name}: two faults have this name" for name in sorted({name for name in names if names.count(name) > 1})]
     for mutant in mutants:
-        if unknown := (set(mutant) - {"unseen"}) ^ {"name", "promise", "edit"}:
+        if unknown := (set(mutant) - {"unseen", "by"}) ^ {"name", "promise", "edit"}:
             wrong.append(f"{mutant['name']}: missing or unknown: {', '.join(sorted(unknown))}")
         for edit in mutant.get("edit", []):
             name, forms = edit.get("fn", ""), [form for form in FORMS if form in edit]
@@ -152,26 +153,39 @@ def put_in(tree, edits):
         tree[name] = VERSION.sub(rb'\1-mutants', tree[name])
 
 
-def build():
-    command = ["cargo", "test", "--locked", "--profile", "world", "-p", "drivegate-world", "--test", "world", "--no-run", "--message-format=json"]
+def build(crates):
+    """The program of the world, and those of the unit tests of these crates, by name."""
+    profile = ["--locked", "--profile", "world", "--no-run", "--message-format=json"]
+    programs = {"world": built(["cargo", "test", *profile, "-p", "drivegate-world", "--test", "world"], "world")}
+    for crate in sorted(crates):
+        programs[crate] = built(["cargo", "test", *profile, "-p", f"drivegate-{crate}", "--lib"], f"drivegate_{crate}")
+    return programs
+
+
+def built(command, target):
     env = os.environ | {"CARGO_TARGET_DIR": str(ROOT / "target")}
-    built = subprocess.run(command, cwd=COPY, env=env, stdout=subprocess.PIPE, text=True)
-    messages = [json.loads(line) for line in built.stdout.splitlines() if line.startswith("{")]
-    if built.returncode != 0:
+    ended = subprocess.run(command, cwd=COPY, env=env, stdout=subprocess.PIPE, text=True)
+    messages = [json.loads(line) for line in ended.stdout.splitlines() if line.startswith("{")]
+    if ended.returncode != 0:
         print("BUILD ERROR")
         for message in messages:
             if message.get("message", {}).get("level") == "error":
                 print(message["message"]["rendered"])
         sys.exit(2)
-    programs = [m["executable"] for m in messages if m.get("target", {}).get("name") == "world" and m.get("executable")]
+    programs = [m["executable"] for m in messages if m.get("target", {}).get("name") == target and m.get("executable")]
     return programs[-1]
 
 
-def run(program, name, options):
-    """What found the fault, a seed or else a scenario, and what was seen; None where none did."""
-    for tests in (["fixed_seeds"], ["--skip", "fixed_seeds", "--test-threads", "1"]):
+STALLS = "no_motor_starts_that_nobody_wants_to_run"
+
+
+def run(programs, mutant, options):
+    """What found the fault, a seed or else a scenario or a test, and what was seen; None where none did."""
+    name, by = mutant["name"], mutant.get("by")
+    seeds = ([STALLS], ["fixed_seeds"], ["--skip", "fixed_seeds", "--skip", STALLS, "--test-threads", "1"])
+    for tests in seeds if by is None else ([],):
         env = os.environ | {"MUTANT": name, "WORLD_SEEDS": str(options.seeds), "WORLD_FROM": "0"}
-        command = [program, *tests]
+        command = [programs[by or "world"], *tests]
         try:
             ended = subprocess.run(command, cwd=COPY, env=env, capture_output=True, text=True, timeout=options.time)
         except subprocess.TimeoutExpired:
@@ -185,8 +199,9 @@ def run(program, name, options):
         scenario = re.search(r"^test (\S+) \.\.\. FAILED", output, re.MULTILINE)
         seen = re.search(r"panicked at [^\n]*:\n([^\n]*)", output)
         words = re.sub(r":? ?(Record )?\{.*", "", seen.group(1)) if seen else output[-200:]
-        by = f"seed {seed.group(1)}" if seed else f"scenario `{scenario.group(1)}`" if scenario else "nothing"
-        return (by, words)
+        kind = "scenario" if by is None else "unit test"
+        found = f"seed {seed.group(1)}" if seed else f"{kind} `{scenario.group(1)}`" if scenario else "nothing"
+        return (found, words)
     return None
 
 
@@ -210,13 +225,13 @@ def main():
         return print(f"{len(mutants)} faults with {len(edits)} edits: each names one function")
     put_in(tree, edits)
     write_tree(tree)
-    program = build()
     chosen = [mutant for mutant in mutants if not options.only or mutant["name"] in options.only]
+    programs = build({mutant["by"] for mutant in chosen if "by" in mutant})
     sound = {"name": "none", "promise": "no fault is switched on: all seeds pass"}
     survived = []
     print("| fault | promise | found by |\n|---|---|---|")
     with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
-        work = [(mutant, pool.submit(run, program, mutant["name"], options)) for mutant in [sound, *chosen]]
+        work = [(mutant, pool.submit(run, programs, mutant, options)) for mutant in [sound, *chosen]]
         for mutant, ended in work:
             found = ended.result()
             name, promise = mutant["name"], mutant["promise"]

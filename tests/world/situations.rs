@@ -6,7 +6,7 @@ use drivegate_world::codec::{Protocol, Reply, Table};
 use drivegate_world::drive::{ModelPoint, Value};
 use drivegate_world::order::{Order, Outcome};
 use drivegate_world::plant::Placed;
-use drivegate_world::process_image::{LeaseAction, Supervision};
+use drivegate_world::process_image::{LeaseAction, OnShutdown, Supervision};
 use drivegate_world::sim::faults::FaultPlan;
 use drivegate_world::sim::random::Random;
 
@@ -88,6 +88,37 @@ fn an_action_that_the_drive_does_not_hear_is_written_again() {
             !is_running(&mut rig),
             "seed {seed}: it runs 120 s after its client fell silent"
         );
+    }
+}
+
+/// A drive that is off the line when the gateway ends, and comes back within its time, is stopped.
+#[test]
+fn a_stop_of_the_shutdown_is_ordered_again() {
+    for (family, protocol) in [("vacon-nx", Protocol::ModbusRtu), ("vacon-nx-n2", Protocol::N2)] {
+        let timeout = if protocol == Protocol::N2 { 250 } else { 60 };
+        let works = Line {
+            on_shutdown: OnShutdown::Stop,
+            response_timeout: Duration::from_millis(timeout),
+            ..line(family, protocol, 9_600, 1)
+        };
+        let mut rig = rig(&works);
+        leave_running(&mut rig);
+        assert!(is_running(&mut rig));
+        rig.set_alive(1, false);
+        let deadline = rig.now + 4 * SECOND;
+        let mut report = rig.bus.handle.queue.begin_shutdown(deadline, rig.now);
+        rig.bus.command_came(rig.now);
+        rig.run(Duration::from_millis(1_500));
+        rig.set_alive(1, true);
+        while report
+            .try_recv()
+            .map(|missing| assert!(missing.is_empty(), "{missing:?}"))
+            .is_err()
+        {
+            assert!(rig.step(deadline).is_some(), "{family}: no report");
+        }
+        rig.run(5 * SECOND);
+        assert!(!is_running(&mut rig), "{family}");
     }
 }
 

@@ -81,12 +81,26 @@ async fn diagnose(args: &Args) -> Result<String, String> {
         .map(|texts| texts.join("\n"))
 }
 
+/// The drives that have answered nothing so far, in words.
+fn mute(drives: &[Counted]) -> Option<String> {
+    let mute = drives.iter().filter(|one| one.answered == 0 && one.silent > 0);
+    let names: Vec<_> = mute.map(|one| printable::line(&one.drive).to_string()).collect();
+    match names.len() {
+        0 => None,
+        count if count == drives.len() => Some("no drive has answered in the last minute".to_string()),
+        _ => Some(format!("no answer in the last minute from {}", names.join(", "))),
+    }
+}
+
 fn text(diagnosis: &Diagnosis) -> String {
     let mut text = format!("{}:", printable::line(&diagnosis.bus));
-    text += match (&diagnosis.time, diagnosis.verdicts.as_slice()) {
-        (None, _) => " not available yet; try again in a few seconds\n",
-        (_, []) => " no problems detected in the last minute\n",
-        _ => "\n",
+    text += &match (&diagnosis.time, diagnosis.verdicts.as_slice()) {
+        (None, _) => " not available yet; try again in a few seconds\n".to_string(),
+        (_, []) => match mute(&diagnosis.drives) {
+            None => " no problems detected in the last minute\n".to_string(),
+            Some(mute) => format!(" {mute}; the cause is known within half a minute of requests\n"),
+        },
+        _ => "\n".to_string(),
     };
     for verdict in &diagnosis.verdicts {
         let about = verdict
@@ -162,6 +176,17 @@ mod tests {
         );
         diagnosis.time = Some("2026-03-02T06:11:09.480Z".to_string());
         assert_eq!(text(&diagnosis), "line1: no problems detected in the last minute\n");
+        diagnosis.drives[0].silent = 7;
+        let begin = "line1: no drive has answered in the last minute; the cause is known within half a minute";
+        assert!(text(&diagnosis).starts_with(begin), "{}", text(&diagnosis));
+        let other = Counted {
+            drive: "fan-2".to_string(),
+            answered: 9,
+            ..Counted::default()
+        };
+        diagnosis.drives.push(other);
+        let begin = "line1: no answer in the last minute from pump-1; ";
+        assert!(text(&diagnosis).starts_with(begin), "{}", text(&diagnosis));
         diagnosis.verdicts.push(Verdict {
             verdict: Cause::OneDrive,
             drive: Some("pump-1".to_string()),

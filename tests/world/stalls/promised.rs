@@ -187,7 +187,7 @@ impl Promised {
                 let since = if waited > UNNOTICED { order.sent } else { read };
                 stop.read.is_some_and(|stopped| stopped > since)
             };
-            later && stop.read.is_some_and(|read| read <= at)
+            later && stop.read.is_some_and(|read| read < at)
         });
         stopped.map(|(place, _)| format!("was stopped by order {place}"))
     }

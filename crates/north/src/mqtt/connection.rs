@@ -22,7 +22,7 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use super::broker_limits::{BrokerLimits, Lack};
-use super::dial::{CONNECT_TIMEOUT, Dial};
+use super::dial::{ACCEPT_TIMEOUT, Dial};
 use super::keep_alive::{KEEP_ALIVE_S, Silence, Verdict};
 use super::outbox::Message;
 use super::request::Incoming;
@@ -358,7 +358,7 @@ fn mqtt_options(
     mqtt.set_connect_properties(properties);
     mqtt.set_keep_alive(KEEP_ALIVE_S)
         .set_clean_start(true)
-        .set_connect_timeout(CONNECT_TIMEOUT)
+        .set_connect_timeout(ACCEPT_TIMEOUT)
         .set_max_request_batch(BATCH)
         .set_read_batch_size(BATCH)
         .set_outgoing_inflight_upper_limit(INFLIGHT)

@@ -11,8 +11,10 @@ use tokio::net::TcpStream;
 
 use super::Broker;
 
-/// Time limit for TCP, TLS and CONNACK.
-pub(super) const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+/// Time limit for TCP, TLS and CONNACK: a broker that is busy, or asks its database who connects, takes some seconds.
+pub(super) const ACCEPT_TIMEOUT: Duration = Duration::from_secs(10);
+/// Time limit for a TCP connection.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 /// So many attempts within so long, to whatever address.
 const ATTEMPTS: usize = 3;
 const WITHIN: Duration = Duration::from_secs(1);
