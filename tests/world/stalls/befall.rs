@@ -3,6 +3,22 @@
 use super::*;
 
 impl World {
+    /// A client begins a request before a stall, and completes it in the stall or behind it.
+    fn begins_a_request(&mut self, stall: Duration) {
+        let idle =
+            |connection: &Connection| connection.open && connection.closed.is_none() && connection.rest.is_none();
+        let Some(index) = self.connections.iter().position(idle) else {
+            return;
+        };
+        let unit = self.dice.within(1..=u64::from(self.bus.line.drives)) as u8;
+        self.write(index, unit, 0x8100, 1, true);
+        self.run_readers();
+        let later = self.now + stall.mul_f64(self.dice.unit() * 1.1);
+        if let Some((at, ..)) = &mut self.connections[index].rest {
+            *at = later;
+        }
+    }
+
     /// What befalls threads, drives and names.
     pub(super) fn incidents(&mut self) {
         let now = self.now;
@@ -37,6 +53,9 @@ impl World {
             _ => self.ms(8_000..=60_000),
         };
         self.stalled_for = time;
+        if !self.healthy && self.chance(0.4) {
+            self.begins_a_request(time);
+        }
         let until = Some(now + time);
         let who = match self.dice.within(0..=3) {
             0 => {

@@ -40,7 +40,9 @@ impl World {
         if busy || waits {
             return;
         }
-        if !self.healthy && self.chance(0.04) {
+        // Who gets no answer gives up.
+        let gives_up = if self.standing.readers.is_some() { 0.2 } else { 0.03 };
+        if !self.healthy && self.chance(gives_up) {
             return self.hang_up(index);
         }
         if !self.healthy && self.chance(0.1) {
