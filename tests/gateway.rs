@@ -25,6 +25,7 @@ mod gateway {
     mod holder;
     mod listening;
     mod living;
+    mod local_answers;
     mod local_socket;
     mod messages;
     mod openapi;

@@ -176,6 +176,12 @@ fn a_gateway_that_was_killed_in_the_middle_holds_the_drive_until_that_is_settled
         let mut restore = Running::drivegate(&command);
         until("the journal", || journal.exists().then_some(()));
         let (code, _, said) = settle(&plant, &["write", "pump-1", "run=true"]);
+        if code == Some(0) && !journal.exists() {
+            // On a busy machine the restore is over before the order comes.
+            assert_eq!(settle(&plant, &["write", "pump-1", "run=false"]).0, Some(0));
+            assert!(restore.ended().success());
+            continue;
+        }
         assert_eq!((code, said.contains("being restored")), (Some(1), true), "{said}");
         std::thread::sleep(Duration::from_millis(kill * 397 % 2000));
         gateway.signal("KILL");

@@ -46,6 +46,8 @@ const STOP_SLACK: Duration = Duration::from_millis(300);
 /// Time limit for the bus threads to end.
 const STOP_BUSES: Duration = Duration::from_secs(2);
 
+/// Time limit for clients of the local socket to take their last answers.
+const STOP_LOCAL: Duration = Duration::from_secs(1);
 /// Time limit for the audit file, and for events and counters, to be written.
 const STOP_AUDIT: Duration = Duration::from_secs(1);
 /// Interval at which refusals are reported whose count is due.
@@ -420,6 +422,8 @@ impl Daemon {
     /// Shuts down in order: no new commands of local clients, tools and Modbus TCP clients, the configured stop commands, the buses,
     /// the last MQTT messages.
     pub async fn stop(mut self) {
+        // Orders that came over the local socket are answered when the buses have ended.
+        let local = self.local.server().map(local::Local::connections);
         self.local.stop().await;
         self.slots.stop().await;
         self.bacnet.stop().await;
@@ -457,6 +461,10 @@ impl Daemon {
             .report_refusals(Instant::now() + Duration::from_secs(60));
         self.mqtt.stop().await;
         self.http.stop().await;
+        if let Some(connections) = local {
+            connections.close();
+            within(STOP_LOCAL, "local clients", connections.wait()).await;
+        }
         self.stop_keeper().await;
         self.stop_starts().await;
         let audit = self.writes.audit();

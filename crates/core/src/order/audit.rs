@@ -28,15 +28,18 @@ const UNSENT_KEPT: usize = 500;
 pub const SENT: &str = "sent command";
 
 /// One value that a command sets.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
+#[schema(as = AuditChange)]
 pub struct Change {
     /// Point, or table and address of a raw write.
     pub point: String,
     /// The last good value before, if there was one.
     #[serde(serialize_with = "bare_or_null")]
+    #[schema(value_type = serde_json::Value)]
     pub old: Option<Value>,
     /// The requested value.
     #[serde(serialize_with = "bare")]
+    #[schema(value_type = serde_json::Value)]
     pub new: Value,
     /// Its effect on the run command: run or stop, if any.
     #[serde(skip)]
@@ -47,10 +50,11 @@ pub struct Change {
 }
 
 /// One command and the result.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct AuditRecord {
     /// When the outcome was known.
     #[serde(serialize_with = "crate::event::rfc3339")]
+    #[schema(value_type = String)]
     pub time: SystemTime,
     /// Kind of the source.
     pub source: &'static str,
@@ -68,9 +72,11 @@ pub struct AuditRecord {
     pub text: String,
     /// From acceptance to result, ms.
     #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
+    #[schema(value_type = f64)]
     pub latency: Duration,
     /// From acceptance to the read that showed the effect, ms.
     #[serde(rename = "confirmed_ms", serialize_with = "milliseconds_or_null")]
+    #[schema(value_type = Option<f64>)]
     pub confirmed: Option<Duration>,
     /// Number of commands covered: refusals of one client are counted.
     pub count: u64,

@@ -12,7 +12,8 @@ use utoipa::openapi::path::{HttpMethod, OperationBuilder, ParameterBuilder, Para
 use utoipa::openapi::request_body::RequestBodyBuilder;
 use utoipa::openapi::schema::{ArrayBuilder, Components, Schema, SchemaType, Type};
 use utoipa::openapi::{
-    ContentBuilder, InfoBuilder, ObjectBuilder, OpenApiBuilder, Paths, Ref, RefOr, Required, ResponseBuilder,
+    ContentBuilder, InfoBuilder, ObjectBuilder, OneOfBuilder, OpenApiBuilder, Paths, Ref, RefOr, Required,
+    ResponseBuilder,
 };
 
 use super::app_state::AppState;
@@ -22,6 +23,17 @@ use super::messages::ErrorReply;
 pub(super) const PATH: &str = "/api/v1/openapi.json";
 
 const JSON: &str = "application/json";
+
+/// What is not a success, and what it says; the last two of requests that reach a drive only.
+const FAILURES: [(&str, &str); 4] = [
+    ("4XX", "refused, and why"),
+    (
+        "503",
+        "not carried out: the gateway, the bus or the drive does not serve it now",
+    ),
+    ("502", "the drive refused it, or its reply was not valid"),
+    ("504", "what became of it is not known, or not all of it is"),
+];
 
 /// The routes so far.
 pub(super) struct Api {
@@ -39,6 +51,8 @@ pub(super) struct Doc {
     body: Option<RefOr<Schema>>,
     content_type: &'static str,
     reply: Option<RefOr<Schema>>,
+    /// What a reply has that is no success, where it is no error of the request itself.
+    failure: Option<RefOr<Schema>>,
     schemas: Vec<(String, RefOr<Schema>)>,
 }
 
@@ -67,6 +81,7 @@ impl Doc {
             body: None,
             content_type,
             reply: None,
+            failure: None,
             schemas: Vec::new(),
         }
     }
@@ -85,11 +100,42 @@ impl Doc {
         doc
     }
 
+    /// Or with another object.
+    pub(super) fn or<T: ToSchema>(mut self) -> Doc {
+        let other = schema_of::<T>(&mut self.schemas);
+        self.or_schema(other)
+    }
+
+    /// Or with a list of objects.
+    pub(super) fn or_list<T: ToSchema>(mut self) -> Doc {
+        let other = schema_of_list::<T>(&mut self.schemas);
+        self.or_schema(other)
+    }
+
+    fn or_schema(self, other: RefOr<Schema>) -> Doc {
+        let replies = OneOfBuilder::new();
+        let replies = match self.reply {
+            Some(RefOr::T(Schema::OneOf(before))) => before.items.into_iter().fold(replies, OneOfBuilder::item),
+            Some(before) => replies.item(before),
+            None => replies,
+        };
+        Doc {
+            reply: Some(replies.item(other).build().into()),
+            ..self
+        }
+    }
+
     /// A route that replies with JSON of several forms.
     pub(super) fn any(summary: &'static str) -> Doc {
         let mut doc = Doc::text(summary, JSON);
         doc.reply = Some(any());
         doc
+    }
+
+    /// A request that was understood, and not carried out, is answered with this object.
+    pub(super) fn failing_with<T: ToSchema>(mut self) -> Doc {
+        self.failure = Some(schema_of::<T>(&mut self.schemas));
+        self
     }
 
     /// With an object as its body whose fields depend on the drive.
@@ -175,12 +221,18 @@ impl Api {
         let done = ResponseBuilder::new()
             .description("done")
             .content(doc.content_type, reply);
-        let error = RefOr::Ref(Ref::from_schema_name("ErrorReply"));
-        let error = ContentBuilder::new().schema(Some(error)).build();
-        let refused = ResponseBuilder::new()
-            .description("refused, and why")
-            .content(JSON, error);
-        operation = operation.response("200", done.build()).response("4XX", refused.build());
+        operation = operation.response("200", done.build());
+        let served = if doc.failure.is_some() { FAILURES.len() } else { 2 };
+        for (status, description) in FAILURES.iter().take(served) {
+            let error = RefOr::Ref(Ref::from_schema_name("ErrorReply"));
+            let schema = match doc.failure.clone() {
+                Some(failure) => OneOfBuilder::new().item(failure).item(error).build().into(),
+                None => error,
+            };
+            let content = ContentBuilder::new().schema(Some(schema)).build();
+            let response = ResponseBuilder::new().description(*description).content(JSON, content);
+            operation = operation.response(*status, response.build());
+        }
         self.paths.add_path_operation(path, vec![method], operation.build());
         self
     }

@@ -26,6 +26,7 @@ use crate::NorthState;
 use crate::command_json::{CommandResult, HoldReply, StopBody};
 use crate::drill::DrillReport;
 use crate::history::Entry;
+use crate::order::AuditRecord;
 use crate::plant::SharedPlant;
 use crate::stop_all::StopReport;
 
@@ -78,7 +79,8 @@ fn described() -> Api {
         )
         .post(
             RELOAD,
-            Doc::object::<ReloadOutcome>("Reads the configuration again; at the local socket only"),
+            Doc::object::<ReloadOutcome>("Reads the configuration again; at the local socket only")
+                .failing_with::<ReloadOutcome>(),
             views::reload,
         )
         .get(
@@ -103,12 +105,15 @@ fn described() -> Api {
         )
         .get(
             "/api/v1/drives/{name}/trend",
-            Doc::any("Trend of values; without `point`, which ones are kept").query(&[
-                ("point", POINT),
-                ("from", TIME),
-                ("to", TIME),
-                ("format", "json or csv"),
-            ]),
+            Doc::object::<trend::Kept<'_>>("Trend of values, a list for several; without `point`, which ones are kept")
+                .or::<trend::Shown<'_>>()
+                .or_list::<trend::Shown<'_>>()
+                .query(&[
+                    ("point", POINT),
+                    ("from", TIME),
+                    ("to", TIME),
+                    ("format", "json or csv"),
+                ]),
             trend::trend,
         )
         .post(
@@ -149,7 +154,8 @@ fn described() -> Api {
         .post(
             "/api/v1/drives/{name}/commands",
             Doc::object::<CommandResult<'_>>("Commands a drive: points and their values, `id`, `expires_ms`, `wait`")
-                .any_body(),
+                .any_body()
+                .failing_with::<CommandResult<'_>>(),
             operating::command,
         )
         .post(
@@ -180,7 +186,7 @@ fn described() -> Api {
         )
         .get(
             "/api/v1/audit",
-            Doc::any("The last commands").query(&[("drive", "only those for this drive")]),
+            Doc::list::<AuditRecord>("The last commands").query(&[("drive", "only those for this drive")]),
             views::audit,
         )
         .get("/api/v1/recordings", Doc::list::<Entry>("Recordings"), recordings::list)
@@ -228,7 +234,9 @@ fn described() -> Api {
         )
         .post(
             "/api/v1/stop",
-            Doc::object::<StopReport>("Stops all drives; 504 unless all are known to have stopped").body::<StopBody>(),
+            Doc::object::<StopReport>("Stops all drives; 504 unless all are known to have stopped")
+                .body::<StopBody>()
+                .failing_with::<StopReport>(),
             operating::stop,
         )
         .get(

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use axum::Router;
+use axum::http::Method;
 use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper::service::{Service, service_fn};
@@ -14,9 +15,10 @@ use hyper_util::service::TowerToHyperService;
 use tokio::io::{AsyncRead, AsyncWrite, DuplexStream, duplex};
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
 
 use super::in_use::InUse;
-use super::limits::{GRACE, HEAD_TIMEOUT, MAX_HEAD};
+use super::limits::{ANSWERED_WITHIN, GRACE, HEAD_TIMEOUT, MAX_HEAD};
 use super::operating::Operating;
 use super::reached::{Client, Coverage, LocalUser, Reached};
 use super::routes;
@@ -53,6 +55,8 @@ impl SocketDoor {
             address: reached.address,
             coverage: Coverage::Everything,
         };
+        // One token for each command whose reply is to come.
+        let commands = TaskTracker::new();
         let router = TowerToHyperService::new(self.router.clone());
         let service = service_fn(|mut request: hyper::Request<Incoming>| {
             let in_use = InUse::new(place.clone());
@@ -60,8 +64,13 @@ impl SocketDoor {
             request.extensions_mut().insert(reached.clone());
             request.extensions_mut().insert(reader.last());
             request.extensions_mut().insert(reader.clone());
+            let command = matches!(*request.method(), Method::POST | Method::DELETE).then(|| commands.token());
             let reply = router.call(request);
-            async move { reply.await.map(|reply| reply.map(|body| in_use.until_end_of(body))) }
+            async move {
+                let reply = reply.await;
+                drop(command);
+                reply.map(|reply| reply.map(|body| in_use.until_end_of(body)))
+            }
         });
         let connection = http1::Builder::new()
             .timer(TokioTimer::new())
@@ -73,7 +82,16 @@ impl SocketDoor {
             ended = connection.as_mut() => ended,
             () = place.closing().cancelled() => {
                 connection.as_mut().graceful_shutdown();
-                timeout(GRACE, connection).await.unwrap_or(Ok(()))
+                commands.close();
+                let last = async {
+                    // Whichever it was that ended the wait.
+                    let _ = timeout(ANSWERED_WITHIN, commands.wait()).await;
+                    tokio::time::sleep(GRACE).await;
+                };
+                tokio::select! {
+                    ended = connection.as_mut() => ended,
+                    () = last => Ok(()),
+                }
             }
         };
         if let Err(error) = ended {

@@ -8,7 +8,7 @@ use axum::Json;
 use axum::extract::{Path, RawQuery, State};
 use axum::http::header;
 use axum::response::IntoResponse;
-use serde::{Serialize, Serializer};
+use serde::Serialize;
 
 use super::app_state::AppState;
 use super::query::{self, QueryError};
@@ -117,29 +117,29 @@ pub(super) async fn trend(
     }
     Ok(match (&parts[..], &wanted.points[..]) {
         (_, []) => Json(Kept::new(&name, history.as_deref(), &known)).into_response(),
-        ([part], [_]) => Json(Trend { drive: &name, part }).into_response(),
+        ([part], [_]) => Json(Shown::new(&name, part)).into_response(),
         _ => {
-            let all: Vec<_> = parts.iter().map(|part| Trend { drive: &name, part }).collect();
+            let all: Vec<_> = parts.iter().map(|part| Shown::new(&name, part)).collect();
             Json(all).into_response()
         }
     })
 }
 
 /// Which trends there are.
-#[derive(Debug, Serialize)]
-struct Kept<'d> {
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub(super) struct Kept<'d> {
     drive: &'d str,
     ranges: Vec<KeptRange>,
     points: Vec<KeptPoint>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct KeptRange {
     span_s: u64,
     step_s: u64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, utoipa::ToSchema)]
 struct KeptPoint {
     point: &'static str,
     unit: &'static str,
@@ -170,30 +170,29 @@ impl<'d> Kept<'d> {
 }
 
 /// The trend of one point.
-#[derive(Debug)]
-struct Trend<'p> {
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+#[schema(as = Trend)]
+pub(super) struct Shown<'p> {
     drive: &'p str,
-    part: &'p Part,
+    point: &'p str,
+    unit: &'p str,
+    step_s: u64,
+    #[serde(serialize_with = "crate::event::rfc3339")]
+    #[schema(value_type = String)]
+    from: SystemTime,
+    #[serde(serialize_with = "crate::event::rfc3339")]
+    #[schema(value_type = String)]
+    to: SystemTime,
+    /// Of each step: its beginning, ms since 1970, the least, the greatest and the last value; `null` where there was none.
+    #[schema(value_type = Vec<Option<Vec<f64>>>)]
+    samples: Vec<Option<(u64, f32, f32, f32)>>,
 }
 
-impl Serialize for Trend<'_> {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        #[derive(Serialize)]
-        struct Shown<'p> {
-            drive: &'p str,
-            point: &'p str,
-            unit: &'p str,
-            step_s: u64,
-            #[serde(serialize_with = "crate::event::rfc3339")]
-            from: SystemTime,
-            #[serde(serialize_with = "crate::event::rfc3339")]
-            to: SystemTime,
-            samples: Vec<Option<(u64, f32, f32, f32)>>,
-        }
-        let part = self.part;
+impl<'p> Shown<'p> {
+    fn new(drive: &'p str, part: &'p Part) -> Shown<'p> {
         let sample = |step: &Option<Step>| step.map(|Step { at, min, max, last }| (at, min, max, last));
         Shown {
-            drive: self.drive,
+            drive,
             point: part.point,
             unit: part.unit,
             step_s: part.step.as_secs(),
@@ -201,7 +200,6 @@ impl Serialize for Trend<'_> {
             to: part.to,
             samples: part.steps.iter().map(sample).collect(),
         }
-        .serialize(serializer)
     }
 }
 

@@ -20,6 +20,7 @@ use tokio::net::UnixStream;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
 
 use self::path::Bound;
 use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Limits, Newcomer};
@@ -66,12 +67,18 @@ pub struct Local {
     /// Whether those who reached it may still write.
     right: Arc<AtomicBool>,
     task: JoinHandle<()>,
+    connections: TaskTracker,
 }
 
 impl Local {
     /// The path of the socket.
     pub fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// Its connections: each ends when the orders that came over it are answered, also once the server is stopped.
+    pub fn connections(&self) -> TaskTracker {
+        self.connections.clone()
     }
 }
 
@@ -102,8 +109,14 @@ impl server::Server for Local {
             control: options.control,
         });
         tracing::info!(target: "drivegate::local", path = %path.display(), "local socket: listening");
-        let task = tokio::spawn(accept(bound, door, cancel));
-        Ok(Local { path, right, task })
+        let connections = TaskTracker::new();
+        let task = tokio::spawn(accept(bound, door, connections.clone(), cancel));
+        Ok(Local {
+            path,
+            right,
+            task,
+            connections,
+        })
     }
 
     /// Its file says who may command, and is there no more: another one may be open to others.
@@ -120,7 +133,7 @@ impl server::Server for Local {
     }
 }
 
-async fn accept(bound: Bound, door: Arc<Door>, cancel: CancellationToken) {
+async fn accept(bound: Bound, door: Arc<Door>, connections: TaskTracker, cancel: CancellationToken) {
     let limit = ConnectionLimit::new(Limits::new(MAX_CLIENTS, MAX_CLIENTS));
     let newcomer = Newcomer {
         address: THIS_MACHINE,
@@ -148,7 +161,7 @@ async fn accept(bound: Bound, door: Arc<Door>, cancel: CancellationToken) {
             Ok((stream, _)) => match limit.acquire(newcomer, Instant::now(), || Some(Authority::Write)) {
                 Ok((permit, _)) => {
                     let stream = Dated::new(stream, Arc::new(reader.accepted()));
-                    drop(tokio::spawn(serve(stream, door.clone(), permit)));
+                    drop(connections.spawn(serve(stream, door.clone(), permit)));
                 }
                 Err(_) => turn_away(&stream),
             },
