@@ -48,10 +48,11 @@ fn a_reload_that_moves_the_socket_loses_no_answer() {
     gateway.signal("HUP");
     gateway.until_printed("configuration reloaded");
     let answer = answer(waiting);
-    assert!(
-        answer.starts_with("HTTP/1.1 504"),
-        "it was sent, and nobody answered: {answer:?}"
-    );
+    // Whoever may open the new socket is another one: what was not sent yet is refused.
+    let is_told = ["HTTP/1.1 504", "HTTP/1.1 403"]
+        .iter()
+        .any(|begin| answer.starts_with(begin));
+    assert!(is_told, "{answer:?}");
     assert!(UnixStream::connect(site.path("other")).is_ok());
 }
 

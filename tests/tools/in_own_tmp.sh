@@ -7,7 +7,10 @@ set -euo pipefail
 base=${TMPDIR:-/tmp}
 for left in "$base"/drivegate-test-*; do
     owner=${left##*-}
-    if [ -O "$left" ] && [[ $owner =~ ^[0-9]+$ ]] && ! kill -0 "$owner" 2>/dev/null; then rm -rf "$left"; fi
+    if [ -O "$left" ] && [[ $owner =~ ^[0-9]+$ ]] && ! kill -0 "$owner" 2>/dev/null; then
+        # What a child of it is just writing makes the first try fail.
+        rm -rf "$left" 2>/dev/null || { sleep 0.5 && rm -rf "$left"; }
+    fi
 done
 own=$base/drivegate-test-$$
 mkdir "$own"

@@ -188,10 +188,14 @@ async function operate(browser) {
   await browser.press("#stop-all");
   await browser.until("the question", seen("#stops .operate-stop"));
   await accessible(browser, "while stop all asks");
-  await browser.press("#stops .operate-button");
+  // The question ends by itself after a time, which a busy machine needs for that check.
+  try {
+    await browser.press("#stops .operate-button");
+  } catch {
+    await browser.answer("#stop-all", "#stops .operate-button");
+  }
   await browser.until("it runs still: nothing was stopped", "document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
-  await browser.press("#stop-all");
-  await browser.press("#stops .operate-stop");
+  await browser.answer("#stop-all", "#stops .operate-stop");
   await browser.until("all stand", "document.getElementById('stops').innerText.includes('All drives have stopped: 1 of 1')");
   await browser.until("it stands", "!document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
   await browser.press("#stops .operate-button");

@@ -120,7 +120,7 @@ impl Doc {
             None => replies,
         };
         Doc {
-            reply: Some(replies.item(other).build().into()),
+            reply: Some(RefOr::T(Schema::OneOf(replies.item(other).build()))),
             ..self
         }
     }
@@ -226,7 +226,7 @@ impl Api {
         for (status, description) in FAILURES.iter().take(served) {
             let error = RefOr::Ref(Ref::from_schema_name("ErrorReply"));
             let schema = match doc.failure.clone() {
-                Some(failure) => OneOfBuilder::new().item(failure).item(error).build().into(),
+                Some(failure) => RefOr::T(Schema::OneOf(OneOfBuilder::new().item(failure).item(error).build())),
                 None => error,
             };
             let content = ContentBuilder::new().schema(Some(schema)).build();
