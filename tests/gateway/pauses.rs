@@ -274,7 +274,7 @@ fn a_client_that_gave_up_starts_nothing() {
     assert_eq!(events.matches("\"paused\"").count(), 18, "{events}");
 }
 
-/// Nor does an order that was begun before the pause, and completed in it.
+/// An order that is begun before a pause and completed in it starts no motor.
 #[test]
 fn what_is_completed_in_a_pause_starts_nothing() {
     let plant = Plant::new();

@@ -76,7 +76,7 @@ impl Arrival {
         }
     }
 
-    /// The same order, whose last byte came so: what a client sends in two parts it may have given up in between.
+    /// This arrival for an order whose last byte came as `last`: a client that sends in two parts may have given up in between.
     #[must_use]
     pub fn completed(self, last: &Arrival) -> Arrival {
         Arrival {

@@ -100,13 +100,13 @@ impl Doc {
         doc
     }
 
-    /// Or with another object.
+    /// The route may reply with an object of that type instead.
     pub(super) fn or<T: ToSchema>(mut self) -> Doc {
         let other = schema_of::<T>(&mut self.schemas);
         self.or_schema(other)
     }
 
-    /// Or with a list of objects.
+    /// The route may reply with a list of such objects instead.
     pub(super) fn or_list<T: ToSchema>(mut self) -> Doc {
         let other = schema_of_list::<T>(&mut self.schemas);
         self.or_schema(other)

@@ -183,7 +183,7 @@ pub(super) struct Shown<'p> {
     #[serde(serialize_with = "crate::event::rfc3339")]
     #[schema(value_type = String)]
     to: SystemTime,
-    /// Of each step: its beginning, ms since 1970, the least, the greatest and the last value; `null` where there was none.
+    /// Each step: its beginning, ms since 1970, the least, the greatest and the last value; `null` where there was none.
     #[schema(value_type = Vec<Option<Vec<f64>>>)]
     samples: Vec<Option<(u64, f32, f32, f32)>>,
 }

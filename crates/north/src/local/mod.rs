@@ -76,7 +76,7 @@ impl Local {
         &self.path
     }
 
-    /// Its connections: each ends when the orders that came over it are answered, also once the server is stopped.
+    /// The open connections: each ends when the orders that came over it are answered, also once the server is stopped.
     pub fn connections(&self) -> TaskTracker {
         self.connections.clone()
     }
