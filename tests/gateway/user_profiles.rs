@@ -85,7 +85,10 @@ fn the_energy_meter_of_the_page_is_served() {
     let meter = "cycle = \"50ms\"\nslow_cycle = \"200ms\"\n\
          [[bus.drive]]\nname = \"meter\"\naddress = 7\nprofile = \"our-meter\"\naccess = \"control\"\n\
          limits = { current_transformer_ratio = [1, 500] }\n";
-    let bus = LINE1.replace("port = \"line1\"", &format!("port = \"tcp://127.0.0.1:{port}\""));
+    // With its socket where the commands below look for it: a command that finds no gateway is a second master.
+    let bus = LINE1
+        .replace("port = \"line1\"", &format!("port = \"tcp://127.0.0.1:{port}\""))
+        .replace("name = \"test\"", "name = \"test\"\nsocket = \"own.sock\"");
     let site = Site::of(&[&bus, meter, MODBUS_TCP, HTTP]);
     let (modbus, http) = (site.modbus, site.http);
     std::fs::copy(root().join("docs/energy-meter.toml"), site.file("energy-meter.toml")).unwrap();
@@ -167,9 +170,14 @@ fn the_energy_meter_of_the_page_is_served() {
     let program = Path::new(env!("CARGO_BIN_EXE_drivegate"));
     let config = site.config();
     let write = |set: &str| run(program, &["write", "--config", &config, "meter", set]);
-    assert!(write("display=short").status.success());
+    let written = |set: &str| {
+        let said = write(set);
+        let why = String::from_utf8_lossy(&said.stderr).into_owned();
+        assert!(said.status.success(), "{set}: {why}");
+    };
+    written("display=short");
     site.until_point("meter", "display", 3);
-    assert!(write("display=all of it").status.success());
+    written("display=all of it");
     site.until_point("meter", "display", 15);
     assert!(!write("display=7").status.success() && !write("display=long").status.success());
     let refused = mbpoll_write(modbus, 7, 257, &[7]).unwrap_err();
