@@ -23,6 +23,7 @@ mod gateway {
     mod fleet;
     mod history;
     mod holder;
+    mod hung_disk;
     mod listening;
     mod living;
     mod local_answers;

@@ -18,7 +18,7 @@ use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled, drive};
 use crate::support::tools::{python, root, run, tool};
 
 /// A port that no UDP socket of this machine has.
-fn free_udp_port() -> u16 {
+pub(super) fn free_udp_port() -> u16 {
     UdpSocket::bind("0.0.0.0:0").unwrap().local_addr().unwrap().port()
 }
 

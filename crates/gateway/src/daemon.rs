@@ -188,8 +188,8 @@ impl Daemon {
         daemon.hold_unfinished(&settings).await;
         daemon.replace_buses(&settings, prepared).await;
         daemon.apply_reservations(&settings);
-        daemon.apply_drills(&settings);
-        reservations::restore(&daemon.reservations, &daemon.plant.load());
+        daemon.apply_drills(&settings).await;
+        reservations::restore(&daemon.reservations, &daemon.north.patience, &daemon.plant.load_full()).await;
         daemon.apply_mqtt(&settings).await?;
         daemon.discard_kept_slots(&settings).await;
         // The servers that report readiness come last.
@@ -254,7 +254,7 @@ impl Daemon {
         self.replace_buses(&settings, prepared).await;
         self.void_slots();
         self.apply_reservations(&settings);
-        self.apply_drills(&settings);
+        self.apply_drills(&settings).await;
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
         self.apply_audit(&settings).await;

@@ -9,6 +9,7 @@ use super::listener::ListenerStates;
 use super::mqtt::{BrokerRights, Handover};
 use super::stats::{BacnetStats, ModbusTcpStats, MqttStats, RefusalStats, ReloadStats, SlotStats};
 use crate::drill::Drills;
+use crate::files::Patience;
 use crate::history::{History, Recordings};
 use crate::parameters::Vault;
 use crate::stop_all::StopAll;
@@ -16,6 +17,8 @@ use crate::stop_all::StopAll;
 /// What the servers share and a reload, which replaces servers, keeps: counters, recent commands, and what is recorded.
 #[derive(Debug, Default)]
 pub struct NorthState {
+    /// How long starts and reloads wait for the disk.
+    pub patience: Patience,
     /// The recordings.
     pub recordings: Arc<Recordings>,
     /// Readings of parameters, and restores.

@@ -61,7 +61,10 @@ fn run_from(path: &Path) -> io::Result<ExitCode> {
         early.wanted.add(signal);
     }
     signals.wanted = early.wanted;
-    Ok(runtime.block_on(serve(settings, path, &log, signals)))
+    let code = runtime.block_on(serve(settings, path, &log, signals));
+    // Threads that a disk holds up end with the process.
+    runtime.shutdown_background();
+    Ok(code)
 }
 
 /// Loads the configuration; `None` if the gateway is to stop before that is done.

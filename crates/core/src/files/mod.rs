@@ -2,11 +2,13 @@
 //!
 //! - [`rotated`]: a file of lines with older ones next to it, bounded together.
 //! - [`Keeper`]: the thread that writes some of them.
+//! - [`Patience`]: how long a start or a reload waits for the disk.
 //! - [`names`]: what the gateway calls its files.
 //! - [`read`]: what one of them has. [`replace`]: a new content in the place of the old one, never a half of either.
 
 mod keeper;
 pub mod names;
+mod patience;
 pub mod rotated;
 
 use std::fs::{self, File};
@@ -14,6 +16,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 pub use keeper::Keeper;
+pub use patience::{DISK, Patience, late};
 pub use rotated::Rotated;
 
 /// Ending of a file that is not written to its end.

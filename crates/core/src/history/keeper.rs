@@ -11,8 +11,8 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant, SystemTime};
 
 use serde::{Deserialize, Serialize};
-use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::TryRecvError;
+use tokio::sync::{broadcast, oneshot};
 
 use super::counters::Totals;
 use super::drives::History;
@@ -41,17 +41,26 @@ struct CounterFile {
     drives: BTreeMap<String, Totals>,
 }
 
-/// Keeps events and counters in that directory from now on. With `first`, the first of this run, events of earlier runs are
-/// taken from there before it returns: to be called before anything happens.
+/// Keeps events and counters in that directory from now on. The channel has the events of earlier runs for the `first` one of
+/// this run, none for a later one.
 ///
 /// # Errors
 /// The system gives no thread.
-pub fn keep(dir: &Path, first: bool, history: Arc<History>, events: &Events) -> io::Result<Keeper> {
+pub fn keep(
+    dir: &Path,
+    first: bool,
+    history: Arc<History>,
+    events: &Events,
+) -> io::Result<(Keeper, oneshot::Receiver<Vec<Event>>)> {
     let mut writer = Writer::new(dir, first, history, events.subscribe());
-    if first {
-        writer.remember(events);
-    }
-    Keeper::start("history", dir, move |end| writer.run(end))
+    let (found, earlier) = oneshot::channel();
+    let keeper = Keeper::start("history", dir, move |end| {
+        let earlier = if first { writer.remember() } else { Vec::new() };
+        // Nobody waits any longer for a disk that was slow.
+        let _ = found.send(earlier);
+        writer.run(end);
+    })?;
+    Ok((keeper, earlier))
 }
 
 #[derive(Debug)]
@@ -103,13 +112,12 @@ impl Writer {
         }
     }
 
-    /// Loads the files of earlier runs.
-    fn remember(&mut self, events: &Events) {
+    /// Takes on the counters of earlier runs; their events.
+    fn remember(&mut self) -> Vec<Event> {
         let done = self.open();
-        if done.is_ok() {
-            events.remember(self.earlier());
-        }
+        let earlier = if done.is_ok() { self.earlier() } else { Vec::new() };
         self.report(done, false);
+        earlier
     }
 
     /// The events of earlier runs, oldest first.

@@ -51,6 +51,8 @@ pub struct Recordings {
 
 #[derive(Debug, Default)]
 struct Shared {
+    /// Counts the recorders that were started.
+    recorder: u64,
     options: Option<RecorderOptions>,
     control: Option<Sender<Control>>,
     entries: Vec<Arc<Entry>>,
@@ -125,12 +127,14 @@ impl Recordings {
 #[derive(Debug)]
 pub struct RecorderTask {
     recordings: Arc<Recordings>,
+    number: u64,
     control: Sender<Control>,
     threads: Vec<JoinHandle<()>>,
 }
 
 impl RecorderTask {
-    /// Starts the threads. Nothing is recorded before [`RecorderTask::adopt`].
+    /// Starts the threads. Nothing is recorded before [`RecorderTask::adopt`]. The channel ends when the recordings that are
+    /// on disk are known.
     ///
     /// # Errors
     /// The system gives no thread.
@@ -140,22 +144,33 @@ impl RecorderTask {
         history: Arc<History>,
         events: Events,
         writes: &Arc<WriteStats>,
-    ) -> std::io::Result<RecorderTask> {
+    ) -> std::io::Result<(RecorderTask, oneshot::Receiver<()>)> {
         let (control, orders) = channel();
         let (captures, waiting) = sync_channel(WAITING);
-        // Without recordings the directory is left alone.
-        let store = options.is_on().then(|| Store::open(&options));
-        {
+        let (opening, opened) = oneshot::channel();
+        let number = {
             let mut shared = recordings.shared();
-            shared.entries = store.as_ref().map_or_else(Vec::new, |store| store.entries().to_vec());
+            shared.recorder += 1;
+            shared.entries = Vec::new();
             shared.control = Some(control.clone());
             shared.options = Some(options.clone()).filter(RecorderOptions::is_on);
-        }
-        let writer = store.map(|store| Writer {
-            store,
-            recordings: recordings.clone(),
-            events: events.clone(),
-            failing: false,
+            shared.recorder
+        };
+        // Without recordings the directory is left alone.
+        let writer = options.is_on().then(|| {
+            let (options, recordings, events) = (options.clone(), recordings.clone(), events.clone());
+            move || {
+                let writer = Writer {
+                    store: Store::open(&options),
+                    recordings,
+                    number,
+                    events,
+                    failing: false,
+                };
+                writer.show(|_| {});
+                drop(opening);
+                writer.run(&waiting);
+            }
         });
         let taker = Taker {
             recorder: Recorder::new(options, history),
@@ -166,14 +181,16 @@ impl RecorderTask {
             left_out: 0,
         };
         let thread = |name: &str| std::thread::Builder::new().name(name.to_string());
-        let writer = writer.map(|writer| thread("recordings").spawn(move || writer.run(&waiting)));
+        let writer = writer.map(|writer| thread("recordings").spawn(writer));
         let writer = writer.transpose()?;
         let taker = thread("recorder").spawn(move || taker.run(&orders))?;
-        Ok(RecorderTask {
+        let task = RecorderTask {
             recordings,
+            number,
             control,
             threads: [taker].into_iter().chain(writer).collect(),
-        })
+        };
+        Ok((task, opened))
     }
 
     /// Records these buses from now on; process data is stale from `stale_after` on.
@@ -191,7 +208,10 @@ impl RecorderTask {
             }
         }
         let mut shared = self.recordings.shared();
-        (shared.control, shared.options) = (None, None);
+        // Another one may be at work since the disk has held up this one.
+        if shared.recorder == self.number {
+            (shared.control, shared.options) = (None, None);
+        }
     }
 }
 
@@ -329,12 +349,23 @@ fn shortened(text: &str) -> String {
 struct Writer {
     store: Store,
     recordings: Arc<Recordings>,
+    /// Its recorder's.
+    number: u64,
     events: Events,
     /// The last one could not be written.
     failing: bool,
 }
 
 impl Writer {
+    /// Lists the recordings of the store, unless another recorder is at work since.
+    fn show(&self, and: impl FnOnce(&mut Shared)) {
+        let mut shared = self.recordings.shared();
+        if shared.recorder == self.number {
+            shared.entries = self.store.entries().to_vec();
+            and(&mut shared);
+        }
+    }
+
     fn run(mut self, waiting: &Receiver<Capture>) {
         while let Ok(capture) = waiting.recv() {
             let mut recording = assemble(&capture);
@@ -344,11 +375,7 @@ impl Writer {
             match written {
                 Ok(entry) => {
                     self.failing = false;
-                    {
-                        let mut shared = self.recordings.shared();
-                        shared.entries = self.store.entries().to_vec();
-                        *shared.made.entry(entry.trigger).or_default() += 1;
-                    }
+                    self.show(|shared| *shared.made.entry(entry.trigger).or_default() += 1);
                     let text = match entry.trigger.has_event() {
                         true => format!("recording {}", entry.id),
                         false => format!("recording {}: {}", entry.id, entry.summary),

@@ -6,6 +6,8 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant, SystemTime};
 
+use tokio::sync::oneshot;
+
 use super::{Guards, Saved};
 use crate::files::names::STARTS;
 use crate::files::{self, Keeper};
@@ -15,14 +17,25 @@ const BEAT: Duration = Duration::from_millis(100);
 /// Longest file that is read.
 const LONGEST: u64 = 64 << 20;
 
-/// Keeps starts in that directory from now on; those of earlier runs are taken from there.
+/// Keeps starts in that directory from now on; those of earlier runs are taken from there. Until they are, which the channel
+/// tells by its end, guarded drives are not started.
 ///
 /// # Errors
 /// The system gives no thread.
-pub fn keep(dir: &Path, guards: Arc<Guards>) -> io::Result<Keeper> {
+pub fn keep(dir: &Path, guards: Arc<Guards>) -> io::Result<(Keeper, oneshot::Receiver<()>)> {
     let path = dir.join(STARTS);
-    guards.keep(&load(&path), Instant::now(), SystemTime::now());
-    Keeper::start("starts", dir, move |end| run(&path, &guards, end))
+    let (reading, read) = oneshot::channel();
+    guards.await_file(&path);
+    let keeper = Keeper::start("starts", dir, move |end| {
+        let saved = load(&path);
+        // A thread that the disk held up until another one has its place counts nothing.
+        if end.try_recv() == Err(TryRecvError::Empty) {
+            guards.keep(&saved, Instant::now(), SystemTime::now());
+            drop(reading);
+            run(&path, &guards, end);
+        }
+    })?;
+    Ok((keeper, read))
 }
 
 fn run(path: &Path, guards: &Guards, end: &Receiver<()>) {

@@ -1,6 +1,7 @@
 //! The motors of all buses, their groups, and what is saved of them. Pure: time is an argument.
 
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -46,6 +47,8 @@ enum Disk {
     /// In memory only.
     #[default]
     None,
+    /// In a file that is not read yet.
+    Unread(PathBuf),
     /// In a file.
     File {
         /// Newest generation that is in it.
@@ -92,6 +95,11 @@ impl Guards {
     /// Something changed that belongs on disk.
     pub(super) fn tell_change(&self) {
         self.changed.notify_one();
+    }
+
+    /// Starts are about to be kept in that file; until [`Guards::keep`] has what is in it, none is allowed.
+    pub fn await_file(&self, path: &Path) {
+        self.lock().disk = Disk::Unread(path.to_path_buf());
     }
 
     /// From now on starts are kept in a file: none is written to a drive before [`Guards::wrote`] says that it is there.
@@ -250,6 +258,10 @@ impl Ledger {
     pub(super) fn kept(&self, reserved: &Reserved, now: Instant) -> Kept {
         match &self.disk {
             Disk::None => Kept::Yes,
+            Disk::Unread(path) => Kept::Failed(format!(
+                "{}: it is not read yet: the disk does not answer",
+                path.display()
+            )),
             Disk::File { written, .. } if *written >= reserved.generation => Kept::Yes,
             Disk::File {
                 failed: Some((generation, why)),
@@ -292,7 +304,7 @@ impl Ledger {
 
     fn is_behind(&self) -> bool {
         match &self.disk {
-            Disk::None => false,
+            Disk::None | Disk::Unread(_) => false,
             Disk::File { written, failed } => {
                 let tried = failed.as_ref().map_or(0, |(generation, _)| *generation);
                 self.generation > tried.max(*written)

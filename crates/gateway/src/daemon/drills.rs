@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
 use crate::drill::{DrillState, Drills, LOOK, SavedDrills};
-use crate::files;
 use crate::files::names::DRILLS;
+use crate::files::{self, Patience};
 use crate::order::{Origin, SourceKind};
 use crate::plant::SharedPlant;
 
@@ -27,14 +27,18 @@ fn path(file: &DrillsFile) -> Option<PathBuf> {
 }
 
 /// From now on they are kept in that state directory. What another one has is taken in.
-pub(super) fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, drills: &Drills) {
+pub(super) async fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, patience: &Patience, drills: &Drills) {
     let new = state_dir.map(|dir| dir.join(DRILLS));
     drills.keep(new.is_some());
     let before = std::mem::replace(&mut *file.lock().unwrap_or_else(PoisonError::into_inner), new.clone());
     let Some(path) = new.filter(|new| before.as_ref() != Some(new)) else {
         return;
     };
-    match load(&path) {
+    let found = patience.read({
+        let path = path.clone();
+        move || load(&path)
+    });
+    match found.await.and_then(|found| found) {
         Ok(Some(saved)) => drills.restore(saved),
         Ok(None) => {}
         Err(why) => tracing::error!(

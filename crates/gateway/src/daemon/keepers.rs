@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::server::within;
 use super::{Daemon, STOP_AUDIT, StartError, drills, reservations};
 use crate::config::Settings;
-use crate::files::Keeper;
+use crate::files::{self, Keeper};
 use crate::history::{self, RecorderTask};
 use crate::north::parameter_jobs::{hold_unfinished, keep_reading};
 use crate::order::AuditFile;
@@ -18,14 +18,25 @@ impl Daemon {
         if self.recorder.is_some() && self.settings.recordings == settings.recordings {
             return Ok(());
         }
-        if let Some(recorder) = self.recorder.take() {
-            // A thread of it that panicked has logged that.
-            let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
+        let patience = self.north.patience.clone();
+        if let Some(recorder) = self.recorder.take()
+            && let Err(why) = patience.read(move || recorder.stop()).await
+        {
+            tracing::error!(
+                target: "drivegate::daemon", "recordings in progress may be lost: {why}; the next recorder starts; check the disk"
+            );
         }
         let (recordings, history) = (self.north.recordings.clone(), self.north.history.clone());
         let options = settings.recordings.clone();
         let started = RecorderTask::start(options, recordings, history, self.events.clone(), &self.writes);
-        self.recorder = Some(started.map_err(StartError::Recorder)?);
+        let (recorder, opened) = started.map_err(StartError::Recorder)?;
+        self.recorder = Some(recorder);
+        if patience.wait(opened).await.is_none() {
+            tracing::error!(
+                target: "drivegate::daemon", "cannot list the recordings of earlier runs: {}; they are listed when it does; \
+                                              check the disk of recordings.dir", files::late()
+            );
+        }
         Ok(())
     }
 
@@ -47,7 +58,12 @@ impl Daemon {
 
     /// New drives whose parameters may be half restored take no commands but stops, before their bus starts.
     pub(super) async fn hold_unfinished(&self, settings: &Settings) {
-        hold_unfinished(&self.north.parameters, &self.events, settings.drives()).await;
+        hold_unfinished(
+            &self.north.parameters,
+            (&self.events, &self.north.patience),
+            settings.drives(),
+        )
+        .await;
     }
 
     /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.
@@ -59,7 +75,18 @@ impl Daemon {
         let first = self.keeper.is_none();
         self.stop_keeper().await;
         match history::keep(&settings.state_dir, first, self.north.history.clone(), &self.events) {
-            Ok(keeper) => self.keeper = Some(keeper),
+            Ok((keeper, earlier)) => {
+                self.keeper = Some(keeper);
+                match self.north.patience.wait(earlier).await {
+                    // A thread that panicked has logged that.
+                    Some(earlier) => self.events.remember(earlier.unwrap_or_default()),
+                    None => tracing::error!(
+                        target: "drivegate::daemon",
+                        "cannot read the events of earlier runs in {}: {}; they are not shown, and counters follow when it \
+                         does; check the disk of state_dir", settings.state_dir.display(), files::late()
+                    ),
+                }
+            }
             Err(error) => {
                 tracing::error!(
                     target: "drivegate::daemon", "cannot start the thread that keeps events and counters: {error}; free memory or threads"
@@ -78,7 +105,16 @@ impl Daemon {
         }
         self.stop_starts().await;
         match start_guard::keep(&settings.state_dir, self.guards.clone()) {
-            Ok(keeper) => self.starts = Some(keeper),
+            Ok((keeper, read)) => {
+                self.starts = Some(keeper);
+                if self.north.patience.wait(read).await.is_none() {
+                    tracing::error!(
+                        target: "drivegate::daemon",
+                        "cannot read the starts of earlier runs in {}: {}; drives with a guard are not started until it does; \
+                         check the disk of state_dir", settings.state_dir.display(), files::late()
+                    );
+                }
+            }
             Err(error) => tracing::error!(
                 target: "drivegate::daemon",
                 "cannot start the thread that counts starts: {error}; drives with a guard are not started; free memory or threads"
@@ -123,10 +159,11 @@ impl Daemon {
     }
 
     /// Drills as they are configured, kept where the gateway keeps its state.
-    pub(super) fn apply_drills(&self, settings: &Settings) {
+    pub(super) async fn apply_drills(&self, settings: &Settings) {
         let drills = &self.north.drills;
         let kept = settings.keeps_history && settings.drill.is_some();
-        drills::keep_in(&self.drills, kept.then_some(settings.state_dir.as_path()), drills);
+        let dir = kept.then_some(settings.state_dir.as_path());
+        drills::keep_in(&self.drills, dir, &self.north.patience, drills).await;
         drills.set_options(settings.drill);
     }
 

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::files;
 use crate::files::names::RESERVATIONS;
+use crate::files::{self, Patience};
 use crate::permit::KeptReservation;
 use crate::plant::{Plant, SharedPlant};
 
@@ -27,9 +27,13 @@ pub(super) fn keep_in(file: &ReservationsFile, state_dir: Option<&Path>) {
 }
 
 /// Goes on with those of before the start.
-pub(super) fn restore(file: &ReservationsFile, plant: &Plant) {
+pub(super) async fn restore(file: &ReservationsFile, patience: &Patience, plant: &Plant) {
     let Some(path) = path(file) else { return };
-    match load(&path) {
+    let found = patience.read({
+        let path = path.clone();
+        move || load(&path)
+    });
+    match found.await.and_then(|found| found) {
         Ok(kept) => plant.restore_reservations(&kept, Instant::now(), SystemTime::now()),
         Err(why) => tracing::error!(
             target: "drivegate::daemon",

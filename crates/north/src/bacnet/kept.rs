@@ -14,7 +14,7 @@ use super::rights::HostRights;
 use crate::NorthState;
 use crate::drive::Value;
 use crate::event::{Event, EventKind, Events};
-use crate::files;
+use crate::files::{self, DISK};
 use crate::order::{Commanded, Entry, Origin, SourceKind};
 use crate::permit::PROTECTING;
 use crate::plant::{BusHandle, Plant};
@@ -26,9 +26,6 @@ pub(super) const FILE: &str = "bacnet-priorities.json";
 const LONGEST: u64 = 4 << 20;
 /// Time between two tries to write the file.
 const AGAIN: Duration = Duration::from_secs(10);
-/// Longest wait for the disk at the start, and at the end.
-const DISK: Duration = Duration::from_secs(2);
-
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct KeptSlot {
     #[serde(flatten)]
@@ -136,7 +133,7 @@ pub async fn discard(stats: &NorthState, state_dir: &Path, events: &Events) {
         }
     };
     // On a slow disk it is done later.
-    let _ = tokio::time::timeout(DISK, tokio::task::spawn_blocking(discard)).await;
+    let _ = stats.patience.read(discard).await;
 }
 
 /// Slots, and the file that has them.

@@ -105,7 +105,7 @@ impl Task {
     }
 
     pub(super) async fn run(mut self, mut orders: mpsc::UnboundedReceiver<ToTask>, cancel: CancellationToken) {
-        self.load();
+        self.load().await;
         self.hear_drives();
         self.desk.start(Instant::now());
         let mut ticks = interval(TICK);
@@ -254,13 +254,17 @@ impl Task {
     }
 
     /// Takes up the slots of before the start. A server that a reload starts takes up none: they were void before.
-    fn load(&mut self) {
+    async fn load(&mut self) {
         let Some(path) = self.keep_file() else { return };
         if self.stats.kept_slots_read.swap(true, Ordering::Relaxed) {
             return;
         }
-        match kept::load(&path) {
-            Ok(slots) => {
+        let found = self.stats.patience.read({
+            let path = path.clone();
+            move || kept::load(&path)
+        });
+        match found.await {
+            Ok(Ok(slots)) => {
                 let view = &self.desk.view;
                 kept::restore(&view.plant, &view.rights, &slots, Instant::now(), SystemTime::now());
                 self.kept.read(path, slots);
@@ -270,7 +274,12 @@ impl Task {
                 };
                 self.watched = self.desk.view.drives.keys().copied().filter(protected).collect();
             }
-            Err(why) => {
+            Err(why) => tracing::error!(
+                target: "drivegate::bacnet",
+                "cannot read {}: {why}; the slots from before the restart are lost, write them again; check the disk",
+                path.display()
+            ),
+            Ok(Err(why)) => {
                 let aside = files::set_aside(&path, &path.with_extension("damaged"));
                 tracing::error!(
                     target: "drivegate::bacnet",

@@ -3,16 +3,14 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 use super::restore::blocking;
 use crate::event::{Event, EventKind, Events};
+use crate::files::Patience;
 use crate::parameters::{Claim, Journal, JournalFile, Owner, Vault, claims};
 use crate::plant::{DriveHandle, SharedPlant};
 use crate::process_image::{Access, BusSpec, DriveSpec, Machine};
-
-/// Time for the journals to be read at the start; on a slow disk the drives are held until they are.
-const LOOK: Duration = Duration::from_secs(5);
 
 /// A journal, and its owner.
 type Found = (JournalFile, Result<Owner, String>);
@@ -192,7 +190,7 @@ struct Configured {
 /// the disk.
 pub async fn hold_unfinished<'a>(
     vault: &Arc<Vault>,
-    events: &Events,
+    (events, patience): (&Events, &Patience),
     drives: impl Iterator<Item = (&'a BusSpec, &'a DriveSpec)>,
 ) {
     let configured = |(bus, spec): (&BusSpec, &DriveSpec)| {
@@ -214,11 +212,11 @@ pub async fn hold_unfinished<'a>(
         )));
     }
     let (vault, events) = (vault.clone(), events.clone());
-    let looked = tokio::task::spawn_blocking(move || look(&vault, &events, store.dir(), &drives));
-    if tokio::time::timeout(LOOK, looked).await.is_err() {
+    let looked = patience.read(move || look(&vault, &events, store.dir(), &drives));
+    if let Err(why) = looked.await {
         tracing::warn!(
-            target: "drivegate::north::parameter_jobs", "the disk is slow: the drives accept only stops until the \
-                                                         journals of restores are read"
+            target: "drivegate::north::parameter_jobs", "cannot look for journals of restores: {why}; the drives accept \
+                                                         only stops until they are read; check the disk of state_dir"
         );
     }
 }

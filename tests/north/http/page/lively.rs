@@ -192,7 +192,7 @@ impl Lively {
             cast,
             recorder,
             _dir: dir,
-            _task: task.expect("threads"),
+            _task: task.expect("threads").0,
         };
         Lively { plant, stats, going_on }
     }

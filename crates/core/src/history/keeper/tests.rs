@@ -21,7 +21,7 @@ impl Run {
     fn new(dir: &Path) -> Run {
         let (events, history) = (Events::default(), Arc::<History>::default());
         let mut writer = Writer::new(dir, true, history.clone(), events.subscribe());
-        writer.remember(&events);
+        events.remember(writer.remember());
         Run {
             events,
             history,
@@ -223,7 +223,7 @@ fn counters_that_cannot_be_read_are_kept_aside_and_never_cut() {
 async fn the_thread_writes_what_it_has_when_it_ends() {
     let dir = tempfile::tempdir().unwrap();
     let (events, history) = (Events::default(), Arc::<History>::default());
-    let keeper = keep(dir.path(), true, history.clone(), &events).unwrap();
+    let (keeper, _) = keep(dir.path(), true, history.clone(), &events).unwrap();
     history.count_on(totals(5, 50.0));
     (0..10).for_each(|n| events.publish(event(n)));
     keeper.stop().await;

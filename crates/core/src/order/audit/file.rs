@@ -286,9 +286,10 @@ impl Writer {
                 if !std::mem::replace(&mut self.failing, true) {
                     tracing::error!(
                         target: "drivegate::command::audit", "audit file: cannot write {path}: {error}; commands are \
-                                                              still carried out and are in the log; {} records wait \
+                                                              still carried out and are in the log; up to {} \
+                                                              records of commands that were sent and {} others wait \
                                                               in memory; check [audit] and the disk",
-                        WAITING.0
+                        WAITING.0, WAITING.1
                     );
                 }
                 let queues = self.shared.queues();

@@ -6,6 +6,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use crate::files::Patience;
 use crate::files::names::SPARKPLUG;
 
 /// Longest wait for the file.
@@ -24,9 +25,13 @@ pub(super) struct BdSeq {
 
 impl BdSeq {
     /// Goes on behind the number in the file, which was used last; begins with 0 without one, or if it cannot be read.
-    pub(super) fn open(dir: &Path) -> BdSeq {
+    pub(super) async fn open(dir: &Path, patience: &Patience) -> BdSeq {
         let path = dir.join(SPARKPLUG);
-        let text = fs::read_to_string(&path).unwrap_or_default();
+        let read = patience.read({
+            let path = path.clone();
+            move || fs::read_to_string(path).unwrap_or_default()
+        });
+        let text = read.await.unwrap_or_default();
         let last: Option<u8> = text.trim().parse().ok();
         BdSeq {
             path,
@@ -90,11 +95,15 @@ mod tests {
         number
     }
 
+    async fn reopened(state: &Path) -> u8 {
+        next(&mut BdSeq::open(state, &Patience::default()).await).await
+    }
+
     #[tokio::test]
     async fn numbers_go_on_over_restarts() {
         let dir = tempfile::tempdir().unwrap();
         let state = dir.path().join("state");
-        let mut bd_seq = BdSeq::open(&state);
+        let mut bd_seq = BdSeq::open(&state, &Patience::default()).await;
         assert_eq!(
             (next(&mut bd_seq).await, next(&mut bd_seq).await),
             (0, 0),
@@ -107,10 +116,10 @@ mod tests {
         bd_seq.accepted();
         assert_eq!(next(&mut bd_seq).await, 0);
         // Killed before or after the broker accepted the connection: the next run cannot know.
-        assert_eq!(next(&mut BdSeq::open(&state)).await, 1);
-        assert_eq!(next(&mut BdSeq::open(&state)).await, 2);
+        assert_eq!(reopened(&state).await, 1);
+        assert_eq!(reopened(&state).await, 2);
         fs::write(state.join(SPARKPLUG), "damaged").unwrap();
-        assert_eq!(next(&mut BdSeq::open(&state)).await, 0);
+        assert_eq!(reopened(&state).await, 0);
     }
 
     #[tokio::test]
@@ -118,7 +127,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("file");
         fs::write(&file, "").unwrap();
-        let mut bd_seq = BdSeq::open(&file);
+        let mut bd_seq = BdSeq::open(&file, &Patience::default()).await;
         for expected in 0..3 {
             let (number, written) = bd_seq.next().await;
             assert_eq!((number, written.is_err()), (expected, true));

@@ -57,7 +57,8 @@ pub(in crate::mqtt) async fn run(
     stats: Arc<NorthState>,
     cancel: CancellationToken,
 ) {
-    let mut client = NodeClient::new(options, broker, plant, stats);
+    let bd_seq = BdSeq::open(&options.state_dir, &stats.patience).await;
+    let mut client = NodeClient::new(options, broker, bd_seq, plant, stats);
     session::run(&mut client, cancel).await;
     // What is still to come is published by the node that comes after.
     session::end(&mut client).await;
@@ -107,6 +108,7 @@ impl NodeClient {
     fn new(
         options: Options,
         (broker, right): (BrokerOptions, Right),
+        bd_seq: BdSeq,
         plant: SharedPlant,
         stats: Arc<NorthState>,
     ) -> NodeClient {
@@ -132,7 +134,7 @@ impl NodeClient {
             session: Session::new(rules),
             drives: Vec::new(),
             cursor: 0,
-            bd_seq: BdSeq::open(&options.state_dir),
+            bd_seq,
             bd_seq_fails: false,
             held: None,
             buses_at: now,

@@ -1,0 +1,117 @@
+//! Files of the state directory that cannot be opened, as on a disk that hangs: named pipes that nobody writes to.
+
+use std::path::Path;
+
+use drivegate::sim::statistics::Direction;
+use serde_json::{Value as Json, json};
+
+use super::bacnet::free_udp_port;
+use crate::support::process::until;
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, USERS, controlled};
+
+const REST: &str = "[mqtt.sparkplug]\ngroup = \"plant\"\n[audit]\nfile = \"audit.jsonl\"\n[drill]\n\
+     [authority]\nmode = \"exclusive\"\nlease = \"30s\"\n[[authority.principal]]\nname = \"alice\"\nrank = \"operator\"\nhttp_user = \"alice\"\n";
+
+/// What is read of the state directory at a start.
+const FILES: [&str; 11] = [
+    "events.jsonl",
+    "counters.json",
+    "starts.json",
+    "reservations.json",
+    "drills.json",
+    "bacnet-priorities.json",
+    "sparkplug-bdseq",
+    "mqtt-topics",
+    "audit.jsonl",
+    "recordings/old.dgrec",
+    "params/fan-3/restore.journal",
+];
+
+/// `pump-1` is guarded, `fan-2` stops with the gateway.
+fn site() -> Site {
+    let line = LINE1.replace("profile_dirs", "state_dir = \"state\"\nprofile_dirs");
+    let drives =
+        controlled("pump-1", 1, "guard = { starts_per_hour = 9 }") + &controlled("fan-2", 2, "on_shutdown = \"stop\"");
+    let bacnet = format!(
+        "[bacnet]\nlisten = \"127.0.0.10:{}\"\ncommands = true\nwrite = [\"127.0.0.16/28\"]\nkeep_priorities = true\n",
+        free_udp_port()
+    );
+    let site = Site::of(&[&line, &drives, MODBUS_TCP, MQTT, REST, HTTP, USERS, &bacnet]);
+    site.add_user("alice");
+    site
+}
+
+fn hang(file: &Path) {
+    std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+    let mode = rustix::fs::Mode::from_raw_mode(0o600);
+    rustix::fs::mknodat(rustix::fs::CWD, file, rustix::fs::FileType::Fifo, mode, 0).unwrap();
+}
+
+/// The answer to a start, once it is not refused for what passes by itself.
+fn start(site: &Site, drive: &str) -> Json {
+    let path = format!("drives/{drive}/commands");
+    until("an answer", || {
+        let (_, answer) = site.curl("alice", &path, &["-d", "{\"run\": true}"]);
+        let passes = ["offline", "timeout", "expired"]
+            .iter()
+            .any(|word| answer["result"] == *word);
+        (!passes).then_some(answer)
+    })
+}
+
+/// The gateway starts, commands, is reloaded and stops its motor while the files hang.
+fn lives_with(files: &[&str]) {
+    let site = site();
+    for file in files {
+        hang(&site.file("state").join(file));
+    }
+    let line = site.line(&[1, 2]);
+    let mut gateway = site.run_ready();
+    let holds = files.iter().any(|file| file.starts_with("params"));
+    let guarded = start(&site, "pump-1");
+    match (holds, files.contains(&"starts.json")) {
+        (true, _) => assert_eq!(guarded["result"], "not_allowed", "{files:?}: {guarded}"),
+        (false, false) => assert_eq!(guarded["ok"], true, "{files:?}: {guarded}"),
+        (false, true) => {
+            let why = guarded["error"]["message"].as_str().unwrap_or_default();
+            assert_eq!(guarded["result"], "guarded", "{guarded}");
+            assert!(why.contains("starts.json") && why.contains("not read yet"), "{why}");
+        }
+    }
+    if !holds {
+        assert_eq!(start(&site, "fan-2")["ok"], true, "{files:?}");
+    }
+    site.change("response_timeout = \"2s\"", "response_timeout = \"1900ms\"");
+    gateway.signal("HUP");
+    gateway.until_printed("configuration reloaded");
+    site.change("state_dir = \"state\"", "state_dir = \"elsewhere\"");
+    gateway.signal("HUP");
+    until("the second reload", || {
+        (gateway.output().matches("configuration reloaded").count() == 2).then_some(())
+    });
+    let (status, answer) = site.curl("alice", "drives/pump-1/commands", &["-d", "{\"run\": false}"]);
+    assert_eq!((status, &answer["ok"]), (200, &json!(true)), "{files:?}: {answer}");
+    gateway.signal("TERM");
+    let ended = gateway.ended();
+    assert!(ended.success(), "{files:?}: {ended}");
+    let mut words = line.transcript();
+    words.retain(|frame| frame.direction == Direction::ToDrives && frame.bytes.starts_with(&[2, 6]));
+    let last = words.last().map(|frame| frame.bytes[5] & 1);
+    assert_eq!(last, Some(0), "{files:?}: the motor of fan-2 is stopped");
+}
+
+#[test]
+fn one_file_that_hangs_holds_up_neither_start_nor_reload_nor_stop() {
+    for some in FILES.chunks(4) {
+        std::thread::scope(|scope| {
+            some.iter().for_each(|file| {
+                scope.spawn(|| lives_with(&[file]));
+            });
+        });
+    }
+}
+
+#[test]
+fn a_disk_that_hangs_holds_up_neither_start_nor_reload_nor_stop() {
+    lives_with(&FILES);
+}
