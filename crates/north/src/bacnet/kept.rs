@@ -238,4 +238,33 @@ mod tests {
         std::fs::write(&file, "[{").unwrap();
         assert!(load(&file).is_err());
     }
+
+    /// Looks after the write that is under way until it has ended.
+    async fn until_ended(kept: &mut KeptFile, path: &Path, plant: &Plant, now: Instant) {
+        while kept.writing.is_some() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+            kept.keep(Some(path.to_path_buf()), plant, now);
+        }
+    }
+
+    #[tokio::test]
+    async fn what_a_full_disk_refused_is_written_when_there_is_room_unasked() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join(FILE);
+        // No file can be made in that place.
+        let aside = file.with_extension(files::PARTIAL);
+        std::fs::create_dir(&aside).unwrap();
+        let plant = Plant::new("test", Duration::from_secs(1), Vec::new());
+        let (mut kept, start) = (KeptFile::default(), Instant::now());
+        kept.keep(Some(file.clone()), &plant, start);
+        until_ended(&mut kept, &file, &plant, start).await;
+        assert!(kept.again.is_some() && !file.exists());
+        std::fs::remove_dir(&aside).unwrap();
+        kept.keep(Some(file.clone()), &plant, start + AGAIN / 2);
+        assert!(kept.writing.is_none(), "too early");
+        kept.keep(Some(file.clone()), &plant, start + AGAIN);
+        until_ended(&mut kept, &file, &plant, start + AGAIN).await;
+        assert_eq!(load(&file), Ok(Vec::new()));
+        assert!(file.exists() && kept.again.is_none());
+    }
 }
