@@ -338,8 +338,12 @@ impl Schedule {
         let Some(drive) = self.drives.get_mut(index).filter(online) else {
             return;
         };
-        let fast = |item: &&Item| item.read.class == PollClass::Fast;
-        let Some(read) = drive.items.iter().find(fast).map(|item| item.read) else {
+        let Some(read) = drive
+            .items
+            .iter()
+            .find(|item| item.is_process_data())
+            .map(|item| item.read)
+        else {
             return;
         };
         if !self.round.is_empty() {
@@ -562,7 +566,7 @@ impl Schedule {
         for drive in &mut self.drives {
             drive.presence = Presence::Away(now, Duration::ZERO);
             drive.early.found_anew();
-            drive.failures = 0;
+            (drive.failures, drive.away_by) = (0, None);
         }
     }
 }

@@ -116,8 +116,7 @@ pub(super) struct Supervision {
     refused: Option<Refusal>,
     /// It was reported that the drive does not report whether it runs.
     blind_reported: bool,
-    /// For how long the drive answered since the lease expired without showing what is to be done, and until when that
-    /// is calculated.
+    /// For how long the drive has answered without showing whether its motor runs, and until when that is calculated.
     waited: Option<(Duration, Instant)>,
     /// A failure of the action that is not reported yet.
     failure: Option<Outcome>,
@@ -167,7 +166,7 @@ impl Supervision {
 
     /// Another action, or another lease.
     fn begin_anew(&mut self) {
-        (self.refused, self.next_try, self.waited) = (None, None, None);
+        (self.refused, self.next_try) = (None, None);
         (self.failure, self.failures) = (None, 0);
         self.reasons.clear();
     }
@@ -185,6 +184,7 @@ impl Supervision {
         let Some(spec) = &reading.spec.supervision else {
             return Demand::None;
         };
+        self.count_in_vain(reading, now);
         let held = orders.held_until.is_some_and(|until| until > now);
         match self.lease.state {
             State::Unheard => {
@@ -208,7 +208,7 @@ impl Supervision {
             State::Held(_) if self.answer.is_some() => Demand::Withdraw,
             State::Held(since) => {
                 if has_run_out(since, spec.timeout, now) && !held {
-                    self.runs_out(since, reading, words, now, news, drive);
+                    self.runs_out(since, reading, words, news, drive);
                 }
                 match self.lease.state {
                     State::RanOut => self.act(reading, now),
@@ -235,11 +235,10 @@ impl Supervision {
         since: Instant,
         reading: &Reading<'_>,
         words: &KnownWords,
-        now: Instant,
         news: &mut Vec<News>,
         drive: DriveIndex,
     ) {
-        let in_vain = self.waits_in_vain(reading, now);
+        let in_vain = self.waits_in_vain(reading);
         let Some(running) = self.running(reading, words, in_vain, news, drive) else {
             return;
         };
@@ -262,14 +261,26 @@ impl Supervision {
         }
     }
 
-    /// Whether the drive answered since the lease expired for as long as a read of what is to be seen may take. The
-    /// time in which it does not answer is not counted: after it everything is read again.
-    fn waits_in_vain(&mut self, reading: &Reading<'_>, now: Instant) -> bool {
+    /// Counts for how long the drive has answered without showing whether its motor runs. The time in which it does not answer
+    /// is not counted: after it everything is read again.
+    fn count_in_vain(&mut self, reading: &Reading<'_>, now: Instant) {
+        let is_shown =
+            |point| reading.spec.profile.model_point(point).is_none() || reading.model(point).good().is_some();
+        if [ModelPoint::Running, ModelPoint::Run].into_iter().all(is_shown) {
+            self.waited = None;
+            return;
+        }
         let online = reading.snapshot.link.is_online();
         let (time, until) = self.waited.unwrap_or((Duration::ZERO, now));
         let passed = now.saturating_duration_since(until);
         let time = if online { time + passed } else { time };
         self.waited = Some((time, now));
+    }
+
+    /// Whether that has lasted for as long as a read of what is to be seen may take.
+    fn waits_in_vain(&self, reading: &Reading<'_>) -> bool {
+        let online = reading.snapshot.link.is_online();
+        let time = self.waited.map_or(Duration::ZERO, |(time, _)| time);
         let points = [ModelPoint::Running, ModelPoint::Run];
         let mut points = points
             .iter()

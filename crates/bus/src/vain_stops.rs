@@ -2,14 +2,14 @@
 //!
 //! A person presses the button again, and the drive may listen again at any moment: the next stop goes out after the others
 //! had the line for as long as the last one took it. Stops without end must not take half of the line: beyond a few in a row
-//! they get a tenth.
+//! they get a tenth, but wait no longer than for one reply.
 
 use std::time::{Duration, Instant};
 
 /// Stops in a row that go out in turn with the rest.
 const IN_TURN: f64 = 8.0;
-/// Beyond that the pause is this multiple of the duration of the last one, up to this limit.
-const PAUSE: (u32, Duration) = (10, Duration::from_secs(2));
+/// Beyond that the pause is this multiple of the duration of the last one, up to the time for a reply.
+const PAUSE: u32 = 10;
 
 /// The unanswered stops of one drive.
 #[derive(Debug, Default)]
@@ -28,11 +28,11 @@ impl VainStops {
         self.took += took;
     }
 
-    /// A stop failed without any reply.
-    pub(super) fn in_vain(&mut self, now: Instant) {
+    /// A stop failed without any reply, for which the drive has `response_timeout`.
+    pub(super) fn in_vain(&mut self, response_timeout: Duration, now: Instant) {
         let took = std::mem::take(&mut self.took);
-        let share = took * PAUSE.0;
-        let pause = share.min(PAUSE.1).max(took);
+        let share = took * PAUSE;
+        let pause = share.min(response_timeout).max(took);
         if let Some(last) = self.last.replace(now) {
             let paid = now.saturating_duration_since(last).as_secs_f64() / share.as_secs_f64().max(1e-6);
             self.count = (self.count - paid).max(0.0);
@@ -69,7 +69,7 @@ mod tests {
             for _ in 0..40 {
                 now += took;
                 stops.not_answered(took);
-                stops.in_vain(now);
+                stops.in_vain(ms(1000), now);
                 let until = stops.waits_until(now).unwrap();
                 pauses.push(until - now);
                 now = until;
@@ -77,11 +77,14 @@ mod tests {
             }
             assert!(pauses[..8].iter().all(|pause| *pause == took), "{pauses:?}");
             let last: Duration = pauses[20..].iter().sum();
-            assert!(last >= took * 20 * 3 / 2, "a flood has the line to itself: {pauses:?}");
-            assert!(pauses.iter().all(|pause| *pause <= PAUSE.1), "{pauses:?}");
+            assert!(last >= took * 20, "a flood has the line to itself: {pauses:?}");
+            assert!(
+                pauses[20..].iter().all(|pause| *pause <= (took * 10).min(ms(1000))),
+                "{pauses:?}"
+            );
             stops.answered();
             stops.not_answered(took);
-            stops.in_vain(now);
+            stops.in_vain(ms(1000), now);
             assert_eq!(stops.waits_until(now), Some(now + took));
         }
     }
@@ -91,7 +94,7 @@ mod tests {
         let (mut stops, mut now) = (VainStops::default(), Instant::now());
         for _ in 0..1000 {
             stops.not_answered(Duration::from_millis(100));
-            stops.in_vain(now);
+            stops.in_vain(Duration::from_secs(1), now);
             now += Duration::from_secs(1);
             assert_eq!(stops.waits_until(now), None);
         }

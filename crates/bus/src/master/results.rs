@@ -425,7 +425,7 @@ impl Master {
         if let Some(outcome) = outcome {
             drive.end(slot, &outcome, image, now);
             if silent {
-                drive.vain_stops.in_vain(now);
+                drive.vain_stops.in_vain(self.response_timeout, now);
                 self.schedule.doubted(index);
             }
         }

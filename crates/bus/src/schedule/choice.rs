@@ -111,7 +111,7 @@ impl Schedule {
             .collect();
         waiting.sort();
         waiting.into_iter().find_map(|(_, index)| {
-            let read = self.drives.get(index)?.items.first()?.read;
+            let read = self.drives.get(index)?.probe()?;
             Some(Poll {
                 drive: index,
                 read,

@@ -11,6 +11,8 @@ use crate::drive::{Plan, PlannedRead, PollClass};
 const DEAD_SHARE: f64 = 0.016;
 /// First and longest pause between two probes of a drive that does not answer.
 const PROBE_PAUSE: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
+/// Every so many probes ask for something else: what the others ask for may be what the drive never answers.
+const OTHER_PROBE: usize = 3;
 /// When a drive that went away is probed first, whatever that costs: most outages are short. A drive that answers saves up
 /// for it, out of the same share.
 const EARLY_PROBES: [Duration; 3] = [
@@ -21,6 +23,9 @@ const EARLY_PROBES: [Duration; 3] = [
 /// First and longest pause before a request that the drive refused is tried again: a drive that is starting may refuse what
 /// it soon has, one that never has it must not take time from others.
 const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
+
+/// First and longest pause before a request that is not answered, while the drive answers others, is tried again.
+pub(super) const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 
 /// Pause before a read that no manual states is tried: where it failed, and where its reply proved nothing.
 pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(20));
@@ -40,6 +45,8 @@ pub(super) struct Item {
     pub(super) postponed: bool,
     pub(super) cost: Duration,
     pub(super) refused: bool,
+    /// The drive answers others and not this one: that does not take it away.
+    pub(super) mute: bool,
     /// How often in a row.
     pub(super) refusals: u32,
     pub(super) failures: u32,
@@ -77,6 +84,9 @@ pub(super) struct DriveSchedule {
     pub(super) garbled: u32,
     /// It did not answer when it was asked last.
     pub(super) unanswered: bool,
+    /// The read without a reply that took it away, and the probes since.
+    pub(super) away_by: Option<PlannedRead>,
+    pub(super) probes: usize,
     /// The last failed poll of process data.
     pub(super) troubled: Option<Instant>,
     pub(super) items: Vec<Item>,
@@ -166,6 +176,7 @@ impl Item {
             postponed: false,
             cost,
             refused: false,
+            mute: false,
             refusals: 0,
             failures: 0,
             failed_at: None,
@@ -174,6 +185,11 @@ impl Item {
             asked: None,
             whole_again: None,
         }
+    }
+
+    /// Read in every round, and answered as far as is known.
+    pub(super) fn is_process_data(&self) -> bool {
+        self.read.class == PollClass::Fast && !self.mute
     }
 
     pub(super) fn is_slow(&self) -> bool {
@@ -208,6 +224,8 @@ impl DriveSchedule {
             failures: 0,
             garbled: 0,
             unanswered: false,
+            away_by: None,
+            probes: 0,
             troubled: None,
             items,
             behind_state,
@@ -294,11 +312,62 @@ impl DriveSchedule {
 
     /// Whether slow reads wait until process data shows that it still answers.
     pub(super) fn waits_for_fast(&self) -> bool {
-        self.unanswered && self.has_fast()
+        self.unanswered && self.items.iter().any(Item::is_process_data)
     }
 
-    pub(super) fn has_fast(&self) -> bool {
-        self.items.iter().any(|i| i.read.class == PollClass::Fast)
+    /// Whether the answers to that read show that the drive is there.
+    pub(super) fn shows_presence(&self, read: &PlannedRead) -> bool {
+        let Some(item) = self.items.iter().find(|item| item.read == *read) else {
+            return true;
+        };
+        match self.items.iter().any(Item::is_process_data) {
+            true => item.is_process_data(),
+            false => !item.mute || self.items.iter().all(|item| item.mute),
+        }
+    }
+
+    /// What it is asked to find out whether it answers: the first read that is not known to be in vain, whose reply may also be
+    /// that to the probe before; every third time another one.
+    pub(super) fn probe(&self) -> Option<PlannedRead> {
+        let (known, mute): (Vec<&Item>, Vec<&Item>) = self.items.iter().partition(|item| !item.mute);
+        let mut all = known.into_iter().chain(mute).map(|item| item.read);
+        let first = all.next()?;
+        let others: Vec<PlannedRead> = all
+            .filter(|read| !matches!(read.class, PollClass::Fault | PollClass::Monitor))
+            .collect();
+        let turn =
+            (self.probes % OTHER_PROBE == OTHER_PROBE - 1).then(|| self.probes / OTHER_PROBE % others.len().max(1));
+        turn.and_then(|turn| others.get(turn).copied()).or(Some(first))
+    }
+
+    /// The drive, which answers others, did not answer this read as often as it is tried. A block of process data is read in
+    /// halves from now on, until what it does not answer is found; that is tried again after a pause that grows.
+    pub(super) fn in_vain(&mut self, read: PlannedRead, retries: u32, now: Instant) {
+        let Some(index) = self.items.iter().position(|item| item.read == read) else {
+            return;
+        };
+        let Some(item) = self.items.get_mut(index) else {
+            return;
+        };
+        item.mute = true;
+        item.failures = item.failures.max(retries + 1);
+        let vain = item.failures.saturating_sub(retries + 1);
+        item.due = now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1);
+        let origin = item.origin;
+        if read.class != PollClass::Fast {
+            return;
+        }
+        let Some((low, high)) = Plan::halves(read) else {
+            self.join(origin, now);
+            return;
+        };
+        let cost = item.cost;
+        let halves = [low, high].map(|half| Item {
+            mute: true,
+            whole_again: Some(now + REFUSED_PAUSE.1),
+            ..Item::new(half, origin, cost, now)
+        });
+        self.items.splice(index..=index, halves);
     }
 
     /// Splits a refused block until the bad point is found, which is retried slowly.
@@ -349,8 +418,8 @@ impl DriveSchedule {
                 Some(last)
                     if item.origin == origin
                         && last.origin == origin
-                        && !item.refused
-                        && !last.refused
+                        && !(item.refused || item.mute)
+                        && !(last.refused || last.mute)
                         && u32::from(last.read.start) + u32::from(last.read.count) == u32::from(item.read.start) =>
                 {
                     last.read.append(&item.read);

@@ -3,18 +3,16 @@
 
 use std::time::{Duration, Instant};
 
-use super::drives::Presence;
+use super::drives::{MUTE_PAUSE, Presence};
 use super::{Change, Poll, Polled, Schedule};
 use crate::drive::{DriveIndex, PollClass};
 
-/// First and longest pause before a slow request that is not answered, while the drive answers others, is tried again.
-const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 /// Garbled answers in a row after which a drive counts as away: something is there, but nothing comes of it.
 const MOST_GARBLED: u32 = 8;
 
 impl Schedule {
     pub(super) fn answered(&mut self, poll: &Poll, polled: Polled, now: Instant) -> Change {
-        let slow = self.cadence.slow;
+        let (slow, retries) = (self.cadence.slow, self.cadence.retries);
         let Some(drive) = self.drives.get_mut(poll.drive) else {
             return Change::None;
         };
@@ -27,6 +25,11 @@ impl Schedule {
         if came {
             drive.presence = Presence::Online;
             drive.early.came(now);
+            drive.probes = 0;
+            // It answers, but not this one.
+            if let Some(vain) = drive.away_by.take().filter(|vain| *vain != poll.read) {
+                drive.in_vain(vain, retries, now);
+            }
             if self.round_started.is_none() {
                 self.round_due = self.round_due.min(now);
             }
@@ -43,7 +46,8 @@ impl Schedule {
             item.failures = 0;
             item.unread = false;
             item.refusals = 0;
-            if std::mem::take(&mut item.refused) {
+            let was_in_vain = [&mut item.refused, &mut item.mute].map(std::mem::take);
+            if was_in_vain.contains(&true) {
                 // The bad point is readable again: it is read with its neighbours.
                 item.whole_again = Some(now);
             }
@@ -69,6 +73,7 @@ impl Schedule {
         };
         if let Presence::Away(_, pause) = drive.presence {
             drive.failures += 1;
+            drive.probes += usize::from(drive.tried);
             // A drive that has just answered something is there: it is asked again at once.
             if (!drive.tried || drive.heard) && drive.failures <= retries {
                 drive.presence = Presence::Away(now, pause);
@@ -76,20 +81,24 @@ impl Schedule {
             }
             let first = !drive.tried;
             drive.tried = true;
+            if first {
+                (drive.away_by, drive.probes) = (Some(poll.read), 0);
+            }
             drive.is_away(now, took);
             return if first { Change::Offline } else { Change::None };
         }
         drive.unanswered = true;
-        let presence_counts = poll.read.class == PollClass::Fast || !drive.has_fast();
-        if !presence_counts {
+        if !drive.shows_presence(&poll.read) {
             // A request that is never answered must not take the drive away while its process data comes.
+            let mut in_vain = false;
             if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
                 item.failures += 1;
                 item.failed_at = Some(now);
-                item.due = match item.failures.checked_sub(retries + 1) {
-                    Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
-                    None => now,
-                };
+                item.due = now;
+                in_vain = item.failures > retries;
+            }
+            if in_vain {
+                drive.in_vain(poll.read, retries, now);
             }
             self.ask_whether_it_answers(poll.drive, now);
             return Change::None;
@@ -105,6 +114,7 @@ impl Schedule {
             return Change::None;
         }
         drive.is_away(now, took);
+        (drive.away_by, drive.probes) = (Some(poll.read), 0);
         drive.failures = 0;
         drive.garbled = 0;
         self.round.retain(|(index, _)| *index != poll.drive);
@@ -119,7 +129,7 @@ impl Schedule {
             return;
         }
         let items = self.drives.get(index).into_iter().flat_map(|drive| &drive.items);
-        let fast = items.filter(|item| item.read.class == PollClass::Fast && item.due <= now);
+        let fast = items.filter(|item| item.is_process_data() && item.due <= now);
         self.round.extend(fast.map(|item| (index, item.read)));
     }
 
@@ -128,7 +138,7 @@ impl Schedule {
         let Some(drive) = self.drives.get_mut(poll.drive) else {
             return Change::None;
         };
-        let counts = poll.read.class == PollClass::Fast || !drive.has_fast();
+        let counts = drive.shows_presence(&poll.read);
         if drive.presence != Presence::Online || !counts || drive.garbled >= MOST_GARBLED.max(retries) {
             return self.failed(poll, took, now);
         }

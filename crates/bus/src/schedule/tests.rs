@@ -9,6 +9,7 @@ use crate::drive::DriveIndex;
 mod chance;
 mod commands;
 mod presence;
+mod silent_points;
 
 const COST: Duration = Duration::from_millis(12);
 

@@ -21,14 +21,6 @@ impl SupervisedDrive {
         image.update(|s| s.refuse(raw.table, raw.address, 1, Exception::ADDRESS));
     }
 
-    /// When the client was last heard of.
-    fn heard(&self) -> Instant {
-        match self.drive.supervision.lease.state {
-            State::Held(since) => since,
-            _ => self.now - Duration::from_secs(7),
-        }
-    }
-
     /// `ms` later its lease is looked at; the action.
     fn later(&mut self, ms: u64) -> Option<Command> {
         self.now += Duration::from_millis(ms);
@@ -69,18 +61,26 @@ fn a_run_command_that_is_known_only_from_a_write_counts() {
 #[test]
 fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
     let mut rig = cx();
-    for _ in 0..6 {
+    for _ in 0..4 {
+        assert!(rig.later(1_000).is_none());
+    }
+    let offline = |rig: &SupervisedDrive| rig.image().update(|s| s.link = Link::Offline(SystemTime::now()));
+    let online = |rig: &SupervisedDrive| rig.image().update(|s| s.link = Link::Online(SystemTime::now()));
+    offline(&rig);
+    for _ in 0..10 {
         assert!(rig.later(1_000).is_none());
     }
     assert_eq!(rig.news, []);
+    online(&rig);
     assert!(rig.after(10, true).is_some());
-    // But not for ever, if it answers and this is not read again, whatever comes instead.
+    // But not for ever, if it answers and this is not read again, whatever comes instead: it acts when the lease runs out.
     let mut rig = cx();
     rig.look(0, true);
     rig.heartbeat();
+    let heard = rig.now;
     let action = (0..100).find_map(|_| rig.later(100));
     assert!(action.is_some(), "the stop");
-    assert!(rig.now - rig.heard() <= Duration::from_millis(7_200));
+    assert!(rig.now - heard <= Duration::from_millis(5_100));
     assert_eq!(
         rig.news,
         [
@@ -92,24 +92,20 @@ fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
     let mut rig = cx();
     rig.look(0, true);
     rig.heartbeat();
-    let mut online = Duration::ZERO;
+    offline(&rig);
+    assert!(rig.later(5_000).is_none());
+    let (heard, mut answered) = (rig.now, Duration::ZERO);
     while rig.later(100).is_none() {
-        let is_late = rig.now - rig.heard() > Duration::from_secs(5);
-        let comes = rig.image().snapshot().link.is_online();
-        online += if comes && is_late {
-            Duration::from_millis(100)
-        } else {
-            Duration::ZERO
-        };
-        assert!(rig.now - rig.heard() < Duration::from_secs(20));
-        let link = if comes {
-            Link::Offline(SystemTime::now())
-        } else {
-            Link::Online(SystemTime::now())
-        };
-        rig.image().update(|s| s.link = link);
+        assert!(rig.now - heard < Duration::from_secs(20));
+        match rig.image().snapshot().link.is_online() {
+            true => {
+                answered += Duration::from_millis(100);
+                offline(&rig);
+            }
+            false => online(&rig),
+        }
     }
-    assert!(online >= Duration::from_millis(1_800), "{online:?}");
+    assert!(answered >= Duration::from_millis(1_800), "{answered:?}");
     // So does one that does not answer at all, though it refused before.
     let mut rig = cx();
     rig.refuses_running();

@@ -1,0 +1,123 @@
+//! Drives that answer others and never one point.
+
+use super::*;
+use crate::drive::DriveIndex;
+use crate::drive::profile::Profiles;
+
+/// A drive that never answers what covers `address`: its polls, and how often it went away and came.
+struct Silent {
+    rig: PolledLine,
+    of: (Table, u16),
+    asked: Vec<(Instant, PlannedRead)>,
+    went: usize,
+    came: usize,
+}
+
+impl Silent {
+    fn new(plan: &Plan, of: (Table, u16)) -> Silent {
+        let mut rig = PolledLine::new(1, Duration::from_millis(10));
+        let cadence = Cadence {
+            fast: Duration::from_millis(10),
+            slow: Duration::from_secs(1),
+            retries: 1,
+        };
+        rig.schedule = Schedule::new(cadence, &[plan], |_, _| COST, rig.now);
+        Silent {
+            rig,
+            of,
+            asked: Vec::new(),
+            went: 0,
+            came: 0,
+        }
+    }
+
+    fn run(&mut self, time: Duration) {
+        let end = self.rig.now + time;
+        while self.rig.now < end {
+            let poll = match self.rig.schedule.next(self.rig.now, None) {
+                Decision::Idle(until) => {
+                    self.rig.now = until;
+                    continue;
+                }
+                Decision::Command(_) => unreachable!(),
+                Decision::Poll(poll) => poll,
+            };
+            let silent = poll.read.covers(self.of.0, self.of.1);
+            let took = if silent { COST * 10 } else { COST };
+            self.rig.now += took;
+            self.asked.push((self.rig.now, poll.read));
+            let polled = if silent { Polled::Failed } else { Polled::Ok };
+            match self.rig.schedule.poll_done(&poll, polled, took, self.rig.now) {
+                Change::Online => self.came += 1,
+                Change::Offline => self.went += 1,
+                _ => {}
+            }
+        }
+    }
+
+    fn is_online(&self) -> bool {
+        self.rig.schedule.is_online(DriveIndex::new(0))
+    }
+}
+
+#[test]
+fn a_point_that_is_never_answered_is_found_in_its_block_and_takes_no_drive_away() {
+    let mut drive = Silent::new(&plan(), (Table::Holding, 2105));
+    drive.run(Duration::from_secs(10));
+    assert!(drive.is_online());
+    assert_eq!((drive.went, drive.came), (1, 1), "it was never online before that");
+    drive.asked.clear();
+    drive.run(Duration::from_secs(40));
+    assert_eq!((drive.went, drive.came), (1, 1));
+    let of = |start: u16, count: u16| {
+        let same = |(_, read): &&(Instant, PlannedRead)| (read.start, read.count) == (start, count);
+        drive.asked.iter().filter(same).count()
+    };
+    assert!(
+        of(2100, 5) > 500 && of(2106, 5) > 500,
+        "its neighbours are read in every round"
+    );
+    assert!((1..20).contains(&of(2105, 1)), "{}", of(2105, 1));
+    // It is answered again: read with its neighbours soon, and in every round.
+    drive.of.1 = 9;
+    drive.run(Duration::from_secs(130));
+    drive.asked.clear();
+    drive.run(Duration::from_secs(10));
+    let whole = drive
+        .asked
+        .iter()
+        .filter(|(_, read)| (read.start, read.count) == (2100, 11));
+    assert!(whole.count() > 100, "{:?}", drive.asked.last());
+    // A drive that is away altogether is away, after as many tries as ever.
+    drive.of = (Table::Holding, 2100);
+    drive.rig.dead = vec![0];
+    drive.rig.run(Duration::from_secs(2));
+    assert!(!drive.is_online());
+}
+
+/// For each family, whatever one point of its process data is never answered.
+#[test]
+fn of_every_family_any_point_may_keep_silent() {
+    for profile in Profiles::built_in().iter() {
+        let plan = Plan::of(profile);
+        let points = |read: &PlannedRead| {
+            (read.start..read.start + read.count)
+                .map(|start| (read.table, start))
+                .collect()
+        };
+        let fast = plan.reads.iter().filter(|read| read.class == PollClass::Fast);
+        let all: Vec<Vec<(Table, u16)>> = fast.map(points).collect();
+        for of in all.concat() {
+            let mut drive = Silent::new(&plan, of);
+            drive.run(Duration::from_secs(30));
+            let others = plan.reads.iter().any(|read| !read.covers(of.0, of.1));
+            let shown = (&profile.name, of);
+            assert_eq!(drive.is_online(), others, "{shown:?}");
+            assert!(drive.went <= 2, "{shown:?}: it went away {} times", drive.went);
+            if others {
+                drive.run(Duration::from_secs(120));
+                assert!(drive.is_online() && drive.went <= 2, "{shown:?}: {}", drive.went);
+            }
+        }
+    }
+}
