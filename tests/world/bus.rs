@@ -317,7 +317,7 @@ impl WorldBus {
         if lose_reply {
             self.wire.cut();
         }
-        let closed = self.core.closed();
+        let closed = self.core.closed(now);
         match closed {
             Closed::Reconnect | Closed::ReconnectToAsk => self.core.reconnected(),
             Closed::Lost => {

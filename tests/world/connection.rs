@@ -95,6 +95,43 @@ fn values_and_drives_stay_as_they_are_whenever_the_server_closes() {
     }
 }
 
+/// What is asked within 5 ms of a reply goes into a connection that nobody reads.
+#[test]
+fn a_server_that_closes_soon_after_each_reply_costs_no_time_of_a_reply() {
+    for mut rig in usual() {
+        let (drives, began) = (rig.bus.line.drives, rig.now);
+        let (mut bad, mut lost) = (0, 0);
+        for _ in 0..200 {
+            let until = rig.now + PATIENCE;
+            let mut heard = false;
+            loop {
+                let seen = rig.step(until).expect("a reply");
+                heard |= seen.iter().any(|seen| matches!(seen, Seen::Heard(_)));
+                if heard && seen.iter().any(is_over) {
+                    break;
+                }
+            }
+            let asked = |rig: &mut Rig| {
+                rig.step(rig.now + Duration::from_millis(5))
+                    .is_some_and(|seen| seen.iter().any(is_poll))
+            };
+            lost += u32::from(asked(&mut rig));
+            assert_ne!(rig.bus.close(true, rig.now), Closed::Lost);
+            bad += u32::from((1..=drives).any(|address| rig.state(address) != State::Ready));
+        }
+        let family = &rig.bus.line.family;
+        assert!(
+            lost <= 10 && bad <= 20,
+            "{family}: {lost} of 200 requests, {bad} of 200 looks"
+        );
+        assert!(
+            rig.now - began < 200 * Duration::from_millis(150),
+            "{family}: {:?}",
+            rig.now - began
+        );
+    }
+}
+
 #[test]
 fn orders_survive_the_end_of_a_connection() {
     for mut rig in usual() {
@@ -148,9 +185,9 @@ fn a_server_that_answers_nothing_any_more_is_lost() {
     for mut rig in usual() {
         assert_eq!(close_on(&mut rig, is_over, false), Closed::Reconnect);
         // Idle: there is time until something is to be asked.
-        assert_eq!(rig.bus.core.closed(), Closed::ReconnectToAsk);
+        assert_eq!(rig.bus.core.closed(rig.now), Closed::ReconnectToAsk);
         rig.bus.core.reconnected();
-        assert_eq!(rig.bus.core.closed(), Closed::Lost, "it takes no request at all");
+        assert_eq!(rig.bus.core.closed(rig.now), Closed::Lost, "it takes no request at all");
     }
     for mut rig in usual() {
         assert_eq!(close_on(&mut rig, is_over, false), Closed::Reconnect);

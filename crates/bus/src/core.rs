@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::BusOptions;
+use super::closing_server::ClosingServer;
 use super::drive_counters::DriveCounters;
 use super::line_state::{Exchanged, LineState};
 use super::master::{Handover, Master, Purpose, Remains, Turn, TurnEnd};
@@ -86,6 +87,7 @@ pub struct BusCore {
     /// The transaction on the line.
     asked: Option<Turn>,
     connection: Connection,
+    server: ClosingServer,
     tap: Option<Tap>,
     counters: DriveCounters,
     writes: Arc<WriteStats>,
@@ -124,6 +126,7 @@ impl BusCore {
             quiet_until: before.quiet_until,
             asked: None,
             connection: Connection::default(),
+            server: ClosingServer::default(),
             tap: None,
             news: Vec::new(),
             stalls: None,
@@ -160,6 +163,7 @@ impl BusCore {
     pub fn opened(&mut self, now: Instant) {
         self.line.reset(now);
         self.connection = Connection::default();
+        self.server.connected();
         if let Some(until) = self.quiet_until.take() {
             self.line.leave_alone(until);
         }
@@ -170,7 +174,8 @@ impl BusCore {
 
     /// A device server closed the connection, which is not a line fault if it replies: the drives' states stay as they
     /// are, and pending requests keep waiting. Returns what to do with the port.
-    pub fn closed(&mut self) -> Closed {
+    pub fn closed(&mut self, now: Instant) -> Closed {
+        self.server.closed(self.line.is_underway(), now);
         self.line.cut();
         let Connection {
             anew,
@@ -206,6 +211,7 @@ impl BusCore {
             vain,
             ..Connection::default()
         };
+        self.server.connected();
         self.report.reconnected();
         // Commands that arrived meanwhile did not wake the bus.
         self.command_came();
@@ -216,6 +222,7 @@ impl BusCore {
         self.bus.queue.close(Outcome::BusDown, now);
         (self.chosen, self.asked, self.tap) = (None, None, None);
         self.master.lost(now);
+        self.server.lost();
         self.report.bus_down(why, now);
     }
 
@@ -245,6 +252,7 @@ impl BusCore {
                 continue;
             };
             let clear = self.line.clear_at(chosen.since);
+            let clear = self.server.closes_until().map_or(clear, |until| clear.max(until));
             if now < clear {
                 return wait(clear, !chosen.turn.is_stop(), true);
             }
@@ -381,6 +389,7 @@ impl BusCore {
                 answered: true,
                 ..Connection::default()
             };
+            self.server.replied(now);
         }
         self.report.exchanged(turn.drive, &exchanged, now);
         let drive = self.known(&turn);

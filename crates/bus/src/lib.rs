@@ -18,6 +18,7 @@
 //! Only `line_loop` and [`prober`] do I/O and look at the clock; everything else takes time as an argument. `report` and
 //! `tap`, which feeds the trace, add the time of day to what they report.
 
+mod closing_server;
 pub mod command_run;
 pub mod confirm;
 pub mod core;

@@ -276,7 +276,7 @@ impl Worker {
                 return Ok(());
             };
             let closed = match lost.closed {
-                true => core.closed(),
+                true => core.closed(Instant::now()),
                 false => Closed::Lost,
             };
             // Some servers have but one connection.
@@ -450,7 +450,7 @@ trait Core {
     ) -> Opened<Self::Line>;
     fn opened(&mut self, now: Instant);
     fn lost(&mut self, why: &str, now: Instant);
-    fn closed(&mut self) -> Closed;
+    fn closed(&mut self, now: Instant) -> Closed;
     fn reconnected(&mut self);
     /// Returns when something is to be sent, or the bus is to stop.
     fn wait_to_ask(&mut self, worker: &Worker);
@@ -478,8 +478,8 @@ impl Core for BusCore {
         BusCore::lost(self, why, now);
     }
 
-    fn closed(&mut self) -> Closed {
-        BusCore::closed(self)
+    fn closed(&mut self, now: Instant) -> Closed {
+        BusCore::closed(self, now)
     }
 
     fn reconnected(&mut self) {
@@ -516,7 +516,7 @@ impl Core for ListenCore {
         ListenCore::lost(self, why, now);
     }
 
-    fn closed(&mut self) -> Closed {
+    fn closed(&mut self, _: Instant) -> Closed {
         ListenCore::closed(self)
     }
 

@@ -1,0 +1,123 @@
+//! A device server that closes its connection soon after a reply. A request that is sent before that is seen goes into a
+//! connection that nobody reads: it holds the line until its time is over. So the bus notes after how many replies, and how
+//! soon, the server closes, and sends nothing there before it has. Pure: time is an argument.
+
+use std::time::{Duration, Instant};
+
+/// A connection that ends later than that after a reply ends for another reason.
+const SOON: Duration = Duration::from_millis(60);
+/// The server is waited for for twice the time that it took, and this.
+const MARGIN: Duration = Duration::from_millis(10);
+/// Replies beyond the last one that show that it does not close any more.
+const STAYED: u32 = 3;
+
+/// What is known of the server, and of the connection to it.
+#[derive(Debug, Default)]
+pub(super) struct ClosingServer {
+    /// Replies over this connection, and when the last one came.
+    replies: u32,
+    last: Option<Instant>,
+    habit: Option<Habit>,
+}
+
+/// It closes after so many replies, within that time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Habit {
+    replies: u32,
+    within: Duration,
+}
+
+impl ClosingServer {
+    /// There is another connection.
+    pub(super) fn connected(&mut self) {
+        (self.replies, self.last) = (0, None);
+    }
+
+    /// The port was lost: whatever is there next is another one.
+    pub(super) fn lost(&mut self) {
+        *self = ClosingServer::default();
+    }
+
+    /// A reply came over the connection.
+    pub(super) fn replied(&mut self, now: Instant) {
+        self.replies = self.replies.saturating_add(1);
+        self.last = Some(now);
+        let stays = |habit: &mut Habit| self.replies > habit.replies.saturating_add(STAYED);
+        self.habit.take_if(stays);
+    }
+
+    /// The server closed the connection; `asked`: a request had been sent over it since the last reply.
+    pub(super) fn closed(&mut self, asked: bool, now: Instant) {
+        let within = self.last.map(|last| now.saturating_duration_since(last));
+        let Some(within) = within.filter(|within| *within <= SOON) else {
+            return;
+        };
+        let replies = self.replies;
+        match &mut self.habit {
+            Some(habit) if habit.replies == replies => habit.within = habit.within.max(within),
+            _ if asked => self.habit = Some(Habit { replies, within }),
+            _ => {}
+        }
+    }
+
+    /// Until when nothing is sent over the connection, because the server is about to close it.
+    pub(super) fn closes_until(&self) -> Option<Instant> {
+        let habit = self.habit.filter(|habit| self.replies >= habit.replies)?;
+        Some(self.last? + habit.within * 2 + MARGIN)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: Duration = Duration::from_millis(1);
+
+    #[test]
+    fn a_server_that_closes_after_a_reply_is_waited_for_from_the_second_connection_on() {
+        for replies in [1, 2, 7] {
+            let (mut server, mut now) = (ClosingServer::default(), Instant::now());
+            let reply = |server: &mut ClosingServer, now: &mut Instant| {
+                for _ in 0..replies {
+                    assert_eq!(server.closes_until(), None);
+                    *now += 20 * MS;
+                    server.replied(*now);
+                }
+            };
+            reply(&mut server, &mut now);
+            server.closed(true, now + 5 * MS);
+            for _ in 0..3 {
+                server.connected();
+                reply(&mut server, &mut now);
+                assert_eq!(server.closes_until(), Some(now + 20 * MS));
+                server.closed(false, now + 5 * MS);
+            }
+            // It stays from now on: after a few more replies it is believed.
+            server.connected();
+            (0..replies + STAYED).for_each(|_| server.replied(now));
+            assert!(server.closes_until().is_some());
+            server.replied(now);
+            assert_eq!(server.closes_until(), None);
+        }
+    }
+
+    #[test]
+    fn a_connection_that_ends_in_a_pause_or_before_a_reply_shows_nothing() {
+        let (mut server, now) = (ClosingServer::default(), Instant::now());
+        server.closed(true, now);
+        server.replied(now);
+        server.closed(true, now + SOON + MS);
+        server.connected();
+        server.replied(now);
+        server.closed(false, now + MS);
+        server.connected();
+        server.replied(now);
+        assert_eq!(server.closes_until(), None);
+        server.closed(true, now + MS);
+        server.connected();
+        server.replied(now);
+        assert!(server.closes_until().is_some());
+        server.lost();
+        assert_eq!(server.closes_until(), None);
+    }
+}
