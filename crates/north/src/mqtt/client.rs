@@ -18,8 +18,9 @@ use self::buffering::buffers;
 use self::discovery::{Subscribed, announcer, discovery_topics, report_refused, subscriptions};
 use self::repair::Repair;
 use super::broker_limits::BrokerLimits;
-use super::commands::{Commands, Finished, Rules};
+use super::commands::{Commands, Finished, OrdersLeft, Rules};
 use super::connection::{self, Step};
+use super::handover::ClientLeft;
 use super::home_assistant::{Announcer, Sources};
 use super::link::BrokerLink;
 use super::outbox::{Delivery, Key, Message, Outbox, Settled};
@@ -60,7 +61,7 @@ fn seconds(expiry: Duration) -> u32 {
 
 /// Runs the MQTT client until `cancel`.
 pub(super) async fn run(
-    options: (Options, Right),
+    options: (Options, Right, ClientLeft<OrdersLeft>),
     plant: SharedPlant,
     stats: Arc<NorthState>,
     events: Receiver<Arc<Event>>,
@@ -104,13 +105,13 @@ struct PlainClient {
 
 impl PlainClient {
     fn new(
-        (options, right): (Options, Right),
+        (options, right, left): (Options, Right, ClientLeft<OrdersLeft>),
         plant: SharedPlant,
         stats: Arc<NorthState>,
         events: Receiver<Arc<Event>>,
     ) -> PlainClient {
-        let kept = stats.mqtt_left.lock().broker.take();
-        let link = BrokerLink::new(options.clone(), options.client_id.clone(), "", kept.as_ref());
+        let ClientLeft { mut orders, broker } = left;
+        let link = BrokerLink::new(options.clone(), options.client_id.clone(), "", broker.as_ref());
         let common = Common::new(link, plant, stats);
         let (observed, stats) = (&common.observed, &common.stats);
         let topics = Topics::new(&options.base, &observed.gateway);
@@ -140,14 +141,13 @@ impl PlainClient {
         let (events_buffer, history_buffer) = buffers(&options);
         let has_buffer = events_buffer.is_some();
         let now = Instant::now();
-        let mut left = stats.mqtt_left.lock().orders.take();
-        let results = left.as_mut().map(|left| std::mem::take(&mut left.results));
+        let results = orders.as_mut().map(|left| std::mem::take(&mut left.results));
         let commands = Commands::new(
             topics.clone(),
             rules,
             stats.commands.mqtt.clone(),
             stats.stop_all.clone(),
-            left,
+            orders,
         );
         let mut client = PlainClient {
             store: Store::open(events_buffer, MQTT_EVENTS, (stats, MqttKind::Event)),
@@ -282,8 +282,10 @@ impl PlainClient {
         // The client that replaces it after a reload continues with them.
         let mut left = self.common.stats.mqtt_left.lock();
         left.unread = Some(self.events);
-        left.broker = Some(self.common.link.broker());
-        left.orders = Some(self.commands.leave(self.outbox.into_results()));
+        left.client = ClientLeft {
+            orders: Some(self.commands.leave(self.outbox.into_results())),
+            broker: Some(self.common.link.broker()),
+        };
     }
 }
 

@@ -19,12 +19,28 @@ pub(super) struct Left {
     pub(super) retained: Vec<String>,
     /// The events that were not read.
     pub(super) unread: Option<Receiver<Arc<Event>>>,
+    /// Of the client with the topics of drivegate.
+    pub(super) client: ClientLeft<OrdersLeft>,
+    /// Of the edge node.
+    pub(super) node: ClientLeft<NodeOrdersLeft>,
+}
+
+/// What one of the clients left.
+#[derive(Debug)]
+pub(super) struct ClientLeft<Orders> {
     /// The commands whose results are still owed.
-    pub(super) orders: Option<OrdersLeft>,
-    pub(super) node_orders: Option<NodeOrdersLeft>,
-    /// The brokers in use.
+    pub(super) orders: Option<Orders>,
+    /// The broker in use.
     pub(super) broker: Option<Broker>,
-    pub(super) node_broker: Option<Broker>,
+}
+
+impl<Orders> Default for ClientLeft<Orders> {
+    fn default() -> Self {
+        ClientLeft {
+            orders: None,
+            broker: None,
+        }
+    }
 }
 
 impl Handover {

@@ -249,19 +249,33 @@ pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthState>, c
     let (topics, hosts) = stats.broker_rights.begin(&options);
     let kept = options.clone();
     let events = plant.load().events.subscribe();
-    let unread = stats.mqtt_left.lock().unread.take();
+    // Taken here too: what no client has taken when this returns is discarded.
+    let (unread, of_client, of_node) = {
+        let mut left = stats.mqtt_left.lock();
+        (
+            left.unread.take(),
+            std::mem::take(&mut left.client),
+            std::mem::take(&mut left.node),
+        )
+    };
     let events = unread.filter(|unread| unread.same_channel(&events)).unwrap_or(events);
     let node = options.sparkplug.clone().map(|node| {
         let broker = options.clone();
         tokio::spawn(sparkplug::run(
             node,
-            (broker, hosts),
+            (broker, hosts, of_node),
             plant.clone(),
             stats.clone(),
             cancel.clone(),
         ))
     });
-    let client = tokio::spawn(client::run((options, topics), plant, stats.clone(), events, cancel));
+    let client = tokio::spawn(client::run(
+        (options, topics, of_client),
+        plant,
+        stats.clone(),
+        events,
+        cancel,
+    ));
     Mqtt {
         tasks: [client].into_iter().chain(node).collect(),
         rights: Some((kept, stats)),

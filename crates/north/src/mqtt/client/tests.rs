@@ -46,7 +46,12 @@ async fn client(buffer: Option<Buffer>) -> PlainClient {
 async fn client_with(options: Options) -> PlainClient {
     let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(fixture::plant(&["p1"])));
     let events = plant.load().events.subscribe();
-    PlainClient::new((options, Right::lasting()), plant, Arc::default(), events)
+    PlainClient::new(
+        (options, Right::lasting(), ClientLeft::default()),
+        plant,
+        Arc::default(),
+        events,
+    )
 }
 
 fn lost_events(client: &mut PlainClient) -> u64 {

@@ -14,6 +14,7 @@ use super::super::Options as BrokerOptions;
 use super::super::back_off::chance;
 use super::super::broker_limits::BrokerLimits;
 use super::super::connection::{self, Step};
+use super::super::handover::ClientLeft;
 use super::super::link::BrokerLink;
 use super::super::outbox::Message;
 use super::super::request::Incoming;
@@ -22,7 +23,7 @@ use super::super::session::{self, Common, Will};
 use super::bd_seq::BdSeq;
 use super::metric::Moment;
 use super::model::{self, DriveMetrics};
-use super::orders::{Finished, Orders};
+use super::orders::{Finished, NodeOrdersLeft, Orders};
 use super::session::{Packet, REBIRTH_METRIC, Rules, Session};
 use super::topics::{Received, StateForm, Topics};
 use super::wire::{MetricValue, Payload};
@@ -52,7 +53,7 @@ fn births_at() -> Instant {
 /// Runs the edge node until `cancel`.
 pub(in crate::mqtt) async fn run(
     options: Options,
-    broker: (BrokerOptions, Right),
+    broker: (BrokerOptions, Right, ClientLeft<NodeOrdersLeft>),
     plant: SharedPlant,
     stats: Arc<NorthState>,
     cancel: CancellationToken,
@@ -64,8 +65,10 @@ pub(in crate::mqtt) async fn run(
     session::end(&mut client).await;
     let Common { link, stats, .. } = client.common;
     let mut left = stats.mqtt_left.lock();
-    left.node_broker = Some(link.broker());
-    left.node_orders = Some(client.orders.leave());
+    left.node = ClientLeft {
+        orders: Some(client.orders.leave()),
+        broker: Some(link.broker()),
+    };
 }
 
 struct Drive {
@@ -107,7 +110,7 @@ struct NodeClient {
 impl NodeClient {
     fn new(
         options: Options,
-        (broker, right): (BrokerOptions, Right),
+        (broker, right, left): (BrokerOptions, Right, ClientLeft<NodeOrdersLeft>),
         bd_seq: BdSeq,
         plant: SharedPlant,
         stats: Arc<NorthState>,
@@ -121,15 +124,11 @@ impl NodeClient {
             min_interval: broker.min_interval,
         };
         let client_id = format!("{}-sparkplug", broker.client_id);
-        let (kept, orders) = {
-            let mut left = stats.mqtt_left.lock();
-            (left.node_broker.take(), left.node_orders.take())
-        };
-        let link = BrokerLink::new(broker.clone(), client_id, "Sparkplug: ", kept.as_ref());
+        let link = BrokerLink::new(broker.clone(), client_id, "Sparkplug: ", left.broker.as_ref());
         let mut client = NodeClient {
             topics,
             broker,
-            orders: Orders::new(stats.commands.mqtt.clone(), right, orders),
+            orders: Orders::new(stats.commands.mqtt.clone(), right, left.orders),
             common: Common::new(link, plant, stats),
             session: Session::new(rules),
             drives: Vec::new(),
