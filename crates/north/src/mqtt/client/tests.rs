@@ -231,3 +231,19 @@ async fn what_is_in_memory_only_is_counted_when_the_client_ends() {
         assert_eq!(stats.mqtt.losses().map(|(_, count)| count).sum::<u64>(), expected);
     }
 }
+
+/// A reload discards what no client took, before the task of the new client has run.
+#[tokio::test]
+async fn a_client_takes_what_the_one_before_left_when_it_is_started() {
+    let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(fixture::plant(&["p1"])));
+    let stats = Arc::<NorthState>::default();
+    stats.mqtt_left.lock().client.orders = Some(OrdersLeft::default());
+    let cancel = CancellationToken::new();
+    let started = crate::mqtt::start(options(None), plant, stats.clone(), cancel.clone());
+    // Nothing was awaited, so its task has not begun.
+    assert!(stats.mqtt_left.lock().client.orders.is_none());
+    stats.mqtt_left.discard();
+    cancel.cancel();
+    crate::Server::stopped(started).await;
+    assert!(stats.mqtt_left.lock().client.orders.is_some(), "and leaves it to the next one");
+}
