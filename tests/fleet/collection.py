@@ -7,6 +7,7 @@ import copy
 import json
 import pathlib
 import sys
+import tempfile
 import tomllib
 import unittest
 
@@ -17,6 +18,7 @@ sys.path.insert(0, str(ROOT / "deploy/fleet/plugins/module_utils"))
 sys.dont_write_bytecode = True
 
 import state  # noqa: E402
+from lock import Busy, alone  # noqa: E402
 from toml_text import to_toml  # noqa: E402
 
 METRICS = """# HELP drivegate_drive_up The drive is online
@@ -108,6 +110,22 @@ class Socket(unittest.TestCase):
         for place in ("/nonexistent/socket", "http://127.0.0.1:9"):
             with self.assertRaises(state.NoAnswer):
                 state.Door(place).get("/metrics")
+
+
+class Lock(unittest.TestCase):
+    def test_gateways_of_one_folder_do_not_wait_for_each_other(self):
+        with tempfile.TemporaryDirectory() as folder:
+            one, other = (pathlib.Path(folder) / name for name in ("a.toml", "b.toml"))
+            with alone(one), alone(other), self.assertRaises(Busy) as refused, alone(one):
+                self.fail("two rollouts of one file")
+            self.assertIn(f"at work on {one};", str(refused.exception))
+            with alone(one):
+                # The file is exchanged meanwhile.
+                one.write_text("")
+                (pathlib.Path(folder) / "new").write_text("")
+                (pathlib.Path(folder) / "new").replace(one)
+                with self.assertRaises(Busy), alone(one):
+                    self.fail("two rollouts of one file")
 
 
 class Toml(unittest.TestCase):

@@ -98,8 +98,6 @@ is_as_before:
 """
 
 import contextlib
-import errno
-import fcntl
 import json
 import os
 import signal
@@ -108,6 +106,7 @@ import time
 
 from ansible.module_utils.basic import AnsibleModule
 from ansible_collections.drivegate.fleet.plugins.module_utils import state as states
+from ansible_collections.drivegate.fleet.plugins.module_utils.lock import Busy, alone
 
 # Seconds between two looks, and for one command; a reload waits up to 40 s for its answer.
 PACE = 0.5
@@ -285,22 +284,6 @@ class Files:
         os.close(folder)
 
 
-@contextlib.contextmanager
-def alone(config):
-    """One rollout at a time."""
-    folder = os.open(os.path.dirname(config), os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-                raise
-            raise Bad([f"another rollout is at work on {config}; wait for its end"]) from error
-        yield
-    finally:
-        os.close(folder)
-
-
 def new_doubts(gateway, files, before):
     """Errors of the new file end it; what it warns of and the former file did not is returned."""
     errors, doubts = gateway.check(files.new)
@@ -434,6 +417,8 @@ def main():
                 result["state"] = gateway.state()
             else:
                 change(module, gateway, files, result)
+    except Busy as busy:
+        module.fail_json(msg=str(busy), worse=[str(busy)], **result)
     except Bad as bad:
         module.fail_json(msg=sentence(bad, result), worse=bad.reasons, **result)
     except (states.NoAnswer, OSError) as error:
