@@ -301,6 +301,7 @@ impl BusCore {
                     stood: false,
                     took: Duration::ZERO,
                     mangled: false,
+                    doubted: false,
                     frame: Vec::new(),
                 },
                 now,
@@ -400,6 +401,7 @@ impl BusCore {
         }
         self.master.put_late(exchanged.transaction.take_late());
         let mangled = exchanged.transaction.is_mangled_reply();
+        let doubted = exchanged.transaction.only_doubted();
         let frame = match turn.purpose {
             Purpose::Background => exchanged.transaction.reply_frame().to_vec(),
             Purpose::Poll(_) | Purpose::Session(..) | Purpose::Command { .. } => Vec::new(),
@@ -414,6 +416,7 @@ impl BusCore {
             stood: self.stood,
             took,
             mangled,
+            doubted,
             frame,
         };
         self.done(&turn, end, now);

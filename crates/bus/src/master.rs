@@ -135,6 +135,8 @@ pub struct TurnEnd {
     pub took: Duration,
     /// The invalid bytes were the drive's own reply, damaged.
     pub mangled: bool,
+    /// A whole reply came, and was not believed because the line could not have carried it so soon.
+    pub doubted: bool,
     /// The frame of the reply, as the drive sent it, to [`Purpose::Background`].
     pub frame: Vec<u8>,
 }

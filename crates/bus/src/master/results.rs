@@ -226,6 +226,10 @@ impl Master {
             *probes = probes.saturating_add(1);
         }
         let change = self.schedule.poll_done(poll, polled, took, now);
+        if poll.probe && end.doubted {
+            // Whoever sent that is there: a second reply like it is believed, and does not have to wait for the next probe.
+            self.schedule.seen(poll.drive, now);
+        }
         if let Some(round) = self.schedule.take_slow_round() {
             news.push(News::SlowRound(round.cycle));
         }

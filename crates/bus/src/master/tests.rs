@@ -201,6 +201,7 @@ impl Rig {
                     stood: false,
                     took,
                     mangled,
+                    doubted: false,
                     frame: Vec::new(),
                 };
                 self.master.done(&turn, end, self.now, &mut news);
@@ -468,6 +469,7 @@ fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
             stood: false,
             took: COST,
             mangled: false,
+            doubted: false,
             frame: Vec::new(),
         };
         rig.now += COST;

@@ -51,6 +51,7 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
             stood: false,
             took: COST,
             mangled,
+            doubted: false,
             frame: Vec::new(),
         };
         let garbled = end(Ended::Corrupt("checksum"));
@@ -81,4 +82,36 @@ fn a_reply_to_a_broken_off_exchange_is_waited_for_by_the_bus_that_comes_after() 
     }
     let mut rig = Rig::new(1);
     assert_eq!(rig.master.ended(None, rig.now).quiet_until, Some(rig.now));
+}
+
+/// The reply of a drive that was just switched on may be too early for the configured baud rate: it is asked again at once, not
+/// after the pause between two probes.
+#[test]
+fn a_probe_whose_reply_was_not_believed_is_repeated_at_once() {
+    for (doubted, soon) in [(true, true), (false, false)] {
+        let mut rig = Rig::new(1);
+        rig.drives[0].silent = true;
+        rig.run(Duration::from_secs(60));
+        let turn = loop {
+            match rig.master.next(rig.now, &mut Vec::new()) {
+                Err(until) => rig.now = until,
+                Ok(turn) => break turn,
+            }
+        };
+        rig.master.sending(&turn, rig.now);
+        let began = rig.now;
+        rig.now += TIMEOUT;
+        let end = TurnEnd {
+            ended: Ended::Silent,
+            began,
+            at: rig.now,
+            stood: false,
+            took: TIMEOUT,
+            mangled: false,
+            doubted,
+            frame: Vec::new(),
+        };
+        rig.master.done(&turn, end, rig.now, &mut Vec::new());
+        assert_eq!(rig.master.next(rig.now, &mut Vec::new()).is_ok(), soon);
+    }
 }

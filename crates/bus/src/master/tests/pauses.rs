@@ -45,6 +45,7 @@ impl Rig {
             stood,
             took: at.saturating_duration_since(began),
             mangled: false,
+            doubted: false,
             frame: Vec::new(),
         };
         self.master.done(turn, end, self.now, &mut news);

@@ -245,5 +245,8 @@ async fn a_client_takes_what_the_one_before_left_when_it_is_started() {
     stats.mqtt_left.discard();
     cancel.cancel();
     crate::Server::stopped(started).await;
-    assert!(stats.mqtt_left.lock().client.orders.is_some(), "and leaves it to the next one");
+    assert!(
+        stats.mqtt_left.lock().client.orders.is_some(),
+        "and leaves it to the next one"
+    );
 }
