@@ -15,6 +15,9 @@ const DRIVE: usize = 42 << 10;
 /// BACnet: subscriptions, writes, answers that wait; and what it shows of a drive, bytes.
 const BACNET: (usize, usize) = (7 << 20, 24 << 10);
 
+/// What comparing the passwords of users takes, bytes; measured. 12 MiB of it are what `drivegate user add` makes a hash cost.
+const LOGINS: usize = 14 << 20;
+
 /// Memory of a gateway at most.
 #[derive(Debug)]
 pub struct Memory {
@@ -71,6 +74,8 @@ impl Memory {
             .map(|bus| bus.trends + bus.recorder.with_growth())
             .sum();
         let bacnet = settings.bacnet.as_ref().map_or(0, |_| BACNET.0 + BACNET.1 * drives);
-        PROGRAM + bacnet + BUS * settings.buses.len() + DRIVE * drives + past
+        let users = settings.http.as_ref().and_then(|http| http.users.as_ref());
+        let logins = users.map_or(0, |_| LOGINS);
+        PROGRAM + bacnet + logins + BUS * settings.buses.len() + DRIVE * drives + past
     }
 }

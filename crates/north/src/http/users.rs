@@ -5,8 +5,8 @@
 use std::fmt;
 use std::str::FromStr;
 
-use argon2::password_hash::{PasswordHash, PasswordHasher, PasswordVerifier, SaltString};
-use argon2::{Algorithm, Argon2, Params, Version};
+use argon2::password_hash::{self, Output, PasswordHash, PasswordHasher, SaltString};
+use argon2::{Algorithm, Argon2, Block, Params, Version};
 use ring::rand::{SecureRandom, SystemRandom};
 
 use super::credentials::{Credential, CredentialError, Credentials, checked_name};
@@ -70,12 +70,38 @@ impl User {
     }
 }
 
-/// Whether this is the password of that hash. Takes as long for any password.
-pub(super) fn is_password(hash: &str, password: &str) -> bool {
-    let Ok(hash) = PasswordHash::new(hash) else {
-        return false;
-    };
-    Argon2::default().verify_password(password.as_bytes(), &hash).is_ok()
+/// The memory in which passwords are compared, one after the other. The allocator would keep each that is given back: so it is
+/// taken once.
+#[derive(Debug, Default)]
+pub(super) struct Workspace(Vec<Block>);
+
+impl Workspace {
+    /// Whether this is the password of that hash. Takes as long for any password.
+    pub(super) fn is_password(&mut self, hash: &str, password: &str) -> bool {
+        let found = PasswordHash::new(hash).and_then(|hash| self.compute(&hash, password).map(|own| hash.hash == own));
+        found.unwrap_or(false)
+    }
+
+    /// What `hash` is if this is its password; nothing if it is no whole hash.
+    fn compute(&mut self, hash: &PasswordHash<'_>, password: &str) -> password_hash::Result<Option<Output>> {
+        let (Some(salt), Some(length)) = (hash.salt, hash.hash.map(|own| own.len())) else {
+            return Err(password_hash::Error::PhcStringField);
+        };
+        let (algorithm, params) = (Algorithm::try_from(hash.algorithm)?, Params::try_from(hash)?);
+        let version = hash.version.map_or(Ok(Version::V0x13), Version::try_from)?;
+        let mut bytes = [0; 64];
+        let salt = salt.decode_b64(&mut bytes)?;
+        let blocks = params.block_count();
+        if self.0.len() < blocks {
+            self.0 = vec![Block::default(); blocks];
+        }
+        let memory = self.0.get_mut(..blocks).unwrap_or_default();
+        let argon2 = Argon2::new(algorithm, version, params);
+        Output::init_with(length, |out| {
+            Ok(argon2.hash_password_into_with_memory(password.as_bytes(), salt, out, memory)?)
+        })
+        .map(Some)
+    }
 }
 
 /// The part of a hash that says how it is computed: name, version and parameters of the function.
@@ -158,6 +184,10 @@ impl Users {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    fn is_password(hash: &str, password: &str) -> bool {
+        Workspace::default().is_password(hash, password)
+    }
 
     /// The test vector of the reference implementation: Argon2id, 64 MiB, 2 passes, "password", "somesalt".
     const FOREIGN: &str = "$argon2id$v=19$m=65536,t=2,p=1$c29tZXNhbHQ$CTFhFdXPJO1aFaMaO6Mm5c8y7cJHAph8ArZWb2GRPPc";
