@@ -72,7 +72,11 @@ impl Rig {
     fn order(&self, orders: &[Order]) {
         for order in orders {
             let before = self.drive.output().len();
-            assert_eq!(self.exchange(order), Answer::Done, "{order:?}");
+            // A gateway that stood still on a busy machine may take an order to be older than the stop before it, and answers 06.
+            let answer = until("an answer", || {
+                Some(self.exchange(order)).filter(|answer| *answer != Answer::Exception(6))
+            });
+            assert_eq!(answer, Answer::Done, "{order:?}");
             let wanted = order.as_seen();
             until(&wanted, || {
                 self.drive.output().get(before..)?.contains(&wanted).then_some(())

@@ -7,6 +7,7 @@ mod watch;
 use std::io;
 use std::path::Path;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use futures_util::FutureExt;
 use sd_notify::NotifyState;
@@ -21,6 +22,9 @@ use crate::config::{Loaded, Settings};
 use crate::daemon::Daemon;
 use crate::north::local::Control;
 use crate::north::reading::watched_runtime;
+
+/// Time for files that are being written when the gateway has stopped.
+const LAST_WRITES: Duration = Duration::from_secs(1);
 
 /// Runs the gateway until SIGTERM or Ctrl-C; SIGHUP reloads the configuration
 #[derive(Debug, clap::Args)]
@@ -62,8 +66,8 @@ fn run_from(path: &Path) -> io::Result<ExitCode> {
     }
     signals.wanted = early.wanted;
     let code = runtime.block_on(serve(settings, path, &log, signals));
-    // Threads that a disk holds up end with the process.
-    runtime.shutdown_background();
+    // What is being written is written; threads that a disk holds up end with the process.
+    runtime.shutdown_timeout(LAST_WRITES);
     Ok(code)
 }
 

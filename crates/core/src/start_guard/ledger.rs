@@ -258,7 +258,7 @@ impl Ledger {
     pub(super) fn kept(&self, reserved: &Reserved, now: Instant) -> Kept {
         match &self.disk {
             Disk::None => Kept::Yes,
-            Disk::Unread(path) => Kept::Failed(format!(
+            Disk::Unread(path) if now >= reserved.at + DISK => Kept::Failed(format!(
                 "{}: it is not read yet: the disk does not answer",
                 path.display()
             )),
@@ -270,7 +270,7 @@ impl Ledger {
             Disk::File { .. } if now >= reserved.at + DISK => {
                 Kept::Failed(format!("the disk did not take them within {}", shown(DISK)))
             }
-            Disk::File { .. } => Kept::NotYet,
+            Disk::Unread(_) | Disk::File { .. } => Kept::NotYet,
         }
     }
 

@@ -407,6 +407,34 @@ fn a_start_waits_until_it_is_on_disk() {
 }
 
 #[test]
+fn a_start_waits_a_second_for_a_file_that_is_not_read_and_is_refused_then() {
+    let rig = GuardedDrives::of(per_hour(3), Vec::new());
+    rig.shared.await_file(std::path::Path::new("state/starts.json"));
+    rig.read(0, false, 0.0);
+    assert_eq!(reason(rig.clear(&[0], 1, 1.0)), "wait");
+    assert_eq!(reason(rig.clear(&[0], 1, 1.9)), "wait");
+    let refused = rig.clear(&[0], 1, 2.0);
+    let Verdict::Refuse(refusal) = &refused else {
+        unreachable!("{refused:?}")
+    };
+    assert!(
+        refusal.to_string().contains("state/starts.json: it is not read yet"),
+        "{refusal}"
+    );
+    assert_eq!(
+        rig.shared.to_write(rig.at(2.0), SystemTime::now()),
+        None,
+        "nothing replaces what is there"
+    );
+    // The disk answers: it is counted with what was there.
+    rig.shared.keep(&Saved::default(), rig.at(3.0), SystemTime::now());
+    assert_eq!(reason(rig.clear(&[0], 2, 3.0)), "wait");
+    let (generation, _) = rig.shared.to_write(rig.at(3.0), SystemTime::now()).unwrap();
+    rig.shared.wrote(generation, Ok(()));
+    assert_eq!(rig.clear(&[0], 2, 3.1), Verdict::Go);
+}
+
+#[test]
 fn a_start_that_cannot_be_counted_is_refused_and_is_none() {
     let rig = GuardedDrives::of(per_hour(1), Vec::new());
     let time = SystemTime::now();
