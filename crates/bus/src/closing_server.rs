@@ -4,7 +4,7 @@
 
 use std::time::{Duration, Instant};
 
-/// A connection that ends later than that after a reply ends for another reason.
+/// A connection that ends later than that after a reply is not closed because of the reply.
 const SOON: Duration = Duration::from_millis(60);
 /// The server is waited for for twice the time that it took, and this.
 const MARGIN: Duration = Duration::from_millis(10);
@@ -20,7 +20,7 @@ pub(super) struct ClosingServer {
     habit: Option<Habit>,
 }
 
-/// It closes after so many replies, within that time.
+/// The server closes a connection after so many replies, within that time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Habit {
     replies: u32,
@@ -92,7 +92,7 @@ mod tests {
                 assert_eq!(server.closes_until(), Some(now + 20 * MS));
                 server.closed(false, now + 5 * MS);
             }
-            // It stays from now on: after a few more replies it is believed.
+            // The server stays from now on: after a few more replies that is believed.
             server.connected();
             (0..replies + STAYED).for_each(|_| server.replied(now));
             assert!(server.closes_until().is_some());

@@ -187,7 +187,7 @@ impl Item {
         }
     }
 
-    /// Read in every round, and answered as far as is known.
+    /// Whether the item is read in every round, and answered as far as is known.
     pub(super) fn is_process_data(&self) -> bool {
         self.read.class == PollClass::Fast && !self.mute
     }

@@ -26,7 +26,7 @@ impl Schedule {
             drive.presence = Presence::Online;
             drive.early.came(now);
             drive.probes = 0;
-            // It answers, but not this one.
+            // The drive answers, but not what took it away.
             if let Some(vain) = drive.away_by.take().filter(|vain| *vain != poll.read) {
                 drive.in_vain(vain, retries, now);
             }

@@ -72,7 +72,7 @@ mod tests {
         let (other, hangs) = oneshot::channel::<()>();
         assert_eq!(patience.wait(hangs).await, None);
         assert_eq!(begun.elapsed(), DISK + NEXT);
-        // It answers again.
+        // The disk answers again.
         drop((answer, other));
         tokio::time::sleep(Duration::from_millis(1)).await;
         let begun = Instant::now();

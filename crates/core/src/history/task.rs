@@ -349,7 +349,7 @@ fn shortened(text: &str) -> String {
 struct Writer {
     store: Store,
     recordings: Arc<Recordings>,
-    /// Its recorder's.
+    /// The number of its recorder.
     number: u64,
     events: Events,
     /// The last one could not be written.

@@ -539,7 +539,7 @@ fn files_of_others_are_refused_with_a_reason() {
     let path = folder.path().join("starts.json");
     std::fs::write(&path, "{").unwrap();
     let (keeper, read) = keep(folder.path(), Arc::new(Guards::default())).unwrap();
-    // Its end tells that the file is read.
+    // The end of the channel tells that the file is read.
     let _ = read.blocking_recv();
     assert!(folder.path().join("starts.damaged").exists(), "it is kept aside");
     drop(keeper);

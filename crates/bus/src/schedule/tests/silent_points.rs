@@ -78,7 +78,7 @@ fn a_point_that_is_never_answered_is_found_in_its_block_and_takes_no_drive_away(
         "its neighbours are read in every round"
     );
     assert!((1..20).contains(&of(2105, 1)), "{}", of(2105, 1));
-    // It is answered again: read with its neighbours soon, and in every round.
+    // The point is answered again: read with its neighbours soon, and in every round.
     drive.of.1 = 9;
     drive.run(Duration::from_secs(130));
     drive.asked.clear();

@@ -47,7 +47,7 @@ struct Queue {
     numbered: u64,
     /// A thread takes from the queue.
     served: bool,
-    /// That of the thread, while there is none.
+    /// The memory of the thread, while none runs.
     workspace: Workspace,
 }
 
