@@ -50,6 +50,8 @@ impl Plant {
         let simulator = site.simulate(&["--addresses", "1", "--baud", "38400"]);
         let broker = site.broker();
         let gateway = site.run_ready();
+        // The local socket comes last: what connects to it before is taken up later.
+        gateway.until_printed("drivegate is running");
         site.until_connected(true);
         site.until_state("pump-1", "ready");
         Plant {
