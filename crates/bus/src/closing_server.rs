@@ -6,12 +6,12 @@ use std::time::{Duration, Instant};
 
 /// A connection that ends later than that after a reply is not closed because of the reply.
 const SOON: Duration = Duration::from_millis(60);
-/// The server is waited for for twice the time that it took, and this.
+/// Wait for the server to close, beyond twice the time that it took before.
 const MARGIN: Duration = Duration::from_millis(10);
-/// Replies beyond the last one that show that it does not close any more.
+/// After so many further replies over one connection the server is taken to stay.
 const STAYED: u32 = 3;
 
-/// What is known of the server, and of the connection to it.
+/// What the bus knows of a device server, and of its present connection.
 #[derive(Debug, Default)]
 pub(super) struct ClosingServer {
     /// Replies over this connection, and when the last one came.
@@ -28,7 +28,7 @@ struct Habit {
 }
 
 impl ClosingServer {
-    /// There is another connection.
+    /// The bus has connected to the server again.
     pub(super) fn connected(&mut self) {
         (self.replies, self.last) = (0, None);
     }

@@ -3,6 +3,7 @@
 //! - `line_loop`: the thread, the port, the clock; it does what the core says. [`prober`] does the same for `scan`.
 //! - [`core`](self::core): the bus without its thread: bytes and time in, what to do with the port out.
 //! - [`line_state`]: how long the line has been silent, and the transaction that is in progress, a [`transaction`].
+//! - `closing_server`: when a device server is about to close its connection, and nothing is sent over it.
 //! - [`master`]: what goes on the line next (`choose`), the result (`results`), the stops at shutdown (`shutdown`).
 //!   [`schedule`] knows which poll is due, [`predict`] what that comes to on a given line.
 //! - `drive_state`: what is known of one drive besides its samples, polls and N2 session: its started commands

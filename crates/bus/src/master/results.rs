@@ -227,7 +227,7 @@ impl Master {
         }
         let change = self.schedule.poll_done(poll, polled, took, now);
         if poll.probe && end.doubted {
-            // Whoever sent that is there: a second reply like it is believed, and does not have to wait for the next probe.
+            // The drive is there: a second early reply is believed, and is asked for at once instead of with the next probe.
             self.schedule.seen(poll.drive, now);
         }
         if let Some(round) = self.schedule.take_slow_round() {

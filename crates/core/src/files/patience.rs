@@ -6,19 +6,19 @@ use std::time::Duration;
 
 /// Longest wait for a file.
 pub const DISK: Duration = Duration::from_secs(2);
-/// Longest wait while the disk already owes another one.
+/// Longest wait for a file while another one is overdue.
 const NEXT: Duration = Duration::from_millis(100);
 
 /// The wait for files that are read at a start or a reload. A disk that hangs is waited for once, not once for each file.
 #[derive(Debug, Clone, Default)]
 pub struct Patience {
-    /// Work that was not done in time, and is not done yet.
+    /// How many waits were given up whose work is not done yet.
     overdue: Arc<AtomicUsize>,
 }
 
 impl Patience {
-    /// What the work results in; `None` if the disk does not answer in time. The work goes on then, unattended. Must be
-    /// called within a Tokio runtime.
+    /// The result of `work`; `None` if the disk does not answer in time: the work goes on then, and its result is dropped.
+    /// Must be called within a Tokio runtime.
     pub async fn wait<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> Option<T> {
         let limit = match self.overdue.load(Ordering::Relaxed) {
             0 => DISK,

@@ -33,7 +33,7 @@ impl Daemon {
         self.recorder = Some(recorder);
         if patience.wait(opened).await.is_none() {
             tracing::error!(
-                target: "drivegate::daemon", "cannot list the recordings of earlier runs: {}; they are listed when it does; \
+                target: "drivegate::daemon", "cannot list the recordings of earlier runs: {}; they are listed as soon as it answers; \
                                               check the disk of recordings.dir", files::late()
             );
         }
@@ -82,8 +82,8 @@ impl Daemon {
                     Some(earlier) => self.events.remember(earlier.unwrap_or_default()),
                     None => tracing::error!(
                         target: "drivegate::daemon",
-                        "cannot read the events of earlier runs in {}: {}; they are not shown, and counters follow when it \
-                         does; check the disk of state_dir", settings.state_dir.display(), files::late()
+                        "cannot read the events of earlier runs in {}: {}; they are not shown, and counting goes on \
+                         from the file as soon as it answers; check the disk of state_dir", settings.state_dir.display(), files::late()
                     ),
                 }
             }
@@ -110,7 +110,7 @@ impl Daemon {
                 if self.north.patience.wait(read).await.is_none() {
                     tracing::error!(
                         target: "drivegate::daemon",
-                        "cannot read the starts of earlier runs in {}: {}; drives with a guard are not started until it does; \
+                        "cannot read the starts of earlier runs in {}: {}; drives with a guard are not started until it answers; \
                          check the disk of state_dir", settings.state_dir.display(), files::late()
                     );
                 }
