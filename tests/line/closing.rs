@@ -114,6 +114,12 @@ async fn a_server_that_closes_after_replies_or_pauses_is_no_lost_port() {
         });
         let ready = |r: &Rig| r.state(1) == State::Ready && r.state(2) == State::Ready;
         rig.until("both drives answer", ready).await;
+        // A drive's first event follows behind its values.
+        let told = |r: &Rig| {
+            let events = r.events.recent();
+            events.iter().filter(|e| e.kind == EventKind::Online).count() == 2
+        };
+        rig.until("both drives are told to be online", told).await;
         let mut events = rig.events.subscribe();
         let before = rig.bus.handle().image.health().reconnects;
         for turn in 0..10 {

@@ -315,10 +315,11 @@ impl DriveSchedule {
         self.unanswered && self.items.iter().any(Item::is_process_data)
     }
 
-    /// Whether the answers to that read show that the drive is there.
+    /// Whether the answers to that read show that the drive is there. One that was split or joined since it was queued
+    /// shows nothing: what is read in its place does.
     pub(super) fn shows_presence(&self, read: &PlannedRead) -> bool {
         let Some(item) = self.items.iter().find(|item| item.read == *read) else {
-            return true;
+            return false;
         };
         match self.items.iter().any(Item::is_process_data) {
             true => item.is_process_data(),
@@ -344,6 +345,9 @@ impl DriveSchedule {
     /// halves from now on, until what it does not answer is found; that is tried again after a pause that grows.
     pub(super) fn in_vain(&mut self, read: PlannedRead, retries: u32, now: Instant) {
         let Some(index) = self.items.iter().position(|item| item.read == read) else {
+            // The block was taken apart meanwhile: any of its parts may be what is not answered.
+            let parts = self.items.iter_mut().filter(|item| read.covers(item.read.table, item.read.start));
+            parts.for_each(|part| part.mute = true);
             return;
         };
         let Some(item) = self.items.get_mut(index) else {

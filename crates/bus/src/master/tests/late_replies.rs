@@ -84,6 +84,37 @@ fn a_reply_to_a_broken_off_exchange_is_waited_for_by_the_bus_that_comes_after() 
     assert_eq!(rig.master.ended(None, rig.now).quiet_until, Some(rig.now));
 }
 
+/// The end of a turn without a reply that is believed.
+fn no_reply(rig: &mut Rig, doubted: bool) -> TurnEnd {
+    let began = rig.now;
+    rig.now += TIMEOUT;
+    TurnEnd {
+        ended: Ended::Silent,
+        began,
+        at: rig.now,
+        stood: false,
+        took: TIMEOUT,
+        mangled: false,
+        doubted,
+        frame: Vec::new(),
+    }
+}
+
+/// Sends the next request and ends it without a reply that is believed.
+fn fail(rig: &mut Rig, doubted: bool) {
+    let turn = loop {
+        match rig.master.next(rig.now, &mut Vec::new()) {
+            Err(until) => rig.now = until,
+            Ok(turn) => break turn,
+        }
+    };
+    rig.master.sending(&turn, rig.now);
+    let end = no_reply(rig, doubted);
+    let mut news = Vec::new();
+    rig.master.done(&turn, end, rig.now, &mut news);
+    rig.news.append(&mut news);
+}
+
 /// The reply of a drive that was just switched on may be too early for the configured baud rate: it is asked again at once, not
 /// after the pause between two probes.
 #[test]
@@ -92,26 +123,20 @@ fn a_probe_whose_reply_was_not_believed_is_repeated_at_once() {
         let mut rig = Rig::new(1);
         rig.drives[0].silent = true;
         rig.run(Duration::from_secs(60));
-        let turn = loop {
-            match rig.master.next(rig.now, &mut Vec::new()) {
-                Err(until) => rig.now = until,
-                Ok(turn) => break turn,
-            }
-        };
-        rig.master.sending(&turn, rig.now);
-        let began = rig.now;
-        rig.now += TIMEOUT;
-        let end = TurnEnd {
-            ended: Ended::Silent,
-            began,
-            at: rig.now,
-            stood: false,
-            took: TIMEOUT,
-            mangled: false,
-            doubted,
-            frame: Vec::new(),
-        };
-        rig.master.done(&turn, end, rig.now, &mut Vec::new());
+        fail(&mut rig, doubted);
         assert_eq!(rig.master.next(rig.now, &mut Vec::new()).is_ok(), soon);
+    }
+}
+
+/// Replies that come sooner than the baud rate allows take no drive away while they are not believed yet; silence does.
+#[test]
+fn replies_that_are_not_believed_take_no_drive_away() {
+    for (doubted, gone) in [(true, false), (false, true)] {
+        let mut rig = Rig::new(1);
+        rig.run(Duration::from_secs(2));
+        rig.news.clear();
+        (0..4).for_each(|_| fail(&mut rig, doubted));
+        let offline = rig.news.contains(&News::Offline(DriveIndex::new(0)));
+        assert_eq!(offline, gone);
     }
 }
