@@ -4,6 +4,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
+use tokio_util::sync::CancellationToken;
+
 /// Longest wait for a file.
 pub const DISK: Duration = Duration::from_secs(2);
 /// Longest wait for a file while another one is overdue.
@@ -14,9 +16,16 @@ const NEXT: Duration = Duration::from_millis(100);
 pub struct Patience {
     /// How many waits were given up whose work is not done yet.
     overdue: Arc<AtomicUsize>,
+    /// The gateway ends: its stops wait for no disk.
+    ended: CancellationToken,
 }
 
 impl Patience {
+    /// The gateway ends. A wait that is under way, and each later one, takes 0.1 s at most.
+    pub fn end(&self) {
+        self.ended.cancel();
+    }
+
     /// The result of `work`; `None` if the disk does not answer in time: the work goes on then, and its result is dropped.
     /// Must be called within a Tokio runtime.
     pub async fn wait<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> Option<T> {
@@ -24,9 +33,17 @@ impl Patience {
             0 => DISK,
             _ => NEXT,
         };
+        let given_up = async {
+            tokio::select! {
+                () = tokio::time::sleep(limit) => {}
+                () = self.ended.cancelled() => tokio::time::sleep(NEXT.min(limit)).await,
+            }
+        };
         let mut work = Box::pin(work);
-        if let Ok(done) = tokio::time::timeout(limit, work.as_mut()).await {
-            return Some(done);
+        tokio::select! {
+            biased;
+            done = work.as_mut() => return Some(done),
+            () = given_up => {}
         }
         self.overdue.fetch_add(1, Ordering::Relaxed);
         let overdue = self.overdue.clone();
@@ -52,7 +69,7 @@ impl Patience {
 
 /// Why there is nothing from a disk that does not answer.
 pub fn late() -> String {
-    format!("the disk did not answer within {} s", DISK.as_secs())
+    "the disk did not answer in time".to_string()
 }
 
 #[cfg(test)]
@@ -79,5 +96,25 @@ mod tests {
         let (_answer, hangs) = oneshot::channel::<()>();
         assert_eq!(patience.wait(hangs).await, None);
         assert_eq!(begun.elapsed(), DISK);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_gateway_that_ends_waits_for_no_disk() {
+        let patience = Patience::default();
+        let (begun, ending) = (Instant::now(), patience.clone());
+        tokio::spawn(async move {
+            tokio::time::sleep(DISK / 4).await;
+            ending.end();
+        });
+        let (_answer, hangs) = oneshot::channel::<()>();
+        assert_eq!(patience.wait(hangs).await, None);
+        assert_eq!(begun.elapsed(), DISK / 4 + NEXT);
+        // A disk that answers is still heard.
+        let answers = async {
+            tokio::time::sleep(NEXT / 2).await;
+            7
+        };
+        assert_eq!(Patience::default().wait(answers).await, Some(7));
+        assert_eq!(patience.wait(async { 7 }).await, Some(7));
     }
 }

@@ -33,12 +33,18 @@ pub(super) async fn until_stopped(
             Some(order) = orders.recv() => reloads.begin(Some(order), &mut watch),
             loaded = reloads.loaded() => {
                 let outcome = {
+                    let patience = daemon.stats().patience.clone();
                     let applying = apply(&mut daemon, loaded, path, log);
                     tokio::pin!(applying);
                     loop {
                         tokio::select! {
                             outcome = &mut applying => break outcome,
-                            signal = signals.next() => signals.wanted.add(signal),
+                            signal = signals.next() => {
+                                signals.wanted.add(signal);
+                                if signals.wanted.stop {
+                                    patience.end();
+                                }
+                            }
                             () = watch.tick() => {}
                         }
                     }
