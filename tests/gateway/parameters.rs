@@ -101,4 +101,38 @@ fn only_what_the_gateway_did_not_write_is_told_as_a_change() {
     assert_eq!(kept, 3);
     assert!(ran(&site, &["params", "list", "pump-1"]).1.contains("few"));
     assert!(ran(&site, &["params", "show", "pump-1"]).1.contains("43.21 Hz"));
+    listed_from_elsewhere(&site);
+}
+
+/// The readings that are stored, as the gateway tells them where the configuration is not.
+fn listed_from_elsewhere(site: &Site) {
+    let url = format!("http://127.0.0.1:{}", site.http);
+    let told = |arguments: &[&str]| {
+        let output = drivegate(&[arguments, &["--url", &url]].concat()).output().unwrap();
+        let [out, err] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+        (output.status.code(), out, err)
+    };
+    let list = |text: &str| -> Vec<Value> { serde_json::from_str(text).unwrap() };
+    let mut here = list(&ran(site, &["params", "list", "--json"]).1);
+    assert_eq!(here.len(), 3);
+    for reading in &mut here {
+        // The gateway tells the name of the file only.
+        let name = std::path::Path::new(reading["file"].as_str().unwrap()).file_name();
+        reading["file"] = name.unwrap().to_str().unwrap().into();
+        assert_eq!((&reading["family"], &reading["missing"]), (&"few".into(), &0.into()));
+    }
+    assert_eq!(list(&told(&["params", "list", "--json"]).1), here);
+    assert_eq!(list(&told(&["params", "list", "pump-1", "--json"]).1), here);
+    assert_eq!(told(&["params", "list", "pump-9", "--json"]).1, "[]\n");
+    let shown = ran(site, &["params", "show", "pump-1"]).1;
+    assert_eq!(told(&["params", "show", "pump-1"]), (Some(0), shown, String::new()));
+    let (code, _, why) = told(&["params", "show", "pump-9"]);
+    assert!(code == Some(1) && why.contains("pump-9"), "{why}");
+    // One that cannot be read is named beside the others.
+    std::fs::write(site.file("state/params/pump-1/19700101T000000Z.params"), "no reading").unwrap();
+    for (code, text, why) in [told(&["params", "list"]), ran(site, &["params", "list"])] {
+        assert_eq!((code, text.matches("few").count()), (Some(0), 3), "{why}");
+        assert!(why.contains("19700101T000000Z.params"), "{why}");
+    }
+    assert_eq!(list(&told(&["params", "list", "--json"]).1).len(), 4);
 }

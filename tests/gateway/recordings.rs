@@ -70,6 +70,26 @@ fn a_recording_by_command_is_listed_shown_and_exported() {
     let capture = site.path("frames.pcapng");
     printed(&site, &["recordings", "export", &id, "--pcap", "--output", &capture]);
     assert_eq!(fs::read(&capture).unwrap()[..4], [0x0A, 0x0D, 0x0D, 0x0A]);
+    // From elsewhere, where the configuration is not.
+    let url = format!("http://127.0.0.1:{}", site.http);
+    for command in [
+        &["recordings", "list", "--json"][..],
+        &["recordings", "list"],
+        &["recordings", "show", &id],
+        &["recordings", "export", &id, "--csv"],
+        &["recordings", "export", &id, "--json"],
+    ] {
+        let output = drivegate(&[command, &["--url", &url]].concat()).output().unwrap();
+        assert_eq!(
+            String::from_utf8(output.stdout).unwrap(),
+            printed(&site, command),
+            "{command:?}"
+        );
+    }
+    let unknown = drivegate(&["recordings", "show", "x", "--url", &url]).output().unwrap();
+    let told = String::from_utf8(unknown.stderr).unwrap();
+    assert_eq!(unknown.status.code(), Some(1));
+    assert!(told.contains("there is no recording `x`"), "{told}");
     // The same files over HTTP, with a name.
     assert_eq!(
         get(site.http, &format!("/api/v1/recordings/{id}?format=csv")).unwrap(),
@@ -85,7 +105,7 @@ fn a_recording_by_command_is_listed_shown_and_exported() {
     assert_eq!(fs::read(&file).unwrap(), fs::read(&capture).unwrap());
     let (status, refused) = get(site.http, &format!("/api/v1/recordings/{id}?format=xml")).unwrap();
     assert_eq!(status, 400);
-    assert!(refused.contains("it is `json`, `csv` or `pcap`"), "{refused}");
+    assert!(refused.contains("it is `json`, `csv`, `pcap` or `dgrec`"), "{refused}");
     site.until_metric("drivegate_recordings_total{trigger=\"command\"} 1");
     // A truncated file is reported, with the place.
     let file = site.file("state/recordings").join(format!("{id}.dgrec"));

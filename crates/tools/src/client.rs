@@ -192,6 +192,14 @@ impl Client {
         self.open(asked).await?.whole(asked).await
     }
 
+    /// [`Client::ask`], outside of a runtime.
+    ///
+    /// # Errors
+    /// Likewise, as a message.
+    pub(crate) fn ask_now(&self, asked: &Asked) -> Result<Reply, String> {
+        Ok(crate::runtime()?.block_on(self.ask(asked))?)
+    }
+
     /// The document at `path`, which begins with a slash.
     ///
     /// # Errors

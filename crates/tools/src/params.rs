@@ -1,6 +1,7 @@
 //! `drivegate params`: parameters of drives read, compared, restored, listed and shown.
 
 mod restore;
+mod stored;
 
 use std::io::{IsTerminal, Write as _};
 use std::path::{Path, PathBuf};
@@ -11,10 +12,9 @@ use super::client::Gateway;
 use super::drive_access::target;
 use super::failure::{Failure, Outcome, negative};
 use super::report;
-use crate::drive::parameters::RawValue;
 use crate::files;
 use crate::north::http::messages::{ParameterReading, ReadParameters};
-use crate::parameters::{Names, ParameterFile, Store, differences, read as read_file};
+use crate::parameters::{Names, ParameterFile, differences, read as read_file};
 
 /// Reads, compares, restores and shows the parameters of drives.
 ///
@@ -74,12 +74,21 @@ continues the restore if the command is interrupted.")]
         how: restore::How,
     },
     /// Lists the stored readings, oldest first.
-    #[command(after_help = "Example:\n  drivegate params list pump-1")]
+    ///
+    /// Reads the files of the configuration, or with --url asks the gateway there.
+    #[command(after_help = "Examples:
+  drivegate params list pump-1
+  drivegate params list --json --url http://gateway:9488")]
     List {
         /// Name of a drive [default: all].
         drive: Option<String>,
+        /// JSON instead of a table.
+        #[arg(long)]
+        json: bool,
     },
     /// Shows a file, or the last stored reading of a drive.
+    ///
+    /// Reads the files of the configuration, or with --url asks the gateway there.
     #[command(after_help = "Examples:
   drivegate params show pump-1
   drivegate params show pump-1.params --names vacon-nx.csv")]
@@ -111,14 +120,14 @@ struct ReadArgs {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let (gateway, config) = (&args.gateway, args.gateway.config());
+    let gateway = &args.gateway;
     match &args.action {
         Action::Read(read) => read_drive(gateway, read),
         Action::Diff { before, after } => diff(gateway, before, after),
         Action::Restore(args_of_it) => restore::restore(gateway, args_of_it),
         Action::Clone { from, to, how } => restore::clone(gateway, from, to, how),
-        Action::List { drive } => list(config, drive.as_deref()),
-        Action::Show { of, names } => show(config, of, names.as_deref()),
+        Action::List { drive, json } => stored::list(gateway, drive.as_deref(), *json),
+        Action::Show { of, names } => stored::show(gateway, of, names.as_deref()),
     }
 }
 
@@ -273,93 +282,6 @@ fn diff(gateway: &Gateway, before: &str, after: &str) -> Outcome {
         true => Ok(printed),
         false => negative(),
     }
-}
-
-/// The store of the configuration.
-fn store(config: &Path) -> Result<Store, Failure> {
-    Ok(Store::new(super::settings(config)?.params.dir))
-}
-
-fn list(config: &Path, drive: Option<&str>) -> Outcome {
-    let store = store(config)?;
-    let kept = store.list().map_err(|error| {
-        format!(
-            "cannot read the readings: {error}; {}; make it a directory that you may read, or use sudo",
-            store.dir().display()
-        )
-    })?;
-    let mut table = report::table(["drive", "time", "family", "application", "missing", "file"]);
-    let mut rows = 0;
-    for one in kept.iter().filter(|one| drive.is_none_or(|drive| one.drive == drive)) {
-        match read_file(&one.path) {
-            Ok(file) => {
-                rows += 1;
-                table.add_row([
-                    one.drive.clone(),
-                    file.time.clone(),
-                    file.family.clone(),
-                    file.application(),
-                    file.missing().to_string(),
-                    one.path.display().to_string(),
-                ]);
-            }
-            Err(why) => report::warning(&why),
-        }
-    }
-    if rows == 0 {
-        report::note(&format!("no readings are kept in {}", store.dir().display()));
-        return Ok(ExitCode::SUCCESS);
-    }
-    Ok(report::print(&report::lines(&table)))
-}
-
-fn show(config: &Path, of: &str, names: Option<&Path>) -> Outcome {
-    let names = self::names(names)?;
-    let file = match Path::new(of).is_file() {
-        true => read_written(Path::new(of))?,
-        false => {
-            let store = store(config)?;
-            let last = store.latest(of).map_err(|why| format!("{why}; correct or remove it"))?;
-            last.ok_or_else(|| {
-                format!(
-                    "no reading of `{of}` is stored; {}; read it with `drivegate params read {of}`",
-                    store.dir().display()
-                )
-            })?
-        }
-    };
-    let file = match names {
-        Some(names) => {
-            let profile = built_in(&file.family)?;
-            file.named(&profile, &names)
-        }
-        None => file,
-    };
-    let mut table = report::table(["parameter", "raw", "value and name"]);
-    for (id, entry) in &file.values {
-        let (raw, text) = match &entry.value {
-            Ok(RawValue::Word(word)) => (word.to_string(), entry.note.clone()),
-            Ok(RawValue::Float(bits)) => (f32::from_bits(*bits).to_string(), entry.note.clone()),
-            Err(why) => (
-                "?".to_string(),
-                format!("{} (not read: {why})", entry.note).trim_start().to_string(),
-            ),
-        };
-        table.add_row([id.to_string(), raw, text]);
-    }
-    let counters = match file.counters.as_str() {
-        "" => String::new(),
-        counters => format!("counted by the drive: {counters}\n"),
-    };
-    let head = format!(
-        "{} ({}), read {}; identification: {}; {}\n{counters}",
-        file.drive,
-        file.family,
-        file.time,
-        file.identification,
-        file.application()
-    );
-    Ok(report::print(&(head + &report::lines(&table))))
 }
 
 fn names(path: Option<&Path>) -> Result<Option<Names>, Failure> {

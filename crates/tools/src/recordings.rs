@@ -6,26 +6,28 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use super::client::{Asked, Client, Gateway, encoded};
 use super::failure::{Failure, Outcome};
-use super::{DEFAULT_CONFIG, report};
+use super::report;
 use crate::document::nearest;
-use crate::history::{Entry, Recording, export, pcapng, store};
+use crate::history::{Entry, Recording, export, pcapng, recording, store};
 
 /// Lists, shows and exports recordings.
 ///
-/// Reads the gateway's files; no gateway needs to run. A recording is given by its id, or by the path of its file.
+/// Reads the gateway's files; no gateway needs to run. With --url the gateway there is asked. A recording is given by its
+/// id, or by the path of its file.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate recordings
+  drivegate recordings list --url http://gateway:9488
   drivegate recordings show 20260302T074012.118Z-pump-1
   drivegate recordings export 20260302T074012.118Z-pump-1 --csv > trip.csv
   drivegate recordings export 20260302T074012.118Z-pump-1 --pcap --output trip.pcapng")]
 pub(super) struct Args {
-    /// Configuration file; its state_dir has the recordings.
-    #[arg(long = "config", value_name = "FILE", default_value = DEFAULT_CONFIG, global = true)]
-    config: PathBuf,
+    #[command(flatten)]
+    gateway: Gateway,
     /// Directory with recordings, instead of that of the configuration.
-    #[arg(long, value_name = "DIR", global = true)]
+    #[arg(long, value_name = "DIR", global = true, conflicts_with = "url")]
     dir: Option<PathBuf>,
     #[command(subcommand)]
     action: Option<Action>,
@@ -84,7 +86,7 @@ fn directory(args: &Args) -> Result<PathBuf, Failure> {
     if let Some(dir) = &args.dir {
         return Ok(dir.clone());
     }
-    Ok(super::settings(&args.config)?.recordings.dir)
+    Ok(super::settings(args.gateway.config())?.recordings.dir)
 }
 
 fn entries(dir: &Path) -> Result<Vec<Entry>, Failure> {
@@ -97,14 +99,19 @@ fn entries(dir: &Path) -> Result<Vec<Entry>, Failure> {
 }
 
 fn list(args: &Args, json: bool) -> Outcome {
-    let dir = directory(args)?;
-    let entries = entries(&dir)?;
+    let (entries, place) = match args.gateway.network() {
+        Some(client) => (listed_by(&client)?, "at the gateway".to_string()),
+        None => {
+            let dir = directory(args)?;
+            (entries(&dir)?, format!("in {}", dir.display()))
+        }
+    };
     if json {
         let text = serde_json::to_string_pretty(&entries).unwrap_or_default();
         return Ok(report::print(&(text + "\n")));
     }
     if entries.is_empty() {
-        report::note(&format!("no recordings in {}", dir.display()));
+        report::note(&format!("no recordings {place}"));
         return Ok(ExitCode::SUCCESS);
     }
     let mut table = report::table(["id", "trigger", "kB", "summary"]);
@@ -119,8 +126,30 @@ fn list(args: &Args, json: bool) -> Outcome {
     Ok(report::print(&report::lines(&table)))
 }
 
+/// The recordings of a gateway.
+fn listed_by(client: &Client) -> Result<Vec<Entry>, Failure> {
+    let asked = Asked::get("/api/v1/recordings");
+    Ok(client.ask_now(&asked)?.accepted(&asked)?)
+}
+
+/// A recording of a gateway.
+fn fetched(client: &Client, id: &str) -> Result<Recording, Failure> {
+    let path = format!("/api/v1/recordings/{}?format={}", encoded(id), recording::ENDING);
+    let asked = Asked::get(path).if_refused("choose one from `drivegate recordings list`");
+    let reply = client.ask_now(&asked)?;
+    if !reply.status.is_success() {
+        return Err(reply.refusal(&asked).into());
+    }
+    let parsed = Recording::parse(reply.bytes());
+    Ok(parsed.map_err(|error| reply.strange(format!("unexpected reply ({error})")))?)
+}
+
 fn open(args: &Args, id: &str) -> Result<Recording, Failure> {
-    let path = match id.contains('/') || Path::new(id).is_file() {
+    let is_file = id.contains('/') || Path::new(id).is_file();
+    if let Some(client) = args.gateway.network().filter(|_| !is_file) {
+        return fetched(&client, id);
+    }
+    let path = match is_file {
         true => PathBuf::from(id),
         false => {
             let dir = directory(args)?;

@@ -28,6 +28,8 @@ struct Manners {
     farewell: Option<Vec<u8>>,
     /// It does not answer subscriptions.
     deaf: bool,
+    /// From the first ping on it answers nothing.
+    mute: bool,
     /// It refuses a last will with QoS 1, and one that is retained.
     no_will: bool,
     /// It refuses filters with wildcards.
@@ -105,6 +107,7 @@ struct Session {
     aliases: HashMap<u16, String>,
     /// Packet ids of events to acknowledge, with their reason codes.
     owed: Vec<(u16, u8)>,
+    pinged: bool,
 }
 
 fn number(bytes: &[u8]) -> usize {
@@ -120,10 +123,14 @@ impl Session {
             first,
             aliases: HashMap::new(),
             owed: Vec::new(),
+            pinged: false,
         }
     }
 
     fn send(&mut self, kind: u8, body: &[u8]) -> Option<()> {
+        if self.pinged && self.manners.mute {
+            return Some(());
+        }
         let packet = [&[kind, u8::try_from(body.len()).unwrap()][..], body].concat();
         if !self.manners.piecemeal {
             return self.stream.write_all(&packet).ok();
@@ -168,7 +175,10 @@ impl Session {
                     self.send(0x90, &packets::subscribed(&body, &codes))?;
                 }
                 3 => self.publish(kind, &body)?,
-                12 => self.send(0xD0, &[])?,
+                12 => {
+                    self.pinged = true;
+                    self.send(0xD0, &[])?;
+                }
                 14 => {
                     self.seen.lock().unwrap().farewells.push(body);
                     return None;
@@ -341,6 +351,29 @@ fn odd_brokers_are_served() {
         drop(seen);
         gateway.stop();
     }
+}
+
+/// A broker that falls silent is told that the connection ends, so that it does not take the gateway for lost by an accident.
+#[test]
+fn a_broker_that_falls_silent_is_told_goodbye() {
+    let keep_alive = with(vec![0x13, 0, 2]);
+    let broker = Hostile::start(Manners {
+        mute: true,
+        ..keep_alive
+    });
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    wait_for("the farewell", || {
+        (!broker.seen.lock().unwrap().farewells.is_empty()).then_some(())
+    });
+    // "Disconnect with Will Message": until it is back, whoever reads at this broker is to know that it is away.
+    assert_eq!(
+        broker.seen.lock().unwrap().farewells.first().unwrap().first(),
+        Some(&0x04)
+    );
+    wait_for("the next connection", || {
+        (broker.seen.lock().unwrap().connections > 1).then_some(())
+    });
+    gateway.stop();
 }
 
 #[test]

@@ -346,7 +346,10 @@ impl DriveSchedule {
     pub(super) fn in_vain(&mut self, read: PlannedRead, retries: u32, now: Instant) {
         let Some(index) = self.items.iter().position(|item| item.read == read) else {
             // The block was taken apart meanwhile: any of its parts may be what is not answered.
-            let parts = self.items.iter_mut().filter(|item| read.covers(item.read.table, item.read.start));
+            let parts = self
+                .items
+                .iter_mut()
+                .filter(|item| read.covers(item.read.table, item.read.start));
             parts.for_each(|part| part.mute = true);
             return;
         };

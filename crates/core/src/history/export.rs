@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime};
 use serde::{Serialize, Serializer};
 use serde_json::{Map, Value as Json, json};
 
-use super::recording::{CommandNote, EventNote, Frame, Recording};
+use super::recording::{CommandNote, EventNote, Frame, Header, Recording};
 
 /// One JSON object: the header, `values` by point, `samples` with theirs, `events`, `commands`, `frames`. It is written a
 /// sample at a time: as a tree, a recording of 1 MB takes 10 MB of memory.
@@ -19,7 +19,7 @@ pub fn json(recording: &Recording) -> String {
     let names = (0..).map(|place| name(recording, place));
     let known: BTreeMap<&str, &Json> = names.zip(&recording.header.values).collect();
     header.insert("values".into(), json!(known));
-    let object = Object {
+    let object = RecordingObject {
         header,
         samples: Samples(recording),
         events: &recording.events,
@@ -30,10 +30,13 @@ pub fn json(recording: &Recording) -> String {
     serde_json::to_string(&object).unwrap_or_default()
 }
 
-#[derive(Serialize)]
-struct Object<'r> {
+/// A recording as JSON.
+#[derive(Serialize, utoipa::ToSchema)]
+pub struct RecordingObject<'r> {
     #[serde(flatten)]
+    #[schema(value_type = Header)]
     header: Map<String, Json>,
+    #[schema(value_type = Vec<SampleObject<'r>>)]
     samples: Samples<'r>,
     events: &'r [EventNote],
     commands: &'r [CommandNote],
@@ -57,9 +60,13 @@ impl Serialize for Samples<'_> {
     }
 }
 
-#[derive(Serialize)]
+/// The values of one read.
+#[derive(Serialize, utoipa::ToSchema)]
+#[schema(as = RecordedSample)]
 struct SampleObject<'r> {
+    /// When it was read, s from the trigger.
     t: f64,
+    /// The values by point; `null` where it has none.
     points: BTreeMap<&'r str, &'r Json>,
 }
 

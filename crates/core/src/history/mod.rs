@@ -39,6 +39,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime};
 
 pub use drives::{DriveHistory, History};
+pub use export::RecordingObject;
 pub use keeper::keep;
 pub use recorder::{Capture, Recorder};
 pub use recording::{Recording, RecordingError};

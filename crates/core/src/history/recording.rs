@@ -20,7 +20,8 @@ pub const VERSION: u32 = 1;
 pub const ENDING: &str = "dgrec";
 
 /// The subject of a recording, and its summary.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = RecordedHeader)]
 pub struct Header {
     /// [`VERSION`]; its presence marks the file as a recording.
     pub drivegate_recording: u32,
@@ -29,6 +30,7 @@ pub struct Header {
     /// Time of the trigger, RFC 3339 with microseconds, UTC. All times below are seconds from it.
     pub time: String,
     /// Its trigger.
+    #[schema(value_type = String)]
     pub trigger: TriggerKind,
     /// Its summary, in one sentence.
     pub summary: String,
@@ -44,7 +46,8 @@ pub struct Header {
     pub to: f64,
     /// The points, in the order of `values` here.
     pub points: Vec<Column>,
-    /// The values known at the trigger, of any age.
+    /// The values known at the trigger, of any age. As JSON of the gateway they are by point.
+    #[schema(value_type = BTreeMap<String, Json>)]
     pub values: Vec<Json>,
     /// The reads that the samples are of.
     pub reads: Vec<Read>,
@@ -53,18 +56,21 @@ pub struct Header {
 }
 
 /// A further trigger.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = RecordedFurther)]
 pub struct Further {
     /// When.
     pub t: f64,
     /// What.
+    #[schema(value_type = String)]
     pub trigger: TriggerKind,
     /// In words.
     pub text: String,
 }
 
 /// The drive of a recording.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = RecordedDrive)]
 pub struct Drive {
     pub name: String,
     /// Address on the bus.
@@ -74,7 +80,8 @@ pub struct Drive {
 }
 
 /// The bus of a recording.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = RecordedBus)]
 pub struct Bus {
     pub name: String,
     pub protocol: String,
@@ -85,7 +92,8 @@ pub struct Bus {
 }
 
 /// A point.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = RecordedColumn)]
 pub struct Column {
     pub name: String,
     /// Unit; empty for states and codes.
@@ -93,8 +101,10 @@ pub struct Column {
 }
 
 /// A read that samples are of.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = RecordedRead)]
 pub struct Read {
+    #[schema(value_type = String)]
     pub table: Table,
     /// First PDU address.
     pub start: u16,
@@ -115,7 +125,7 @@ pub struct Sample {
     values: Range<usize>,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct EventNote {
     /// When.
     pub t: f64,
@@ -126,7 +136,7 @@ pub struct EventNote {
 }
 
 /// A completed command.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct CommandNote {
     /// When it completed.
     pub t: f64,
@@ -143,16 +153,19 @@ pub struct CommandNote {
 }
 
 /// Bytes on the line.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = RecordedFrame)]
 pub struct Frame {
     /// A request: when it was given to the port. Else when the last of it came.
     pub t: f64,
     /// Place of the drive that was asked.
     pub drive: Option<usize>,
     /// Its verdict.
+    #[schema(value_type = String)]
     pub verdict: Verdict,
     /// The bytes; in the file two hexadecimal digits each.
     #[serde(rename = "hex", with = "hexadecimal")]
+    #[schema(value_type = String)]
     pub bytes: Arc<[u8]>,
 }
 

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::RecorderOptions;
 use super::recording::{ENDING, Header, Recording, RecordingError};
@@ -21,7 +21,7 @@ const MOST_HEADER: u64 = 1 << 20;
 const MOST_BYTES: u64 = 1 << 30;
 
 /// A recording in short.
-#[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Entry {
     /// Its id.
     pub id: String,

@@ -10,7 +10,7 @@ pub use crate::command_json::StopBody;
 use crate::drill::Kind;
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Point, Quality, Sample};
-use crate::parameters::{Plan, RestoreStage, RestoreStatus, Status};
+use crate::parameters::{Kept, ParameterFile, Plan, RestoreStage, RestoreStatus, Status, read};
 use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 
 /// An error reply.
@@ -187,6 +187,45 @@ pub struct Recorded {
     pub id: String,
     /// Time until it is complete, s.
     pub after_s: f64,
+}
+
+/// A reading of parameters that is stored.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct StoredReading {
+    /// Name of the drive.
+    pub drive: String,
+    /// Its file.
+    pub file: String,
+    /// When it was made, RFC 3339; this and what follows is `null` where the file cannot be read.
+    pub time: Option<String>,
+    /// Profile of the drive.
+    pub family: Option<String>,
+    /// The application that the drive ran.
+    pub application: Option<String>,
+    /// Parameters that were not read.
+    pub missing: Option<usize>,
+    /// Why the file cannot be read.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub error: Option<String>,
+}
+
+impl StoredReading {
+    /// Reads its file, which is called `file`.
+    pub fn of(kept: &Kept, file: String) -> StoredReading {
+        let (reading, error) = match read(&kept.path) {
+            Ok(reading) => (Some(reading), None),
+            Err(why) => (None, Some(why)),
+        };
+        StoredReading {
+            drive: kept.drive.clone(),
+            file,
+            time: reading.as_ref().map(|reading| reading.time.clone()),
+            family: reading.as_ref().map(|reading| reading.family.clone()),
+            application: reading.as_ref().map(ParameterFile::application),
+            missing: reading.as_ref().map(ParameterFile::missing),
+            error,
+        }
+    }
 }
 
 /// A reading of parameters.

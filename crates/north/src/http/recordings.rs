@@ -10,6 +10,7 @@ use axum::response::{IntoResponse, Response};
 use super::app_state::AppState;
 use super::query::{self, QueryError};
 use super::replies::{Replied, not_found, refused};
+use crate::history::recording::ENDING;
 use crate::history::{Recording, export, pcapng};
 
 /// The forms of a recording.
@@ -18,6 +19,8 @@ enum Form {
     Json,
     Csv,
     Pcap,
+    /// The gateway's own.
+    Dgrec,
 }
 
 impl Form {
@@ -27,6 +30,7 @@ impl Form {
             Form::Json => ("application/json", "json"),
             Form::Csv => ("text/csv; charset=utf-8", "csv"),
             Form::Pcap => ("application/x-pcapng", "pcapng"),
+            Form::Dgrec => ("application/octet-stream", ENDING),
         }
     }
 
@@ -35,6 +39,7 @@ impl Form {
             Form::Json => export::json(recording).into_bytes(),
             Form::Csv => export::csv(recording).into_bytes(),
             Form::Pcap => pcapng::pcapng(recording),
+            Form::Dgrec => recording.to_bytes(),
         }
     }
 }
@@ -46,10 +51,11 @@ fn form(query: Option<&str>) -> Result<Form, QueryError> {
         None | Some("json") => Ok(Form::Json),
         Some("csv") => Ok(Form::Csv),
         Some("pcap") => Ok(Form::Pcap),
+        Some("dgrec") => Ok(Form::Dgrec),
         Some(other) => Err(QueryError::Value {
             name: "format",
             value: other.to_string(),
-            expected: "it is `json`, `csv` or `pcap`",
+            expected: "it is `json`, `csv`, `pcap` or `dgrec`",
         }),
     }
 }
@@ -61,7 +67,8 @@ pub(super) async fn list(State(app): State<Arc<AppState>>) -> Response {
     Json(entries.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }
 
-/// One recording with all its samples and frames; with `format=csv` its samples, with `format=pcap` its frames, as a file.
+/// One recording with all its samples and frames; with `format=csv` its samples, with `format=pcap` its frames, with
+/// `format=dgrec` as the gateway keeps it, as a file.
 pub(super) async fn one(
     State(app): State<Arc<AppState>>,
     Path(id): Path<String>,

@@ -15,7 +15,7 @@ use super::access::AccessError;
 use super::app_state::AppState;
 use super::messages::{
     DrillWish, Health, HoldAct, ParameterReading, PointValue, ReadParameters, Recorded, ReloadOutcome, Restore,
-    RestoreAct, Why,
+    RestoreAct, StoredReading, Why,
 };
 use super::openapi::{Api, Doc};
 use super::operating::{self, Operating};
@@ -25,7 +25,7 @@ use super::{api, event_log, expect, line, page, points, recordings, replies, str
 use crate::NorthState;
 use crate::command_json::{CommandResult, HoldReply, StopBody};
 use crate::drill::DrillReport;
-use crate::history::Entry;
+use crate::history::{Entry, RecordingObject};
 use crate::order::AuditRecord;
 use crate::plant::SharedPlant;
 use crate::stop_all::StopReport;
@@ -123,7 +123,10 @@ fn described() -> Api {
         )
         .get(
             "/api/v1/drives/{name}/params",
-            Doc::object::<Parameters<'_>>("The last reading of the parameters, and what is in progress"),
+            Doc::object::<Parameters<'_>>("The last reading of the parameters, and what is in progress").query(&[(
+                "format",
+                "json, or file: the last reading as `drivegate params` writes it",
+            )]),
             views::params,
         )
         .get(
@@ -189,10 +192,16 @@ fn described() -> Api {
             Doc::list::<AuditRecord>("The last commands").query(&[("drive", "only those for this drive")]),
             views::audit,
         )
+        .get(
+            "/api/v1/params",
+            Doc::list::<StoredReading>("Stored readings of parameters").query(&[("drive", "only those of this drive")]),
+            views::all_params,
+        )
         .get("/api/v1/recordings", Doc::list::<Entry>("Recordings"), recordings::list)
         .get(
             "/api/v1/recordings/{id}",
-            Doc::any("A recording").query(&[("format", "json, csv or pcap")]),
+            Doc::object::<RecordingObject<'_>>("A recording")
+                .query(&[("format", "json, csv, pcap, or dgrec: as the gateway keeps it")]),
             recordings::one,
         )
         .get(

@@ -11,13 +11,14 @@ use axum::http::{Method, StatusCode, Uri};
 use axum::response::{Html, IntoResponse, Response};
 
 use super::app_state::AppState;
-use super::messages::{Health, Why};
+use super::messages::{Health, StoredReading, Why};
 use super::params::Parameters;
+use super::query::QueryError;
 use super::reached::Reached;
 use super::replies::{Replied, find_bus, no_drive, not_found, refused};
 use super::{api, page, query};
 use crate::local::control;
-use crate::parameters::ParameterFile;
+use crate::parameters::{Kept, ParameterFile, Store};
 use crate::{metrics, readiness};
 
 pub(super) async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
@@ -126,7 +127,12 @@ pub(super) async fn why(State(app): State<Arc<AppState>>, Path(name): Path<Strin
 }
 
 /// The last reading of a drive's parameters, and the one in progress.
-pub(super) async fn params(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Replied {
+pub(super) async fn params(
+    State(app): State<Arc<AppState>>,
+    Path(name): Path<String>,
+    RawQuery(query): RawQuery,
+) -> Replied {
+    let as_file = params_as_file(query.as_deref())?;
     let plant = app.plant.load_full();
     let drive = plant.drive(&name).ok_or_else(|| no_drive(&plant, &name))?;
     let machine = drive.machine();
@@ -135,21 +141,69 @@ pub(super) async fn params(State(app): State<Arc<AppState>>, Path(name): Path<St
         Some(file) => Some(file),
         None => stored_params(&app, &name).await?.map(Arc::new),
     };
+    if as_file {
+        let none = || not_found(format!("no reading of `{name}` is stored"), Vec::new());
+        return Ok(last.ok_or_else(none)?.text().into_response());
+    }
     let restore = app.north.parameters.restore(&machine);
     let parameters = Parameters::new(&name, last.as_deref(), status.as_ref(), restore.as_ref());
     Ok(Json(parameters).into_response())
 }
 
+/// Whether a query asks for the last reading as its file.
+fn params_as_file(query: Option<&str>) -> Result<bool, QueryError> {
+    let [format] = query::parameters(query, &["format"])?;
+    match format.as_deref() {
+        None | Some("json") => Ok(false),
+        Some("file") => Ok(true),
+        Some(other) => Err(QueryError::Value {
+            name: "format",
+            value: other.to_string(),
+            expected: "it is `json` or `file`",
+        }),
+    }
+}
+
 /// The last reading on disk.
 async fn stored_params(app: &AppState, name: &str) -> Replied<Option<ParameterFile>> {
+    let name = name.to_string();
+    let latest = from_store(app, move |store| store.latest(&name)).await?;
+    Ok(latest.flatten())
+}
+
+/// All readings on disk, drive by drive, the oldest first; with `drive` those of one drive.
+pub(super) async fn all_params(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Replied {
+    let [drive] = query::parameters(query.as_deref(), &["drive"])?;
+    let readings = from_store(&app, move |store| {
+        let all = store
+            .list()
+            .map_err(|error| format!("cannot read the readings: {error}"))?;
+        let wanted = all
+            .iter()
+            .filter(|kept| drive.as_ref().is_none_or(|drive| kept.drive == *drive));
+        // The name tells it from others; where the directory is concerns this machine only.
+        let file = |kept: &Kept| kept.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(wanted
+            .map(|kept| StoredReading::of(kept, file(kept)))
+            .collect::<Vec<_>>())
+    });
+    Ok(Json(readings.await?.unwrap_or_default()).into_response())
+}
+
+/// What `read` finds in the store, away from the tasks of other clients; nothing where readings are not stored.
+async fn from_store<T: Send + 'static>(
+    app: &AppState,
+    read: impl FnOnce(Store) -> Result<T, String> + Send + 'static,
+) -> Replied<Option<T>> {
     let Some(store) = app.north.parameters.store() else {
         return Ok(None);
     };
     let unavailable = StatusCode::SERVICE_UNAVAILABLE;
     let _permit = app.files.acquire().await.map_err(|_| unavailable)?;
-    let name = name.to_string();
-    let read = tokio::task::spawn_blocking(move || store.latest(&name)).await;
-    read.map_err(|_| unavailable)?
+    let found = tokio::task::spawn_blocking(move || read(store)).await;
+    found
+        .map_err(|_| unavailable)?
+        .map(Some)
         .map_err(|why| refused(StatusCode::INTERNAL_SERVER_ERROR, why))
 }
 

@@ -74,6 +74,8 @@ pub(super) enum Step {
     Message(Box<Incoming>),
     /// There is room for further messages.
     Room,
+    /// The broker was asked whether it is there.
+    Pinged,
     /// Nothing for the client, such as any other packet from the broker.
     Nothing,
     /// The connection stands and cannot be used any more, for this reason: it is to be given up.
@@ -190,8 +192,13 @@ impl Connection {
         // The sender is dropped without a last event only if the task panicked.
         let silent = || Step::Lost("the MQTT client failed".to_string());
         let event = self.event.recv().await.unwrap_or_else(silent);
-        if matches!(event, Step::Sent(_) | Step::Room) {
-            return event;
+        match event {
+            Step::Sent(_) | Step::Room => return event,
+            Step::Pinged => {
+                self.silence.pinged(Instant::now());
+                return Step::Nothing;
+            }
+            _ => {}
         }
         self.silence.heard(Instant::now());
         match event {
@@ -286,16 +293,17 @@ impl Connection {
         }
     }
 
-    /// Ends the connection without waiting for it, and tells the broker, as far as it listens. The last will is published if it
-    /// is `true_now`: others take the gateway for online.
-    pub(super) fn give_up(mut self, true_now: bool) {
+    /// Ends the connection without waiting for it, and tells the broker why, as far as it listens. The last will is published if
+    /// it is `true_now`: others take the gateway for online.
+    pub(super) fn give_up(mut self, why: &str, true_now: bool) {
         let reason = match true_now {
             true => DisconnectReasonCode::DisconnectWithWillMessage,
             false => DisconnectReasonCode::NormalDisconnection,
         };
         let properties = DisconnectProperties {
             session_expiry_interval: None,
-            reason_string: None,
+            // Without any property the library sends the code of a normal end, whatever the reason.
+            reason_string: Some(why.to_string()),
             user_properties: Vec::new(),
             server_reference: None,
         };
@@ -446,6 +454,7 @@ fn interpret(event: Event, arrival: Arrival) -> Option<Step> {
         Event::Incoming(_) => Some(Step::Nothing),
         // A packet id was about to be used again before its acknowledgement.
         Event::Outgoing(Outgoing::AwaitAck(_)) => Some(Step::Stuck("the broker did not acknowledge a message")),
+        Event::Outgoing(Outgoing::PingReq) => Some(Step::Pinged),
         Event::Outgoing(_) | Event::Auth(_) => None,
     }
 }

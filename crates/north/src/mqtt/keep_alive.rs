@@ -8,6 +8,8 @@ pub(super) const KEEP_ALIVE_S: u16 = 10;
 const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
 /// Without a packet from the broker for this long, the connection is considered lost.
 const LOST: Duration = KEEP_ALIVE.saturating_mul(3);
+/// Part of the interval in which a ping is to be answered.
+const OF_INTERVAL: f64 = 0.8;
 
 /// The decision about a broker that may be silent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,6 +29,8 @@ pub(super) struct Silence {
     heard: Instant,
     /// Whether it was asked, and the answer is still to come.
     asked: bool,
+    /// When the library sent a ping; `None` once the broker sent anything since.
+    pinged: Option<Instant>,
 }
 
 impl Silence {
@@ -34,12 +38,18 @@ impl Silence {
         Silence {
             heard: now,
             asked: false,
+            pinged: None,
         }
     }
 
     /// The broker sent a packet.
     pub(super) fn heard(&mut self, now: Instant) {
-        self.heard = now;
+        (self.heard, self.pinged) = (now, None);
+    }
+
+    /// The library sent a ping.
+    pub(super) fn pinged(&mut self, now: Instant) {
+        self.pinged.get_or_insert(now);
     }
 
     /// The broker was asked.
@@ -52,12 +62,18 @@ impl Silence {
         std::mem::take(&mut self.asked)
     }
 
-    /// `interval` is the one that the broker set instead of ours, 0: no keep-alive. A broker that is pinged less often
-    /// than we want, or never, has no reason to speak, and is asked.
+    /// `interval` is the one that the broker set instead of ours, s; 0: no keep-alive. A broker that is pinged less often
+    /// than we want, or never, has no reason to speak, and is asked. The library closes the connection an interval after a
+    /// ping without an answer, and sends no DISCONNECT then: the connection is lost a little earlier.
     pub(super) fn judge(&self, interval: Option<u16>, now: Instant) -> Verdict {
         let silent = now.saturating_duration_since(self.heard);
-        let pinged = interval.is_none_or(|seconds| (1..=KEEP_ALIVE_S).contains(&seconds));
-        if silent > LOST {
+        let interval = interval.unwrap_or(KEEP_ALIVE_S);
+        let pinged = (1..=KEEP_ALIVE_S).contains(&interval);
+        let patience = Duration::from_secs(interval.into()).mul_f64(OF_INTERVAL);
+        let unanswered = self
+            .pinged
+            .is_some_and(|ping| now.saturating_duration_since(ping) >= patience);
+        if silent > LOST || unanswered {
             Verdict::Lost
         } else if silent > KEEP_ALIVE && !pinged && !self.asked {
             Verdict::Ask
@@ -71,14 +87,18 @@ impl Silence {
 mod tests {
     use super::*;
 
-    /// Seconds of an hour at which a broker is asked that says nothing else, and when it is lost, if ever.
+    /// Seconds of an hour at which a broker is asked that says nothing else, and when it is lost, if ever. The library pings it
+    /// once in so many seconds.
     fn hour(interval: Option<u16>, answers: bool, pings: Option<u64>) -> (Vec<u64>, Option<u64>) {
         let start = Instant::now();
         let (mut silence, mut asked) = (Silence::new(start), Vec::new());
         for second in 1..=3600 {
             let now = start + Duration::from_secs(second);
             if pings.is_some_and(|every| second % every == 0) {
-                silence.heard(now);
+                silence.pinged(now);
+                if answers {
+                    silence.heard(now);
+                }
             }
             match silence.judge(interval, now) {
                 Verdict::Fine => {}
@@ -115,6 +135,10 @@ mod tests {
         for (interval, pings) in [(None, 10), (Some(10), 10), (Some(1), 1)] {
             assert_eq!(hour(interval, true, Some(pings)), (vec![], None));
             assert_eq!(hour(interval, true, None), (vec![], Some(31)));
+        }
+        // Before the library closes the connection, after two intervals.
+        for (interval, pings, lost) in [(None, 10, 18), (Some(10), 10, 18), (Some(5), 5, 9), (Some(20), 20, 31)] {
+            assert_eq!(hour(interval, false, Some(pings)).1, Some(lost), "{interval:?}");
         }
     }
 }

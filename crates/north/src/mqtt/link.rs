@@ -250,7 +250,7 @@ impl BrokerLink {
     /// Ends the connection for this reason, and tells the broker. The last will is published if it is `true_now`.
     pub(super) fn give_up(&mut self, why: &str, true_now: bool) {
         if let Some(connection) = self.lost(why) {
-            connection.give_up(true_now);
+            connection.give_up(why, true_now);
         }
     }
 

@@ -244,6 +244,11 @@ impl Reply {
         serde_json::from_slice(&self.text).map_err(|error| self.strange(format!("unexpected reply ({error})")))
     }
 
+    /// The body of a reply of any status.
+    pub(crate) fn bytes(&self) -> &[u8] {
+        &self.text
+    }
+
     /// The text of a reply of any status.
     pub(crate) fn text(&self) -> String {
         String::from_utf8_lossy(&self.text).into_owned()
