@@ -177,7 +177,7 @@ impl Schedule {
                 })
             });
             let items = items.collect();
-            DriveSchedule::new(items, plan.behind_state.clone(), plan.trials.clone(), now)
+            DriveSchedule::new(items, plan, now)
         });
         let drives: PerDrive<DriveSchedule> = drives.collect();
         let slow = drives.iter().flat_map(|drive| &drive.items);

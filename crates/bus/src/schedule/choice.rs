@@ -135,10 +135,13 @@ impl Schedule {
     }
 
     fn due_slow(&self, now: Instant) -> Option<(Instant, Poll, Duration)> {
-        // Points read once when a drive comes online go first: commands in percent depend on its frequencies.
-        let rank = |due: Instant, item: &Item| {
-            let first = item.read.class == PollClass::Once && item.failures == 0 && !item.refused;
-            (!first, due)
+        // Points read once when a drive comes online go first: commands in percent depend on its frequencies. The bits of the
+        // status word follow: it is not whole before.
+        let rank = |drive: &DriveSchedule, due: Instant, item: &Item| {
+            let sound = item.failures == 0 && !item.refused;
+            let first = item.read.class == PollClass::Once && sound;
+            let completes = item.unread && sound && drive.behind_status_word.contains(&item.origin);
+            (!first, !completes, due)
         };
         let (mut least, mut best) = (None, None);
         for (index, drive) in self
@@ -148,13 +151,13 @@ impl Schedule {
         {
             let slow = drive.items.iter().filter(|item| item.is_slow());
             for (due, item) in slow.map(|item| (drive.due(item), item)).filter(|(due, _)| *due <= now) {
-                if least.is_none_or(|least| rank(due, item) < least) {
+                if least.is_none_or(|least| rank(drive, due, item) < least) {
                     let poll = Poll {
                         drive: index,
                         read: item.read,
                         probe: false,
                     };
-                    least = Some(rank(due, item));
+                    least = Some(rank(drive, due, item));
                     best = Some((due, poll, item.cost));
                 }
             }

@@ -92,6 +92,8 @@ pub(super) struct DriveSchedule {
     pub(super) items: Vec<Item>,
     /// Those that decide its state.
     pub(super) behind_state: Vec<PlannedRead>,
+    /// Slow reads of the plan that show bits of the status word.
+    pub(super) behind_status_word: Vec<PlannedRead>,
     /// Reads that are longer than a manual states, and those of them that no reply has proved since the drive came online.
     trials: Vec<PlannedRead>,
     pub(super) unproved: Vec<PlannedRead>,
@@ -208,12 +210,7 @@ impl DriveSchedule {
     }
 
     /// A drive that was not asked yet.
-    pub(super) fn new(
-        items: Vec<Item>,
-        behind_state: Vec<PlannedRead>,
-        trials: Vec<PlannedRead>,
-        now: Instant,
-    ) -> DriveSchedule {
+    pub(super) fn new(items: Vec<Item>, plan: &Plan, now: Instant) -> DriveSchedule {
         DriveSchedule {
             presence: Presence::Away(now, Duration::ZERO),
             quiet_until: None,
@@ -228,9 +225,10 @@ impl DriveSchedule {
             probes: 0,
             troubled: None,
             items,
-            behind_state,
-            unproved: trials.clone(),
-            trials,
+            behind_state: plan.behind_state.clone(),
+            behind_status_word: plan.behind_status_word.clone(),
+            unproved: plan.trials.clone(),
+            trials: plan.trials.clone(),
         }
     }
 

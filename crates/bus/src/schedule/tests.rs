@@ -47,14 +47,17 @@ struct PolledLine {
 impl PolledLine {
     fn new(drives: usize, cycle: Duration) -> PolledLine {
         let plan = plan();
-        let plans: Vec<&Plan> = (0..drives).map(|_| &plan).collect();
+        PolledLine::of(&vec![&plan; drives], cycle)
+    }
+
+    fn of(plans: &[&Plan], cycle: Duration) -> PolledLine {
         let now = Instant::now();
         let cadence = Cadence {
             fast: cycle,
             slow: Duration::from_secs(1),
             retries: 1,
         };
-        let schedule = Schedule::new(cadence, &plans, |_, _| COST, now);
+        let schedule = Schedule::new(cadence, plans, |_, _| COST, now);
         PolledLine {
             schedule,
             now,

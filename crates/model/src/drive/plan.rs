@@ -41,6 +41,17 @@ impl PlannedRead {
     }
 }
 
+/// The points that decide the drive's state.
+const DECIDING: [ModelPoint; 3] = [ModelPoint::Fault, ModelPoint::Running, ModelPoint::Ready];
+/// The other bits of the status word (register 0x8000).
+const STATUS_BITS: [ModelPoint; 5] = [
+    ModelPoint::Reversed,
+    ModelPoint::Warning,
+    ModelPoint::AtReference,
+    ModelPoint::ZeroSpeed,
+    ModelPoint::Remote,
+];
+
 /// All requests of one drive, fast ones first.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Plan {
@@ -55,6 +66,8 @@ pub struct Plan {
     pub trials: Vec<PlannedRead>,
     /// The reads of process data that decide the drive's state: fault, running, ready.
     pub behind_state: Vec<PlannedRead>,
+    /// The slow reads of the other bits of the status word: they are read first when the drive is there.
+    pub behind_status_word: Vec<PlannedRead>,
 }
 
 impl Plan {
@@ -104,8 +117,10 @@ impl Plan {
             monitors,
             trials: Vec::new(),
             behind_state: Vec::new(),
+            behind_status_word: Vec::new(),
         };
-        plan.behind_state = plan.behind_state(profile);
+        plan.behind_state = plan.behind(profile, &DECIDING, PollClass::Fast);
+        plan.behind_status_word = plan.behind(profile, &STATUS_BITS, PollClass::Slow);
         let is_trial = |read: &&PlannedRead| {
             let range = profile.range(read.table, read.start);
             read.class == PollClass::Fast && range.is_some_and(|range| read.count > range.read)
@@ -114,15 +129,15 @@ impl Plan {
         plan
     }
 
-    fn behind_state(&self, profile: &Profile) -> Vec<PlannedRead> {
-        let deciding = [ModelPoint::Fault, ModelPoint::Running, ModelPoint::Ready];
-        let deciding = deciding.into_iter().filter_map(|point| profile.model_index(point));
-        let deciding: Vec<PointIndex> = deciding.flat_map(|point| profile.raw_points_of(point)).collect();
-        let raws = || deciding.iter().filter_map(|point| profile.points.get(*point)?.raw());
-        let decides =
+    /// The reads of a class that one of the points rests on.
+    fn behind(&self, profile: &Profile, points: &[ModelPoint], class: PollClass) -> Vec<PlannedRead> {
+        let points = points.iter().filter_map(|point| profile.model_index(*point));
+        let points: Vec<PointIndex> = points.flat_map(|point| profile.raw_points_of(point)).collect();
+        let raws = || points.iter().filter_map(|point| profile.points.get(*point)?.raw());
+        let shows =
             |read: &&PlannedRead| raws().any(|raw| raw.addresses().any(|address| read.covers(raw.table, address)));
-        let fast = self.reads.iter().filter(|read| read.class == PollClass::Fast);
-        fast.filter(decides).copied().collect()
+        let of_class = self.reads.iter().filter(|read| read.class == class);
+        of_class.filter(shows).copied().collect()
     }
 
     /// All requests: those of the poll classes, those after a fault and those of comparisons.

@@ -1,6 +1,7 @@
 //! Drives that are away, refuse or cannot be understood.
 
 use super::*;
+use crate::drive::profile::Profiles;
 use crate::drive::DriveIndex;
 
 impl PolledLine {
@@ -306,7 +307,7 @@ fn probes(drive: &mut DriveSchedule, away: Instant, took: Duration, until: Durat
 fn the_first_probes_come_at_half_a_second_one_and_two_whatever_they_cost() {
     let (ms, now) = (Duration::from_millis, Instant::now());
     for took in [ms(10), ms(110), ms(240)] {
-        let mut drive = DriveSchedule::new(Vec::new(), Vec::new(), Vec::new(), now);
+        let mut drive = DriveSchedule::new(Vec::new(), &Plan::default(), now);
         let times = probes(&mut drive, now, took, Duration::from_secs(120));
         assert_eq!(times[..3], [ms(500), ms(1_000), ms(2_000)], "{took:?}");
         let later: Vec<Duration> = times[2..].windows(2).map(|pair| pair[1] - pair[0]).collect();
@@ -323,7 +324,7 @@ fn the_first_probes_come_at_half_a_second_one_and_two_whatever_they_cost() {
 fn a_drive_that_comes_and_goes_has_no_more_early_probes_than_it_saved_up() {
     let (ms, took) = (Duration::from_millis, Duration::from_millis(110));
     let mut now = Instant::now();
-    let mut drive = DriveSchedule::new(Vec::new(), Vec::new(), Vec::new(), now);
+    let mut drive = DriveSchedule::new(Vec::new(), &Plan::default(), now);
     let mut early = Vec::new();
     for _ in 0..20 {
         drive.presence = Presence::Online;
@@ -351,7 +352,7 @@ fn what_a_bad_line_swallowed_is_due_once_process_data_was_sound_for_a_while() {
         due: now + 60 * second,
         ..Item::new(read, read, COST, now)
     };
-    let mut drive = DriveSchedule::new(vec![put_off.clone()], Vec::new(), Vec::new(), now);
+    let mut drive = DriveSchedule::new(vec![put_off.clone()], &Plan::default(), now);
     assert_eq!(drive.due(&put_off), now + 60 * second, "the drive is mute to it");
     drive.troubled = Some(now + 3 * second);
     assert_eq!(drive.due(&put_off), now + 13 * second);
@@ -360,4 +361,32 @@ fn what_a_bad_line_swallowed_is_due_once_process_data_was_sound_for_a_while() {
     let answered = Item { failures: 0, ..put_off };
     drive.troubled = Some(now);
     assert_eq!(drive.due(&answered), now + 60 * second);
+}
+
+/// Every family that reads bits of the status word with the slow points: the word is whole before anything else is read that
+/// no command needs.
+#[test]
+fn the_bits_of_the_status_word_come_before_other_slow_reads() {
+    let mut families = 0;
+    for profile in Profiles::built_in().iter() {
+        let plan = Plan::of(profile);
+        if plan.behind_status_word.is_empty() {
+            continue;
+        }
+        families += 1;
+        let mut rig = PolledLine::of(&[&plan, &plan, &plan], Duration::from_millis(10));
+        rig.run(Duration::from_secs(20));
+        for drive in 0..3 {
+            let slow = rig.log.iter().filter_map(|(_, decision)| match decision {
+                Decision::Poll(poll) if poll.drive.place() == drive && !poll.probe => Some(poll.read),
+                _ => None,
+            });
+            let slow: Vec<PlannedRead> = slow.filter(|read| read.class == PollClass::Slow).collect();
+            let (first, others) = slow.split_at(plan.behind_status_word.len());
+            let bits = |read: &PlannedRead| plan.behind_status_word.contains(read);
+            assert!(first.iter().all(bits), "{}: {first:?}", profile.name);
+            assert!(others.iter().any(bits), "{}: they are read again", profile.name);
+        }
+    }
+    assert!(families > 2, "{families}");
 }

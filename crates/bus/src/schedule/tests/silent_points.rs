@@ -15,13 +15,7 @@ struct Silent {
 
 impl Silent {
     fn new(plan: &Plan, of: (Table, u16)) -> Silent {
-        let mut rig = PolledLine::new(1, Duration::from_millis(10));
-        let cadence = Cadence {
-            fast: Duration::from_millis(10),
-            slow: Duration::from_secs(1),
-            retries: 1,
-        };
-        rig.schedule = Schedule::new(cadence, &[plan], |_, _| COST, rig.now);
+        let rig = PolledLine::of(&[plan], Duration::from_millis(10));
         Silent {
             rig,
             of,
