@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::parameters::few;
 use crate::support::process::{drivegate, get, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
-use crate::support::tools::{root, tool};
+use crate::support::tools::{python, root, tool};
 
 #[test]
 fn every_answer_is_as_the_description_says() {
@@ -75,7 +75,42 @@ fn every_answer_is_as_the_description_says() {
     ] {
         assert!(described.contains(&path), "{path}: {described:?}");
     }
+    read_by_a_generated_client(&site, &names);
     // Whoever may read may read that, too.
     let (status, text) = get(site.http, "/api/v1/openapi.json").unwrap();
     assert!(status == 200 && text.contains("\"openapi\":\"3.1"), "{text}");
+}
+
+/// A client that a generator made of the description understands every answer of it, refusals included.
+fn read_by_a_generated_client(site: &Site, names: &Value) {
+    let read = Command::new(python())
+        .arg("tests/tools/openapi_client.py")
+        .args([
+            format!("http://127.0.0.1:{}", site.http),
+            site.path("socket"),
+            names.to_string(),
+            site.path("client"),
+        ])
+        .current_dir(root())
+        .output()
+        .unwrap();
+    assert!(read.status.success(), "{}", String::from_utf8_lossy(&read.stderr));
+    let read: Value = serde_json::from_slice(&read.stdout).unwrap();
+    let answers = read["answers"].as_object().unwrap();
+    assert!(answers.len() > 20, "{answers:?}");
+    for (operation, answer) in answers {
+        assert_ne!(answer[1], "NoneType", "{operation} says nothing: {answer}");
+    }
+    assert_eq!(answers["get_api_v1_recordings_id"], json!([200, "RecordingObject"]));
+    assert_eq!(answers["get_api_v1_drives_name_why"], json!([200, "Why"]));
+    // An unknown drive, point and value, a stop, and an order where nobody may command.
+    let result = |status: u16| json!([status, "CommandResult"]);
+    let expected = [
+        result(404),
+        result(422),
+        result(422),
+        result(200),
+        json!([405, "ErrorReply"]),
+    ];
+    assert_eq!(read["commands"], json!(expected));
 }

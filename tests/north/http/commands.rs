@@ -134,7 +134,10 @@ async fn without_users_nothing_of_it_is_there() {
             (405, Some("GET, HEAD")),
             "{path}"
         );
-        assert_eq!(reply.body, "this interface is read-only: use GET or HEAD\n");
+        assert_eq!(
+            reply.body,
+            r#"{"error":"this interface is read-only: use GET or HEAD"}"#
+        );
     }
     let page = get(rig.address(), "/").await.body;
     assert!(page.contains("read-only") && !page.contains("operate"), "{page}");
@@ -229,7 +232,7 @@ async fn results_have_their_status() {
     let not_served = post(rig.address(), "/api/v1/drives", &alice, STOP).await;
     assert_eq!(
         (not_served.status, not_served.body.as_str()),
-        (405, "this is read-only: use GET or HEAD\n")
+        (405, r#"{"error":"this is read-only: use GET or HEAD"}"#)
     );
 }
 

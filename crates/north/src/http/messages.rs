@@ -134,27 +134,37 @@ pub struct ReadParameters {
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum RestoreAct {
     /// Reads the drive and prepares what would be written.
-    Prepare {
-        /// The file of parameters.
-        file: String,
-        /// These alone; empty: all.
-        #[serde(default)]
-        only: Vec<String>,
-        /// Treat refusals that can be forced as risks.
-        #[serde(default)]
-        force: bool,
-    },
+    Prepare(RestoreWish),
     /// Writes the prepared restore of that number.
-    CarryOut {
-        /// Its number.
-        number: u64,
-    },
+    CarryOut(PreparedRestore),
     /// Resumes an interrupted one.
     Resume,
     /// One that was cut off is taken back.
     Undo,
     /// One that was cut off is left as it is.
     Release,
+}
+
+/// What is to be restored.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RestoreWish {
+    /// The file of parameters.
+    pub file: String,
+    /// These alone; empty: all.
+    #[serde(default)]
+    pub only: Vec<String>,
+    /// Treat refusals that can be forced as risks.
+    #[serde(default)]
+    pub force: bool,
+}
+
+/// A restore that is prepared.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct PreparedRestore {
+    /// Its number.
+    pub number: u64,
 }
 
 /// The configuration was read again; it applies unless there are errors.

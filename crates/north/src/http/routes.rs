@@ -58,7 +58,7 @@ fn described() -> Api {
         .get("/", Doc::text("Status page", "text/html"), views::status_page)
         .get(
             "/assets/{name}",
-            Doc::text("A file of the status page", "*/*"),
+            Doc::text("A file of the status page", "application/octet-stream"),
             views::asset,
         )
         .get("/metrics", Doc::text("Metrics for Prometheus", TEXT), views::exposition)
@@ -301,19 +301,20 @@ async fn guard(
     let mut response = if let Some(refusal) = refusal {
         refusal
     } else if coverage == Some(Coverage::Health) && !is_urgent {
-        let text = "too many connections are open; close some and try again\n";
-        (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "5")], text).into_response()
+        let why = "too many connections are open; close some and try again";
+        let refusal = replies::refused(StatusCode::SERVICE_UNAVAILABLE, why);
+        ([(header::RETRY_AFTER, "5")], refusal).into_response()
     } else if let Err((status, why)) = expect::check(request.headers(), &app.plant.load(), &reached) {
         replies::refused(status, why).into_response()
     } else if (is_on && operating::may_change(method, path)) || (is_local && path == RELOAD) {
         next.run(request).await
     } else if !matches!(*method, Method::GET | Method::HEAD) {
         let text = match is_on {
-            true => "this is read-only: use GET or HEAD\n",
-            false => "this interface is read-only: use GET or HEAD\n",
+            true => "this is read-only: use GET or HEAD",
+            false => "this interface is read-only: use GET or HEAD",
         };
         let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
-        (StatusCode::METHOD_NOT_ALLOWED, allow, text).into_response()
+        (allow, replies::refused(StatusCode::METHOD_NOT_ALLOWED, text)).into_response()
     } else if !is_on && operating::is_operating(path) {
         views::unknown(request.uri().clone()).await
     } else {

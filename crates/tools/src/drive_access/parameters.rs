@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::{Conversation, Needs, Target};
 use crate::client::Asked;
-use crate::north::http::messages::{ParameterReading, ReadParameters, Restore, RestoreAct, Stage};
+use crate::north::http::messages::{ParameterReading, PreparedRestore, ReadParameters, Restore, RestoreAct, Stage};
 
 /// Time between two looks at how far it is.
 const LOOK: Duration = Duration::from_millis(250);
@@ -88,7 +88,9 @@ impl Target {
         let ended = loop {
             let next = match reply.accepted::<Restore>(&asked) {
                 Ok(status) => match status.stage {
-                    Stage::Prepared if agreed(&status) => Some(RestoreAct::CarryOut { number: status.number }),
+                    Stage::Prepared if agreed(&status) => {
+                        Some(RestoreAct::CarryOut(PreparedRestore { number: status.number }))
+                    }
                     Stage::Reading | Stage::Working => {
                         progress(&status);
                         tokio::time::sleep(LOOK).await;

@@ -9,7 +9,7 @@ use super::super::drive_access::target;
 use super::super::failure::{Failure, Outcome, negative};
 use super::super::{EXIT_FAILED, EXIT_USAGE, report};
 use super::{StatusLine, read_from_drive, read_written};
-use crate::north::http::messages::{ReadParameters, Restore, RestoreAct, Stage};
+use crate::north::http::messages::{ReadParameters, Restore, RestoreAct, RestoreWish, Stage};
 use crate::parameters::{Entry, Id, ParameterFile};
 
 #[derive(Debug, clap::Args)]
@@ -87,11 +87,11 @@ pub(super) fn clone(gateway: &Gateway, from: &str, to: &str, how: &How) -> Outco
 }
 
 fn write(gateway: &Gateway, file: &ParameterFile, drive: &str, how: &How) -> Outcome {
-    let act = RestoreAct::Prepare {
+    let act = RestoreAct::Prepare(RestoreWish {
         file: without_notes(file).text(),
         only: how.only.clone(),
         force: how.force,
-    };
+    });
     carry(gateway, drive, Some(act), how)
 }
 

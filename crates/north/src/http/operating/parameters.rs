@@ -8,7 +8,7 @@ use axum::http::StatusCode;
 use serde::de::DeserializeOwned;
 
 use super::super::app_state::AppState;
-use super::super::messages::{ParameterReading, ReadParameters, Restore, RestoreAct};
+use super::super::messages::{ParameterReading, PreparedRestore, ReadParameters, Restore, RestoreAct, RestoreWish};
 use super::super::replies::{Refused, Replied, refused};
 use super::asker::Ordered;
 use crate::order::{Origin, Pace};
@@ -71,7 +71,7 @@ fn understood<T: DeserializeOwned>(body: &[u8]) -> Replied<T> {
 async fn act_on(app: &AppState, drive: &DriveHandle, act: RestoreAct, origin: Origin) -> Result<(), String> {
     let (shared, vault) = (&app.plant, &app.north.parameters);
     match act {
-        RestoreAct::Prepare { file, only, force } => {
+        RestoreAct::Prepare(RestoreWish { file, only, force }) => {
             let wanted = ParameterFile::parse(&file).map_err(|why| format!("the file is invalid: {why}"))?;
             let wishes = Wishes {
                 only: only.iter().map(|id| Id::new(id)).collect(),
@@ -79,7 +79,7 @@ async fn act_on(app: &AppState, drive: &DriveHandle, act: RestoreAct, origin: Or
             };
             prepare(vault, drive.clone(), wanted, wishes, origin).map(drop)
         }
-        RestoreAct::CarryOut { number } => carry_out(shared, vault, drive, number, origin),
+        RestoreAct::CarryOut(PreparedRestore { number }) => carry_out(shared, vault, drive, number, origin),
         RestoreAct::Resume => take_up(shared, vault, drive, Again::Resume, origin).await,
         RestoreAct::Undo => take_up(shared, vault, drive, Again::Undo, origin).await,
         RestoreAct::Release => release(shared, vault, drive, &origin).await,
