@@ -17,6 +17,7 @@ mod gateway {
     mod cli;
     mod commands;
     mod demo;
+    mod documents;
     mod drill;
     mod drive_access;
     mod families;

@@ -16,6 +16,8 @@ const DIFFERING: u8 = 3;
 const AGREEING: u8 = 2;
 /// First and longest pause before a value is compared again that proved nothing, such as 0 of a motor that stands.
 const PAUSE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(600));
+/// Pause between two looks at process data that is 0 in a motor that does not run.
+const LOOK: Duration = Duration::from_millis(500);
 /// Values that move differ by that part of them, or by that many counts, without a changed selection.
 const TOLERANCE: f64 = 0.1;
 const COUNTS: f64 = 50.0;
@@ -150,7 +152,7 @@ impl Selections {
                 compared.open = value(compared.point).zip(value(compared.monitor));
                 continue;
             }
-            if !point.raw().is_some_and(|raw| covers(read, raw)) {
+            if !compared.looks_at(point, now) || !point.raw().is_some_and(|raw| covers(read, raw)) {
                 continue;
             }
             let Some(own) = value(compared.point) else { continue };
@@ -211,13 +213,25 @@ impl Compared {
         matches!(self.trust, Trust::Doubted(..) | Trust::Differs(_))
     }
 
+    /// Whether process data that was just read matters: it is asked after each read.
+    fn looks_at(&self, point: &Point, now: Instant) -> bool {
+        match self.trust {
+            Trust::Unproven(next, _) => now >= next || is_code(point) || self.open.is_some(),
+            _ => self.open.is_some(),
+        }
+    }
+
     /// When it is to be compared, where process data that was just read gives a reason.
     fn wants(&mut self, point: &Point, own: f64, runs: &dyn Fn() -> bool, now: Instant) -> Option<Instant> {
         let Trust::Unproven(next, pause) = self.trust else {
             return None;
         };
         let came = is_code(point) && self.last == 0.0 && own != 0.0;
-        if !came && (now < next || (own == 0.0 && !runs())) {
+        if !came && now < next {
+            return None;
+        }
+        if !came && own == 0.0 && !runs() {
+            self.trust = Trust::Unproven(now + LOOK, pause);
             return None;
         }
         self.trust = Trust::Unproven(now + pause, (pause * 2).min(PAUSE.1));

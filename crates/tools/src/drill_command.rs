@@ -9,7 +9,7 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::client::{Asked, Client, Gateway, encoded};
-use super::failure::{Failure, Outcome};
+use super::failure::{Failure, Outcome, documented};
 use super::{printable, report};
 use crate::drill::{DrillReport, DrillState, Kind};
 use crate::north::http::messages::DrillWish;
@@ -44,6 +44,9 @@ enum Shown {
     List {
         #[command(flatten)]
         gateway: Gateway,
+        /// JSON instead of a table.
+        #[arg(long)]
+        json: bool,
     },
     /// Prints a drill as an HTML page.
     #[command(
@@ -80,7 +83,7 @@ struct Wish {
 pub(super) fn run(args: &Args) -> Outcome {
     super::block_on(async {
         match (&args.shown, &args.wish.drive) {
-            (Some(Shown::List { gateway }), _) => Ok(report::print(&list(gateway).await?)),
+            (Some(Shown::List { gateway, json }), _) => documented(*json, list(gateway, *json).await),
             (Some(Shown::Report { gateway, id }), _) => Ok(report::print(&printed(gateway, id).await?)),
             (None, Some(name)) => match drill(name, &args.wish).await? {
                 passed if passed.state == DrillState::Passed => Ok(ExitCode::SUCCESS),
@@ -93,8 +96,11 @@ pub(super) fn run(args: &Args) -> Outcome {
     })
 }
 
-async fn list(gateway: &Gateway) -> Result<String, String> {
+async fn list(gateway: &Gateway, json: bool) -> Outcome {
     let drills: Vec<DrillReport> = asked(&gateway.client()?, &Asked::view("/api/v1/drills")).await?;
+    if json {
+        return Ok(report::json(&drills));
+    }
     let mut table = report::table(["id", "drive", "result", "order", "client", "gateway", "by"]);
     for drill in &drills {
         let of = |kind: Kind| {
@@ -114,7 +120,7 @@ async fn list(gateway: &Gateway) -> Result<String, String> {
             drill.who.clone(),
         ]);
     }
-    Ok(printable::lines(&report::lines(&table)))
+    Ok(report::print(&report::lines(&table)))
 }
 
 async fn printed(gateway: &Gateway, id: &str) -> Result<String, String> {

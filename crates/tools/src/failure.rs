@@ -4,6 +4,7 @@ use std::process::ExitCode;
 
 use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::document::Problem;
+use crate::north::http::messages::ErrorReply;
 
 /// How a command ends: an exit code, or why it could not do what it should.
 pub(super) type Outcome = Result<ExitCode, Failure>;
@@ -43,6 +44,14 @@ impl Failure {
             Failure::Reported(code) => ExitCode::from(code),
         }
     }
+}
+
+/// With `json` a refusal is a document on stdout too, besides its message on stderr.
+pub(super) fn documented(json: bool, outcome: Outcome) -> Outcome {
+    if let (true, Err(Failure::Failed(why) | Failure::Misused(why))) = (json, &outcome) {
+        report::json(&ErrorReply::of(why));
+    }
+    outcome
 }
 
 /// The command did its work and has reported what it found wrong.

@@ -5,6 +5,7 @@ use hyper::StatusCode;
 use super::client::{Asked, Gateway};
 use super::failure::{Outcome, negative};
 use super::report;
+use crate::north::http::messages::Health;
 
 /// Reports whether the running gateway is ready, for containers and scripts.
 ///
@@ -18,11 +19,19 @@ use super::report;
 pub(super) struct Args {
     #[command(flatten)]
     gateway: Gateway,
+    /// JSON instead of text.
+    #[arg(long)]
+    json: bool,
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
     super::block_on(async {
         let reasons = unready(&args.gateway).await.unwrap_or_else(|why| vec![why]);
+        if args.json {
+            let ready = reasons.is_empty();
+            let printed = report::json(&Health { ready, reasons });
+            return if ready { Ok(printed) } else { negative() };
+        }
         if reasons.is_empty() {
             return Ok(report::print("ready\n"));
         }

@@ -1,9 +1,10 @@
 //! `drivegate hold`: who holds a drive, and taking, renewing, releasing and breaking that.
 
 use serde::Deserialize;
+use serde_json::Value as Json;
 
 use super::client::{Asked, Gateway, encoded};
-use super::failure::Outcome;
+use super::failure::{Outcome, documented};
 use super::{printable, report};
 use crate::north::http::messages::HoldAct;
 
@@ -22,6 +23,9 @@ pub(super) struct Args {
     /// What to do; by default only the holder is printed.
     #[arg(value_parser = ["take", "renew", "release", "break"])]
     action: Option<String>,
+    /// JSON instead of text.
+    #[arg(long)]
+    json: bool,
 }
 
 /// The gateway's reply.
@@ -42,8 +46,14 @@ struct Reason {
 
 pub(super) fn run(args: &Args) -> Outcome {
     super::block_on(async {
-        let hold = hold(args).await?;
-        let printed = report::print(&line(&hold));
+        let (hold, document) = match hold(args).await {
+            Ok(hold) => hold,
+            Err(why) => return documented(args.json, Err(why.into())),
+        };
+        let printed = match args.json {
+            true => report::json(&document),
+            false => report::print(&line(&hold)),
+        };
         match hold.error {
             None => Ok(printed),
             Some(reason) => Err(reason.message.into()),
@@ -51,7 +61,8 @@ pub(super) fn run(args: &Args) -> Outcome {
     })
 }
 
-async fn hold(args: &Args) -> Result<Hold, String> {
+/// The reply of the gateway, and as it was sent.
+async fn hold(args: &Args) -> Result<(Hold, Json), String> {
     let path = format!("/api/v1/drives/{}/hold", encoded(&args.drive));
     let asked = match &args.action {
         None => Asked::get(path),
@@ -61,7 +72,7 @@ async fn hold(args: &Args) -> Result<Hold, String> {
         }
     };
     let reply = args.gateway.client()?.ask(&asked).await?;
-    match reply.parsed() {
+    match reply.parsed().zip(reply.parsed()) {
         // Of either status.
         Some(hold) => Ok(hold),
         None => Err(reply.refusal(&asked).to_string()),

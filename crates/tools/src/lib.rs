@@ -10,6 +10,7 @@ mod audit;
 mod backup;
 mod check;
 mod client;
+mod completions;
 mod credentials_file;
 mod demo;
 mod diagnose;
@@ -22,6 +23,7 @@ mod inventory;
 mod listen;
 mod loading;
 mod log;
+mod man;
 mod map;
 mod params;
 mod printable;
@@ -90,6 +92,23 @@ pub const EXIT_DATA: u8 = 65;
 pub const EXIT_CONFIG: u8 = 78;
 /// Default path of the configuration.
 pub const DEFAULT_CONFIG: &str = crate::config::DEFAULT_FILE;
+
+/// The variable that names the configuration where `--config` is missing.
+const CONFIG_VARIABLE: &str = "DRIVEGATE_CONFIG";
+
+/// The configuration that [`CONFIG_VARIABLE`] names.
+fn config_of_environment() -> Option<&'static Path> {
+    static NAMED: LazyLock<Option<PathBuf>> = LazyLock::new(|| {
+        let named = std::env::var_os(CONFIG_VARIABLE).filter(|named| !named.is_empty());
+        named.map(PathBuf::from)
+    });
+    NAMED.as_deref()
+}
+
+/// The configuration where `--config` is missing.
+fn default_config() -> &'static Path {
+    config_of_environment().unwrap_or(Path::new(DEFAULT_CONFIG))
+}
 
 /// Version and commit of the build.
 static VERSION: LazyLock<String> = LazyLock::new(|| match version::commit() {
@@ -160,13 +179,15 @@ commands! {
     Backup => backup,
     Restore => restore,
     Schema => schema,
+    Completions => completions,
+    Man => man,
 }
 
 /// The option that names the configuration.
 #[derive(Debug, clap::Args)]
 struct ConfigFile {
     /// Configuration file.
-    #[arg(long = "config", value_name = "FILE", default_value = DEFAULT_CONFIG)]
+    #[arg(long = "config", value_name = "FILE", default_value_os_t = default_config().to_path_buf())]
     path: PathBuf,
 }
 

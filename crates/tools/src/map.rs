@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 use self::rows::{Row, gateway_rows};
 use super::failure::{Failure, Outcome};
-use super::{DEFAULT_CONFIG, report};
+use super::{default_config, report};
 use crate::config::{BusSettings, Settings};
 use crate::north::modbus_tcp::Role;
 use crate::plant::{BusHandle, DriveHandle, Plant};
@@ -27,7 +27,7 @@ use crate::queue::CommandQueue;
   drivegate map --config /etc/drivegate/drivegate.toml --bacnet --ede plant.csv")]
 pub(super) struct Args {
     /// Configuration file
-    #[arg(long, value_name = "FILE", default_value = DEFAULT_CONFIG)]
+    #[arg(long, value_name = "FILE", default_value_os_t = default_config().to_path_buf())]
     config: PathBuf,
     /// Comma-separated values, one line for each register of each unit
     #[arg(long)]

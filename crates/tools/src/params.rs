@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use super::client::Gateway;
 use super::drive_access::target;
-use super::failure::{Failure, Outcome, negative};
+use super::failure::{Failure, Outcome, documented, negative};
 use super::report;
 use crate::files;
 use crate::north::http::messages::{ParameterReading, ReadParameters};
@@ -126,7 +126,7 @@ pub(super) fn run(args: &Args) -> Outcome {
         Action::Diff { before, after } => diff(gateway, before, after),
         Action::Restore(args_of_it) => restore::restore(gateway, args_of_it),
         Action::Clone { from, to, how } => restore::clone(gateway, from, to, how),
-        Action::List { drive, json } => stored::list(gateway, drive.as_deref(), *json),
+        Action::List { drive, json } => documented(*json, stored::list(gateway, drive.as_deref(), *json)),
         Action::Show { of, names } => stored::show(gateway, of, names.as_deref()),
     }
 }

@@ -9,6 +9,9 @@ use std::fmt::Write;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use serde_json::{Value as Json, json};
 
 use super::failure::{Failure, Outcome};
 use super::{printable, report};
@@ -32,6 +35,9 @@ const NOT_VERIFIED: &str = "not verified";
 pub(super) struct Args {
     #[command(subcommand)]
     what: Option<What>,
+    /// The list as JSON instead of a table.
+    #[arg(long)]
+    json: bool,
     /// Include the profile_dirs of this configuration.
     #[arg(long, value_name = "FILE", global = true)]
     config: Option<PathBuf>,
@@ -85,6 +91,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     };
     super::add_profiles(&mut profiles, &args.profile_dir)?;
     let text = match &args.what {
+        None if args.json => return Ok(report::json(&listed(&profiles))),
         None => list(&profiles),
         Some(What::Show { name, toml }) => match profiles.get(name) {
             Some(profile) if *toml => profile.text.to_string(),
@@ -162,6 +169,21 @@ fn list(profiles: &Profiles) -> String {
         ]);
     }
     report::lines(&table)
+}
+
+/// The list as JSON.
+fn listed(profiles: &Profiles) -> Vec<Json> {
+    let one = |profile: &Arc<Profile>| {
+        json!({
+            "name": profile.name,
+            "points": profile.points.len(),
+            "protocols": profile.protocols.iter().map(|protocol| protocol.name()).collect::<Vec<_>>(),
+            "built_in": profile.built_in,
+            "verified": profile.verified,
+            "drives": profile.described(),
+        })
+    };
+    profiles.iter().map(one).collect()
 }
 
 fn protocols(profile: &Profile) -> String {

@@ -107,8 +107,7 @@ fn list(args: &Args, json: bool) -> Outcome {
         }
     };
     if json {
-        let text = serde_json::to_string_pretty(&entries).unwrap_or_default();
-        return Ok(report::print(&(text + "\n")));
+        return Ok(report::json(&entries));
     }
     if entries.is_empty() {
         report::note(&format!("no recordings {place}"));

@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use comfy_table::{CellAlignment, ContentArrangement, Table, TableComponent, presets};
+use serde::Serialize;
 
 use super::{EXIT_FAILED, log, printable};
 use crate::config::Loaded;
@@ -13,6 +14,13 @@ use crate::document::{Finding, Problem, parse_duration};
 /// Prints the lines of `text`, harmless for a terminal, to stdout.
 pub(super) fn print(text: &str) -> ExitCode {
     print_bytes(printable::lines(text).as_bytes())
+}
+
+/// Prints one JSON document to stdout.
+pub(super) fn json(document: &impl Serialize) -> ExitCode {
+    // Strings, numbers and maps with names: this cannot fail.
+    let text = serde_json::to_string_pretty(document).unwrap_or_default();
+    print_bytes((text + "\n").as_bytes())
 }
 
 /// Writes `bytes` to stdout as they are.

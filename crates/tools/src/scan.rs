@@ -11,12 +11,14 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use serde_json::{Value as Json, json};
+
 pub(super) use self::found::Found;
 pub(super) use self::search::{Extent, Heard, Search};
 pub(super) use self::settings::{Options, Setting, parse_port, protocols};
 pub(super) use self::snippet::{Snippet, absolute};
 use super::adapters::persistent_name;
-use super::failure::{Failure, Outcome, negative};
+use super::failure::{Failure, Outcome, documented, negative};
 use super::report;
 use crate::bus::Mode;
 use crate::drive::profile::Profiles;
@@ -38,10 +40,17 @@ pub(super) struct Args {
     /// Continue with other settings after a drive has replied.
     #[arg(long)]
     exhaustive: bool,
+    /// What was found as JSON instead of a configuration.
+    #[arg(long)]
+    json: bool,
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let (settings, profiles) = prepare(&args.options, &args.port)?;
+    let prepared = match prepare(&args.options, &args.port) {
+        Ok(prepared) => prepared,
+        Err(failure) => return documented(args.json, Err(failure)),
+    };
+    let (settings, profiles) = prepared;
     let stop = Arc::new(AtomicBool::new(false));
     stop_on_signal(stop.clone());
     let mut search = Search::new(&args.port, &args.options, profiles, stop);
@@ -85,8 +94,37 @@ pub(super) fn configuration(port: &str, options: &Options, search: &Search<'_>) 
     snippet.text()
 }
 
+/// What was found, as JSON; `error`: what ended the scan early.
+fn document(args: &Args, search: &Search<'_>, error: Option<&String>) -> Json {
+    let drive = |found: &Found| {
+        json!({
+            "address": found.address,
+            "protocol": found.setting.protocol.name(),
+            "baud": found.setting.format.baud,
+            "format": found.setting.format.characters(),
+            "profiles": found.profiles,
+            "turnaround_ms": found.turnaround.map(|time| time.as_secs_f64() * 1000.0),
+        })
+    };
+    let mut document = json!({
+        "port": args.port,
+        "drives": search.found.iter().map(drive).collect::<Vec<_>>(),
+    });
+    if let Some((object, error)) = document.as_object_mut().zip(error) {
+        object.insert("error".to_string(), json!(error));
+    }
+    document
+}
+
 fn finish(args: &Args, tried: &[Setting], search: &Search<'_>, outcome: Result<(), String>) -> Outcome {
-    let printed = if search.found.is_empty() {
+    let printed = if args.json {
+        let printed = report::json(&document(args, search, outcome.as_ref().err()));
+        if search.found.is_empty() {
+            negative()
+        } else {
+            Ok(printed)
+        }
+    } else if search.found.is_empty() {
         negative()
     } else {
         Ok(report::print(&configuration(&args.port, &args.options, search)))

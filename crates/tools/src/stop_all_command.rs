@@ -1,7 +1,7 @@
 //! `drivegate stop-all`: stops all drives.
 
 use super::client::{Asked, Gateway};
-use super::failure::{Outcome, negative};
+use super::failure::{Outcome, documented, negative};
 use super::{printable, report};
 use crate::north::http::messages::StopBody;
 use crate::stop_all::{StopReport, Stopped};
@@ -23,17 +23,24 @@ pub(super) struct Args {
     /// Only the drives with this `group`.
     #[arg(long, value_name = "GROUP", conflicts_with = "bus")]
     group: Option<String>,
+    /// JSON instead of text.
+    #[arg(long)]
+    json: bool,
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    super::block_on(async {
+    let outcome = super::block_on(async {
         let stopped = stop_all(args).await?;
-        let printed = report::print(&shown(&stopped));
+        let printed = match args.json {
+            true => report::json(&stopped),
+            false => report::print(&shown(&stopped)),
+        };
         match stopped.ok {
             true => Ok(printed),
             false => negative(),
         }
-    })
+    });
+    documented(args.json, outcome)
 }
 
 async fn stop_all(args: &Args) -> Result<StopReport, String> {

@@ -4,7 +4,7 @@ use std::io::{self, IsTerminal, Write};
 use std::process::ExitCode;
 use std::time::Duration;
 
-use serde_json::Value;
+use serde_json::{Value, json};
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::client::{Client, Gateway};
@@ -28,6 +28,9 @@ pub(super) struct Args {
     /// Print the table once and exit.
     #[arg(long)]
     once: bool,
+    /// JSON instead of tables: a line each time.
+    #[arg(long)]
+    json: bool,
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
@@ -36,7 +39,13 @@ pub(super) fn run(args: &Args) -> Outcome {
 
 async fn watch(args: &Args) -> Outcome {
     let client = args.gateway.viewer()?;
-    let live = !args.once && io::stdout().is_terminal();
+    let live = !args.once && (args.json || io::stdout().is_terminal());
+    if !live && args.json {
+        let document = document(&client).await;
+        let failed = document.as_ref().err().map(|why| why.clone().into());
+        report::print_bytes(&json_line(document));
+        return failed.map_or(Ok(ExitCode::SUCCESS), Err);
+    }
     if !live {
         return Ok(report::print(&page(&client).await?));
     }
@@ -49,6 +58,14 @@ async fn watch(args: &Args) -> Outcome {
             _ = interrupt.recv() => return Ok(ExitCode::SUCCESS),
             _ = terminate.recv() => return Ok(ExitCode::SUCCESS),
             _ = tick.tick() => {}
+        }
+        if args.json {
+            let line = json_line(document(&client).await);
+            let mut stdout = io::stdout().lock();
+            if stdout.write_all(&line).and_then(|()| stdout.flush()).is_err() {
+                return Ok(ExitCode::SUCCESS);
+            }
+            continue;
         }
         // Survive a restart of the gateway.
         let text = match page(&client).await {
@@ -65,6 +82,19 @@ async fn watch(args: &Args) -> Outcome {
             return Ok(ExitCode::SUCCESS);
         }
     }
+}
+
+/// Buses and drives as the gateway tells them.
+async fn document(client: &Client) -> Result<Value, String> {
+    let buses: Value = client.view("/api/v1/buses").await?;
+    let drives: Value = client.view("/api/v1/drives").await?;
+    Ok(json!({ "buses": buses, "drives": drives }))
+}
+
+/// One line, also where there is no answer.
+fn json_line(document: Result<Value, String>) -> Vec<u8> {
+    let document = document.unwrap_or_else(|why| json!({ "error": why }));
+    format!("{document}\n").into_bytes()
 }
 
 async fn page(client: &Client) -> Result<String, String> {

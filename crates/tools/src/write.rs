@@ -5,7 +5,7 @@ use serde_json::Value as Json;
 
 use super::client::Asked;
 use super::drive_access::{Needs, OneDrive, Target, Way, point};
-use super::failure::{Failure, Outcome};
+use super::failure::{Failure, Outcome, documented};
 use super::{printable, report};
 use crate::drive::model::Kind;
 use crate::drive::{ModelPoint, Point, Profile, RESTART_COMMUNICATION, Value};
@@ -26,6 +26,9 @@ pub(super) struct Args {
     /// What to set.
     #[arg(required = true, value_name = "POINT=VALUE")]
     values: Vec<String>,
+    /// The reply of the gateway as JSON.
+    #[arg(long)]
+    json: bool,
 }
 
 /// One value of a command, and how it is shown.
@@ -63,6 +66,13 @@ struct WriteError {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
+    let mut printed = false;
+    let outcome = write(args, &mut printed);
+    documented(args.json && !printed, outcome)
+}
+
+/// `printed`: a document was.
+fn write(args: &Args, printed: &mut bool) -> Outcome {
     let target = args.drive.target()?;
     let setting = |text: &String| parse(target.profile().map(|profile| &**profile), text);
     let (mut settings, mut mistake) = (Vec::new(), None);
@@ -72,13 +82,22 @@ pub(super) fn run(args: &Args) -> Outcome {
             Err(why) => mistake = mistake.or(Some(why)),
         }
     }
+    let mut send = |settings: &[Setting]| -> Outcome {
+        let (document, told) = command(&target, settings)?;
+        if args.json {
+            *printed = true;
+            let shown = report::json(&document);
+            return told.map(|_| shown).map_err(Failure::from);
+        }
+        Ok(report::print(&told?))
+    };
     let Some(mistake) = mistake else {
-        return Ok(report::print(&command(&target, &settings)?));
+        return send(&settings);
     };
     // A stop is carried out whatever else is wrong.
     settings.retain(|setting| setting.point == ModelPoint::Run.name());
     if !settings.is_empty() && settings.iter().all(|setting| setting.value == false) {
-        report::print(&command(&target, &settings)?);
+        send(&settings)?;
     }
     Err(Failure::Misused(mistake))
 }
@@ -152,24 +171,29 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
     }
 }
 
-fn command(target: &Target, settings: &[Setting]) -> Result<String, String> {
+/// The reply as it was sent, and in words or why it failed.
+///
+/// # Errors
+/// There is no such reply.
+fn command(target: &Target, settings: &[Setting]) -> Result<(Json, Result<String, String>), String> {
     let shown: Vec<&str> = settings.iter().map(|setting| setting.shown.as_str()).collect();
     let what = format!("{} {}", target.drive, shown.join(" "));
     let names: Vec<String> = settings.iter().map(|setting| setting.point.clone()).collect();
     let asked = Asked::post(target.path("commands"), &Body(settings))
         .if_lost("it is unknown whether the drive executed the command: read before you repeat it");
     let (reply, way) = target.ask(&asked, Needs::Commands(&names))?;
-    let Some(written) = reply.parsed::<Written>() else {
+    let Some((written, document)) = reply.parsed::<Written>().zip(reply.parsed()) else {
         return Err(reply.refusal(&asked).to_string());
     };
-    match &written.error {
+    let told = match &written.error {
         None if written.ok => Ok(acknowledged(&what, &written, way)),
         error => {
             let message = error.as_ref().map_or("", |error| error.message.as_str());
             let note = written.note.as_ref().map_or(String::new(), |note| format!("; {note}"));
             Err(format!("{what}: {message}{note} ({})", written.result))
         }
-    }
+    };
+    Ok((document, told))
 }
 
 fn acknowledged(what: &str, write: &Written, way: Way) -> String {

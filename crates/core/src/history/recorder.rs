@@ -89,14 +89,7 @@ fn leave(base: &mut Arc<Snapshot>, at: Instant, packed: &[u8]) {
 
 /// How a drive reads at that time, by its samples.
 pub(super) fn reading<'d>(spec: &'d DriveSpec, snapshot: &Arc<Snapshot>, at: Instant) -> Reading<'d> {
-    Reading {
-        spec,
-        hold: None,
-        snapshot: snapshot.clone(),
-        now: at,
-        stale_after: ANY_AGE,
-        slow_cycle: Duration::ZERO,
-    }
+    Reading::new(spec, snapshot.clone(), at, ANY_AGE, Duration::ZERO)
 }
 
 /// All that a recording is made of.

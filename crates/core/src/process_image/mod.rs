@@ -166,15 +166,8 @@ impl DriveImage {
 
     /// How a reader at `now` looks at the drive.
     pub fn reading(&self, now: Instant, stale_after: Duration) -> Reading<'_> {
-        let snapshot = self.snapshot();
-        Reading {
-            spec: &self.spec,
-            hold: Some(&self.hold),
-            snapshot,
-            now,
-            stale_after: stale_after.max(Duration::from_nanos(self.stale_floor.load(Ordering::Relaxed))),
-            slow_cycle: self.slow_cycle,
-        }
+        let stale_after = stale_after.max(Duration::from_nanos(self.stale_floor.load(Ordering::Relaxed)));
+        Reading::new(&self.spec, self.snapshot(), now, stale_after, self.slow_cycle).held(&self.hold)
     }
 
     /// Counts one transaction.

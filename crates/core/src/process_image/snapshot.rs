@@ -262,6 +262,42 @@ pub struct Reading<'d> {
     pub stale_after: Duration,
     /// Cadence of the slow class.
     pub slow_cycle: Duration,
+    /// Samples of the fast class that are older are stale, and those of the slow class.
+    fresh_from: [Fresh; 2],
+}
+
+/// The time from which a sample is not stale yet; `None`: any, as the clock has not run for so long.
+type Fresh = Option<Instant>;
+
+impl<'d> Reading<'d> {
+    /// How a reader at `now` looks at a snapshot, which samples of that age make stale; those of the slow class two slow cycles
+    /// later.
+    pub fn new(
+        spec: &'d DriveSpec,
+        snapshot: Arc<Snapshot>,
+        now: Instant,
+        stale_after: Duration,
+        slow_cycle: Duration,
+    ) -> Reading<'d> {
+        let limits = [stale_after, stale_after + 2 * slow_cycle];
+        Reading {
+            spec,
+            hold: None,
+            snapshot,
+            now,
+            stale_after,
+            slow_cycle,
+            fresh_from: limits.map(|limit| now.checked_sub(limit)),
+        }
+    }
+
+    /// Of a drive that accepts only stops while that says so.
+    pub fn held(self, hold: &'d Hold) -> Reading<'d> {
+        Reading {
+            hold: Some(hold),
+            ..self
+        }
+    }
 }
 
 impl Reading<'_> {
@@ -305,15 +341,27 @@ impl Reading<'_> {
         }
     }
 
+    /// Whether a cell of that time is stale; asked some twenty times an exchange.
+    fn is_old(&self, class: PollClass, cell: &Cell, at: Instant) -> bool {
+        if self.snapshot.heard.is_some() {
+            let age = self.now.saturating_duration_since(at);
+            return self.limit_of(class, cell).is_some_and(|limit| age > limit);
+        }
+        let [fast, slow] = self.fresh_from;
+        let fresh_from = match class {
+            PollClass::Fast => fast,
+            PollClass::Slow | PollClass::Monitor => slow,
+            PollClass::Once | PollClass::Fault | PollClass::Never => None,
+        };
+        fresh_from.is_some_and(|from| at < from)
+    }
+
     fn quality(&self, class: PollClass, cell: &Cell) -> Quality {
         match (cell.refused, cell.at) {
             (Some(_), _) | (None, None) => Quality::Bad,
             _ if !self.snapshot.link.is_online() || cell.outlived => Quality::Stale,
-            (None, Some(at)) => {
-                let age = self.now.saturating_duration_since(at);
-                let old = self.limit_of(class, cell).is_some_and(|limit| age > limit);
-                if old { Quality::Stale } else { Quality::Good }
-            }
+            (None, Some(at)) if self.is_old(class, cell, at) => Quality::Stale,
+            (None, Some(_)) => Quality::Good,
         }
     }
 

@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 
 use super::door::Network;
 use super::{Client, Door, Url};
-use crate::DEFAULT_CONFIG;
 use crate::config::{Settings, environment};
 use crate::north::http::messages::Expected;
 use crate::north::local::{RuntimeDirectories, SocketPath, absolute};
@@ -16,7 +15,8 @@ const USUAL: &str = "http://127.0.0.1:9488";
 /// The options that select the gateway and how to reach it.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct Gateway {
-    /// Configuration file of the gateway, to use its local socket [default: /etc/drivegate/drivegate.toml].
+    /// Configuration file of the gateway, to use its local socket [default: $DRIVEGATE_CONFIG, else
+    /// /etc/drivegate/drivegate.toml].
     #[arg(long, value_name = "FILE", global = true)]
     config: Option<PathBuf>,
     /// Use the gateway's HTTP server at this address instead.
@@ -33,7 +33,12 @@ pub(crate) struct Gateway {
 impl Gateway {
     /// The configuration file.
     pub(crate) fn config(&self) -> &Path {
-        self.config.as_deref().unwrap_or(Path::new(DEFAULT_CONFIG))
+        self.named_config().unwrap_or_else(|| crate::default_config())
+    }
+
+    /// The configuration file that the command line or the environment names.
+    fn named_config(&self) -> Option<&Path> {
+        self.config.as_deref().or_else(|| crate::config_of_environment())
     }
 
     /// The HTTP server, if selected.
@@ -61,7 +66,7 @@ impl Gateway {
     /// # Errors It cannot be reached in any way.
     pub(crate) fn viewer(&self) -> Result<Client, String> {
         let mut client = self.client()?;
-        if self.config.is_none() && self.url.is_none() {
+        if self.named_config().is_none() && self.url.is_none() {
             client.expected = None;
             let network = Network {
                 url: USUAL.parse()?,

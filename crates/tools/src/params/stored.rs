@@ -22,8 +22,7 @@ pub(super) fn list(gateway: &Gateway, drive: Option<&str>, json: bool) -> Outcom
         None => listed_here(gateway.config(), drive)?,
     };
     if json {
-        let text = serde_json::to_string_pretty(&readings).unwrap_or_default();
-        return Ok(report::print(&(text + "\n")));
+        return Ok(report::json(&readings));
     }
     let mut table = report::table(["drive", "time", "family", "application", "missing", "file"]);
     let mut rows = 0;

@@ -188,8 +188,10 @@ impl Raw {
             (Count::Whole(whole), None) if matches!(self.form, Form::Bit { .. }) => Some(Value::Bool(whole == 1)),
             (Count::Whole(whole), None) if kind == Kind::Integer => whole_value(whole),
             (Count::Whole(whole), None) => {
-                let exact = whole.unsigned_abs() <= u128::from(EXACT);
-                exact.then_some(()).and_then(|()| self.scaled(whole as f64, power))
+                let whole = i64::try_from(whole)
+                    .ok()
+                    .filter(|whole| whole.unsigned_abs() <= EXACT)?;
+                self.scaled(whole as f64, power)
             }
             (Count::Real(real), _) if kind == Kind::Integer => Some(Value::Integer(real as i64)),
             (Count::Real(real), _) => self.scaled(real, power),
@@ -223,7 +225,8 @@ impl Raw {
     fn scaled(&self, count: f64, power: i64) -> Option<Value> {
         // A division by a power of ten is rounded once, a product with a fraction of it twice.
         let count = match i32::try_from(power) {
-            Ok(power @ 0..=MOST_POWER) => count * 10f64.powi(power),
+            Ok(0) => count,
+            Ok(power @ 1..=MOST_POWER) => count * 10f64.powi(power),
             Ok(power @ LEAST_POWER..0) => count / 10f64.powi(-power),
             _ => return None,
         };
