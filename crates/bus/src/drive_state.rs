@@ -2,15 +2,15 @@
 
 use std::time::{Duration, Instant};
 
-use super::command_run::{CommandRun, KnownWords, Next, Step};
+use super::command_run::{CommandRun, KnownWords, Next, Step, read_place};
 use super::confirm::Confirmations;
 use super::late_replies::LateReplies;
 use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
 use super::vain_stops::VainStops;
 use crate::codec::{Reply, Table};
-use crate::drive::ModelPoint;
 use crate::drive::control::Control;
+use crate::drive::{ModelPoint, Point, Profile};
 use crate::order::{Command, Interruption, Origin, Outcome, Receipt, Urgency};
 use crate::permit::LastWritten;
 use crate::process_image::{DriveImage, Reading};
@@ -24,6 +24,8 @@ pub(super) struct DriveState {
     pub(super) fresh: Duration,
     /// Its own command words.
     pub(super) words: KnownWords,
+    /// The places of what orders write, and of the command word where the drive shows its own: they are kept from every read.
+    pub(super) commanded: Vec<(Table, u16)>,
     /// Replies that it may still send.
     pub(super) late: LateReplies,
     /// Its lease.
@@ -65,12 +67,21 @@ fn slot(urgency: Urgency) -> usize {
     urgency as usize
 }
 
+fn commanded(profile: &Profile) -> Vec<(Table, u16)> {
+    let written = profile.points.iter().filter(|point| point.write);
+    let written = written.filter_map(Point::raw);
+    let written = written.flat_map(|raw| raw.addresses().map(|address| (raw.table, address)));
+    let word = read_place(profile).map(|place| (place.table, place.address));
+    written.chain(word).collect()
+}
+
 impl DriveState {
     /// A drive about which nothing is known; its status is read every `round` at best.
-    pub(super) fn new(round: Duration) -> DriveState {
+    pub(super) fn new(profile: &Profile, round: Duration) -> DriveState {
         DriveState {
             fresh: FRESH.max(3 * round),
             words: KnownWords::default(),
+            commanded: commanded(profile),
             late: LateReplies::default(),
             supervision: Supervision::default(),
             confirmations: Confirmations::default(),

@@ -209,7 +209,10 @@ impl Master {
         };
         let round = spec.cycle.max(plans.enumerate().map(fast).sum());
         let schedule = Schedule::new(cadence, &plans, cost, now);
-        let mut drives: PerDrive<DriveState> = images.iter().map(|_| DriveState::new(round)).collect();
+        let mut drives: PerDrive<DriveState> = images
+            .iter()
+            .map(|image| DriveState::new(&image.spec.profile, round))
+            .collect();
         for (drive, lease) in drives.iter_mut().zip(&before.leases) {
             drive.supervision.take_over(*lease);
         }

@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 use super::{Before, Master, Purpose, Turn, TurnEnd};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command_run::{Step, StepPurpose, read_place};
-use crate::drive::{DriveIndex, PlannedRead, Point, PointIndex, Raw};
+use crate::command_run::{Step, StepPurpose};
+use crate::drive::{DriveIndex, PlannedRead, Point, PointIndex};
 use crate::n2_late_replies::Asked;
 use crate::n2_session::Progress;
 use crate::news::News;
@@ -301,18 +301,14 @@ impl Master {
         at: Instant,
         news: &mut Vec<News>,
     ) {
-        let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) else {
+        let Some(drive) = self.drives.get_mut(index) else {
             return;
         };
         drive.was_read = true;
-        let written = image.spec.profile.points.iter().filter(|point| point.write);
-        let commanded = written.filter_map(Point::raw).filter(|raw| raw.table == read.table);
-        let control = read_place(&image.spec.profile).filter(|place| place.table == read.table);
-        let control = control.map(|place| place.address);
-        for address in commanded.flat_map(Raw::addresses).chain(control) {
+        for &(table, address) in drive.commanded.iter().filter(|(table, _)| *table == read.table) {
             let place = address.checked_sub(read.start).map(usize::from);
             if let Some(word) = place.and_then(|place| words.get(place)) {
-                drive.words.learn(read.table, address, *word);
+                drive.words.learn(table, address, *word);
             }
         }
         news.push(News::Read {

@@ -65,8 +65,8 @@ impl SupervisedDrive {
             ..controlled("d", "b", 1, profile)
         };
         SupervisedDrive {
+            drive: DriveState::new(&spec.profile, Duration::ZERO),
             bus: handle(bus_spec("b"), image(spec)),
-            drive: DriveState::new(Duration::ZERO),
             stats: Arc::default(),
             news: Vec::new(),
             now: Instant::now(),
@@ -149,8 +149,8 @@ impl SupervisedDrive {
         self.drive
             .close(&Outcome::ShuttingDown, Interruption::ShuttingDown, self.now);
         let lease = self.drive.supervision.lease();
+        self.drive = DriveState::new(&spec.profile, Duration::ZERO);
         self.bus = handle(self.bus.image.spec.clone(), image(spec));
-        self.drive = DriveState::new(Duration::ZERO);
         self.drive.supervision.take_over(lease);
     }
 
