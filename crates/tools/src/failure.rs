@@ -49,7 +49,7 @@ impl Failure {
 /// With `json` a refusal is a document on stdout too, besides its message on stderr.
 pub(super) fn documented(json: bool, outcome: Outcome) -> Outcome {
     if let (true, Err(Failure::Failed(why) | Failure::Misused(why))) = (json, &outcome) {
-        report::json(&ErrorReply::of(why));
+        report::json(&ErrorReply::new(why));
     }
     outcome
 }

@@ -25,12 +25,7 @@ pub struct ErrorReply {
 
 impl ErrorReply {
     /// One without names.
-    pub fn of(error: impl Into<String>) -> ErrorReply {
-        ErrorReply::new(error)
-    }
-
-    /// One without names.
-    pub(crate) fn new(error: impl Into<String>) -> ErrorReply {
+    pub fn new(error: impl Into<String>) -> ErrorReply {
         ErrorReply {
             error: error.into(),
             known: Vec::new(),
