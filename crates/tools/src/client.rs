@@ -195,7 +195,7 @@ impl Client {
     /// [`Client::ask`], outside of a runtime.
     ///
     /// # Errors
-    /// Likewise, as a message.
+    /// Those of [`Client::ask`], as a message.
     pub(crate) fn ask_now(&self, asked: &Asked) -> Result<Reply, String> {
         Ok(crate::runtime()?.block_on(self.ask(asked))?)
     }

@@ -71,7 +71,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     documented(args.json && !printed, outcome)
 }
 
-/// `printed`: a document was.
+/// Sends the command; `printed` tells whether a document was printed.
 fn write(args: &Args, printed: &mut bool) -> Outcome {
     let target = args.drive.target()?;
     let setting = |text: &String| parse(target.profile().map(|profile| &**profile), text);
@@ -171,10 +171,10 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
     }
 }
 
-/// The reply as it was sent, and in words or why it failed.
+/// The reply as the gateway sent it, and in words: what was acknowledged, or why the command failed.
 ///
 /// # Errors
-/// There is no such reply.
+/// The reply is not one to a command, or there is none.
 fn command(target: &Target, settings: &[Setting]) -> Result<(Json, Result<String, String>), String> {
     let shown: Vec<&str> = settings.iter().map(|setting| setting.shown.as_str()).collect();
     let what = format!("{} {}", target.drive, shown.join(" "));

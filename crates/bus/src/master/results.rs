@@ -216,7 +216,7 @@ impl Master {
             }
             // Its reply may have been lost by that: it does not count as away before it is asked again.
             Ended::Silent if end.stood => Polled::Garbled,
-            // Something is there, though a reply that came so early is not believed yet.
+            // The drive is there, though a reply that came so early is not believed yet.
             Ended::Silent if end.doubted => Polled::Garbled,
             Ended::Silent => Polled::Failed,
             Ended::Corrupt(_) => Polled::Garbled,

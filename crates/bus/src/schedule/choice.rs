@@ -136,7 +136,7 @@ impl Schedule {
 
     fn due_slow(&self, now: Instant) -> Option<(Instant, Poll, Duration)> {
         // Points read once when a drive comes online go first: commands in percent depend on its frequencies. The bits of the
-        // status word follow: it is not whole before.
+        // status word follow: register 0x8000 is stale until all of them were read.
         let rank = |drive: &DriveSchedule, due: Instant, item: &Item| {
             let sound = item.failures == 0 && !item.refused;
             let first = item.read.class == PollClass::Once && sound;

@@ -262,16 +262,16 @@ pub struct Reading<'d> {
     pub stale_after: Duration,
     /// Cadence of the slow class.
     pub slow_cycle: Duration,
-    /// Samples of the fast class that are older are stale, and those of the slow class.
+    /// From when on a sample is not stale yet: one of the fast class, and one of the slow class.
     fresh_from: [Fresh; 2],
 }
 
-/// The time from which a sample is not stale yet; `None`: any, as the clock has not run for so long.
+/// The earliest time of a sample that is not stale yet; `None`: any, as the clock has not run for so long.
 type Fresh = Option<Instant>;
 
 impl<'d> Reading<'d> {
-    /// How a reader at `now` looks at a snapshot, which samples of that age make stale; those of the slow class two slow cycles
-    /// later.
+    /// A snapshot as seen at `now`. A sample of the fast class is stale beyond the age `stale_after`, one of the slow class
+    /// two slow cycles later.
     pub fn new(
         spec: &'d DriveSpec,
         snapshot: Arc<Snapshot>,
@@ -291,7 +291,7 @@ impl<'d> Reading<'d> {
         }
     }
 
-    /// Of a drive that accepts only stops while that says so.
+    /// The reading of a drive that accepts only stops while `hold` says so.
     pub fn held(self, hold: &'d Hold) -> Reading<'d> {
         Reading {
             hold: Some(hold),

@@ -66,7 +66,7 @@ pub struct Plan {
     pub trials: Vec<PlannedRead>,
     /// The reads of process data that decide the drive's state: fault, running, ready.
     pub behind_state: Vec<PlannedRead>,
-    /// The slow reads of the other bits of the status word: they are read first when the drive is there.
+    /// The slow reads of the other bits of the status word, which precede other slow reads once the drive answers.
     pub behind_status_word: Vec<PlannedRead>,
 }
 
@@ -129,7 +129,7 @@ impl Plan {
         plan
     }
 
-    /// The reads of a class that one of the points rests on.
+    /// The reads of a class that any of the points needs.
     fn behind(&self, profile: &Profile, points: &[ModelPoint], class: PollClass) -> Vec<PlannedRead> {
         let points = points.iter().filter_map(|point| profile.model_index(*point));
         let points: Vec<PointIndex> = points.flat_map(|point| profile.raw_points_of(point)).collect();

@@ -151,7 +151,7 @@ pub enum RestoreAct {
 pub struct RestoreWish {
     /// The file of parameters.
     pub file: String,
-    /// These alone; empty: all.
+    /// The parameters to be written; empty: all.
     #[serde(default)]
     pub only: Vec<String>,
     /// Treat refusals that can be forced as risks.
@@ -163,7 +163,7 @@ pub struct RestoreWish {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PreparedRestore {
-    /// Its number.
+    /// The number of the restore.
     pub number: u64,
 }
 
@@ -204,7 +204,7 @@ pub struct Recorded {
 pub struct StoredReading {
     /// Name of the drive.
     pub drive: String,
-    /// Its file.
+    /// Path of the file, or its name where it is on another machine.
     pub file: String,
     /// When it was made, RFC 3339; this and what follows is `null` where the file cannot be read.
     pub time: Option<String>,
@@ -220,7 +220,7 @@ pub struct StoredReading {
 }
 
 impl StoredReading {
-    /// Reads its file, which is called `file`.
+    /// Reads the file of a stored reading; `file` is how the reader of the list gets to know it.
     pub fn of(kept: &Kept, file: String) -> StoredReading {
         let (reading, error) = match read(&kept.path) {
             Ok(reading) => (Some(reading), None),

@@ -19,7 +19,7 @@ enum Form {
     Json,
     Csv,
     Pcap,
-    /// The gateway's own.
+    /// The gateway's own format.
     Dgrec,
 }
 

@@ -181,7 +181,7 @@ pub(super) async fn all_params(State(app): State<Arc<AppState>>, RawQuery(query)
         let wanted = all
             .iter()
             .filter(|kept| drive.as_ref().is_none_or(|drive| kept.drive == *drive));
-        // The name tells it from others; where the directory is concerns this machine only.
+        // A client elsewhere cannot open the path.
         let file = |kept: &Kept| kept.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         Ok(wanted
             .map(|kept| StoredReading::of(kept, file(kept)))
