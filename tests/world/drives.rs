@@ -20,7 +20,7 @@ pub struct Truth {
     pub may_run: Option<Instant>,
     /// Open orders that may change the run command the other way: stops, resets.
     pub last_stop_over: Option<Instant>,
-    /// Place of the last order that went onto the wire, stops apart.
+    /// Behind that place are the orders that may still go onto the wire, stops apart.
     pub last_place: usize,
     /// The last order with these words: they come again after some thousands.
     pub uniques: HashMap<Unique, usize>,

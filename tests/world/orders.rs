@@ -87,6 +87,8 @@ pub struct Record {
     pub unique: Option<Unique>,
     /// Place in the order of acceptance; a newer reference takes that of the one it replaces.
     pub place: usize,
+    /// The earliest place that it may have: the rest of a stop that waits, which it replaces, is answered with the stop.
+    pub earliest: usize,
     pub sent: Option<Instant>,
     pub answer: Option<(String, Instant)>,
     pub read: Option<(RequestPdu, Option<Vec<u16>>)>,

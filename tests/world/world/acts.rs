@@ -198,6 +198,7 @@ impl World {
             expires: now + expiry,
             unique: None,
             place: id + 1,
+            earliest: id + 1,
             sent: None,
             answer: None,
             read: None,

@@ -52,7 +52,15 @@ impl World {
             && let Some(older) = replaced.next()
         {
             older.succeeded = true;
-            newest.place = older.place;
+            (newest.place, newest.earliest) = (older.place, older.earliest);
+        }
+        let stops = |record: &&Record| record.wish == Wish::StopAtReference && record.answer.is_none();
+        let of_drive = |record: &&Record| (record.bus, record.drive) == (newest.bus, newest.drive);
+        let recent = before.iter().rev().take(1_000).filter(of_drive);
+        if newest.wish.replaces(Wish::StopAtReference)
+            && let Some(stop) = recent.into_iter().find(stops)
+        {
+            newest.earliest = newest.earliest.min(stop.place);
         }
     }
 

@@ -247,13 +247,14 @@ impl World {
         record.sent.get_or_insert(now);
         // Of an order that stops and does more these words are the rest, which overtakes nothing.
         if first {
-            let (place, truth) = (record.place, &mut self.truths[bus][drive]);
+            let (place, earliest) = (record.place, record.earliest);
+            let truth = &mut self.truths[bus][drive];
             assert!(
                 place > truth.last_place,
                 "order {id} of place {place} goes out behind place {}",
                 truth.last_place
             );
-            truth.last_place = place;
+            truth.last_place = truth.last_place.max(earliest);
         }
     }
 
