@@ -262,7 +262,7 @@ impl World {
             // The probe of a dead N2 drive, and what waits for its late reply, come at other moments than in the sound world.
             let probe = match bus.line.dead.is_empty() || bus.line.protocol != Protocol::N2 {
                 true => Duration::ZERO,
-                false => bus.line.response_timeout,
+                false => bus.line.response_timeout + self.exchange(bus),
             };
             for ((drive, healed), sound) in healed.iter().enumerate().zip(&sound) {
                 if !self.is_alive(bus.index, drive) {
