@@ -16,9 +16,10 @@ use std::time::{Duration, Instant};
 
 pub use self::control::read_place;
 pub use self::known_words::KnownWords;
+pub(crate) use self::look::Look;
+pub(crate) use self::standing::Motor;
 pub use self::steps::{Step, StepPurpose};
 
-use self::look::Look;
 use self::parameter::ParameterRun;
 use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, unsendable, write_on_change};
 use super::confirm::{self, Effect};

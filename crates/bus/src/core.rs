@@ -404,7 +404,7 @@ impl BusCore {
         let doubted = exchanged.transaction.only_doubted();
         let frame = match turn.purpose {
             Purpose::Background => exchanged.transaction.reply_frame().to_vec(),
-            Purpose::Poll(_) | Purpose::Session(..) | Purpose::Command { .. } => Vec::new(),
+            Purpose::Poll(_) | Purpose::Refresh | Purpose::Session(..) | Purpose::Command { .. } => Vec::new(),
         };
         let Exchanged {
             ended, began, at, took, ..

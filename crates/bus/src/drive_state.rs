@@ -6,14 +6,15 @@ use super::command_run::{CommandRun, KnownWords, Next, Step, read_place};
 use super::confirm::Confirmations;
 use super::late_replies::LateReplies;
 use super::n2_late_replies::N2LateReplies;
+use super::refresh::{End, OrderEnd, Refresh};
 use super::supervision::Supervision;
 use super::vain_stops::VainStops;
 use crate::codec::{Reply, Table};
 use crate::drive::control::Control;
 use crate::drive::{ModelPoint, Point, Profile};
-use crate::order::{Command, Interruption, Origin, Outcome, Receipt, Urgency};
+use crate::order::{Command, Interruption, Order, Origin, Outcome, Receipt, Urgency};
 use crate::permit::LastWritten;
-use crate::process_image::{DriveImage, Reading};
+use crate::process_image::{DriveImage, DriveSpec, Reading};
 
 /// A status older than this, or than three rounds of the line, does not show whether the motor runs.
 pub(super) const FRESH: Duration = Duration::from_secs(2);
@@ -30,6 +31,10 @@ pub(super) struct DriveState {
     pub(super) late: LateReplies,
     /// Its lease.
     pub(super) supervision: Supervision,
+    /// What is written again for its own timeout.
+    pub(super) refresh: Refresh,
+    /// Why that ended, where it is not told yet.
+    pub(super) refresh_ended: Option<End>,
     /// Commands that it acknowledged and has not shown yet.
     pub(super) confirmations: Confirmations,
     /// Started commands: one of each rank, so that they keep their order.
@@ -77,13 +82,16 @@ fn commanded(profile: &Profile) -> Vec<(Table, u16)> {
 
 impl DriveState {
     /// A drive about which nothing is known; its status is read every `round` at best.
-    pub(super) fn new(profile: &Profile, round: Duration) -> DriveState {
+    pub(super) fn new(spec: &DriveSpec, round: Duration) -> DriveState {
+        let profile = &spec.profile;
         DriveState {
             fresh: FRESH.max(3 * round),
             words: KnownWords::default(),
             commanded: commanded(profile),
             late: LateReplies::default(),
             supervision: Supervision::default(),
+            refresh: Refresh::new(profile, spec.refresh),
+            refresh_ended: None,
             confirmations: Confirmations::default(),
             runs: [None, None, None],
             stopped: None,
@@ -198,6 +206,7 @@ impl DriveState {
         if run.in_doubt() {
             self.forget_words();
         }
+        self.refresh_after(&run, outcome, image, now);
         if run.is_heard() && run.reached_the_wire() {
             self.supervision.renew(now);
         }
@@ -243,6 +252,34 @@ impl DriveState {
         }
     }
 
+    /// What the end of a command changes for the refresh.
+    fn refresh_after(&mut self, run: &CommandRun, outcome: &Outcome, image: &DriveImage, now: Instant) {
+        let is_command = matches!(run.intent().order, Order::Points(_) | Order::Write(_));
+        if !is_command || !run.has_begun() {
+            return;
+        }
+        let is_drill = run.origins().any(Origin::is_drill);
+        let how = match outcome {
+            outcome if outcome.is_ok() && run.is_of_client() && !is_drill => OrderEnd::Done,
+            outcome if outcome.is_ok() && run.is_of_supervision() && run.urgency() == Urgency::Command => {
+                OrderEnd::Action
+            }
+            outcome if outcome.is_ok() => OrderEnd::Other,
+            // The drive took nothing of the step that it refused.
+            Outcome::Exception(_) | Outcome::Refused(_) if !run.in_doubt() => return,
+            _ => OrderEnd::Unknown,
+        };
+        let held = self.supervision.is_held();
+        let ended = self.refresh.order_over(&image.spec.profile, how, held, now);
+        self.refresh_ended = ended.or(self.refresh_ended.take());
+    }
+
+    /// The refresh ends for that reason, if it has begun.
+    pub(super) fn end_refresh(&mut self, why: End) {
+        let ended = self.refresh.end(why);
+        self.refresh_ended = ended.or(self.refresh_ended.take());
+    }
+
     /// A step of a started command is sent.
     pub(super) fn sent(&mut self, urgency: Urgency, step: &Step, now: Instant) {
         let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut) else {
@@ -259,6 +296,7 @@ impl DriveState {
 
     /// The drive received a command that is not a started one: a broadcast, or one that is not decoded.
     pub(super) fn heard_order(&mut self, renews: bool, now: Instant) {
+        self.end_refresh(End::Passed);
         self.stopped = None;
         if renews {
             self.supervision.renew(now);
@@ -308,6 +346,7 @@ impl DriveState {
 
     /// The drive no longer replies. A stop is retried; other started commands have failed.
     pub(super) fn went_offline(&mut self, now: Instant) {
+        self.refresh.not_answered(now);
         self.words.forget();
         self.stopped = None;
         for urgency in [Urgency::Command, Urgency::Read] {
@@ -328,6 +367,7 @@ impl DriveState {
 
     /// The drive has restarted: everything known about it is void.
     pub(super) fn restarted(&mut self) {
+        self.end_refresh(End::Restart);
         self.words.forget();
         self.stopped = None;
     }

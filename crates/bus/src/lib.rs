@@ -9,6 +9,7 @@
 //! - `drive_state`: what is known of one drive besides its samples, polls and N2 session: its started commands
 //!   ([`command_run`]), what they still have to show ([`confirm`]), its lease ([`supervision`]), the replies that it may
 //!   still send ([`late_replies`]).
+//! - [`refresh`]: what is written again for a drive whose own timeout counts writes only.
 //! - `start_gate`: which commands to guarded drives may start them, and the stops of interlocks.
 //! - [`n2_session`] and [`n2_late_replies`]: what N2 needs beyond that, for the whole line.
 //! - [`listener`]: the bus without its thread on a line that another master owns: it decodes and never sends.
@@ -37,6 +38,7 @@ pub mod news;
 pub mod predict;
 pub mod prober;
 pub mod proof;
+pub mod refresh;
 mod report;
 pub mod schedule;
 mod selection;

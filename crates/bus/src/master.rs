@@ -11,6 +11,7 @@ mod hold;
 mod passed_on;
 mod pauses;
 mod permission;
+mod refreshing;
 mod remains;
 mod results;
 mod shutdown;
@@ -35,6 +36,7 @@ use super::line_state::{Learned, Sending};
 use super::n2_late_replies::{N2LateReplies, n2_look_alike};
 use super::n2_session::N2Sessions;
 use super::news::News;
+use super::refresh::Repeated;
 use super::schedule::{Cadence, Poll, Schedule};
 use super::start_gate::StartGate;
 use super::supervision::{Demand, Lease, Orders};
@@ -85,6 +87,8 @@ pub enum Purpose {
     },
     /// The background request that has its turn.
     Background,
+    /// A step of the refresh of the drive.
+    Refresh,
     /// A step of the N2 session, needed before a read of the plan or a step of the started command in that slot.
     Session(Session, Before),
 }
@@ -107,14 +111,14 @@ impl Turn {
     /// The rank of its command; none for a poll or a background transaction.
     pub fn rank(&self) -> Option<Urgency> {
         match &self.purpose {
-            Purpose::Poll(_) | Purpose::Background | Purpose::Session(_, Before::Poll(_)) => None,
+            Purpose::Poll(_) | Purpose::Background | Purpose::Refresh | Purpose::Session(_, Before::Poll(_)) => None,
             Purpose::Command { rank, .. } | Purpose::Session(_, Before::Command(_, rank)) => Some(*rank),
         }
     }
 
     fn slot(&self) -> Option<Urgency> {
         match &self.purpose {
-            Purpose::Poll(_) | Purpose::Background | Purpose::Session(_, Before::Poll(_)) => None,
+            Purpose::Poll(_) | Purpose::Background | Purpose::Refresh | Purpose::Session(_, Before::Poll(_)) => None,
             Purpose::Command { slot, .. } | Purpose::Session(_, Before::Command(slot, _)) => Some(*slot),
         }
     }
@@ -141,11 +145,40 @@ pub struct TurnEnd {
     pub frame: Vec<u8>,
 }
 
+/// What goes on with a drive over a reload.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Carried {
+    /// Its lease.
+    pub lease: Lease,
+    /// What is written again for its own timeout.
+    pub repeated: Repeated,
+}
+
+impl Carried {
+    /// The lease without what is refreshed.
+    #[must_use]
+    pub fn alone(self) -> Carried {
+        Carried {
+            repeated: Repeated::default(),
+            ..self
+        }
+    }
+
+    /// The lease when its time stood for so long.
+    #[must_use]
+    pub fn after(self, stood: Duration) -> Carried {
+        Carried {
+            lease: self.lease.after(stood),
+            ..self.alone()
+        }
+    }
+}
+
 /// State that a stopped bus hands over to the next one on the same line.
 #[derive(Debug, Clone, Default)]
 pub struct Handover {
-    /// The leases of its drives, in their order.
-    pub leases: Vec<Lease>,
+    /// The leases of its drives, in their order, with what is refreshed under them.
+    pub leases: Vec<Carried>,
     /// Until when a reply to its request may arrive; none if no bus used the line before.
     pub quiet_until: Option<Instant>,
     /// Its findings about the line.
@@ -179,6 +212,8 @@ pub struct Master {
     probes: PerDrive<u32>,
     /// A reply may have come late since before the transaction that is on the line.
     late_before: bool,
+    /// The last round of a refresh is over, and nothing was polled since.
+    refreshed_last: bool,
 }
 
 impl Master {
@@ -209,12 +244,10 @@ impl Master {
         };
         let round = spec.cycle.max(plans.enumerate().map(fast).sum());
         let schedule = Schedule::new(cadence, &plans, cost, now);
-        let mut drives: PerDrive<DriveState> = images
-            .iter()
-            .map(|image| DriveState::new(&image.spec.profile, round))
-            .collect();
-        for (drive, lease) in drives.iter_mut().zip(&before.leases) {
-            drive.supervision.take_over(*lease);
+        let mut drives: PerDrive<DriveState> = images.iter().map(|image| DriveState::new(&image.spec, round)).collect();
+        for (drive, carried) in drives.iter_mut().zip(&before.leases) {
+            drive.supervision.take_over(carried.lease);
+            drive.refresh.take_over(carried.repeated, now);
         }
         let sessions = match spec.protocol {
             Protocol::N2 => N2Sessions::new(images.iter().map(|d| d.spec.profile.n2)),
@@ -242,6 +275,7 @@ impl Master {
             successor: before.quiet_until.is_some(),
             writes,
             late_before: false,
+            refreshed_last: false,
             bus,
         }
     }
@@ -282,7 +316,10 @@ impl Master {
         drop(queue);
         let close = |drive: &mut DriveState| {
             drive.close(&Outcome::ShuttingDown, Interruption::ShuttingDown, now);
-            drive.supervision.lease()
+            Carried {
+                lease: drive.supervision.lease(),
+                repeated: drive.refresh.handed_over(),
+            }
         };
         let leases = self.drives.iter_mut().map(close).collect();
         self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
@@ -351,6 +388,7 @@ impl Master {
                 supervise(bus, index, image, drive, writes, now, news);
             }
         }
+        self.look_at_refreshes(now, news);
         self.look_at_starts(now);
         for drive in self.waits.sessions.neglected(now).collect::<Vec<_>>() {
             self.schedule.ask(drive, now);
@@ -424,6 +462,7 @@ impl Master {
         if turn.purpose == Purpose::Background {
             self.background_sent(now);
         }
+        self.others_before_refresh(turn);
         let mut late = self
             .drives
             .iter()

@@ -65,6 +65,13 @@ pub enum News {
     },
     /// A drive whose lease expired does not report whether it runs.
     RunningUnknown(DriveIndex),
+    /// What is written again for the drive's own timeout is so no more.
+    RefreshEnded {
+        /// Which drive.
+        drive: DriveIndex,
+        /// Why, as text.
+        why: String,
+    },
     /// A waiting or started command was refused.
     Denied(Denied),
     /// An interlock does not hold, and the motor is stopped by that.

@@ -13,6 +13,7 @@ pub use faster::faster_points;
 use std::fmt;
 use std::time::Duration;
 
+use super::refresh;
 use super::schedule::{SLOW_SHARE, slow_share};
 use crate::codec::LineFormat;
 use crate::codec::wire::Silence;
@@ -27,6 +28,9 @@ const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 1
 /// Most of the line that is planned for if there is a choice: the rest is for commands, retries and drives slower than
 /// their profile.
 const MOST_LOAD: f64 = 0.8;
+
+/// Share of the line that polls have at least, beside refreshes: one poll between two rounds of them.
+const LEAST_LEFT: f64 = 0.1;
 
 /// Part of a cadence by which it may be missed before it is reported.
 const TOLERANCE: f64 = 0.001;
@@ -55,6 +59,8 @@ pub struct Prediction {
     pub demand: f64,
     /// Share of the line that will be in use, 0..=1.
     pub load: f64,
+    /// Share of the line that the refreshes of all drives take while all of them are going.
+    pub refreshes: f64,
     /// Cadences that the line cannot carry.
     pub shortage: Option<Shortage>,
 }
@@ -114,11 +120,12 @@ pub fn predict(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Predic
     let (fast_share, slow_share) = line.shares(&total);
     let present = |round: f64, cycle: f64| (round > 0.0).then(|| seconds(cycle));
     let mut prediction = Prediction {
+        refreshes: total.refreshes,
         requests: line.requests(),
         fast_cycle: present(total.fast, fast),
         slow_cycle: present(total.slow, slow),
-        demand: fast_share + slow_share,
-        load: (total.fast / fast + total.slow / slow).min(1.0),
+        demand: fast_share + slow_share + total.refreshes,
+        load: (total.fast / fast + total.slow / slow + total.refreshes).min(1.0),
         shortage: None,
     };
     prediction.shortage = line.shortage(&prediction, &total);
@@ -140,6 +147,8 @@ struct Rounds {
     /// Requests of a slow round, and the longest of them.
     slow_requests: f64,
     longest_slow: f64,
+    /// Share of the line that refreshes take.
+    refreshes: f64,
 }
 
 impl Rounds {
@@ -149,6 +158,7 @@ impl Rounds {
             slow: self.slow + other.slow,
             slow_requests: self.slow_requests + other.slow_requests,
             longest_slow: self.longest_slow.max(other.longest_slow),
+            refreshes: self.refreshes + other.refreshes,
         }
     }
 
@@ -198,7 +208,10 @@ impl<'a> Line<'a> {
             ..self.spec.format
         };
         let of = |(drive, plan): &(&DriveSpec, Plan)| {
-            let mut rounds = Rounds::default();
+            let mut rounds = Rounds {
+                refreshes: self.refresh_share(&format, drive),
+                ..Rounds::default()
+            };
             for read in &plan.reads {
                 let wire = self.wire(&format, drive, read).as_secs_f64();
                 match read.class {
@@ -214,6 +227,15 @@ impl<'a> Line<'a> {
             rounds
         };
         self.drives.iter().map(of).collect()
+    }
+
+    /// Share of the line that the refresh of a drive takes.
+    fn refresh_share(&self, format: &LineFormat, drive: &DriveSpec) -> f64 {
+        let Some(every) = drive.refresh else { return 0.0 };
+        let silence = self.spec.protocol.silence(self.silence, format);
+        let wire = |pdu| WireTime::of(self.spec.protocol, format, &pdu).total(drive.turnaround, silence);
+        let round: Duration = refresh::requests(&drive.profile).into_iter().map(wire).sum();
+        round.as_secs_f64() / every.as_secs_f64().max(1e-3)
     }
 
     /// Rounds of all drives at that baud.
@@ -242,7 +264,8 @@ impl<'a> Line<'a> {
             return 1.0;
         }
         let cycle = self.spec.cycle.as_secs_f64().max(1e-6);
-        let fitting = ((cycle - rounds.fast).max(0.0) / rounds.longest_slow.max(1e-6)).floor();
+        let fitting =
+            ((cycle * (1.0 - rounds.refreshes) - rounds.fast).max(0.0) / rounds.longest_slow.max(1e-6)).floor();
         (fitting * rounds.mean_slow() / cycle).max(least)
     }
 
@@ -250,7 +273,8 @@ impl<'a> Line<'a> {
     fn cycles(&self, rounds: &Rounds) -> (f64, f64) {
         let (fast, slow) = self.shares(rounds);
         let granted = slow.min(self.room(rounds));
-        let fast_cycle = if fast > 0.0 { rounds.fast / (1.0 - granted) } else { 0.0 };
+        let left = (1.0 - granted - rounds.refreshes).max(LEAST_LEFT);
+        let fast_cycle = if fast > 0.0 { rounds.fast / left } else { 0.0 };
         let slow_cycle = if slow > 0.0 { rounds.slow / granted } else { 0.0 };
         (
             fast_cycle.max(self.spec.cycle.as_secs_f64()),
@@ -363,7 +387,10 @@ impl<'a> Line<'a> {
         let (_, slow) = self.shares(rounds);
         match slow {
             _ if rounds.fast == 0.0 => None,
-            slow if slow <= SLOW_SHARE => Some(whole_milliseconds(rounds.fast / (1.0 - slow))),
+            slow if slow <= SLOW_SHARE => {
+                let left = (1.0 - slow - rounds.refreshes).max(LEAST_LEFT);
+                Some(whole_milliseconds(rounds.fast / left))
+            }
             _ => self.roomy_cycle(rounds),
         }
     }

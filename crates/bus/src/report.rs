@@ -145,6 +145,7 @@ impl Report {
             }
             News::RunsUnsupervised(drive, adopted) => self.runs_unsupervised(*drive, *adopted),
             News::Denied(denied) => self.denied(denied, now),
+            News::RefreshEnded { drive, why } => self.refresh_ended(*drive, why),
             News::Tripped { drive, why } => self.drive_event(*drive, EventKind::Interlock, None, |name| {
                 format!("an interlock of {name} is not satisfied: {why}; the drive is being stopped")
             }),

@@ -263,6 +263,11 @@ impl Schedule {
         self.share.commanded(urgency, took);
     }
 
+    /// A step of a refresh was on the line for `took`: it has the rank of a fast poll.
+    pub(crate) fn refreshed(&mut self, took: Duration) {
+        self.share.polled(took);
+    }
+
     /// A poll has ended.
     pub(crate) fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
         let item = self.drives.get_mut(poll.drive);

@@ -136,6 +136,11 @@ impl Supervision {
         self.lease
     }
 
+    /// Whether the lease runs.
+    pub(super) fn is_held(&self) -> bool {
+        matches!(self.lease.state, State::Held(_))
+    }
+
     /// Whether the lease expired, and its action is not acknowledged.
     pub(super) fn owes_action(&self) -> bool {
         self.lease.state == State::RanOut

@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use super::functions::TakenFunctions;
 use crate::codec::{RequestPdu, Table};
+use crate::drive::Profile;
 use crate::drive::control::Control;
 use crate::order::written;
 
@@ -57,6 +58,11 @@ impl KnownWords {
                 self.fell.insert((table, address), (fell, now));
             }
         }
+    }
+
+    /// A write in the form that the drive takes.
+    pub(crate) fn formed(&self, pdu: RequestPdu, profile: &Profile) -> RequestPdu {
+        self.functions.form(pdu, profile)
     }
 
     /// The reply that is applied next came at `now`.

@@ -53,7 +53,7 @@ impl Shown {
 
 /// A look at a drive: what is left to read, and what was read.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Look {
+pub(crate) struct Look {
     running: Shown,
     fault: Option<Shown>,
     remote: Option<Shown>,
@@ -72,7 +72,7 @@ impl Look {
 
     /// Whether it runs by the bus: a faulted drive may show its motor as it was before the fault, and one that is commanded at its
     /// panel does not run by a word of the gateway.
-    pub(super) fn at_motor(profile: &Profile) -> Option<Look> {
+    pub(crate) fn at_motor(profile: &Profile) -> Option<Look> {
         Look::of(profile, &[ModelPoint::Fault, ModelPoint::Remote])
     }
 
@@ -102,13 +102,18 @@ impl Look {
     }
 
     /// The next request.
-    pub(super) fn request(&self) -> RequestPdu {
+    pub(crate) fn request(&self) -> RequestPdu {
         let more = self.answered.checked_sub(1).and_then(|number| self.more.get(number));
         more.unwrap_or(&self.first).clone()
     }
 
+    /// All of them.
+    pub(crate) fn requests(&self) -> impl Iterator<Item = &RequestPdu> {
+        [&self.first].into_iter().chain(&self.more)
+    }
+
     /// The reply to that. Whether all were answered.
-    pub(super) fn hears(&mut self, reply: &Reply) -> bool {
+    pub(crate) fn hears(&mut self, reply: &Reply) -> bool {
         if let RequestPdu::Read { table, start, .. } = self.request() {
             let words = reply.words().unwrap_or_default();
             let words = (start..=u16::MAX).zip(words);
@@ -119,7 +124,7 @@ impl Look {
     }
 
     /// Everything is asked anew.
-    pub(super) fn begin_again(&mut self) {
+    pub(crate) fn begin_again(&mut self) {
         self.answered = 0;
         self.words.clear();
     }
@@ -130,7 +135,7 @@ impl Look {
     }
 
     /// How the motor stands to the gateway's word.
-    pub(super) fn motor(&self) -> Motor {
+    pub(crate) fn motor(&self) -> Motor {
         let is = |shown: &Option<Shown>| shown.as_ref().and_then(|shown| shown.value(&self.words));
         match (self.runs(), is(&self.fault), is(&self.remote)) {
             (None, ..) => Motor::NotShown,

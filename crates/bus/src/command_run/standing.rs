@@ -7,7 +7,7 @@ use crate::order::Refusal;
 
 /// What the drive showed of its motor, in the same command and right before the write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Motor {
+pub(crate) enum Motor {
     /// It runs by the bus, as far as the drive shows who commands it.
     Runs,
     /// It runs, and is commanded elsewhere.

@@ -115,6 +115,12 @@ impl Master {
             self.turns.served(Urgency::Command, commands.waits(Urgency::Read));
             return Some(Ok(self.turn(ready, now)));
         }
+        if self.shutdown.is_none()
+            && !commands.waits(Urgency::Stop)
+            && let Some(turn) = self.refresh_goes_on(now)
+        {
+            return Some(Ok(turn));
+        }
         let rank = self.turns.rank(|rank| commands.waits(rank));
         if self.polls_cease() {
             if !self.stops_the_line() {
@@ -133,14 +139,21 @@ impl Master {
         match self.schedule.next_of(now, rank, highest) {
             // A stop waits for one poll at most, and for nothing else.
             Decision::Poll(poll) if highest == Some(Urgency::Stop) => self.poll(poll, now),
-            Decision::Poll(poll) => match self.background(false, now) {
+            Decision::Poll(poll) => match self
+                .refresh(false, now)
+                .ok_or(())
+                .or_else(|()| self.background(false, now))
+            {
                 Ok(turn) => Some(Ok(turn)),
                 Err(_) => self.poll(poll, now),
             },
-            Decision::Idle(until) => Some(self.background(true, now).map_err(|again| {
-                let wake = commands.wake_at.into_iter().chain(again);
-                wake.fold(until, Instant::min)
-            })),
+            Decision::Idle(until) => {
+                let turn = self.refresh(true, now).ok_or(());
+                Some(turn.or_else(|()| self.background(true, now)).map_err(|again| {
+                    let wake = commands.wake_at.into_iter().chain(again).chain(self.next_refresh());
+                    wake.fold(until, Instant::min)
+                }))
+            }
             Decision::Command(rank) => self.command(rank, &mut commands, now),
         }
     }
@@ -294,6 +307,9 @@ impl Master {
         let starts = self.waits.starts.as_ref();
         let start = starts.and_then(|starts| starts.start_of(&command.intent, command.ticket.origin(), index));
         let renews = self.bus.renews_by(&command);
+        if !matches!(rank, Urgency::Read) {
+            drive.refresh.order_begins(self.bus.queue.lock().gate.stops(index));
+        }
         let mut run = CommandRun::new(command, &image.spec.profile);
         (run.rank, run.renews, run.start) = (rank, renews, start);
         drive.begin(run);
@@ -356,6 +372,9 @@ impl Master {
     pub(crate) fn is_still_due(&mut self, turn: &Turn, now: Instant) -> bool {
         if turn.purpose == Purpose::Background {
             return self.background_is_due(now);
+        }
+        if turn.purpose == Purpose::Refresh {
+            return self.may_still_refresh(turn, now);
         }
         let Some(slot) = turn.slot() else { return true };
         if !self.may_still_write(turn.drive, slot, now) {

@@ -24,6 +24,9 @@ impl Master {
         }
         drop(queue);
         for drive in &mut self.drives {
+            if stall.is_pause() {
+                drive.refresh.stood(stall.length(), now);
+            }
             for urgency in [Urgency::Command, Urgency::Read] {
                 if let Some(run) = drive.run(urgency).filter(|_| stall.is_pause()) {
                     run.interrupted(slept, now);

@@ -23,6 +23,7 @@ impl Master {
             Purpose::Session(step, before) => self.session_went_on(turn.drive, *step, before, end, now, news),
             Purpose::Poll(poll) => self.polled(poll, end, now, news),
             Purpose::Background => self.background_over(turn, end, now, news),
+            Purpose::Refresh => self.refreshed(turn, end, now, news),
             Purpose::Command { slot, rank, step } => {
                 let step = Step {
                     purpose: *step,
@@ -195,6 +196,7 @@ impl Master {
 
     /// Applies the result of a poll.
     fn polled(&mut self, poll: &Poll, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
+        self.refreshed_last = false;
         // Of a step before the poll this is known already.
         let heard = self.waits.sessions.heard(poll.drive, &end.ended);
         if heard == Progress::Restarted {
@@ -375,6 +377,9 @@ impl Master {
             && !matches!(reply, Reply::Exception(_))
         {
             image.note_written(&items, now);
+        }
+        if step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
+            drive.refresh.ordered(&image.spec.profile, &step.pdu, now);
         }
         let outcome = drive.answered(slot, step, reply, now);
         if let Some(outcome) = outcome {

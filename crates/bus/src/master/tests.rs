@@ -18,9 +18,11 @@ use crate::transaction::MAY_BE_LATE;
 
 mod background;
 mod drill;
+mod family_drive;
 mod hold;
 mod late_replies;
 mod pauses;
+mod refreshing;
 mod rights;
 mod shutdown;
 mod stop_all;
@@ -41,6 +43,8 @@ struct Registers {
     to_writes: Option<(u32, Exception)>,
     /// It answers that to every read.
     to_reads: Option<Exception>,
+    /// It is of a family of its own.
+    family: Option<family_drive::FamilyDrive>,
 }
 
 impl Registers {
@@ -61,6 +65,9 @@ impl Registers {
         }
         if let (Some(exception), RequestPdu::Read { .. }) = (self.to_reads, pdu) {
             return Ended::Reply(Reply::Exception(exception));
+        }
+        if let Some(family) = &mut self.family {
+            return Ended::Reply(family.answer(pdu));
         }
         let reply = match pdu {
             RequestPdu::Read {
@@ -127,6 +134,19 @@ impl Rig {
         cycle: Duration,
         other: impl Fn(DriveSpec) -> DriveSpec,
     ) -> Rig {
+        let mut rig = Rig::empty(drives, profile, protocol, cycle, other);
+        rig.run(Duration::from_secs(3));
+        rig
+    }
+
+    /// Nothing was sent yet.
+    fn empty(
+        drives: u8,
+        profile: &str,
+        protocol: Protocol,
+        cycle: Duration,
+        other: impl Fn(DriveSpec) -> DriveSpec,
+    ) -> Rig {
         let profile = drivegate_testkit::profile(profile);
         let spec = |address: u8| DriveSpec {
             turnaround: Duration::ZERO,
@@ -156,7 +176,7 @@ impl Rig {
         let silence = Duration::from_micros(1750);
         let mut master = Master::new(bus.clone(), &options, silence, stats.clone(), &Handover::default(), now);
         master.opened(now);
-        let mut rig = Rig {
+        Rig {
             bus,
             master,
             stats,
@@ -165,9 +185,28 @@ impl Rig {
             news: Vec::new(),
             wire: Vec::new(),
             now,
+        }
+    }
+
+    /// Another bus takes the place of this one.
+    fn begin_anew(&mut self, before: &Handover) {
+        let options = BusOptions {
+            response_timeout: Duration::from_millis(100),
+            retries: 1,
+            silence: Silence::Spec,
+            line: LineOptions::default(),
+            mode: Default::default(),
         };
-        rig.run(Duration::from_secs(3));
-        rig
+        let silence = Duration::from_micros(1750);
+        self.master = Master::new(
+            self.bus.clone(),
+            &options,
+            silence,
+            self.stats.clone(),
+            before,
+            self.now,
+        );
+        self.master.opened(self.now);
     }
 
     /// One exchange, or the wait for the next one.

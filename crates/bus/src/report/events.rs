@@ -126,6 +126,14 @@ impl Report {
         });
     }
 
+    pub(super) fn refresh_ended(&self, index: DriveIndex, why: &str) {
+        let name = self.image.drives.get(index).map_or("?", |image| &image.spec.name);
+        tracing::info!(
+            target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %name,
+            "what was ordered is no longer written again (refresh): {why}"
+        );
+    }
+
     pub(super) fn runs_unsupervised(&self, index: DriveIndex, adopted: Adopted) {
         let then = match adopted {
             Adopted::Yes => "its lease starts now (supervision.adopt)",

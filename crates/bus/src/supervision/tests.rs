@@ -65,7 +65,7 @@ impl SupervisedDrive {
             ..controlled("d", "b", 1, profile)
         };
         SupervisedDrive {
-            drive: DriveState::new(&spec.profile, Duration::ZERO),
+            drive: DriveState::new(&spec, Duration::ZERO),
             bus: handle(bus_spec("b"), image(spec)),
             stats: Arc::default(),
             news: Vec::new(),
@@ -149,7 +149,7 @@ impl SupervisedDrive {
         self.drive
             .close(&Outcome::ShuttingDown, Interruption::ShuttingDown, self.now);
         let lease = self.drive.supervision.lease();
-        self.drive = DriveState::new(&spec.profile, Duration::ZERO);
+        self.drive = DriveState::new(&spec, Duration::ZERO);
         self.bus = handle(self.bus.image.spec.clone(), image(spec));
         self.drive.supervision.take_over(lease);
     }

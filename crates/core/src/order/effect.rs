@@ -2,7 +2,7 @@
 
 use super::{Order, Touched, Urgency, written};
 use crate::codec::Table;
-use crate::drive::{DriveIndex, ModelPoint, PointIndex, Profile, Source};
+use crate::drive::{DriveIndex, ModelPoint, Profile};
 
 /// What a command requires of the hold of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -94,7 +94,7 @@ impl Effect {
                     let is = |point: ModelPoint| {
                         profile
                             .model_index(point)
-                            .is_some_and(|own| behind(profile, own) == behind(profile, *index))
+                            .is_some_and(|own| profile.behind(own) == profile.behind(*index))
                     };
                     if is(ModelPoint::Run) {
                         effect.run = Some(value.as_bool());
@@ -115,29 +115,10 @@ impl Effect {
     }
 }
 
-/// The point whose register accepts the commands for a point.
-fn behind(profile: &Profile, index: PointIndex) -> PointIndex {
-    let mut at = index;
-    // A point rests on one with a register, over one that takes its commands.
-    for _ in 0..4 {
-        let Some(point) = profile.points.get(at) else { return at };
-        let next = match (&point.source, point.write_to) {
-            (_, Some(target)) => Some(target),
-            (Source::Derived(derived), None) => derived.band().map(|(of, ..)| of),
-            (Source::Raw(_), None) => None,
-        };
-        match next {
-            Some(next) => at = next,
-            None => return at,
-        }
-    }
-    at
-}
-
 fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
     let register = |point: ModelPoint| {
         let index = profile.model_index(point)?;
-        profile.points.get(behind(profile, index))?.raw()
+        profile.points.get(profile.behind(index))?.raw()
     };
     let covered = |point: ModelPoint| {
         register(point).is_some_and(|raw| items.iter().any(|(address, _)| raw.covers(table, *address)))

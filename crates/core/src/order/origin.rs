@@ -201,7 +201,7 @@ impl Origin {
     }
 
     /// Whether a drill gives the order.
-    pub(crate) fn is_drill(&self) -> bool {
+    pub fn is_drill(&self) -> bool {
         self.acting == Acting::Drill
     }
 

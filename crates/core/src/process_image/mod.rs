@@ -59,6 +59,8 @@ pub struct DriveImage {
     supervisions: AtomicU64,
     supervision_failures: AtomicU64,
     unsupervised: AtomicBool,
+    refreshing: AtomicBool,
+    refresh_writes: AtomicU64,
     /// Values of parameters that the gateway wrote since they were read last, and when, by address.
     written: Mutex<BTreeMap<u16, (u16, Instant)>>,
 }
@@ -84,6 +86,8 @@ impl DriveImage {
             supervisions: AtomicU64::new(0),
             supervision_failures: AtomicU64::new(0),
             unsupervised: AtomicBool::new(false),
+            refreshing: AtomicBool::new(false),
+            refresh_writes: AtomicU64::new(0),
             written: Mutex::default(),
         }
     }
@@ -231,6 +235,26 @@ impl DriveImage {
     /// Whether the drive has supervision, but runs without a lease: no client is known to have commanded it.
     pub fn is_unsupervised(&self) -> bool {
         self.unsupervised.load(Ordering::Relaxed)
+    }
+
+    /// Notes whether what was ordered last is being written again for the drive's own timeout.
+    pub fn set_refreshing(&self, refreshing: bool) {
+        self.refreshing.store(refreshing, Ordering::Relaxed);
+    }
+
+    /// Whether what was ordered last is being written again for the drive's own timeout.
+    pub fn is_refreshing(&self) -> bool {
+        self.refreshing.load(Ordering::Relaxed)
+    }
+
+    /// Counts a write request of a refresh.
+    pub fn count_refresh_write(&self) {
+        self.refresh_writes.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Write requests of refreshes so far.
+    pub fn refresh_writes(&self) -> u64 {
+        self.refresh_writes.load(Ordering::Relaxed)
     }
 
     /// Counts a try of the action of a lease, or of the stop of a shutdown, that failed.

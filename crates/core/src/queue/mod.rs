@@ -402,6 +402,12 @@ impl Pending {
         commands.filter_map(Command::client_waits_until).max()
     }
 
+    /// Whether an order to that drive waits, a stop that `min_run` delays apart.
+    pub fn awaits(&self, drive: DriveIndex) -> bool {
+        let waits = |c: &Command| c.reaches(drive) && c.urgency() != Urgency::Read && !c.is_delayed_stop();
+        self.stopped.contains(&drive) || self.waiting.iter().any(waits)
+    }
+
     /// Ends and removes the commands that `which` selects.
     pub fn remove(&mut self, now: Instant, outcome: &Outcome, which: impl Fn(&Command) -> bool) {
         let mut index = 0;

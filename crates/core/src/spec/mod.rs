@@ -106,6 +106,8 @@ pub struct DriveSpec {
     pub raw_writes: RawWrites,
     /// The permitted access to its parameters.
     pub params: ParamsAccess,
+    /// How often what was ordered last is written again, for its own timeout; none where it is not.
+    pub refresh: Option<Duration>,
 }
 
 /// A value that makes a recording when it holds for a time.
@@ -195,6 +197,7 @@ impl DriveSpec {
             triggers: Vec::new(),
             raw_writes: RawWrites::Points,
             params: ParamsAccess::Read,
+            refresh: None,
         }
     }
 

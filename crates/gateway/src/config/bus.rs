@@ -66,7 +66,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
     reader.finish();
     let access = |mut spec: DriveSpec| {
         if options.mode == Mode::Listen {
-            spec.access = Access::Listen;
+            (spec.access, spec.refresh) = (Access::Listen, None);
         }
         spec
     };
@@ -149,6 +149,7 @@ fn check_listening(reader: &Reader<'_>, drives: &[drive::Found]) {
             (control, "access = \"control\"", "access"),
             (drive.lease.as_ref(), "supervision", "supervision"),
             (drive.shutdown_stop.as_ref(), "on_shutdown = \"stop\"", "on_shutdown"),
+            (drive.refresh.as_ref(), "refresh", "refresh"),
         ];
         for (place, wish, key) in wishes {
             let Some(place) = place else { continue };

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
+use std::time::Duration;
 
 use super::key::{Key, Number};
 use super::keys::{ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, SUPERVISION, TRIGGER};
@@ -34,6 +35,8 @@ pub(super) struct Found {
     pub(super) limits: Place,
     pub(super) lease: Option<Place>,
     pub(super) shutdown_stop: Option<Place>,
+    /// Place of a `refresh` that is written and not off.
+    pub(super) refresh: Option<Place>,
     pub(super) guards: Guards,
     pub(super) spec: Option<DriveSpec>,
 }
@@ -61,6 +64,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let frequency_range = read_frequencies(reader);
     let limits = read_limits(reader, profile.as_deref(), frequency_range.as_ref());
     let supervision = read_supervision(reader, profile.as_deref(), &limits);
+    let refresh = read_refresh(reader, profile.as_deref(), access, supervision.as_ref());
     let on_shutdown = read_on_shutdown(reader, profile.as_deref());
     let turnaround = DRIVE.turnaround.read(reader);
     let triggers = read_triggers(reader, profile.as_deref());
@@ -91,6 +95,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             triggers,
             raw_writes,
             params,
+            refresh,
         }),
         _ => None,
     };
@@ -105,9 +110,51 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             .has(DRIVE.supervision.name)
             .then(|| DRIVE.supervision.place(reader)),
         shutdown_stop: (on_shutdown == OnShutdown::Stop).then(|| DRIVE.on_shutdown.place(reader)),
+        refresh: DRIVE
+            .refresh
+            .written(reader)
+            .flatten()
+            .map(|_| DRIVE.refresh.place(reader)),
         guards,
         spec,
     }
+}
+
+/// How often what was ordered is written again: as written, or as the profile says for a drive with a lease of its own.
+fn read_refresh(
+    reader: &Reader<'_>,
+    profile: Option<&Profile>,
+    access: Access,
+    supervision: Option<&Supervision>,
+) -> Option<Duration> {
+    let key = DRIVE.refresh.name;
+    let repeats = profile.map(Profile::repeats);
+    if !reader.has(key) {
+        let may = access == Access::Control && supervision.is_some() && repeats.is_some_and(|repeats| repeats.is_ok());
+        return profile?.control.as_ref()?.refresh.filter(|_| may);
+    }
+    let every = DRIVE.refresh.read(reader).flatten()?;
+    if access != Access::Control {
+        reader.problem(
+            key,
+            "nothing is written to a drive that is only monitored, so nothing is written again",
+            "set access = \"control\" for the drive, or leave `refresh` out",
+        );
+    } else if !reader.has(DRIVE.supervision.name) {
+        reader.problem(
+            key,
+            "what feeds the drive's own timeout needs a lease of its own, or the motor would run on without its client",
+            "add [bus.drive.supervision], or leave `refresh` out",
+        );
+    }
+    if let (Some(Err(why)), Some(profile)) = (repeats, profile) {
+        reader.problem(
+            key,
+            format!("nothing can be written again for profile `{}`: {why}", profile.name),
+            "leave `refresh` out",
+        );
+    }
+    Some(every)
 }
 
 /// What the drive does when the gateway stops: it cannot be stopped where its profile does not write `run`.

@@ -6,8 +6,9 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::bus::supervision::Lease;
+use crate::bus::master::Carried;
 use crate::config::BusSettings;
+use crate::drive::control::Control;
 use crate::event::{Event, EventKind};
 use crate::plant::BusHandle;
 use crate::process_image::{Access, DriveSpec, Machine};
@@ -21,13 +22,15 @@ const MOST_BUSES: usize = 64;
 #[derive(Debug, Default)]
 pub(super) struct Leases {
     left: BTreeMap<Machine, Left>,
-    parted: BTreeMap<Machine, (Instant, Lease)>,
+    parted: BTreeMap<Machine, (Instant, Carried)>,
 }
 
 /// A lease, and what the drive was called that had it.
 #[derive(Debug)]
 struct Left {
-    lease: Lease,
+    carried: Carried,
+    /// By which it was commanded.
+    control: Option<Control>,
     bus: String,
     drive: String,
 }
@@ -38,7 +41,7 @@ pub(super) struct Parted(Arc<Mutex<Kept>>);
 
 #[derive(Debug, Default)]
 struct Kept {
-    leases: BTreeMap<Machine, (Instant, Lease)>,
+    leases: BTreeMap<Machine, (Instant, Carried)>,
     buses: Vec<(Instant, BusHandle)>,
 }
 
@@ -83,9 +86,12 @@ impl Parted {
     pub(super) fn keep(&self, leases: &Leases, stopped: &[BusHandle], now: Instant) {
         let mut kept = self.lock();
         kept.leases.clone_from(&leases.parted);
-        let left = leases.left.iter().filter(|(_, left)| left.lease.ends().is_some());
+        let left = leases
+            .left
+            .iter()
+            .filter(|(_, left)| left.carried.lease.ends().is_some());
         kept.leases
-            .extend(left.map(|(machine, left)| (machine.clone(), (now, left.lease))));
+            .extend(left.map(|(machine, left)| (machine.clone(), (now, left.carried.alone()))));
         kept.buses.extend(stopped.iter().map(|bus| (now, bus.clone())));
         let excess = kept.buses.len().saturating_sub(MOST_BUSES);
         kept.buses.drain(..excess);
@@ -94,11 +100,12 @@ impl Parted {
 
 impl Leases {
     /// A bus was stopped; `leases` are those of its drives, in their order. A drive that could have none has left none.
-    pub(super) fn left(&mut self, bus: &BusSettings, leases: Vec<Lease>) {
+    pub(super) fn left(&mut self, bus: &BusSettings, leases: Vec<Carried>) {
         let all = bus.drives.iter().zip(leases);
-        for (drive, lease) in all.filter(|(drive, _)| is_commanded(drive) && drive.supervision.is_some()) {
+        for (drive, carried) in all.filter(|(drive, _)| is_commanded(drive) && drive.supervision.is_some()) {
             let left = Left {
-                lease,
+                carried,
+                control: drive.profile.control.clone(),
                 bus: bus.spec.name.clone(),
                 drive: drive.name.clone(),
             };
@@ -110,19 +117,25 @@ impl Leases {
 
     /// Those with which the drives of a new bus go on at `now`, in their order. One that is commanded no more has none. The time of one
     /// stood while its drive was left out, as while a drive is offline.
-    pub(super) fn of(&mut self, bus: &BusSettings, now: Instant) -> Vec<Lease> {
+    pub(super) fn of(&mut self, bus: &BusSettings, now: Instant) -> Vec<Carried> {
         let mut lease = |drive: &DriveSpec| {
             let machine = bus.spec.machine(drive);
             if !is_commanded(drive) {
                 return None;
             }
-            let left = self.left.remove(&machine).map(|left| left.lease);
+            let left = self.left.remove(&machine);
             if drive.supervision.is_none() {
                 // Its time stands until a configuration supervises the drive again.
-                self.parted.extend(left.map(|lease| (machine, (now, lease))));
+                self.parted
+                    .extend(left.map(|left| (machine, (now, left.carried.alone()))));
                 return None;
             }
-            let back = |(at, lease): (Instant, Lease)| lease.after(now.saturating_duration_since(at));
+            // What is refreshed goes on only where the drive is commanded as before.
+            let left = left.map(|left| match left.control == drive.profile.control {
+                true => left.carried,
+                false => left.carried.alone(),
+            });
+            let back = |(at, carried): (Instant, Carried)| carried.after(now.saturating_duration_since(at));
             left.or_else(|| self.parted.remove(&machine).map(back))
         };
         bus.drives
@@ -134,7 +147,7 @@ impl Leases {
     /// What happened to the others.
     pub(super) fn ended(self, time: SystemTime) -> impl Iterator<Item = Event> {
         self.left.into_iter().filter_map(move |(machine, left)| {
-            let ends = left.lease.ends()?;
+            let ends = left.carried.lease.ends()?;
             let text = format!(
                 "the reload ended the lease of {} ({machine}), which has no drive to command in the new \
                  configuration: {ends}; it continues if a reload within {} s brings the drive back",

@@ -29,6 +29,10 @@ pub struct Control {
     pub fault_reset: Option<Reset>,
     /// A reset while a run command is set starts the motor.
     pub restarts_on_reset: bool,
+    /// Time between two refreshes, where the family needs them: its timeout counts writes only.
+    pub refresh: Option<Duration>,
+    /// A refresh of the reference alone feeds that timeout, too.
+    pub refresh_with_reference: bool,
 }
 
 /// A register or coil that takes commands.

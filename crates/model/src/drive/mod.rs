@@ -14,6 +14,7 @@ pub mod plan;
 pub mod profile;
 mod profile_file;
 pub mod raw_writes;
+mod refresh;
 pub mod why;
 
 pub use commissioning::{Commissioning, Step};
@@ -24,6 +25,7 @@ pub use model::{ModelPoint, Quality, Sample, State, Value};
 pub use plan::{Plan, PlannedRead};
 pub use profile::{Point, PollClass, Probe, Profile, Raw, Source};
 pub use raw_writes::RawWrites;
+pub use refresh::{REFRESH, Repeats};
 
 /// Name of the point with the drive's own response to a silent master; 0 is no response. For Vacon NX parameter
 /// P2.7.22.

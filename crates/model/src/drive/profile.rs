@@ -496,6 +496,8 @@ impl Profile {
                 hold: 2 * self.update_period,
             }),
             restarts_on_reset: false,
+            refresh: None,
+            refresh_with_reference: false,
         })
     }
 

@@ -73,6 +73,8 @@ pub(super) struct Drive<'d> {
     /// For how long an ordinary stop still waits.
     #[serde(skip_serializing_if = "Option::is_none")]
     stop_waits_ms: Option<u64>,
+    /// Whether what was ordered last is being written again for the drive's own timeout.
+    refreshing: bool,
     /// Who holds it, where `[authority]` is on.
     #[serde(flatten)]
     #[schema(value_type = HoldFields)]
@@ -124,6 +126,7 @@ impl<'d> Drive<'d> {
             why: why.causes,
             held: image.hold.why().map(|why| why.to_string()),
             stop_waits_ms: drive.stop_waits(clock.now).map(millis),
+            refreshing: image.is_refreshing(),
             hold: drive.hold_view(None, clock.now).map(|(view, _)| view.into()),
             stops: None,
             turnaround_ms: image.turnaround().map(fine_millis),

@@ -84,6 +84,10 @@ fn drives(plant: &Plant, north: &NorthState, now: Instant, all: &mut Families) {
         "drivegate_drive_unsupervised",
         "1 if a drive with supervision runs without a lease, else 0.",
     );
+    let refresh_writes = all.counter(
+        "drivegate_refresh_writes_total",
+        "Write requests by which what was ordered is written again for the drive's own timeout.",
+    );
     let held = all.gauge(
         "drivegate_drive_held",
         "1 for the rank of the client that holds the drive; no series while nobody does.",
@@ -116,6 +120,9 @@ fn drives(plant: &Plant, north: &NorthState, now: Instant, all: &mut Families) {
         all.add(failed, labels.clone(), failures);
         if image.spec.supervision.is_some() {
             all.add(unsupervised, labels.clone(), image.is_unsupervised());
+        }
+        if image.spec.refresh.is_some() {
+            all.add(refresh_writes, labels.clone(), image.refresh_writes());
         }
         let guards = drive.bus.queue.guards().filter(|guards| guards.guards(drive.index));
         if let Some(counted) = guards.map(|guards| guards.refused(drive.index)) {

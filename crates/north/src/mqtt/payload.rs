@@ -29,6 +29,8 @@ pub(super) struct StateContent {
     pub(super) blocked_by: Vec<String>,
     /// For how long an ordinary stop still waits, in whole seconds.
     pub(super) stop_waits: Option<u64>,
+    /// Whether what was ordered is being written again; none where it never is.
+    pub(super) refreshing: Option<bool>,
     /// Who holds it; none where `[authority]` is off.
     pub(super) hold: Option<HoldFields>,
     /// Value (only if good) and quality of each published point.
@@ -58,6 +60,7 @@ impl StateContent {
             quality: reading.overall(),
             blocked_by,
             stop_waits: stop_waits.map(|time| u64::try_from(time.as_millis().div_ceil(1000)).unwrap_or(u64::MAX)),
+            refreshing: None,
             hold: hold.map(HoldFields::from),
             points: points.map(shown).collect(),
         }
@@ -97,6 +100,9 @@ impl Serialize for StateObject<'_> {
         map.serialize_entry("blocked_by", &self.shown.blocked_by)?;
         if let Some(seconds) = self.shown.stop_waits {
             map.serialize_entry("stop_waits_ms", &seconds.saturating_mul(1000))?;
+        }
+        if let Some(refreshing) = self.shown.refreshing {
+            map.serialize_entry("refreshing", &refreshing)?;
         }
         if !self.profile.verified {
             map.serialize_entry("profile_verified", &false)?;
@@ -327,6 +333,7 @@ mod tests {
                 quality: Quality::Good,
                 blocked_by: Vec::new(),
                 stop_waits: None,
+                refreshing: None,
                 points: vec![(value.map(Value::Integer), Quality::Good)],
             };
             let object = StateObject {
@@ -359,6 +366,7 @@ mod tests {
             blocked_by: Vec::new(),
             hold: None,
             stop_waits: None,
+            refreshing: None,
             points: Vec::new(),
         };
         let object = StateObject {

@@ -346,7 +346,10 @@ impl DriveTopics {
         let (drive, indices) = (&self.drive, self.indices.iter().copied());
         let words = drive.why(reading).words();
         let hold = drive.hold_view(None, reading.now).map(|(view, _)| view);
-        StateContent::of(reading, indices, words, drive.stop_waits(reading.now), hold)
+        StateContent {
+            refreshing: reading.spec.refresh.map(|_| drive.image.is_refreshing()),
+            ..StateContent::of(reading, indices, words, drive.stop_waits(reading.now), hold)
+        }
     }
 
     /// The line of the log about a state that is published without some of its points.

@@ -67,6 +67,10 @@ keys! {
         /// What may be done with its [parameters](parameters.md#restoring): `"read"`, or `"write"`: they may also be
         /// restored, which needs `access = "control"`.
         params: ParamsAccess = Words(&[("read", ParamsAccess::Read), ("write", ParamsAccess::Write)]), default "read";
+        /// How often the control word and the reference that a client ordered last are [written
+        /// again](commands.md#refresh), for a drive whose own timeout counts only writes. Needs `access = "control"` and
+        /// `supervision`.
+        refresh: Option<Duration> = REPEATED, or "the profile's where the drive has `supervision`, else `\"off\"`";
         /// Values that trigger a [recording](history.md#recordings), in addition to faults.
         trigger: Present = Own { schema: || each(Trigger::schema()), range: "[[bus.drive.trigger]]" }, or "none";
     }

@@ -39,6 +39,22 @@ pub(super) const IDLE_TIMEOUT: Parsed<Option<Duration>> = Parsed {
     range: "\"off\", or \"1s\" to \"168h\"",
 };
 
+/// How often what was ordered is written again.
+pub(super) const REPEATED: Parsed<Option<Duration>> = Parsed {
+    parse: parse_refresh,
+    words: &["off"],
+    pattern: DURATION,
+    range: "\"off\", or \"100ms\" to \"60s\"",
+};
+
+/// A duration, or `None` for the word `off`.
+fn parse_refresh(text: &str) -> Result<Option<Duration>, Finding> {
+    match text {
+        "off" => Ok(None),
+        text => Time(crate::drive::REFRESH).check(parse_duration(text)?).map(Some),
+    }
+}
+
 /// A duration, or `None` for the word `off`.
 fn parse_idle(text: &str) -> Result<Option<Duration>, Finding> {
     match text {

@@ -4,6 +4,14 @@ use super::*;
 use crate::bus::supervision::Lease;
 use crate::config::Settings;
 
+/// A lease that runs since then.
+fn held(since: Instant) -> Carried {
+    Carried {
+        lease: Lease::held(since),
+        ..Carried::default()
+    }
+}
+
 const LEASE: &str = "supervision = { timeout = \"5s\" }\n";
 
 /// One bus at that port with these drives: name, address and access.
@@ -27,11 +35,11 @@ fn bus(port: &str, drives: &[(&str, u8, &str)]) -> BusSettings {
 /// The leases with which `after` goes on when the first drive of `before` had one and the second had none, and what is told.
 fn reloaded(before: &BusSettings, after: &BusSettings) -> (Vec<bool>, Vec<String>) {
     let mut leases = Leases::default();
-    leases.left(before, vec![Lease::held(Instant::now()), Lease::default()]);
+    leases.left(before, vec![held(Instant::now()), Carried::default()]);
     let of = leases
         .of(after, Instant::now())
         .into_iter()
-        .map(|lease| lease.ends().is_some())
+        .map(|carried| carried.lease.ends().is_some())
         .collect();
     let told = leases.ended(SystemTime::now()).map(|event| {
         assert_eq!(event.kind, EventKind::Supervision);
@@ -80,7 +88,7 @@ fn a_lease_goes_with_the_machine_and_where_it_ends_that_is_told() {
 /// Reloads from the first bus to the last one, each so long after the one before; how long ago the lease of `pump-1` was renewed then.
 fn over(buses: &[&BusSettings], pause: Duration) -> Option<Duration> {
     let (parted, mut now) = (Parted::default(), Instant::now());
-    let mut held = vec![Lease::held(now); buses[0].drives.len()];
+    let mut held = vec![self::held(now); buses[0].drives.len()];
     for pair in buses.windows(2) {
         now += pause;
         let (mut leases, _) = parted.recall(now);
@@ -94,7 +102,7 @@ fn over(buses: &[&BusSettings], pause: Duration) -> Option<Duration> {
         .position(|drive| drive.name == "pump-1")?;
     (0..600)
         .map(Duration::from_secs)
-        .find(|ago| now.checked_sub(*ago).map(Lease::held) == Some(held[place]))
+        .find(|ago| now.checked_sub(*ago).map(self::held) == Some(held[place]))
 }
 
 #[test]

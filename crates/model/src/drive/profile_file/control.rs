@@ -7,6 +7,7 @@ use super::super::control::{Always, Control, ControlItem, Mask, OwnWord, Reset, 
 use super::super::derive::Derived;
 use super::super::model::ModelPoint;
 use super::super::profile::{AddressRange, Form, Point, PollClass, Raw, Source};
+use super::super::refresh::REFRESH;
 use super::derived::point_of;
 use super::place::parse_place;
 use super::ranges::Offsets;
@@ -53,6 +54,15 @@ pub(super) fn read(reader: &Reader<'_>, around: &Around<'_>) -> Option<Control> 
     let also_stop = read_stops(&table, around);
     let fault_reset = read_reset(&table, around);
     let restarts_on_reset = table.or("restarts_on_reset", false);
+    let refresh = read_refresh(&table);
+    let refresh_with = table.parsed("refresh_with", |text| match text {
+        "word" => Ok(false),
+        "reference" => Ok(true),
+        other => Err(Finding::new(
+            format!("unknown word `{other}`"),
+            "write \"word\" or \"reference\"",
+        )),
+    });
     for key in ["run", "stop"].into_iter().filter(|key| !table.has(key)) {
         table.problem(key, format!("`{key}` is missing"), "say which word does it");
     }
@@ -67,6 +77,8 @@ pub(super) fn read(reader: &Reader<'_>, around: &Around<'_>) -> Option<Control> 
         reverse,
         fault_reset,
         restarts_on_reset,
+        refresh,
+        refresh_with_reference: refresh_with.unwrap_or_default(),
     };
     check(&table, &control);
     Some(control)
@@ -382,6 +394,16 @@ pub(super) fn read_mask(table: &Reader<'_>, around: &Around<'_>, key: &str) -> O
         mask: u64::from(mask),
         is: u64::from(is),
     })
+}
+
+/// `refresh`: how often what was ordered is written again, where the family needs that.
+fn read_refresh(table: &Reader<'_>) -> Option<Duration> {
+    let key = "refresh";
+    let every: Duration = table.optional(key)?;
+    if !REFRESH.contains(&every) {
+        table.problem(key, "the time is out of range", "write 100ms to 60s");
+    }
+    Some(every)
 }
 
 fn read_reset(table: &Reader<'_>, around: &Around<'_>) -> Option<Reset> {

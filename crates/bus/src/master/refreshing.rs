@@ -1,0 +1,239 @@
+//! When the refresh of a drive has its turn, and what follows from the replies to its steps.
+
+use std::time::Instant;
+
+use super::permission::AtTurn;
+use super::{Master, Purpose, Turn, TurnEnd};
+use crate::codec::{Reply, RequestPdu, Table};
+use crate::drive::{DriveIndex, PlannedRead, PollClass};
+use crate::drive_state::DriveState;
+use crate::news::News;
+use crate::order::{Arrival, Effect, Effects, Intent, Order, Origin, Outcome, SourceKind, Touched, Window};
+use crate::permit::{Ask, Facts, Stage, Verdict};
+use crate::refresh::{Around, End};
+use crate::transaction::Ended;
+
+/// Whether a refresh may write.
+enum May {
+    Yes,
+    NotNow,
+    No(End),
+}
+
+impl Master {
+    /// Ends refreshes by what time, samples and accepted orders have changed, and tells which go on.
+    pub(super) fn look_at_refreshes(&mut self, now: Instant, news: &mut Vec<News>) {
+        let Master { bus, drives, .. } = self;
+        for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
+            if image.spec.refresh.is_none() {
+                continue;
+            }
+            if drive.refresh.has_begun() && !drive.has_runs() {
+                let queue = bus.queue.lock();
+                let around = Around {
+                    stops: queue.gate.stops(index),
+                    delayed: queue.stop_waits(index, now).is_some(),
+                    held: drive.supervision.is_held(),
+                };
+                drop(queue);
+                let ended = drive.refresh.look(&image.reading(now, drive.fresh), around);
+                drive.refresh_ended = ended.or(drive.refresh_ended.take());
+            }
+            if let Some(why) = drive.refresh_ended.take() {
+                news.push(News::RefreshEnded {
+                    drive: index,
+                    why: why.to_string(),
+                });
+            }
+            image.set_refreshing(drive.refresh.is_going());
+        }
+    }
+
+    /// The next step of a round that has read: nothing but stops, and orders to that drive, goes between its frames.
+    pub(super) fn refresh_goes_on(&mut self, now: Instant) -> Option<Turn> {
+        let under_way = |(_, drive): &(DriveIndex, &DriveState)| drive.refresh.is_under_way() && !drive.has_runs();
+        let (index, _) = self.drives.enumerate().find(under_way)?;
+        self.refresh_step(index, now)
+    }
+
+    /// The first step of the round that is due longest. Between two rounds a poll has its turn, unless the line is `idle`.
+    pub(super) fn refresh(&mut self, idle: bool, now: Instant) -> Option<Turn> {
+        if self.refreshed_last && !idle {
+            return None;
+        }
+        let (_, index) = self.due_refreshes().filter(|(due, _)| *due <= now).min()?;
+        match self.may_refresh(index, Stage::Turn, now) {
+            May::Yes => self.refresh_step(index, now),
+            May::NotNow => None,
+            May::No(why) => {
+                self.end_refresh(index, why);
+                None
+            }
+        }
+    }
+
+    /// When the next round is due.
+    pub(super) fn next_refresh(&self) -> Option<Instant> {
+        self.due_refreshes().map(|(due, _)| due).min()
+    }
+
+    fn due_refreshes(&self) -> impl Iterator<Item = (Instant, DriveIndex)> + '_ {
+        let may = |index: DriveIndex, drive: &DriveState| {
+            let is_quiet = self.waits.quiet.is_some_and(|(quiet, _)| quiet == index);
+            !drive.has_runs() && !is_quiet && self.shutdown.is_none() && self.schedule.is_online(index)
+        };
+        let due = move |(index, drive): (DriveIndex, &DriveState)| {
+            let due = drive.refresh.due().filter(|_| may(index, drive))?;
+            Some((due, index))
+        };
+        self.drives.enumerate().filter_map(due)
+    }
+
+    /// The request of the present step, where the gate lets it pass.
+    fn refresh_step(&mut self, index: DriveIndex, now: Instant) -> Option<Turn> {
+        match self.may_refresh(index, Stage::Write, now) {
+            May::Yes => {}
+            May::NotNow => {
+                self.drives.get_mut(index)?.refresh.put_off(now);
+                return None;
+            }
+            May::No(why) => {
+                self.end_refresh(index, why);
+                return None;
+            }
+        }
+        let (drive, image) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index))?;
+        let profile = &image.spec.profile;
+        let pdu = drive.words.formed(drive.refresh.request(profile)?, profile);
+        if let Some(until) = drive.late.blocks(&pdu, now) {
+            drive.refresh.put_off(until);
+            return None;
+        }
+        Some(Turn {
+            drive: index,
+            purpose: Purpose::Refresh,
+            pdu,
+        })
+    }
+
+    /// Whether a frame of a refresh that was chosen earlier may still go.
+    pub(super) fn may_still_refresh(&mut self, turn: &Turn, now: Instant) -> bool {
+        let is_under_way = self
+            .drives
+            .get(turn.drive)
+            .is_some_and(|drive| drive.refresh.is_under_way());
+        is_under_way && matches!(self.may_refresh(turn.drive, Stage::Write, now), May::Yes)
+    }
+
+    /// The rules, asked in the name of the gateway: what stands is repeated, whoever holds the drive now.
+    fn may_refresh(&self, index: DriveIndex, stage: Stage, now: Instant) -> May {
+        let Some((drive, image)) = self.drives.get(index).zip(self.bus.image.drives.get(index)) else {
+            return May::NotNow;
+        };
+        if self.shutdown.is_some() || drive.has_runs() {
+            return May::NotNow;
+        }
+        let (runs, pdu) = (drive.refresh.runs(), drive.refresh.writes(&image.spec.profile));
+        let Some(pdu) = pdu else { return May::NotNow };
+        let effect = Effect {
+            stops: !runs,
+            reference: true,
+            ..Effect::default()
+        };
+        let order = Order::Write(pdu);
+        let touched = Touched::of(&order, &[], &image.spec.profile);
+        let window = Window {
+            arrival: Arrival::now(now),
+            expires: now + super::LOOK_ROUND,
+            waits: false,
+        };
+        let intent = Intent::new(index, order, Effects::on_one(index, effect, touched), window);
+        let facts = AtTurn::of(&self.drives, &self.bus.image.drives, now);
+        let seen = facts.seen(index);
+        let origin = Origin::new(SourceKind::Supervision, "refresh");
+        let ask = Ask {
+            stage,
+            now,
+            drive: index,
+            intent: &intent,
+            origin: &origin,
+            seen: seen.as_ref(),
+        };
+        let mut queue = self.bus.queue.lock();
+        if runs && queue.gate.stops(index) != drive.refresh.stops_before() && queue.stop_waits(index, now).is_none() {
+            return May::No(End::Stop);
+        }
+        if queue.awaits(index) {
+            return May::NotNow;
+        }
+        match queue.gate.ask(&ask) {
+            Verdict::Go => May::Yes,
+            Verdict::Wait(_) | Verdict::LookFirst => May::NotNow,
+            Verdict::Refuse(Outcome::Refused(refusal)) => May::No(End::Refused(refusal.to_string())),
+            Verdict::Refuse(outcome) => May::No(End::Refused(outcome.to_string())),
+        }
+    }
+
+    fn end_refresh(&mut self, index: DriveIndex, why: End) {
+        if let Some(drive) = self.drives.get_mut(index) {
+            drive.end_refresh(why);
+        }
+    }
+
+    /// A frame goes out: rounds of other drives read again before they write.
+    pub(super) fn others_before_refresh(&mut self, turn: &Turn) {
+        for ((index, drive), image) in self.drives.enumerate_mut().zip(&self.bus.image.drives) {
+            if drive.refresh.is_under_way() && !(turn.purpose == Purpose::Refresh && turn.drive == index) {
+                drive.refresh.others_go_first(&image.spec.profile);
+            }
+        }
+        if turn.purpose == Purpose::Refresh
+            && turn.pdu.is_write()
+            && let Some(image) = self.bus.image.drives.get(turn.drive)
+        {
+            image.count_refresh_write();
+        }
+    }
+
+    /// A step of a refresh has ended.
+    pub(super) fn refreshed(&mut self, turn: &Turn, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
+        self.schedule.refreshed(end.took);
+        self.refreshed_last = true;
+        let Some((drive, image)) = self
+            .drives
+            .get_mut(turn.drive)
+            .zip(self.bus.image.drives.get(turn.drive))
+        else {
+            return;
+        };
+        let Ended::Reply(reply) = end.ended else {
+            drive.refresh.not_answered(now);
+            return;
+        };
+        let is_answer = !matches!(reply, Reply::Exception(_));
+        if is_answer {
+            let believed = !drive.late.proves_nothing(&turn.pdu, end.began, now);
+            drive.late.answered(&turn.pdu, end.began, now);
+            if !believed {
+                drive.refresh.not_answered(now);
+                return;
+            }
+        }
+        if let Err(why) = drive.refresh.answered(&image.spec.profile, &reply, now) {
+            drive.end_refresh(why);
+        }
+        if let (RequestPdu::Read { table, start, count }, Some(words)) = (&turn.pdu, reply.words()) {
+            self.learn(turn.drive, read_of(*table, *start, *count), words, end.at, news);
+        }
+    }
+}
+
+fn read_of(table: Table, start: u16, count: u16) -> PlannedRead {
+    PlannedRead {
+        class: PollClass::Fast,
+        table,
+        start,
+        count,
+        wide: 0,
+    }
+}

@@ -1,0 +1,342 @@
+//! Refreshes of a drive of each kind of command word, in virtual time.
+
+use super::family_drive::FamilyDrive;
+use super::*;
+use crate::drive::Profile;
+use crate::order::written;
+
+const EVERY: Duration = Duration::from_secs(1);
+
+/// Whether the control word is repeated; else the reference alone is.
+const FAMILIES: [(&str, bool); 12] = [
+    ("abb-acs580", true),
+    ("siemens-g120", true),
+    ("schneider-altivar", true),
+    ("danfoss-fc", true),
+    ("yaskawa-v1000", true),
+    ("weg-cfw", true),
+    ("teco-f510", true),
+    ("toshiba-vf-s15", true),
+    ("vacon-10", true),
+    ("vacon-nx", true),
+    ("invt-goodrive", false),
+    ("delta-ms300", false),
+];
+
+struct Plant {
+    rig: Rig,
+    profile: Arc<Profile>,
+    name: &'static str,
+}
+
+impl Plant {
+    /// A drive that stands, and whose orders are repeated every second.
+    fn new(name: &'static str) -> Plant {
+        Plant::with(name, |spec| spec)
+    }
+
+    fn with(name: &'static str, other: impl Fn(DriveSpec) -> DriveSpec) -> Plant {
+        let profile = drivegate_testkit::profile(name);
+        let cycle = Duration::from_millis(100);
+        let mut rig = Rig::empty(1, name, Protocol::ModbusRtu, cycle, |spec| {
+            other(DriveSpec {
+                refresh: Some(EVERY),
+                supervision: Some(Settings {
+                    timeout: Duration::from_secs(3600),
+                    action: LeaseAction::Stop,
+                    adopt: false,
+                }),
+                ..spec
+            })
+        });
+        rig.drives[0].family = Some(FamilyDrive::new(&profile));
+        rig.run(Duration::from_secs(12));
+        Plant { rig, profile, name }
+    }
+
+    fn drive(&mut self) -> &mut FamilyDrive {
+        self.rig.drives[0].family.as_mut().unwrap()
+    }
+
+    fn order(&mut self, sets: &[(ModelPoint, Value)]) {
+        let image = &self.rig.bus.image.drives[0];
+        let index = |point| image.spec.profile.model_index(point).unwrap();
+        let order = Order::Points(sets.iter().map(|(point, value)| (index(*point), *value)).collect());
+        let admitted = admit(order, &image.reading(self.rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
+        let origin = Origin::new(SourceKind::Mqtt, "client");
+        let (ticket, mut answer) = Ticket::new(origin, "d", String::new(), true, self.rig.now, self.rig.stats.clone());
+        let window = window(self.rig.now, DEFAULT_EXPIRY);
+        let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
+        self.rig.bus.queue.submit(command, &(), self.rig.now);
+        let until = self.rig.now + DEFAULT_EXPIRY;
+        let outcome = loop {
+            self.rig.step();
+            if let Some(outcome) = outcome(&mut answer) {
+                break outcome;
+            }
+            assert!(self.rig.now < until, "{}: no answer", self.name);
+        };
+        assert!(outcome.is_ok(), "{}: {outcome:?}", self.name);
+    }
+
+    fn starts(&mut self) {
+        self.order(&[
+            (ModelPoint::SpeedReference, Value::Number(50.0)),
+            (ModelPoint::Run, Value::Bool(true)),
+        ]);
+        assert!(self.drive().runs, "{}", self.name);
+    }
+
+    fn stops(&mut self) {
+        self.order(&[(ModelPoint::Run, Value::Bool(false))]);
+        assert!(!self.drive().runs, "{}", self.name);
+    }
+
+    /// The refreshes of the next so many seconds, each with its time, and what was on the wire right before.
+    fn refreshes(&mut self, seconds: u64) -> Vec<(Instant, RequestPdu, Turn)> {
+        let from = self.rig.wire.len();
+        self.rig.run(Duration::from_secs(seconds));
+        let wire = &self.rig.wire[from..];
+        let writes = wire
+            .windows(2)
+            .filter(|pair| pair[1].1.purpose == Purpose::Refresh && pair[1].1.pdu.is_write());
+        writes
+            .map(|pair| (pair[1].0, pair[1].1.pdu.clone(), pair[0].1.clone()))
+            .collect()
+    }
+
+    /// Nothing is written again for so many seconds, and the image says so.
+    fn assert_ended(&mut self, why: &str) {
+        self.rig.run(Duration::from_millis(300));
+        let refreshes = self.refreshes(8);
+        assert!(refreshes.is_empty(), "{} {why}: {refreshes:?}", self.name);
+        assert!(!self.rig.bus.image.drives[0].is_refreshing(), "{} {why}", self.name);
+        let told = self
+            .rig
+            .news
+            .iter()
+            .any(|news| matches!(news, News::RefreshEnded { .. }));
+        assert!(told, "{} {why}: nothing is told", self.name);
+    }
+
+    fn is_reference(&self, pdu: &RequestPdu) -> bool {
+        let (table, items) = written(pdu).unwrap();
+        let of = |(address, _): &(u16, u16)| self.profile.is_repeated_reference(*address);
+        table == Table::Holding && items.iter().all(of)
+    }
+
+    fn has_word(&self, pdu: &RequestPdu) -> Option<u16> {
+        let at = self.profile.control.as_ref().unwrap().at;
+        let (table, items) = written(pdu).unwrap();
+        let here = items
+            .iter()
+            .find(|(address, _)| (table, *address) == (at.table, at.address));
+        here.map(|(_, word)| *word)
+    }
+}
+
+#[test]
+fn what_stands_is_written_again_once_a_period_behind_a_look() {
+    for (name, by_word) in FAMILIES {
+        let mut plant = Plant::new(name);
+        assert!(plant.refreshes(5).is_empty(), "{name}: nobody ordered anything");
+        plant.starts();
+        let word = plant.drive().word();
+        let began = plant.rig.now;
+        let refreshes = plant.refreshes(20);
+        assert!(
+            plant.drive().runs && plant.rig.bus.image.drives[0].is_refreshing(),
+            "{name}"
+        );
+        let fed: Vec<Instant> = refreshes
+            .iter()
+            .filter(|(_, pdu, _)| !by_word || plant.has_word(pdu).is_some())
+            .map(|(at, ..)| *at)
+            .collect();
+        let longest = [began].iter().chain(&fed).zip(&fed).map(|(a, b)| *b - *a).max();
+        assert!((17..=21).contains(&fed.len()), "{name}: {} in 20 s", fed.len());
+        assert!(longest < Some(Duration::from_millis(1400)), "{name}: {longest:?}");
+        for (_, pdu, before) in &refreshes {
+            if let Some(again) = plant.has_word(pdu) {
+                assert!(by_word && again == word, "{name}: {pdu:?}, not {word:#06x}");
+                assert!(
+                    before.purpose == Purpose::Refresh && !before.pdu.is_write(),
+                    "{name}: {before:?}"
+                );
+            } else {
+                assert!(plant.is_reference(pdu), "{name}: {pdu:?}");
+            }
+        }
+        let counted = plant.rig.bus.image.drives[0].refresh_writes();
+        assert_eq!(counted, refreshes.len() as u64, "{name}");
+        // Behind a stop its word.
+        plant.stops();
+        let stop = plant.drive().word();
+        let refreshes = plant.refreshes(10);
+        assert!(!plant.drive().runs, "{name}");
+        for (_, pdu, _) in &refreshes {
+            let word = plant.has_word(pdu);
+            assert!(word.is_none_or(|word| word == stop), "{name}: {pdu:?}");
+        }
+        assert!(
+            refreshes.len() >= 8,
+            "{name}: {} {:?}",
+            refreshes.len(),
+            plant
+                .rig
+                .news
+                .iter()
+                .filter(|n| matches!(n, News::RefreshEnded { .. }))
+                .collect::<Vec<_>>()
+        );
+    }
+}
+
+/// What ends a refresh, and nothing but an order begins it again.
+#[test]
+fn a_refresh_ends_for_good_with_everything_that_contradicts_it() {
+    type Event = fn(&mut Plant);
+    let events: [(&str, Event); 7] = [
+        ("panel stop", |plant| plant.drive().stand()),
+        ("fault", |plant| plant.drive().show(ModelPoint::Fault, true)),
+        ("local", |plant| plant.drive().show(ModelPoint::Remote, false)),
+        ("power cycle", |plant| plant.drive().power_cycle()),
+        ("outage", |plant| {
+            plant.rig.drives[0].silent = true;
+            plant.rig.run(Duration::from_secs(6));
+            plant.rig.drives[0].silent = false;
+        }),
+        ("broadcast", |plant| {
+            plant.rig.master.drives[0].heard_order(false, plant.rig.now);
+        }),
+        ("lease", |plant| {
+            let lease = Lease::held(plant.rig.now - Duration::from_secs(3601));
+            plant.rig.master.drives[0].supervision.take_over(lease);
+        }),
+    ];
+    for (name, _) in FAMILIES {
+        for (event, happens) in &events {
+            let mut plant = Plant::new(name);
+            let point = |point| plant.profile.model_index(point).is_some();
+            if *event == "local" && !point(ModelPoint::Remote) || *event == "fault" && !point(ModelPoint::Fault) {
+                continue;
+            }
+            plant.starts();
+            plant.rig.run(Duration::from_secs(5));
+            assert!(plant.rig.bus.image.drives[0].is_refreshing(), "{name} {event}");
+            happens(&mut plant);
+            plant.assert_ended(event);
+            // Once the cause is gone, too.
+            plant.drive().show(ModelPoint::Fault, false);
+            plant.drive().show(ModelPoint::Remote, true);
+            assert!(
+                plant.refreshes(5).is_empty(),
+                "{name} {event}: it begins again by itself"
+            );
+            if *event == "power cycle" {
+                assert!(!plant.drive().runs, "{name}");
+                plant.drive().run();
+                plant.order(&[(ModelPoint::SpeedReference, Value::Number(20.0))]);
+                let refreshes = plant.refreshes(5);
+                assert!(refreshes.is_empty(), "{name}: by a reference alone, {refreshes:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn from_the_acceptance_of_a_stop_no_run_word_is_repeated() {
+    for (name, _) in FAMILIES {
+        let mut plant = Plant::new(name);
+        plant.starts();
+        plant.rig.run(Duration::from_secs(5));
+        // The drive refuses the stop as long as it is busy.
+        let from = plant.rig.wire.len();
+        let _stop = plant.rig.switch(0, "client", false);
+        plant.rig.drives[0].to_writes = Some((u32::MAX, Exception::BUSY));
+        plant.rig.run(Duration::from_secs(5));
+        let refreshed = plant.rig.wire[from..]
+            .iter()
+            .any(|(_, turn)| turn.purpose == Purpose::Refresh);
+        assert!(!refreshed && plant.drive().runs, "{name}");
+        assert!(!plant.rig.bus.image.drives[0].is_refreshing(), "{name}");
+    }
+}
+
+#[test]
+fn another_masters_word_and_reference_stay() {
+    for (name, by_word) in FAMILIES {
+        let mut plant = Plant::new(name);
+        let control = plant.profile.control.clone().unwrap();
+        plant.starts();
+        plant.rig.run(Duration::from_secs(5));
+        if !control.is_read() || !by_word || control.own_word == crate::drive::control::OwnWord::Shadow {
+            continue;
+        }
+        // A bit that nothing gives a meaning, and the other direction.
+        for bit in [0x0100u16, 0x0800, 0x0002] {
+            let foreign = plant.drive().word() ^ bit;
+            if control.is_stop(control.at, foreign) {
+                continue;
+            }
+            plant.drive().write_word(foreign);
+            let refreshes = plant.refreshes(8);
+            assert!(
+                refreshes.iter().all(|(_, pdu, _)| plant.has_word(pdu).is_none()),
+                "{name} {foreign:#06x}: {refreshes:?}"
+            );
+            assert_eq!(plant.drive().word(), foreign, "{name}");
+            plant.stops();
+            plant.starts();
+            plant.rig.run(Duration::from_secs(3));
+        }
+    }
+}
+
+#[test]
+fn a_short_outage_suspends_a_refresh_and_it_goes_on_by_what_the_drive_shows() {
+    for (name, _) in FAMILIES {
+        let mut plant = Plant::new(name);
+        plant.starts();
+        plant.rig.run(Duration::from_secs(5));
+        plant.rig.drives[0].silent = true;
+        plant.rig.run(Duration::from_millis(1500));
+        plant.rig.drives[0].silent = false;
+        plant.rig.run(Duration::from_millis(1500));
+        let refreshes = plant.refreshes(5);
+        assert!(refreshes.len() >= 4, "{name}: {}", refreshes.len());
+    }
+}
+
+#[test]
+fn a_drive_that_knows_no_function_16_gets_both_apart() {
+    let mut plant = Plant::new("abb-acs580");
+    plant.drive().only_06 = true;
+    plant.starts();
+    let refreshes = plant.refreshes(10);
+    let singles = refreshes
+        .iter()
+        .filter(|(_, pdu, _)| matches!(pdu, RequestPdu::WriteRegister { .. }));
+    assert!(singles.count() >= 16, "{refreshes:?}");
+    assert!(plant.drive().runs);
+}
+
+#[test]
+fn what_was_handed_over_goes_on_with_a_lease_and_soon() {
+    let mut plant = Plant::new("danfoss-fc");
+    plant.starts();
+    plant.rig.run(Duration::from_secs(5));
+    let now = plant.rig.now;
+    let handover = plant.rig.master.ended(None, now);
+    assert_eq!(handover.leases.len(), 1);
+    for alone in [false, true] {
+        let carried = handover.leases[0];
+        let before = Handover {
+            leases: vec![if alone { carried.alone() } else { carried }],
+            ..Handover::default()
+        };
+        plant.rig.begin_anew(&before);
+        let refreshes = plant.refreshes(6);
+        assert_eq!(refreshes.is_empty(), alone, "{refreshes:?}");
+    }
+}
