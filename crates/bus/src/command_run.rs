@@ -167,6 +167,7 @@ impl CommandRun {
             check: Check::NotYet,
             blind: false,
             names_run: matches!(&order, Order::Points(values) if names_run(profile, values)),
+            stopped: false,
             running: true,
             masks: false,
             motor: None,

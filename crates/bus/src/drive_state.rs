@@ -321,8 +321,18 @@ impl DriveState {
                 .is_some_and(|stopped| running.at.is_some_and(|at| at > stopped))
     }
 
-    /// A stop arrived: started commands end, except clearing a reset bit that is set.
-    pub(super) fn purge(&mut self, image: &DriveImage, now: Instant) {
+    /// A stop goes before what is left of a started command.
+    pub(super) fn stop_goes_first(&mut self) {
+        if let Some(run) = self.run(Urgency::Command) {
+            run.stop_goes_first();
+        }
+    }
+
+    /// A stop arrived, which `min_run` delays or not: started commands end, except clearing a reset bit that is set.
+    pub(super) fn purge(&mut self, image: &DriveImage, is_delayed: bool, now: Instant) {
+        if !is_delayed {
+            self.stop_goes_first();
+        }
         let outcome = self.run(Urgency::Command).and_then(CommandRun::purge);
         if let Some(outcome) = outcome {
             self.end(Urgency::Command, &outcome, image, now);

@@ -472,6 +472,10 @@ fn may_stand(
     let Some(wants) = word.wants() else {
         return Ok(Verdict::AsItStands);
     };
+    // The drive may have taken a stop that it has not acknowledged, and its motor still comes down.
+    if known.stopped {
+        return Ok(Verdict::WithoutRun);
+    }
     let Some(holds) = holds(control, words, released) else {
         return Ok(Verdict::WithoutRun);
     };

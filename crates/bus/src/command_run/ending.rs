@@ -68,6 +68,11 @@ impl CommandRun {
         self.actions.is_empty().then(|| self.success())
     }
 
+    /// A stop of its motor goes before what it still sends, the end of a pulse.
+    pub fn stop_goes_first(&mut self) {
+        self.known.stopped = true;
+    }
+
     /// Ending it then sends no separate stop to the motor that it started.
     fn leave_motor(&mut self) {
         if self.phase == Phase::MotorStarted {

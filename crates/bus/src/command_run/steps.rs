@@ -116,6 +116,8 @@ pub(super) struct Known {
     pub(super) blind: bool,
     /// The command says whether the motor is to run.
     pub(super) names_run: bool,
+    /// A stop of the motor is on its way: nothing carries a run command any more, whatever the drive shows.
+    pub(super) stopped: bool,
     /// Whether the motor runs, as last reported.
     pub(super) running: bool,
     /// The drive changes bits of a register by itself.

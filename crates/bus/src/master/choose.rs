@@ -185,10 +185,16 @@ impl Master {
 
     /// Ends the started commands of a drive after a stop.
     fn purge(&mut self, now: Instant) {
-        let stopped = self.bus.queue.lock().take_stopped();
-        for index in stopped {
+        let mut queue = self.bus.queue.lock();
+        let stopped = queue.take_stopped();
+        let stopped: Vec<(DriveIndex, bool)> = stopped
+            .into_iter()
+            .map(|index| (index, queue.stop_waits(index, now).is_some()))
+            .collect();
+        drop(queue);
+        for (index, is_delayed) in stopped {
             if let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) {
-                drive.purge(image, now);
+                drive.purge(image, is_delayed, now);
             }
         }
     }
@@ -303,6 +309,7 @@ impl Master {
         }
         if command.is_stop() {
             begin_time(&mut command, now);
+            drive.stop_goes_first();
         }
         let starts = self.waits.starts.as_ref();
         let start = starts.and_then(|starts| starts.start_of(&command.intent, command.ticket.origin(), index));

@@ -39,7 +39,8 @@ impl Master {
                 let ended = drive.refresh.look(&image.reading(now, drive.fresh), around);
                 drive.refresh_ended = ended.or(drive.refresh_ended.take());
             }
-            if let Some(why) = drive.refresh_ended.take() {
+            // That of a stop is the usual one.
+            if let Some(why) = drive.refresh_ended.take().filter(|why| *why != End::Stop) {
                 news.push(News::RefreshEnded {
                     drive: index,
                     why: why.to_string(),

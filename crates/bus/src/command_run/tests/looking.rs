@@ -284,6 +284,7 @@ fn the_next_start_has_the_direction_that_was_kept() {
                     check: Check::InVain,
                     blind: true,
                     names_run: true,
+                    stopped: false,
                     running: false,
                     masks: false,
                     motor: None,

@@ -340,3 +340,59 @@ fn what_was_handed_over_goes_on_with_a_lease_and_soon() {
         assert_eq!(refreshes.is_empty(), alone, "{refreshes:?}");
     }
 }
+
+/// The drive is too busy for the stop: the end of a reset, which goes before the next try, carries no run command.
+#[test]
+fn no_end_of_a_reset_repeats_a_run_command_behind_a_stop() {
+    let mut ends = 0;
+    let resetting = [
+        "vacon-cx",
+        "eaton-hvx",
+        "eaton-svx",
+        "teco-7300pa",
+        "fuji-frenic",
+        "ls-g100",
+    ];
+    for name in FAMILIES.map(|(name, _)| name).into_iter().chain(resetting) {
+        let mut plant = Plant::with(name, |spec| DriveSpec { refresh: None, ..spec });
+        let control = plant.profile.control.clone().unwrap();
+        plant.order(&[(ModelPoint::Run, Value::Bool(true))]);
+        plant.rig.run(Duration::from_secs(1));
+        let resets = control
+            .fault_reset
+            .is_some_and(|reset| reset.setting.place.is_none() && !reset.setting.once);
+        if !resets {
+            continue;
+        }
+        let from = plant.rig.wire.len();
+        let _reset = plant.rig.order(0, "client", ModelPoint::FaultReset, Value::Bool(true));
+        let reset = control.fault_reset.unwrap().setting;
+        let until = plant.rig.now + Duration::from_secs(1);
+        while !reset.holds(plant.drive().word()) && plant.rig.now < until {
+            plant.rig.step();
+        }
+        if !reset.holds(plant.drive().word()) {
+            // Refused: a reset would stop the motor.
+            continue;
+        }
+        let stopped = plant.rig.wire.len();
+        let _stop = plant.rig.switch(0, "client", false);
+        plant.rig.drives[0].to_writes = Some((1, Exception::BUSY));
+        plant.rig.run(Duration::from_secs(1));
+        let words: Vec<u16> = plant.rig.wire[stopped..]
+            .iter()
+            .filter(|(_, turn)| turn.pdu.is_write())
+            .filter_map(|(_, turn)| plant.has_word(&turn.pdu))
+            .collect();
+        let runs = words
+            .iter()
+            .any(|word| control.is_run(control.at, control.without_reset(*word)));
+        assert!(
+            !runs && !words.is_empty() && !plant.drive().runs,
+            "{name}: {words:#06x?}, {:?}",
+            &plant.rig.wire[from..]
+        );
+        ends += 1;
+    }
+    assert!(ends >= 3, "{ends}");
+}
