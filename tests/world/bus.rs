@@ -34,6 +34,8 @@ pub struct Asked {
     pub pdu: RequestPdu,
     pub at: Instant,
     pub is_poll: bool,
+    /// What was ordered is written again.
+    pub is_refresh: bool,
     /// When the image had the first word of a read from, before.
     pub last_read: Option<Instant>,
     /// What the drive answered, if it acted upon the request.
@@ -371,6 +373,7 @@ impl WorldBus {
             pdu: turn.pdu().clone(),
             at: now,
             is_poll: matches!(turn.purpose, Purpose::Poll(_)),
+            is_refresh: turn.purpose == Purpose::Refresh,
             last_read: match turn.pdu() {
                 RequestPdu::Read { table, start, .. } => {
                     let image = self.handle.image.drives.get(turn.drive);
@@ -489,6 +492,7 @@ pub fn handle(
             access: Access::Control,
             unit: index as u8 * 40 + place,
             supervision: line.supervision.clone(),
+            refresh: line.refresh,
             on_shutdown: line.on_shutdown,
             turnaround: line.turnaround,
             frequency_range: (line.protocol == Protocol::N2).then_some(0.0..=50.0),

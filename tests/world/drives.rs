@@ -3,7 +3,7 @@
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
-use drivegate_world::codec::RequestPdu;
+use drivegate_world::codec::{RequestPdu, Table};
 use drivegate_world::order::written;
 
 use super::orders::{Unique, sets};
@@ -26,6 +26,14 @@ pub struct Truth {
     pub uniques: HashMap<Unique, usize>,
     /// What the drive did, with the words that it answered.
     pub acts: VecDeque<(Instant, RequestPdu, Option<Vec<u16>>)>,
+    /// What orders set last, as the drive took it.
+    pub ordered: HashMap<(Table, u16), u16>,
+    /// Its run command was written last, by an order or again.
+    pub fed: Option<Instant>,
+    /// An order started it then, and nothing has stopped it since.
+    pub ran_by_order: Option<Instant>,
+    /// An order to it waited last.
+    pub waited_until: Option<Instant>,
     /// The latest time at which a client was heard of for certain, and the latest at which it may have been.
     pub heard: (Option<Instant>, Option<Instant>),
     /// The motor runs since.
@@ -94,6 +102,10 @@ impl Truth {
             last_place: 0,
             uniques: HashMap::new(),
             acts: VecDeque::new(),
+            ordered: HashMap::new(),
+            fed: None,
+            ran_by_order: None,
+            waited_until: None,
             heard: (None, None),
             running_since: None,
             ran_at: None,

@@ -54,6 +54,7 @@ impl Counts {
 /// A sound line of that family with drives 1 to `drives`, process data as often as it goes.
 pub fn line(family: &'static str, protocol: Protocol, baud: u32, drives: u8) -> Line {
     Line {
+        refresh: None,
         family,
         protocol,
         baud,

@@ -41,6 +41,8 @@ pub struct Line {
     /// Share of what comes to the gateway in which one bit is wrong besides.
     pub flips: f64,
     pub supervision: Option<Supervision>,
+    /// How often what was ordered is written again.
+    pub refresh: Option<Duration>,
     pub on_shutdown: OnShutdown,
     /// Addresses where nobody answers.
     pub dead: Vec<u8>,
@@ -178,7 +180,13 @@ impl Line {
             _ => LeaseAction::SpeedReference(20.0),
         };
         let supervised = dice.chance(0.6);
+        // Without the dice, as `spec`: every second line that has a lease and registers that are not stored.
+        let repeats = supervised && protocol != Protocol::N2 && timeout.as_millis().is_multiple_of(2);
+        // A quarter of the line at most: a round is about a hundred characters.
+        let round = Duration::from_micros(u64::from(1_100_000_000 / baud)) + 4 * turnaround;
+        let every = (4 * round * u32::from(drives)).max(ms(200));
         Line {
+            refresh: repeats.then_some(every),
             family,
             protocol,
             baud,
@@ -224,6 +232,11 @@ impl Line {
     /// Whether anything goes wrong on its wire.
     pub fn is_noisy(&self) -> bool {
         !self.faults.is_empty() || self.flips > 0.0
+    }
+
+    /// Whether bits of replies change on the way, in a way that a weak checksum does not show.
+    pub fn flips_bits(&self) -> bool {
+        self.flips > 0.0 || self.faults.contains("corrupt")
     }
 
     /// Whether replies may come when they are not expected any more, or twice.

@@ -8,6 +8,7 @@ mod incidents;
 mod lines;
 mod look;
 mod readers;
+mod refreshes;
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -58,6 +59,7 @@ pub struct Figures {
     pub orders: u64,
     pub confirmed: u64,
     pub supervised: u64,
+    pub refreshed: u64,
 }
 
 impl Figures {
@@ -68,6 +70,7 @@ impl Figures {
         self.orders += other.orders;
         self.confirmed += other.confirmed;
         self.supervised += other.supervised;
+        self.refreshed += other.refreshed;
     }
 }
 
@@ -76,8 +79,8 @@ impl fmt::Display for Figures {
         let hours = self.bus_time.as_secs_f64() / 3600.0;
         write!(
             f,
-            "{} worlds, {hours:.2} bus-hours, {} exchanges, {} orders, {} confirmed, {} leases ran out",
-            self.worlds, self.exchanges, self.orders, self.confirmed, self.supervised
+            "{} worlds, {hours:.2} bus-hours, {} exchanges, {} orders, {} confirmed, {} leases ran out, {} refreshes",
+            self.worlds, self.exchanges, self.orders, self.confirmed, self.supervised, self.refreshed
         )
     }
 }

@@ -212,8 +212,8 @@ pub struct Master {
     probes: PerDrive<u32>,
     /// A reply may have come late since before the transaction that is on the line.
     late_before: bool,
-    /// The last round of a refresh is over, and nothing was polled since.
-    refreshed_last: bool,
+    /// How much longer the line was taken by refreshes than by polls since: they have as much of it as polls at most.
+    refresh_debt: Duration,
 }
 
 impl Master {
@@ -275,7 +275,7 @@ impl Master {
             successor: before.quiet_until.is_some(),
             writes,
             late_before: false,
-            refreshed_last: false,
+            refresh_debt: Duration::ZERO,
             bus,
         }
     }
@@ -292,6 +292,7 @@ impl Master {
     pub fn lost(&mut self, now: Instant) {
         self.successor = true;
         for drive in &mut self.drives {
+            drive.refresh.not_answered(now);
             drive.close(&Outcome::BusDown, Interruption::BusDown, now);
         }
         self.abandon_background(Outcome::BusDown, Interruption::BusDown, now);
@@ -314,6 +315,12 @@ impl Master {
         }
         queue.gate.settle(|_| false);
         drop(queue);
+        for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
+            // One that came while the port was lost, and that nobody has looked at.
+            if let Some(at) = image.take_heartbeat() {
+                drive.supervision.renew(at);
+            }
+        }
         let close = |drive: &mut DriveState| {
             drive.close(&Outcome::ShuttingDown, Interruption::ShuttingDown, now);
             Carried {

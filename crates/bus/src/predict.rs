@@ -29,8 +29,8 @@ const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 1
 /// their profile.
 const MOST_LOAD: f64 = 0.8;
 
-/// Share of the line that polls have at least, beside refreshes: one poll between two rounds of them.
-const LEAST_LEFT: f64 = 0.1;
+/// Share of the line that polls have at least beside refreshes.
+const LEAST_LEFT: f64 = 0.5;
 
 /// Part of a cadence by which it may be missed before it is reported.
 const TOLERANCE: f64 = 0.001;

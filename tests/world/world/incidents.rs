@@ -119,6 +119,9 @@ impl World {
     pub(super) fn restart(&mut self, index: usize) {
         self.note(move || format!("a reload starts line{index} anew"));
         self.buses[index].restart(index, &self.events, &self.writes, self.now);
+        for truth in &mut self.truths[index] {
+            truth.online_since = None;
+        }
         let plant = plant_of(&self.buses, &self.events, &self.writes);
         self.plant.store(Arc::new(plant));
         let timeout = self.buses[index]

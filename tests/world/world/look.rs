@@ -41,9 +41,13 @@ impl World {
                 truth.offline_since = offline.then(|| truth.offline_since.unwrap_or(now));
             }
         }
+        for key in self.open.keys() {
+            self.truths[key.0][key.1].waited_until = Some(self.now);
+        }
         self.check_answered_in_time();
         if !self.stopping {
             self.check_leases();
+            self.check_feeding();
             self.check_polls();
             self.check_probes();
         }

@@ -1,6 +1,6 @@
 //! When the refresh of a drive has its turn, and what follows from the replies to its steps.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use super::permission::AtTurn;
 use super::{Master, Purpose, Turn, TurnEnd};
@@ -12,6 +12,9 @@ use crate::order::{Arrival, Effect, Effects, Intent, Order, Origin, Outcome, Sou
 use crate::permit::{Ask, Facts, Stage, Verdict};
 use crate::refresh::{Around, End};
 use crate::transaction::Ended;
+
+/// Most of the time of refreshes that polls make up for.
+const MOST_DEBT: Duration = Duration::from_secs(2);
 
 /// Whether a refresh may write.
 enum May {
@@ -57,9 +60,9 @@ impl Master {
         self.refresh_step(index, now)
     }
 
-    /// The first step of the round that is due longest. Between two rounds a poll has its turn, unless the line is `idle`.
+    /// The first step of the round that is due longest. Polls have the line for as long as refreshes had it, unless it is `idle`.
     pub(super) fn refresh(&mut self, idle: bool, now: Instant) -> Option<Turn> {
-        if self.refreshed_last && !idle {
+        if !self.refresh_debt.is_zero() && !idle {
             return None;
         }
         let (_, index) = self.due_refreshes().filter(|(due, _)| *due <= now).min()?;
@@ -199,7 +202,7 @@ impl Master {
     /// A step of a refresh has ended.
     pub(super) fn refreshed(&mut self, turn: &Turn, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         self.schedule.refreshed(end.took);
-        self.refreshed_last = true;
+        self.refresh_debt = (self.refresh_debt + end.took).min(MOST_DEBT);
         let Some((drive, image)) = self
             .drives
             .get_mut(turn.drive)

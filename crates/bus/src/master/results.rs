@@ -196,7 +196,7 @@ impl Master {
 
     /// Applies the result of a poll.
     fn polled(&mut self, poll: &Poll, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
-        self.refreshed_last = false;
+        self.refresh_debt = self.refresh_debt.saturating_sub(end.took);
         // Of a step before the poll this is known already.
         let heard = self.waits.sessions.heard(poll.drive, &end.ended);
         if heard == Progress::Restarted {

@@ -308,6 +308,47 @@ fn a_short_outage_suspends_a_refresh_and_it_goes_on_by_what_the_drive_shows() {
     }
 }
 
+/// What a round has read holds no longer when the port was lost, or the thread stood still, before its write.
+#[test]
+fn a_round_that_was_interrupted_reads_again_before_it_writes() {
+    type Event = fn(&mut Rig);
+    let events: [(&str, Event); 2] = [
+        ("port", |rig| {
+            rig.master.lost(rig.now);
+            rig.master.opened(rig.now);
+        }),
+        ("pause", |rig| {
+            let began = rig.now;
+            rig.now += Duration::from_millis(1100);
+            let stall = crate::stalls::Stall { began, ended: rig.now, slept: Duration::ZERO };
+            rig.master.stood(stall, rig.now);
+        }),
+    ];
+    for (name, _) in FAMILIES {
+        for (event, happens) in &events {
+            let mut plant = Plant::new(name);
+            plant.starts();
+            let until = plant.rig.now + Duration::from_secs(5);
+            let reads = |turn: &Turn| turn.purpose == Purpose::Refresh && !turn.pdu.is_write();
+            while !plant.rig.wire.last().is_some_and(|(_, turn)| reads(turn)) {
+                plant.rig.step();
+                assert!(plant.rig.now < until, "{name}");
+            }
+            // It stands now, and nobody has seen that.
+            plant.drive().stand();
+            happens(&mut plant.rig);
+            let from = plant.rig.wire.len();
+            plant.rig.run(Duration::from_secs(8));
+            let writes = plant.rig.wire[from..].iter().filter(|(_, turn)| turn.purpose == Purpose::Refresh);
+            let words: Vec<Turn> = writes
+                .map(|(_, turn)| turn.clone())
+                .filter(|turn| turn.pdu.is_write() && plant.has_word(&turn.pdu).is_some())
+                .collect();
+            assert!(words.is_empty() && !plant.drive().runs, "{name} {event}: {words:?}");
+        }
+    }
+}
+
 #[test]
 fn a_drive_that_knows_no_function_16_gets_both_apart() {
     let mut plant = Plant::new("abb-acs580");
