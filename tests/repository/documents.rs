@@ -3,6 +3,7 @@
 mod cabinet;
 mod commands;
 mod drives;
+mod timeouts;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -244,6 +245,11 @@ fn the_page_of_drives_says_what_the_profiles_deliver() {
 #[test]
 fn the_page_of_commissioning_says_what_the_profiles_deliver() {
     generated("commissioning.md", "cabinet", &cabinet::lists());
+}
+
+#[test]
+fn the_page_of_safety_says_what_feeds_each_timeout() {
+    generated("safety.md", "timeouts", &timeouts::table());
 }
 
 #[test]

@@ -39,6 +39,8 @@ pub struct Truth {
     /// The motor runs since.
     pub running_since: Option<Instant>,
     pub ran_at: Option<Instant>,
+    /// Its motor turned last, whether or not anybody saw it.
+    pub turned_at: Option<Instant>,
     /// The image has had it online since.
     pub online_since: Option<Instant>,
     /// Supervision last acted.
@@ -109,6 +111,7 @@ impl Truth {
             heard: (None, None),
             running_since: None,
             ran_at: None,
+            turned_at: None,
             online_since: None,
             supervised: None,
             troubled_until: None,

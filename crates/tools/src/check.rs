@@ -17,6 +17,7 @@ use crate::bus::proof;
 use crate::config::memory::{BusMemory, Memory};
 use crate::config::{BusSettings, Loaded, Settings, environment};
 use crate::daemon::drills::load as kept_drills;
+use crate::document::format_duration;
 use crate::document::{Finding, Problem};
 use crate::drill::{Kind, ways};
 use crate::drive::raw_writes;
@@ -63,6 +64,7 @@ struct Bus<'a> {
     load_ratio: f64,
     fast_cycle_ms: Option<f64>,
     slow_cycle_ms: Option<f64>,
+    refresh_ratio: f64,
     /// Duration of the stops at shutdown if all drives reply, and if none does.
     shutdown_ms: f64,
     shutdown_worst_ms: f64,
@@ -197,6 +199,7 @@ fn bus_report<'a>(bus: &'a BusSettings, memory: &BusMemory) -> Bus<'a> {
         load_ratio: prediction.load,
         fast_cycle_ms: prediction.fast_cycle.map(milliseconds),
         slow_cycle_ms: prediction.slow_cycle.map(milliseconds),
+        refresh_ratio: prediction.refreshes,
         shutdown_ms: milliseconds(shutdown.answered),
         shutdown_worst_ms: milliseconds(shutdown.unanswered),
         recorder_bytes: memory.recorder.total(),
@@ -406,6 +409,25 @@ fn slots(bus: &BusSettings, settings: &Settings) -> String {
     of_bus.map(line).collect()
 }
 
+/// Whose commands are written again, and what that takes of the line.
+fn refreshes(bus: &BusSettings, prediction: &Prediction) -> String {
+    let refreshed: Vec<String> = bus
+        .drives
+        .iter()
+        .filter_map(|drive| Some(format!("{} every {}", drive.name, format_duration(drive.refresh?))))
+        .collect();
+    if refreshed.is_empty() {
+        return String::new();
+    }
+    let first = refreshed.iter().take(NAMED).cloned().collect::<Vec<_>>().join(", ");
+    let more = match refreshed.len().saturating_sub(NAMED) {
+        0 => String::new(),
+        more => format!(" and {more} more"),
+    };
+    let share = prediction.refreshes * 100.0;
+    format!("  refresh     {first}{more}: {share:.1} % of the line while all of them are commanded\n")
+}
+
 fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
     let cycle = |name: &str, achieved: Option<Duration>, wanted: Duration| match achieved {
         Some(achieved) => format!(
@@ -429,6 +451,7 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
     cycle("fast", prediction.fast_cycle, bus.spec.cycle)
         + &cycle("slow", prediction.slow_cycle, bus.spec.slow_cycle)
         + &format!("  line load   {:.1} %{wanted}\n", prediction.load * 100.0)
+        + &refreshes(bus, prediction)
         + &shutdown(bus)
         + behind
 }

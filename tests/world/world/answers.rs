@@ -52,7 +52,11 @@ impl World {
             && let Some(older) = replaced.next()
         {
             older.succeeded = true;
-            (newest.place, newest.earliest) = (older.place, older.earliest);
+            newest.earliest = older.earliest;
+            // The rest of a stop may have been purged by another stop instead.
+            if older.answer.as_ref().is_some_and(|(code, _)| code == "replaced") {
+                newest.place = older.place;
+            }
         }
         let stops = |record: &&Record| record.wish == Wish::StopAtReference && record.answer.is_none();
         let of_drive = |record: &&Record| (record.bus, record.drive) == (newest.bus, newest.drive);
@@ -355,7 +359,10 @@ impl World {
             let turns = u32::from(bus.line.drives) * u32::try_from(record.before + 1).unwrap_or(u32::MAX);
             let is_slow = 2 * turn * turns > record.expires - record.accepted;
             assert!(
-                record.before > 4 || is_slow || truth.is_troubled(record.accepted) || !self.is_alive(record.bus, record.drive),
+                record.before > 4
+                    || is_slow
+                    || truth.is_troubled(record.accepted)
+                    || !self.is_alive(record.bus, record.drive),
                 "order {id} of a steady client expired behind {} others",
                 record.before
             );

@@ -322,7 +322,10 @@ impl World {
         // The checksum of N2 does not show two flipped bits that make up for each other.
         let flipped = self.buses[bus].line.protocol == Protocol::N2 && self.buses[bus].line.flips_bits();
         let alike = |words: &Vec<u16>| {
-            let bits = words.iter().zip(&stored).map(|(said, stored)| (said ^ stored).count_ones());
+            let bits = words
+                .iter()
+                .zip(&stored)
+                .map(|(said, stored)| (said ^ stored).count_ones());
             words.len() == stored.len() && (bits.clone().sum::<u32>() == 0 || (flipped && bits.sum::<u32>() == 1))
         };
         let said = |did: &RequestPdu, words: Option<&Vec<u16>>| *did == asked.pdu && words.is_some_and(alike);

@@ -31,6 +31,9 @@ impl World {
                 // Where the drive refuses to report whether it runs, its run command stands for it.
                 let blind = index == 0 && bus.line.refuses.is_some() && truth.run && image.snapshot().link.is_online();
                 let running = drive.state().running && drive.answers() && (seen || blind);
+                if drive.state().running {
+                    truth.turned_at = Some(now);
+                }
                 truth.running_since = running.then(|| truth.running_since.unwrap_or(now));
                 if running {
                     truth.ran_at = Some(now);

@@ -16,7 +16,12 @@ impl World {
                 let control = profile.control.as_ref().filter(|control| control.at.address == address);
                 control.map_or(ordered, |control| control.without_reset(ordered))
             });
-            assert_eq!(released, Some(word), "drive {}: {table} {address} was not ordered", drive + 1);
+            assert_eq!(
+                released,
+                Some(word),
+                "drive {}: {table} {address} was not ordered",
+                drive + 1
+            );
         }
         assert!(!self.buses[bus].ending, "a refresh goes out while the gateway ends");
         if run_command(&profile, pdu) != Some(true) {
@@ -28,12 +33,20 @@ impl World {
             // By MQTT the answer of an order that is done waits for its confirmation.
             record.wish.is_stop() && record.accepted < now && self.clients[record.client].habit != Habit::Mqtt
         };
-        assert!(open.clone().find(stops).is_none(), "a run command is repeated behind a stop of drive {}", drive + 1);
-        assert!(truth.run, "drive {} gets a run command again that it does not have", drive + 1);
+        assert!(
+            open.clone().find(stops).is_none(),
+            "a run command is repeated behind a stop of drive {}",
+            drive + 1
+        );
+        assert!(
+            truth.run,
+            "drive {} gets a run command again that it does not have",
+            drive + 1
+        );
         // What the drive showed right before.
         let within = Duration::from_millis(500);
         assert!(
-            truth.ran_at.is_some_and(|at| now - at <= within),
+            truth.turned_at.is_some_and(|at| now - at <= within),
             "drive {} stands, and its run command is repeated",
             drive + 1
         );
@@ -64,7 +77,7 @@ impl World {
             }
             // All others may have their turn before.
             let round = bus.handle.image.health().fast.last.unwrap_or(bus.round);
-            let most = 2 * every + 3 * round + 2 * self.exchange(bus) * u32::from(bus.line.drives);
+            let most = 3 * every + 3 * round + 2 * self.exchange(bus) * u32::from(bus.line.drives);
             for (drive, truth) in truths.iter().enumerate() {
                 let (Some(ordered), Some(heard)) = (truth.ran_by_order, truth.heard.0) else {
                     continue;
@@ -92,19 +105,23 @@ impl World {
     pub(super) fn note_ordered(&mut self, bus: usize, drive: usize, asked: &Asked) {
         let (profile, now) = (self.buses[bus].profile.clone(), self.now);
         let truth = &mut self.truths[bus][drive];
-        let Some((table, items)) = written(&asked.pdu) else { return };
+        let Some((table, items)) = written(&asked.pdu) else {
+            return;
+        };
         if !asked.is_refresh {
-            truth.ordered.extend(items.iter().map(|(address, word)| ((table, *address), *word)));
+            truth
+                .ordered
+                .extend(items.iter().map(|(address, word)| ((table, *address), *word)));
         }
-        match run_command(&profile, &asked.pdu) {
-            Some(true) => {
-                truth.fed = Some(now);
-                if !asked.is_refresh {
-                    truth.ran_by_order = Some(now);
-                }
-            }
+        let runs = run_command(&profile, &asked.pdu);
+        let by_reference = profile.repeats().is_ok_and(|repeats| !repeats.word);
+        if runs == Some(true) || (asked.is_refresh && by_reference) {
+            truth.fed = Some(now);
+        }
+        match runs {
+            Some(true) if !asked.is_refresh => truth.ran_by_order = Some(now),
             Some(false) => truth.ran_by_order = None,
-            None => {}
+            _ => {}
         }
     }
 }

@@ -6,7 +6,7 @@ use super::keys::{DRIVE, ROOT};
 use super::{bacnet, bus, http, interlocks, modbus_tcp, unique};
 use crate::document::{Finding, Place, Reader};
 use crate::north::mqtt as mqtt_client;
-use crate::process_image::Access;
+use crate::process_image::{Access, LeaseAction};
 
 /// The sections by which clients reach the drives.
 pub(super) struct Clients<'c> {
@@ -58,6 +58,7 @@ pub(super) fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients
         }
         warn_of_idle_stops(reader, buses);
         warn_of_long_shutdowns(reader, buses);
+        warn_of_refreshes(reader, buses);
         let written = modbus_tcp.filter(|m| m.stale_written);
         warn_of_cadence(reader, buses, written.map(|m| (m.stale_after, &m.stale_place)));
     }
@@ -251,5 +252,42 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
             ),
             format!("{own}; set supervision = {{ timeout = \"5s\", action = \"stop\" }}"),
         );
+    }
+}
+
+/// Refreshes that end by what the configuration does, and drives that need one and have none.
+fn warn_of_refreshes(reader: &Reader<'_>, buses: &[bus::Found]) {
+    let key = DRIVE.refresh.name;
+    for drive in buses.iter().flat_map(|bus| &bus.drives) {
+        let (Some(spec), (Access::Control, access)) = (&drive.spec, &drive.access) else {
+            continue;
+        };
+        let name = &spec.name;
+        let place = drive.refresh.as_ref().or(drive.lease.as_ref()).unwrap_or(access);
+        let needs = spec.profile.control.as_ref().and_then(|control| control.refresh);
+        match (spec.refresh, &spec.supervision) {
+            (None, _) if needs.is_some() && spec.profile.repeats().is_ok() => reader.document().warning(
+                place,
+                format!(
+                    "the own timeout of drive `{name}` counts only writes, and nothing is written between commands: where it \
+                     is set, the drive trips"
+                ),
+                format!("add [bus.drive.supervision], which turns {key} on, or set a timeout of the drive that counts any request"),
+            ),
+            (Some(_), Some(supervision)) if supervision.action == LeaseAction::Hold => reader.document().warning(
+                place,
+                format!(
+                    "{key} of drive `{name}` ends when its lease expires, and then the drive acts by its own timeout: action = \
+                     \"hold\" keeps it running only until that"
+                ),
+                "write action = \"stop\" or { speed_reference = 20.0 }, or leave it if that is meant",
+            ),
+            (Some(every), Some(supervision)) if supervision.timeout <= every => reader.document().warning(
+                place,
+                format!("the lease of drive `{name}` expires before anything is written again ({key})"),
+                format!("set {key} below half of the timeout of supervision"),
+            ),
+            _ => {}
+        }
     }
 }

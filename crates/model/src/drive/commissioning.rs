@@ -14,6 +14,8 @@ pub enum Step {
     Settings,
     /// How to make the drive obey the bus.
     ControlPlace,
+    /// The drive's own timeout: where it is set, and what it counts.
+    Timeout,
     /// Lamps and panel.
     Lamps,
     /// How to test it.
@@ -22,11 +24,12 @@ pub enum Step {
 
 impl Step {
     /// All steps, in their order.
-    pub const ALL: [Step; 6] = [
+    pub const ALL: [Step; 7] = [
         Step::Connect,
         Step::Terminate,
         Step::Settings,
         Step::ControlPlace,
+        Step::Timeout,
         Step::Lamps,
         Step::Test,
     ];
@@ -38,6 +41,7 @@ impl Step {
             Step::Terminate => "terminate",
             Step::Settings => "settings",
             Step::ControlPlace => "control_place",
+            Step::Timeout => "timeout",
             Step::Lamps => "lamps",
             Step::Test => "test",
         }
@@ -50,6 +54,7 @@ impl Step {
             Step::Terminate => "terminate and bias",
             Step::Settings => "settings",
             Step::ControlPlace => "control place",
+            Step::Timeout => "the drive's own timeout",
             Step::Lamps => "lamps and panel",
             Step::Test => "test",
         }
@@ -63,6 +68,7 @@ pub struct Commissioning {
     pub(super) terminate: Vec<String>,
     pub(super) settings: Vec<String>,
     pub(super) control_place: Vec<String>,
+    pub(super) timeout: Vec<String>,
     pub(super) lamps: Vec<String>,
     pub(super) test: Vec<String>,
 }
@@ -75,6 +81,7 @@ impl Commissioning {
             Step::Terminate => &self.terminate,
             Step::Settings => &self.settings,
             Step::ControlPlace => &self.control_place,
+            Step::Timeout => &self.timeout,
             Step::Lamps => &self.lamps,
             Step::Test => &self.test,
         }

@@ -40,6 +40,7 @@ pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, 
         let hold = format_duration(reset.hold);
         lines.push(("fault reset", format!("{}, for {hold}", setting(&reset.setting))));
     }
+    lines.push(("own timeout", refresh(profile, control)));
     if control.restarts_on_reset {
         lines.push((
             "caution",
@@ -47,6 +48,27 @@ pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, 
         ));
     }
     lines
+}
+
+/// What a refresh writes again, and whether it is on by itself.
+fn refresh(profile: &Profile, control: &Control) -> String {
+    let repeats = match profile.repeats() {
+        Ok(repeats) => repeats,
+        Err(why) => return format!("nothing is written again (`refresh`): {why}"),
+    };
+    let what = match (repeats.word, repeats.reference, control.refresh_with_reference) {
+        (true, true, true) => "the reference, or the control word where none was ordered",
+        (true, true, false) => "reference and control word",
+        (true, false, _) => "the control word",
+        (false, ..) => "the reference",
+    };
+    match control.refresh {
+        Some(every) => format!(
+            "counts only writes: {what} every {} with `supervision`",
+            format_duration(every)
+        ),
+        None => format!("`refresh` writes {what}; off unless it is set"),
+    }
 }
 
 fn place(place: ControlItem) -> String {

@@ -320,7 +320,11 @@ fn a_round_that_was_interrupted_reads_again_before_it_writes() {
         ("pause", |rig| {
             let began = rig.now;
             rig.now += Duration::from_millis(1100);
-            let stall = crate::stalls::Stall { began, ended: rig.now, slept: Duration::ZERO };
+            let stall = crate::stalls::Stall {
+                began,
+                ended: rig.now,
+                slept: Duration::ZERO,
+            };
             rig.master.stood(stall, rig.now);
         }),
     ];
@@ -339,7 +343,9 @@ fn a_round_that_was_interrupted_reads_again_before_it_writes() {
             happens(&mut plant.rig);
             let from = plant.rig.wire.len();
             plant.rig.run(Duration::from_secs(8));
-            let writes = plant.rig.wire[from..].iter().filter(|(_, turn)| turn.purpose == Purpose::Refresh);
+            let writes = plant.rig.wire[from..]
+                .iter()
+                .filter(|(_, turn)| turn.purpose == Purpose::Refresh);
             let words: Vec<Turn> = writes
                 .map(|(_, turn)| turn.clone())
                 .filter(|turn| turn.pdu.is_write() && plant.has_word(&turn.pdu).is_some())

@@ -21,6 +21,7 @@ pub(super) fn read(reader: &Reader<'_>) -> Commissioning {
         terminate: lines(Step::Terminate),
         settings: lines(Step::Settings),
         control_place: lines(Step::ControlPlace),
+        timeout: lines(Step::Timeout),
         lamps: lines(Step::Lamps),
         test: lines(Step::Test),
     };
