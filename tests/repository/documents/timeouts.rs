@@ -14,7 +14,10 @@ pub(crate) fn table() -> String {
     for profile in Profiles::built_in().iter().filter(|profile| profile.base.is_none()) {
         let lines = profile.commissioning.lines(Step::Timeout);
         assert!(!lines.is_empty(), "{} says nothing of its own timeout", profile.name);
-        let needs = profile.control.as_ref().is_some_and(|control| control.refresh.is_some());
+        let needs = profile
+            .control
+            .as_ref()
+            .is_some_and(|control| control.refresh.is_some());
         let text = lines.join("; ").replace(UNKNOWN, "");
         assert_eq!(needs, text.contains("`refresh` writes"), "{}", profile.name);
         let name = format!("`{}`", profile.name);

@@ -47,7 +47,11 @@ impl World {
         self.truths[bus][drive].asked = Some(now);
         if !pdu.is_write() {
             // A lease begins with any frame of an order, also of one that only reads and writes nothing.
-            if !asked.is_poll && !asked.is_refresh && self.open.contains_key(&(bus, drive)) {
+            let open = self.open.get(&(bus, drive)).into_iter().flatten();
+            let reads = open
+                .clone()
+                .any(|id| matches!(self.records[*id].wish, Wish::Reverse | Wish::Reset));
+            if reads && !asked.is_poll && !asked.is_refresh && matches!(pdu, RequestPdu::Read { .. }) {
                 self.truths[bus][drive].maybe_heard(now);
             }
             return;
@@ -326,7 +330,7 @@ impl World {
                 .iter()
                 .zip(&stored)
                 .map(|(said, stored)| (said ^ stored).count_ones());
-            words.len() == stored.len() && (bits.clone().sum::<u32>() == 0 || (flipped && bits.sum::<u32>() == 1))
+            words.len() == stored.len() && (bits.clone().sum::<u32>() == 0 || (flipped && bits.sum::<u32>() <= 2))
         };
         let said = |did: &RequestPdu, words: Option<&Vec<u16>>| *did == asked.pdu && words.is_some_and(alike);
         assert!(

@@ -83,7 +83,9 @@ impl World {
                     continue;
                 };
                 let alive = self.now - heard < supervision.timeout / 2;
-                let waits = self.open.contains_key(&(bus.index, drive)) || truth.is_troubled(ordered);
+                // After a lease expired only an order begins it again, not a heartbeat.
+                let expired = truth.supervised.is_some_and(|at| at >= ordered);
+                let waits = expired || self.open.contains_key(&(bus.index, drive)) || truth.is_troubled(ordered);
                 let runs = truth.run && truth.running_since.is_some_and(|since| self.now - since > most);
                 if !alive || waits || !runs || self.now - ordered < most {
                     continue;

@@ -110,10 +110,8 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             .has(DRIVE.supervision.name)
             .then(|| DRIVE.supervision.place(reader)),
         shutdown_stop: (on_shutdown == OnShutdown::Stop).then(|| DRIVE.on_shutdown.place(reader)),
-        refresh: DRIVE
-            .refresh
-            .written(reader)
-            .flatten()
+        refresh: refresh
+            .filter(|_| reader.has(DRIVE.refresh.name))
             .map(|_| DRIVE.refresh.place(reader)),
         guards,
         spec,

@@ -266,14 +266,20 @@ fn warn_of_refreshes(reader: &Reader<'_>, buses: &[bus::Found]) {
         let place = drive.refresh.as_ref().or(drive.lease.as_ref()).unwrap_or(access);
         let needs = spec.profile.control.as_ref().and_then(|control| control.refresh);
         match (spec.refresh, &spec.supervision) {
-            (None, _) if needs.is_some() && spec.profile.repeats().is_ok() => reader.document().warning(
-                place,
-                format!(
-                    "the own timeout of drive `{name}` counts only writes, and nothing is written between commands: where it \
-                     is set, the drive trips"
-                ),
-                format!("add [bus.drive.supervision], which turns {key} on, or set a timeout of the drive that counts any request"),
-            ),
+            (None, lease) if needs.is_some() && spec.profile.repeats().is_ok() => {
+                let remedy = match lease {
+                    None => format!("add [bus.drive.supervision], which turns {key} on"),
+                    Some(_) => format!("leave {key} out"),
+                };
+                reader.document().warning(
+                    place,
+                    format!(
+                        "the own timeout of drive `{name}` counts only writes, and nothing is written between commands: \
+                         where it is set, the drive trips"
+                    ),
+                    format!("{remedy}, or switch that timeout off, or let it count any request, if the drive can"),
+                );
+            }
             (Some(_), Some(supervision)) if supervision.action == LeaseAction::Hold => reader.document().warning(
                 place,
                 format!(
