@@ -260,7 +260,8 @@ impl DriveState {
         }
         let is_drill = run.origins().any(Origin::is_drill);
         let how = match outcome {
-            outcome if outcome.is_ok() && run.is_of_client() && !is_drill => OrderEnd::Done,
+            outcome if outcome.is_ok() && run.is_of_client() && is_drill => OrderEnd::Drill,
+            outcome if outcome.is_ok() && run.is_of_client() => OrderEnd::Done,
             outcome if outcome.is_ok() && run.is_of_supervision() && run.urgency() == Urgency::Command => {
                 OrderEnd::Action
             }

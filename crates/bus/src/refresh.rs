@@ -41,6 +41,17 @@ impl Reference {
     }
 }
 
+/// Whose order began a refresh.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Beginner {
+    /// A client's, whose lease it needs.
+    Client,
+    /// A drill's, which feeds the timeout until it falls silent to try it.
+    Drill,
+    /// The action of a lease that expired: it needs none.
+    Action,
+}
+
 /// What the orders of the gateway wrote last, as far as the drive acknowledged it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 struct Ordered {
@@ -69,8 +80,8 @@ struct Going {
     seen: bool,
     /// The drive has not answered since.
     lost: Option<Instant>,
-    /// The action of a lease that expired began it: it needs no lease.
-    by_action: bool,
+    /// Whose order began it.
+    by: Beginner,
 }
 
 /// A refresh, as handed over to the bus that takes the place of this one.
@@ -125,11 +136,13 @@ impl fmt::Display for End {
 pub(super) enum OrderEnd {
     /// A client's order was acknowledged.
     Done,
+    /// A drill's order was.
+    Drill,
     /// The speed reference of a lease that expired was.
     Action,
     /// What the drive took of it is unknown.
     Unknown,
-    /// An order of the gateway itself, or of a drill, was sent.
+    /// An order of the gateway itself was sent.
     Other,
 }
 
@@ -264,23 +277,24 @@ impl Refresh {
     /// An order that was sent is over. Why that ends the refresh, if it does.
     pub(super) fn order_over(&mut self, profile: &Profile, how: OrderEnd, held: bool, now: Instant) -> Option<End> {
         self.round = None;
-        let begins = match how {
-            OrderEnd::Done if self.by_lease && !self.says_run => false,
-            OrderEnd::Done => held,
-            OrderEnd::Action => self.by_lease,
+        let (begins, by) = match how {
+            OrderEnd::Done if self.by_lease && !self.says_run => (false, Beginner::Client),
+            OrderEnd::Done => (held, Beginner::Client),
+            OrderEnd::Drill => (held, Beginner::Drill),
+            OrderEnd::Action => (self.by_lease, Beginner::Action),
             OrderEnd::Unknown => return self.end(End::Unknown),
             OrderEnd::Other => return self.end(End::Other),
         };
         self.by_lease = false;
         if begins {
-            self.begin(profile, how == OrderEnd::Action, now);
+            self.begin(profile, by, now);
         } else {
             self.forget();
         }
         None
     }
 
-    fn begin(&mut self, profile: &Profile, by_action: bool, now: Instant) {
+    fn begin(&mut self, profile: &Profile, by: Beginner, now: Instant) {
         let (Some((every, repeats)), Some(control)) = (self.settings, &profile.control) else {
             return;
         };
@@ -297,7 +311,7 @@ impl Refresh {
             due: ordered.fed.unwrap_or(now) + every,
             seen: false,
             lost: None,
-            by_action,
+            by,
         });
     }
 
@@ -328,7 +342,7 @@ impl Refresh {
         let (every, _) = self.settings?;
         let going = self.repeated.going.as_mut()?;
         let now = reading.now;
-        let end = if !around.held && !going.by_action {
+        let end = if !around.held && going.by != Beginner::Action {
             Some(End::Lease)
         } else if going
             .lost
@@ -356,6 +370,11 @@ impl Refresh {
     /// Whether a run command is what stands.
     pub(super) fn runs(&self) -> bool {
         self.repeated.going.is_some_and(|going| going.does == Does::Run)
+    }
+
+    /// Whether a drill's order began it.
+    pub(super) fn is_of_drill(&self) -> bool {
+        self.repeated.going.is_some_and(|going| going.by == Beginner::Drill)
     }
 
     /// Stops that were accepted before the order that began it.

@@ -81,10 +81,14 @@ impl Master {
         self.due_refreshes().map(|(due, _)| due).min()
     }
 
+    /// Whether a drill sends nothing to that drive, so that its own timeout acts.
+    fn is_quiet(&self, index: DriveIndex) -> bool {
+        self.waits.quiet.is_some_and(|(quiet, _)| quiet == index)
+    }
+
     fn due_refreshes(&self) -> impl Iterator<Item = (Instant, DriveIndex)> + '_ {
         let may = |index: DriveIndex, drive: &DriveState| {
-            let is_quiet = self.waits.quiet.is_some_and(|(quiet, _)| quiet == index);
-            !drive.has_runs() && !is_quiet && self.shutdown.is_none() && self.schedule.is_online(index)
+            !drive.has_runs() && !self.is_quiet(index) && self.shutdown.is_none() && self.schedule.is_online(index)
         };
         let due = move |(index, drive): (DriveIndex, &DriveState)| {
             let due = drive.refresh.due().filter(|_| may(index, drive))?;
@@ -134,7 +138,7 @@ impl Master {
         let Some((drive, image)) = self.drives.get(index).zip(self.bus.image.drives.get(index)) else {
             return May::NotNow;
         };
-        if self.shutdown.is_some() || drive.has_runs() {
+        if self.shutdown.is_some() || drive.has_runs() || self.is_quiet(index) {
             return May::NotNow;
         }
         let (runs, pdu) = (drive.refresh.runs(), drive.refresh.writes(&image.spec.profile));
@@ -155,6 +159,10 @@ impl Master {
         let facts = AtTurn::of(&self.drives, &self.bus.image.drives, now);
         let seen = facts.seen(index);
         let origin = Origin::new(SourceKind::Supervision, "refresh");
+        let origin = match drive.refresh.is_of_drill() {
+            true => origin.of_drill("refresh".to_string()),
+            false => origin,
+        };
         let ask = Ask {
             stage,
             now,

@@ -184,7 +184,8 @@ impl Origin {
     }
 
     /// The drill that this client armed, which appears under that name in audit and events.
-    pub(crate) fn of_drill(mut self, who: String) -> Origin {
+    #[must_use]
+    pub fn of_drill(mut self, who: String) -> Origin {
         (self.who, self.acting) = (who, Acting::Drill);
         self
     }

@@ -4,12 +4,14 @@ use super::family_drive::FamilyDrive;
 use super::*;
 use crate::drive::Profile;
 use crate::order::written;
+use crate::permit::DrillLock;
 
 const EVERY: Duration = Duration::from_secs(1);
 
 /// Whether the control word is repeated; else the reference alone is.
-const FAMILIES: [(&str, bool); 12] = [
-    ("abb-acs580", true),
+const FAMILIES: [(&str, bool); 13] = [
+    ("abb-acs550", true),
+    ("abb-acs580", false),
     ("siemens-g120", true),
     ("schneider-altivar", true),
     ("danfoss-fc", true),
@@ -59,11 +61,14 @@ impl Plant {
     }
 
     fn order(&mut self, sets: &[(ModelPoint, Value)]) {
+        self.order_of(Origin::new(SourceKind::Mqtt, "client"), sets);
+    }
+
+    fn order_of(&mut self, origin: Origin, sets: &[(ModelPoint, Value)]) {
         let image = &self.rig.bus.image.drives[0];
         let index = |point| image.spec.profile.model_index(point).unwrap();
         let order = Order::Points(sets.iter().map(|(point, value)| (index(*point), *value)).collect());
         let admitted = admit(order, &image.reading(self.rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
-        let origin = Origin::new(SourceKind::Mqtt, "client");
         let (ticket, mut answer) = Ticket::new(origin, "d", String::new(), true, self.rig.now, self.rig.stats.clone());
         let window = window(self.rig.now, DEFAULT_EXPIRY);
         let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
@@ -263,6 +268,37 @@ fn from_the_acceptance_of_a_stop_no_run_word_is_repeated() {
     }
 }
 
+/// A drill ends what was repeated before, feeds the motor that it has started, and is silent when it tries the timeout.
+#[test]
+fn a_drill_feeds_the_timeout_until_it_tries_it() {
+    for (name, _) in FAMILIES {
+        let mut plant = Plant::new(name);
+        plant.starts();
+        plant.rig.run(Duration::from_secs(3));
+        let lock = |quiet_until: Option<Instant>| DrillLock {
+            who: "drill".to_string(),
+            quiet_until,
+        };
+        let set = |plant: &Plant, until| plant.rig.bus.queue.set_drill(DriveIndex::new(0), Some(lock(until)));
+        set(&plant, None);
+        plant.assert_ended("drill");
+        let drill = || Origin::new(SourceKind::Mqtt, "client").of_drill("drill".to_string());
+        plant.order_of(
+            drill(),
+            &[
+                (ModelPoint::SpeedReference, Value::Number(20.0)),
+                (ModelPoint::Run, Value::Bool(true)),
+            ],
+        );
+        assert!(plant.refreshes(6).len() >= 4, "{name}");
+        set(&plant, Some(plant.rig.now + Duration::from_secs(6)));
+        let refreshes = plant.refreshes(6);
+        assert!(refreshes.is_empty(), "{name}: {refreshes:?}");
+        plant.order_of(drill(), &[(ModelPoint::Run, Value::Bool(false))]);
+        assert!(!plant.drive().runs, "{name}");
+    }
+}
+
 #[test]
 fn another_masters_word_and_reference_stay() {
     for (name, by_word) in FAMILIES {
@@ -357,7 +393,7 @@ fn a_round_that_was_interrupted_reads_again_before_it_writes() {
 
 #[test]
 fn a_drive_that_knows_no_function_16_gets_both_apart() {
-    let mut plant = Plant::new("abb-acs580");
+    let mut plant = Plant::new("abb-acs550");
     plant.drive().only_06 = true;
     plant.starts();
     let refreshes = plant.refreshes(10);
