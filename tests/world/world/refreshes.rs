@@ -77,7 +77,7 @@ impl World {
             }
             // All others may have their turn before.
             let round = bus.handle.image.health().fast.last.unwrap_or(bus.round);
-            let most = 3 * every + 3 * round + 2 * self.exchange(bus) * u32::from(bus.line.drives);
+            let most = 4 * every + 3 * round + 2 * self.exchange(bus) * u32::from(bus.line.drives);
             for (drive, truth) in truths.iter().enumerate() {
                 let (Some(ordered), Some(heard)) = (truth.ran_by_order, truth.heard.0) else {
                     continue;

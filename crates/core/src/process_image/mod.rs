@@ -5,6 +5,7 @@
 
 mod contradiction;
 mod health;
+mod reading;
 mod restore_lock;
 mod snapshot;
 mod standstill;
@@ -12,8 +13,9 @@ mod tape;
 mod trace;
 
 pub use health::{BusHealth, Histogram, HistogramSnapshot, Outcome, PollCycle};
+pub use reading::Reading;
 pub use restore_lock::Hold;
-pub use snapshot::{Cadence, Link, Reading, Snapshot, Unavailable};
+pub use snapshot::{Cadence, Link, Snapshot, Unavailable};
 pub use standstill::Standstill;
 pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Taping, Verdict};
 pub use trace::{Direction, FrameRecord, Trace};

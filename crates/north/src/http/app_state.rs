@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use axum::http::StatusCode;
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
@@ -26,7 +27,7 @@ pub(super) struct AppState {
     /// and `/healthz` does not wait for it.
     rendering: Semaphore,
     /// The permit for reading a recording: what waits for the disk holds up nothing else.
-    pub(super) files: Semaphore,
+    files: Semaphore,
     pub(super) operating: Arc<Operating>,
 }
 
@@ -51,6 +52,16 @@ impl AppState {
     /// A turn to render a large reply.
     pub(super) async fn turn(&self) -> Option<SemaphorePermit<'_>> {
         self.rendering.acquire().await.ok()
+    }
+
+    /// What `read` finds in files, away from the tasks of other clients, one reader at a time.
+    ///
+    /// # Errors
+    /// 503 where the gateway ends.
+    pub(super) async fn read_files<T: Send + 'static>(&self, read: impl FnOnce() -> T + Send + 'static) -> Replied<T> {
+        let unavailable = StatusCode::SERVICE_UNAVAILABLE;
+        let _permit = self.files.acquire().await.map_err(|_| unavailable)?;
+        Ok(tokio::task::spawn_blocking(read).await.map_err(|_| unavailable)?)
     }
 
     /// The cookies of this gateway, on a connection that came like that.

@@ -76,17 +76,13 @@ pub(super) async fn one(
 ) -> Replied {
     let form = form(query.as_deref())?;
     let recordings = app.north.recordings.clone();
-    // Files are read and converted away from the tasks of other clients, one at a time.
-    let Ok(_permit) = app.files.acquire().await else {
-        return Err(StatusCode::SERVICE_UNAVAILABLE.into());
-    };
     let wanted = id.clone();
-    let read = tokio::task::spawn_blocking(move || {
+    let read = app.read_files(move || {
         let read = recordings.read(&wanted);
         read.map(|read| read.map(|recording| form.of(&recording)))
     });
-    match read.await {
-        Ok(Some(Ok(bytes))) => {
+    match read.await? {
+        Some(Ok(bytes)) => {
             let (content_type, end) = form.kind();
             let mut response = ([(header::CONTENT_TYPE, content_type)], bytes).into_response();
             // An id that there is consists of letters, digits, `-`, `_`, `.` and `:`.
@@ -96,8 +92,7 @@ pub(super) async fn one(
             }
             Ok(response)
         }
-        Ok(Some(Err(error))) => Err(refused(StatusCode::INTERNAL_SERVER_ERROR, error.to_string())),
-        Ok(None) => Err(not_found(format!("there is no recording `{id}`"), Vec::new())),
-        Err(_) => Err(StatusCode::INTERNAL_SERVER_ERROR.into()),
+        Some(Err(error)) => Err(refused(StatusCode::INTERNAL_SERVER_ERROR, error.to_string())),
+        None => Err(not_found(format!("there is no recording `{id}`"), Vec::new())),
     }
 }

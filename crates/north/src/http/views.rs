@@ -198,11 +198,8 @@ async fn from_store<T: Send + 'static>(
     let Some(store) = app.north.parameters.store() else {
         return Ok(None);
     };
-    let unavailable = StatusCode::SERVICE_UNAVAILABLE;
-    let _permit = app.files.acquire().await.map_err(|_| unavailable)?;
-    let found = tokio::task::spawn_blocking(move || read(store)).await;
+    let found = app.read_files(move || read(store)).await?;
     found
-        .map_err(|_| unavailable)?
         .map(Some)
         .map_err(|why| refused(StatusCode::INTERNAL_SERVER_ERROR, why))
 }

@@ -1,4 +1,8 @@
+use std::time::SystemTime;
+
 use super::*;
+use crate::codec::Exception;
+use crate::process_image::{Cadence, Link};
 use crate::testkit::{STALE_AFTER, image, monitored, nx, online, profile};
 
 /// What rests on the drive's frequency range is no worse than the figures that it rests on.

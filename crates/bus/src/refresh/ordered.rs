@@ -1,0 +1,110 @@
+//! What the orders of the gateway wrote last to a drive. Pure.
+
+use std::time::Instant;
+
+use crate::codec::Table;
+use crate::drive::control::{Control, ControlItem};
+use crate::process_image::Reading;
+
+/// Registers of the longest reference.
+const LONGEST: usize = 2;
+
+/// Which command stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Does {
+    Run,
+    Stop,
+}
+
+/// The registers of a reference.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Reference {
+    pub(super) start: u16,
+    pub(super) words: [u16; LONGEST],
+    pub(super) count: u16,
+}
+
+impl Reference {
+    pub(super) fn words(&self) -> &[u16] {
+        self.words.get(..usize::from(self.count)).unwrap_or(&self.words)
+    }
+}
+
+/// What the orders of the gateway wrote last, as far as the drive acknowledged it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct Ordered {
+    pub(super) does: Option<Does>,
+    /// The control word, without a reset.
+    pub(super) word: Option<u16>,
+    pub(super) reference: Option<Reference>,
+    /// The last write of what feeds the timeout.
+    pub(super) fed: Option<Instant>,
+    /// When the reference was written last.
+    pub(super) referred: Option<Instant>,
+    /// The drive was seen to tell that reference.
+    pub(super) tells_reference: bool,
+}
+
+impl Ordered {
+    /// Whether the registers of the reference were read since it was written, and say something else though they said it before.
+    pub(super) fn is_foreign(&mut self, reading: &Reading<'_>) -> bool {
+        let (Some(reference), Some(referred)) = (self.reference, self.referred) else {
+            return false;
+        };
+        let is_new = |at: Instant| at > referred;
+        if !reading
+            .snapshot
+            .read_at(Table::Holding, reference.start)
+            .is_some_and(is_new)
+        {
+            return false;
+        }
+        match reading.words(Table::Holding, reference.start, reference.count) {
+            Ok(words) => !self.tells(&words),
+            Err(_) => false,
+        }
+    }
+
+    /// The registers of the reference are these, or were not read. Whether that is what was written, as far as the drive tells it.
+    pub(super) fn tells(&mut self, read: &[u16]) -> bool {
+        let Some(reference) = self.reference.filter(|r| read.len() == r.words().len()) else {
+            return true;
+        };
+        let is_told = reference.words() == read;
+        let fits = is_told || !self.tells_reference;
+        self.tells_reference |= is_told;
+        fits
+    }
+}
+
+/// What a word at that place says of run and stop; none where it says nothing.
+pub(super) fn does(control: &Control, place: ControlItem, word: u16) -> Option<Option<Does>> {
+    let word = if place == control.at {
+        control.without_reset(word)
+    } else {
+        word
+    };
+    if control.is_own_stop(place, word) {
+        return Some(Some(Does::Stop));
+    }
+    if control.is_run(place, word) {
+        return Some(Some(Does::Run));
+    }
+    // Behind a word that stops by other means, or that is neither, nothing is repeated.
+    (place == control.at || place == control.run_place()).then_some(None)
+}
+
+/// The registers that lie side by side.
+pub(super) fn reference_of(items: &[(u16, u16)]) -> Option<Reference> {
+    let (start, _) = *items.first()?;
+    let mut words = [0; LONGEST];
+    let mut count = 0;
+    for ((address, word), place) in items.iter().zip(&mut words) {
+        if *address != start.wrapping_add(count) {
+            break;
+        }
+        *place = *word;
+        count += 1;
+    }
+    Some(Reference { start, words, count })
+}

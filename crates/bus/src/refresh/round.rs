@@ -1,0 +1,308 @@
+//! A round of a refresh: a reference that lies apart, the reads, the write. Pure: time is an argument.
+
+use std::time::{Duration, Instant};
+
+use super::ordered::{Ordered, Reference, reference_of};
+use super::{Does, End, Refresh};
+use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::command_run::{Look, Motor};
+use crate::drive::Profile;
+use crate::drive::control::Control;
+
+/// A step of a round.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Stage {
+    /// A reference that does not lie beside the control word.
+    Reference,
+    /// The control word of the drive, and the reference beside it.
+    Own,
+    /// How the motor stands.
+    Look,
+    Write,
+}
+
+/// A round that has begun.
+#[derive(Debug)]
+pub(super) struct Round {
+    stage: Stage,
+    look: Look,
+}
+
+/// Whether what the drive has is what was written.
+enum Fits {
+    Yes,
+    No,
+    /// A reset stands in it.
+    NotNow,
+}
+
+impl Refresh {
+    /// The next round is not due before then.
+    pub(crate) fn put_off(&mut self, until: Instant) {
+        self.round = None;
+        if let Some(going) = &mut self.repeated.going {
+            going.due = going.due.max(until);
+        }
+    }
+
+    /// Whether a round has begun, and its next step must follow at once.
+    pub(crate) fn is_under_way(&self) -> bool {
+        self.round.is_some()
+    }
+
+    /// Another transaction goes first: what the round has read is read again.
+    pub(crate) fn others_go_first(&mut self, profile: &Profile) {
+        if let Some(round) = self.round.as_mut().filter(|round| round.stage != Stage::Reference) {
+            round.stage = first_read(profile);
+            round.look.begin_again();
+        }
+    }
+
+    /// The request of the present step of the round, which begins where none has.
+    pub(crate) fn request(&mut self, profile: &Profile) -> Option<RequestPdu> {
+        let control = profile.control.as_ref()?;
+        if self.round.is_none() {
+            let apart = self.reference_apart(profile, control);
+            self.round = Some(Round {
+                stage: apart.map_or(first_read(profile), |_| Stage::Reference),
+                look: Look::at_motor(profile)?,
+            });
+        }
+        let round = self.round.as_ref()?;
+        match round.stage {
+            Stage::Reference => self
+                .reference_apart(profile, control)
+                .map(|r| write(profile, r.start, r.words())),
+            Stage::Own => Some(self.read_own(profile, control)),
+            Stage::Look => Some(round.look.request()),
+            Stage::Write => self.write(profile, control),
+        }
+    }
+
+    /// What the round writes, as far as the rules of the gate ask: word and reference.
+    pub(crate) fn writes(&self, profile: &Profile) -> Option<RequestPdu> {
+        let control = profile.control.as_ref()?;
+        match self.reference_apart(profile, control) {
+            Some(reference) => Some(write(profile, reference.start, reference.words())),
+            None => self.write(profile, control),
+        }
+    }
+
+    /// What is written behind the reads.
+    fn write(&self, profile: &Profile, control: &Control) -> Option<RequestPdu> {
+        let (_, repeats) = self.settings?;
+        let ordered = &self.repeated.ordered;
+        if self.is_fed_by_reference(control, repeats) {
+            return ordered.reference.map(|r| write(profile, r.start, r.words()));
+        }
+        let word = ordered.word?;
+        Some(match self.together(profile, control) {
+            None => write(profile, control.at.address, &[word]),
+            Some(r) if r.start > control.at.address => {
+                let words: Vec<u16> = [word].iter().chain(r.words()).copied().collect();
+                write(profile, control.at.address, &words)
+            }
+            Some(r) => {
+                let words: Vec<u16> = r.words().iter().copied().chain([word]).collect();
+                write(profile, r.start, &words)
+            }
+        })
+    }
+
+    /// The reference, where it lies beside the control word and one request writes both.
+    fn together(&self, profile: &Profile, control: &Control) -> Option<Reference> {
+        let at = control.at.address;
+        let reference = self.repeated.ordered.reference?;
+        let beside = reference.start == at.wrapping_add(1) || reference.start.wrapping_add(reference.count) == at;
+        let first = reference.start.min(at);
+        (beside && !self.apart && profile.writes_together(first, reference.count + 1)).then_some(reference)
+    }
+
+    /// The reference that is written before the control word.
+    fn reference_apart(&self, profile: &Profile, control: &Control) -> Option<Reference> {
+        let (_, repeats) = self.settings?;
+        let alone = self.is_fed_by_reference(control, repeats);
+        let reference = self.repeated.ordered.reference?;
+        (!alone && self.together(profile, control).is_none()).then_some(reference)
+    }
+
+    /// The read of the control word of the drive, with the reference beside it.
+    fn read_own(&self, profile: &Profile, control: &Control) -> RequestPdu {
+        let at = control.at.address;
+        let beside = self.together(profile, control).filter(|r| r.start > at);
+        let count = 1 + beside.map_or(0, |r| r.count);
+        let may = profile
+            .ranges
+            .iter()
+            .any(|range| range.table == Table::Holding && range.addresses.contains(&at) && range.read >= count);
+        RequestPdu::Read {
+            table: Table::Holding,
+            start: at,
+            count: if may { count } else { 1 },
+        }
+    }
+
+    /// The drive answered the present step. Whether the round is over, or why the refresh has ended.
+    pub(crate) fn answered(&mut self, profile: &Profile, reply: &Reply, now: Instant) -> Result<bool, End> {
+        let (Some((every, _)), Some(control)) = (self.settings, profile.control.as_ref()) else {
+            return Ok(true);
+        };
+        let Some(stage) = self.round.as_ref().map(|round| round.stage) else {
+            return Ok(true);
+        };
+        if let Reply::Exception(code) = reply {
+            if *code == Exception::FUNCTION && stage == Stage::Write && !self.apart {
+                self.apart = true;
+                self.round = None;
+                return Ok(true);
+            }
+            if code.is_busy() || code.leaves_open() || code.is_no_answer() {
+                self.not_answered(now);
+                return Ok(true);
+            }
+            return Err(End::Refused(format!("the drive refused it with {code}")));
+        }
+        let next = match stage {
+            Stage::Reference => first_read(profile),
+            Stage::Own => match self.judge_own(control, reply) {
+                Fits::Yes => Stage::Look,
+                Fits::NotNow => {
+                    self.put_off(now + every);
+                    return Ok(true);
+                }
+                Fits::No => return Err(End::Foreign),
+            },
+            Stage::Look => {
+                let Some(round) = &mut self.round else { return Ok(true) };
+                if !round.look.hears(reply) {
+                    return Ok(false);
+                }
+                let motor = round.look.motor();
+                match self.judge_motor(motor) {
+                    Ok(true) => Stage::Write,
+                    Ok(false) => {
+                        self.not_answered(now);
+                        return Ok(true);
+                    }
+                    Err(end) => return Err(end),
+                }
+            }
+            Stage::Write => {
+                if let Some(going) = &mut self.repeated.going {
+                    (going.due, going.lost) = (now + every, None);
+                }
+                self.round = None;
+                return Ok(true);
+            }
+        };
+        if let Some(round) = &mut self.round {
+            round.stage = next;
+        }
+        Ok(false)
+    }
+
+    /// Whether the drive has the word, and the reference, that were written.
+    fn judge_own(&mut self, control: &Control, reply: &Reply) -> Fits {
+        let words = reply.words().unwrap_or_default();
+        let (Some(read), Some(word)) = (words.first().copied(), self.repeated.ordered.word) else {
+            return Fits::NotNow;
+        };
+        let released = control.without_reset(read);
+        if released != word {
+            return Fits::No;
+        }
+        let reference = words.get(1..).unwrap_or_default();
+        let told = self.repeated.ordered.tells(reference);
+        match (read == released, told) {
+            (_, false) => Fits::No,
+            (false, true) => Fits::NotNow,
+            (true, true) => Fits::Yes,
+        }
+    }
+
+    /// Whether the motor stands as the word says: that is written, or nothing this time.
+    fn judge_motor(&mut self, motor: Motor) -> Result<bool, End> {
+        let Some(going) = &mut self.repeated.going else {
+            return Ok(false);
+        };
+        match (going.does, motor) {
+            (_, Motor::RunsElsewise) => Err(End::Local),
+            (_, Motor::NotShown) => Ok(false),
+            (Does::Run, Motor::Runs) => {
+                going.seen = true;
+                Ok(true)
+            }
+            (Does::Run, Motor::Stands) => Err(End::Stands),
+            (Does::Stop, Motor::Runs) if going.seen => Err(End::Starts),
+            // It comes down.
+            (Does::Stop, Motor::Runs) => Ok(true),
+            (Does::Stop, Motor::Stands) => {
+                going.seen = true;
+                Ok(true)
+            }
+        }
+    }
+
+    /// No reply to a step, or none that is believed: it goes on with the next period, by what the drive shows then.
+    pub(crate) fn not_answered(&mut self, now: Instant) {
+        self.round = None;
+        let Some((every, _)) = self.settings else { return };
+        if let Some(going) = &mut self.repeated.going {
+            going.lost.get_or_insert(now);
+            going.due = now + every;
+        }
+    }
+
+    /// The thread stood still for that time, in which nothing was written.
+    pub(crate) fn stood(&mut self, time: Duration, now: Instant) {
+        self.round = None;
+        if let Some(going) = &mut self.repeated.going {
+            going.lost.get_or_insert(now.checked_sub(time).unwrap_or(now));
+        }
+    }
+}
+
+/// The first read of a round.
+fn first_read(profile: &Profile) -> Stage {
+    match profile.control.as_ref().is_some_and(Control::is_read) && profile.repeats().is_ok_and(|r| r.word) {
+        true => Stage::Own,
+        false => Stage::Look,
+    }
+}
+
+fn write(profile: &Profile, start: u16, words: &[u16]) -> RequestPdu {
+    match words {
+        [word] => profile.functions.write_register(start, *word),
+        words => RequestPdu::WriteRegisters {
+            start,
+            values: words.to_vec(),
+        },
+    }
+}
+
+/// The requests of a round of a drive of that profile, with a reference of one register, for the prediction.
+pub(crate) fn requests(profile: &Profile) -> Vec<RequestPdu> {
+    let (Ok(repeats), Some(control)) = (profile.repeats(), profile.control.as_ref()) else {
+        return Vec::new();
+    };
+    let mut refresh = Refresh {
+        settings: Some((Duration::from_secs(1), repeats)),
+        ..Refresh::default()
+    };
+    let address = (0..=u16::MAX).find(|address| profile.is_repeated_reference(*address));
+    refresh.repeated.ordered = Ordered {
+        word: repeats.word.then_some(0),
+        reference: address.and_then(|address| reference_of(&[(address, 0)])),
+        ..Ordered::default()
+    };
+    let apart = refresh.reference_apart(profile, control);
+    let own = (first_read(profile) == Stage::Own).then(|| refresh.read_own(profile, control));
+    let looks = Look::at_motor(profile).map(|look| look.requests().cloned().collect::<Vec<_>>());
+    apart
+        .map(|r| write(profile, r.start, r.words()))
+        .into_iter()
+        .chain(own)
+        .chain(looks.into_iter().flatten())
+        .chain(refresh.write(profile, control))
+        .collect()
+}
