@@ -266,8 +266,7 @@ impl DriveState {
                 OrderEnd::Action
             }
             outcome if outcome.is_ok() => OrderEnd::Other,
-            // The drive took nothing of the step that it refused.
-            Outcome::Exception(_) | Outcome::Refused(_) if !run.in_doubt() => return,
+            Outcome::Exception(_) | Outcome::Refused(_) if !run.in_doubt() => OrderEnd::Refused,
             _ => OrderEnd::Unknown,
         };
         let held = self.supervision.is_held();

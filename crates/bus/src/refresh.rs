@@ -68,6 +68,8 @@ pub(super) enum OrderEnd {
     Drill,
     /// The speed reference of a lease that expired was.
     Action,
+    /// The drive refused a step of it.
+    Refused,
     /// What the drive took of it is unknown.
     Unknown,
     /// An order of the gateway itself was sent.
@@ -191,7 +193,9 @@ impl Refresh {
             OrderEnd::Done => (held, Beginner::Client),
             OrderEnd::Drill => (held, Beginner::Drill),
             OrderEnd::Action => (self.by_lease, Beginner::Action),
-            OrderEnd::Unknown => return self.end(End::Unknown),
+            // What was taken before that may be another command than the one that is repeated.
+            OrderEnd::Refused if self.repeats_what_was_ordered() => return None,
+            OrderEnd::Refused | OrderEnd::Unknown => return self.end(End::Unknown),
             OrderEnd::Other => return self.end(End::Other),
         };
         self.by_lease = false;
@@ -201,6 +205,11 @@ impl Refresh {
             self.forget();
         }
         None
+    }
+
+    fn repeats_what_was_ordered(&self) -> bool {
+        let Repeated { ordered, going } = self.repeated;
+        going.is_none_or(|going| ordered.does == Some(going.does))
     }
 
     fn begin(&mut self, profile: &Profile, by: Beginner, now: Instant) {

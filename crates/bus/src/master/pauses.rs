@@ -23,9 +23,10 @@ impl Master {
             queue.slept(slept);
         }
         drop(queue);
-        for drive in &mut self.drives {
-            if stall.is_pause() {
-                drive.refresh.stood(stall.length(), now);
+        for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
+            match stall.is_pause() {
+                true => drive.refresh.stood(stall.length(), now),
+                false => drive.refresh.others_go_first(&image.spec.profile),
             }
             for urgency in [Urgency::Command, Urgency::Read] {
                 if let Some(run) = drive.run(urgency).filter(|_| stall.is_pause()) {

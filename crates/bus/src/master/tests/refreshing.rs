@@ -348,7 +348,17 @@ fn a_short_outage_suspends_a_refresh_and_it_goes_on_by_what_the_drive_shows() {
 #[test]
 fn a_round_that_was_interrupted_reads_again_before_it_writes() {
     type Event = fn(&mut Rig);
-    let events: [(&str, Event); 2] = [
+    let events: [(&str, Event); 3] = [
+        ("stall", |rig| {
+            let began = rig.now;
+            rig.now += Duration::from_millis(600);
+            let stall = crate::stalls::Stall {
+                began,
+                ended: rig.now,
+                slept: Duration::ZERO,
+            };
+            rig.master.stood(stall, rig.now);
+        }),
         ("port", |rig| {
             rig.master.lost(rig.now);
             rig.master.opened(rig.now);
