@@ -28,7 +28,7 @@ pub struct Truth {
     pub acts: VecDeque<(Instant, RequestPdu, Option<Vec<u16>>)>,
     /// What orders set last, as the drive took it.
     pub ordered: HashMap<(Table, u16), u16>,
-    /// Its run command was written last, by an order or again.
+    /// The run command was written last, by an order or again.
     pub fed: Option<Instant>,
     /// An order started it then, and nothing has stopped it since.
     pub ran_by_order: Option<Instant>,
@@ -39,7 +39,7 @@ pub struct Truth {
     /// The motor runs since.
     pub running_since: Option<Instant>,
     pub ran_at: Option<Instant>,
-    /// Its motor turned last, whether or not anybody saw it.
+    /// The motor turned last, whether or not anybody saw it.
     pub turned_at: Option<Instant>,
     /// The image has had it online since.
     pub online_since: Option<Instant>,

@@ -96,11 +96,11 @@ pub(super) struct Refresh {
     round: Option<Round>,
     /// Stops that were accepted before the order that has begun.
     stops: u64,
-    /// That order has said whether the motor is to run.
+    /// The order that has begun said whether the motor is to run.
     says_run: bool,
     /// The drive does not take word and reference in one request.
     apart: bool,
-    /// It ended by the lease: only the action of that lease begins it again.
+    /// The lease ended the refresh: only its action, or an order with a run command or stop, begins another one.
     by_lease: bool,
 }
 

@@ -42,7 +42,7 @@ impl Master {
                 let ended = drive.refresh.look(&image.reading(now, drive.fresh), around);
                 drive.refresh_ended = ended.or(drive.refresh_ended.take());
             }
-            // That of a stop is the usual one.
+            // A stop is the usual end, and not reported.
             if let Some(why) = drive.refresh_ended.take().filter(|why| *why != End::Stop) {
                 news.push(News::RefreshEnded {
                     drive: index,

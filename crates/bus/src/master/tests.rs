@@ -43,7 +43,7 @@ struct Registers {
     to_writes: Option<(u32, Exception)>,
     /// It answers that to every read.
     to_reads: Option<Exception>,
-    /// It is of a family of its own.
+    /// The drive is of another family.
     family: Option<family_drive::FamilyDrive>,
 }
 

@@ -234,7 +234,7 @@ impl Refresh {
             }
             (Does::Run, Motor::Stands) => Err(End::Stands),
             (Does::Stop, Motor::Runs) if going.seen => Err(End::Starts),
-            // It comes down.
+            // The motor comes down.
             (Does::Stop, Motor::Runs) => Ok(true),
             (Does::Stop, Motor::Stands) => {
                 going.seen = true;

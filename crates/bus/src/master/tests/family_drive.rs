@@ -13,7 +13,7 @@ pub(super) struct FamilyDrive {
     profile: Arc<Profile>,
     items: BTreeMap<(Table, u16), u16>,
     pub(super) runs: bool,
-    /// It does not know function 16.
+    /// Function 16 is unknown to the drive.
     pub(super) only_06: bool,
 }
 
@@ -79,21 +79,21 @@ impl FamilyDrive {
         }
     }
 
-    /// Its motor turns.
+    /// The motor turns.
     pub(super) fn run(&mut self) {
         self.runs = true;
         self.show(ModelPoint::Ready, true);
         self.show(ModelPoint::Running, true);
     }
 
-    /// Its motor stands.
+    /// The motor stands.
     pub(super) fn stand(&mut self) {
         self.runs = false;
         self.show(ModelPoint::Running, false);
         self.show(ModelPoint::Ready, true);
     }
 
-    /// Its mains were off: it stands, and its words are gone.
+    /// The mains were off: the motor stands, and the words are gone.
     pub(super) fn power_cycle(&mut self) {
         *self = FamilyDrive::new(&self.profile.clone());
     }

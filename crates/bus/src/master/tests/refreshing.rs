@@ -384,7 +384,7 @@ fn a_round_that_was_interrupted_reads_again_before_it_writes() {
                 plant.rig.step();
                 assert!(plant.rig.now < until, "{name}");
             }
-            // It stands now, and nobody has seen that.
+            // The motor stands now, and nobody has seen that.
             plant.drive().stand();
             happens(&mut plant.rig);
             let from = plant.rig.wire.len();
